@@ -1,0 +1,1 @@
+"""The solver core: from poses and wrenches to a calibration. Pure: numpy and scipy, no device."""

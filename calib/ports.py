@@ -1,0 +1,76 @@
+"""What the calibration routine asks of the outside world: a driver, a recording or a fake of this shape fits."""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class WrenchSamples(Protocol):
+    """n samples of a force/torque sensor, as measured; see `Recording` for the meaning of the columns."""
+
+    @property
+    def t_host_ns(self) -> NDArray[np.int64]:
+        """(n,) host clock at receipt."""
+
+    @property
+    def t_device_s(self) -> Array:
+        """(n,) device clock, NaN where there is none."""
+
+    @property
+    def seq(self) -> NDArray[np.int64]:
+        """(n,) running number; gaps are lost samples."""
+
+    @property
+    def counts(self) -> NDArray[np.int32]:
+        """(n, k) raw device counts."""
+
+    @property
+    def wrench(self) -> Array:
+        """(n, 6) N and N·m, in the sensor frame."""
+
+    @property
+    def status(self) -> NDArray[np.uint32]:
+        """(n,) vendor status word."""
+
+
+class Sensor(Protocol):
+    """A source of wrenches."""
+
+    def collect(self, duration_s: float) -> WrenchSamples:
+        """Every sample of the next `duration_s` seconds, or an exception."""
+
+    def check(self) -> None:
+        """Raise if the stream has failed."""
+
+
+class ArmReading(Protocol):
+    """One look at the arm."""
+
+    @property
+    def t_host_ns(self) -> int:
+        """Host clock at receipt."""
+
+    @property
+    def q_rad(self) -> Array:
+        """(6,) joint angles."""
+
+    @property
+    def R_base_flange(self) -> Array:
+        """(3, 3) flange coordinates to base coordinates."""
+
+
+class Arm(Protocol):
+    """Something that takes the sensor to an orientation."""
+
+    def state(self) -> ArmReading:
+        """Read a fresh state, or raise."""
+
+    def move_to(self, q_rad: Sequence[float], *, timeout_s: float, guard: Callable[[], None]) -> None:
+        """Move the joints to `q_rad` (6,); return on arrival, or stop the arm and raise."""
+
+    def wait_until_still(self, *, timeout_s: float, guard: Callable[[], None]) -> None:
+        """Return when the arm has come to rest, or raise."""

@@ -1,0 +1,1 @@
+"""Adapters for arms and force/torque sensors behind two abstract interfaces."""

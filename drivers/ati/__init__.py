@@ -1,0 +1,1 @@
+"""ATI force/torque sensors: one codec and one calibration model, two wires."""

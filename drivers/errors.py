@@ -1,0 +1,35 @@
+"""What can go wrong with a device.
+
+DriverError
+├── ConnectError     the device could not be opened, or is not what it should be
+├── StreamBroken     the connection was lost after it had worked
+├── DeviceTimeout    nothing arrived in time (also a TimeoutError)
+├── ProtocolError    bytes arrived that the document does not allow
+└── DeviceFault      the device itself reports a fault: sensor status, protective or emergency stop
+
+Every message says what happened, with the value, and what to do next.
+"""
+
+
+class DriverError(Exception):
+    """Base of all device errors."""
+
+
+class ConnectError(DriverError):
+    """The device could not be opened, or is not what it should be."""
+
+
+class StreamBroken(DriverError):
+    """The connection was lost after it had worked."""
+
+
+class DeviceTimeout(DriverError, TimeoutError):
+    """Nothing arrived in time."""
+
+
+class ProtocolError(DriverError):
+    """Bytes arrived that the device's document does not allow."""
+
+
+class DeviceFault(DriverError):
+    """The device reports a fault of its own."""

@@ -1,0 +1,173 @@
+"""The two things a cell has: an arm and a wrist force/torque sensor.
+
+Constructors only store configuration; `open` talks to the device and `close` is safe at any time, twice, and after the
+device is gone. Every wait has a time-out. An old value is never returned: stale data is an error.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+Guard = Callable[[], None]
+"""Called between two looks at the arm; raises when the motion must not go on."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceInfo:
+    """Who a device says it is."""
+
+    model: str
+    serial: str
+    firmware: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FtSamples:
+    """n consecutive samples of one sensor, one row each, as measured: no bias, tare or filter applied.
+
+    The wrench is exerted on the sensor by what hangs on it or pushes on it, in the sensor frame, about its origin.
+    """
+
+    t_host_ns: NDArray[np.int64]
+    """(n,) `time.monotonic_ns()` at receipt."""
+    t_device_s: Array
+    """(n,) the device's own clock, own epoch; NaN where it has none. Never subtract it from host time."""
+    seq: NDArray[np.int64]
+    """(n,) counts every sample the device sent or was asked for, so that gaps are visible."""
+    counts: NDArray[np.int32]
+    """(n, k) raw device counts; k = 0 where the device reports physical units."""
+    wrench: Array
+    """(n, 6) force in N, then torque in N·m."""
+    status: NDArray[np.uint32]
+    """(n,) the vendor's status word."""
+
+    def __len__(self) -> int:
+        """Count the rows."""
+        return len(self.t_host_ns)
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence["FtSamples"]) -> "FtSamples":
+        """Join blocks in the order given."""
+        return cls(
+            *(
+                np.concatenate([getattr(block, name) for block in blocks])
+                for name in ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
+            )
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """What a stream has been through since it was opened."""
+
+    received: int
+    lost: int
+    """Samples the device sent, or was asked for, that never arrived."""
+    malformed: int
+    """Frames that arrived damaged and were thrown away."""
+    rate_Hz: float
+    """Over the last second."""
+    age_s: float
+    """Since the newest sample."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmState:
+    """One look at the arm. The flange is the mechanical flange, whatever TCP is active."""
+
+    t_host_ns: int
+    t_device_s: float
+    q_rad: Array
+    """(6,) actual joint angles."""
+    qd_rad_s: Array
+    """(6,) actual joint speeds."""
+    R_base_flange: Array
+    """(3, 3) maps flange coordinates to base coordinates."""
+    p_base_flange_m: Array
+    """(3,)"""
+
+
+class _Device(ABC):
+    @abstractmethod
+    def close(self) -> None:
+        """Let the device go. Idempotent; never raises on a lost device."""
+
+    @abstractmethod
+    def identify(self) -> DeviceInfo:
+        """Tell model, serial number and firmware, as read when the device was opened."""
+
+
+class ForceTorqueSensor(_Device):
+    """A streaming six-axis force/torque sensor."""
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connect and start the stream. Idempotent. Raises `ConnectError`."""
+
+    @abstractmethod
+    def collect(self, duration_s: float) -> FtSamples:
+        """Every sample received in the `duration_s` seconds that begin with this call.
+
+        Raises `StreamBroken`, `DeviceTimeout` or `DeviceFault` as soon as the stream fails, never later than half a
+        second after the end; never a result with missing time.
+        """
+
+    @abstractmethod
+    def latest(self, *, timeout_s: float) -> FtSamples:
+        """The newest sample (one row), waiting up to `timeout_s` for one that is fresh. Never an old value."""
+
+    @abstractmethod
+    def check(self) -> None:
+        """Raise the stream's failure, if it has one: broken, silent for too long, or a critical device status."""
+
+    @abstractmethod
+    def health(self) -> Health:
+        """Counters since `open`."""
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class RobotArm(_Device):
+    """A six-joint arm."""
+
+    @abstractmethod
+    def open(self, *, control: bool = False) -> None:
+        """Connect, read-only unless `control` is asked for. Idempotent. Raises `ConnectError`."""
+
+    @abstractmethod
+    def state(self) -> ArmState:
+        """Read a fresh, consistent state; raises `DeviceTimeout` when the controller's clock stands still."""
+
+    @abstractmethod
+    def within_safety_limits(self, q_rad: Sequence[float]) -> bool:
+        """Ask the controller whether it would accept these joint angles (6,). Needs control."""
+
+    @abstractmethod
+    def move_to(self, q_rad: Sequence[float], *, timeout_s: float, guard: Guard) -> None:
+        """Move all joints to `q_rad` (6,), at the speed given at construction, and return when they have arrived.
+
+        `guard` is called at least 20 times a second while the arm moves. Whatever ends the wait early (an exception
+        of the guard, a fault, the time-out, Ctrl-C) stops the arm first and is raised after.
+        """
+
+    @abstractmethod
+    def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
+        """Return when the joints have been at rest long enough for the structure to stop ringing."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Stop the arm. From any thread, any time; does nothing without control."""
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

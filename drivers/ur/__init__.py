@@ -1,0 +1,1 @@
+"""Universal Robots arms, through ur_rtde."""

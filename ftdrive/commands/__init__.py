@@ -1,0 +1,1 @@
+"""Commands of the application, one module each, imported only when called."""

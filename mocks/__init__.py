@@ -1,0 +1,1 @@
+"""The far side of the wire: an emulated robot cell. Imports nothing of the other packages."""
