@@ -1,0 +1,5 @@
+"""`python -m ftdrive`."""
+
+from ftdrive.cli import main
+
+raise SystemExit(main())

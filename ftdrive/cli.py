@@ -1,0 +1,90 @@
+"""The command line: one group, lazy commands, and the one place where an exception becomes an exit code."""
+
+import importlib
+import logging
+
+import click
+
+from ftdrive import __version__, _siblings
+
+# A command, its module, its line in the help. The module is imported only when the command is called: help is fast.
+_COMMANDS = {
+    "demo": ("ftdrive.commands.demo", "Calibrate an emulated cell: nothing to connect, half a minute."),
+    "calibrate": ("ftdrive.commands.calibrate", "Take an arm through the tour, average its sensor, solve."),
+    "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
+    "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
+    "replay": ("ftdrive.commands.replay", "Repeat a recorded run through the same routine and solver."),
+}
+
+_EPILOG = """\b
+Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,
+5 device fault, 6 file unreadable or not what it should be, 7 not acceptable (not observable, rejected),
+130 interrupted (data kept)."""
+
+
+class _LazyGroup(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return None
+        command: click.Command = getattr(importlib.import_module(_COMMANDS[cmd_name][0]), cmd_name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, line) for name, (_, line) in _COMMANDS.items()])
+
+
+@click.group(cls=_LazyGroup, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("-v", "--verbose", count=True, help="Say more on stderr; twice for everything.")
+@click.option("-q", "--quiet", is_flag=True, help="Only errors on stderr.")
+@click.version_option(__version__, prog_name="ftdrive")
+def cli(verbose: int, quiet: bool) -> None:
+    """Calibrate a wrist force/torque sensor on a Universal Robots arm, and see the true contact force.
+
+    New here? `ftdrive demo` needs no hardware.
+    """
+    level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")
+
+
+def exit_code(error: BaseException) -> int | None:
+    """Exit code of an error that a user can mend; None for a defect of ours."""
+    from calib.errors import BadDataset, NotObservable
+    from drivers.errors import ConnectError, DeviceFault, DriverError
+    from ftdrive.errors import ConfigError, NotAccepted
+
+    codes: list[tuple[type[BaseException], int]] = [
+        (ConfigError, 2),
+        (ConnectError, 3),
+        (DeviceFault, 5),
+        (DriverError, 4),
+        (BadDataset, 6),
+        (NotObservable, 7),
+        (NotAccepted, 7),
+        (OSError, 6),
+    ]
+    return next((code for kind, code in codes if isinstance(error, kind)), None)
+
+
+def main() -> int:
+    """Run the command line; return the exit code."""
+    try:
+        _siblings.check()
+        return int(cli.main(prog_name="ftdrive", standalone_mode=False) or 0)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("interrupted", err=True)
+        return 130
+    except BrokenPipeError:
+        return 0
+    except Exception as error:
+        code = exit_code(error)
+        if code is None:
+            raise
+        click.echo(f"error: {error}", err=True)
+        return code

@@ -1,0 +1,78 @@
+"""What several commands share: options, the progress bar, JSON on stdout."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from calib import CalibrationResult
+from calib.routine import Progress as RoutineProgress
+from ftdrive.config import CellConfig, RobotConfig, SensorConfig, load
+from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.report import describe, talk
+from ftdrive.runs import Run
+
+JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+RUNS = click.option(
+    "--runs",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("runs"),
+    show_default=True,
+    help="Folder in which the run's own folder is made.",
+)
+
+
+def write_json(value: Mapping[str, Any]) -> None:
+    """Write one JSON object to stdout, on one line."""
+    click.echo(json.dumps(value))
+
+
+def read_cell(config: Path | None, robot: str | None, sensor: str | None) -> CellConfig:
+    """Take the cell from a file, or from the two addresses that nothing can guess."""
+    if config is not None:
+        if robot or sensor:
+            raise ConfigError("give either --config or --robot and --sensor, not both")
+        return load(config)
+    if robot and sensor:
+        return CellConfig(RobotConfig(robot), SensorConfig(sensor))
+    raise ConfigError("which cell? Give --config FILE, or --robot HOST and --sensor URL, or --simulate")
+
+
+@contextmanager
+def progress_bar() -> Iterator[tuple[Callable[[RoutineProgress], None], Callable[[Run], None]]]:
+    """Show the routine's progress on stderr; when it fails, say where the poses taken so far are kept.
+
+    Yields what to call with every step, and with the run as soon as it exists: the bar appears then, after questions.
+    """
+    runs: list[Run] = []
+    bar = Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=talk)
+    task = bar.add_task("", total=None)
+
+    def on_run(run: Run) -> None:
+        runs.append(run)
+        bar.start()
+
+    def on_progress(progress: RoutineProgress) -> None:
+        done = progress.stop - (progress.stage != "taken")
+        bar.update(task, description=describe(progress), completed=done, total=progress.stops)
+
+    try:
+        yield on_progress, on_run
+    except BaseException:
+        bar.stop()
+        for run in runs:
+            poses = len(list((run.folder / "poses").glob("*.npz")))
+            talk.print(f"{poses} poses are kept in {run.folder}")
+        raise
+    finally:
+        bar.stop()
+
+
+def stop_unless_accepted(result: CalibrationResult) -> None:
+    """Raise `NotAccepted` for a rejected result."""
+    if result.verdict == "rejected":
+        raise NotAccepted("the result is rejected and was not saved: " + "; ".join(result.reasons))

@@ -1,0 +1,190 @@
+"""`ftdrive live`: raw and compensated wrench, ten times a second."""
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+from rich.live import Live
+from rich.table import Table
+
+from calib import CalibrationResult
+from calib.noise import PoseMean, mean_and_covariance
+from drivers.interfaces import DeviceInfo
+from ftdrive.commands.common import JSON, read_cell, write_json
+from ftdrive.config import CellConfig
+from ftdrive.errors import ConfigError
+from ftdrive.report import talk
+from ftdrive.runs import Run
+from ftdrive.simulation import Station
+from ftdrive.wiring import build_arm, build_sensor
+
+Array = NDArray[np.float64]
+Axes = Literal["sensor", "flange", "base"]
+
+_PERIOD_S = 0.1
+_NAMES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """The mean of a tenth of a second."""
+
+    mean: PoseMean
+    R_base_flange: Array
+    rate_Hz: float
+    lost: int
+
+
+@click.command()
+@click.option(
+    "--calibration", "path", required=True, type=click.Path(exists=True, dir_okay=False, path_type=Path), help="FILE."
+)
+@click.option("--config", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="The cell, in TOML.")
+@click.option("--robot", metavar="HOST", help="Address of the controller.")
+@click.option("--sensor", metavar="URL", help="Such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0.")
+@click.option("--simulate", is_flag=True, help="An emulated cell: that of the demo which made the calibration.")
+@click.option("--replay", type=click.Path(exists=True, file_okay=False, path_type=Path), help="A recorded run.")
+@click.option(
+    "--axes", type=click.Choice(["sensor", "flange", "base"]), default="sensor", show_default=True, help="Shown along."
+)
+@click.option("--once", is_flag=True, help="One look, then end.")
+@JSON
+def live(
+    path: Path,
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    simulate: bool,
+    replay: Path | None,
+    axes: Axes,
+    once: bool,
+    as_json: bool,
+) -> None:
+    """Show the raw and the compensated wrench, refreshed ten times a second.
+
+    The compensated wrench is what touches the tool: bias and weight of the tool are taken away. Both are shown about
+    the sensor's origin, along the axes asked for. The arm is only read, never moved. With --json, one object a line.
+    """
+    calibration = CalibrationResult.load(path)
+    with ExitStack() as stack:
+        if replay is not None:
+            looks = _recorded_looks(Run(replay))
+        else:
+            if simulate:
+                made_by = calibration.provenance.get("station") or {}
+                station = stack.enter_context(Station(made_by.get("sensor", "can"), made_by.get("options", ())))
+                cell = station.cell
+            else:
+                cell = read_cell(config, robot, sensor)
+            looks = stack.enter_context(_live_looks(cell, calibration))
+        if once or as_json:
+            for look in looks:
+                reading = _reading(look, calibration, axes)
+                if as_json:
+                    write_json(reading)
+                else:
+                    click.echo(_line(reading))
+                if once:
+                    break
+        else:
+            with Live(console=talk, refresh_per_second=10) as screen:
+                for look in looks:
+                    screen.update(_screen(_reading(look, calibration, axes), path))
+
+
+@contextmanager
+def _live_looks(cell: CellConfig, calibration: CalibrationResult) -> Iterator[Iterator[Look]]:
+    with build_sensor(cell) as sensor, build_arm(cell) as arm:
+        arm.open()
+        _refuse_other_devices(calibration, {"arm": arm.identify(), "sensor": sensor.identify()})
+
+        def looks() -> Iterator[Look]:
+            while True:
+                samples = sensor.collect(_PERIOD_S)
+                R_base_flange = arm.state().R_base_flange
+                health = sensor.health()
+                yield Look(mean_and_covariance(samples.wrench), R_base_flange, health.rate_Hz, health.lost)
+
+        yield looks()
+
+
+def _recorded_looks(run: Run) -> Iterator[Look]:
+    for record in run.records():
+        samples = record.samples
+        t_s = (samples.t_host_ns - samples.t_host_ns[0]) * 1e-9
+        for start_s in np.arange(0.0, t_s[-1], _PERIOD_S):
+            inside = (t_s >= start_s) & (t_s < start_s + _PERIOD_S)
+            if np.count_nonzero(inside) > 1:
+                lost = int(np.ptp(samples.seq)) + 1 - len(samples.seq)
+                rate_Hz = float(np.count_nonzero(inside) / _PERIOD_S)
+                yield Look(mean_and_covariance(samples.wrench[inside]), record.before.R_base_flange, rate_Hz, lost)
+                time.sleep(_PERIOD_S)
+
+
+def _refuse_other_devices(calibration: CalibrationResult, found: dict[str, DeviceInfo]) -> None:
+    made_with = calibration.provenance.get("devices") or {}
+    for role, device in found.items():
+        serial = made_with.get(role, {}).get("serial")
+        if serial is not None and serial != device.serial:
+            raise ConfigError(
+                f"the calibration belongs to {role} {serial}, but {role} {device.serial} is connected: "
+                "calibrate this cell"
+            )
+
+
+def _reading(look: Look, calibration: CalibrationResult, axes: Axes) -> dict[str, Any]:
+    raw = look.mean.mean
+    contact = calibration.compensate(raw, look.R_base_flange)
+    covariance = look.mean.covariance + calibration.wrench_covariance(look.R_base_flange)
+    R_axes_sensor = {
+        "sensor": np.eye(3),
+        "flange": calibration.R_flange_sensor,
+        "base": look.R_base_flange @ calibration.R_flange_sensor,
+    }[axes]
+    turn = np.kron(np.eye(2), R_axes_sensor)
+    raw, contact, covariance = turn @ raw, turn @ contact, turn @ covariance @ turn.T
+    sigma = np.sqrt(np.diag(covariance))
+    return {
+        "schema_version": 1,
+        "axes": axes,
+        "about": "sensor origin",
+        "raw": {"force_N": raw[:3].tolist(), "torque_Nm": raw[3:].tolist()},
+        "compensated": {"force_N": contact[:3].tolist(), "torque_Nm": contact[3:].tolist()},
+        "sigma": {"force_N": sigma[:3].tolist(), "torque_Nm": sigma[3:].tolist()},
+        "rate_Hz": look.rate_Hz,
+        "lost": look.lost,
+        "calibration": calibration.provenance.get("created_utc"),
+        "verdict": calibration.verdict,
+    }
+
+
+def _line(reading: dict[str, Any]) -> str:
+    contact = reading["compensated"]
+    force, torque = (" ".join(f"{value:9.4f}" for value in contact[key]) for key in ("force_N", "torque_Nm"))
+    return f"F {force} N   T {torque} N·m   ({reading['axes']} axes, about the {reading['about']})"
+
+
+def _screen(reading: dict[str, Any], path: Path) -> Table:
+    table = Table(
+        title=f"raw → bias and gravity taken away ({path.name}, {reading['verdict']})   "
+        f"[bold]{reading['axes']} axes, about the {reading['about']}[/]   {reading['rate_Hz']:.0f} Hz, "
+        f"lost {reading['lost']}   Ctrl-C ends",
+        title_justify="left",
+        box=None,
+    )
+    for title in ("", "raw", "contact", "± 1 sigma", ""):
+        table.add_column(title, justify="right")
+    columns = [np.r_[reading[key]["force_N"], reading[key]["torque_Nm"]] for key in ("raw", "compensated", "sigma")]
+    for i, name in enumerate(_NAMES):
+        raw, contact, sigma = (column[i] for column in columns)
+        unit, full, digits = ("N", 20.0, 2) if i < 3 else ("N·m", 2.0, 4)
+        filled = min(20, round(20 * abs(contact) / full))
+        bar = ("[red]" if contact < 0 else "[green]") + "█" * filled + "[/]" + "·" * (20 - filled)
+        table.add_row(name, f"{raw:.{digits}f}", f"{contact:.{digits}f} {unit}", f"{sigma:.{digits}f}", bar)
+    return table

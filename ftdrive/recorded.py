@@ -1,0 +1,52 @@
+"""A recorded run played back to the routine, in place of an arm and a sensor."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from calib.ports import ArmReading, WrenchSamples
+from calib.routine import PoseRecord, is_return
+from calib.tour import TourPose
+
+
+class EndOfRecording(Exception):
+    """The run was broken off here."""
+
+
+class RecordedRun:
+    """Arm and sensor in one, as `calib.ports` wants them; neither moves nor waits."""
+
+    def __init__(self, records: Sequence[PoseRecord]) -> None:
+        self._records = list(records)
+        self._stop = -1
+        self._collected = False
+
+    @property
+    def tour(self) -> list[TourPose]:
+        """The poses visited, without the return to the first."""
+        return [record.pose for record in self._records if not is_return(record, self._records)]
+
+    def move_to(self, q_rad: Sequence[float], *, timeout_s: float, guard: Callable[[], None]) -> None:
+        """Go on to the next recorded stop."""
+        self._stop += 1
+        if self._stop == len(self._records):
+            raise EndOfRecording
+        if not np.array_equal(q_rad, self._records[self._stop].pose.q_rad):
+            raise ValueError(f"stop {self._stop + 1} of the recording went elsewhere than the routine now asks")
+
+    def wait_until_still(self, *, timeout_s: float, guard: Callable[[], None]) -> None:
+        """Begin a look at the pose."""
+        self._collected = False
+
+    def state(self) -> ArmReading:
+        """Look at the arm as it was before or after the samples."""
+        record = self._records[self._stop]
+        return record.after if self._collected else record.before
+
+    def collect(self, duration_s: float) -> WrenchSamples:
+        """Give the samples of this stop."""
+        self._collected = True
+        return self._records[self._stop].samples
+
+    def check(self) -> None:
+        """Find nothing wrong: a recording cannot fail."""

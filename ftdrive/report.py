@@ -1,0 +1,129 @@
+"""Results and plans as text for a person."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationResult
+from calib.routine import DriftCheck, Progress
+from ftdrive.session import Plan
+
+Array = NDArray[np.float64]
+
+talk = Console(stderr=True, highlight=False)
+"""Everything said to a person goes to stderr; data goes to stdout."""
+
+_MARK = {"good": "[bold green]GOOD[/]", "usable": "[bold yellow]USABLE[/]", "rejected": "[bold red]REJECTED[/]"}
+
+
+def print_plan(plan: Plan) -> None:
+    """Show what the arm is going to do."""
+    talk.print(f"arm     {plan.arm.model}, serial {plan.arm.serial}, PolyScope {plan.arm.firmware}")
+    talk.print(f"sensor  {plan.sensor.model}, serial {plan.sensor.serial}, firmware {plan.sensor.firmware}")
+    table = Table(title="Where each joint will go, degrees", title_justify="left", box=None)
+    for joint in ("", "base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3"):
+        table.add_column(joint, justify="right")
+    table.add_row("from", *(f"{low:.0f}" for low, _ in plan.ranges_deg))
+    table.add_row("to", *(f"{high:.0f}" for _, high in plan.ranges_deg))
+    talk.print(table)
+    talk.print(
+        f"First a move of {plan.approach_deg:.0f}° to the first pose, then {len(plan.tour)} moves of 90° through "
+        f"{len(plan.tour)} orientations and back, at {plan.speed_deg_s:.0f}°/s: about {plan.duration_s / 60:.0f} min.\n"
+        "Base, shoulder and elbow stay where they are; the tool turns every way around the wrist, upside down too.\n"
+        "Collisions are not checked: keep a ball of 0.5 m around the wrist free, cables slack, e-stop in reach."
+    )
+
+
+def describe(progress: Progress) -> str:
+    """Say in a line where the routine stands."""
+    where = f"{progress.stop:2d}/{progress.stops}  R{progress.pose.number:02d}"
+    if progress.record is None:
+        return f"{where}  {progress.stage}"
+    record = progress.record
+    sigma_N = float(np.sqrt(np.trace(record.mean.covariance[:3, :3]) / 3))
+    unsteady = "" if record.steady else "  [yellow]not steady[/]"
+    return f"{where}  {len(record.samples.t_host_ns)} samples, mean ± {sigma_N:.4f} N{unsteady}"
+
+
+def print_result(
+    result: CalibrationResult, *, truth: Mapping[str, Any] | None = None, drift: DriftCheck | None = None
+) -> None:
+    """Show verdict, estimates with one sigma, and the truth and the error where the truth is known."""
+    data = result.to_dict()
+    error = result.predicted_error()
+    talk.print(
+        f"\n {_MARK[result.verdict]}  {result.n_poses} poses, method {result.method}; compensation error "
+        f"{error.force_rms_N:.3f} N, {error.torque_rms_Nm:.4f} N·m rms over all orientations (predicted)"
+    )
+    for reason in result.reasons:
+        talk.print(f"   {reason}")
+    errors = {} if truth is None else errors_in_sigma(result, truth)
+    table = Table(box=None, padding=(0, 2))
+    for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
+        if truth is not None or title not in {"truth", "error / sigma"}:
+            table.add_column(title, justify="right" if title else "left")
+    for label, scale, unit, key, digits in _ROWS:
+        estimates, sigmas = (_values(source[key], key) * scale for source in (data, data["sigma"]))
+        truths = None if truth is None else _values(truth[key], key) * scale
+        for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
+            cells = [f"{label} {axis}", f"{estimates[i]:.{digits}f} {unit}", f"{sigmas[i]:.{digits}f}"]
+            if truths is not None:
+                cells.insert(1, f"{truths[i]:.{digits}f}")
+                cells.append(f"{errors[key][i]:+.1f}")
+            table.add_row(*cells)
+    talk.print(table)
+    residual = data["residual"]
+    talk.print(
+        f" residuals: force {residual['force_rms_N']:.4f} N rms, {residual['force_max_N']:.4f} max; "
+        f"torque {residual['torque_rms_Nm']:.5f} N·m rms, {residual['torque_max_Nm']:.5f} max"
+    )
+    if drift is not None:
+        talk.print(_drift_line(drift))
+
+
+# Label, factor from the file's unit to the screen's, unit on the screen, key, decimals.
+_ROWS: Sequence[tuple[str, float, str, str, int]] = (
+    ("mass", 1.0, "kg", "mass_kg", 4),
+    ("centre of mass", 1e3, "mm", "p_sensor_com_m", 2),
+    ("force bias", 1.0, "N", "force_bias_N", 3),
+    ("torque bias", 1.0, "N·m", "torque_bias_Nm", 4),
+    ("flange to sensor", 180 / np.pi, "deg", "R_flange_sensor", 3),
+    ("gravity in base", 1.0, "N", "gravity_force_base_N", 3),
+    ("base tilt alpha", 180 / np.pi, "deg", "tilt_alpha_rad", 3),
+    ("base tilt beta", 180 / np.pi, "deg", "tilt_beta_rad", 3),
+)
+
+
+def _values(value: Any, key: str) -> Array:
+    values = np.asarray(value, dtype=np.float64)
+    if key == "R_flange_sensor" and values.ndim == 2:  # shown as a rotation vector
+        values = Rotation.from_matrix(values).as_rotvec()
+    return np.atleast_1d(values)
+
+
+def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, Array]:
+    """Errors of the estimates, each divided by its standard deviation.
+
+    That of the rotation is the small rotation about the flange axes that leads from the truth to the estimate.
+    """
+    data = result.to_dict()
+    errors = {}
+    for _, _, _, key, _ in _ROWS:
+        if key == "R_flange_sensor":
+            error = Rotation.from_matrix(result.R_flange_sensor @ np.transpose(truth[key])).as_rotvec()
+        else:
+            error = np.atleast_1d(np.subtract(data[key], truth[key]))
+        errors[key] = error / np.atleast_1d(data["sigma"][key])
+    return errors
+
+
+def _drift_line(drift: DriftCheck) -> str:
+    worst = float(np.max(np.abs(drift.change) / drift.sigma))
+    force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
+    said = "no drift seen" if worst < 4 else "[yellow]the sensor drifts: let it warm up, then calibrate again[/]"
+    return f" drift: pose 1 again after {drift.elapsed_s:.0f} s, {force_N:.4f} N, {torque_Nm:.5f} N·m away: {said}"

@@ -1,0 +1,161 @@
+"""A run folder: what was planned, every pose with its raw samples, and what came of it.
+
+run.json          ftdrive.run/1: when, with what, command line, versions, configuration, devices, tour
+poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm moves on
+dataset.json      ftdrive.dataset/1: means and covariances
+calibration.json  ftdrive.calibration/1: the result
+"""
+
+import io
+import json
+import platform
+import sys
+import time
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.errors import BadDataset
+from calib.files import write_new
+from calib.routine import PoseRecord
+from calib.tour import TourPose
+from ftdrive import __version__
+
+RUN_FORMAT = "ftdrive.run/1"
+RECORDING_FORMAT = "ftdrive.recording/1"
+
+_SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Samples read back from a recording; the columns are those of `calib.ports.WrenchSamples`."""
+
+    t_host_ns: NDArray[np.int64]
+    t_device_s: Array
+    seq: NDArray[np.int64]
+    counts: NDArray[np.int32]
+    wrench: Array
+    status: NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """One look at the arm, read back from a recording."""
+
+    t_host_ns: int
+    q_rad: Array
+    R_base_flange: Array
+
+
+class Run:
+    """A run folder on disk."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @classmethod
+    def create(cls, parent: Path, name: str, description: Mapping[str, Any]) -> "Run":
+        """Make a new folder `<UTC time>-<name>` and write its run.json."""
+        now = datetime.now(UTC)
+        folder = parent / f"{now:%Y-%m-%dT%H%M%SZ}-{name}"
+        number = 1
+        while True:
+            try:
+                folder.mkdir(parents=True)
+                break
+            except FileExistsError:
+                number += 1
+                folder = parent / f"{now:%Y-%m-%dT%H%M%SZ}-{name}-{number}"
+        (folder / "poses").mkdir()
+        header = {
+            "format": RUN_FORMAT,
+            "created_utc": now.isoformat(),
+            "created_host_ns": time.monotonic_ns(),
+            "argv": sys.argv,
+            "versions": versions(),
+            **description,
+        }
+        write_new(folder / "run.json", json.dumps(header, indent=1).encode())
+        return cls(folder)
+
+    @property
+    def calibration_path(self) -> Path:
+        """Where the result is kept."""
+        return self.folder / "calibration.json"
+
+    def header(self) -> Mapping[str, Any]:
+        """Read run.json; raises `BadDataset` when it is not one."""
+        path = self.folder / "run.json"
+        try:
+            header = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise BadDataset(f"{path} is not JSON: {error}") from error
+        except FileNotFoundError as error:
+            raise BadDataset(f"{self.folder} is not a run folder: it has no run.json") from error
+        found = header.get("format") if isinstance(header, dict) else None
+        if found != RUN_FORMAT:
+            raise BadDataset(f"{path} has format {found!r}: this version reads {RUN_FORMAT}")
+        return header  # type: ignore[no-any-return]
+
+    def commit(self, record: PoseRecord) -> None:
+        """Put one pose on disk; returns when it is safe."""
+        buffer = io.BytesIO()
+        readings = {
+            f"{when}_{name}": np.asarray(getattr(reading, name))
+            for when, reading in (("before", record.before), ("after", record.after))
+            for name in ("t_host_ns", "q_rad", "R_base_flange")
+        }
+        np.savez_compressed(
+            buffer,
+            format=np.array(RECORDING_FORMAT),
+            stop=np.array(record.stop),
+            number=np.array(record.pose.number),
+            q_target_rad=record.pose.q_rad,
+            steady=np.array(record.steady),
+            **readings,
+            **{name: getattr(record.samples, name) for name in _SAMPLE_COLUMNS},
+        )
+        write_new(self.folder / "poses" / f"{record.stop:02d}.npz", buffer.getvalue())
+
+    def records(self) -> list[PoseRecord]:
+        """Read every pose back, in the order of the tour."""
+        return [_read_record(path) for path in sorted((self.folder / "poses").glob("*.npz"))]
+
+
+def _read_record(path: Path) -> PoseRecord:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {name: file[name] for name in file.files}
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise BadDataset(f"{path} is not a recording of a pose: {error}") from error
+    found = str(data.get("format"))
+    if found != RECORDING_FORMAT:
+        raise BadDataset(f"{path} has format {found!r}: this version reads {RECORDING_FORMAT}")
+    before, after = (
+        Reading(int(data[f"{when}_t_host_ns"]), data[f"{when}_q_rad"], data[f"{when}_R_base_flange"])
+        for when in ("before", "after")
+    )
+    return PoseRecord(
+        stop=int(data["stop"]),
+        pose=TourPose(int(data["number"]), data["q_target_rad"]),
+        before=before,
+        after=after,
+        samples=Samples(*(data[name] for name in _SAMPLE_COLUMNS)),
+        steady=bool(data["steady"]),
+    )
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that had a part in a result."""
+    found = {"ftdrive": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    return found | {name: version(name) for name in ("numpy", "scipy", "python-can", "pyserial")}

@@ -1,0 +1,90 @@
+"""An emulated cell as a child process: the real drivers talk to it over real wires."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
+from calib.routine import Sampling
+from drivers.errors import ConnectError
+from ftdrive.config import CellConfig, RobotConfig, SensorConfig
+
+TIME_SCALE = 20
+"""The emulated arm lives this many times faster; nothing else differs from a real cell."""
+
+
+class Station:
+    """One `mocks` process, ended by leaving its `with` block or by the end of ours.
+
+    Parameters
+    ----------
+    sensor : {"can", "serial"}
+    options : sequence of str
+        More options of `python -m mocks station`.
+    """
+
+    def __init__(self, sensor: str = "can", options: Sequence[str] = ()) -> None:
+        self.sensor = sensor
+        self.options = tuple(options)
+        self.endpoints: Mapping[str, Any] = {}
+        self._process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> Self:
+        command = [sys.executable, "-P", "-m", "mocks", "station", "--sensor", self.sensor]
+        command += ["--time-scale", str(TIME_SCALE), *self.options]
+        # A session of its own: Ctrl-C in the terminal is for us, not for the emulated cell.
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+        )
+        self.endpoints = self._answer()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is None:
+            return
+        process, self._process = self._process, None
+        try:
+            process.communicate(timeout=3)  # closes its stdin, which ends it
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+
+    @property
+    def truth(self) -> Mapping[str, Any]:
+        """What a perfect calibration of this cell would find."""
+        truth: Mapping[str, Any] = self.endpoints["truth"]
+        return truth
+
+    @property
+    def pid(self) -> int:
+        """Process number while the station lives."""
+        return self._process.pid if self._process else 0
+
+    def control(self, **request: Any) -> Mapping[str, Any]:
+        """Send one request, such as `do="unplug", device="sensor"`, and return the answer."""
+        if self._process and self._process.stdin:
+            self._process.stdin.write(json.dumps(request) + "\n")
+            self._process.stdin.flush()
+        return self._answer()
+
+    def _answer(self) -> Mapping[str, Any]:
+        line = self._process.stdout.readline() if self._process and self._process.stdout else ""
+        if not line:
+            raise ConnectError("the emulated cell has ended: its message stands above")
+        answer: Mapping[str, Any] = json.loads(line)
+        return answer
+
+    @property
+    def cell(self) -> CellConfig:
+        """Configuration that reaches this station as it would reach a real cell."""
+        arm, can, serial = (self.endpoints[wire] for wire in ("arm", "can", "serial"))
+        if self.sensor == "can":
+            url = f"ati-can://{can['channel']}?interface={can['interface']}&bitrate={can['bitrate']}&base={can['base']}"
+        else:
+            url = f"ati-serial://{serial['port']}"
+        return CellConfig(
+            robot=RobotConfig(arm["host"], arm["model"], speed_deg_s=60.0, acceleration_deg_s2=80.0),
+            sensor=SensorConfig(url),
+            sampling=Sampling(average_s=0.4),
+        )
