@@ -9,20 +9,14 @@ from numpy.typing import NDArray
 from calib.tour import wrist_tour
 
 # Yu et al., Fig. 3: rows of the 24 matrices base -> flange as signed axes.
-PAPER = (
-    "+x+y+z +x-y-z +x-z+y +x+z-y -x+y-z -x-y+z -x+z+y -x-z-y +y+x-z -y+x+z +z+x+y -z+x-y "
-    "+y-x+z -y-x-z -z-x+y +z-x-y +y+z+x -y-z+x -z+y+x +z-y+x +y-z-x -y+z-x +z+y-x -z-y-x"
-).split()
-MODELS = {  # d1, a2, a3, d4, d5, d6 in m
-    "ur3e": (0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921),
-    "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
-    "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
-    "ur20": (0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543),
-}
+PAPER = """
++x+y+z +x-y-z +x-z+y +x+z-y -x+y-z -x-y+z -x+z+y -x-z-y +y+x-z -y+x+z +z+x+y -z+x-y
++y-x+z -y-x-z -z-x+y +z-x-y +y+z+x -y-z+x -z+y+x +z-y+x +y-z-x -y+z-x +z+y-x -z-y-x
+"""
 
 
 def paper_matrix(number: int) -> NDArray[np.float64]:
-    text = PAPER[number - 1]
+    text = PAPER.split()[number - 1]
     rows = [np.eye(3)["xyz".index(text[i + 1])] * (1 if text[i] == "+" else -1) for i in (0, 2, 4)]
     return np.array(rows)
 

@@ -1,0 +1,106 @@
+"""What happens when a tour is broken off: the exit code, in time; the arm stopped; the poses kept."""
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Protocol
+
+import pytest
+
+from ftdrive.config import CellConfig
+from ftdrive.simulation import Station
+
+
+class CommandLine(Protocol):
+    folder: Path
+
+    def start(self, *arguments: str | Path) -> subprocess.Popen[str]: ...
+    def run(self, *arguments: str | Path, typed: str = "") -> subprocess.CompletedProcess[str]: ...
+    def poses(self) -> list[Path]: ...
+
+
+@pytest.fixture
+def station() -> Iterator[Station]:
+    with Station("can", ["--seed", "3"]) as station:
+        yield station
+
+
+@pytest.fixture
+def tour(station: Station, ftdrive: CommandLine, write_config: Callable[[CellConfig], Path]) -> subprocess.Popen[str]:
+    """A calibration on its way, two poses taken."""
+    process = ftdrive.start("calibrate", "--config", write_config(station.cell), "--json")
+    assert process.stdin is not None
+    process.stdin.write("MOVE\n")
+    process.stdin.flush()
+    deadline = time.monotonic() + 30
+    while len(ftdrive.poses()) < 2:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    return process
+
+
+def end_of(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Exit code and talk; at most three seconds after the event."""
+    _, talk = process.communicate(timeout=3)
+    return process.returncode, talk
+
+
+def test_ctrl_c_stops_the_arm_and_keeps_the_poses(
+    station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine
+) -> None:
+    tour.send_signal(signal.SIGINT)
+    code, talk = end_of(tour)
+    assert code == 130, talk
+    assert "Traceback" not in talk
+    assert not station.control(do="state")["moving"]
+    kept = ftdrive.poses()
+    assert f"{len(kept)} poses are kept" in talk
+    solved = ftdrive.run("solve", kept[0].parent.parent)
+    assert solved.returncode == 7
+    assert "Traceback" not in solved.stderr
+
+
+def test_unplugged_sensor_stops_the_arm_and_keeps_the_poses(
+    station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine
+) -> None:
+    station.control(do="unplug", device="sensor")
+    code, talk = end_of(tour)
+    assert code == 4, talk
+    assert "Traceback" not in talk
+    assert not station.control(do="state")["moving"]
+    assert len(ftdrive.poses()) >= 2
+
+
+def test_protective_stop_is_a_device_fault(station: Station, tour: subprocess.Popen[str]) -> None:
+    station.control(do="protective-stop")
+    code, talk = end_of(tour)
+    assert code == 5, talk
+    assert "protective" in talk
+
+
+def test_killed_station_is_a_lost_stream(station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine) -> None:
+    os.kill(station.pid, signal.SIGKILL)
+    code, talk = end_of(tour)
+    assert code == 4, talk
+    assert "Traceback" not in talk
+    assert len(ftdrive.poses()) >= 2
+
+
+def test_without_the_typed_word_nothing_moves(
+    station: Station, ftdrive: CommandLine, write_config: Callable[[CellConfig], Path]
+) -> None:
+    before = station.control(do="state")["q_rad"]
+    outcome = ftdrive.run("calibrate", "--config", write_config(station.cell), typed="yes\n")
+    assert outcome.returncode == 130
+    assert station.control(do="state")["q_rad"] == before
+    assert not (ftdrive.folder / "runs").exists()
+
+
+def test_nobody_there(ftdrive: CommandLine) -> None:
+    outcome = ftdrive.run("calibrate", "--robot", "127.213.7.9", "--sensor", "ati-serial:///dev/no-such-port")
+    assert outcome.returncode == 3
+    assert outcome.stderr.startswith("error: ")

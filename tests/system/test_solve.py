@@ -1,0 +1,142 @@
+"""`ftdrive solve` on files, good and bad, as a user meets it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+HEADER = "r11,r12,r13,r21,r22,r23,r31,r32,r33,fx,fy,fz,tx,ty,tz"
+
+
+def solve(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "ftdrive", "solve", *map(str, arguments)], capture_output=True, text=True, check=False
+    )
+
+
+def rows(n: int) -> list[str]:
+    """Rows of a made-up but consistent recording: 1.2 kg, sensor turned 40 degrees about z, R_base_flange."""
+    rng = np.random.default_rng(3)
+    R_flange_sensor = Rotation.from_rotvec([0, 0, np.radians(40)]).as_matrix()
+    lines = []
+    for R in Rotation.random(n, rng=rng).as_matrix():
+        weight = R_flange_sensor.T @ R.T @ [0, 0, -1.2 * 9.80665]
+        torque = np.cross([0.01, 0.0, 0.06], weight)
+        wrench = np.r_[np.add(weight, (1, 2, 3)), np.add(torque, (0.1, 0.2, 0.3))] + rng.normal(0, 1e-3, 6)
+        lines.append(",".join(f"{value:.9f}" for value in np.r_[R.ravel(), wrench]))
+    return lines
+
+
+def test_real_recording_gives_the_published_result(real_data: Path) -> None:
+    folder = real_data / "agimus_mini45_b"
+    outcome = solve(folder / "poses.csv", "--orientation", "R_flange_base", "--json")
+    assert outcome.returncode == 0, outcome.stderr
+    result = json.loads(outcome.stdout)
+    published = json.loads((folder / "expected.json").read_text())["R_se_published_refined"]  # flange -> sensor
+    angle = Rotation.from_matrix(np.array(published) @ np.array(result["R_flange_sensor"])).magnitude()
+    assert result["mass_kg"] == pytest.approx(0.788, abs=0.004)
+    assert np.degrees(angle) < 0.7
+    assert result["residual"]["force_rms_N"] <= 0.25
+    assert result["residual"]["torque_rms_Nm"] <= 0.007
+
+
+def test_drifting_recording_is_not_called_good(real_data: Path) -> None:
+    outcome = solve(real_data / "foamcutting_2013_06_12" / "poses.csv", "--orientation", "R_flange_base", "--json")
+    if outcome.returncode == 0:
+        assert json.loads(outcome.stdout)["verdict"] != "good"
+    else:
+        assert outcome.returncode == 7
+
+
+def test_json_has_the_documented_keys_and_talk_stays_off_stdout(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join([HEADER, *rows(12)]))
+    outcome = solve(path, "--json")
+    assert outcome.returncode == 0, outcome.stderr
+    result = json.loads(outcome.stdout)
+    estimates = {
+        *("mass_kg", "weight_N", "gravity_force_base_N", "R_flange_sensor", "force_bias_N", "torque_bias_Nm"),
+        *("p_sensor_com_m", "tilt_alpha_rad", "tilt_beta_rad"),
+    }
+    assert {"schema_version", "method", "verdict", "reasons", "n_poses", "sigma"} | estimates <= result.keys()
+    assert estimates <= result["sigma"].keys()
+    assert set(result["residual"]) == {"force_rms_N", "force_max_N", "torque_rms_Nm", "torque_max_Nm"}
+    assert result["mass_kg"] == pytest.approx(1.2, abs=0.001)
+    assert solve(path).stdout == ""
+
+
+def test_output_is_a_calibration_that_is_never_overwritten(tmp_path: Path) -> None:
+    path, output = tmp_path / "poses.csv", tmp_path / "calibration.json"
+    path.write_text("\n".join([HEADER, *rows(12)]))
+    assert solve(path, "-o", output).returncode == 0
+    saved = output.read_bytes()
+    assert json.loads(saved)["format"] == "ftdrive.calibration/1"
+    again = solve(path, "-o", output)
+    assert again.returncode == 2
+    assert "exists" in again.stderr
+    assert output.read_bytes() == saved
+
+
+def _replaced(row: str, column: int, value: str) -> str:
+    cells = row.split(",")
+    cells[column] = value
+    return ",".join(cells)
+
+
+BAD = {
+    "missing column": ([HEADER.replace(",tz", ""), *(row.rsplit(",", 1)[0] for row in rows(8))], 6, "tz"),
+    "NaN": ([HEADER, *rows(7), _replaced(rows(8)[7], 9, "nan")], 6, "8"),
+    "not a number": ([HEADER, *rows(7), _replaced(rows(8)[7], 9, "1,5e")], 6, "8"),
+    "not a rotation": ([HEADER, *rows(7), _replaced(rows(8)[7], 0, "2.0")], 6, "8"),
+    "two poses": ([HEADER, *rows(2)], 7, "4"),
+    "all poses equal": ([HEADER, *(rows(1) * 8)], 7, "pose"),
+    "header only": ([HEADER], 6, "no"),
+    "empty file": ([], 6, "empty"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_csv_gets_one_clear_sentence(case: str, tmp_path: Path) -> None:
+    lines, code, word = BAD[case]
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join(lines))
+    outcome = solve(path, "-o", tmp_path / "calibration.json")
+    assert outcome.returncode == code, outcome.stderr
+    assert outcome.stdout == ""
+    assert outcome.stderr.startswith("error: ")
+    assert outcome.stderr.count("\n") == 1
+    assert word in outcome.stderr
+    assert [item.name for item in tmp_path.iterdir()] == ["poses.csv"]
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        ('{"format": "ftdrive.dataset/9"}', "ftdrive.dataset/9"),
+        ('{"format": "something/1"}', "something/1"),
+        ("", "empty"),
+        ('{"format": "ftdr', "JSON"),
+    ],
+)
+def test_bad_dataset_file_gets_one_clear_sentence(content: str, word: str, tmp_path: Path) -> None:
+    path = tmp_path / "dataset.json"
+    path.write_text(content)
+    outcome = solve(path)
+    assert outcome.returncode == 6, outcome.stderr
+    assert outcome.stderr.startswith("error: ")
+    assert outcome.stderr.count("\n") == 1
+    assert word in outcome.stderr
+
+
+def test_a_folder_that_is_no_run_and_a_run_of_another_version(tmp_path: Path) -> None:
+    outcome = solve(tmp_path)
+    assert outcome.returncode == 6
+    assert "run.json" in outcome.stderr
+    (tmp_path / "run.json").write_text('{"format": "ftdrive.run/7"}')
+    outcome = solve(tmp_path)
+    assert outcome.returncode == 6
+    assert "ftdrive.run/7" in outcome.stderr

@@ -1,0 +1,37 @@
+"""Cells that are not level, not straight, not on the floor."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pytest
+
+from ftdrive.config import CellConfig
+from ftdrive.report import errors_in_sigma
+from ftdrive.simulation import Station
+
+
+class CommandLine(Protocol):
+    def json(self, *arguments: str | Path, typed: str = "") -> dict[str, Any]: ...
+
+
+WORLDS = {
+    "base tilted by 8 degrees": ["--tilt-deg", "8,0"],
+    "sensor turned 137 degrees about an odd axis": ["--sensor-rotvec-deg", "79.1,-98.9,52.7"],
+    "arm on a wall, with a TCP set": ["--mount", "wall", "--tcp", "0.03,-0.02,0.15,0.4,-0.3,0.9"],
+}
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_odd_cells_are_recovered_within_their_sigmas(
+    world: str, ftdrive: CommandLine, write_config: Callable[[CellConfig], Path], tmp_path: Path
+) -> None:
+    from calib import CalibrationResult
+
+    with Station("can", ["--seed", "7", *WORLDS[world]]) as station:
+        answer = ftdrive.json("calibrate", "--config", write_config(station.cell), typed="MOVE\n")
+        truth = station.truth
+    result = CalibrationResult.load(tmp_path / answer["run"] / "calibration.json")
+    for key, errors in errors_in_sigma(result, truth).items():
+        assert np.abs(errors).max() < 4, (key, errors)
