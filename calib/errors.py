@@ -2,6 +2,7 @@
 
 CalibError
 ├── BadDataset       the data are not what they should be: the message names the row and the reason
+├── BadCalibration   a file is not a calibration that this version can read
 └── NotObservable    the poses cannot determine the parameters: the message says what is missing
 """
 
@@ -12,6 +13,10 @@ class CalibError(Exception):
 
 class BadDataset(CalibError):
     """The data are not what they should be."""
+
+
+class BadCalibration(CalibError):
+    """A stored calibration cannot be read."""
 
 
 class NotObservable(CalibError):

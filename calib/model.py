@@ -1,0 +1,162 @@
+"""The forward model: what a rigid tool at rest makes a wrist sensor read.
+
+    force_N   = R_flange_sensor.T @ R_base_flange.T @ gravity_force_base_N + force_bias_N
+    torque_Nm = p_sensor_com_m x (force_N - force_bias_N) + torque_bias_Nm
+
+Source: Yu, Shi, Lou 2021, eqs 12-13, with e_bR = R_base_flange.T and s_eR = R_flange_sensor.T.
+"""
+
+from dataclasses import dataclass, fields
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+PARAMETER_NAMES = tuple(
+    f"{name}.{axis}"
+    for name in ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")
+    for axis in "xyz"
+)
+"""The 15 error coordinates, in the order of the Jacobian and of every covariance."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parameters:
+    """All that is estimated."""
+
+    R_flange_sensor: Array
+    """(3, 3) maps sensor coordinates to flange coordinates."""
+    gravity_force_base_N: Array
+    """(3,) weight of what hangs on the sensor, in base."""
+    force_bias_N: Array
+    """(3,) in the sensor frame."""
+    p_sensor_com_m: Array
+    """(3,) centre of mass in the sensor frame."""
+    torque_bias_Nm: Array
+    """(3,) in the sensor frame, about its origin."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            shape = (3, 3) if field.name == "R_flange_sensor" else (3,)
+            value = read_only(getattr(self, field.name))
+            if value.shape != shape:
+                raise ValueError(f"{field.name} has shape {value.shape}, expected {shape}")
+            object.__setattr__(self, field.name, value)
+
+    def moved(self, step: Array) -> Self:
+        """Apply an error vector.
+
+        Parameters
+        ----------
+        step : array, shape (15,)
+            In the order of `PARAMETER_NAMES`. The first three are a small rotation vector delta in rad, about the
+            flange axes: s_eR <- s_eR exp([delta]x), which is R_flange_sensor <- exp([delta]x).T R_flange_sensor.
+        """
+        return type(self)(
+            Rotation.from_rotvec(-step[:3]).as_matrix() @ self.R_flange_sensor,
+            self.gravity_force_base_N + step[3:6],
+            self.force_bias_N + step[6:9],
+            self.p_sensor_com_m + step[9:12],
+            self.torque_bias_Nm + step[12:15],
+        )
+
+    def difference(self, other: Self) -> Array:
+        """Give the error vector (15,) that `moved` would need to reach `other` from here."""
+        return np.concatenate(
+            [
+                -Rotation.from_matrix(other.R_flange_sensor @ self.R_flange_sensor.T).as_rotvec(),
+                other.gravity_force_base_N - self.gravity_force_base_N,
+                other.force_bias_N - self.force_bias_N,
+                other.p_sensor_com_m - self.p_sensor_com_m,
+                other.torque_bias_Nm - self.torque_bias_Nm,
+            ]
+        )
+
+
+def gravity_wrench(parameters: Parameters, R_base_flange: Array) -> Array:
+    """Wrench of the weight alone, without bias.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    R_base_flange : array, shape (..., 3, 3)
+
+    Returns
+    -------
+    array, shape (..., 6)
+        N and N·m, exerted on the sensor, in the sensor frame, about its origin.
+    """
+    R_base_sensor = R_base_flange @ parameters.R_flange_sensor
+    force_N = parameters.gravity_force_base_N @ R_base_sensor  # row vector times R is R.T times the vector
+    torque_Nm = np.cross(parameters.p_sensor_com_m, force_N)
+    return np.asarray(np.concatenate([force_N, torque_Nm], axis=-1))
+
+
+def predict(parameters: Parameters, R_base_flange: Array) -> Array:
+    """Wrench the sensor reads with nothing in contact: weight and bias, Yu eqs 12-13.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    R_base_flange : array, shape (..., 3, 3)
+
+    Returns
+    -------
+    array, shape (..., 6)
+        N and N·m, in the sensor frame, about its origin.
+    """
+    bias = np.concatenate([parameters.force_bias_N, parameters.torque_bias_Nm])
+    return np.asarray(gravity_wrench(parameters, R_base_flange) + bias)
+
+
+def jacobian(parameters: Parameters, R_base_flange: Array) -> Array:
+    """Derivative of `predict` by the error vector of `Parameters.moved`.
+
+    With R = s_eR, A = e_bR, g = A F_b and u = R g:  dF = -R [g]x delta + R A dF_b + dF0,
+    dT = [P]x (dF - dF0) - [u]x dP + dT0.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    R_base_flange : array, shape (..., 3, 3)
+
+    Returns
+    -------
+    array, shape (..., 6, 15)
+        Columns as in `PARAMETER_NAMES`.
+    """
+    R_sensor_flange = parameters.R_flange_sensor.T
+    gravity_flange_N = parameters.gravity_force_base_N @ R_base_flange
+    P = skew(parameters.p_sensor_com_m)
+    J = np.zeros((*R_base_flange.shape[:-2], 6, 15))
+    J[..., :3, 0:3] = -R_sensor_flange @ skew(gravity_flange_N)
+    J[..., :3, 3:6] = R_sensor_flange @ np.swapaxes(R_base_flange, -1, -2)
+    J[..., :3, 6:9] = np.eye(3)
+    J[..., 3:, 0:6] = P @ J[..., :3, 0:6]
+    J[..., 3:, 9:12] = -skew(gravity_flange_N @ parameters.R_flange_sensor)
+    J[..., 3:, 12:15] = np.eye(3)
+    return J
+
+
+def skew(v: Array) -> Array:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3): skew(a) @ b = a x b."""
+    matrix = np.zeros((*v.shape[:-1], 3, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return matrix - np.swapaxes(matrix, -1, -2)
+
+
+def nearest_rotation(M: Array) -> Array:
+    """Give the rotations closest to the matrices M (..., 3, 3) in the Frobenius norm: U diag(1, 1, ±1) V^T."""
+    U, _, Vt = np.linalg.svd(M)
+    U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    return np.asarray(U @ Vt)
+
+
+def read_only(value: ArrayLike) -> Array:
+    """Copy to a float64 array that cannot be written to."""
+    array = np.array(value, dtype=np.float64)
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,255 @@
+"""The outcome of a calibration: estimates, their uncertainty, what they were made from, and a verdict."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, Self
+
+import numpy as np
+
+from calib.errors import BadCalibration
+from calib.files import JSON, check_format, read_object, write_new
+from calib.model import PARAMETER_NAMES, Array, Parameters, jacobian, predict, read_only
+from calib.yu import SPECIAL_R_flange_base, weight_and_tilt
+
+FORMAT = "ftdrive.calibration/1"
+
+Method = Literal["srom", "lrom", "ml"]
+Verdict = Literal["good", "usable", "rejected"]
+NoiseSource = Literal["measured", "residuals"]
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """Estimates with their covariance; arrays are read-only. Frames and signs are those of calib/README.md."""
+
+    parameters: Parameters
+    covariance: Array
+    """(15, 15) of the error coordinates `PARAMETER_NAMES`, from the noise alone: never scaled by the residuals."""
+    residuals: Array
+    """(n, 6) measured minus predicted wrench, N and N·m, in the sensor frame."""
+    chi2: float
+    """Residuals squared, weighted by the noise."""
+    dof: int
+    noise_source: NoiseSource
+    """Where the noise comes from: the spread inside each pose, or the residuals of the fit."""
+    g_m_s2: float
+    method: Method
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    """Plain words: why the verdict is not better, and what else is worth knowing."""
+    provenance: Mapping[str, JSON] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.residuals)
+        for name, shape in (("covariance", (15, 15)), ("residuals", (n, 6))):
+            value = read_only(getattr(self, name))
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"{name} must be {shape} finite numbers, got shape {value.shape}")
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "reasons", tuple(self.reasons))
+        try:
+            provenance = json.loads(json.dumps(dict(self.provenance), allow_nan=False))
+        except (TypeError, ValueError) as exc:
+            raise ValueError(f"provenance cannot be written as JSON ({exc})") from exc
+        object.__setattr__(self, "provenance", MappingProxyType(provenance))
+
+    @property
+    def n_poses(self) -> int:
+        """Number of poses behind the result."""
+        return len(self.residuals)
+
+    @property
+    def R_flange_sensor(self) -> Array:
+        """(3, 3) maps sensor coordinates to flange coordinates."""
+        return self.parameters.R_flange_sensor
+
+    @property
+    def gravity_force_base_N(self) -> Array:
+        """(3,) weight of what hangs on the sensor, in base."""
+        return self.parameters.gravity_force_base_N
+
+    @property
+    def force_bias_N(self) -> Array:
+        """(3,) in the sensor frame."""
+        return self.parameters.force_bias_N
+
+    @property
+    def torque_bias_Nm(self) -> Array:
+        """(3,) in the sensor frame, about its origin."""
+        return self.parameters.torque_bias_Nm
+
+    @property
+    def p_sensor_com_m(self) -> Array:
+        """(3,) centre of mass in the sensor frame."""
+        return self.parameters.p_sensor_com_m
+
+    @property
+    def weight_N(self) -> float:
+        """Weight of what hangs on the sensor."""
+        return weight_and_tilt(self.gravity_force_base_N)[0]
+
+    @property
+    def mass_kg(self) -> float:
+        """Weight divided by `g_m_s2`."""
+        return self.weight_N / self.g_m_s2
+
+    @property
+    def tilt_alpha_rad(self) -> float:
+        """First tilt angle of the base, see `calib.yu.weight_and_tilt`."""
+        return weight_and_tilt(self.gravity_force_base_N)[1]
+
+    @property
+    def tilt_beta_rad(self) -> float:
+        """Second tilt angle of the base."""
+        return weight_and_tilt(self.gravity_force_base_N)[2]
+
+    @property
+    def sigma(self) -> Mapping[str, Array | float]:
+        """One standard deviation of every quantity, by its name; `R_flange_sensor`: (3,) rad about the flange axes."""
+        std = np.sqrt(np.diag(self.covariance))
+        weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, self.covariance[3:6, 3:6])
+        return {
+            "R_flange_sensor": std[0:3],
+            "gravity_force_base_N": std[3:6],
+            "force_bias_N": std[6:9],
+            "p_sensor_com_m": std[9:12],
+            "torque_bias_Nm": std[12:15],
+            "weight_N": weight,
+            "mass_kg": weight / self.g_m_s2,
+            "tilt_alpha_rad": alpha,
+            "tilt_beta_rad": beta,
+        }
+
+    def compensate(self, wrench: Array, R_base_flange: Array) -> Array:
+        """Remove weight and bias: what is left is contact.
+
+        Parameters
+        ----------
+        wrench : array, shape (6,) or (n, 6)
+            As measured, N and N·m, in the sensor frame.
+        R_base_flange : array, shape (3, 3) or (n, 3, 3)
+
+        Returns
+        -------
+        array, same shape as `wrench`
+            Contact wrench on the sensor, in the sensor frame, about the sensor origin.
+        """
+        wrench, R_base_flange = np.asarray(wrench, dtype=np.float64), np.asarray(R_base_flange, dtype=np.float64)
+        if wrench.shape[-1:] != (6,) or R_base_flange.shape != (*wrench.shape[:-1], 3, 3):
+            raise ValueError(
+                f"wrench has shape {wrench.shape} and R_base_flange {R_base_flange.shape}: "
+                "expected (6,) with (3, 3), or (n, 6) with (n, 3, 3)"
+            )
+        return np.asarray(wrench - predict(self.parameters, R_base_flange))
+
+    def wrench_covariance(self, R_base_flange: Array) -> Array:
+        """Covariance of the predicted wrench that the uncertainty of the parameters causes.
+
+        Parameters
+        ----------
+        R_base_flange : array, shape (..., 3, 3)
+
+        Returns
+        -------
+        array, shape (..., 6, 6)
+        """
+        J = jacobian(self.parameters, np.asarray(R_base_flange, dtype=np.float64))
+        return np.asarray(J @ self.covariance @ np.swapaxes(J, -1, -2))
+
+    def predicted_error(self) -> tuple[float, float]:
+        """Root mean square error of `compensate` over all orientations, N and N·m, as far as noise explains it.
+
+        The error is of second degree in the orientation, so its mean over the 24 rotations of the cube is the mean
+        over all rotations, exactly.
+        """
+        cov = self.wrench_covariance(np.swapaxes(SPECIAL_R_flange_base, 1, 2)).mean(axis=0)
+        return float(np.sqrt(np.trace(cov[:3, :3]))), float(np.sqrt(np.trace(cov[3:, 3:])))
+
+    def residual_summary(self) -> dict[str, float]:
+        """Root mean square and largest norm of the force and torque residuals over the poses."""
+        force, torque = np.linalg.norm(self.residuals[:, :3], axis=1), np.linalg.norm(self.residuals[:, 3:], axis=1)
+        return {
+            "force_rms_N": float(np.sqrt(np.mean(force**2))),
+            "force_max_N": float(force.max()),
+            "torque_rms_Nm": float(np.sqrt(np.mean(torque**2))),
+            "torque_max_Nm": float(torque.max()),
+        }
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Give the content of a calibration file."""
+        force_N, torque_Nm = self.predicted_error()
+        return {
+            "format": FORMAT,
+            "schema_version": 1,
+            "method": self.method,
+            "verdict": self.verdict,
+            "reasons": list(self.reasons),
+            "n_poses": self.n_poses,
+            "mass_kg": self.mass_kg,
+            "weight_N": self.weight_N,
+            "gravity_force_base_N": self.gravity_force_base_N.tolist(),
+            "R_flange_sensor": self.R_flange_sensor.tolist(),
+            "force_bias_N": self.force_bias_N.tolist(),
+            "torque_bias_Nm": self.torque_bias_Nm.tolist(),
+            "p_sensor_com_m": self.p_sensor_com_m.tolist(),
+            "tilt_alpha_rad": self.tilt_alpha_rad,
+            "tilt_beta_rad": self.tilt_beta_rad,
+            "sigma": {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in self.sigma.items()},
+            "residual": self.residual_summary(),
+            "predicted_error": {"force_rms_N": force_N, "torque_rms_Nm": torque_Nm},
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "noise_source": self.noise_source,
+            "g_m_s2": self.g_m_s2,
+            "parameter_names": list(PARAMETER_NAMES),
+            "covariance": self.covariance.tolist(),
+            "residuals": self.residuals.tolist(),
+            "provenance": dict(self.provenance),
+        }
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Build from the content of a calibration file; unknown fields are ignored. Raises `BadCalibration`."""
+        check_format(document, FORMAT, BadCalibration)
+        try:
+            return cls(
+                parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
+                **{field.name: document[field.name] for field in fields(cls) if field.name != "parameters"},
+            )
+        except KeyError as exc:
+            raise BadCalibration(f"the calibration lacks the field {exc.args[0]}: the file is damaged.") from exc
+        except (TypeError, ValueError) as exc:
+            raise BadCalibration(f"the calibration cannot be read ({exc}): the file is damaged.") from exc
+
+    def save(self, path: Path) -> None:
+        """Write a new file; raises `FileExistsError` rather than overwrite."""
+        write_new(path, json.dumps(self.to_dict(), allow_nan=False, indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what `save` wrote. Raises `BadCalibration` or `OSError`."""
+        try:
+            return cls.from_dict(read_object(path, BadCalibration))
+        except BadCalibration as exc:
+            raise BadCalibration(f"{path.name}: {exc}") from exc
+
+
+def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]:
+    """Propagate the covariance of the gravity force to weight (N), alpha and beta (rad).
+
+    Angles cannot be worse known than not at all, which is where the linear formula stops: at pi.
+    """
+    weight, _, _ = weight_and_tilt(F_b)
+    if weight == 0.0:
+        return float(np.sqrt(np.trace(cov))), float(np.pi), float(np.pi)
+    x, y, z = F_b.tolist()
+    h = float(np.hypot(x, z))
+    out = np.array([x, 0.0, z]) / h if h > 0 else np.array([1.0, 0.0, 0.0])  # away from the base y axis
+    gradients = np.array([F_b / weight, (h * np.array([0.0, 1.0, 0.0]) - y * out) / weight**2])
+    weight_sigma, alpha = np.sqrt(np.einsum("ki,ij,kj->k", gradients, cov, gradients)).tolist()
+    along_beta = np.array([z, 0.0, -x])
+    beta = float(np.sqrt(along_beta @ cov @ along_beta)) / h**2 if h > 0 else float("inf")
+    return weight_sigma, min(alpha, float(np.pi)), min(beta, float(np.pi))

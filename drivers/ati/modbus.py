@@ -1,0 +1,236 @@
+"""ATI Digital F/T over RS-485: Modbus RTU frames, the calibration block and the 13-byte stream, as pure functions.
+
+Ref: ATI "Digital F/T" Modbus interface (sections 8.1, 8.3, 8.4 of 9620-05-Digital FT, as cited by public drivers).
+Checked on hardware: no. Verified against: tests/unit/test_ati_modbus.py.
+
+A decoder returns a value or raises `ProtocolError`, never anything else. Registers are big-endian, high word first.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.ati.codec import decode_text
+from drivers.errors import ProtocolError
+from drivers.interfaces import Array
+
+ADDRESS = 10
+"""The slave address, fixed by ATI."""
+
+READ_HOLDING, WRITE_MULTIPLE = 0x03, 0x10
+START_STREAM, STORAGE = 0x46, 0x6A
+
+GAINS, OFFSETS, STATUS = 0x0000, 0x0006, 0x001D
+
+JAM = b"\xaa" * 14
+"""Any 14 bytes stop a running stream; these are no Modbus frame."""
+
+RECORD_SIZE = 13
+NOMINAL_RATE_Hz = 7000.0
+
+STATUS_BITS: Mapping[int, str] = MappingProxyType(
+    {
+        0: "watchdog reset",
+        1: "excitation voltage too high",
+        2: "excitation voltage too low",
+        3: "artificial analog ground out of range",
+        4: "power supply too high",
+        5: "power supply too low",
+        6: "no valid active calibration",
+        7: "EEPROM error",
+        8: "invalid configuration data",
+        9: "gauge bridge supply current too high",
+        10: "gauge bridge supply current too low",
+        11: "thermistor too high",
+        12: "thermistor too low",
+        13: "DAC reading out of range",
+        14: "CAN bus error",
+        15: "any error",
+    }
+)
+CRITICAL = 0x3EFE
+"""All but watchdog reset, configuration, CAN and the summary bit."""
+
+_EXCEPTIONS = {1: "illegal function", 2: "illegal register", 3: "illegal value", 4: "device failure or locked"}
+
+
+def _crc_entry(byte: int) -> int:
+    for _ in range(8):
+        byte = byte >> 1 ^ (0xA001 if byte & 1 else 0)
+    return byte
+
+
+_CRC_TABLE = tuple(_crc_entry(byte) for byte in range(256))
+
+
+def crc16(data: bytes) -> int:
+    """CRC-16/MODBUS; sent low byte first."""
+    crc = 0xFFFF
+    for byte in data:
+        crc = crc >> 8 ^ _CRC_TABLE[(crc ^ byte) & 0xFF]
+    return crc
+
+
+def frame(function: int, payload: bytes) -> bytes:
+    """Build a frame to or from the sensor."""
+    body = bytes([ADDRESS, function]) + payload
+    return body + crc16(body).to_bytes(2, "little")
+
+
+UNLOCK = frame(STORAGE, b"\xaa")
+LOCK = frame(STORAGE, b"\x18")
+START = frame(START_STREAM, b"\x55")
+
+
+def read_registers(register: int, count: int) -> bytes:
+    """Request `count` holding registers (at most 64 are known to work)."""
+    return frame(READ_HOLDING, struct.pack(">HH", register, count))
+
+
+def write_registers(register: int, values: Sequence[int]) -> bytes:
+    """Request to write holding registers."""
+    n = len(values)
+    return frame(WRITE_MULTIPLE, struct.pack(f">HHB{n}H", register, n, 2 * n, *values))
+
+
+def reply_size(request: bytes) -> int:
+    """Length in bytes of the success reply to `request`; a refusal (Modbus exception) has 5."""
+    match request[1]:
+        case 0x03:
+            return 5 + 2 * int.from_bytes(request[4:6], "big")
+        case 0x10:
+            return 8
+        case _:
+            return 5
+
+
+def check_reply(request: bytes, reply: bytes) -> bytes:
+    """Check a whole reply against its request and return its payload, without address, function and CRC.
+
+    Raises
+    ------
+    ProtocolError
+        Damaged, not the reply to this request, or a refusal.
+    """
+    text = reply.hex(" ")
+    if len(reply) < 5 or crc16(reply[:-2]) != int.from_bytes(reply[-2:], "little"):
+        raise ProtocolError(f"reply is damaged ({text or 'empty'}); check baud rate, parity and termination")
+    function = request[1]
+    if reply[0] == ADDRESS and reply[1] == function | 0x80 and len(reply) == 5:
+        reason = _EXCEPTIONS.get(reply[2], "unknown reason")
+        raise ProtocolError(f"the sensor refused function 0x{function:02X}: {reply[2]} ({reason})")
+    if reply[0] != ADDRESS or reply[1] != function or len(reply) != reply_size(request):
+        raise ProtocolError(f"reply {text} does not belong to request {request.hex(' ')}")
+    payload = reply[2:-2]
+    if function == READ_HOLDING:
+        if payload[0] != len(payload) - 1:
+            raise ProtocolError(f"reply announces {payload[0]} bytes and carries {len(payload) - 1}")
+        return payload[1:]
+    if function == WRITE_MULTIPLE:
+        if payload != request[2:6]:
+            raise ProtocolError(f"reply {text} confirms other registers than request {request.hex(' ')}")
+        return b""
+    if payload != b"\x01":
+        raise ProtocolError(
+            f"the sensor refused command 0x{function:02X} 0x{request[2]:02X} (answer 0x{payload.hex()})"
+        )
+    return b""
+
+
+def calibration_reads(index: int) -> list[tuple[int, int]]:
+    """Registers (start, count) that hold calibration `index`, 1 to 16, in reads of at most 64."""
+    base = 0x00E3 + 192 * (index - 1)
+    return [(base, 64), (base + 64, 64), (base + 128, 41)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationBlock:
+    """What the sensor stores about one calibration."""
+
+    serial: str
+    part_number: str
+    calibrated_at: str
+    matrix: Array
+    """(6, 6) counts per gauge count, rows Fx..Tz, columns G0..G5."""
+    unit_codes: tuple[int, int]
+    counts_per_unit: tuple[int, int]
+    gains: tuple[int, ...]
+    offsets: tuple[int, ...]
+
+
+def decode_calibration_block(data: bytes) -> CalibrationBlock:
+    """Decode the 338 bytes of a calibration; an empty slot is a `ProtocolError`."""
+    if len(data) != 338:
+        raise ProtocolError(f"a calibration has 338 bytes, got {len(data)}")
+    matrix = np.frombuffer(data, ">f4", 36, offset=2 * 32).astype(np.float64).reshape(6, 6)
+    force, torque = struct.unpack_from(">ii", data, 2 * 117)
+    if not np.isfinite(matrix).all() or force <= 0 or torque <= 0:
+        raise ProtocolError(f"this calibration slot is empty (counts per unit {force} and {torque}); choose another")
+    return CalibrationBlock(
+        serial=decode_text(data[0:8]),
+        part_number=decode_text(data[8:40]),
+        calibrated_at=decode_text(data[44:64]),
+        matrix=matrix,
+        unit_codes=(data[208], data[209]),
+        counts_per_unit=(force, torque),
+        gains=struct.unpack_from(">6H", data, 2 * 121),
+        offsets=struct.unpack_from(">6H", data, 2 * 127),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Records:
+    """n decoded stream records."""
+
+    gauges: NDArray[np.int32]
+    """(n, 6) in natural order G0..G5."""
+    intact: NDArray[np.bool_]
+    """(n,) the checksum holds."""
+    error: NDArray[np.bool_]
+    """(n,) the sensor says: stop and read the status word."""
+
+
+def decode_records(data: bytes) -> Records:
+    """Decode n whole stream records, 13 bytes each: G0 G2 G4 G1 G3 G5, then error bit and 7-bit sum."""
+    if len(data) % RECORD_SIZE:
+        raise ProtocolError(f"{len(data)} bytes are no whole number of {RECORD_SIZE}-byte records")
+    raw = np.frombuffer(data, np.uint8).reshape(-1, RECORD_SIZE)
+    gauges = np.ascontiguousarray(raw[:, :12]).view(">i2")
+    last = raw[:, 12]
+    return Records(
+        gauges=gauges[:, [0, 3, 1, 4, 2, 5]].astype(np.int32),
+        intact=raw[:, :12].sum(axis=1, dtype=np.uint16) & 0x7F == last & 0x7F,
+        error=last & 0x80 != 0,
+    )
+
+
+def keep_records(intact: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int, bool]:
+    """Judge n records by their checksums: which to use, how many are settled, and whether the stream has slipped.
+
+    The stream has no sync byte, and after a slip one record in 128 still passes. So three damaged records in a row mean
+    a slip, and an intact one between two damaged ones is not believed. Trailing damage waits for what comes next.
+
+    Returns
+    -------
+    keep : array of bool, shape (settled,)
+    settled : int
+        The remaining n - settled records are to be judged again, together with their successors.
+    slipped : bool
+        Everything behind `settled` is misaligned.
+    """
+    bad = ~intact
+    n = len(bad)
+    runs = np.flatnonzero(bad[:-2] & bad[1:-1] & bad[2:]) if n >= 3 else np.zeros(0, np.intp)
+    slipped = len(runs) > 0
+    if slipped:
+        settled = int(runs[0])
+    else:
+        tail = bad[-2:]
+        settled = n - len(tail) + int(tail.argmax()) if tail.any() else n
+    keep = intact.copy()
+    keep[1:-1] &= ~(bad[:-2] & bad[2:])
+    return keep[:settled], settled, slipped

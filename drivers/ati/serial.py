@@ -1,0 +1,274 @@
+"""ATI Digital F/T and NETCANOEM force/torque sensors over RS-485.
+
+Ref: ATI "Digital F/T" Modbus interface (sections 8.1, 8.3, 8.4 of 9620-05-Digital FT, as cited by public drivers).
+Checked on hardware: no. Verified against: tests/unit/test_ati_modbus.py and the emulator (tests/wire).
+
+Modbus RTU for set-up, then a bare stream of 13-byte records at 7 kHz which only a jamming sequence stops, and which
+outlives the program that started it. Gauge gains and offsets are volatile and are written at every start.
+"""
+
+import contextlib
+import logging
+import os
+import time
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+import serial
+
+from drivers._stream import LINK_ERRORS, StreamingSensor
+from drivers.ati import modbus
+from drivers.ati.calibration import Calibration, saturated_gauges
+from drivers.ati.codec import describe_status
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
+from drivers.interfaces import DeviceInfo, FtSamples
+
+if TYPE_CHECKING:
+    from drivers.registry import Options
+
+log = logging.getLogger(__name__)
+
+_BAUD = 1_250_000
+_READ_S = 0.02
+"""The port's only time-out, also the silence after which a stopped stream is believed to have stopped."""
+_REPLY_S = 0.1
+_SILENCE_S = 0.2
+_ATTEMPTS = 3
+_BATCH_BYTES = 32 * modbus.RECORD_SIZE
+"""4.6 ms of stream: few wake-ups, and far less than a serial port buffers."""
+_MAX_RESTARTS = 3
+
+
+class AtiSerialSensor(StreamingSensor):
+    """An ATI Digital F/T (or the RS-485 port of a NETCANOEM) on a serial port, 7 kHz.
+
+    Records carry no time and no number: `t_host_ns` is the receipt of the batch of about 32 they came in, `t_device_s`
+    is NaN, `seq` counts records, damaged ones included; what a restart of the stream lost is estimated from the clock.
+    `status` is the status word as last read: a record itself has one error bit, on which the stream ends with the word
+    read anew. `counts` are the six gauges.
+
+    Parameters
+    ----------
+    port : str
+        The serial port; ``/dev/serial/by-id/…`` survives replugging.
+    calibration : int
+        Which stored calibration to use, 1 to 16.
+    sign : int
+        -1 for a sensor mounted or wired to report the reaction.
+    """
+
+    def __init__(self, port: str, *, calibration: int = 1, sign: int = 1) -> None:
+        super().__init__(f"ATI serial sensor on {port}", sign=sign)
+        self._port_name = port
+        self._calibration_index = calibration
+        self._port: serial.Serial | None = None
+        self._buffer = bytearray()
+        self._seq = self._status = self._restarts = 0
+        self._slipped = False
+        self._last_good_ns: int | None = None
+        """While a restarted stream has not delivered: when the old one last did."""
+
+    @classmethod
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
+        """Build from ``ati-serial:///dev/serial/by-id/…?calibration=1``."""
+        return cls(address, calibration=options.integer("calibration", 1, 1, 16), sign=sign)
+
+    def _connect(self) -> DeviceInfo:
+        self._seq = self._restarts = 0
+        self._slipped, self._last_good_ns = False, None
+        self._port = self._open_port()
+        self._status = self._stop_stream()
+        if self._status & modbus.CRITICAL:
+            raise self._fault()
+        if self._status:
+            text = describe_status(self._status, modbus.STATUS_BITS)
+            log.warning("%s: status %s; measuring goes on", self.name, text)
+        block = modbus.decode_calibration_block(
+            b"".join(
+                self._ask(modbus.read_registers(register, count))
+                for register, count in modbus.calibration_reads(self._calibration_index)
+            )
+        )
+        self._calibration = Calibration.from_vendor(block.matrix, block.counts_per_unit, block.unit_codes)
+        self._ask(modbus.UNLOCK)
+        try:
+            self._ask(modbus.write_registers(modbus.GAINS, block.gains))
+            self._ask(modbus.write_registers(modbus.OFFSETS, block.offsets))
+        finally:
+            self._ask(modbus.LOCK)
+        self._start_stream()
+        return DeviceInfo(
+            model=f"ATI Digital F/T {block.part_number}".strip(), serial=block.serial, firmware="not reported"
+        )
+
+    def _read_block(self) -> FtSamples:
+        if self._slipped:
+            self._restart()
+        self._buffer += self._read(_BATCH_BYTES)
+        t_host_ns = time.monotonic_ns()
+        whole = len(self._buffer) // modbus.RECORD_SIZE * modbus.RECORD_SIZE
+        records = modbus.decode_records(bytes(self._buffer[:whole]))
+        keep, settled, slipped = modbus.keep_records(records.intact)
+        del self._buffer[: settled * modbus.RECORD_SIZE]
+        gauges = records.gauges[:settled][keep]
+        seq = self._seq + 1 + np.flatnonzero(keep)
+        if self._last_good_ns is not None and len(gauges):
+            missed = max(0, round((t_host_ns - self._last_good_ns) * 1e-9 * modbus.NOMINAL_RATE_Hz) - settled)
+            seq += missed
+            self._seq += missed
+            self._lost += missed
+            self._last_good_ns = None
+            self._restarts = 0
+        self._seq += settled
+        self._malformed += settled - len(gauges)
+        self._lost += settled - len(gauges)
+        if slipped:
+            self._slipped = True
+            self._last_good_ns = self._last_good_ns or t_host_ns
+        if records.error[:settled][keep].any():
+            self._status = self._stop_stream()
+            raise self._fault()
+        if saturated := saturated_gauges(gauges):
+            names = ", ".join(f"G{g}" for g in saturated)
+            raise DeviceFault(f"{self.name}: gauge {names} at the end of its range; take the load off, check the cable")
+        n = len(gauges)
+        return FtSamples(
+            t_host_ns=np.full(n, t_host_ns, np.int64),
+            t_device_s=np.full(n, np.nan),
+            seq=seq.astype(np.int64),
+            counts=gauges,
+            wrench=self._calibration.wrench(gauges),
+            status=np.full(n, self._status, np.uint32),
+        )
+
+    def _disconnect(self) -> None:
+        port = self._port
+        if port is None:
+            return
+        try:
+            self._jam()
+        finally:
+            self._port = None
+            with contextlib.suppress(*LINK_ERRORS):
+                port.close()
+
+    def _open_port(self) -> serial.Serial:
+        # A pseudo-terminal refuses even parity at the second look; everything is set in the constructor, never later.
+        emulated = os.path.realpath(self._port_name).startswith("/dev/pts/")
+        try:
+            port = serial.Serial(
+                self._port_name,
+                baudrate=_BAUD,
+                bytesize=serial.EIGHTBITS,
+                parity=serial.PARITY_NONE if emulated else serial.PARITY_EVEN,
+                stopbits=serial.STOPBITS_ONE,
+                timeout=_READ_S,
+                write_timeout=_REPLY_S,
+                exclusive=True,
+            )
+        except (ValueError, *LINK_ERRORS) as exc:
+            raise ConnectError(
+                f"{self.name}: the port does not open ({exc}); is it plugged in, free, and are you in its group?"
+            ) from exc
+        with contextlib.suppress(ValueError, NotImplementedError, *LINK_ERRORS):
+            port.set_low_latency_mode(True)  # a courtesy of some adapters: 1 ms instead of 16 ms
+        return port
+
+    def _stop_stream(self) -> int:
+        """Jam, wait for silence and prove it by reading the status word, which is returned."""
+        for _ in range(_ATTEMPTS - 1):
+            self._jam()
+            with contextlib.suppress(DeviceTimeout, ProtocolError):
+                return self._read_status()
+        self._jam()
+        try:
+            return self._read_status()
+        except (DeviceTimeout, ProtocolError) as exc:
+            raise DeviceTimeout(f"{exc}; is it the sensor, and are supply, wiring and termination right?") from exc
+
+    def _read_status(self) -> int:
+        return int.from_bytes(self._exchange(modbus.read_registers(modbus.STATUS, 1)), "big")
+
+    def _start_stream(self) -> None:
+        for _ in range(_ATTEMPTS - 1):
+            with contextlib.suppress(DeviceTimeout, ProtocolError):
+                self._exchange(modbus.START)
+                break
+            self._jam()  # perhaps only the reply was lost
+        else:
+            self._exchange(modbus.START)
+        self._buffer.clear()
+
+    def _restart(self) -> None:
+        self._restarts += 1
+        self._malformed += 3
+        if self._restarts > _MAX_RESTARTS:
+            raise ProtocolError(
+                f"{self.name}: no intact record after {_MAX_RESTARTS} restarts of the stream; check parity and wiring"
+            )
+        log.warning("%s: stream out of step, restarting it", self.name)
+        self._stop_stream()
+        self._start_stream()
+        self._slipped = False
+
+    def _jam(self) -> None:
+        """Stop whatever is streaming and wait until the line is silent."""
+        self._write(modbus.JAM)
+        deadline = time.monotonic() + _SILENCE_S
+        while self._read(_BATCH_BYTES) and time.monotonic() < deadline:
+            pass
+
+    def _ask(self, request: bytes) -> bytes:
+        """Exchange with retries; not for the start of the stream."""
+        for _ in range(_ATTEMPTS - 1):
+            with contextlib.suppress(DeviceTimeout, ProtocolError):
+                return self._exchange(request)
+            self._read(_BATCH_BYTES)  # a late reply passes
+        return self._exchange(request)
+
+    def _exchange(self, request: bytes) -> bytes:
+        """Send a request and return the payload of its reply."""
+        self._write(request)
+        deadline = time.monotonic() + _REPLY_S
+        reply = self._read_exactly(5, deadline)
+        if not reply[1] & 0x80:
+            reply += self._read_exactly(modbus.reply_size(request) - 5, deadline)
+        try:
+            return modbus.check_reply(request, reply)
+        except ProtocolError as exc:
+            raise ProtocolError(f"{self.name}: {exc}") from exc
+
+    def _read_exactly(self, size: int, deadline: float) -> bytes:
+        data = b""
+        while len(data) < size:
+            data += self._read(size - len(data))
+            if len(data) < size and time.monotonic() > deadline:
+                raise DeviceTimeout(f"{self.name}: no reply within {_REPLY_S} s ({len(data)} of {size} bytes)")
+        return data
+
+    def _read(self, size: int) -> bytes:
+        """Read what comes within the port's time-out, at most `size` bytes."""
+        try:
+            return self._open_or_broken().read(size)
+        except (TypeError, *LINK_ERRORS) as exc:  # TypeError: closed under a blocked read
+            raise self._broken(exc) from exc
+
+    def _write(self, data: bytes) -> None:
+        port = self._open_or_broken()
+        try:
+            port.reset_input_buffer()
+            port.write(data)
+        except (TypeError, *LINK_ERRORS) as exc:
+            raise self._broken(exc) from exc
+
+    def _open_or_broken(self) -> serial.Serial:
+        if self._port is None:
+            raise StreamBroken(f"{self.name}: closed")
+        return self._port
+
+    def _broken(self, exc: Exception) -> DriverError:
+        return StreamBroken(f"{self.name}: the port is gone ({exc}); plug it in and open it again")
+
+    def _fault(self) -> DeviceFault:
+        text = describe_status(self._status, modbus.STATUS_BITS)
+        return DeviceFault(f"{self.name}: status {text}; its data must not be used")

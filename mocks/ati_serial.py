@@ -1,0 +1,314 @@
+"""An emulated ATI Digital F/T sensor: Modbus RTU over RS-485, and a 7 kHz stream of 13-byte records.
+
+Ref: ATI 9620-05-Digital FT, sections 8.1, 8.3, 8.4; ATI 9610-05-1030-04, section 9 (the same port on a NETCANOEM).
+
+Does not model: parity and baud mismatch (a pty has neither), collisions of a half-duplex line, writing calibrations to
+storage, the power-up time. Unspecified by the sources and chosen here: an empty calibration slot reads zeros, the 23
+registers between two slots do not exist, a read of more than 64 registers is exception 3.
+"""
+
+import struct
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mocks.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
+from mocks.pty import PtyDevice
+
+ADDRESS = 0x0A
+STREAM_HZ = 7000.0
+BURST_S = 1e-3
+RECORD_BYTES = 13
+CHARACTER_BITS = 11
+JAM_BYTES = 14
+JAM_PAUSE_S = 0.050  # a longer pause and the jam counts from the start again
+FRAME_GAP_S = 1.75e-3  # Modbus RTU: fixed above 19 200 baud
+LONGEST_FRAME = 256
+MAX_READ = 64
+MAX_BACKLOG = 1400  # records, 0.2 s: what the terminal buffers anyway
+
+GAINS, OFFSETS, SESSION, STATUS, BAUD_STORE, BAUD = 0x0000, 0x0006, 0x000C, 0x001D, 0x001E, 0x001F
+WRITABLE = {*range(GAINS, SESSION + 1), BAUD_STORE, BAUD}
+CALIBRATION, CALIBRATION_STRIDE, CALIBRATION_SLOTS, CALIBRATION_REGISTERS = 0x00E3, 192, 16, 169
+DIAGNOSTICS = dict(enumerate((0x07FF, 0x0000, 0x0A3C, 0x09C4, 0x0800, 0x0003), start=0x0027))
+BAUD_RATES = (1_250_000, 19_200, 115_200)
+
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 2, 3, 4
+
+
+class ModbusError(Exception):
+    """A request answered with an exception code."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"Modbus exception {code}")
+        self.code = code
+
+
+def crc16(data: bytes) -> bytes:
+    """CRC-16/MODBUS as it goes on the wire, low byte first."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc >> 1) ^ (0xA001 if crc & 1 else 0)
+    return crc.to_bytes(2, "little")
+
+
+def with_crc(body: bytes) -> bytes:
+    """Return a frame's body followed by its CRC."""
+    return body + crc16(body)
+
+
+def stream_records(gauges: NDArray[np.int16], *, error: bool = False) -> NDArray[np.uint8]:
+    """Stream records of gauge counts.
+
+    Parameters
+    ----------
+    gauges
+        (n, 6) gauge counts, natural order.
+    error
+        Bit 7 of the checksum byte: something is wrong, read the status word.
+
+    Returns
+    -------
+    (n, 13) bytes: gauges 0 2 4 1 3 5 as big-endian int16, then the 7-bit sum of these twelve bytes.
+    """
+    records = np.empty((len(gauges), RECORD_BYTES), dtype=np.uint8)
+    records[:, :12] = gauges[:, WIRE_ORDER].astype(">i2", order="C").view(np.uint8)
+    checksum = np.add.reduce(records[:, :12], axis=1, dtype=np.uint8)
+    records[:, 12] = (checksum & 0x7F) | (0x80 if error else 0)
+    return records
+
+
+def calibration_block(calibration: Calibration) -> bytes:
+    """The 338 bytes of a calibration slot; resolution, range, scale factors, user and spare fields are zero."""
+    block = b"".join(
+        (
+            calibration.serial.encode("ascii").ljust(8, b"\0"),
+            calibration.part_number.encode("ascii").ljust(32, b"\0"),
+            b"Net\0",
+            calibration.date.encode("ascii").ljust(20, b"\0"),
+            calibration.matrix.astype(">f4").tobytes(),
+            bytes((calibration.force_unit, calibration.torque_unit)),
+            struct.pack(">6f", *calibration.max_rating),
+            struct.pack(">2i", calibration.counts_per_force, calibration.counts_per_torque),
+            struct.pack(">6H", *calibration.gauge_gains),
+            struct.pack(">6H", *calibration.gauge_offsets),
+        )
+    )
+    return block.ljust(2 * CALIBRATION_REGISTERS, b"\0")
+
+
+class AtiSerialBox(PtyDevice):
+    """The sensor's RS-485 interface.
+
+    Everything public is a plain attribute and may be changed while the box runs.
+
+    Parameters
+    ----------
+    measure
+        Returns (n, 6) successive noisy readings in N and N·m, sensor axes; thread-safe. The stream has no sync byte:
+        the noise must reach a gauge count, or shifted records validate.
+    seed
+        Of the faults below.
+    calibrations
+        What each slot 1 to 16 holds; a slot not named is empty. The lowest one describes the transducer.
+    needs_gains
+        Whether gauges read wrong until gains and offsets of the calibration have been written.
+    status
+        Status word; its bit 15 is the error bit of every record.
+    gauge_offset
+        (6,) or scalar, added to every gauge, in counts.
+    saturated_gauge
+        Number of a gauge that always reads +32767.
+    streaming_at_start
+        Streams from power-up on, as after a crash of the last client.
+    refuse_start
+        Answers the start command with "refused".
+    bad_checksum, byte_slip
+        Probability of a record to carry a wrong checksum, and to lose a byte.
+    silent
+        Sends nothing.
+    """
+
+    def __init__(
+        self,
+        measure: Callable[[int], NDArray[np.float64]],
+        *,
+        seed: int = 0,
+        calibrations: Mapping[int, Calibration] | None = None,
+        needs_gains: bool = True,
+        status: int = 0,
+        gauge_offset: float | Sequence[float] = 0.0,
+        saturated_gauge: int | None = None,
+        streaming_at_start: bool = False,
+        refuse_start: bool = False,
+        bad_checksum: float = 0.0,
+        byte_slip: float = 0.0,
+        silent: bool = False,
+    ) -> None:
+        super().__init__()
+        self.measure = measure
+        self.calibrations = {1: REFERENCE} if calibrations is None else dict(calibrations)
+        self.needs_gains = needs_gains
+        self.status = status
+        self.gauge_offset = gauge_offset
+        self.saturated_gauge = saturated_gauge
+        self.streaming_at_start = streaming_at_start
+        self.refuse_start = refuse_start
+        self.bad_checksum = bad_checksum
+        self.byte_slip = byte_slip
+        self.silent = silent
+        self.streaming = False
+        self.produced_records = 0
+        self.dropped_records = 0
+        self._random = np.random.default_rng(seed)
+        self._stored_baud_code = 0
+        self._registers: dict[int, int] = {}
+        self._unlocked = False
+        self._burst = bytearray()
+        self._last_byte_s = 0.0
+        self._stream_start_s = 0.0
+        self._stream_hz = STREAM_HZ
+
+    def _power_up(self) -> None:
+        self._registers = dict.fromkeys(range(GAINS, SESSION + 1), 0)
+        self._registers |= {BAUD_STORE: 0, BAUD: self._stored_baud_code}
+        for slot in range(1, CALIBRATION_SLOTS + 1):
+            calibration = self.calibrations.get(slot)
+            block = calibration_block(calibration) if calibration else bytes(2 * CALIBRATION_REGISTERS)
+            words = struct.unpack(f">{CALIBRATION_REGISTERS}H", block)
+            self._registers |= dict(enumerate(words, start=CALIBRATION + (slot - 1) * CALIBRATION_STRIDE))
+        self._unlocked = False
+        self._burst.clear()
+        self.streaming = False
+        if self.streaming_at_start:
+            self._start_streaming()
+
+    def _received(self, data: bytes) -> None:
+        now_s = time.monotonic()
+        if self.streaming and now_s - self._last_byte_s > JAM_PAUSE_S:
+            self._burst.clear()
+        self._last_byte_s = now_s
+        self._burst += data[: LONGEST_FRAME + 1 - len(self._burst)]  # longer is no frame: remember no more of it
+        if self.streaming and len(self._burst) >= JAM_BYTES:
+            self.streaming = False  # and what follows without a pause still belongs to the jam
+            self._forget_unsent()
+
+    def _tick(self) -> float | None:
+        now_s = time.monotonic()
+        if not self.streaming and self._burst:
+            wait_s = self._last_byte_s + FRAME_GAP_S - now_s
+            if wait_s > 0:
+                return wait_s
+            request = bytes(self._burst)
+            self._burst.clear()
+            reply = self._reply(request)
+            if reply and not self.silent:
+                self._send(reply, len(reply))
+        if not self.streaming:
+            return None
+        elapsed_s = max(0.0, now_s - self._stream_start_s)
+        self._stream(elapsed_s)
+        return BURST_S - elapsed_s % BURST_S
+
+    def _reply(self, frame: bytes) -> bytes:
+        """Answer to one frame; nothing when it is damaged or for another device."""
+        if len(frame) < 4 or len(frame) > LONGEST_FRAME or frame[0] != ADDRESS or crc16(frame[:-2]) != frame[-2:]:
+            return b""
+        function, data = frame[1], frame[2:-2]
+        try:
+            return with_crc(bytes((ADDRESS, function)) + self._execute(function, data))
+        except ModbusError as refused:
+            return with_crc(bytes((ADDRESS, function | 0x80, refused.code)))
+
+    def _execute(self, function: int, data: bytes) -> bytes:
+        match function:
+            case 0x03:
+                return self._read(data, self._registers | {STATUS: self.status})
+            case 0x04:
+                return self._read(data, DIAGNOSTICS)
+            case 0x10:
+                return self._write_registers(data)
+            case 0x46 | 0x6A if len(data) != 1:
+                raise ModbusError(ILLEGAL_VALUE)
+            case 0x46:
+                accepted = data == b"\x55" and not self.refuse_start
+                if accepted:
+                    self._start_streaming()
+                return bytes([accepted])
+            case 0x6A:
+                accepted = data in (b"\xaa", b"\x18")
+                if accepted:
+                    self._unlocked = data == b"\xaa"
+                return bytes([accepted])
+        raise ModbusError(ILLEGAL_FUNCTION)
+
+    def _read(self, data: bytes, registers: Mapping[int, int]) -> bytes:
+        if len(data) != 4:
+            raise ModbusError(ILLEGAL_VALUE)
+        first, count = struct.unpack(">2H", data)
+        if not 1 <= count <= MAX_READ:
+            raise ModbusError(ILLEGAL_VALUE)
+        if any(address not in registers for address in range(first, first + count)):
+            raise ModbusError(ILLEGAL_ADDRESS)
+        values = [registers[address] for address in range(first, first + count)]
+        return struct.pack(f">B{count}H", 2 * count, *values)
+
+    def _write_registers(self, data: bytes) -> bytes:
+        if len(data) < 5:
+            raise ModbusError(ILLEGAL_VALUE)
+        first, count, size = struct.unpack(">2HB", data[:5])
+        if count == 0 or size != 2 * count or len(data) != 5 + size:
+            raise ModbusError(ILLEGAL_VALUE)
+        addresses = range(first, first + count)
+        if any(address not in WRITABLE for address in addresses):
+            raise ModbusError(ILLEGAL_ADDRESS)
+        if first < SESSION and not self._unlocked:
+            raise ModbusError(DEVICE_FAILURE)
+        values = dict(zip(addresses, struct.unpack(f">{count}H", data[5:]), strict=True))
+        if values.get(BAUD, 0) >= len(BAUD_RATES):
+            raise ModbusError(ILLEGAL_VALUE)
+        self._registers |= values
+        if BAUD in values and self._registers[BAUD_STORE] == 1:
+            self._stored_baud_code = values[BAUD]
+        return data[:4]
+
+    def _start_streaming(self) -> None:
+        self.streaming = True
+        self.produced_records = self.dropped_records = 0
+        self._stream_hz = min(STREAM_HZ, BAUD_RATES[self._registers[BAUD]] / (CHARACTER_BITS * RECORD_BYTES))
+        self._stream_start_s = time.monotonic()
+
+    def _stream(self, elapsed_s: float) -> None:
+        """Send the records that are due; those of a backlog no terminal would hold are dropped."""
+        due = int(elapsed_s * self._stream_hz) - self.produced_records
+        if due <= 0:
+            return
+        self.produced_records += due
+        if self.silent:
+            return
+        count = min(due, MAX_BACKLOG)
+        records = stream_records(self._gauges(count), error=bool(self.status & 0x8000))
+        if self.bad_checksum:
+            records[self._random.random(count) < self.bad_checksum, 12] ^= 0x01
+        data = records.tobytes()
+        if self.byte_slip and self._random.random() < self.byte_slip * count:
+            data = data[1:]
+        self.dropped_records += due - count + self._send(data, RECORD_BYTES)
+
+    def _gauges(self, count: int) -> NDArray[np.int16]:
+        """(count, 6) gauges at the gains and offsets in force, which are right only when they are the calibration's."""
+        calibration = self.calibrations[min(self.calibrations)]
+        gain: NDArray[np.float64] | float = 1.0
+        shift = np.asarray(self.gauge_offset, dtype=np.float64)
+        if self.needs_gains:
+            active = np.array([self._registers[address] for address in range(GAINS, SESSION)], dtype=np.float64)
+            gain = active[:6] / calibration.gauge_gains
+            shift = gain * shift + (active[6:] - calibration.gauge_offsets) / 4
+        gauges = calibration.gauges(self.measure(count), gain=gain, shift=shift)
+        if self.saturated_gauge is not None:
+            gauges[:, self.saturated_gauge] = GAUGE_MAX
+        return gauges

@@ -1,0 +1,122 @@
+"""A device behind a pseudo-terminal: one thread that sleeps until bytes arrive or the device has something to do.
+
+Ref: pty(7), termios(3). The slave end stays open here, or the master would read EIO as soon as a client leaves.
+
+Does not model: line speed and parity (a pty has neither), modem lines, breaks.
+"""
+
+import os
+import select
+import threading
+import tty
+from abc import ABC, abstractmethod
+
+
+class PtyDevice(ABC):
+    """Base of the emulated serial devices: opening, unplugging, reading, and writing that never blocks.
+
+    A subclass says what happens at power-up, on received bytes, and when its time comes.
+    """
+
+    def __init__(self) -> None:
+        self._thread: threading.Thread | None = None
+        self._master = self._wake_read = self._wake_write = -1
+        self._unsent = b""
+
+    def start(self) -> str:
+        """Power the device up behind a new pseudo-terminal.
+
+        Returns
+        -------
+        Path a client opens, for example ``/dev/pts/3``.
+
+        Raises
+        ------
+        RuntimeError
+            If the device is running already.
+        """
+        if self._thread is not None:
+            raise RuntimeError(f"{type(self).__name__} runs already: stop it before starting it again")
+        self._master, slave = os.openpty()
+        tty.setraw(self._master)
+        tty.setraw(slave)  # else the terminal echoes the device's own bytes back to it
+        os.set_blocking(self._master, False)
+        self._wake_read, self._wake_write = os.pipe()
+        self._unsent = b""
+        path = os.ttyname(slave)
+        self._power_up()
+        self._thread = threading.Thread(target=self._serve, args=(slave,), name=f"{type(self).__name__} {path}")
+        self._thread.daemon = True
+        self._thread.start()
+        return path
+
+    def unplug(self) -> None:
+        """Close the pseudo-terminal as a pulled cable does: the client's next read or write fails."""
+        if self._thread is None:
+            return
+        os.write(self._wake_write, b"!")
+        self._thread.join()
+        self._thread = None
+        os.close(self._wake_write)
+        os.close(self._wake_read)
+
+    def stop(self) -> None:
+        """End the device; harmless when it has ended already."""
+        self.unplug()
+
+    @abstractmethod
+    def _power_up(self) -> None:
+        """Set the state the device has after power-up."""
+
+    @abstractmethod
+    def _received(self, data: bytes) -> None:
+        """Take what the client wrote, in whatever pieces it arrives."""
+
+    @abstractmethod
+    def _tick(self) -> float | None:
+        """Do what is due and return the seconds until the next call is needed, None for not before new bytes."""
+
+    def _send(self, data: bytes, record_bytes: int) -> int:
+        """Write without blocking; when the client does not read, drop whole records and keep none.
+
+        Parameters
+        ----------
+        data
+            Whole records; the first may lack bytes at its start.
+        record_bytes
+            Length of a record: a record whose first bytes left is finished before the next one.
+
+        Returns
+        -------
+        Number of records dropped.
+        """
+        if self._unsent:
+            self._unsent = self._unsent[self._write(self._unsent) :]
+        rest = data if self._unsent else data[self._write(data) :]
+        if not rest:
+            return 0
+        if not self._unsent:
+            self._unsent = rest[: len(rest) % record_bytes]
+        return len(rest) // record_bytes
+
+    def _forget_unsent(self) -> None:
+        """Give up a record that left in part."""
+        self._unsent = b""
+
+    def _write(self, data: bytes) -> int:
+        try:
+            return os.write(self._master, data)
+        except BlockingIOError:
+            return 0
+
+    def _serve(self, slave: int) -> None:
+        try:
+            while True:
+                readable, _, _ = select.select([self._master, self._wake_read], [], [], self._tick())
+                if self._wake_read in readable:
+                    return
+                if self._master in readable:
+                    self._received(os.read(self._master, 4096))
+        finally:
+            os.close(self._master)
+            os.close(slave)

@@ -1,0 +1,102 @@
+"""The CAN emulator without a wire: payloads and the adapter's lines."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mocks.ati_can import matrix_row_payloads, sg_payloads
+from mocks.ati_gauges import REFERENCE
+from mocks.slcan import CanFrame, SlcanAdapter
+
+
+@pytest.mark.parametrize(
+    ("status", "gauges", "first", "second"),
+    [
+        (0x0000, [100, -200, 300, -400, 500, -600], "0000 0064 012C 01F4", "FF38 FE70 FDA8"),
+        (0x0000, [221, -926, 69, -1086, 2342, 1266], "0000 00DD 0045 0926", "FC62 FBC2 04F2"),
+        (0xC000, [100, -200, 300, -400, 500, -600], "C000 0064 012C 01F4", "FF38 FE70 FDA8"),
+        (0x4000, [18, 1274, -454, -1389, -6488, 323], "4000 0012 FE3A E6A8", "04FA FA93 0143"),
+    ],
+)
+def test_sg_payloads(status: int, gauges: list[int], first: str, second: str) -> None:
+    assert sg_payloads(status, np.array(gauges, dtype=np.int16)) == [bytes.fromhex(first), bytes.fromhex(second)]
+
+
+def test_matrix_rows() -> None:
+    rows = [b"".join(matrix_row_payloads(row)).hex(" ", 4).upper() for row in REFERENCE.matrix]
+    assert rows == [
+        "00000000 00000000 00000000 C584D000 00000000 4584D000",
+        "00000000 4599C000 00000000 C519C000 00000000 C519C000",
+        "45ED8000 00000000 45ED8000 00000000 45ED8000 00000000",
+        "00000000 00000000 C35C0000 00000000 435C0000 00000000",
+        "437E0000 00000000 C2FE0000 00000000 C2FE0000 00000000",
+        "00000000 C3060000 00000000 C3060000 00000000 C3060000",
+    ]
+
+
+def opened_adapter() -> SlcanAdapter:
+    adapter = SlcanAdapter()
+    assert adapter.feed(b"S5\rO\r") == (b"\r\r", [])
+    return adapter
+
+
+def test_adapter_needs_a_bit_rate_and_an_open_channel() -> None:
+    adapter = SlcanAdapter()
+    assert adapter.feed(b"O\rt2000\rC\rF\r") == (b"\a\a\a\a", [])
+    assert adapter.feed(b"\rS5\rO\rO\rS6\r") == (b"\r\r\r\a\a", [])
+    assert adapter.bitrate == 250_000
+
+
+@pytest.mark.parametrize(
+    ("line", "answer", "frame"),
+    [
+        (b"t2000\r", b"z\r", CanFrame(0x200)),
+        (b"t206100\r", b"z\r", CanFrame(0x206, b"\0")),
+        (b"T1234567F20aFf\r", b"Z\r", CanFrame(0x1234567F, b"\x0a\xff", extended=True)),
+        (b"r2004\r", b"z\r", CanFrame(0x200, remote=True)),
+    ],
+)
+def test_adapter_transmits(line: bytes, answer: bytes, frame: CanFrame) -> None:
+    adapter = opened_adapter()
+    assert adapter.feed(line[:3]) == (b"", [])
+    assert adapter.feed(line[3:]) == (answer, [frame])
+
+
+@pytest.mark.parametrize(
+    "line", [b"t200", b"t2009", b"t20010", b"t2001000", b"tzzz0", b"t8000", b"T200000000", b"r2009", b"Q1", b"t" * 50]
+)
+def test_adapter_refuses_malformed_lines(line: bytes) -> None:
+    assert opened_adapter().feed(line + b"\r") == (b"\a", [])
+
+
+def test_listen_only_transmits_nothing_but_reports_the_bus() -> None:
+    adapter = SlcanAdapter()
+    assert adapter.feed(b"S5\rL\rt2000\r") == (b"\r\r\a", [])
+    assert adapter.line(CanFrame(0x206, b"\0")) == b"t206100\r"
+    assert adapter.feed(b"C\r") == (b"\r", [])
+    assert adapter.line(CanFrame(0x206, b"\0")) == b""
+
+
+def test_garbage_without_end_keeps_little_memory_and_the_next_line_works() -> None:
+    adapter = opened_adapter()
+    for _ in range(100):
+        adapter.feed(b"t2000" * 100)
+    assert len(adapter._line) < 64
+    assert adapter.feed(b"\rt2000\r") == (b"\az\r", [CanFrame(0x200)])
+
+
+@given(
+    st.booleans().flatmap(
+        lambda extended: st.builds(
+            CanFrame,
+            st.integers(0, 0x1FFFFFFF if extended else 0x7FF),
+            st.binary(max_size=8),
+            st.just(extended),
+            st.just(False),
+        )
+    )
+)
+def test_a_reported_line_reads_back_as_the_same_frame(frame: CanFrame) -> None:
+    adapter = opened_adapter()
+    assert adapter.feed(adapter.line(frame)) == ((b"Z\r" if frame.extended else b"z\r"), [frame])

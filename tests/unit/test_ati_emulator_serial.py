@@ -1,0 +1,161 @@
+"""The serial emulator without a wire: frames, calibration block and stream records."""
+
+import struct
+import zlib
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from mocks.ati_gauges import REFERENCE
+from mocks.ati_serial import AtiSerialBox, calibration_block, crc16, stream_records, with_crc
+
+V1 = [100, -200, 300, -400, 500, -600]
+V2 = [221, -926, 69, -1086, 2342, 1266]
+
+
+@pytest.fixture
+def box() -> Iterator[AtiSerialBox]:
+    box = AtiSerialBox(lambda n: np.zeros((n, 6)))
+    box._power_up()
+    yield box
+    box.stop()
+
+
+def test_crc_check_value() -> None:
+    assert crc16(b"123456789") == bytes.fromhex("374B")
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        "0A 6A AA FF 1D",
+        "0A 6A 01 BE A2",
+        "0A 6A 18 7F 68",
+        "0A 46 55 A3 9D",
+        "0A 46 01 A2 62",
+        "0A 46 00 63 A2",
+        "0A 03 00 1D 00 01 15 77",
+        "0A 83 02 B1 33",
+    ],
+)
+def test_documented_crcs(frame: str) -> None:
+    assert with_crc(bytes.fromhex(frame)[:-2]) == bytes.fromhex(frame)
+
+
+@pytest.mark.parametrize(
+    ("gauges", "error", "record"),
+    [
+        (V1, False, "00 64 01 2C 01 F4 FF 38 FE 70 FD A8 50"),
+        (V1, True, "00 64 01 2C 01 F4 FF 38 FE 70 FD A8 D0"),
+        (V2, False, "00 DD 00 45 09 26 FC 62 FB C2 04 F2 62"),
+        ([0] * 6, False, "00 " * 13),
+    ],
+)
+def test_stream_record(gauges: list[int], error: bool, record: str) -> None:
+    assert stream_records(np.array([gauges], dtype=np.int16), error=error).tobytes() == bytes.fromhex(record)
+
+
+@given(hnp.arrays(np.int16, st.tuples(st.integers(1, 9), st.just(6))), st.booleans())
+def test_stream_records_hold_their_gauges_and_sum(gauges: np.ndarray, error: bool) -> None:
+    for record, expected in zip(stream_records(gauges, error=error), gauges, strict=True):
+        g0, g2, g4, g1, g3, g5 = struct.unpack(">6h", record[:12].tobytes())
+        assert [g0, g1, g2, g3, g4, g5] == expected.tolist()
+        assert record[12] == (sum(record[:12].tolist()) & 0x7F) + 128 * error
+
+
+def test_calibration_block_fields_stand_at_their_registers() -> None:
+    block = calibration_block(REFERENCE)
+    assert len(block) == 2 * 169
+    assert block[0:8] == b"FT12345\0"
+    assert block[8:40].rstrip(b"\0") == b"SI-130-10"
+    assert block[40:44] == b"Net\0"
+    assert block[44:64] == b"2020-01-0100:00:00Z\0"
+    assert np.frombuffer(block[64:208], ">f4").reshape(6, 6).tolist() == REFERENCE.matrix.tolist()
+    assert block[208:210] == bytes([2, 3])
+    assert struct.unpack(">6f", block[210:234]) == (130, 130, 400, 10, 10, 10)
+    assert struct.unpack(">ii", block[234:242]) == (1_000_000, 1_000_000)
+    assert struct.unpack(">6H", block[242:254]) == (543, 555, 569, 579, 565, 567)
+    assert struct.unpack(">6H", block[254:266]) == (0x8000,) * 6
+
+
+@pytest.mark.parametrize(
+    ("request_hex", "reply_hex"),
+    [
+        ("0A 03 00 1D 00 01 15 77", "0A 03 02 00 00 1D 85"),
+        ("0A 6A AA FF 1D", "0A 6A 01 BE A2"),
+        ("0A 6A 18 7F 68", "0A 6A 01 BE A2"),
+        ("0A 10 00 1E 00 01 02 00 01 17 1E", with_crc(bytes.fromhex("0A 10 00 1E 00 01")).hex()),
+        ("0A 10 00 1F 00 01 02 00 02 56 CE", with_crc(bytes.fromhex("0A 10 00 1F 00 01")).hex()),
+        ("0A 03 00 0C 00 01 45 72", with_crc(bytes.fromhex("0A 03 02 00 00")).hex()),
+    ],
+)
+def test_documented_requests(box: AtiSerialBox, request_hex: str, reply_hex: str) -> None:
+    assert box._reply(bytes.fromhex(request_hex)) == bytes.fromhex(reply_hex)
+
+
+@pytest.mark.parametrize(
+    ("body", "code"),
+    [
+        ("0A 01 00 00 00 01", 1),
+        ("0A 03 00 0D 00 01", 2),
+        ("0A 03 FF FF 00 02", 2),
+        ("0A 04 00 26 00 01", 2),
+        ("0A 03 01 8C 00 01", 2),
+        ("0A 10 00 1D 00 01 02 00 00", 2),
+        ("0A 10 00 E3 00 01 02 00 00", 2),
+        ("0A 03 00 E3 00 41", 3),
+        ("0A 03 00 E3 00 00", 3),
+        ("0A 03 00 E3", 3),
+        ("0A 10 00 0C 00 01 02 00", 3),
+        ("0A 10 00 1F 00 01 02 00 03", 3),
+        ("0A 46 55 55", 3),
+        ("0A 10 00 00 00 01 02 00 01", 4),
+        ("0A 10 00 0B 00 02 04 00 01 00 01", 4),
+    ],
+)
+def test_exceptions(box: AtiSerialBox, body: str, code: int) -> None:
+    request = bytes.fromhex(body)
+    assert box._reply(with_crc(request)) == with_crc(bytes([0x0A, request[1] | 0x80, code]))
+
+
+@given(st.binary(max_size=300))
+def test_bytes_with_a_wrong_crc_are_met_with_silence(body: bytes) -> None:
+    box = AtiSerialBox(lambda n: np.zeros((n, 6)))
+    box._power_up()
+    damaged = bytearray(with_crc(b"\x0a" + body))
+    damaged[-1] ^= 1 + zlib.crc32(body) % 255
+    assert box._reply(bytes(damaged)) == b""
+
+
+def test_other_addresses_are_met_with_silence(box: AtiSerialBox) -> None:
+    for address in (0x00, 0x09, 0x0B):
+        assert box._reply(with_crc(bytes([address]) + bytes.fromhex("03 00 1D 00 01"))) == b""
+
+
+def test_calibration_slots_follow_each_other_and_empty_ones_read_zero(box: AtiSerialBox) -> None:
+    def words(first: int, count: int) -> bytes:
+        return box._reply(with_crc(struct.pack(">BBHH", 0x0A, 3, first, count)))[3:-2]
+
+    block = calibration_block(REFERENCE)
+    assert words(0x00E3, 64) + words(0x0123, 64) + words(0x0163, 41) == block
+    assert words(0x00E3 + 192, 64) == bytes(128)
+    assert words(0x0C23 + 128, 41) == bytes(82)
+
+
+def test_baud_survives_a_power_cycle_only_when_stored(box: AtiSerialBox) -> None:
+    def write(register: int, value: int) -> None:
+        reply = box._reply(with_crc(struct.pack(">BBHHBH", 0x0A, 0x10, register, 1, 2, value)))
+        assert reply[1] == 0x10
+
+    read_baud = with_crc(bytes.fromhex("0A 03 00 1F 00 01"))
+    write(0x1F, 2)
+    box._power_up()
+    assert box._reply(read_baud)[3:5] == b"\x00\x00"
+    write(0x1E, 1)
+    write(0x1F, 2)
+    box._power_up()
+    assert box._reply(read_baud)[3:5] == b"\x00\x02"
