@@ -2,13 +2,14 @@
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from calib.errors import CalibError
 
-JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
+JSON: TypeAlias = Any
+"""What `json` can write: numbers, strings, None, and lists and dicts of them."""
 
 
 def write_new(path: Path, content: str | bytes) -> None:

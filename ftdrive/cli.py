@@ -52,7 +52,7 @@ def cli(verbose: int, quiet: bool) -> None:
 
 def exit_code(error: BaseException) -> int | None:
     """Exit code of an error that a user can mend; None for a defect of ours."""
-    from calib.errors import BadDataset, NotObservable
+    from calib.errors import BadCalibration, BadDataset, NotObservable
     from drivers.errors import ConnectError, DeviceFault, DriverError
     from ftdrive.errors import ConfigError, NotAccepted
 
@@ -62,6 +62,7 @@ def exit_code(error: BaseException) -> int | None:
         (DeviceFault, 5),
         (DriverError, 4),
         (BadDataset, 6),
+        (BadCalibration, 6),
         (NotObservable, 7),
         (NotAccepted, 7),
         (OSError, 6),

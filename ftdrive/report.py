@@ -55,10 +55,10 @@ def print_result(
 ) -> None:
     """Show verdict, estimates with one sigma, and the truth and the error where the truth is known."""
     data = result.to_dict()
-    error = result.predicted_error()
+    force_N, torque_Nm = result.predicted_error()
     talk.print(
         f"\n {_MARK[result.verdict]}  {result.n_poses} poses, method {result.method}; compensation error "
-        f"{error.force_rms_N:.3f} N, {error.torque_rms_Nm:.4f} N·m rms over all orientations (predicted)"
+        f"{force_N:.4f} N, {torque_Nm:.5f} N·m rms over all orientations (predicted)"
     )
     for reason in result.reasons:
         talk.print(f"   {reason}")

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import BadDataset
-from calib.files import write_new
+from calib.files import check_format, read_object, write_new
 from calib.routine import PoseRecord
 from calib.tour import TourPose
 from ftdrive import __version__
@@ -85,7 +85,7 @@ class Run:
             "versions": versions(),
             **description,
         }
-        write_new(folder / "run.json", json.dumps(header, indent=1).encode())
+        write_new(folder / "run.json", json.dumps(header, indent=1))
         return cls(folder)
 
     @property
@@ -96,21 +96,19 @@ class Run:
     def header(self) -> Mapping[str, Any]:
         """Read run.json; raises `BadDataset` when it is not one."""
         path = self.folder / "run.json"
+        if not path.exists():
+            raise BadDataset(f"{self.folder} is not a run folder: it has no run.json")
+        header = read_object(path, BadDataset)
         try:
-            header = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise BadDataset(f"{path} is not JSON: {error}") from error
-        except FileNotFoundError as error:
-            raise BadDataset(f"{self.folder} is not a run folder: it has no run.json") from error
-        found = header.get("format") if isinstance(header, dict) else None
-        if found != RUN_FORMAT:
-            raise BadDataset(f"{path} has format {found!r}: this version reads {RUN_FORMAT}")
-        return header  # type: ignore[no-any-return]
+            check_format(header, RUN_FORMAT, BadDataset)
+        except BadDataset as error:
+            raise BadDataset(f"{path}: {error}") from error
+        return header
 
     def commit(self, record: PoseRecord) -> None:
         """Put one pose on disk; returns when it is safe."""
         buffer = io.BytesIO()
-        readings = {
+        readings: dict[str, Any] = {
             f"{when}_{name}": np.asarray(getattr(reading, name))
             for when, reading in (("before", record.before), ("after", record.after))
             for name in ("t_host_ns", "q_rad", "R_base_flange")

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from calib import CalibrationDataset, CalibrationResult, Method, solve
+from calib import CalibrationDataset, CalibrationResult, solve
+from calib.result import Method
 from calib.routine import DriftCheck, PoseRecord, Progress, dataset_from, drift_check, run_tour
 from calib.tour import TourPose, wrist_tour
 from drivers.interfaces import DeviceInfo, ForceTorqueSensor, RobotArm

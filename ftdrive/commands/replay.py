@@ -5,9 +5,8 @@ from pathlib import Path
 import click
 
 from calib import CalibrationResult
-from calib.routine import PoseRecord, run_tour
+from calib.routine import PoseRecord, Sampling, run_tour
 from ftdrive.commands.common import JSON, stop_unless_accepted, write_json
-from ftdrive.config import Sampling
 from ftdrive.errors import NotAccepted
 from ftdrive.recorded import EndOfRecording, RecordedRun
 from ftdrive.report import describe, print_result, talk

@@ -1,16 +1,20 @@
 """`ftdrive solve`: from data on disk to a calibration, without any device."""
 
 from pathlib import Path
+from typing import Literal
 
 import click
 
-from calib import CalibrationDataset, CalibrationResult, Method, read_csv
+from calib import CalibrationDataset, CalibrationResult, read_csv
 from calib import solve as solve_dataset
+from calib.result import Method
 from ftdrive.commands.common import JSON, stop_unless_accepted, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.report import print_result, talk
 from ftdrive.runs import Run, versions
 from ftdrive.session import solve_run
+
+Orientation = Literal["R_base_flange", "R_flange_base"]
 
 
 @click.command()
@@ -25,7 +29,7 @@ from ftdrive.session import solve_run
 )
 @click.option("--output", "-o", type=click.Path(dir_okay=False, path_type=Path), help="Save the calibration here.")
 @JSON
-def solve(source: Path, method: Method, orientation: str, output: Path | None, as_json: bool) -> None:
+def solve(source: Path, method: Method, orientation: Orientation, output: Path | None, as_json: bool) -> None:
     """Solve DATASET: a run folder, a dataset.json, or a CSV file.
 
     A CSV has a header with r11..r33 (or the rotation vector rx,ry,rz), fx,fy,fz,tx,ty,tz in N and N·m, and optionally
@@ -44,7 +48,7 @@ def solve(source: Path, method: Method, orientation: str, output: Path | None, a
         talk.print(f" Saved {output}")
 
 
-def _solve(source: Path, method: Method, orientation: str) -> CalibrationResult:
+def _solve(source: Path, method: Method, orientation: Orientation) -> CalibrationResult:
     if source.is_dir():
         return solve_run(Run(source), method).result
     dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
