@@ -52,7 +52,7 @@ def matrix_row_payloads(row: NDArray[np.float64]) -> list[bytes]:
 class AtiCanNode(PtyDevice):
     """The sensor's CAN node and the adapter a client opens.
 
-    Everything public is a plain attribute and may be changed while the node runs.
+    Public attributes may be changed while the node runs, except `base` and `bitrate`, which show what is in force.
 
     Parameters
     ----------

@@ -104,7 +104,8 @@ def calibration_block(calibration: Calibration) -> bytes:
 class AtiSerialBox(PtyDevice):
     """The sensor's RS-485 interface.
 
-    Everything public is a plain attribute and may be changed while the box runs.
+    Public attributes may be changed while the box runs; `produced_records` and `dropped_records` count since the
+    stream started.
 
     Parameters
     ----------

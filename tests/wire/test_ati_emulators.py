@@ -1,0 +1,591 @@
+"""The emulated ATI sensors behind their pseudo-terminals, as python-can and pyserial see them."""
+
+import struct
+import termios
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+
+import can
+import numpy as np
+import pytest
+import serial
+from can.interfaces.slcan import slcanBus
+from numpy.typing import NDArray
+
+from mocks.ati_can import AtiCanNode
+from mocks.ati_gauges import REFERENCE
+from mocks.ati_serial import AtiSerialBox, calibration_block, with_crc
+
+V1 = np.array([-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608])
+V2 = np.array([10, -5, 20, 0.5, -0.25, 0.1])
+V1_FRAMES = ["200#0000 0064 012C 01F4", "201#FF38 FE70 FDA8"]
+V1_RECORD = bytes.fromhex("00 64 01 2C 01 F4 FF 38 FE 70 FD A8 50")
+READ_STATUS = bytes.fromhex("0A 03 00 1D 00 01 15 77")
+STATUS_OK = bytes.fromhex("0A 03 02 00 00 1D 85")
+START = bytes.fromhex("0A 46 55 A3 9D")
+STARTED = bytes.fromhex("0A 46 01 A2 62")
+UNLOCK, LOCK = bytes.fromhex("0A 6A AA FF 1D"), bytes.fromhex("0A 6A 18 7F 68")
+ACCEPTED = bytes.fromhex("0A 6A 01 BE A2")
+WRITE_GAINS = bytes.fromhex("0A 10 00 00 00 06 0C 02 1F 02 2B 02 39 02 43 02 35 02 37 47 2D")
+WRITE_OFFSETS = bytes.fromhex("0A 10 00 06 00 06 0C" + "80 00" * 6 + "75 66")
+JAM = bytes(range(1, 15))
+UNPLUGGED = (serial.SerialException, can.CanError, OSError, termios.error)
+
+
+def constant(wrench: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:
+    return lambda n: np.tile(wrench, (n, 1))
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, "the condition never came true"
+        time.sleep(0.002)
+
+
+# ---------------------------------------------------------------- CAN
+
+
+def text(message: can.Message) -> str:
+    return f"{message.arbitration_id:03X}#{message.data.hex(' ', 2).upper()}"
+
+
+def frame(line: str) -> can.Message:
+    identifier, data = line.split("#")
+    return can.Message(arbitration_id=int(identifier, 16), data=bytes.fromhex(data), is_extended_id=False)
+
+
+class CanClient:
+    """A python-can bus with the two things every test does."""
+
+    def __init__(self, path: str, bitrate: int = 250_000) -> None:
+        self.bus = can.Bus(interface="slcan", channel=path, bitrate=bitrate, sleep_after_open=0)
+
+    def ask(self, line: str, count: int) -> list[str]:
+        self.bus.send(frame(line))
+        return [text(message) for message in self.collect(count)]
+
+    def collect(self, count: int) -> list[can.Message]:
+        messages = [self.bus.recv(2.0) for _ in range(count)]
+        return [message for message in messages if message is not None]
+
+    def hears_only_the_serial_number(self, request: str = "205#") -> bool:
+        """Whether everything sent before was ignored: requests are answered in order."""
+        return self.ask(request, 1) == [f"{request[:3]}#4654 3132 3334 3500"]
+
+
+@contextmanager
+def can_client(path: str, bitrate: int = 250_000) -> Iterator[CanClient]:
+    client = CanClient(path, bitrate)
+    try:
+        yield client
+    finally:
+        with suppress(*UNPLUGGED):
+            client.bus.shutdown()
+
+
+@pytest.fixture
+def node() -> Iterator[AtiCanNode]:
+    node = AtiCanNode(constant(V1), boot_s=0.05)
+    yield node
+    node.stop()
+
+
+@pytest.fixture
+def client(node: AtiCanNode) -> Iterator[CanClient]:
+    with can_client(node.start()) as client:
+        yield client
+
+
+@pytest.mark.parametrize(
+    ("request_", "answer"),
+    [
+        ("200#", V1_FRAMES),
+        ("202#00", ["202#0000 0000 0000 0000", "203#0000 0000 C584 D000", "204#0000 0000 4584 D000"]),
+        ("202#01", ["202#0000 0000 4599 C000", "203#0000 0000 C519 C000", "204#0000 0000 C519 C000"]),
+        ("202#02", ["202#45ED 8000 0000 0000", "203#45ED 8000 0000 0000", "204#45ED 8000 0000 0000"]),
+        ("202#03", ["202#0000 0000 0000 0000", "203#C35C 0000 0000 0000", "204#435C 0000 0000 0000"]),
+        ("202#04", ["202#437E 0000 0000 0000", "203#C2FE 0000 0000 0000", "204#C2FE 0000 0000 0000"]),
+        ("202#05", ["202#0000 0000 C306 0000", "203#0000 0000 C306 0000", "204#0000 0000 C306 0000"]),
+        ("205#", ["205#4654 3132 3334 3500"]),
+        ("206#00", ["206#00"]),
+        ("207#", ["207#000F 4240 000F 4240"]),
+        ("208#", ["208#0203"]),
+        ("209#02", ["209#0A3C"]),
+        ("20F#", ["20F#0308 0002"]),
+        ("20D#21", ["20D#"]),
+        ("20E#03", ["20E#"]),
+    ],
+)
+def test_can_transactions_of_the_document(client: CanClient, request_: str, answer: list[str]) -> None:
+    assert client.ask(request_, len(answer)) == answer
+    assert client.hears_only_the_serial_number()
+
+
+def test_can_second_vector_and_status_bits(node: AtiCanNode, client: CanClient) -> None:
+    node.measure = constant(V2)
+    assert client.ask("200#", 2) == ["200#0000 00DD 0045 0926", "201#FC62 FBC2 04F2"]
+    node.status = 0xC000
+    node.measure = constant(V1)
+    assert client.ask("200#", 2) == ["200#C000 0064 012C 01F4", "201#FF38 FE70 FDA8"]
+    node.status = 0x4000
+    assert client.ask("200#", 2)[0].startswith("200#4000")
+
+
+def test_can_superfluous_byte_is_tolerated_where_no_argument_is_needed(client: CanClient) -> None:
+    assert client.ask("200#00", 2) == V1_FRAMES
+    assert client.ask("207#00", 1) == ["207#000F 4240 000F 4240"]
+    assert client.hears_only_the_serial_number()
+
+
+def test_can_everything_that_is_no_request_is_ignored(client: CanClient) -> None:
+    for opcode in range(16):
+        client.bus.send(can.Message(arbitration_id=0x200 + opcode, is_extended_id=True, data=b"\0"))
+        client.bus.send(can.Message(arbitration_id=0x200 + opcode, is_extended_id=False, is_remote_frame=True, dlc=1))
+        client.bus.send(frame(f"21{opcode:X}#00"))
+        client.bus.send(frame(f"20{opcode:X}#0000"))
+        client.bus.send(frame(f"20{opcode:X}#" + "00" * 8))
+    for line in ("201#", "203#", "204#", "20A#", "20B#", "201#00", "202#", "206#", "209#", "20D#", "20E#"):
+        client.bus.send(frame(line))
+    for line in ("202#06", "202#FF", "209#01", "209#06", "206#10"):
+        client.bus.send(frame(line))
+    assert client.hears_only_the_serial_number()
+
+
+def test_can_empty_slot_is_active_and_says_so(client: CanClient) -> None:
+    assert client.ask("206#0F", 1) == ["206#0F"]
+    assert client.ask("200#", 2)[0].startswith("200#8040")
+    assert client.ask("202#02", 3) == [f"{i}#0000 0000 0000 0000" for i in (202, 203, 204)]
+    assert client.ask("206#00", 1) == ["206#00"]
+    assert client.ask("200#", 2) == V1_FRAMES
+
+
+def test_can_reset_is_silent_then_slot_0_with_new_base_and_bit_rate(node: AtiCanNode) -> None:
+    path = node.start()
+    with can_client(path) as client:
+        client.ask("206#05", 1)
+        client.ask("20D#21", 1)
+        client.ask("20E#03", 1)
+        assert client.hears_only_the_serial_number(), "settings wait for the reset"
+        client.bus.send(frame("20C#"))
+        client.bus.send(frame("205#"))
+        assert client.bus.recv(2 * node.boot_s) is None, "the node boots, then listens at another bit rate"
+    with can_client(path, bitrate=500_000) as client:
+        client.bus.send(frame("205#"))
+        assert client.hears_only_the_serial_number("215#")
+        assert client.ask("210#", 2)[0] == "210#0000 0064 012C 01F4"
+
+
+def test_can_boot_time(node: AtiCanNode, client: CanClient) -> None:
+    node.boot_s = 0.15
+    client.bus.send(frame("20C#"))
+    reset_s = time.monotonic()
+    message = None
+    while message is None:
+        assert time.monotonic() - reset_s < 3.0
+        client.bus.send(frame("205#"))
+        message = client.bus.recv(0.01)
+    assert time.monotonic() - reset_s > 0.14
+
+
+def test_can_settings_may_wait_for_power_up(node: AtiCanNode) -> None:
+    node.reset_applies_settings = False
+    node.boot_s = 0.0
+    with can_client(node.start()) as client:
+        client.ask("20D#7F", 1)
+        client.bus.send(frame("20C#"))
+        assert client.hears_only_the_serial_number()
+    node.stop()
+    with can_client(node.start()) as client:
+        assert client.hears_only_the_serial_number("7F5#")
+
+
+@pytest.mark.parametrize(
+    ("firmware", "answered"),
+    [((3, 8, 0), ["207", "208", "209"]), ((3, 7, 9), ["207", "208"]), ((3, 6, 9), [])],
+)
+def test_can_firmware_levels(firmware: tuple[int, int, int], answered: list[str]) -> None:
+    node = AtiCanNode(constant(V1), firmware=firmware)
+    with can_client(node.start()) as client:
+        for line in ("207#", "208#", "209#00"):
+            client.bus.send(frame(line))
+        client.bus.send(frame("20F#"))
+        assert [text(message)[:3] for message in client.collect(len(answered) + 1)] == [*answered, "20F"]
+    node.stop()
+
+
+def test_can_saturation(node: AtiCanNode, client: CanClient) -> None:
+    node.measure = constant(np.array([0, 0, 900.0, 0, 0, 0]))
+    assert client.ask("200#", 2)[0] == "200#0000 7FFF 7FFF 7FFF"
+    node.measure = constant(V1)
+    node.saturated_gauge = 3
+    assert client.ask("200#", 2)[1] == "201#FF38 7FFF FDA8"
+
+
+def test_can_gauge_offset(node: AtiCanNode, client: CanClient) -> None:
+    node.gauge_offset = (1, 0, 0, 0, 0, -1)
+    assert client.ask("200#", 2) == ["200#0000 0065 012C 01F4", "201#FF38 FE70 FDA7"]
+
+
+def test_can_lost_doubled_and_swapped_frames(node: AtiCanNode, client: CanClient) -> None:
+    node.swap = 1.0
+    assert client.ask("200#", 2) == V1_FRAMES[::-1]
+    node.swap, node.duplicate = 0.0, 1.0
+    assert client.ask("200#", 4) == [V1_FRAMES[0], V1_FRAMES[0], V1_FRAMES[1], V1_FRAMES[1]]
+    node.duplicate, node.loss = 0.0, 1.0
+    client.bus.send(frame("200#"))
+    assert client.bus.recv(0.05) is None
+    node.loss = 0.3
+    for _ in range(200):
+        client.bus.send(frame("200#"))
+    heard = 0
+    while client.bus.recv(0.1) is not None:
+        heard += 1
+    assert 240 < heard < 320, "about 280 of 400"
+
+
+def test_can_foreign_traffic_stands_between_the_halves_and_is_not_ours(node: AtiCanNode, client: CanClient) -> None:
+    node.foreign = 1.0
+    for _ in range(50):
+        client.bus.send(frame("200#"))
+        foreign_1, first, foreign_2, second = client.collect(4)
+        assert [text(first), text(second)] == V1_FRAMES
+        for foreign in (foreign_1, foreign_2):
+            assert foreign.is_extended_id or foreign.arbitration_id >> 4 != 0x20
+
+
+def test_can_latency_and_jitter_delay_the_answer(node: AtiCanNode, client: CanClient) -> None:
+    node.latency_s, node.jitter_s = 0.03, 0.005
+    start_s = time.monotonic()
+    assert client.ask("200#", 2) == V1_FRAMES
+    assert time.monotonic() - start_s >= 0.03
+
+
+def test_can_wrong_echo_and_silent_sensor(node: AtiCanNode, client: CanClient) -> None:
+    node.wrong_echo = 7
+    assert client.ask("206#00", 1) == ["206#07"]
+    node.silent = True
+    client.bus.send(frame("205#"))
+    assert client.bus.recv(0.05) is None
+
+
+def test_can_another_bit_rate_hears_nothing(node: AtiCanNode) -> None:
+    with can_client(node.start(), bitrate=500_000) as client:
+        client.bus.send(frame("205#"))
+        assert client.bus.recv(0.05) is None
+
+
+def test_can_adapter_answers_its_own_questions(client: CanClient) -> None:
+    assert isinstance(client.bus, slcanBus)
+    assert client.bus.get_version(1.0) == (10, 13)
+    assert client.bus.get_serial_number(1.0) == "EMUL"
+
+
+def test_can_client_may_leave_and_come_back(node: AtiCanNode) -> None:
+    path = node.start()
+    for _ in range(3):
+        with can_client(path) as client:
+            assert client.ask("200#", 2) == V1_FRAMES
+
+
+def test_can_host_that_never_reads_costs_frames_not_memory(node: AtiCanNode) -> None:
+    with serial.Serial(node.start(), timeout=2.0) as port:
+        port.write(b"S5\rO\r")
+        while not node.dropped_messages:
+            port.write(b"t2000\r" * 50)
+            port.flush()
+        assert len(node._to_host) + len(node._unsent) < 40_000, "the answers to one read of 4096 bytes"
+        port.timeout = 0.1
+        stuck = b""
+        while some := port.read(4096):
+            stuck += some
+        port.timeout = 2.0
+        port.write(b"t20F0\r")
+        lines = (stuck + port.read_until(b"t20F403080002\r")).split(b"\r")
+        assert set(lines) == {b"", b"z", b"t200800000064012C01F4", b"t2016FF38FE70FDA8", b"t20F403080002"}
+
+
+@pytest.mark.parametrize("device", [AtiCanNode(constant(V1)), AtiSerialBox(constant(V1))])
+def test_unplugging_fails_the_client_and_stop_is_idempotent(device: AtiCanNode | AtiSerialBox) -> None:
+    device.stop()
+    with ExitStack() as stack:
+        port = stack.enter_context(serial.Serial(device.start(), timeout=0.5))
+        with pytest.raises(RuntimeError, match="runs already"):
+            device.start()
+        device.unplug()
+        with pytest.raises(UNPLUGGED):
+            port.read(1)
+        with pytest.raises(UNPLUGGED):
+            port.write(b"\r")
+    device.stop()
+    device.stop()
+
+
+def test_can_unplugging_fails_the_bus(node: AtiCanNode, client: CanClient) -> None:
+    assert client.hears_only_the_serial_number()
+    node.unplug()
+    with pytest.raises(can.CanOperationError):
+        client.bus.recv(1.0)
+    with pytest.raises(can.CanOperationError):
+        client.bus.send(frame("200#"))
+
+
+# ---------------------------------------------------------------- serial
+
+
+class SerialClient:
+    """A pyserial port with the two things every test does."""
+
+    def __init__(self, port: serial.Serial) -> None:
+        self.port = port
+
+    def ask(self, request: bytes, reply_bytes: int) -> bytes:
+        self.port.write(request)
+        return self.port.read(reply_bytes)
+
+    def is_silent_to(self, request: bytes) -> bool:
+        self.port.timeout = 0.03
+        silent = self.ask(request, 1) == b""
+        self.port.timeout = 2.0
+        return silent
+
+    def records(self, count: int) -> NDArray[np.uint8]:
+        return np.frombuffer(self.port.read(13 * count), dtype=np.uint8).reshape(-1, 13)
+
+    def stop(self) -> None:
+        """Jam, then wait for 20 ms of silence."""
+        self.port.write(JAM)
+        self.port.timeout = 0.02
+        while self.port.read(4096):
+            pass
+        self.port.timeout = 2.0
+
+
+def checksums_are_right(records: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    right: NDArray[np.bool_] = (records[:, :12].sum(axis=1) & 0x7F) == (records[:, 12] & 0x7F)
+    return right
+
+
+def noisy(wrench: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:
+    rng = np.random.default_rng(3)
+    return lambda n: wrench + rng.normal(scale=[0.05] * 3 + [0.002] * 3, size=(n, 6))
+
+
+@pytest.fixture
+def box() -> Iterator[AtiSerialBox]:
+    box = AtiSerialBox(constant(V1), needs_gains=False)
+    yield box
+    box.stop()
+
+
+@pytest.fixture
+def line(box: AtiSerialBox) -> Iterator[SerialClient]:
+    with serial.Serial(box.start(), 1_250_000, timeout=2.0) as port:
+        yield SerialClient(port)
+
+
+def test_serial_frames_of_the_document(box: AtiSerialBox, line: SerialClient) -> None:
+    assert line.ask(READ_STATUS, 7) == STATUS_OK
+    box.status = 1
+    assert line.ask(READ_STATUS, 7) == bytes.fromhex("0A 03 02 00 01 DC 45")
+    diagnostics = line.ask(bytes.fromhex("0A 04 00 27 00 06 C1 78"), 17)
+    assert diagnostics[:3] == bytes.fromhex("0A 04 0C")
+    assert with_crc(diagnostics[:-2]) == diagnostics
+    assert line.ask(UNLOCK, 5) == ACCEPTED
+    assert line.ask(WRITE_GAINS, 8) == bytes.fromhex("0A 10 00 00 00 06 41 70")
+    assert line.ask(WRITE_OFFSETS, 8) == bytes.fromhex("0A 10 00 06 00 06 A1 71")
+    assert line.ask(LOCK, 5) == ACCEPTED
+    assert line.ask(with_crc(bytes.fromhex("0A 03 00 00 00 0C")), 29)[3:-2] == WRITE_GAINS[7:-2] + WRITE_OFFSETS[7:-2]
+
+
+def test_serial_calibration_block(line: SerialClient) -> None:
+    requests = ("0A 03 00 E3 00 40 B4 B7", "0A 03 01 23 00 40 B5 77", "0A 03 01 63 00 29 74 8D")
+    sizes = (133, 133, 87)
+    replies = [line.ask(bytes.fromhex(r), size) for r, size in zip(requests, sizes, strict=True)]
+    assert all(with_crc(reply[:-2]) == reply for reply in replies)
+    assert b"".join(reply[3:-2] for reply in replies) == calibration_block(REFERENCE)
+
+
+def test_serial_gains_are_locked_until_unlocked(line: SerialClient) -> None:
+    refused = with_crc(bytes.fromhex("0A 90 04"))
+    assert line.ask(WRITE_GAINS, 5) == refused
+    assert line.ask(UNLOCK, 5) == ACCEPTED
+    assert line.ask(WRITE_GAINS, 8)[1] == 0x10
+    assert line.ask(LOCK, 5) == ACCEPTED
+    assert line.ask(WRITE_OFFSETS, 5) == refused
+
+
+def test_serial_exceptions(line: SerialClient) -> None:
+    assert line.ask(with_crc(bytes.fromhex("0A 03 00 20 00 01")), 5) == bytes.fromhex("0A 83 02 B1 33")
+    assert line.ask(with_crc(bytes.fromhex("0A 06 00 0C 00 01")), 5) == with_crc(bytes.fromhex("0A 86 01"))
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        READ_STATUS[:-1] + b"\x00",
+        with_crc(b"\x09" + READ_STATUS[1:-2]),
+        READ_STATUS[:-1],
+        b"\x0a",
+        bytes(72),
+        JAM,
+        JAM + READ_STATUS,
+        READ_STATUS + READ_STATUS,
+        bytes(3000),
+    ],
+    ids=["crc", "address", "short", "one", "zeros", "jam", "jam without pause", "two without pause", "flood"],
+)
+def test_serial_damaged_frames_are_met_with_silence(line: SerialClient, request_: bytes) -> None:
+    assert line.is_silent_to(request_)
+    assert line.ask(READ_STATUS, 7) == STATUS_OK
+
+
+def test_serial_stream_starts_after_the_reply_and_stops_when_jammed(line: SerialClient) -> None:
+    for _ in range(3):
+        assert line.ask(START, 5) == STARTED
+        assert line.port.read(130) == V1_RECORD * 10
+        line.stop()
+        assert line.ask(READ_STATUS, 7) == STATUS_OK
+
+
+@pytest.mark.parametrize("jam", [b"\xaa" * 14, bytes(72)], ids=["14 x AA", "72 zeros"])
+def test_serial_any_14_bytes_stop_the_stream(box: AtiSerialBox, line: SerialClient, jam: bytes) -> None:
+    assert line.ask(START, 5) == STARTED
+    line.port.write(jam)
+    wait_until(lambda: not box.streaming)
+
+
+def test_serial_fewer_bytes_do_not_stop_it_and_a_pause_restarts_the_count(
+    box: AtiSerialBox, line: SerialClient
+) -> None:
+    assert line.ask(START, 5) == STARTED
+    for _ in range(2):
+        line.port.write(JAM[:13])
+        assert line.port.read(13 * 1400) == V1_RECORD * 1400, "0.2 s of stream"
+    assert box.streaming
+    line.port.write(JAM[:7])
+    line.port.write(JAM[7:])
+    wait_until(lambda: not box.streaming)
+
+
+def test_serial_requests_in_a_stream_are_not_answered(line: SerialClient) -> None:
+    assert line.ask(START, 5) == STARTED
+    line.port.write(READ_STATUS)
+    assert line.port.read(13 * 700) == V1_RECORD * 700
+
+
+def test_serial_stream_keeps_real_time(line: SerialClient) -> None:
+    assert line.ask(START, 5) == STARTED
+    start_s = time.monotonic()
+    assert len(line.records(3500)) == 3500
+    assert 0.45 < time.monotonic() - start_s < 0.75
+
+
+def test_serial_slow_line_streams_what_fits(line: SerialClient) -> None:
+    line.ask(bytes.fromhex("0A 10 00 1F 00 01 02 00 02 56 CE"), 8)
+    assert line.ask(START, 5) == STARTED
+    start_s = time.monotonic()
+    assert len(line.records(161)) == 161
+    assert 0.19 < time.monotonic() - start_s < 0.4, "805 records a second at 115 200 baud"
+
+
+def test_serial_gains_decide_what_the_gauges_say(box: AtiSerialBox, line: SerialClient) -> None:
+    def gauges() -> list[int]:
+        assert line.ask(START, 5) == STARTED
+        record = line.port.read(13)
+        line.stop()
+        g0, g2, g4, g1, g3, g5 = struct.unpack(">6h", record[:12])
+        return [g0, g1, g2, g3, g4, g5]
+
+    box.needs_gains = True
+    assert gauges() == [-8192] * 6, "no gain, and an offset of 0 instead of 32768"
+    line.ask(UNLOCK, 5)
+    line.ask(WRITE_OFFSETS, 8)
+    assert gauges() == [0] * 6, "no gain"
+    line.ask(WRITE_GAINS, 8)
+    assert gauges() == [100, -200, 300, -400, 500, -600]
+    gain_0 = with_crc(struct.pack(">BBHHBH", 0x0A, 0x10, 0, 1, 2, 2 * 543))
+    offset_1 = with_crc(struct.pack(">BBHHBH", 0x0A, 0x10, 7, 1, 2, 0x8000 + 400))
+    line.ask(gain_0, 8)
+    line.ask(offset_1, 8)
+    assert gauges() == [200, -100, 300, -400, 500, -600]
+
+
+def test_serial_gains_are_volatile(box: AtiSerialBox) -> None:
+    with serial.Serial(box.start(), timeout=2.0) as port:
+        line = SerialClient(port)
+        line.ask(UNLOCK, 5)
+        line.ask(WRITE_GAINS, 8)
+    box.stop()
+    with serial.Serial(box.start(), timeout=2.0) as port:
+        line = SerialClient(port)
+        assert line.ask(with_crc(bytes.fromhex("0A 03 00 00 00 06")), 17)[3:-2] == bytes(12)
+        assert line.ask(WRITE_GAINS, 5) == with_crc(bytes.fromhex("0A 90 04")), "and the lock is back"
+
+
+def test_serial_host_that_does_not_read_loses_whole_records(box: AtiSerialBox, line: SerialClient) -> None:
+    box.measure = noisy(V1)
+    assert line.ask(START, 5) == STARTED
+    wait_until(lambda: box.dropped_records > 100)
+    assert len(box._unsent) < 13
+    records = line.records(4000)
+    assert len(records) == 4000
+    assert checksums_are_right(records).all()
+    assert line.port.in_waiting < 20_000
+
+
+def test_serial_streaming_at_start_is_ended_by_a_jam(box: AtiSerialBox) -> None:
+    box.streaming_at_start = True
+    with serial.Serial(box.start(), timeout=2.0) as port:
+        line = SerialClient(port)
+        assert len(line.records(10)) == 10
+        line.stop()
+        assert line.ask(READ_STATUS, 7) == STATUS_OK
+
+
+def test_serial_status_bit_and_saturated_gauge_show_in_the_stream(box: AtiSerialBox, line: SerialClient) -> None:
+    box.status = 0x8002
+    assert line.ask(START, 5) == STARTED
+    assert line.port.read(13) == V1_RECORD[:12] + b"\xd0"
+    line.stop()
+    box.status, box.saturated_gauge = 0, 4
+    assert line.ask(START, 5) == STARTED
+    assert line.port.read(6) == bytes.fromhex("00 64 01 2C 7F FF")
+
+
+def test_serial_bad_checksums(box: AtiSerialBox, line: SerialClient) -> None:
+    box.bad_checksum = 0.1
+    assert line.ask(START, 5) == STARTED
+    records = line.records(1000)
+    bad = ~checksums_are_right(records)
+    assert 60 < bad.sum() < 150
+    assert (records[:, :12] == np.frombuffer(V1_RECORD[:12], np.uint8)).all()
+
+
+def test_serial_byte_slip_shifts_the_records(box: AtiSerialBox, line: SerialClient) -> None:
+    box.measure = noisy(V2)
+    assert line.ask(START, 5) == STARTED
+    assert checksums_are_right(line.records(100)).all()
+    box.byte_slip = 1.0
+    wait_until(lambda: bool((~checksums_are_right(line.records(20))).sum() > 10))
+    line.stop()
+    box.byte_slip = 0.0
+    assert line.ask(START, 5) == STARTED
+    assert checksums_are_right(line.records(100)).all()
+
+
+def test_serial_refused_start_and_silent_box(box: AtiSerialBox, line: SerialClient) -> None:
+    box.refuse_start = True
+    assert line.ask(START, 5) == bytes.fromhex("0A 46 00 63 A2")
+    assert line.ask(READ_STATUS, 7) == STATUS_OK, "no stream"
+    box.silent = True
+    assert line.is_silent_to(READ_STATUS)
+
+
+def test_serial_unplugging_fails_the_stream(box: AtiSerialBox, line: SerialClient) -> None:
+    assert line.ask(START, 5) == STARTED
+    assert line.port.read(130) == V1_RECORD * 10
+    box.unplug()
+    with pytest.raises(UNPLUGGED):
+        wait_until(lambda: not line.port.read(4096))
