@@ -3,6 +3,7 @@
 from calib.dataset import CalibrationDataset, read_csv
 from calib.errors import BadCalibration, BadDataset, CalibError, NotObservable
 from calib.model import PARAMETER_NAMES, Parameters
+from calib.noise import PoseMean, is_stationary, mean_and_covariance
 from calib.result import CalibrationResult
 from calib.solver import solve
 
@@ -15,6 +16,9 @@ __all__ = [
     "CalibrationResult",
     "NotObservable",
     "Parameters",
+    "PoseMean",
+    "is_stationary",
+    "mean_and_covariance",
     "read_csv",
     "solve",
 ]

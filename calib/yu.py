@@ -55,7 +55,11 @@ def srom(R_base_flange: Array, wrench: Array) -> Parameters:
     NotObservable
         Orientations are missing or repeated; the message gives their numbers.
     """
-    number, Y = special_numbers(R_base_flange)
+    return srom_numbered(R_base_flange, wrench, *special_numbers(R_base_flange))
+
+
+def srom_numbered(R_base_flange: Array, wrench: Array, number: Indices, Y: Array) -> Parameters:
+    """Do what `srom` does, with the outcome of `special_numbers` at hand."""
     force_N = np.empty((24, 3))
     force_N[number] = wrench[:, :3]
     # With A_i = R_i Y.T the published formulas see the gravity force in the turned base, Y.T F_b.
@@ -209,7 +213,7 @@ def lrom_gravity_force(A: Array, force_N: Array) -> Array:
         raise NotObservable(f"LROM needs at least 5 poses, there are {len(A)}: record more, or use ML, which needs 4.")
     H, x6_of_x9 = reduced_equations(A, force_N)
     _, singular, Vt = np.linalg.svd(H)
-    if singular[7] < 1e-9 * singular[0]:
+    if singular[7] <= 1e-9 * singular[0]:
         raise NotObservable(
             "LROM has more than one solution for these poses: tilt the tool in more directions, or use ML."
         )
