@@ -173,7 +173,7 @@ class AtiCanSensor(StreamingSensor):
                 ignore_config=True,
                 **options,
             )
-        except _BUS_ERRORS as exc:
+        except (NotImplementedError, *_BUS_ERRORS) as exc:
             raise ConnectError(
                 f"{self.name}: the bus does not open ({exc}); is the adapter plugged in, and on socketcan "
                 f"'ip link set {self._channel} up type can bitrate {self._bitrate}' done?"
