@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import can
 import numpy as np
+from can.interfaces.slcan import slcanBus
 
 from drivers._stream import LINK_ERRORS, NOTHING, StreamingSensor
 from drivers.ati import codec
@@ -36,6 +37,8 @@ _POLL_S = 0.03
 _MAX_MISSED_POLLS = 5
 """0.2 s: shorter than a restart, so that a sensor that restarted (back to slot 0) is never taken for a slow one."""
 _QUIET_S = 0.01
+_PERIOD_S = 1e-3
+"""About what a 250 kbit/s bus carries; polling a faster one, or an emulator, for all it gives would eat a CPU core."""
 
 
 class AtiCanSensor(StreamingSensor):
@@ -78,6 +81,7 @@ class AtiCanSensor(StreamingSensor):
         self._bus: can.BusABC | None = None
         self._echoes = False
         self._polls = self._missed = self._seen_status = 0
+        self._next_poll_s = 0.0
 
     @classmethod
     def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
@@ -107,6 +111,8 @@ class AtiCanSensor(StreamingSensor):
         )
 
     def _read_block(self) -> FtSamples:
+        time.sleep(max(0.0, self._next_poll_s - time.monotonic()))
+        self._next_poll_s = max(self._next_poll_s + _PERIOD_S, time.monotonic())
         self._polls += 1
         try:
             first, second = self._exchange(Op.GAUGES, b"", _POLL_S)
@@ -167,7 +173,7 @@ class AtiCanSensor(StreamingSensor):
                 ignore_config=True,
                 **options,
             )
-        except _BUS_ERRORS as exc:
+        except (NotImplementedError, *_BUS_ERRORS) as exc:
             raise ConnectError(
                 f"{self.name}: the bus does not open ({exc}); is the adapter plugged in, and on socketcan "
                 f"'ip link set {self._channel} up type can bitrate {self._bitrate}' done?"
@@ -258,6 +264,10 @@ class AtiCanSensor(StreamingSensor):
 
     def _drain(self, quiet_s: float = 0.0) -> None:
         """Throw away what has arrived, until nothing comes for `quiet_s`; at most for a transaction."""
+        if not quiet_s and isinstance(self._bus, slcanBus):
+            with contextlib.suppress(can.CanError):
+                self._bus.flush()  # its `recv` sits out 1 ms before it says that there is nothing
+            return
         deadline = time.monotonic() + _TRANSACTION_S
         while self._receive(quiet_s) is not None and time.monotonic() < deadline:
             pass

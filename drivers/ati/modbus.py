@@ -166,7 +166,7 @@ def decode_calibration_block(data: bytes) -> CalibrationBlock:
     """Decode the 338 bytes of a calibration; an empty slot is a `ProtocolError`."""
     if len(data) != 338:
         raise ProtocolError(f"a calibration has 338 bytes, got {len(data)}")
-    matrix = np.frombuffer(data, ">f4", 36, offset=2 * 32).astype(np.float64).reshape(6, 6)
+    matrix = np.frombuffer(data, ">f4", 36, offset=2 * 32).reshape(6, 6)
     force, torque = struct.unpack_from(">ii", data, 2 * 117)
     if not np.isfinite(matrix).all() or force <= 0 or torque <= 0:
         raise ProtocolError(f"this calibration slot is empty (counts per unit {force} and {torque}); choose another")
@@ -174,7 +174,7 @@ def decode_calibration_block(data: bytes) -> CalibrationBlock:
         serial=decode_text(data[0:8]),
         part_number=decode_text(data[8:40]),
         calibrated_at=decode_text(data[44:64]),
-        matrix=matrix,
+        matrix=matrix.astype(np.float64),
         unit_codes=(data[208], data[209]),
         counts_per_unit=(force, torque),
         gains=struct.unpack_from(">6H", data, 2 * 121),

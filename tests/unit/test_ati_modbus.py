@@ -1,0 +1,212 @@
+"""Digital F/T frames and stream records: golden bytes, totality, and what happens to damaged records."""
+
+import contextlib
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.ati import modbus
+from drivers.errors import ProtocolError
+
+V1 = bytes.fromhex("00 64 01 2C 01 F4 FF 38 FE 70 FD A8 50")
+V2 = bytes.fromhex("00 DD 00 45 09 26 FC 62 FB C2 04 F2 62")
+i16 = st.integers(-32768, 32767)
+
+
+def test_crc() -> None:
+    assert modbus.crc16(b"123456789") == 0x4B37
+
+
+@pytest.mark.parametrize(
+    ("request_", "golden"),
+    [
+        (modbus.read_registers(modbus.STATUS, 1), "0A 03 00 1D 00 01 15 77"),
+        (modbus.read_registers(0x00E3, 0x40), "0A 03 00 E3 00 40 B4 B7"),
+        (modbus.read_registers(0x0123, 0x40), "0A 03 01 23 00 40 B5 77"),
+        (modbus.read_registers(0x0163, 0x29), "0A 03 01 63 00 29 74 8D"),
+        (
+            modbus.write_registers(modbus.GAINS, [543, 555, 569, 579, 565, 567]),
+            "0A 10 00 00 00 06 0C 02 1F 02 2B 02 39 02 43 02 35 02 37 47 2D",
+        ),
+        (modbus.write_registers(modbus.OFFSETS, [0x8000] * 6), "0A 10 00 06 00 06 0C" + "80 00" * 6 + "75 66"),
+        (modbus.UNLOCK, "0A 6A AA FF 1D"),
+        (modbus.LOCK, "0A 6A 18 7F 68"),
+        (modbus.START, "0A 46 55 A3 9D"),
+    ],
+)
+def test_requests(request_: bytes, golden: str) -> None:
+    assert request_ == bytes.fromhex(golden)
+
+
+@pytest.mark.parametrize(
+    ("request_", "reply", "payload"),
+    [
+        (modbus.read_registers(modbus.STATUS, 1), "0A 03 02 00 00 1D 85", "0000"),
+        (modbus.read_registers(modbus.STATUS, 1), "0A 03 02 00 01 DC 45", "0001"),
+        (modbus.write_registers(modbus.GAINS, [0] * 6), "0A 10 00 00 00 06 41 70", ""),
+        (modbus.write_registers(modbus.OFFSETS, [0] * 6), "0A 10 00 06 00 06 A1 71", ""),
+        (modbus.UNLOCK, "0A 6A 01 BE A2", ""),
+        (modbus.LOCK, "0A 6A 01 BE A2", ""),
+        (modbus.START, "0A 46 01 A2 62", ""),
+    ],
+)
+def test_replies(request_: bytes, reply: str, payload: str) -> None:
+    data = bytes.fromhex(reply)
+    assert len(data) == modbus.reply_size(request_)
+    assert modbus.check_reply(request_, data) == bytes.fromhex(payload)
+
+
+@pytest.mark.parametrize(
+    ("request_", "reply", "message"),
+    [
+        (modbus.read_registers(0x7000, 1), "0A 83 02 B1 33", "illegal register"),
+        (modbus.START, "0A 46 00 63 A2", "refused command 0x46 0x55"),
+        (modbus.START, "0A 46 01 A2 63", "damaged"),
+        (modbus.START, "0A 6A 01 BE A2", "does not belong"),
+        (modbus.read_registers(modbus.STATUS, 2), "0A 03 02 00 00 1D 85", "does not belong"),
+        (modbus.write_registers(modbus.GAINS, [0] * 6), "0A 10 00 06 00 06 A1 71", "other registers"),
+        (modbus.START, "", "empty"),
+    ],
+)
+def test_wrong_replies_are_refused(request_: bytes, reply: str, message: str) -> None:
+    with pytest.raises(ProtocolError, match=message):
+        modbus.check_reply(request_, bytes.fromhex(reply))
+
+
+@given(
+    st.sampled_from([modbus.read_registers(0, 3), modbus.write_registers(0, [1, 2]), modbus.START]),
+    st.binary(max_size=14),
+    st.booleans(),
+)
+def test_check_reply_is_total(request_: bytes, reply: bytes, with_crc: bool) -> None:
+    if with_crc:
+        reply = modbus.frame(request_[1], reply)
+    with contextlib.suppress(ProtocolError):
+        payload = modbus.check_reply(request_, reply)
+        assert len(reply) == modbus.reply_size(request_)
+        assert payload in reply
+
+
+def block(**change: bytes) -> bytes:
+    """Build the 338 bytes of a calibration, field by field at the documented register offsets."""
+    data = bytearray(338)
+    fields = {
+        0: b"FT12345\0",
+        8: b"SI-130-10".ljust(32, b"\0"),
+        40: b"Net\0",
+        44: b"2019-09-2404:00:00Z\0",
+        64: struct.pack(">36f", *range(36)),
+        208: b"\x02\x03",
+        234: struct.pack(">ii", 1_000_000, 2_000_000),
+        242: struct.pack(">6H", 543, 555, 569, 579, 565, 567),
+        254: struct.pack(">6H", 29000, 30000, 31000, 32000, 33000, 34000),
+    } | {int(key[1:]): value for key, value in change.items()}
+    for offset, value in fields.items():
+        data[offset : offset + len(value)] = value
+    return bytes(data)
+
+
+def test_calibration_block() -> None:
+    decoded = modbus.decode_calibration_block(block())
+    assert (decoded.serial, decoded.part_number) == ("FT12345", "SI-130-10")
+    assert decoded.calibrated_at == "2019-09-2404:00:00Z"
+    assert decoded.matrix.tolist() == np.arange(36.0).reshape(6, 6).tolist()
+    assert decoded.unit_codes == (2, 3)
+    assert decoded.counts_per_unit == (1_000_000, 2_000_000)
+    assert decoded.gains == (543, 555, 569, 579, 565, 567)
+    assert decoded.offsets == (29000, 30000, 31000, 32000, 33000, 34000)
+
+
+@pytest.mark.parametrize("empty", [bytes(338), b"\xff" * 338, block(_234=bytes(4)), block(_64=b"\x7f\xc0\0\0")])
+def test_an_empty_calibration_is_refused(empty: bytes) -> None:
+    with pytest.raises(ProtocolError, match="empty"):
+        modbus.decode_calibration_block(empty)
+
+
+@given(st.one_of(st.binary(max_size=40), st.binary(min_size=338, max_size=338)))
+def test_decode_calibration_block_is_total(data: bytes) -> None:
+    with contextlib.suppress(ProtocolError):
+        modbus.decode_calibration_block(data)
+
+
+def test_where_calibrations_are_stored() -> None:
+    assert modbus.calibration_reads(1) == [(0x00E3, 64), (0x0123, 64), (0x0163, 41)]
+    assert modbus.calibration_reads(16)[0] == (0x0C23, 64)
+
+
+def test_stream_records() -> None:
+    records = modbus.decode_records(V1 + V2 + V1[:12] + b"\xd0" + V1[:12] + b"\x51" + bytes(13))
+    assert records.gauges.tolist() == [
+        [100, -200, 300, -400, 500, -600],
+        [221, -926, 69, -1086, 2342, 1266],
+        [100, -200, 300, -400, 500, -600],
+        [100, -200, 300, -400, 500, -600],
+        [0] * 6,
+    ]
+    assert records.intact.tolist() == [True, True, True, False, True]
+    assert records.error.tolist() == [False, False, True, False, False]
+
+
+@given(st.lists(st.tuples(st.tuples(i16, i16, i16, i16, i16, i16), st.booleans())))
+def test_records_round_trip(rows: list[tuple[tuple[int, ...], bool]]) -> None:
+    data = b""
+    for gauges, error in rows:
+        body = struct.pack(">6h", *gauges[0::2], *gauges[1::2])
+        data += body + bytes([sum(body) & 0x7F | error << 7])
+    records = modbus.decode_records(data)
+    assert [tuple(row) for row in records.gauges.tolist()] == [gauges for gauges, _ in rows]
+    assert records.intact.all()
+    assert records.error.tolist() == [error for _, error in rows]
+
+
+@given(st.binary(max_size=80))
+def test_decode_records_is_total(data: bytes) -> None:
+    try:
+        assert len(modbus.decode_records(data).gauges) * 13 == len(data)
+    except ProtocolError:
+        assert len(data) % 13
+
+
+@pytest.mark.parametrize(
+    ("seen", "kept", "slipped"),
+    [
+        ("", "", False),
+        ("gggg", "kkkk", False),
+        ("gbgg", "k-kk", False),
+        ("gbbgg", "k--kk", False),
+        ("ggb", "kk", False),  # the last one waits: is it the first of three?
+        ("ggbb", "kk", False),
+        ("ggbg", "kk", False),  # is the last one real, or a chance in a slipped stream?
+        ("gbgbgg", "k---kk", False),
+        ("ggbbb", "kk", True),
+        ("gbgbbbgg", "k--", True),
+        ("bbb", "", True),
+        ("b", "", False),
+    ],
+)
+def test_which_records_are_believed(seen: str, kept: str, slipped: bool) -> None:
+    keep, settled, slip = modbus.keep_records(np.array([c == "g" for c in seen], dtype=bool))
+    assert "".join("k" if k else "-" for k in keep) == kept
+    assert (settled, slip) == (len(kept), slipped)
+
+
+@given(st.text("gb", max_size=200), st.integers(3, 40))
+def test_judging_in_batches_settles_like_judging_at_once(seen: str, batch: int) -> None:
+    intact = np.array([c == "g" for c in seen], dtype=bool)
+    whole, _, slipped_whole = modbus.keep_records(intact)
+    kept: list[bool] = []
+    waiting = np.zeros(0, dtype=bool)
+    for start in range(0, len(intact), batch):
+        waiting = np.concatenate([waiting, intact[start : start + batch]])
+        keep, settled, slipped = modbus.keep_records(waiting)
+        kept += keep.tolist()
+        waiting = waiting[settled:]
+        if slipped:
+            break
+    else:
+        slipped = False
+    assert slipped == slipped_whole
+    assert kept == whole.tolist()

@@ -1,0 +1,446 @@
+"""The bytes both ATI drivers put on the wire, against small scripted peers: golden start-up, and awkward answers."""
+
+import contextlib
+import itertools
+import os
+import select
+import struct
+import threading
+import tty
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Self, TypeAlias, TypeVar
+
+import can
+import pytest
+
+from drivers.ati.can import AtiCanSensor
+from drivers.ati.serial import AtiSerialSensor
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+
+GAUGES = ["200 0000 0064 012C 01F4", "201 FF38 FE70 FDA8"]
+WRENCH = [-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608]
+START_UP = {
+    "205": ["205 4654313233343500"],
+    "20F": ["20F 03080002"],
+    "206 00": ["206 00"],
+    "202 00": ["202 00000000 00000000", "203 00000000 C584D000", "204 00000000 4584D000"],
+    "202 01": ["202 00000000 4599C000", "203 00000000 C519C000", "204 00000000 C519C000"],
+    "202 02": ["202 45ED8000 00000000", "203 45ED8000 00000000", "204 45ED8000 00000000"],
+    "202 03": ["202 00000000 00000000", "203 C35C0000 00000000", "204 435C0000 00000000"],
+    "202 04": ["202 437E0000 00000000", "203 C2FE0000 00000000", "204 C2FE0000 00000000"],
+    "202 05": ["202 00000000 C3060000", "203 00000000 C3060000", "204 00000000 C3060000"],
+    "207": ["207 000F4240000F4240"],
+    "208": ["208 0203"],
+    "200": GAUGES,
+}
+_numbers = itertools.count()
+
+
+T = TypeVar("T")
+Script: TypeAlias = Mapping[str, Sequence[T]]
+NONE: Mapping[str, Any] = MappingProxyType({})
+
+
+class CanPeer:
+    """Answers requests from a table on a virtual bus; an empty list is silence, a list of lists is one answer each."""
+
+    def __init__(
+        self, change: Mapping[str, Sequence[str | list[str]]] = MappingProxyType({}), *, echo: bool = False
+    ) -> None:
+        self.channel = f"ati-{next(_numbers)}"
+        self.echo = echo
+        self.answers: dict[str, Iterator[list[str]]] = {}
+        for request, answer in {**START_UP, **change}.items():
+            script = [a for a in answer if isinstance(a, list)]
+            once = [a for a in answer if isinstance(a, str)]
+            last = script.pop() if script else once
+            self.answers[request] = itertools.chain(script, itertools.repeat(last))
+        self.requests: list[str] = []
+        self.extra: list[str] = []
+        """Sent once, before the next answer."""
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def sensor(self, slot: int = 0) -> AtiCanSensor:
+        return AtiCanSensor(self.channel, interface="virtual", slot=slot)
+
+    def __enter__(self) -> Self:
+        self._bus = can.Bus(self.channel, interface="virtual", ignore_config=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._bus.shutdown()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            message = self._bus.recv(timeout=0.02)
+            if message is None:
+                continue
+            request = f"{message.arbitration_id:03X} {message.data.hex().upper()}".strip()
+            self.requests.append(request)
+            extra, self.extra = self.extra, []
+            echo = [request] if self.echo else []
+            for line in [*echo, *extra, *next(self.answers.get(request, itertools.repeat([])))]:
+                identifier, _, payload = line.partition(" ")
+                data = bytes.fromhex(payload)
+                self._bus.send(can.Message(arbitration_id=int(identifier, 16), data=data, is_extended_id=False))
+
+
+def test_can_start_up_is_golden_and_then_only_gauges_are_asked() -> None:
+    with CanPeer() as peer, peer.sensor() as sensor:
+        samples = sensor.collect(0.1)
+        info = sensor.identify()
+        assert (info.serial, info.firmware) == ("FT12345", "3.8 build 2")
+        assert samples.wrench.mean(axis=0).tolist() == pytest.approx(WRENCH)
+        assert samples.counts[0].tolist() == [100, -200, 300, -400, 500, -600]
+    assert peer.requests[:12] == list(START_UP)
+    assert set(peer.requests[12:]) == {"200"}
+
+
+def test_can_slot_is_selected_and_its_echo_checked() -> None:
+    with CanPeer({"206 03": ["206 03"]}) as peer, peer.sensor(slot=3):
+        assert "206 03" in peer.requests
+    with CanPeer({"206 03": ["206 00"]}) as peer, pytest.raises(ConnectError, match="slot 3, the sensor answered 0"):
+        peer.sensor(slot=3).open()
+
+
+def test_can_bus_that_echoes_does_not_fake_the_slot_echo() -> None:
+    with CanPeer(echo=True) as peer, peer.sensor() as sensor:
+        sensor.collect(0.05)
+    with CanPeer({"206 03": []}, echo=True) as peer, pytest.raises(ConnectError, match="no answer to SELECT_SLOT"):
+        peer.sensor(slot=3).open()
+
+
+def test_can_old_firmware_has_a_million_counts_per_newton(caplog: pytest.LogCaptureFixture) -> None:
+    with CanPeer({"20F": ["20F 03060001"], "207": [], "208": []}) as peer, peer.sensor() as sensor:
+        assert sensor.latest(timeout_s=1).wrench[0].tolist() == pytest.approx(WRENCH)
+        assert not {"207", "208"} & set(peer.requests)
+    assert "does not tell its units" in caplog.text
+
+
+def test_can_halves_pair_up_by_identifier_among_foreign_frames() -> None:
+    swapped = ["201 FF38 FE70 FDA8", "1FF 0102", "210 0000 0064 012C 01F4", "200", "201 FF", *GAUGES[:1]]
+    with CanPeer({"200": swapped}) as peer, peer.sensor() as sensor:
+        samples = sensor.collect(0.05)
+        assert samples.wrench[0].tolist() == pytest.approx(WRENCH)
+        assert sensor.health().lost == 0
+
+
+def test_can_stale_frames_are_purged_before_a_request() -> None:
+    """A duplicate left over from the last reading must not become half of the next one."""
+    twice = [*GAUGES, "200 0000 7000 7000 7000"]
+    with CanPeer({"200": twice}) as peer, peer.sensor() as sensor:
+        counts = sensor.collect(0.05).counts
+        assert (counts == [100, -200, 300, -400, 500, -600]).all()
+
+
+def test_can_lost_half_is_a_lost_sample_and_no_wrong_one() -> None:
+    script = [GAUGES, GAUGES, GAUGES[:1], GAUGES]
+    with CanPeer({"200": script}) as peer, peer.sensor() as sensor:
+        samples = sensor.collect(0.15)
+        assert (samples.counts == [100, -200, 300, -400, 500, -600]).all()
+        assert sensor.health().lost == 1
+        assert (samples.seq == 3).sum() <= 1
+
+
+def test_can_sensor_that_stops_answering_times_out() -> None:
+    with CanPeer({"200": [GAUGES, GAUGES, []]}) as peer, peer.sensor() as sensor:
+        with pytest.raises(DeviceTimeout, match="silent"):
+            sensor.collect(1.0)
+        with pytest.raises(DeviceTimeout, match="polls in a row"):
+            sensor.latest(timeout_s=1.0)
+
+
+def test_can_nobody_there() -> None:
+    with CanPeer({"205": []}) as peer, pytest.raises(ConnectError, match="no answer to SERIAL after 3 attempts"):
+        peer.sensor().open()
+
+
+def test_can_reply_lost_in_the_start_up_is_asked_again() -> None:
+    with CanPeer({"205": [[], START_UP["205"]]}) as peer, peer.sensor():
+        assert peer.requests[:3] == ["205", "205", "20F"]
+
+
+@pytest.mark.parametrize(
+    ("first_half", "error", "message"),
+    [
+        ("200 8040 0064 012C 01F4", DeviceFault, "bit 6: no valid calibration"),
+        ("200 0800 0064 012C 01F4", DeviceFault, "temperature too high"),
+        ("200 0000 7FFF 012C 01F4", DeviceFault, "gauge G0 at the end"),
+        ("200 0000 0064 012C 8000", DeviceFault, "gauge G4 at the end"),
+        ("200 0001 0064 012C 01F4", StreamBroken, "has reset itself"),
+    ],
+)
+def test_can_status_that_ends_the_stream(first_half: str, error: type[DriverError], message: str) -> None:
+    script = [GAUGES, GAUGES, [first_half, GAUGES[1]]]
+    with CanPeer({"200": script}) as peer, peer.sensor() as sensor, pytest.raises(error, match=message):
+        sensor.collect(1.0)
+
+
+def test_can_harmless_status_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    with CanPeer({"200": ["200 C101 0064 012C 01F4", GAUGES[1]]}) as peer, peer.sensor() as sensor:
+        assert sensor.collect(0.05).status[0] == 0xC101
+    assert caplog.text.count("measuring goes on") == 1
+    assert "CAN bus error" in caplog.text
+
+
+def test_can_empty_slot_is_a_fault() -> None:
+    zeros = {f"202 0{axis}": [f"20{n} {'00' * 8}" for n in (2, 3, 4)] for axis in range(6)}
+    with CanPeer(zeros) as peer, pytest.raises(DeviceFault, match="slot 0 is empty"):
+        peer.sensor().open()
+
+
+@pytest.mark.parametrize(
+    ("interface", "channel"),
+    [("slcan", "/dev/does-not-exist"), ("socketcan", "no-such-can"), ("no-such-interface", "x")],
+)
+def test_can_bus_that_does_not_open(interface: str, channel: str) -> None:
+    with pytest.raises(ConnectError, match=channel):
+        AtiCanSensor(channel, interface=interface).open()
+
+
+# The serial peer -----------------------------------------------------------------------------------------------------
+
+
+def crc(data: bytes) -> bytes:
+    """CRC-16/MODBUS bit by bit, low byte first."""
+    value = 0xFFFF
+    for byte in data:
+        value ^= byte
+        for _ in range(8):
+            value = value >> 1 ^ (0xA001 if value & 1 else 0)
+    return struct.pack("<H", value)
+
+
+def calibration_block() -> bytes:
+    data = bytearray(338)
+    matrix = [
+        *(0, 0, 0, -4250, 0, 4250),
+        *(0, 4920, 0, -2460, 0, -2460),
+        *(7600, 0, 7600, 0, 7600, 0),
+        *(0, 0, -220, 0, 220, 0),
+        *(254, 0, -127, 0, -127, 0),
+        *(0, -134, 0, -134, 0, -134),
+    ]
+    data[0:8] = b"FT54321\0"
+    data[8:17] = b"SI-130-10"
+    data[64:208] = struct.pack(">36f", *matrix)
+    data[208:210] = b"\x02\x03"
+    data[234:242] = struct.pack(">ii", 1_000_000, 1_000_000)
+    data[242:254] = struct.pack(">6H", 543, 555, 569, 579, 565, 567)
+    data[254:266] = struct.pack(">6H", *[0x8000] * 6)
+    return bytes(data)
+
+
+def read_reply(data: bytes) -> bytes:
+    body = bytes([0x0A, 0x03, len(data)]) + data
+    return body + crc(body)
+
+
+JAM = "AA" * 14
+STATUS = "0A03001D00011577"
+START = "0A4655A39D"
+SERIAL_START_UP = [
+    JAM,
+    STATUS,
+    "0A0300E30040B4B7",
+    "0A0301230040B577",
+    "0A0301630029748D",
+    "0A6AAAFF1D",
+    "0A10000000060C021F022B0239024302350237472D",
+    "0A10000600060C" + "8000" * 6 + "7566",
+    "0A6A187F68",
+    START,
+]
+RECORD = bytes.fromhex("0064012C01F4FF38FE70FDA850")
+RECORD_ERROR = RECORD[:12] + b"\xd0"
+RECORD_SATURATED = bytes.fromhex("0064012C01F4FF38FE707FFF") + bytes(
+    [0x64 + 1 + 0x2C + 1 + 0xF4 + 0xFF + 0x38 + 0xFE + 0x70 + 0x7F + 0xFF & 0x7F]
+)
+
+
+class SerialPeer:
+    """Answers requests from a table on a pseudo-terminal and, once started, streams what the test says."""
+
+    def __init__(self, change: Script[bytes] = NONE, *, streaming: bool = False) -> None:
+        block = calibration_block()
+        answers: dict[str, Sequence[bytes]] = {
+            STATUS: [bytes.fromhex("0A030200001D85")],
+            SERIAL_START_UP[2]: [read_reply(block[:128])],
+            SERIAL_START_UP[3]: [read_reply(block[128:256])],
+            SERIAL_START_UP[4]: [read_reply(block[256:])],
+            "0A6AAAFF1D": [bytes.fromhex("0A6A01BEA2")],
+            SERIAL_START_UP[6]: [bytes.fromhex("0A10000000064170")],
+            SERIAL_START_UP[7]: [bytes.fromhex("0A1000060006A171")],
+            "0A6A187F68": [bytes.fromhex("0A6A01BEA2")],
+            START: [bytes.fromhex("0A4601A262")],
+            **change,
+        }
+        self.answers = {key: itertools.chain(value[:-1], itertools.repeat(value[-1])) for key, value in answers.items()}
+        self.requests: list[str] = []
+        self.records = RECORD * 7
+        """Sent every millisecond."""
+        self.once = b""
+        """Sent once, before the next records."""
+        self._streaming = streaming
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def sensor(self) -> AtiSerialSensor:
+        return AtiSerialSensor(self.path)
+
+    def __enter__(self) -> Self:
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self._slave)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+        os.close(self._master)
+        os.close(self._slave)
+
+    def _run(self) -> None:
+        jam = b""
+        while not self._stop.is_set():
+            if not select.select([self._master], [], [], 0.001)[0]:
+                if self._streaming:
+                    with contextlib.suppress(BlockingIOError):
+                        os.write(self._master, self.once + self.records)
+                    self.once = b""
+                continue
+            data = os.read(self._master, 4096)
+            if self._streaming:
+                jam += data
+                self._streaming = len(jam) < 14
+                if self._streaming:
+                    continue
+                data, jam = jam, b""
+            text = data.hex().upper()
+            self.requests.append(text)
+            if text in self.answers:
+                reply = next(self.answers[text])
+                os.write(self._master, reply)
+                self._streaming = text == START and reply == bytes.fromhex("0A4601A262")
+
+
+def test_serial_start_up_and_goodbye_are_golden() -> None:
+    with SerialPeer() as peer:
+        with peer.sensor() as sensor:
+            samples = sensor.collect(0.1)
+            info = sensor.identify()
+            assert (info.model, info.serial) == ("ATI Digital F/T SI-130-10", "FT54321")
+            assert samples.wrench.mean(axis=0).tolist() == pytest.approx(WRENCH)
+            assert samples.counts[0].tolist() == [100, -200, 300, -400, 500, -600]
+            assert len(samples) > 300
+        assert peer.requests == [*SERIAL_START_UP, JAM]
+
+
+def test_serial_sensor_left_streaming_is_jammed_first() -> None:
+    with SerialPeer(streaming=True) as peer, peer.sensor() as sensor:
+        sensor.collect(0.05)
+        assert peer.requests == SERIAL_START_UP
+
+
+def test_serial_single_bad_records_are_dropped_and_counted() -> None:
+    with SerialPeer() as peer, peer.sensor() as sensor:
+        peer.once = RECORD[:12] + b"\x51" + RECORD * 3 + RECORD[:12] + b"\x51"
+        samples = sensor.collect(0.1)
+        health = sensor.health()
+        assert (health.malformed, health.lost) == (2, 2)
+        assert (samples.counts == [100, -200, 300, -400, 500, -600]).all()
+        assert sorted(set(range(samples.seq[0], samples.seq[-1])) - set(samples.seq)) != []
+        assert START not in peer.requests[len(SERIAL_START_UP) :]
+
+
+def test_serial_slipped_stream_is_restarted() -> None:
+    with SerialPeer() as peer, peer.sensor() as sensor:
+        peer.once = b"\x77"
+        samples = sensor.collect(0.3)
+        assert (samples.counts == [100, -200, 300, -400, 500, -600]).all()
+        assert peer.requests[len(SERIAL_START_UP) :] == [JAM, STATUS, START]
+        jump = int((samples.seq[1:] - samples.seq[:-1]).max())
+        health = sensor.health()
+        assert jump > 50  # some 30 ms at 7 kHz
+        assert health.malformed >= 3
+        assert health.lost == pytest.approx(jump, abs=40)
+
+
+def test_serial_stream_that_never_makes_sense_ends() -> None:
+    with SerialPeer() as peer:
+        peer.records = RECORD[:12] + b"\x51"
+        with pytest.raises(ConnectError, match="no intact record after 3 restarts"):
+            peer.sensor().open()
+
+
+def test_serial_error_bit_ends_the_stream_with_the_status_in_words() -> None:
+    status = [bytes.fromhex("0A030200001D85"), read_reply(b"\x80\x80")]
+    with SerialPeer({STATUS: status}) as peer, peer.sensor() as sensor:
+        peer.once = RECORD_ERROR
+        with pytest.raises(DeviceFault, match=r"0x8080 \(bit 7: EEPROM error, bit 15: any error\)"):
+            sensor.collect(1.0)
+        assert peer.requests[len(SERIAL_START_UP) :] == [JAM, STATUS]
+
+
+def test_serial_saturation_is_a_fault() -> None:
+    with SerialPeer() as peer, peer.sensor() as sensor:
+        peer.once = RECORD_SATURATED
+        with pytest.raises(DeviceFault, match="gauge G5 at the end"):
+            sensor.collect(1.0)
+
+
+def test_serial_critical_status_at_start_is_a_fault() -> None:
+    with (
+        SerialPeer({STATUS: [read_reply(b"\x80\x10")]}) as peer,
+        pytest.raises(DeviceFault, match="power supply too high"),
+    ):
+        peer.sensor().open()
+
+
+def test_serial_watchdog_bit_at_start_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    with SerialPeer({STATUS: [bytes.fromhex("0A03020001DC45")]}) as peer, peer.sensor() as sensor:
+        assert sensor.collect(0.05).status[0] == 1
+    assert "watchdog reset" in caplog.text
+
+
+def test_serial_damaged_and_missing_replies_are_asked_again() -> None:
+    good = bytes.fromhex("0A6A01BEA2")
+    with SerialPeer({"0A6AAAFF1D": [b"", good[:-1] + b"\0", good]}) as peer, peer.sensor():
+        assert peer.requests.count("0A6AAAFF1D") == 3
+
+
+def test_serial_lost_start_reply_is_recovered_by_a_jam() -> None:
+    with SerialPeer({START: [b"", bytes.fromhex("0A4601A262")]}) as peer, peer.sensor() as sensor:
+        sensor.collect(0.05)
+        assert peer.requests[-3:] == [START, JAM, START]
+
+
+@pytest.mark.parametrize(
+    ("request_", "reply", "message"),
+    [
+        (START, "0A460063A2", "refused command 0x46 0x55"),
+        ("0A6AAAFF1D", "0A6A00" + crc(bytes.fromhex("0A6A00")).hex(), "refused command 0x6A 0xAA"),
+        (SERIAL_START_UP[2], "0A8302B133", "illegal register"),
+        (STATUS, "", "no reply"),
+    ],
+)
+def test_serial_refusals_end_the_start_up(request_: str, reply: str, message: str) -> None:
+    with SerialPeer({request_: [bytes.fromhex(reply)]}) as peer, pytest.raises(ConnectError, match=message):
+        peer.sensor().open()
+
+
+def test_serial_port_that_is_not_there() -> None:
+    with pytest.raises(ConnectError, match="does not open"):
+        AtiSerialSensor("/dev/does-not-exist").open()
+
+
+def test_serial_port_is_ours_alone() -> None:
+    with SerialPeer() as peer, peer.sensor(), pytest.raises(ConnectError, match="does not open"):
+        peer.sensor().open()

@@ -1,0 +1,256 @@
+"""The reader thread shared by all streaming sensors: nothing lost, nothing old, nothing silent."""
+
+import queue
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from drivers._stream import NOTHING, StreamingSensor
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
+from drivers.interfaces import DeviceInfo, FtSamples
+
+
+class FakeSensor(StreamingSensor):
+    """A sensor whose blocks the test puts into a queue; an exception in the queue is raised in the reader thread."""
+
+    def __init__(self, *, sign: int = 1, first: int = 1, stale_after_s: float = 0.1, limit: int = 1_000_000) -> None:
+        super().__init__("fake", sign=sign, stale_after_s=stale_after_s, max_collect_samples=limit)
+        self.feed: queue.Queue[int | Exception] = queue.Queue()
+        self.connect_error: Exception | None = None
+        self.disconnect_error: Exception | None = None
+        self.connects = self.disconnects = 0
+        self.first = first
+        self.seq = 0
+
+    def _connect(self) -> DeviceInfo:
+        self.connects += 1
+        if self.connect_error:
+            raise self.connect_error
+        if self.first:
+            self.feed.put(self.first)
+        return DeviceInfo("fake", "F1", "1.0")
+
+    def _read_block(self) -> FtSamples:
+        try:
+            item = self.feed.get(timeout=0.02)
+        except queue.Empty:
+            return NOTHING
+        if isinstance(item, Exception):
+            raise item
+        seq = self.seq + np.arange(item)
+        self.seq += item
+        return FtSamples(
+            t_host_ns=np.full(item, time.monotonic_ns()),
+            t_device_s=np.full(item, np.nan),
+            seq=seq,
+            counts=np.ones((item, 6), np.int32),
+            wrench=np.tile(np.arange(1.0, 7.0), (item, 1)),
+            status=np.zeros(item, np.uint32),
+        )
+
+    def _disconnect(self) -> None:
+        self.disconnects += 1
+        if self.disconnect_error:
+            raise self.disconnect_error
+
+
+@pytest.fixture
+def sensor() -> Iterator[FakeSensor]:
+    fake = FakeSensor()
+    fake.open()
+    yield fake
+    fake.close()
+
+
+def feeding(sensor: FakeSensor, blocks: int, size: int, period_s: float = 0.005) -> threading.Thread:
+    """Feed in the background, at a steady pace."""
+
+    def run() -> None:
+        pause = threading.Event()
+        for _ in range(blocks):
+            sensor.feed.put(size)
+            pause.wait(period_s)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread
+
+
+def test_constructor_touches_nothing() -> None:
+    fake = FakeSensor()
+    assert fake.connects == 0
+    with pytest.raises(StreamBroken, match="not open"):
+        fake.check()
+    with pytest.raises(ConnectError, match="open it first"):
+        fake.identify()
+
+
+def test_collect_has_every_sample_of_the_window_and_no_other(sensor: FakeSensor) -> None:
+    feeder = feeding(sensor, 60, 3)
+    start_ns = time.monotonic_ns()
+    samples = sensor.collect(0.2)
+    feeder.join()
+    assert len(samples) > 60
+    assert (np.diff(samples.seq) == 1).all()
+    assert samples.t_host_ns[0] >= start_ns
+    assert samples.t_host_ns[-1] - start_ns < 0.25e9
+
+
+def test_two_threads_collect_the_same_samples(sensor: FakeSensor) -> None:
+    feeder = feeding(sensor, 60, 2)
+    results: list[FtSamples] = []
+    other = threading.Thread(target=lambda: results.append(sensor.collect(0.15)))
+    other.start()
+    mine = sensor.collect(0.15)
+    other.join()
+    feeder.join()
+    assert len(np.intersect1d(mine.seq, results[0].seq)) > 40
+
+
+@pytest.mark.parametrize(
+    "error", [StreamBroken("gone"), DeviceFault("hot"), ProtocolError("odd"), ZeroDivisionError("bug")]
+)
+def test_death_of_the_reader_is_raised_at_every_consumer(sensor: FakeSensor, error: Exception) -> None:
+    threading.Timer(0.03, sensor.feed.put, [error]).start()
+    start = time.monotonic()
+    with pytest.raises(type(error), match=str(error)) as caught:
+        sensor.collect(5.0)
+    assert time.monotonic() - start < 0.5
+    assert caught.value.__cause__ is error
+    for call in (sensor.check, lambda: sensor.latest(timeout_s=0.1), lambda: sensor.collect(0.1)):
+        with pytest.raises(type(error), match=str(error)):
+            call()
+
+
+def test_silence_is_a_timeout_never_an_old_value(sensor: FakeSensor) -> None:
+    assert len(sensor.latest(timeout_s=0.0)) == 1
+    sensor.check()
+    start = time.monotonic()
+    with pytest.raises(DeviceTimeout, match=r"fake: silent for 0\.1\d* s"):
+        sensor.collect(1.0)
+    assert time.monotonic() - start < 0.4
+    with pytest.raises(DeviceTimeout, match="fake: silent"):
+        sensor.check()
+    with pytest.raises(DeviceTimeout, match="fake: silent"):
+        sensor.latest(timeout_s=0.05)
+    sensor.feed.put(1)
+    assert sensor.latest(timeout_s=1.0).seq[0] == 1  # fresh again: silence is judged anew
+    sensor.check()
+
+
+def test_a_pause_inside_a_collect_is_an_error_although_the_stream_came_back() -> None:
+    fake = FakeSensor(stale_after_s=0.05)
+    with fake:
+        feed = [threading.Timer(t, fake.feed.put, [1]) for t in (0.02, 0.04, 0.12, 0.14, 0.16, 0.18, 0.2, 0.22)]
+        for timer in feed:
+            timer.start()
+        with pytest.raises(DeviceTimeout, match="silent"):
+            fake.collect(0.2)
+        for timer in feed:
+            timer.join()
+
+
+def test_more_samples_than_a_collect_may_hold_is_an_error() -> None:
+    fake = FakeSensor(limit=10)
+    with fake:
+        feeder = feeding(fake, 20, 3)
+        with pytest.raises(StreamBroken, match="more than 10 samples"):
+            fake.collect(1.0)
+        feeder.join()
+
+
+def test_sign_turns_the_wrench_once_and_leaves_counts_raw() -> None:
+    fake = FakeSensor(sign=-1)
+    with fake:
+        newest = fake.latest(timeout_s=1.0)
+        assert newest.wrench.tolist() == [[-1.0, -2.0, -3.0, -4.0, -5.0, -6.0]]
+        assert newest.counts.tolist() == [[1] * 6]
+    with pytest.raises(ValueError, match="sign is 0"):
+        FakeSensor(sign=0)
+
+
+def test_open_and_close_are_idempotent_and_a_closed_sensor_opens_again() -> None:
+    fake = FakeSensor()
+    fake.close()
+    fake.open()
+    fake.open()
+    assert fake.connects == 1
+    fake.close()
+    fake.close()
+    assert fake.disconnects == 1
+    with pytest.raises(StreamBroken, match="not open"):
+        fake.latest(timeout_s=0.1)
+    fake.open()
+    assert fake.health().received == 1
+    fake.close()
+
+
+def test_open_after_a_failure_starts_clean(sensor: FakeSensor) -> None:
+    sensor.feed.put(StreamBroken("gone"))
+    with pytest.raises(StreamBroken, match="gone"):
+        sensor.latest(timeout_s=1.0) if sensor._failure else sensor.collect(1.0)
+    sensor.close()
+    sensor.open()
+    sensor.check()
+
+
+@pytest.mark.parametrize(
+    ("raised", "seen"),
+    [(ProtocolError("odd"), ConnectError), (DeviceFault("hot"), DeviceFault), (KeyError(1), KeyError)],
+)
+def test_a_failed_connect_frees_the_port(raised: Exception, seen: type[Exception]) -> None:
+    fake = FakeSensor()
+    fake.connect_error = raised
+    with pytest.raises(seen):
+        fake.open()
+    assert fake.disconnects == 1
+    assert threading.active_count() == 1 or not any("fake" in t.name for t in threading.enumerate())
+
+
+def test_a_device_that_connects_and_stays_silent_is_not_open() -> None:
+    fake = FakeSensor(first=0)
+    with pytest.raises(ConnectError, match="no sample"):
+        fake.open()
+    assert fake.disconnects == 1
+
+
+def test_close_never_raises_and_ends_a_collect_elsewhere(sensor: FakeSensor) -> None:
+    sensor.disconnect_error = OSError("gone")
+    errors: list[BaseException] = []
+
+    def collect() -> None:
+        try:
+            sensor.collect(5.0)
+        except StreamBroken as exc:
+            errors.append(exc)
+
+    feeder = feeding(sensor, 20, 1)
+    thread = threading.Thread(target=collect)
+    thread.start()
+    sensor.collect(0.05)
+    start = time.monotonic()
+    sensor.close()
+    assert time.monotonic() - start < 1.0
+    thread.join(1.0)
+    feeder.join()
+    assert len(errors) == 1
+    assert not any("fake" in t.name for t in threading.enumerate())
+
+
+def test_health_counts_and_tells_the_rate(sensor: FakeSensor) -> None:
+    feeder = feeding(sensor, 40, 2, 0.01)
+    sensor.collect(0.3)
+    health = sensor.health()
+    feeder.join()
+    assert health.received == pytest.approx(1 + 60, abs=15)
+    assert health.rate_Hz == pytest.approx(200, rel=0.3)
+    assert health.age_s < 0.1
+
+
+@pytest.mark.parametrize("duration_s", [0.0, -1.0, float("nan")])
+def test_a_duration_without_length_is_refused(sensor: FakeSensor, duration_s: float) -> None:
+    with pytest.raises(ValueError, match="positive"):
+        sensor.collect(duration_s)
