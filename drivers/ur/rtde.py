@@ -214,13 +214,17 @@ class TcpOffsetReader:
         """
         with self._changed:
             self._changed.wait_for(lambda: self._failure or self._is_since(since_s), timeout_s)
-            if self._failure:
-                raise type(self._failure)(str(self._failure)) from self._failure
+            self.check()
             if self._newest is None or not self._is_since(since_s):
                 raise DeviceTimeout(
                     f"{self._host} has not told its TCP offset for {timeout_s:.1f} s: check the network and the robot."
                 )
             return self._newest
+
+    def check(self) -> None:
+        """Raise what ended the stream, if it has ended."""
+        if self._failure:
+            raise type(self._failure)(str(self._failure)) from self._failure
 
     def _is_since(self, since_s: float) -> bool:
         return self._newest is not None and self._newest[0] >= since_s
