@@ -1,0 +1,353 @@
+"""A Universal Robots arm.
+
+Reading happens in this process (`reading.py`), moving in a disposable one (`control.py`), and stopping has a second
+way that needs neither of them: the dashboard server.
+
+Ref: ur_rtde 1.6.5, API reference; Universal Robots, "Dashboard Server, e-Series" manual; `is_steady` in the URScript
+manual.
+Checked on hardware: no.
+"""
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from math import radians
+from typing import Final
+
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from drivers.interfaces import ArmState, DeviceInfo, Guard, RobotArm
+from drivers.ur.control import ControlProcess
+from drivers.ur.control_child import DECELERATION_RAD_S2
+from drivers.ur.kinematics import MODELS, model_named
+from drivers.ur.library import FREQUENCY_HZ, Dashboard, ask_dashboard
+from drivers.ur.reading import CONNECT_S, PROGRAM_STOPPED, ROBOT_RUNNING, Freshness, Look, Reader
+
+log = logging.getLogger(__name__)
+
+_POLL_S: Final = 0.01
+_ARRIVED_RAD: Final = 1e-3
+_STANDING_RAD_S: Final = 1e-6
+"""Of the set-point, which is exactly zero at rest."""
+_QUIET_RAD_S: Final = 0.002
+_QUIET_S: Final = 0.2
+_STEADY_S: Final = 0.5
+"""The controller calls an arm steady after half a second at zero target velocity."""
+_SIMULATORS: Final = ("localhost", "127.0.0.1", "192.168.56.101")
+"""Addresses at which ur_rtde itself does not ask for remote control, because URSim runs there."""
+
+
+class UrArm(RobotArm):
+    """A Universal Robots arm of the CB3 generation or e-Series, through ur_rtde.
+
+    Parameters
+    ----------
+    host
+        Address of the controller.
+    model
+        Such as "UR5e", for the comparison of poses with nominal kinematics; None takes what the controller says.
+    speed_rad_s, acceleration_rad_s2
+        Of the leading joint in `move_to`. The speed slider of the pendant scales them down further.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        *,
+        model: str | None = None,
+        speed_rad_s: float = radians(30),
+        acceleration_rad_s2: float = radians(40),
+    ) -> None:
+        if not radians(0.5) <= speed_rad_s <= radians(180):
+            raise ValueError(f"speed_rad_s is {speed_rad_s}: choose 0.0087 to 3.14 (0.5 to 180 degrees per second).")
+        if not radians(1) <= acceleration_rad_s2 <= radians(300):
+            raise ValueError(
+                f"acceleration_rad_s2 is {acceleration_rad_s2}: choose 0.0175 to 5.24 (1 to 300 degrees per second "
+                f"squared)."
+            )
+        if model is not None and model_named(model, 0) is None:
+            raise ValueError(f"model {model!r} is not known: choose one of {', '.join(MODELS)}.")
+        self._host = host
+        self._model = None if model is None else model_named(model, 0)
+        self._speed_rad_s = float(speed_rad_s)
+        self._acceleration_rad_s2 = float(acceleration_rad_s2)
+        self._reader: Reader | None = None
+        self._control: ControlProcess | None = None
+        self._goal: list[float] | None = None
+        self._stop_requested = threading.Event()
+
+    # ------------------------------------------------------------------ opening and closing
+
+    def open(self, *, control: bool = False) -> None:
+        """Connect, read-only unless `control` is asked for. Idempotent.
+
+        Reading disturbs nothing and needs no remote control. Taking control ends the program that runs on the
+        controller, if one does. Raises `ConnectError`.
+        """
+        try:
+            self._connect(control)
+        except (StreamBroken, DeviceTimeout, DeviceFault) as error:
+            self.close()
+            raise ConnectError(f"cannot open the arm at {self._host}: {error}") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _connect(self, control: bool) -> None:
+        if self._reader is None:
+            self._reader = Reader(self._host, self._model)
+        if control and self._control is None:
+            self._open_control(self._reader)
+        if not self._reader.tells_tcp and self._control is None:
+            raise ConnectError(
+                f"the controller {self._host} is too old to tell its active TCP, without which its poses say nothing "
+                f"about the flange: update it, or open the arm with control."
+            )
+        if self._reader.look().robot_mode == ROBOT_RUNNING:
+            self.state()  # is it the right model?
+
+    def _open_control(self, reader: Reader) -> None:
+        if fault := reader.look().safety_fault():
+            raise ConnectError(f"the arm at {self._host} cannot move: {fault}.")
+
+        def prepare(dashboard: Dashboard) -> None:
+            asks = reader.version[0] == 5 and reader.version[1] > 5 and self._host not in _SIMULATORS
+            if asks and not dashboard.isInRemoteControl():
+                raise ConnectError(
+                    f"{self._host} is not in remote control: press Local, Remote Control at the top right of the "
+                    f"pendant (enable it first under Settings, System, Remote Control)."
+                )
+            # A program left over would make ur_rtde wait up to 300 s for its end.
+            if reader.look().program_state != PROGRAM_STOPPED:
+                log.warning("ending the program that runs on %s", self._host)
+                dashboard.stop()
+
+        ask_dashboard(self._host, prepare, timeout_s=CONNECT_S)
+        self._control = ControlProcess(self._host, FREQUENCY_HZ)
+        try:
+            self._control.wait_until_ready()
+        except DriverError as error:
+            raise ConnectError(_advice(self._host, str(error))) from error
+
+    def close(self) -> None:
+        """Let the arm go, stopping it and its control script first. Idempotent; within 1.5 s even when all is lost."""
+        control, self._control = self._control, None
+        reader, self._reader = self._reader, None
+        self._goal = None
+        if control is not None and not (control.alive and control.quit(timeout_s=0.7)):
+            control.kill()
+            self._stop_program(timeout_s=0.4)
+        if reader is not None:
+            reader.close()
+
+    def identify(self) -> DeviceInfo:
+        """Tell model, serial number and PolyScope version, as read when the arm was opened."""
+        return self._reading().info
+
+    def state(self) -> ArmState:
+        """Read a fresh, consistent state; the flange pose is that of the mechanical flange, whatever TCP is active.
+
+        Raises `DeviceTimeout` when the controller's clock stands still for 0.2 s, `StreamBroken` when the connection is
+        lost, and `DeviceFault` when the joints are not measured (no power) or the pose does not fit the model.
+        """
+        return self._reading().state(lambda: self._in_control().call("tcp_offset"))
+
+    # ------------------------------------------------------------------ moving
+
+    def within_safety_limits(self, q_rad: Sequence[float]) -> bool:
+        """Ask the controller whether it would accept these joint angles (6,). Needs control.
+
+        The controller knows its own limits and planes, not the obstacles around it. Raises `DeviceFault` or
+        `StreamBroken` rather than to take "not asked" for "no".
+        """
+        q = _joints(q_rad)
+        control = self._in_control()
+        try:
+            return bool(control.call("within_safety_limits", q))
+        except DriverError as error:
+            raise self._fault() or error from error
+
+    def move_to(self, q_rad: Sequence[float], *, timeout_s: float, guard: Guard) -> None:
+        """Move all joints to `q_rad` (6,) and return when they have arrived.
+
+        `guard` is called about 90 times a second. Whatever ends the wait early stops the arm first and is raised after:
+        `DeviceFault` (protective, emergency or safeguard stop, program ended, not arrived), `StreamBroken`,
+        `DeviceTimeout` (silent controller, or `timeout_s` is over), an exception of the guard, KeyboardInterrupt.
+        A stop of the safety system is never reset; what is left of the move is taken from the controller, so that
+        nobody can resume it.
+        """
+        q = _joints(q_rad)
+        control = self._in_control()
+        self._stop_requested.clear()
+        self._goal = None
+        with self._stopping_on_error():
+            self._look_out()
+            accepted, before = control.call("move", q, self._speed_rad_s, self._acceleration_rad_s2)
+            if not accepted:
+                raise self._fault() or DeviceFault(f"the controller did not accept the move to {_degrees(q)}.")
+            for look in self._watch(timeout_s, guard, f"the move to {_degrees(q)} has not ended"):
+                if self._stop_requested.is_set():
+                    raise DeviceFault("the arm was told to stop before it had arrived.")
+                operation, running = control.call("progress")
+                if operation == before or running:
+                    continue
+                if not _near(look.target_q_rad, q):
+                    look = self._reading().next_look()  # the end was told a cycle before the set-points  # noqa: PLW2901
+                    if not _near(look.target_q_rad, q):
+                        raise self._fault() or DeviceFault(
+                            f"the move ended at {_degrees(look.target_q_rad)} instead of {_degrees(q)}: see the "
+                            f"pendant for what ended it."
+                        )
+                self._goal = q
+                return
+
+    def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
+        """Return when the joints have been at rest long enough for the structure to stop ringing.
+
+        That is: where `move_to` went, target velocity zero for 0.5 s of the controller's time (its own rule for
+        "steady", so a simulation that runs faster waits less), and measured joint speeds below 0.002 rad/s for 0.2 s
+        of ours. Errors as in `move_to`; without control, safety stops are not errors.
+        """
+        steady_since_s: float | None = None
+        quiet_since_ns: int | None = None
+        with self._stopping_on_error():
+            for look in self._watch(timeout_s, guard, "the arm has not come to rest"):
+                resting = max(map(abs, look.target_qd_rad_s)) <= _STANDING_RAD_S
+                resting = resting and (self._goal is None or _near(look.target_q_rad, self._goal))
+                quiet = max(map(abs, look.qd_rad_s)) < _QUIET_RAD_S
+                steady_since_s = (look.t_device_s if steady_since_s is None else steady_since_s) if resting else None
+                quiet_since_ns = (look.t_host_ns if quiet_since_ns is None else quiet_since_ns) if quiet else None
+                if steady_since_s is None or quiet_since_ns is None:
+                    continue
+                if look.t_device_s - steady_since_s >= _STEADY_S and look.t_host_ns - quiet_since_ns >= _QUIET_S * 1e9:
+                    return
+
+    def stop(self) -> None:
+        """Stop the arm, and a `move_to` with `DeviceFault`. From any thread, any time; does nothing without control."""
+        if self._control is not None:
+            self._stop_requested.set()
+            self._halt()
+
+    def _watch(self, timeout_s: float, guard: Guard, what: str) -> Iterator[Look]:
+        """Yield a look about 100 times a second, raising whatever is wrong with the arm, until the time is over."""
+        fresh = Freshness(self._host)
+        deadline = time.monotonic() + timeout_s
+        while True:
+            look = self._look_out()
+            fresh.check(look)
+            guard()
+            yield look
+            if time.monotonic() > deadline:
+                raise DeviceTimeout(
+                    f"{what} within {timeout_s:.1f} s; set-points are at {_degrees(look.target_q_rad)}: check the "
+                    f"speed slider, and whether something else moves the arm."
+                )
+            time.sleep(_POLL_S)
+
+    def _look_out(self) -> Look:
+        """Look, and raise whatever is wrong with the arm, its program or the connections."""
+        look = self._reading().look()
+        if self._control is not None:
+            if fault := self._fault(look):
+                raise fault
+            self._in_control()
+        return look
+
+    def _fault(self, look: Look | None = None) -> DeviceFault | None:
+        """Say why the arm does not move, if the controller knows a reason."""
+        reader = self._reading()
+        look = look or reader.look()
+        deadline = time.monotonic() + 0.05
+        while not look.safety_fault() and look.program_fault() and time.monotonic() < deadline:
+            look = reader.next_look()  # the program may end some cycles before its reason is told
+        fault = look.safety_fault() or look.program_fault()
+        return DeviceFault(f"the arm at {self._host} stopped: {fault}; then open the arm again.") if fault else None
+
+    @contextmanager
+    def _stopping_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self._halt()
+            raise
+
+    def _halt(self) -> None:
+        """Stop the arm: softly where that works, else by ending its program; never fails."""
+        control = self._control
+        if control is None:
+            return
+        stopped = False
+        try:
+            stopped = self._stop_softly(control)
+        finally:  # a second Ctrl-C is no reason to let the arm move on
+            if not stopped:
+                control.kill()  # on a lost link ur_rtde would start the program again and again
+                self._stop_program(timeout_s=1.0)
+
+    def _stop_softly(self, control: ControlProcess) -> bool:
+        try:
+            look = self._reading().next_look(limit_s=0.05)
+            if not control.alive or look.safety_fault() or look.program_fault():
+                return False
+            control.call("stop", timeout_s=0.5 + self._speed_rad_s / DECELERATION_RAD_S2)
+            for _ in range(10):  # ur_rtde does not say whether it was done
+                if max(map(abs, self._reading().next_look(limit_s=0.05).target_qd_rad_s)) <= _STANDING_RAD_S:
+                    return True
+        except DriverError as error:
+            log.info("%s: cannot be stopped softly: %s", self._host, error)
+        return False
+
+    def _stop_program(self, *, timeout_s: float) -> None:
+        try:
+            ask_dashboard(self._host, lambda dashboard: dashboard.stop(), timeout_s=timeout_s)
+        except DriverError as error:
+            log.warning("%s could not be told to stop, press the emergency stop if it moves: %s", self._host, error)
+
+    def _in_control(self) -> ControlProcess:
+        if self._control is None:
+            raise ConnectError(f"the arm at {self._host} was opened for reading only: open it with control.")
+        if not self._control.alive:
+            raise StreamBroken(
+                f"the control of {self._host} has ended: close the arm, see to the robot, and open the arm again."
+            )
+        return self._control
+
+    def _reading(self) -> Reader:
+        if self._reader is None:
+            raise ConnectError(f"the arm at {self._host} is not open: open it first.")
+        return self._reader
+
+
+def _joints(q_rad: Sequence[float]) -> list[float]:
+    """Joint angles fit to be sent: ur_rtde checks neither their number nor their values."""
+    q = [float(angle) for angle in q_rad]
+    if len(q) != 6 or not all(math.isfinite(angle) for angle in q):
+        raise ValueError(f"q_rad is {q}: six finite angles in radians are needed.")
+    if max(map(abs, q)) > 2 * math.pi + 1e-9:
+        raise ValueError(f"q_rad is {_degrees(q)}: every joint ends at 360 degrees; are these radians?")
+    return q
+
+
+def _near(a_rad: Sequence[float], b_rad: Sequence[float]) -> bool:
+    return max(abs(a - b) for a, b in zip(a_rad, b_rad, strict=True)) < _ARRIVED_RAD
+
+
+def _degrees(q_rad: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{math.degrees(angle):.1f}" for angle in q_rad) + ") degrees"
+
+
+def _advice(host: str, words: str) -> str:
+    """Turn ur_rtde's words into what to do."""
+    if "already in use" in words:
+        return (
+            f"another client controls {host} and holds its RTDE registers: end it, or disable EtherNet/IP, PROFINET "
+            f"and other fieldbuses on the controller."
+        )
+    if "remote control" in words:
+        return f"{host} is not in remote control: press Local, Remote Control at the top right of the pendant."
+    return (
+        f"ur_rtde cannot control {host}: {words}. Check at the pendant that no message waits for an answer and that no "
+        f"other program starts by itself."
+    )

@@ -1,0 +1,140 @@
+"""The process that holds ur_rtde's `RTDEControlInterface`. Run by its path; imports nothing of ours.
+
+Requests and replies are lines of JSON on stdin and stdout. When stdin ends, for whatever reason, the arm is stopped,
+the control script is ended and the process exits; SIGALRM ends it when ur_rtde hangs, whatever locks it holds.
+
+Ref: ur_rtde 1.6.5, API reference of `RTDEControlInterface`.
+Checked on hardware: no.
+"""
+
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from importlib import import_module
+from queue import SimpleQueue
+from typing import Final, Protocol, cast
+
+STARTING_S: Final = 9  # uploading the script and seeing it run takes 0.1 s, and ur_rtde gives up after 5 s
+LEAVING_S: Final = 3
+DECELERATION_RAD_S2: Final = 4.0  # UR's own external-control program stops with this
+
+
+class _Progress(Protocol):
+    def operationId(self) -> int: ...
+
+    def isAsyncOperationRunning(self) -> bool: ...
+
+
+class _Control(Protocol):
+    def moveJ(self, q: list[float], speed: float, acceleration: float, asynchronous: bool, /) -> bool: ...
+
+    def getAsyncOperationProgressEx(self) -> _Progress: ...
+
+    def stopJ(self, deceleration: float, /) -> None: ...
+
+    def stopScript(self) -> None: ...
+
+    def isJointsWithinSafetyLimits(self, q: list[float], /) -> bool: ...
+
+    def getTCPOffset(self) -> list[float]: ...
+
+    def isProgramRunning(self) -> bool: ...
+
+    def isConnected(self) -> bool: ...
+
+
+class Calls:
+    """What the parent may ask for."""
+
+    def __init__(self, control: _Control) -> None:
+        self._control = control
+
+    def move(self, q_rad: list[float], speed_rad_s: float, acceleration_rad_s2: float) -> tuple[bool, int]:
+        """Begin a move; whether it was accepted, and the id of the operation before it."""
+        before = self._control.getAsyncOperationProgressEx().operationId()
+        return self._control.moveJ(q_rad, speed_rad_s, acceleration_rad_s2, True), before
+
+    def progress(self) -> tuple[int, bool]:
+        """Id of the newest operation, and whether it is running."""
+        progress = self._control.getAsyncOperationProgressEx()
+        if not self._control.isConnected():  # a lost link looks like an arm that has arrived
+            raise RuntimeError("the control connection was lost")
+        return progress.operationId(), progress.isAsyncOperationRunning()
+
+    def stop(self) -> None:
+        """Decelerate all joints and wait for standstill.
+
+        Not the asynchronous way: that decelerates the tool instead of the joints, which a singularity forbids.
+        """
+        self._control.stopJ(DECELERATION_RAD_S2)
+
+    def within_safety_limits(self, q_rad: list[float]) -> bool:
+        """Ask the controller."""
+        if self._control.isProgramRunning() and self._control.isJointsWithinSafetyLimits(q_rad):
+            return True
+        if self._control.isProgramRunning() and self._control.isConnected():
+            return False
+        raise RuntimeError("the control program is not running")  # ur_rtde would say False
+
+    def tcp_offset(self) -> list[float]:
+        """Active TCP in the flange."""
+        return self._control.getTCPOffset()
+
+    def quit(self) -> None:
+        """Stop the arm and end the script, which would otherwise go on running on the controller."""
+        if self._control.getAsyncOperationProgressEx().isAsyncOperationRunning():
+            self.stop()
+        self._control.stopScript()
+
+
+def main() -> None:
+    """Serve until stdin ends."""
+    host, frequency_Hz = sys.argv[1], float(sys.argv[2])
+    replies = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what the C++ library prints must not reach the replies
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle: it stops the arm through us
+
+    def reply(**content: object) -> None:
+        with suppress(OSError):  # the parent is gone: the end of stdin will say so
+            replies.write(json.dumps(content) + "\n")
+            replies.flush()
+
+    signal.alarm(STARTING_S)
+    try:
+        interface = import_module("rtde_control").RTDEControlInterface
+        # rt_priority: the library's default would put this thread under real-time scheduling, where it spins.
+        control = cast(_Control, interface(hostname=host, frequency=frequency_Hz, rt_priority=-1))
+    except Exception as error:
+        reply(id=0, error=str(error))
+        os._exit(1)
+    signal.alarm(0)
+    calls = Calls(control)
+    reply(id=0, value=None)
+
+    requests: SimpleQueue[str | None] = SimpleQueue()
+    threading.Thread(target=_listen, args=(requests,), daemon=True).start()
+    while (line := requests.get()) is not None:
+        request = json.loads(line)
+        call = cast(Callable[..., object], getattr(calls, request["call"]))
+        try:
+            reply(id=request["id"], value=call(*request["args"]))
+        except Exception as error:  # whatever the library raises: the parent decides
+            reply(id=request["id"], error=str(error))
+    with suppress(Exception):
+        calls.quit()
+    os._exit(0)  # the library's own way out takes half a second and may crash
+
+
+def _listen(requests: "SimpleQueue[str | None]") -> None:
+    for line in sys.stdin:
+        requests.put(line)
+    signal.alarm(LEAVING_S)
+    requests.put(None)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""The few calls of ur_rtde made in this process, typed, and the way to live with them.
+
+Ref: ur_rtde 1.6.5, API reference; Universal Robots, "Dashboard Server, e-Series" manual.
+Checked on hardware: no.
+
+`RTDEControlInterface` is not here: it may hang or crash its process, so it has one of its own (`control_child.py`).
+What is here always comes back, but only after up to five seconds when the controller is dead: hence `within`.
+"""
+
+import platform
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
+from typing import Final, Protocol, TypeVar, cast
+
+from drivers.errors import ConnectError, DeviceTimeout, StreamBroken
+
+T = TypeVar("T")
+
+FREQUENCY_HZ: Final = 125.0
+"""A quarter of the CPU that 500 Hz costs, and a fault is still seen within 10 ms."""
+
+_VARIABLES: Final = [  # only names ur_rtde can parse: it would read everything after an unknown one at the wrong place
+    "timestamp",
+    "target_q",
+    "target_qd",
+    "actual_q",
+    "actual_qd",
+    "actual_TCP_pose",
+    "robot_mode",
+    "safety_status_bits",
+    "runtime_state",
+]
+
+
+class Receive(Protocol):
+    """What is used of `RTDEReceiveInterface`. After a loss its getters go on to return the last values."""
+
+    def isConnected(self) -> bool:
+        """Tell the truth up to 2.5 s late."""
+
+    def getTimestamp(self) -> float:
+        """Controller time of the newest sample, s."""
+
+    def getTargetQ(self) -> list[float]:
+        """(6,) rad."""
+
+    def getTargetQd(self) -> list[float]:
+        """(6,) rad/s."""
+
+    def getActualQ(self) -> list[float]:
+        """(6,) rad."""
+
+    def getActualQd(self) -> list[float]:
+        """(6,) rad/s."""
+
+    def getActualTCPPose(self) -> list[float]:
+        """(6,) m and rotation vector, active TCP in base."""
+
+    def getRobotMode(self) -> int:
+        """7 is running."""
+
+    def getSafetyStatusBits(self) -> int:
+        """Bit field of the safety system."""
+
+    def getRuntimeState(self) -> int:
+        """1 stopped, 2 playing, 4 paused."""
+
+    def disconnect(self) -> None:
+        """Take up to 2.7 s when the controller is silent."""
+
+
+class Dashboard(Protocol):
+    """What is used of `DashboardClient`. Every refusal is a RuntimeError with the controller's words."""
+
+    def connect(self, timeout_ms: int) -> None:
+        """Connect and read the banner, the latter within 2.5 s."""
+
+    def disconnect(self) -> None:
+        """Close the connection."""
+
+    def stop(self) -> None:
+        """Stop the program, and the arm with it."""
+
+    def getRobotModel(self) -> str:
+        """Model without its generation, such as UR5."""
+
+    def getSerialNumber(self) -> str:
+        """Digits."""
+
+    def polyscopeVersion(self) -> str:
+        """Such as 5.15.0.1261331."""
+
+    def isInRemoteControl(self) -> bool:
+        """Whether programs sent over the network are accepted (e-Series from 5.6 on)."""
+
+
+def connect_receive(host: str) -> Receive:
+    """Connect to a controller that has just answered over RTDE: a silent one would freeze the interpreter here."""
+    try:
+        return cast(Receive, _load("rtde_receive").RTDEReceiveInterface(host, FREQUENCY_HZ, _VARIABLES))
+    except (RuntimeError, ValueError) as error:
+        raise ConnectError(
+            f"ur_rtde cannot read from {host}: {error}. Restart the controller if this stays."
+        ) from error
+
+
+def ask_dashboard(host: str, ask: Callable[[Dashboard], T], *, timeout_s: float) -> T:
+    """Connect to the dashboard server, ask, disconnect. Raises `StreamBroken` or `DeviceTimeout`."""
+
+    def session() -> T:
+        dashboard = cast(Dashboard, _load("dashboard_client").DashboardClient(host))
+        dashboard.connect(round(1000 * timeout_s))
+        try:
+            return ask(dashboard)
+        finally:
+            dashboard.disconnect()
+
+    try:
+        return within(timeout_s, session)
+    except RuntimeError as error:
+        raise StreamBroken(f"the dashboard server of {host} says: {error}") from error
+    except TimeoutError as error:
+        raise DeviceTimeout(f"the dashboard server of {host} did not answer within {timeout_s:.1f} s") from error
+
+
+def within(timeout_s: float, do: Callable[[], T]) -> T:
+    """Wait up to `timeout_s` for a call that cannot be interrupted; after that, TimeoutError: it ends by itself."""
+    pool = ThreadPoolExecutor(1, "ur-rtde")  # not a daemon: leaving the interpreter in the middle of C++ would abort it
+    try:
+        return pool.submit(do).result(timeout_s)
+    finally:
+        pool.shutdown(wait=False)
+
+
+class _Module(Protocol):
+    RTDEReceiveInterface: Callable[[str, float, list[str]], object]
+    DashboardClient: Callable[[str], object]
+
+
+def _load(name: str) -> _Module:
+    try:
+        return cast(_Module, import_module(name))
+    except ImportError as error:
+        raise ConnectError(
+            f"ur_rtde is not installed for Python {platform.python_version()} on {platform.system()} "
+            f"{platform.machine()} ({error}): install ftdrive with CPython 3.11 or 3.12 on 64-bit x86 Linux, for which "
+            f"ur_rtde has wheels."
+        ) from error

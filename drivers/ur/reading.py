@@ -1,0 +1,260 @@
+"""Looking at a Universal Robots arm: fresh, consistent samples and a flange pose that no TCP setting can spoil.
+
+ur_rtde repeats the last values for ever once a link is lost, so nothing is believed unless the controller's clock
+advances. The TCP offset is read with the controller's time stamp before and after each pose and taken off again, and
+the flange pose that results is compared with the nominal forward kinematics.
+
+Ref: ur_rtde 1.6.5, API reference of `RTDEReceiveInterface`; Universal Robots, "Real-Time Data Exchange (RTDE) Guide"
+(modes, states and safety status bits).
+Checked on hardware: no.
+"""
+
+import logging
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import radians
+from typing import Final
+
+import numpy as np
+
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from drivers.interfaces import ArmState, DeviceInfo
+from drivers.ur.kinematics import MODELS, Pose, forward, model_named
+from drivers.ur.library import Dashboard, Receive, ask_dashboard, connect_receive, within
+from drivers.ur.rtde import TcpOffsetReader
+
+log = logging.getLogger(__name__)
+
+CONNECT_S: Final = 2.0
+STALE_S: Final = 0.2
+_MODEL_POSITION_M: Final = 0.005
+_MODEL_ANGLE_RAD: Final = radians(0.5)
+
+PROGRAM_STOPPED: Final = 1
+PROGRAM_PLAYING: Final = 2
+ROBOT_RUNNING: Final = 7
+_MEASURING: Final = (5, 6, ROBOT_RUNNING)
+_ROBOT_MODES: Final = {
+    -1: "no controller",
+    0: "disconnected",
+    1: "safety not confirmed",
+    2: "booting",
+    3: "power off",
+    4: "power on",
+    5: "idle",
+    6: "backdrive",
+    7: "running",
+    8: "updating firmware",
+}
+_PROGRAM_STATES: Final = {0: "stopping", 1: "stopped", 2: "playing", 3: "pausing", 4: "paused", 5: "resuming"}
+_SAFETY: Final = (  # the first that applies says most
+    (0b0_1110_0000, "emergency stop: make the cell safe, release the button, power the arm on at the pendant"),
+    (0b0_0000_0100, "protective stop: find and remove its cause, then clear it at the pendant"),
+    (0b0_0001_0000, "safeguard stop: close the safeguard and reset it"),
+    (0b0_0000_1000, "recovery mode: move the arm back inside its limits at the pendant"),
+    (0b11_0000_0000, "safety violation or fault: read the pendant's log and restart the arm"),
+    (0b100_0000_0000, "stop for a safety reason: read the pendant's log"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One sample of the controller."""
+
+    t_host_ns: int
+    t_device_s: float
+    q_rad: list[float]
+    qd_rad_s: list[float]
+    target_q_rad: list[float]
+    target_qd_rad_s: list[float]
+    tcp_pose: list[float]
+    robot_mode: int
+    safety_bits: int
+    program_state: int
+
+    def safety_fault(self) -> str | None:
+        """Say why the arm may not move, as far as the arm itself is concerned."""
+        for bits, meaning in _SAFETY:
+            if self.safety_bits & bits:
+                return f"{meaning} (safety status bits 0x{self.safety_bits:x})"
+        if self.robot_mode != ROBOT_RUNNING:
+            mode = _ROBOT_MODES.get(self.robot_mode, "unknown")
+            return f"robot mode {self.robot_mode} ({mode}): power the arm on and release its brakes at the pendant"
+        return None
+
+    def program_fault(self) -> str | None:
+        """Say why our program on the controller does not move the arm."""
+        if self.program_state == PROGRAM_PLAYING:
+            return None
+        state = _PROGRAM_STATES.get(self.program_state, "unknown")
+        return f"the control program was ended or paused by somebody else (state {self.program_state}, {state})"
+
+
+class Freshness:
+    """Judges by the controller's clock whether samples still arrive."""
+
+    def __init__(self, host: str, limit_s: float = STALE_S) -> None:
+        self._host = host
+        self._limit_s = limit_s
+        self._t_device_s = math.nan
+        self._t_look = time.monotonic()
+        self._silent_s = 0.0
+
+    def check(self, look: Look) -> None:
+        """Raise `DeviceTimeout` when this look and those before it show that the controller is silent."""
+        now = time.monotonic()
+        if look.t_device_s != self._t_device_s:
+            self._silent_s = 0.0
+        else:
+            # A process that was itself suspended has not been looking: that time does not count in full.
+            self._silent_s += min(now - self._t_look, 0.05)
+        self._t_device_s, self._t_look = look.t_device_s, now
+        if self._silent_s > self._limit_s:
+            raise DeviceTimeout(
+                f"the clock of {self._host} has stood still at {look.t_device_s:.3f} s for {self._silent_s:.2f} s: "
+                f"check the robot and the network, and press the emergency stop if the arm moves."
+            )
+
+
+class Reader:
+    """The reading side of one arm; connected while it exists.
+
+    Raises `ConnectError` when the arm cannot be reached, or is not the `model` (a key of `MODELS`) it should be.
+    """
+
+    def __init__(self, host: str, model: str | None) -> None:
+        self._host = host
+        self._tcp = TcpOffsetReader(host)
+        self._receive: Receive | None = None
+        try:
+            self._tcp.open(timeout_s=CONNECT_S)
+            self.version = self._tcp.version
+            """Of the controller: major, minor, bugfix, build."""
+            self.info = self._identify(model)
+            self._receive = connect_receive(host)
+        except BaseException:
+            self.close()
+            raise
+
+    def _identify(self, model: str | None) -> DeviceInfo:
+        major = self.version[0]
+        if major > 5:
+            raise ConnectError(
+                f"{self._host} runs PolyScope X (version {major}), which has no dashboard server to stop the arm "
+                f"with: PolyScope 5 or the CB3 generation is needed."
+            )
+
+        def ask(dashboard: Dashboard) -> tuple[str, str, str]:
+            told = dashboard.getRobotModel().strip()
+            try:
+                serial = dashboard.getSerialNumber()
+            except RuntimeError as error:  # the question is younger than some controllers
+                log.info("%s does not tell its serial number: %s", self._host, error)
+                serial = "unknown"
+            return told, serial, dashboard.polyscopeVersion().strip()
+
+        try:
+            told, serial, polyscope = ask_dashboard(self._host, ask, timeout_s=CONNECT_S)
+        except (StreamBroken, DeviceTimeout) as error:
+            raise ConnectError(f"{error}: enable it under Settings, Security, Services.") from error
+        says = model_named(told, major)
+        if model is None and says is None:
+            raise ConnectError(f"{self._host} calls itself {told!r}, which is not known: name its model.")
+        if model is not None and says is not None and MODELS[says] != MODELS[model]:
+            raise ConnectError(f"{self._host} is a {says}, not a {model}: check the address and the model.")
+        return DeviceInfo(model=model or says or told, serial=serial, firmware=polyscope)
+
+    @property
+    def tells_tcp(self) -> bool:
+        """Whether the controller tells its TCP offset without being controlled; old ones do not."""
+        return self._tcp.supported
+
+    def close(self) -> None:
+        """Let the connections go, within 0.3 s even when the controller is silent. Idempotent."""
+        self._tcp.close()
+        receive, self._receive = self._receive, None
+        if receive is not None:
+            try:
+                within(0.2, receive.disconnect)
+            except (TimeoutError, RuntimeError) as error:
+                log.debug("%s: disconnecting goes on in the background: %s", self._host, error)
+
+    def look(self) -> Look:
+        """Take the newest sample. Raises `StreamBroken` once the loss of a connection is known."""
+        receive = self._receive
+        if receive is None or not receive.isConnected():
+            raise StreamBroken(
+                f"the connection to {self._host} was lost: check the robot and the cable, then open the arm again."
+            )
+        self._tcp.check()
+        for _ in range(100):  # ur_rtde has no snapshot: read again when a new sample came in between
+            t_device_s = receive.getTimestamp()
+            look = Look(
+                t_host_ns=time.monotonic_ns(),
+                t_device_s=t_device_s,
+                q_rad=receive.getActualQ(),
+                qd_rad_s=receive.getActualQd(),
+                target_q_rad=receive.getTargetQ(),
+                target_qd_rad_s=receive.getTargetQd(),
+                tcp_pose=receive.getActualTCPPose(),
+                robot_mode=receive.getRobotMode(),
+                safety_bits=receive.getSafetyStatusBits(),
+                program_state=receive.getRuntimeState(),
+            )
+            if receive.getTimestamp() == t_device_s:
+                return look
+        raise DeviceTimeout(f"no consistent sample of {self._host} could be read: this computer is too busy.")
+
+    def next_look(self, *, since_s: float = -math.inf, limit_s: float = STALE_S) -> Look:
+        """Wait for a sample newer than the present one, taken at `since_s` or later.
+
+        Raises `DeviceTimeout` when the controller's clock stands still for `limit_s`.
+        """
+        fresh = Freshness(self._host, limit_s)
+        first = look = self.look()
+        while look.t_device_s == first.t_device_s or look.t_device_s < since_s:
+            fresh.check(look)
+            time.sleep(0.001)
+            look = self.look()
+        return look
+
+    def state(self, ask_tcp: Callable[[], Sequence[float]]) -> ArmState:
+        """Read a state; `ask_tcp` tells the TCP offset (6,) where the controller does not. Errors as `UrArm.state`."""
+        for _ in range(5):
+            t_before_s, before = self._tcp_offset(-math.inf, ask_tcp)
+            look = self.next_look(since_s=t_before_s)
+            _, after = self._tcp_offset(look.t_device_s, ask_tcp)
+            if tuple(before) == tuple(after):  # so this TCP was active when the pose was taken
+                break
+        else:
+            raise DeviceFault(f"the TCP of {self._host} changes all the time: find out what sets it.")
+        if look.robot_mode not in _MEASURING:
+            raise DeviceFault(f"{self._host} does not measure its joints: {look.safety_fault()}.")
+        flange = Pose.from_ur(look.tcp_pose) @ Pose.from_ur(before).inverse()
+        self._check_model(look, flange)
+        return ArmState(
+            t_host_ns=look.t_host_ns,
+            t_device_s=look.t_device_s,
+            q_rad=np.array(look.q_rad),
+            qd_rad_s=np.array(look.qd_rad_s),
+            R_base_flange=flange.R,
+            p_base_flange_m=flange.p_m,
+        )
+
+    def _tcp_offset(self, since_s: float, ask_tcp: Callable[[], Sequence[float]]) -> tuple[float, Sequence[float]]:
+        if self._tcp.supported:
+            return self._tcp.offset(since_s=since_s, timeout_s=STALE_S)
+        return since_s, ask_tcp()
+
+    def _check_model(self, look: Look, flange: Pose) -> None:
+        nominal = forward(MODELS[self.info.model], look.q_rad)
+        distance_m = float(np.linalg.norm(flange.p_m - nominal.p_m))
+        angle_rad = flange.angle_to_rad(nominal)
+        if distance_m > _MODEL_POSITION_M or angle_rad > _MODEL_ANGLE_RAD:
+            raise DeviceFault(
+                f"the flange is {1e3 * distance_m:.1f} mm and {math.degrees(angle_rad):.2f} degrees from where a "
+                f"{self.info.model} has it with these joint angles: the arm at {self._host} is another model, or its "
+                f"TCP was changed this moment; check both and read again."
+            )

@@ -1,0 +1,266 @@
+"""A small RTDE client of our own, for what ur_rtde cannot do.
+
+ur_rtde's constructors freeze the whole interpreter when the controller accepts and stays silent, so somebody has to
+say hello first with a time-out; and ur_rtde cannot parse `tcp_offset`, without which a TCP pose says nothing about the
+flange. Only outputs are read here: this client can never disturb a program.
+
+Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
+Checked on hardware: no.
+"""
+
+import contextlib
+import logging
+import socket
+import struct
+import threading
+import time
+from dataclasses import dataclass
+from typing import Final
+
+from drivers.errors import ConnectError, DeviceTimeout, DriverError, ProtocolError, StreamBroken
+
+log = logging.getLogger(__name__)
+
+PORT: Final = 30004
+
+REQUEST_PROTOCOL_VERSION: Final = ord("V")
+GET_CONTROLLER_VERSION: Final = ord("v")
+SETUP_OUTPUTS: Final = ord("O")
+START: Final = ord("S")
+DATA: Final = ord("U")
+TEXT: Final = ord("M")
+
+_HEADER: Final = struct.Struct(">HB")  # size of the whole package, type
+_FORMATS: Final = {
+    "BOOL": "?",
+    "UINT8": "B",
+    "UINT32": "I",
+    "UINT64": "Q",
+    "INT32": "i",
+    "DOUBLE": "d",
+    "VECTOR3D": "3d",
+    "VECTOR6D": "6d",
+    "VECTOR6INT32": "6i",
+    "VECTOR6UINT32": "6I",
+}
+
+
+def encode(kind: int, payload: bytes = b"") -> bytes:
+    """Frame one package."""
+    return _HEADER.pack(_HEADER.size + len(payload), kind) + payload
+
+
+def encode_setup_outputs(frequency_Hz: float, names: tuple[str, ...]) -> bytes:
+    """Frame the request for one recipe of outputs."""
+    return encode(SETUP_OUTPUTS, struct.pack(">d", frequency_Hz) + ",".join(names).encode("ascii"))
+
+
+def take_package(buffer: bytearray) -> tuple[int, bytes] | None:
+    """Remove the first package from `buffer` as (type, payload); None while it is incomplete.
+
+    Raises `ProtocolError` when the buffer cannot begin with a package.
+    """
+    if len(buffer) < _HEADER.size:
+        return None
+    size, kind = _HEADER.unpack_from(buffer)
+    if size < _HEADER.size:
+        raise ProtocolError(f"RTDE package of {size} bytes, at least {_HEADER.size} expected: is this an RTDE server?")
+    if len(buffer) < size:
+        return None
+    payload = bytes(buffer[_HEADER.size : size])
+    del buffer[:size]
+    return kind, payload
+
+
+def decode_version(payload: bytes) -> tuple[int, int, int, int]:
+    """Decode the controller's version: major, minor, bugfix, build."""
+    if len(payload) != 16:
+        raise ProtocolError(f"RTDE version of {len(payload)} bytes, 16 expected: {payload.hex(' ')}")
+    major, minor, bugfix, build = struct.unpack(">4I", payload)
+    return major, minor, bugfix, build
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How the controller packs the outputs that were asked for."""
+
+    id: int
+    types: tuple[str, ...]
+
+    @classmethod
+    def decode(cls, payload: bytes) -> "Recipe":
+        """Decode the answer to a request for outputs. An unknown output has the type `NOT_FOUND`."""
+        try:
+            return cls(payload[0], tuple(payload[1:].decode("ascii").split(",")))
+        except (IndexError, UnicodeDecodeError) as error:
+            raise ProtocolError(f"RTDE recipe cannot be read: {payload.hex(' ')}") from error
+
+    def unpack(self, payload: bytes) -> list[tuple[float, ...]]:
+        """Unpack a data package into one tuple per output."""
+        formats = [struct.Struct(">" + _FORMATS[kind]) for kind in self.types if kind in _FORMATS]
+        if len(formats) != len(self.types):
+            raise ProtocolError(f"RTDE output of unknown type: {', '.join(self.types)}")
+        expected = 1 + sum(one.size for one in formats)
+        if len(payload) != expected or payload[0] != self.id:
+            raise ProtocolError(
+                f"RTDE data of {len(payload)} bytes, {expected} expected for recipe {self.id}: {payload.hex(' ')}"
+            )
+        values, offset = [], 1
+        for one in formats:
+            values.append(one.unpack_from(payload, offset))
+            offset += one.size
+        return values
+
+
+class _Connection:
+    """One connection, one package at a time."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._socket = sock
+        self._buffer = bytearray()
+
+    def read(self, timeout_s: float | None) -> tuple[int, bytes]:
+        """Read the next package as (type, payload)."""
+        self._socket.settimeout(timeout_s)
+        while (package := take_package(self._buffer)) is None:
+            received = self._socket.recv(4096)
+            if not received:
+                raise StreamBroken("the controller closed the connection")
+            self._buffer += received
+        return package
+
+    def ask(self, request: bytes, deadline: float) -> bytes:
+        """Send a request and return the payload of its answer; an answer has the type of its request."""
+        self._socket.sendall(request)
+        while True:
+            kind, payload = self.read(max(deadline - time.monotonic(), 1e-3))
+            if kind == request[2]:
+                return payload
+            log.debug("RTDE package of type %d instead of an answer: %s", kind, payload.hex(" "))
+
+    def close(self) -> None:
+        """Close, and wake a thread that reads."""
+        with contextlib.suppress(OSError):  # it may be gone already
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+
+class TcpOffsetReader:
+    """The controller's version, and its active TCP offset kept current by a thread.
+
+    Every offset carries the controller's time, the same clock the poses of ur_rtde carry, so that a pose can be matched
+    with the offset that was active when it was taken.
+    """
+
+    _names = ("timestamp", "tcp_offset")
+    _frequency_Hz = 125.0  # the full rate of the CB3 generation; e-Series arms send every fourth cycle
+
+    def __init__(self, host: str) -> None:
+        self._host = host
+        self._connection: _Connection | None = None
+        self._thread: threading.Thread | None = None
+        self._changed = threading.Condition()
+        self._newest: tuple[float, tuple[float, ...]] | None = None
+        self._failure: DriverError | None = None
+        self.version = (0, 0, 0, 0)
+        """Of the controller, after `open`: major, minor, bugfix, build."""
+        self.supported = False
+        """Whether this controller tells its TCP offset; older ones do not."""
+
+    def open(self, *, timeout_s: float) -> None:
+        """Say hello and start to follow the offset. Raises `ConnectError`."""
+        where = f"{self._host}:{PORT}"
+        try:
+            self._connection = _Connection(socket.create_connection((self._host, PORT), timeout=timeout_s))
+        except OSError as error:
+            raise ConnectError(
+                f"{where} cannot be reached ({error}): check the address and the cable, that the robot controller is "
+                f"switched on, and that no firewall stands between."
+            ) from error
+        try:
+            recipe = self._greet(self._connection, time.monotonic() + timeout_s)
+        except TimeoutError as error:
+            raise ConnectError(
+                f"{where} accepts the connection but did not answer within {timeout_s:.1f} s: check that this is a "
+                f"robot controller and that it has finished starting."
+            ) from error
+        except (OSError, ProtocolError, StreamBroken) as error:
+            raise ConnectError(
+                f"{where} does not speak RTDE ({error}): check that this is a robot controller and that RTDE is "
+                f"enabled under Settings, Security, Services."
+            ) from error
+        if recipe is None:
+            self.close()
+            return
+        self.supported = True
+        self._thread = threading.Thread(
+            target=self._run, args=(self._connection, recipe), name="ur-tcp-offset", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """Let the connection go. Idempotent."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+        if self._thread is not None:
+            self._thread.join(timeout=1.0)
+            self._thread = None
+
+    def offset(self, *, since_s: float, timeout_s: float) -> tuple[float, tuple[float, ...]]:
+        """Controller time and TCP offset (6,) of the newest sample, waiting for one taken at `since_s` or later.
+
+        Raises `StreamBroken` when the connection is lost and `DeviceTimeout` when no such sample comes.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._failure or self._is_since(since_s), timeout_s)
+            self.check()
+            if self._newest is None or not self._is_since(since_s):
+                raise DeviceTimeout(
+                    f"{self._host} has not told its TCP offset for {timeout_s:.1f} s: check the network and the robot."
+                )
+            return self._newest
+
+    def check(self) -> None:
+        """Raise what ended the stream, if it has ended."""
+        if self._failure:
+            raise type(self._failure)(str(self._failure)) from self._failure
+
+    def _is_since(self, since_s: float) -> bool:
+        return self._newest is not None and self._newest[0] >= since_s
+
+    def _greet(self, connection: _Connection, deadline: float) -> Recipe | None:
+        """Shake hands; the recipe of the running stream, or None where the controller does not know `tcp_offset`."""
+        if connection.ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02"), deadline) != b"\x01":
+            raise ProtocolError("protocol version 2 is refused")
+        self.version = decode_version(connection.ask(encode(GET_CONTROLLER_VERSION), deadline))
+        answer = connection.ask(encode_setup_outputs(self._frequency_Hz, self._names), deadline)
+        recipe = Recipe.decode(answer)
+        if "NOT_FOUND" in recipe.types:
+            return None
+        if recipe.types != ("DOUBLE", "VECTOR6D"):
+            raise ProtocolError(f"time and TCP offset come as {', '.join(recipe.types)}")
+        if connection.ask(encode(START), deadline) != b"\x01":
+            raise ProtocolError("the controller does not start the stream")
+        return recipe
+
+    def _run(self, connection: _Connection, recipe: Recipe) -> None:
+        """Follow the stream until it ends; what ended it is raised by `offset`."""
+        try:
+            while True:
+                kind, payload = connection.read(None)
+                if kind == DATA:
+                    (t_s,), tcp_offset = recipe.unpack(payload)
+                    with self._changed:
+                        self._newest = (t_s, tcp_offset)
+                        self._changed.notify_all()
+        except (OSError, StreamBroken) as error:
+            failure: DriverError = StreamBroken(
+                f"the RTDE connection to {self._host} was lost ({error}): check the robot and the cable, then open "
+                f"the arm again."
+            )
+        except ProtocolError as error:
+            failure = error
+        with self._changed:
+            self._failure = failure
+            self._changed.notify_all()

@@ -1,0 +1,295 @@
+"""One robot cell in one process: a UR controller and a wrist sensor that share one physical world.
+
+Standard output carries one JSON line when everything listens, then one JSON line for each line of standard input.
+"""
+
+import contextlib
+import json
+import math
+import os
+import selectors
+import signal
+import sys
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from importlib import import_module
+from typing import Any, Protocol
+
+import numpy as np
+
+from mocks.kinematics import MODELS, Array, Vector6, rotation, vector6
+from mocks.ur.robot import Robot, RobotSettings
+from mocks.ur.server import UrServer
+from mocks.world import MOUNTS_RAD, Truth, World
+
+FORMAT = "mocks.station/1"
+SENSORS = ("can", "serial", "both", "none")
+HOST_TRIALS = 20
+CAN_BASE = 0x20
+CAN_BITRATE = 250_000
+
+START_Q_DEG = (45.0, -100.0, 60.0, -50.0, 90.0, 45.0)
+"""Near the first pose of the tour: q4 = -90° - q2 - q3."""
+
+START_SCATTER_DEG = 5.0
+"""The wrist starts this far off at most, so that a first move is a real one."""
+
+
+class SensorEmulator(Protocol):
+    """What a sensor emulator offers: it opens its end of a pty in `start` and serves it from its own thread."""
+
+    def start(self) -> str:
+        """Open the pty and return the path a driver opens."""
+
+    def unplug(self) -> None:
+        """Close the pty, as if the cable were pulled."""
+
+    def stop(self) -> None:
+        """End the thread."""
+
+
+def truth_from(options: Namespace) -> Truth:
+    """The seed's truth, with every quantity that was given on the command line in place of the drawn one."""
+    truth = Truth.drawn(options.seed, options.mount)
+    changes: dict[str, Any] = {}
+    if options.mass is not None:
+        changes["mass_kg"] = options.mass
+    if options.com is not None:
+        changes["p_sensor_com_m"] = np.array(options.com)
+    if options.sensor_rotvec_deg is not None:
+        changes["R_flange_sensor"] = rotation(np.radians(options.sensor_rotvec_deg))
+    if options.tilt_deg is not None:
+        alpha, beta = np.radians(options.tilt_deg).tolist()
+        changes["tilt_alpha_rad"] = alpha
+        changes["tilt_beta_rad"] = math.remainder(MOUNTS_RAD[options.mount] + beta, 2 * math.pi)
+    if options.force_bias is not None:
+        changes["force_bias_N"] = np.array(options.force_bias)
+    if options.torque_bias is not None:
+        changes["torque_bias_Nm"] = np.array(options.torque_bias)
+    if options.noise is not None:
+        changes["noise_force_N"], changes["noise_torque_Nm"] = options.noise
+    if options.force_drift is not None:
+        changes["force_drift_N_min"] = np.array(options.force_drift)
+    if options.torque_drift is not None:
+        changes["torque_drift_Nm_min"] = np.array(options.torque_drift)
+    return replace(truth, **changes)
+
+
+def start_posture(options: Namespace) -> Vector6:
+    """Joint angles (rad) at power-up: as given, or near the tour's first pose with a seeded offset of the wrist."""
+    if options.start_q_deg is not None:
+        return vector6(np.radians(options.start_q_deg))
+    scatter = np.random.default_rng([options.seed, 3]).uniform(-START_SCATTER_DEG, START_SCATTER_DEG, 3)
+    return vector6(np.radians(np.add(START_Q_DEG, [0.0, 0.0, 0.0, *scatter])))
+
+
+def free_hosts() -> Iterator[str]:
+    """Loopback addresses to try, different for every process."""
+    rng = np.random.default_rng([os.getpid(), 4])
+    yield f"127.{64 + os.getpid() // 64516 % 64}.{1 + os.getpid() // 254 % 254}.{1 + os.getpid() % 254}"
+    for _ in range(HOST_TRIALS):
+        a, b, c = rng.integers(1, 255, 3).tolist()
+        yield f"127.{128 + a % 100}.{b}.{c}"
+
+
+class Station:
+    """The cell: world, controller, sensors, and the control channel.
+
+    Parameters
+    ----------
+    options
+        Parsed command line, see `mocks.__main__`.
+    """
+
+    def __init__(self, options: Namespace) -> None:
+        self._options = options
+        nominal = MODELS[options.model]
+        dh = nominal.disturbed(options.seed, 1e-3 * options.dh_noise, 3e-4 * options.dh_noise)
+        self.world = World(truth_from(options), dh, start_posture(options), options.seed)
+        self.robot = Robot(
+            self.world,
+            RobotSettings(
+                model=options.model,
+                polyscope=options.polyscope,
+                serial_number=options.serial_number,
+                tcp=vector6(options.tcp),
+                payload_kg=options.payload,
+                joint_limit_rad=math.radians(options.joint_limit_deg),
+                plane=options.plane,
+                time_scale=options.time_scale,
+            ),
+        )
+        self._selector = selectors.SelectSelector()  # the only one that waits for less than a millisecond
+        self.server = self._listen()
+        self._sensors: dict[str, tuple[SensorEmulator, str]] = {}
+        self._ended = False
+        self._line = bytearray()
+        self._verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+            "unplug": self._unplug,
+            "protective-stop": self._protective_stop,
+            "emergency-stop": self._emergency_stop,
+            "freeze": self._freeze,
+            "drop": self._drop,
+            "remote-control": self._remote_control,
+            "set-tcp": self._set_tcp,
+            "push": self._push,
+            "state": self._state,
+        }
+
+    def run(self) -> int:
+        """Serve until standard input closes or SIGTERM arrives; return the exit code."""
+        sys.setswitchinterval(0.0005)  # the sensors' threads must not delay a control cycle
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._on_signal)
+        try:
+            self._start_sensors()
+            os.set_blocking(sys.stdin.fileno(), False)
+            self._selector.register(sys.stdin.fileno(), selectors.EVENT_READ, self._on_stdin)
+            self._say(self._hello())
+            self.server.run(lambda: self._ended)
+        finally:
+            for sensor, _path in self._sensors.values():
+                sensor.stop()
+            self.server.close()
+        return 0
+
+    def _on_signal(self, _number: int, _frame: object) -> None:
+        self._ended = True
+
+    def _listen(self) -> UrServer:
+        if self._options.host is not None:
+            return UrServer(self.robot, self._options.host, self._selector)
+        for host in free_hosts():
+            with contextlib.suppress(OSError):
+                return UrServer(self.robot, host, self._selector)
+        raise OSError(f"no free loopback address in {HOST_TRIALS} trials: is something listening on 0.0.0.0:30004?")
+
+    def _start_sensors(self) -> None:
+        wanted = self._options.sensor
+        if wanted in ("can", "both"):
+            emulator = import_module("mocks.ati_can").AtiCanNode
+            node = emulator(self.world.measure, base=CAN_BASE, bitrate=CAN_BITRATE, seed=self._options.seed)
+            self._sensors["can"] = (node, node.start())
+        if wanted in ("serial", "both"):
+            emulator = import_module("mocks.ati_serial").AtiSerialBox
+            box = emulator(self.world.measure, seed=self._options.seed)
+            self._sensors["serial"] = (box, box.start())
+
+    def _hello(self) -> dict[str, Any]:
+        can = self._sensors.get("can")
+        serial = self._sensors.get("serial")
+        return {
+            "format": FORMAT,
+            "arm": {
+                "host": self.server.host,
+                "model": self._options.model,
+                "serial_number": self._options.serial_number,
+            },
+            "can": can and {"interface": "slcan", "channel": can[1], "bitrate": CAN_BITRATE, "base": CAN_BASE},
+            "serial": serial and {"port": serial[1]},
+            "truth": self.world.truth.to_json(),
+        }
+
+    # -- control channel ----------------------------------------------------------------------------------------------
+
+    def _say(self, message: dict[str, Any]) -> None:
+        try:
+            sys.stdout.write(json.dumps(message) + "\n")
+            sys.stdout.flush()
+        except BrokenPipeError:
+            self._ended = True
+
+    def _on_stdin(self) -> None:
+        data = os.read(sys.stdin.fileno(), 65536)
+        if not data:
+            self._ended = True
+            return
+        *lines, rest = (bytes(self._line) + data).split(b"\n")
+        self._line = bytearray(rest)
+        for line in lines:
+            if line.strip():
+                self._say(self._obey(line))
+
+    def _obey(self, line: bytes) -> dict[str, Any]:
+        try:
+            request = json.loads(line)
+            verb = self._verbs[request["do"]]
+        except (ValueError, TypeError, KeyError):
+            known = ", ".join(self._verbs)
+            return {"error": f'not understood: {line.decode("utf-8", "replace")}; say {{"do": …}} with {known}'}
+        try:
+            return verb(request)
+        except (ValueError, TypeError, KeyError) as error:
+            return {"error": f"{request['do']}: {error!r}"}
+
+    def _unplug(self, request: dict[str, Any]) -> dict[str, Any]:
+        device = request.get("device", "sensor")
+        names = list(self._sensors) if device == "sensor" else [device]
+        for name in names:
+            self._sensors[name][0].unplug()
+        return {"done": "unplug", "devices": names}
+
+    def _protective_stop(self, _request: dict[str, Any]) -> dict[str, Any]:
+        self.robot.protective_stop("asked for")
+        return {"done": "protective-stop"}
+
+    def _emergency_stop(self, request: dict[str, Any]) -> dict[str, Any]:
+        self.robot.emergency_stop(bool(request.get("on", True)))
+        return {"done": "emergency-stop"}
+
+    def _freeze(self, request: dict[str, Any]) -> dict[str, Any]:
+        self.server.frozen = bool(request.get("on", True))
+        return {"done": "freeze", "on": self.server.frozen}
+
+    def _drop(self, request: dict[str, Any]) -> dict[str, Any]:
+        count = self.server.drop(request["what"], reset=bool(request.get("reset", False)))
+        return {"done": "drop", "connections": count}
+
+    def _remote_control(self, request: dict[str, Any]) -> dict[str, Any]:
+        self.robot.remote_control = bool(request.get("on", True))
+        return {"done": "remote-control", "on": self.robot.remote_control}
+
+    def _set_tcp(self, request: dict[str, Any]) -> dict[str, Any]:
+        self.robot.tcp_offset = vector6(request["tcp"])
+        return {"done": "set-tcp"}
+
+    def _push(self, request: dict[str, Any]) -> dict[str, Any]:
+        self.world.push(request["wrench"])
+        return {"done": "push"}
+
+    def _state(self, _request: dict[str, Any]) -> dict[str, Any]:
+        robot, arm = self.robot, self.robot.arm
+        return {
+            "q_rad": list(arm.actual_q),
+            "target_q_rad": list(arm.q),
+            "moving": not arm.at_rest,
+            "steady": robot.steady,
+            "runtime_state": robot.runtime.name,
+            "program": robot.program_name,
+            "robot_mode": robot.robot_mode.name,
+            "safety_mode": robot.safety_mode.name,
+            "remote_control": robot.remote_control,
+            "tcp_offset": list(robot.tcp_offset),
+            "payload_kg": robot.payload_kg,
+            "payload_cog_m": list(robot.payload_cog_m),
+            "speed_fraction": arm.speed_fraction,
+            "true_wrench": self.world.true_wrench().tolist(),
+            "bad_inputs": self.server.bad_inputs,
+            "dropped_cycles": self.server.dropped_cycles,
+            "events": robot.events,
+        }
+
+
+def parse_vector(text: str, length: int) -> Array:
+    """Numbers separated by commas.
+
+    Raises
+    ------
+    ValueError
+        When there are not exactly `length` finite numbers.
+    """
+    values = np.array([float(part) for part in text.split(",")])
+    if values.shape != (length,) or not np.isfinite(values).all():
+        raise ValueError(f"expected {length} numbers separated by commas, got {text!r}")
+    return values

@@ -1,0 +1,1 @@
+"""The UR controller: RTDE, dashboard and script ports, and the arm behind them."""

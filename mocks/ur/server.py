@@ -1,0 +1,342 @@
+"""The controller's TCP ports on one loopback address, and the clock that drives them.
+
+One thread does everything: between two control cycles it waits for the sockets. Nothing needs a lock.
+"""
+
+import selectors
+import socket
+import struct
+import time
+from collections.abc import Callable
+
+from mocks.ur import dashboard, rtde
+from mocks.ur.robot import Robot
+from mocks.ur.script import take_uploads
+from mocks.ur.variables import INPUTS, OUTPUTS, Reader, output_type
+
+PORTS = {30001: "script", 30002: "script", 30003: "script", 30004: "rtde", 29999: "dashboard"}
+BACKLOG_LIMIT_S = 10.0  # a client that does not read for so long is disconnected
+CATCH_UP_CYCLES = 250  # a longer stall of this process is not made good
+
+Select = selectors.BaseSelector
+
+
+class Client:
+    """One TCP connection: bytes in, bytes out, never blocking."""
+
+    kind = ""
+
+    def __init__(self, server: "UrServer", connection: socket.socket) -> None:
+        self.server = server
+        self.robot = server.robot
+        self.open = True
+        self._socket = connection
+        self._in = bytearray()
+        self._out = bytearray()
+        self._stuck_since: float | None = None
+
+    def fileno(self) -> int:
+        """The socket's."""
+        return self._socket.fileno()
+
+    @property
+    def lagging(self) -> bool:
+        """Whether the client has not yet read what was sent before."""
+        return bool(self._out)
+
+    def on_open(self) -> None:
+        """Say what the port says first."""
+
+    def on_ready(self) -> None:
+        """Read what is there and act on it."""
+        try:
+            data = self._socket.recv(65536)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self.close()
+            return
+        self._in += data
+        self.on_bytes(self._in)
+
+    def on_bytes(self, buffer: bytearray) -> None:
+        """Consume what is complete at the start of `buffer`."""
+        raise NotImplementedError
+
+    def send(self, data: bytes) -> None:
+        """Send now what the socket takes, keep the rest."""
+        self._out += data
+        self.flush()
+
+    def flush(self) -> None:
+        """Try again to send what is left; give up on a client that does not read."""
+        if not self._out or not self.open:
+            return
+        try:
+            sent = self._socket.send(self._out)
+        except BlockingIOError:
+            sent = 0
+        except OSError:
+            self.close()
+            return
+        del self._out[:sent]
+        now = time.monotonic()
+        if sent or self._stuck_since is None:
+            self._stuck_since = now
+        elif now - self._stuck_since > BACKLOG_LIMIT_S:
+            self.close()
+        if not self._out:
+            self._stuck_since = None
+
+    def close(self, *, reset: bool = False) -> None:
+        """Hang up: in order, or with a TCP reset."""
+        if self.open:
+            self.open = False
+            self.server.forget(self)
+            if reset:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            self._socket.close()
+
+
+class ScriptClient(Client):
+    """Ports 30001 to 30003: takes programs, says nothing."""
+
+    kind = "script"
+
+    def on_bytes(self, buffer: bytearray) -> None:
+        """Start every complete program."""
+        for upload in take_uploads(buffer):
+            self.robot.upload(upload)
+
+
+class DashboardClient(Client):
+    """Port 29999: a banner, then one line for each line."""
+
+    kind = "dashboard"
+
+    def on_open(self) -> None:
+        """Send the banner."""
+        self.send(dashboard.BANNER.encode() + b"\n")
+
+    def on_bytes(self, buffer: bytearray) -> None:
+        """Answer every complete line."""
+        while b"\n" in buffer and self.open:
+            line, _, rest = bytes(buffer).partition(b"\n")
+            buffer[:] = rest
+            text = line.decode("utf-8", "replace")
+            self.send(dashboard.answer(self.robot, text).encode() + b"\n")
+            if text.strip().lower() == "quit":
+                self.close()
+
+
+class RtdeClient(Client):
+    """Port 30004: one output recipe, any number of input recipes."""
+
+    kind = "rtde"
+
+    def __init__(self, server: "UrServer", connection: socket.socket) -> None:
+        super().__init__(server, connection)
+        self._outputs: rtde.Recipe | None = None
+        self._readers: list[Reader] = []
+        self._every = 1
+        self._inputs: list[rtde.Recipe] = []
+        self._started = False
+
+    def on_bytes(self, buffer: bytearray) -> None:
+        """Answer every complete package."""
+        try:
+            for kind, payload in rtde.take_packages(buffer):
+                self._on_package(kind, payload)
+        except rtde.RtdeError as error:
+            self.server.reject(str(error))
+            self.close()
+
+    def sample(self, first_cycle: int, last_cycle: int) -> None:
+        """Send the present outputs if one of these cycles is due; skip them when the client lags."""
+        due = last_cycle // self._every > (first_cycle - 1) // self._every
+        if self._started and due and not self.lagging and self._outputs is not None:
+            self.send(self._outputs.pack([read(self.robot) for read in self._readers]))
+
+    def _on_package(self, kind: int, payload: bytes) -> None:
+        if kind == rtde.VERSION:
+            self._reply(kind, bytes([payload == b"\x00\x02"]))
+        elif kind == rtde.CONTROLLER_VERSION:
+            self._reply(kind, struct.pack(">4I", *self.robot.settings.polyscope, dashboard.BUILD))
+        elif kind == rtde.SETUP_OUTPUTS:
+            self._set_up_outputs(payload)
+        elif kind == rtde.SETUP_INPUTS:
+            self._set_up_inputs(payload)
+        elif kind == rtde.START:
+            self._started = self._outputs is not None
+            self._reply(kind, bytes([self._started]))
+        elif kind == rtde.PAUSE:
+            self._started = False
+            self._reply(kind, b"\x01")
+        elif kind == rtde.DATA:
+            self._take_inputs(payload)
+        elif kind != rtde.TEXT:
+            self.server.reject(f"package type {kind}")
+
+    def _reply(self, kind: int, payload: bytes) -> None:
+        self.send(rtde.package(kind, payload))
+
+    def _set_up_outputs(self, payload: bytes) -> None:
+        if len(payload) < 8:
+            self.server.reject(f"output setup of {len(payload)} bytes")
+            return
+        (frequency_hz,) = struct.unpack_from(">d", payload)
+        names = rtde.names_in(payload[8:])
+        recipe = rtde.Recipe(1, names, [output_type(self.robot, name) for name in names])
+        self._outputs = recipe if recipe.valid else None
+        self._readers = [OUTPUTS[name][1] for name in names] if recipe.valid else []
+        base_hz = self.robot.frequency_hz
+        self._every = max(1, int(base_hz / frequency_hz)) if frequency_hz > 0 else 1
+        self._reply(rtde.SETUP_OUTPUTS, recipe.answer())
+
+    def _set_up_inputs(self, payload: bytes) -> None:
+        names = rtde.names_in(payload)
+        owners = self.server.input_owners
+        types = []
+        for name in names:
+            taken = owners.get(name, self) is not self
+            types.append("IN_USE" if taken else INPUTS.get(name, "NOT_FOUND"))
+        recipe = rtde.Recipe(len(self._inputs) + 1, names, types)
+        self._inputs.append(recipe)
+        if recipe.valid:
+            owners.update(dict.fromkeys(names, self))
+        self._reply(rtde.SETUP_INPUTS, recipe.answer())
+
+    def _take_inputs(self, payload: bytes) -> None:
+        recipe_id = payload[0] if payload else 0
+        if not 1 <= recipe_id <= len(self._inputs) or not self._inputs[recipe_id - 1].valid:
+            self.server.reject(f"data for unknown input recipe {recipe_id}")
+            return
+        recipe = self._inputs[recipe_id - 1]
+        size = len(payload) - 1
+        if size != recipe.size:
+            self.server.reject(f"{size} bytes of data for input recipe {recipe_id}, which has {recipe.size}")
+        if size >= recipe.size:
+            self.robot.write_inputs(recipe.unpack(payload[1:]))
+
+
+CLIENTS: dict[str, type[Client]] = {c.kind: c for c in (ScriptClient, DashboardClient, RtdeClient)}
+
+
+class UrServer:
+    """The controller on the network.
+
+    Parameters
+    ----------
+    robot
+        The controller behind the ports.
+    host
+        Exact loopback address to listen on.
+    selector
+        Where sockets wait; the data of every key is a callable without arguments.
+
+    Raises
+    ------
+    OSError
+        When a port of `host` cannot be had.
+    """
+
+    def __init__(self, robot: Robot, host: str, selector: Select) -> None:
+        self.robot = robot
+        self.host = host
+        self.input_owners: dict[str, RtdeClient] = {}
+        self.bad_inputs: list[str] = []
+        """Packages a well-behaved client would not have sent."""
+        self.dropped_cycles = 0
+        """Control cycles lost because this process was stalled for too long."""
+        self.frozen = False
+        """While true nothing runs and nothing is read or sent, but connections stay."""
+        self._selector = selector
+        self._clients: list[Client] = []
+        self._listeners: list[socket.socket] = []
+        try:
+            for port, kind in PORTS.items():
+                self._listen(port, kind)
+        except OSError:
+            self.close()
+            raise
+        self._next_s = time.monotonic() + robot.period_s
+
+    def _listen(self, port: int, kind: str) -> None:
+        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._listeners.append(listener)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((self.host, port))
+        listener.listen(16)
+        listener.setblocking(False)
+        self._selector.register(listener, selectors.EVENT_READ, lambda: self._accept(listener, kind))
+
+    def _accept(self, listener: socket.socket, kind: str) -> None:
+        try:
+            connection, _peer = listener.accept()
+        except OSError:
+            return  # gone again
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client = CLIENTS[kind](self, connection)
+        self._clients.append(client)
+        self._selector.register(client, selectors.EVENT_READ, client.on_ready)
+        client.on_open()
+
+    def forget(self, client: Client) -> None:
+        """A client hung up: its input variables are free again."""
+        self._selector.unregister(client)
+        self._clients.remove(client)
+        self.input_owners = {name: owner for name, owner in self.input_owners.items() if owner is not client}
+
+    def reject(self, what: str) -> None:
+        """Note a package that breaks the protocol."""
+        self.bad_inputs.append(what)
+
+    def drop(self, kind: str, *, reset: bool = False) -> int:
+        """Hang up on all clients of a kind (rtde, dashboard, script); the port goes on listening."""
+        clients = [client for client in self._clients if client.kind == kind]
+        for client in clients:
+            client.close(reset=reset)
+        return len(clients)
+
+    def close(self) -> None:
+        """Hang up and stop listening."""
+        for client in list(self._clients):
+            client.close()
+        for listener in self._listeners:
+            if listener in self._selector.get_map():
+                self._selector.unregister(listener)
+            listener.close()
+
+    def run(self, ended: Callable[[], bool]) -> None:
+        """Serve until `ended()`: it is asked once per control cycle."""
+        while not ended():
+            for key, _events in self._selector.select(max(0.0, self._next_s - time.monotonic())):
+                if not (self.frozen and isinstance(key.fileobj, (Client, socket.socket))):
+                    key.data()
+            if self.frozen:  # unread sockets stay ready: do not spin on them
+                time.sleep(self.robot.period_s)
+            self._run_due_cycles()
+
+    def _run_due_cycles(self) -> None:
+        period_s = self.robot.period_s
+        late_s = time.monotonic() - self._next_s
+        if late_s < 0.0:
+            return
+        due = int(late_s / period_s) + 1
+        self._next_s += due * period_s
+        if self.frozen:
+            return
+        cycles = min(due, CATCH_UP_CYCLES)
+        self.dropped_cycles += due - cycles
+        self.robot.skip(due - cycles)
+        first = self.robot.cycle + 1
+        for _ in range(cycles):
+            self.robot.tick()
+        self.robot.watch(due * period_s)
+        for client in list(self._clients):
+            client.flush()
+            if isinstance(client, RtdeClient):
+                client.sample(first, self.robot.cycle)

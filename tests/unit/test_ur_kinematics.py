@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from drivers.ur.kinematics import MODELS, Pose, forward, model_named
+
+# The constant tour: (number of the orientation, psi, q5, q6) in degrees, psi = q2 + q3 + q4.
+TOUR = [
+    (1, -90, 90, 45), (19, -180, 45, 90), (12, -180, -45, 90), (8, -180, -45, 0), (16, -180, -45, -90),
+    (14, -90, -90, -135), (5, -90, -90, -45), (9, -90, -90, 45), (2, -90, -90, 135), (4, -180, -45, 180),
+    (17, -180, 45, 180), (7, -180, 135, 180), (15, -180, 135, 90), (3, -180, 135, 0), (11, -180, 135, -90),
+    (20, -180, 45, -90), (18, -180, 45, 0), (10, -90, 90, -45), (6, -90, 90, -135), (24, 0, 135, -90),
+    (22, 0, 135, 0), (23, 0, 135, 90), (21, 0, 135, 180), (13, -90, 90, 135),
+]  # fmt: skip
+
+pose_lists = st.tuples(
+    *[st.floats(-2, 2)] * 3,
+    *[st.floats(-1.7, 1.7)] * 3,  # a rotation vector shorter than pi, so that it comes back as it was
+).map(list)
+
+
+def tour_q_deg(psi: float, q5: float, q6: float, q2: float = -100, q3: float = 60) -> list[float]:
+    return [45, q2, q3, psi - q2 - q3, q5, q6]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_tour_reaches_24_different_axis_parallel_orientations(model: str) -> None:
+    found = set()
+    for _, psi, q5, q6 in TOUR:
+        R = forward(MODELS[model], np.radians(tour_q_deg(psi, q5, q6))).R
+        assert np.abs(R - R.round()).max() < 1e-12
+        found.add(tuple(R.round().astype(int).ravel()))
+    assert len(found) == 24
+
+
+@pytest.mark.parametrize(
+    ("model", "centre_m"),
+    [("UR3e", (-0.01, -0.20, 0.56)), ("UR5e", (-0.09, -0.28, 0.87)), ("UR10e", (-0.14, -0.39, 1.19))],
+)
+def test_the_flange_circles_the_documented_centre(model: str, centre_m: tuple[float, float, float]) -> None:
+    p = [forward(MODELS[model], np.radians(tour_q_deg(psi, q5, q6))).p_m for _, psi, q5, q6 in TOUR]
+    assert np.abs((np.min(p, axis=0) + np.max(p, axis=0)) / 2 - centre_m).max() < 0.12
+
+
+def test_first_pose_of_the_tour_by_hand() -> None:
+    # R_01 is the identity in the paper's Fig. 3: the flange stands parallel to the base.
+    R = forward(MODELS["UR5e"], np.radians(tour_q_deg(-90, 90, 45))).R
+    assert np.allclose(R, np.eye(3), atol=1e-12)
+
+
+def test_stretched_ur5e_by_hand() -> None:
+    # All joints zero: the arm lies along -x, the wrist offset and the flange point to -y, wrist 2 hangs down.
+    pose = forward(MODELS["UR5e"], [0.0] * 6)
+    assert np.allclose(pose.p_m, [-0.425 - 0.3922, -0.1333 - 0.0996, 0.1625 - 0.0997], atol=1e-12)
+    assert np.allclose(pose.R @ [0, 0, 1], [0, -1, 0], atol=1e-12)
+
+
+@given(pose_lists, pose_lists)
+def test_taking_the_tcp_off_again_gives_the_flange(flange: list[float], tcp: list[float]) -> None:
+    X_base_flange, X_flange_tcp = Pose.from_ur(flange), Pose.from_ur(tcp)
+    back = X_base_flange @ X_flange_tcp @ X_flange_tcp.inverse()
+    assert np.allclose(back.p_m, flange[:3], atol=1e-12)
+    assert np.allclose(Rotation.from_matrix(back.R).as_rotvec(), flange[3:], atol=1e-7)
+
+
+@given(pose_lists, st.tuples(*[st.floats(-1, 1)] * 3))
+def test_a_pose_moves_a_point_like_a_rotation_and_a_shift(pose: list[float], point: tuple[float, float, float]) -> None:
+    p = np.array(point)
+    moved = (Pose.from_ur(pose) @ Pose(np.eye(3), p)).p_m
+    assert np.allclose(moved, Rotation.from_rotvec(pose[3:]).apply(p) + pose[:3], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("told", "major", "name"),
+    [
+        ("UR5", 5, "UR5e"),
+        ("UR5", 3, "UR5"),
+        ("ur5e", 5, "UR5e"),
+        ("UR10 \n", 5, "UR10e"),
+        ("UR30", 5, "UR30"),
+        ("UR99", 5, None),
+    ],
+)
+def test_model_names(told: str, major: int, name: str | None) -> None:
+    assert model_named(told, major) == name

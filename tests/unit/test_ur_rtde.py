@@ -1,0 +1,191 @@
+import os
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.errors import ConnectError, DeviceTimeout, ProtocolError, StreamBroken
+from drivers.ur import rtde
+
+# Real bytes of an e-Series controller answering, and of a client asking.
+ASK_PROTOCOL, ANSWER_PROTOCOL = bytes.fromhex("0005560002"), bytes.fromhex("00045601")
+ASK_VERSION = bytes.fromhex("000376")
+ANSWER_VERSION = bytes.fromhex("001376 00000005 0000000f 00000000 00000001")
+ASK_START, ANSWER_START = bytes.fromhex("000353"), bytes.fromhex("00045301")
+ANSWER_OUTPUTS = bytes.fromhex("005b4f01") + (
+    b"DOUBLE,UINT32,UINT32,UINT32,INT32,INT32,INT32,DOUBLE,DOUBLE,DOUBLE,DOUBLE,DOUBLE,DOUBLE"
+)
+
+
+def test_requests_are_the_documented_bytes() -> None:
+    assert rtde.encode(rtde.REQUEST_PROTOCOL_VERSION, b"\x00\x02") == ASK_PROTOCOL
+    assert rtde.encode(rtde.GET_CONTROLLER_VERSION) == ASK_VERSION
+    assert rtde.encode(rtde.START) == ASK_START
+    setup = rtde.encode_setup_outputs(500.0, ("timestamp", "robot_status_bits"))
+    assert setup == bytes.fromhex("0026 4f 407f400000000000") + b"timestamp,robot_status_bits"
+
+
+def test_answers_are_read_from_the_documented_bytes() -> None:
+    buffer = bytearray(ANSWER_PROTOCOL + ANSWER_VERSION + ANSWER_OUTPUTS + ANSWER_START)
+    assert rtde.take_package(buffer) == (rtde.REQUEST_PROTOCOL_VERSION, b"\x01")
+    kind, version = rtde.take_package(buffer) or (0, b"")
+    assert kind == rtde.GET_CONTROLLER_VERSION
+    assert rtde.decode_version(version) == (5, 15, 0, 1)
+    kind, outputs = rtde.take_package(buffer) or (0, b"")
+    recipe = rtde.Recipe.decode(outputs)
+    assert (kind, recipe.id, len(recipe.types)) == (rtde.SETUP_OUTPUTS, 1, 13)
+    assert rtde.take_package(buffer) == (rtde.START, b"\x01")
+    assert rtde.take_package(buffer) is None
+
+    sample = rtde.encode(rtde.DATA, b"\x01" + struct.pack(">dIIIiii6d", 12.5, 3, 1, 2, 1, -7, 0, *range(6)))
+    assert len(sample) == 84  # as documented for this recipe
+    kind, data = rtde.take_package(bytearray(sample)) or (0, b"")
+    assert kind == rtde.DATA
+    assert recipe.unpack(data) == [(12.5,), (3,), (1,), (2,), (1,), (-7,), (0,), *((float(k),) for k in range(6))]
+
+
+@given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=80)), max_size=6), st.integers(1, 40))
+def test_packages_survive_any_cut_of_the_stream(packages: list[tuple[int, bytes]], step: int) -> None:
+    stream = b"".join(rtde.encode(kind, payload) for kind, payload in packages)
+    buffer, found = bytearray(), []
+    for at in range(0, len(stream), step):
+        buffer += stream[at : at + step]
+        while (package := rtde.take_package(buffer)) is not None:
+            found.append(package)
+    assert found == packages
+    assert not buffer
+
+
+@given(st.binary(max_size=120))
+def test_decoding_is_total(data: bytes) -> None:
+    buffer = bytearray(data)
+    try:
+        while rtde.take_package(buffer) is not None:
+            pass
+        recipe = rtde.Recipe.decode(data)
+        recipe.unpack(data)
+    except ProtocolError:
+        pass
+    try:
+        rtde.decode_version(data)
+    except ProtocolError:
+        assert len(data) != 16
+
+
+class Server:
+    """A controller that knows only the TCP offset, and answers what `answer` says."""
+
+    host = f"127.83.{os.getpid() % 251}.1"  # its own loopback address: the port is fixed
+
+    def __init__(self, answer: Callable[[bytes], bytes]) -> None:
+        self._answer = answer
+        self._listener = socket.create_server((self.host, rtde.PORT))
+        self.client: socket.socket | None = None
+        self.started = threading.Event()
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        try:
+            self.client, _ = self._listener.accept()
+            while request := self.client.recv(4096):
+                self.client.sendall(self._answer(request))
+                if request == ASK_START:
+                    self.started.set()
+        except OSError:
+            pass
+
+    def tell(self, t_s: float, offset: list[float]) -> None:
+        assert self.started.wait(5)
+        assert self.client is not None
+        self.client.sendall(rtde.encode(rtde.DATA, b"\x01" + struct.pack(">7d", t_s, *offset)))
+
+    def close(self) -> None:
+        for sock in (self._listener, self.client):
+            if sock is not None:
+                with suppress(OSError):
+                    sock.shutdown(socket.SHUT_RDWR)
+                sock.close()
+        self._thread.join(5)
+
+
+@contextmanager
+def served(types: bytes = b"DOUBLE,VECTOR6D", **replace: bytes) -> Iterator[Server]:
+    answers = {"V": ANSWER_PROTOCOL, "v": ANSWER_VERSION, "S": ANSWER_START}
+    answers |= {"O": rtde.encode(rtde.SETUP_OUTPUTS, b"\x01" + types)} | replace
+    server = Server(lambda request: answers[chr(request[2])])
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def test_the_newest_offset_is_told_with_its_time() -> None:
+    with served() as server:
+        reader = rtde.TcpOffsetReader(server.host)
+        try:
+            reader.open(timeout_s=2.0)
+            assert reader.supported
+            assert reader.version == (5, 15, 0, 1)
+            server.tell(1.0, [0.0] * 6)
+            server.tell(2.0, [0.1, 0, 0.2, 0, 0, 1])
+            assert reader.offset(since_s=1.5, timeout_s=2.0) == (2.0, (0.1, 0, 0.2, 0, 0, 1))
+            with pytest.raises(DeviceTimeout, match="TCP offset"):
+                reader.offset(since_s=2.001, timeout_s=0.05)
+        finally:
+            reader.close()
+            reader.close()
+
+
+def test_a_lost_connection_is_raised_at_the_consumer() -> None:
+    with served() as server:
+        reader = rtde.TcpOffsetReader(server.host)
+        reader.open(timeout_s=2.0)
+        server.tell(1.0, [0.0] * 6)
+        reader.offset(since_s=1.0, timeout_s=2.0)
+        server.close()
+        for _ in range(2):
+            with pytest.raises(StreamBroken, match="open the arm again"):
+                reader.offset(since_s=5.0, timeout_s=2.0)
+        reader.close()
+
+
+def test_an_old_controller_is_still_greeted() -> None:
+    with served(b"DOUBLE,NOT_FOUND") as server:
+        reader = rtde.TcpOffsetReader(server.host)
+        reader.open(timeout_s=2.0)
+        assert not reader.supported
+        assert reader.version[:2] == (5, 15)
+        reader.close()
+
+
+@pytest.mark.parametrize(
+    ("replace", "says"),
+    [
+        ({"V": b""}, "did not answer within 0.2 s"),
+        ({"V": bytes.fromhex("00045600")}, "protocol version 2 is refused"),
+        ({"V": b"HTTP/1.1 400 Bad Request\r\n"}, "did not answer"),
+        ({"V": b"\x00\x01\x00"}, "does not speak RTDE"),
+        ({"S": bytes.fromhex("00045300")}, "does not start"),
+        ({"O": rtde.encode(rtde.SETUP_OUTPUTS, b"\x01DOUBLE,DOUBLE")}, "DOUBLE, DOUBLE"),
+    ],
+)
+def test_whoever_does_not_speak_rtde_is_refused_in_time(replace: dict[str, bytes], says: str) -> None:
+    with served(**replace) as server:
+        reader = rtde.TcpOffsetReader(server.host)
+        t0 = time.monotonic()
+        with pytest.raises(ConnectError, match=says):
+            reader.open(timeout_s=0.2)
+        reader.close()
+        assert time.monotonic() - t0 < 1.0
+
+
+def test_nobody_there() -> None:
+    with pytest.raises(ConnectError, match=r"cannot be reached .*switched on"):
+        rtde.TcpOffsetReader("127.83.7.2").open(timeout_s=0.5)
