@@ -168,6 +168,3 @@ class RobotArm(_Device):
     @abstractmethod
     def stop(self) -> None:
         """Stop the arm. From any thread, any time; does nothing without control."""
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

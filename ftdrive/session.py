@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -67,7 +68,7 @@ def calibrate_cell(
     description : mapping
         Goes into run.json beside the configuration, the devices and the tour.
     """
-    with build_sensor(cell) as sensor, build_arm(cell) as arm:
+    with build_sensor(cell) as sensor, closing(build_arm(cell)) as arm:
         arm.open(control=True)
         plan = _plan(cell, arm, sensor)
         confirm(plan)

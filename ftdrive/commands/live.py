@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -100,7 +100,7 @@ def live(
 
 @contextmanager
 def _live_looks(cell: CellConfig, calibration: CalibrationResult) -> Iterator[Iterator[Look]]:
-    with build_sensor(cell) as sensor, build_arm(cell) as arm:
+    with build_sensor(cell) as sensor, closing(build_arm(cell)) as arm:
         arm.open()
         _refuse_other_devices(calibration, {"arm": arm.identify(), "sensor": sensor.identify()})
 
