@@ -15,7 +15,7 @@ from ftdrive.session import Plan
 
 Array = NDArray[np.float64]
 
-talk = Console(stderr=True, highlight=False)
+talk = Console(stderr=True, highlight=False, soft_wrap=True)
 """Everything said to a person goes to stderr; data goes to stdout."""
 
 _MARK = {"good": "[bold green]GOOD[/]", "usable": "[bold yellow]USABLE[/]", "rejected": "[bold red]REJECTED[/]"}
@@ -88,12 +88,12 @@ def print_result(
 
 # Label, factor from the file's unit to the screen's, unit on the screen, key, decimals.
 _ROWS: Sequence[tuple[str, float, str, str, int]] = (
-    ("mass", 1.0, "kg", "mass_kg", 4),
+    ("mass", 1.0, "kg", "mass_kg", 5),
     ("centre of mass", 1e3, "mm", "p_sensor_com_m", 2),
-    ("force bias", 1.0, "N", "force_bias_N", 3),
-    ("torque bias", 1.0, "N·m", "torque_bias_Nm", 4),
+    ("force bias", 1.0, "N", "force_bias_N", 4),
+    ("torque bias", 1.0, "N·m", "torque_bias_Nm", 5),
     ("flange to sensor", 180 / np.pi, "deg", "R_flange_sensor", 3),
-    ("gravity in base", 1.0, "N", "gravity_force_base_N", 3),
+    ("gravity in base", 1.0, "N", "gravity_force_base_N", 4),
     ("base tilt alpha", 180 / np.pi, "deg", "tilt_alpha_rad", 3),
     ("base tilt beta", 180 / np.pi, "deg", "tilt_beta_rad", 3),
 )

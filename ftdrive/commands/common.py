@@ -63,12 +63,12 @@ def progress_bar() -> Iterator[tuple[Callable[[RoutineProgress], None], Callable
     try:
         yield on_progress, on_run
     except BaseException:
-        bar.stop()
         for run in runs:
+            bar.stop()
             poses = len(list((run.folder / "poses").glob("*.npz")))
             talk.print(f"{poses} poses are kept in {run.folder}")
         raise
-    finally:
+    if runs:
         bar.stop()
 
 

@@ -116,7 +116,7 @@ def test_bad_csv_gets_one_clear_sentence(case: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "word"),
     [
-        ('{"format": "ftdrive.dataset/9"}', "ftdrive.dataset/9"),
+        ('{"format": "ftdrive.dataset/9"}', "version '9' of ftdrive.dataset"),
         ('{"format": "something/1"}', "something/1"),
         ("", "empty"),
         ('{"format": "ftdr', "JSON"),
@@ -139,4 +139,4 @@ def test_a_folder_that_is_no_run_and_a_run_of_another_version(tmp_path: Path) ->
     (tmp_path / "run.json").write_text('{"format": "ftdrive.run/7"}')
     outcome = solve(tmp_path)
     assert outcome.returncode == 6
-    assert "ftdrive.run/7" in outcome.stderr
+    assert "version '7' of ftdrive.run" in outcome.stderr
