@@ -174,7 +174,7 @@ class Robot:
             try:
                 if not self._program.step():
                     self.stop_program("ended")
-            except (ScriptError, MotionError) as error:
+            except (ScriptError, MotionError, ArithmeticError, ValueError) as error:
                 self.stop_program(f"run-time error: {error}")
         before = self.arm.q
         try:
@@ -312,7 +312,6 @@ class Robot:
     def power_off(self) -> None:
         """Stop the program, brake, cut the power."""
         self.stop_program("power off")
-        self.arm.paused = False  # let the arm run out instead of freezing in mid-motion
         self.robot_mode = RobotMode.POWER_OFF
         self._later.clear()
 

@@ -80,6 +80,8 @@ def test_movej_keeps_every_joint_below_its_own_limit() -> None:
 def test_a_slow_slider_stretches_the_motion() -> None:
     arm = Arm(DH, HOME)
     arm.speed_fraction = 0.5
+    for _ in range(100):
+        arm.step(DT)
     arm.start(JointMove(DH, shifted(HOME, 5, 1.0), 1.0, 2.0), "main")
     assert run(arm) == pytest.approx(2 * 1.5, abs=3 * DT)
 
@@ -188,12 +190,11 @@ def test_the_set_point_never_jumps_whatever_is_commanded(order: list[tuple[str, 
         elif what == "release":
             arm.release()
         elif what == "slow":
-            arm.speed_fraction = 0.7
+            arm.speed_fraction = rng.uniform(0.0, 1.0)
         else:
             arm.paused = what == "pause"
         for _ in range(steps):
             before, before_rate = arm.q, arm.qd
             arm.step(DT)
             assert max(abs(a - b) for a, b in zip(arm.q, before, strict=True)) <= 3.0 * DT
-            # the slider jumps by 0.3 of the speed; everything else changes gently
-            assert max(abs(a - b) for a, b in zip(arm.qd, before_rate, strict=True)) <= 0.8
+            assert max(abs(a - b) for a, b in zip(arm.qd, before_rate, strict=True)) <= 0.1

@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -360,6 +361,22 @@ def test_wrong_packages_are_noted_and_do_no_harm(fresh: Station) -> None:
     assert len(fresh.ask(do="state")["bad_inputs"]) == 3
 
 
+def test_garbage_on_any_port_harms_nobody(fresh: Station) -> None:
+    noise = Random(1)
+    for port in (29999, 30002, 30003, 30004):
+        for _ in range(20):
+            with socket.create_connection((fresh.host, port), 2.0) as client:
+                client.sendall(noise.randbytes(300) + b"\n")
+    with RtdeSocket(fresh.host) as client:
+        client.ask("I", b"input_int_register_0," + b",".join(b"input_double_register_%d" % i for i in range(6)))
+        with socket.create_connection((fresh.host, 30003), 2.0) as script:
+            script.sendall(b"def rtde_control():\nend\n")
+            wait_for_state(fresh, "runtime_state", "PLAYING")
+        client.send_package("U", b"\x01" + struct.pack(">i6d", 29, *[math.nan] * 6))
+        wait_for_state(fresh, "runtime_state", "STOPPED")
+        assert "nan" in fresh.ask(do="state")["events"][-1]
+
+
 def test_rate_follows_the_request_and_the_real_clock(station: Station) -> None:
     with RtdeSocket(station.host) as client:
         client.ask("O", struct.pack(">d", 100.0) + b"timestamp")
@@ -591,7 +608,7 @@ def test_sensors_share_the_station() -> None:
         for path in (can["channel"], serial["port"]):
             os.close(os.open(path, os.O_RDWR | os.O_NOCTTY))
         assert cell.ask(do="unplug", device="sensor") == {"done": "unplug", "devices": ["can", "serial"]}
-        with pytest.raises(OSError):
+        with pytest.raises(OSError, match=can["channel"]):
             os.open(can["channel"], os.O_RDWR | os.O_NOCTTY)
     finally:
         begun = time.monotonic()
