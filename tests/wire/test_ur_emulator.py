@@ -96,10 +96,10 @@ def fresh() -> Iterator[Station]:
 
 
 def run_client(scenario: str, station: Station, timeout_s: float = 30.0) -> dict[str, Any]:
-    """Run a scenario of ur_client.py in its own process and hand its questions to the station."""
+    """Run a scenario of ur_emulator_client.py in its own process and hand its questions to the station."""
     pytest.importorskip("rtde_control")
     client = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("ur_client.py")), scenario, station.host],
+        [sys.executable, str(Path(__file__).with_name("ur_emulator_client.py")), scenario, station.host],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""Scenarios with the unmodified ur_rtde clients, one per process: ``python ur_client.py SCENARIO HOST``.
+"""Scenarios with the unmodified ur_rtde clients, one per process: ``python ur_emulator_client.py SCENARIO HOST``.
 
 The client may hang or crash (it is C++ and holds the interpreter's lock in its constructors), so it never runs in the
 test process. A scenario prints one line ``@result {...}``; on the way it may ask the station for something with a line
