@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers._stream import StreamingSensor
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from drivers.interfaces import ForceTorqueSensor
 from drivers.registry import sensor_from_url
@@ -72,7 +73,10 @@ class Emulator:
 
     def sensor(self, options: str = "", sign: int = 1) -> ForceTorqueSensor:
         query = "&".join(filter(None, ["interface=slcan" if self.wire == "can" else "", options]))
-        return sensor_from_url(f"ati-{self.wire}://{self.path}?{query}".rstrip("?"), sign=sign)
+        sensor = sensor_from_url(f"ati-{self.wire}://{self.path}?{query}".rstrip("?"), sign=sign)
+        assert isinstance(sensor, StreamingSensor)
+        sensor._stale_after_s = 0.3  # emulator and driver share a busy machine
+        return sensor
 
     def unplug(self) -> None:
         assert self.laboratory.tell("unplug", self._number) == "done"
