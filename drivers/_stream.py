@@ -143,12 +143,13 @@ class StreamingSensor(ForceTorqueSensor):
             self._check()
             start_ns = time.monotonic_ns()
             end_ns = start_ns + round(duration_s * 1e9)
+            before = self._received
             self._taps.append(blocks)
             try:
                 while self._newest_ns < end_ns:
                     self._news.wait(max(0.0, self._stale_after_s - self._age_s()) + 1e-3)
                     self._check()
-                    if blocks and sum(map(len, blocks)) > self._max_collect_samples:
+                    if self._received - before > self._max_collect_samples:
                         raise StreamBroken(
                             f"{self.name}: more than {self._max_collect_samples} samples in one collect of "
                             f"{duration_s} s; collect in shorter pieces"

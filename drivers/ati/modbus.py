@@ -58,6 +58,10 @@ CRITICAL = 0x3EFE
 _EXCEPTIONS = {1: "illegal function", 2: "illegal register", 3: "illegal value", 4: "device failure or locked"}
 
 
+class Refused(ProtocolError):
+    """The device understood a request and refused it; asking again does not help."""
+
+
 def _crc_entry(byte: int) -> int:
     for _ in range(8):
         byte = byte >> 1 ^ (0xA001 if byte & 1 else 0)
@@ -114,7 +118,7 @@ def check_reply(request: bytes, reply: bytes) -> bytes:
     Raises
     ------
     ProtocolError
-        Damaged, not the reply to this request, or a refusal.
+        Damaged, not the reply to this request, or a refusal (`Refused`).
     """
     text = reply.hex(" ")
     if len(reply) < 5 or crc16(reply[:-2]) != int.from_bytes(reply[-2:], "little"):
@@ -122,7 +126,7 @@ def check_reply(request: bytes, reply: bytes) -> bytes:
     function = request[1]
     if reply[0] == ADDRESS and reply[1] == function | 0x80 and len(reply) == 5:
         reason = _EXCEPTIONS.get(reply[2], "unknown reason")
-        raise ProtocolError(f"the sensor refused function 0x{function:02X}: {reply[2]} ({reason})")
+        raise Refused(f"the sensor refused function 0x{function:02X}: {reply[2]} ({reason})")
     if reply[0] != ADDRESS or reply[1] != function or len(reply) != reply_size(request):
         raise ProtocolError(f"reply {text} does not belong to request {request.hex(' ')}")
     payload = reply[2:-2]
@@ -135,9 +139,7 @@ def check_reply(request: bytes, reply: bytes) -> bytes:
             raise ProtocolError(f"reply {text} confirms other registers than request {request.hex(' ')}")
         return b""
     if payload != b"\x01":
-        raise ProtocolError(
-            f"the sensor refused command 0x{function:02X} 0x{request[2]:02X} (answer 0x{payload.hex()})"
-        )
+        raise Refused(f"the sensor refused command 0x{function:02X} 0x{request[2]:02X} (answer 0x{payload.hex()})")
     return b""
 
 

@@ -119,9 +119,11 @@ class AtiSerialSensor(StreamingSensor):
             self._lost += missed
             self._last_good_ns = None
             self._restarts = 0
-        self._seq += settled
-        self._malformed += settled - len(gauges)
-        self._lost += settled - len(gauges)
+        # what lies behind a slip has been sent, and is gone
+        done = len(records.intact) if slipped else settled
+        self._seq += done
+        self._malformed += done - len(gauges)
+        self._lost += done - len(gauges)
         if slipped:
             self._slipped = True
             self._last_good_ns = self._last_good_ns or t_host_ns
@@ -190,18 +192,18 @@ class AtiSerialSensor(StreamingSensor):
         return int.from_bytes(self._exchange(modbus.read_registers(modbus.STATUS, 1)), "big")
 
     def _start_stream(self) -> None:
-        for _ in range(_ATTEMPTS - 1):
-            with contextlib.suppress(DeviceTimeout, ProtocolError):
+        for attempt in range(1, _ATTEMPTS + 1):
+            try:
                 self._exchange(modbus.START)
                 break
-            self._jam()  # perhaps only the reply was lost
-        else:
-            self._exchange(modbus.START)
+            except (DeviceTimeout, ProtocolError) as exc:
+                if attempt == _ATTEMPTS or isinstance(exc, modbus.Refused):
+                    raise
+                self._jam()  # perhaps only the reply was lost
         self._buffer.clear()
 
     def _restart(self) -> None:
         self._restarts += 1
-        self._malformed += 3
         if self._restarts > _MAX_RESTARTS:
             raise ProtocolError(
                 f"{self.name}: no intact record after {_MAX_RESTARTS} restarts of the stream; check parity and wiring"
@@ -221,9 +223,12 @@ class AtiSerialSensor(StreamingSensor):
     def _ask(self, request: bytes) -> bytes:
         """Exchange with retries; not for the start of the stream."""
         for _ in range(_ATTEMPTS - 1):
-            with contextlib.suppress(DeviceTimeout, ProtocolError):
+            try:
                 return self._exchange(request)
-            self._read(_BATCH_BYTES)  # a late reply passes
+            except modbus.Refused:
+                raise
+            except (DeviceTimeout, ProtocolError):
+                self._read(_BATCH_BYTES)  # a late reply passes
         return self._exchange(request)
 
     def _exchange(self, request: bytes) -> bytes:
@@ -236,7 +241,7 @@ class AtiSerialSensor(StreamingSensor):
         try:
             return modbus.check_reply(request, reply)
         except ProtocolError as exc:
-            raise ProtocolError(f"{self.name}: {exc}") from exc
+            raise type(exc)(f"{self.name}: {exc}") from exc
 
     def _read_exactly(self, size: int, deadline: float) -> bytes:
         data = b""

@@ -63,7 +63,9 @@ class CanPeer:
         self._thread = threading.Thread(target=self._run)
 
     def sensor(self, slot: int = 0) -> AtiCanSensor:
-        return AtiCanSensor(self.channel, interface="virtual", slot=slot)
+        sensor = AtiCanSensor(self.channel, interface="virtual", slot=slot)
+        sensor._stale_after_s = 0.3  # peer and driver share a busy machine
+        return sensor
 
     def __enter__(self) -> Self:
         self._bus = can.Bus(self.channel, interface="virtual", ignore_config=True)
@@ -148,11 +150,13 @@ def test_can_lost_half_is_a_lost_sample_and_no_wrong_one() -> None:
 
 
 def test_can_sensor_that_stops_answering_times_out() -> None:
-    with CanPeer({"200": [GAUGES, GAUGES, []]}) as peer, peer.sensor() as sensor:
-        with pytest.raises(DeviceTimeout, match="silent"):
-            sensor.collect(1.0)
-        with pytest.raises(DeviceTimeout, match="polls in a row"):
-            sensor.latest(timeout_s=1.0)
+    script = [GAUGES, GAUGES, []]
+    with (
+        CanPeer({"200": script}) as peer,
+        peer.sensor() as sensor,
+        pytest.raises(DeviceTimeout, match="5 polls in a row"),
+    ):
+        sensor.collect(1.0)
 
 
 def test_can_nobody_there() -> None:
@@ -291,7 +295,9 @@ class SerialPeer:
         self._thread = threading.Thread(target=self._run)
 
     def sensor(self) -> AtiSerialSensor:
-        return AtiSerialSensor(self.path)
+        sensor = AtiSerialSensor(self.path)
+        sensor._stale_after_s = 0.3  # peer and driver share a busy machine
+        return sensor
 
     def __enter__(self) -> Self:
         self._master, self._slave = os.openpty()
@@ -365,12 +371,12 @@ def test_serial_slipped_stream_is_restarted() -> None:
         peer.once = b"\x77"
         samples = sensor.collect(0.3)
         assert (samples.counts == [100, -200, 300, -400, 500, -600]).all()
-        assert peer.requests[len(SERIAL_START_UP) :] == [JAM, STATUS, START]
-        jump = int((samples.seq[1:] - samples.seq[:-1]).max())
+        after = peer.requests[len(SERIAL_START_UP) :]
+        assert (after[0], after[-1], set(after)) == (JAM, START, {JAM, STATUS, START})
+        gaps = int((samples.seq[1:] - samples.seq[:-1] - 1).sum())
         health = sensor.health()
-        assert jump > 50  # some 30 ms at 7 kHz
+        assert 50 < gaps <= health.lost  # some 30 ms at 7 kHz
         assert health.malformed >= 3
-        assert health.lost == pytest.approx(jump, abs=40)
 
 
 def test_serial_stream_that_never_makes_sense_ends() -> None:
@@ -434,6 +440,13 @@ def test_serial_lost_start_reply_is_recovered_by_a_jam() -> None:
 def test_serial_refusals_end_the_start_up(request_: str, reply: str, message: str) -> None:
     with SerialPeer({request_: [bytes.fromhex(reply)]}) as peer, pytest.raises(ConnectError, match=message):
         peer.sensor().open()
+
+
+def test_serial_refusal_is_not_asked_again() -> None:
+    with SerialPeer({START: [bytes.fromhex("0A460063A2")]}) as peer:
+        with contextlib.suppress(ConnectError):
+            peer.sensor().open()
+        assert peer.requests.count(START) == 1
 
 
 def test_serial_port_that_is_not_there() -> None:
