@@ -56,7 +56,7 @@ class StreamingSensor(ForceTorqueSensor):
     """
 
     def __init__(
-        self, name: str, *, sign: int = 1, stale_after_s: float = 0.25, max_collect_samples: int = 1_000_000
+        self, name: str, *, sign: int = 1, stale_after_s: float = 0.3, max_collect_samples: int = 1_000_000
     ) -> None:
         if sign not in {1, -1}:
             raise ValueError(f"sign is {sign}; it is 1, or -1 for a sensor that reports the reaction")

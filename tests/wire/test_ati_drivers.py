@@ -75,7 +75,6 @@ class Emulator:
         query = "&".join(filter(None, ["interface=slcan" if self.wire == "can" else "", options]))
         sensor = sensor_from_url(f"ati-{self.wire}://{self.path}?{query}".rstrip("?"), sign=sign)
         assert isinstance(sensor, StreamingSensor)
-        sensor._stale_after_s = 0.3  # emulator and driver share a busy machine
         return sensor
 
     def unplug(self) -> None:
