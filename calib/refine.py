@@ -141,7 +141,11 @@ def _lowest(R_base_flange: Array, wrench: Array, wrench_cov: Array, starts: Sequ
     found = [_descend(R_base_flange, wrench, whiten, start) for start in starts]
     parameters, information, chi2, settled = min(found, key=lambda end: end[2])
     if not settled:
-        raise NotObservable(f"the fit has not settled in {MAX_STEPS} steps: the poses hardly constrain it, add others.")
+        weight_N = np.linalg.norm(parameters.gravity_force_base_N)
+        raise NotObservable(
+            f"the fit has not settled in {MAX_STEPS} steps, at a weight of {weight_N:.2g} N: "
+            "hang something heavier on the sensor, or add poses with other orientations."
+        )
     others = (c for p, _, c, _ in found if _angle(p.R_flange_sensor, parameters.R_flange_sensor) > SAME_ROTATION_RAD)
     return Fit(parameters, information, chi2, wrench_cov, min(others, default=float("inf")))
 
