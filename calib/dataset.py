@@ -120,7 +120,7 @@ class CalibrationDataset:
         try:
             return cls.from_dict(read_object(path, BadDataset))
         except BadDataset as exc:
-            raise _in_file(path, exc) from exc
+            raise BadDataset(f"{path.name}: {exc}") from exc
 
     def sha256(self) -> str:
         """Hash the content, independent of spacing and order of fields in the file."""
@@ -153,7 +153,7 @@ def read_csv(
     try:
         return _read_csv(path, orientation)
     except BadDataset as exc:
-        raise _in_file(path, exc) from exc
+        raise BadDataset(f"{path.name}: {exc}") from exc
 
 
 def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
@@ -208,11 +208,6 @@ def _table(path: Path) -> list[list[str]]:
     if not rows:
         raise BadDataset("the file is empty: nothing to calibrate from.")
     return rows
-
-
-def _in_file(path: Path, exc: BadDataset) -> BadDataset:
-    text = str(exc)
-    return exc if text.startswith(path.name) else BadDataset(f"{path.name}: {text}")
 
 
 def _shaped(name: str, value: object, shape: tuple[int, ...]) -> Array:

@@ -57,19 +57,19 @@ def _refuse_existing(path: Path) -> None:
 
 
 def read_object(path: Path, error: type[CalibError]) -> dict[str, Any]:
-    """Read a JSON file that holds one object; raise `error` in one sentence when it does not."""
+    """Read a JSON file that holds one object; raise `error`, one sentence without the file's name, when it does not."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as exc:
-        raise error(f"{path.name} is not a text file (byte {exc.start} is not UTF-8): is it the right file?") from exc
+        raise error(f"this is not a text file (byte {exc.start} is not UTF-8): is it the right file?") from exc
     if not text.strip():
-        raise error(f"{path.name} is empty: the run that wrote it left nothing to read.")
+        raise error("the file is empty: the run that wrote it left nothing to read.")
     try:
         document = json.loads(text)
     except ValueError as exc:
-        raise error(f"{path.name} is not valid JSON ({exc}): the file is damaged or of another kind.") from exc
+        raise error(f"this is not valid JSON ({exc}): the file is damaged or of another kind.") from exc
     if not isinstance(document, dict):
-        raise error(f"{path.name} holds a JSON {type(document).__name__}, not an object: is it the right file?")
+        raise error(f"the file holds a JSON {type(document).__name__}, not an object: is it the right file?")
     return document
 
 

@@ -75,7 +75,8 @@ def is_stationary(wrench: Array) -> bool:
     """Tell whether the two halves of a dwell have the same mean in every channel, as far as noise allows.
 
     Their difference is compared with its standard error from 20 batch means, ten in each half, so that filtered noise
-    is judged rightly. Pure noise fails in less than 1 % of dwells.
+    is judged rightly. Pure noise fails in less than 1 % of dwells. A jolt much shorter than half the dwell widens the
+    standard error as much as the difference and passes.
 
     Parameters
     ----------

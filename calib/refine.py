@@ -14,7 +14,8 @@ MAX_STEPS = 100
 MOST_STARTS = 6
 SAME_ROTATION_RAD = np.deg2rad(1.0)
 LEVER_M = 0.025  # usual ratio of torque noise to force noise
-LEVER_BOUNDS_M = (1e-3, 1.0)  # what any sensor has; keeps four or five poses from explaining their torques exactly
+LEVER_BOUNDS_M = (1e-3, 1.0)  # what any sensor has
+FEW_POSES = 6  # fewer cannot tell force noise from torque noise: the usual ratio is taken
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +36,8 @@ def refine(R_base_flange: Array, wrench: Array, wrench_cov: Array | None, starts
     """Fit all 15 parameters, from the given starts and from every minimum of the force equations.
 
     Without a covariance one standard deviation for all forces and one for all torques are estimated from the
-    residuals by restricted maximum likelihood: sum of squares divided by the residual degrees of freedom of each group.
+    residuals by restricted maximum likelihood: sum of squares divided by the residual degrees of freedom of each
+    group; from fewer than six poses a single one for both.
 
     Parameters
     ----------
@@ -48,33 +50,41 @@ def refine(R_base_flange: Array, wrench: Array, wrench_cov: Array | None, starts
     Raises
     ------
     NotObservable
-        No start led to a minimum.
+        The lowest point reached is not a minimum.
     """
     starts = [*starts, *force_only_minima(R_base_flange, wrench)]
     if wrench_cov is not None:
         return _lowest(R_base_flange, wrench, wrench_cov, starts)
     n = len(wrench)
-    least_N = 1e-12 * float(np.abs(wrench[:, :3]).max())
-    sigma_N, sigma_Nm = 1.0, LEVER_M
+    sigma = 1.0, LEVER_M
     for _ in range(50):
-        fit = _lowest(R_base_flange, wrench, np.tile(_white(sigma_N, sigma_Nm), (n, 1, 1)), starts)
-        residuals = wrench - predict(fit.parameters, R_base_flange)
-        J = jacobian(fit.parameters, R_base_flange)
-        explained = J @ np.linalg.pinv(fit.information, hermitian=True) @ np.swapaxes(J, 1, 2)
-        leverage = np.diagonal(explained, axis1=1, axis2=2).sum(axis=0)
-        before = sigma_N, sigma_Nm
-        sigma_N = np.sqrt((residuals[:, :3] ** 2).sum() / (3 * n - leverage[:3].sum() / sigma_N**2))
-        sigma_Nm = np.sqrt((residuals[:, 3:] ** 2).sum() / (3 * n - leverage[3:].sum() / sigma_Nm**2))
-        sigma_N = max(float(sigma_N), least_N)
-        sigma_Nm = float(np.clip(sigma_Nm, LEVER_BOUNDS_M[0] * sigma_N, LEVER_BOUNDS_M[1] * sigma_N))
-        if np.allclose(before, (sigma_N, sigma_Nm), rtol=1e-3, atol=0):
+        fit = _lowest(R_base_flange, wrench, np.tile(_white(*sigma), (n, 1, 1)), starts)
+        before, sigma = sigma, _residual_sigma(fit, R_base_flange, wrench)
+        if np.allclose(before, sigma, rtol=1e-3, atol=0):
             break
         starts = [fit.parameters, *starts]
-    return _lowest(R_base_flange, wrench, np.tile(_white(sigma_N, sigma_Nm), (n, 1, 1)), starts)
+    return fit
 
 
 def _white(sigma_N: float, sigma_Nm: float) -> Array:
     return np.diag(np.repeat([sigma_N**2, sigma_Nm**2], 3))
+
+
+def _residual_sigma(fit: Fit, R_base_flange: Array, wrench: Array) -> tuple[float, float]:
+    """One step of restricted maximum likelihood for the noise of forces and torques."""
+    n = len(wrench)
+    residuals = wrench - predict(fit.parameters, R_base_flange)
+    force, torque = (residuals[:, :3] ** 2).sum(), (residuals[:, 3:] ** 2).sum()
+    least_N = 1e-12 * float(np.abs(wrench[:, :3]).max())  # of exact data
+    if n < FEW_POSES:
+        sigma_N = max(float(np.sqrt((force + torque / LEVER_M**2) / (6 * n - 15))), least_N)
+        return sigma_N, LEVER_M * sigma_N
+    J = jacobian(fit.parameters, R_base_flange)
+    explained = J @ np.linalg.pinv(fit.information, hermitian=True) @ np.swapaxes(J, 1, 2)
+    leverage = np.diagonal(explained, axis1=1, axis2=2).sum(axis=0) / np.diag(fit.wrench_cov[0])
+    sigma_N = max(float(np.sqrt(force / (3 * n - leverage[:3].sum()))), least_N)
+    sigma_Nm = float(np.sqrt(torque / (3 * n - leverage[3:].sum())))
+    return sigma_N, float(np.clip(sigma_Nm, LEVER_BOUNDS_M[0] * sigma_N, LEVER_BOUNDS_M[1] * sigma_N))
 
 
 def force_only_minima(R_base_flange: Array, wrench: Array) -> list[Parameters]:
@@ -128,18 +138,22 @@ def _angle(R1: Array, R2: Array) -> float:
 
 def _lowest(R_base_flange: Array, wrench: Array, wrench_cov: Array, starts: Sequence[Parameters]) -> Fit:
     whiten = np.linalg.inv(np.linalg.cholesky(wrench_cov))
-    found = [fit for start in starts if (fit := _descend(R_base_flange, wrench, whiten, start)) is not None]
-    if not found:
-        raise NotObservable("no start led to a minimum: the poses hardly constrain the fit, add other orientations.")
-    parameters, information, chi2 = min(found, key=lambda fit: fit[2])
-    others = (c for p, _, c in found if _angle(p.R_flange_sensor, parameters.R_flange_sensor) > SAME_ROTATION_RAD)
+    found = [_descend(R_base_flange, wrench, whiten, start) for start in starts]
+    parameters, information, chi2, settled = min(found, key=lambda end: end[2])
+    if not settled:
+        weight_N = np.linalg.norm(parameters.gravity_force_base_N)
+        raise NotObservable(
+            f"the fit has not settled in {MAX_STEPS} steps, at a weight of {weight_N:.2g} N: "
+            "hang something heavier on the sensor, or add poses with other orientations."
+        )
+    others = (c for p, _, c, _ in found if _angle(p.R_flange_sensor, parameters.R_flange_sensor) > SAME_ROTATION_RAD)
     return Fit(parameters, information, chi2, wrench_cov, min(others, default=float("inf")))
 
 
 def _descend(
     R_base_flange: Array, wrench: Array, whiten: Array, parameters: Parameters
-) -> tuple[Parameters, Array, float] | None:
-    """Levenberg-Marquardt with scaled columns; parameters, information and chi2 at the minimum, or None."""
+) -> tuple[Parameters, Array, float, bool]:
+    """Levenberg-Marquardt with scaled columns; gives parameters, information, chi2 and whether it came to rest."""
 
     def residual(p: Parameters) -> Array:
         return np.asarray((whiten @ (wrench - predict(p, R_base_flange))[..., None]).ravel())
@@ -148,7 +162,7 @@ def _descend(
         return np.asarray((whiten @ jacobian(p, R_base_flange)).reshape(-1, 15))
 
     rounding = 1e-14 * float(np.linalg.norm(whiten @ wrench[..., None]))
-    damping = 0.0
+    damping, settled = 0.0, False
     e = residual(parameters)
     for _ in range(MAX_STEPS):
         J = weighted_jacobian(parameters)
@@ -165,10 +179,11 @@ def _descend(
             damping = max(10 * damping, 1e-3)
         moved = float(np.linalg.norm(J @ step))  # in standard deviations of the noise
         small = 1e-8 * float(np.linalg.norm(e)) + rounding
-        if moved <= (small if improved else 100 * small):
-            J = weighted_jacobian(parameters)
-            return parameters, J.T @ J, float(e @ e)
-    return None
+        settled = moved <= (small if improved else 100 * small)
+        if settled:
+            break
+    J = weighted_jacobian(parameters)
+    return parameters, J.T @ J, float(e @ e), settled
 
 
 def column_scale(information: Array) -> Array:

@@ -304,5 +304,5 @@ def weight_and_tilt(F_b: Array) -> tuple[float, float, float]:
     F_b : array, shape (3,)
     """
     x, y, z = F_b.tolist()
-    beta = np.arctan2(-x, -z) if x or z else 0.0
+    beta = np.arctan2(0.0 - x, 0.0 - z) if x or z else 0.0  # not -x: a negative zero would turn pi to -pi
     return float(np.linalg.norm(F_b)), float(np.arctan2(y, np.hypot(x, z))), float(beta)

@@ -1,0 +1,247 @@
+"""Datasets: what is accepted, what is refused and with which words, files, CSV."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from calib import BadDataset, CalibrationDataset, read_csv
+from calib.files import write_new
+
+RNG = np.random.default_rng(3)
+R = Rotation.random(4, rng=RNG).as_matrix()
+
+
+def dataset(**changes: Any) -> CalibrationDataset:
+    fields: dict[str, Any] = {
+        "R_base_flange": R,
+        "wrench": np.arange(24.0).reshape(4, 6) / 7,
+        "wrench_cov": np.tile(np.eye(6) * 0.01, (4, 1, 1)),
+        "n_samples": [100, 200, 300, 400],
+        "t_s": [0.0, 1.5, np.nan, 4.0],
+        "meta": {"sensor": "FT00001", "ports": [1, 2]},
+    }
+    return CalibrationDataset(**{**fields, **changes})
+
+
+def changed(array: object, index: tuple[int, ...], value: float) -> np.ndarray[Any, Any]:
+    copy = np.array(array, dtype=np.float64)
+    copy[index] = value
+    return copy
+
+
+def test_arrays_are_copies_that_cannot_be_written_to() -> None:
+    wrench = np.zeros((4, 6))
+    data = dataset(wrench=wrench)
+    wrench[0] = 1.0
+    assert (data.wrench == 0).all()
+    for array in (data.R_base_flange, data.wrench, data.wrench_cov, data.n_samples, data.t_s):
+        assert array is not None
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+    with pytest.raises(TypeError):
+        data.meta["sensor"] = "other"  # type: ignore[index]  # the point of the test
+
+
+NOT_SYMMETRIC = np.tile(np.eye(6), (4, 1, 1))
+NOT_SYMMETRIC[1, 0, 1] = 0.5
+INDEFINITE = np.tile(np.eye(6), (4, 1, 1))
+INDEFINITE[3, 0, 1] = INDEFINITE[3, 1, 0] = 1.5
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"wrench": changed(np.zeros((4, 6)), (2, 3), np.nan)}, r"row 3: wrench\[3\] is nan, not a finite number"),
+        ({"wrench": changed(np.zeros((4, 6)), (0, 0), np.inf)}, r"row 1: wrench\[0\] is inf"),
+        ({"wrench": np.zeros((3, 6))}, r"wrench has shape \(3, 6\), expected \(4, 6\)"),
+        ({"wrench": [["a"] * 6] * 4}, "wrench is not an array of numbers"),
+        ({"R_base_flange": changed(R, (1, 0, 0), np.nan)}, r"row 2: R_base_flange\[0\]\[0\] is nan"),
+        ({"R_base_flange": R * 1.01}, r"row 1: the orientation is not a rotation matrix.*identity by 0\.02"),
+        ({"R_base_flange": R * [[[1]], [[1]], [[1]], [[-1]]]}, r"row 4: the orientation is a reflection.*-1\.000"),
+        ({"R_base_flange": np.zeros((0, 3, 3)), "wrench": np.zeros((0, 6))}, "there is no pose"),
+        ({"wrench_cov": np.zeros((4, 6, 6))}, "row 1: wrench_cov is not a covariance matrix, the variance of fx is 0"),
+        ({"wrench_cov": NOT_SYMMETRIC}, r"row 2: .*it is not symmetric \(by 0\.5 "),
+        ({"wrench_cov": INDEFINITE}, r"row 4: .*it is not positive definite \(smallest .* -0\.5\)"),
+        ({"wrench_cov": np.eye(6)}, r"wrench_cov has shape \(6, 6\), expected \(4, 6, 6\)"),
+        ({"t_s": [0.0, np.inf, 1.0, 2.0]}, "row 2: t_s is inf"),
+        ({"n_samples": [1, 2, -3, 4]}, "row 3: n_samples is -3"),
+        ({"n_samples": [1, 2.5, 3, 4]}, r"row 2: n_samples is 2\.5"),
+        ({"meta": {"x": object()}}, "meta cannot be written as JSON"),
+        ({"meta": {"x": float("nan")}}, "meta cannot be written as JSON"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_row(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(BadDataset, match=words):
+        dataset(**changes)
+
+
+@pytest.mark.parametrize("decimals", [3, 4, 6])
+def test_rounded_rotations_are_put_back_onto_so3(decimals: int) -> None:
+    exact = Rotation.random(500, rng=np.random.default_rng(1)).as_matrix()
+    data = CalibrationDataset(exact.round(decimals), np.zeros((500, 6)), None, np.zeros(500), np.full(500, np.nan))  # type: ignore[arg-type]
+    assert np.abs(np.swapaxes(data.R_base_flange, 1, 2) @ data.R_base_flange - np.eye(3)).max() < 1e-14
+    assert np.abs(data.R_base_flange - exact).max() < 10.0**-decimals
+
+
+def test_exact_rotations_stay_as_they_are() -> None:
+    np.testing.assert_array_equal(dataset().R_base_flange, R)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.booleans(), st.integers(3, 17))
+def test_a_file_gives_back_the_same_numbers(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, measured: bool, decimals: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(5, 6, 6)) * 10.0 ** rng.uniform(-6, 3)
+    data = CalibrationDataset(
+        Rotation.random(5, rng=rng).as_matrix().round(decimals),
+        rng.normal(size=(5, 6)) * 10.0 ** rng.uniform(-9, 9),
+        A @ np.swapaxes(A, 1, 2) + np.eye(6) if measured else None,
+        rng.integers(0, 10_000, 5),
+        np.where(rng.random(5) < 0.3, np.nan, rng.random(5)),
+        {"note": "µ", "seed": seed},
+    )
+    path = tmp_path_factory.mktemp("d") / "dataset.json"
+    data.save(path)
+    again = CalibrationDataset.load(path)
+    for name in ("R_base_flange", "wrench", "wrench_cov", "n_samples", "t_s"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(data, name))
+    assert dict(again.meta) == dict(data.meta)
+    assert again.sha256() == data.sha256()
+
+
+def test_the_hash_follows_the_content_not_the_layout() -> None:
+    data = dataset()
+    document = data.to_dict()
+    shuffled = CalibrationDataset.from_dict({"unknown": 1, **dict(reversed(document.items()))})
+    assert shuffled.sha256() == data.sha256()
+    assert dataset(wrench=changed(data.wrench, (0, 0), 1e-300)).sha256() != data.sha256()
+
+
+def test_a_file_is_never_overwritten_and_never_half(tmp_path: Path) -> None:
+    path = tmp_path / "d.json"
+    dataset().save(path)
+    before = path.read_bytes()
+    with pytest.raises(FileExistsError, match=r"d\.json exists already and is never overwritten"):
+        dataset(meta={}).save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(FileNotFoundError, match=r"the folder .* does not exist"):
+        dataset().save(tmp_path / "no" / "d.json")
+
+
+def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_new(tmp_path / "x", "content")
+    assert list(tmp_path.iterdir()) == []
+
+
+def without(name: str) -> str:
+    return json.dumps({k: v for k, v in dataset().to_dict().items() if k != name})
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "the file is empty"),
+        ("{", "this is not valid JSON"),
+        ("[1]", "holds a JSON list, not an object"),
+        ("{}", "the field 'format' is missing"),
+        ('{"format": "ftdrive.calibration/1"}', "format is 'ftdrive.calibration/1', not 'ftdrive.dataset/1'"),
+        ('{"format": "ftdrive.dataset/2"}', "version '2' of ftdrive.dataset is unknown"),
+        (without("wrench"), "lacks the field wrench"),
+        (without("t_s")[:-1] + ', "t_s": 3}', "t_s must be a list"),
+        (b"\xff\xfe\x00", "is not a text file"),
+    ],
+)
+def test_a_file_that_is_something_else_is_named_in_one_sentence(
+    tmp_path: Path, content: str | bytes, words: str
+) -> None:
+    path = tmp_path / "d.json"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(BadDataset, match=words) as caught:
+        CalibrationDataset.load(path)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).count("d.json") == 1
+
+
+MATRIX_HEADER = "r11,r12,r13,r21,r22,r23,r31,r32,r33,fx,fy,fz,tx,ty,tz"
+IDENTITY = "1,0,0,0,1,0,0,0,1"
+
+
+def csv(tmp_path: Path, *lines: str) -> Path:
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def test_csv_matrix_is_row_major_and_orientation_says_what_it_maps(tmp_path: Path) -> None:
+    quarter = "0,-1,0,1,0,0,0,0,1"  # x goes to y
+    path = csv(tmp_path, MATRIX_HEADER, f"{quarter},1,2,3,4,5,6")
+    np.testing.assert_array_equal(read_csv(path).R_base_flange[0] @ [1, 0, 0], [0, 1, 0])
+    np.testing.assert_array_equal(read_csv(path, "R_flange_base").R_base_flange[0] @ [0, 1, 0], [1, 0, 0])
+    data = read_csv(path)
+    np.testing.assert_array_equal(data.wrench, [[1, 2, 3, 4, 5, 6]])
+    assert data.wrench_cov is None
+    assert np.isnan(data.t_s).all()
+    assert data.n_samples.tolist() == [0]
+    with pytest.raises(ValueError, match="orientation is 'x'"):
+        read_csv(path, "x")  # type: ignore[arg-type]  # the point of the test
+
+
+def test_csv_rotation_vector_time_extra_columns_and_any_order(tmp_path: Path) -> None:
+    path = csv(
+        tmp_path,
+        "\ufeffname, tz,ty,tx,fz,fy,fx,rz,ry,rx,t",
+        f"a,6,5,4,3,2,1,{np.pi / 2},0,0,10",
+        "",
+        "b,6,5,4,3,2,1,0,0,0,12.5",
+    )
+    data = read_csv(path)
+    np.testing.assert_allclose(data.R_base_flange[0] @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    np.testing.assert_array_equal(data.wrench[1], [1, 2, 3, 4, 5, 6])
+    np.testing.assert_array_equal(data.t_s, [0, 2.5])
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ([""], "the file is empty"),
+        ([MATRIX_HEADER], "a header and no row below it"),
+        (["r11,r12,fx,fy,tx,ty,tz", "1"], "missing column r13, r21, r22, r23, r31, r32, r33, fz:"),
+        (["rx,ry,fx,fy,fz,tx,ty,tz", "1"], "missing column rz:"),
+        (["fx,fy,fz,tx,ty,tz", "1"], "missing column r11, .* r33: the first row must name .* or rx, ry, rz"),
+        ([f"{IDENTITY},1,2,3,4,5,6"], "missing column r11, .*it names 1, 0, 0"),
+        ([f"{MATRIX_HEADER},fx", f"{IDENTITY},1,2,3,4,5,6,7"], "column fx appears more than once"),
+        ([MATRIX_HEADER, f"{IDENTITY},1,2,3,4,5,6", f"{IDENTITY},1,2,3,4,5"], "row 2 has 14 values, the header 15"),
+        ([MATRIX_HEADER, f"{IDENTITY},1,2,3,4,five,6"], "row 1: ty is 'five', not a number"),
+        ([MATRIX_HEADER, f"{IDENTITY},1,2,3,4,,6"], "row 1: ty is '', not a number"),
+        ([MATRIX_HEADER, f"{IDENTITY},1,2,nan,4,5,6"], "row 1: fz is nan, not a finite number"),
+        ([MATRIX_HEADER, f"{IDENTITY},1,2,1e999,4,5,6"], "row 1: fz is 1e999, not a finite number"),
+        ([MATRIX_HEADER, f"{IDENTITY},1,2,3,4,5,6", "1,0,0,0,1,0,0,0,2,1,2,3,4,5,6"], "row 2: .*not a rotation"),
+        ([MATRIX_HEADER, "1,0,0,0,1,0,0,0,-1,1,2,3,4,5,6"], "row 1: the orientation is a reflection"),
+    ],
+)
+def test_csv_errors_name_column_or_row(tmp_path: Path, lines: list[str], words: str) -> None:
+    with pytest.raises(BadDataset, match=words) as caught:
+        read_csv(csv(tmp_path, *lines))
+    assert str(caught.value).startswith("poses.csv: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_csv_that_is_not_text(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_bytes(b"PK\x03\x04\xff\xfe")
+    with pytest.raises(BadDataset, match="not a text table"):
+        read_csv(path)

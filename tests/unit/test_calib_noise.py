@@ -1,0 +1,124 @@
+"""The covariance of a dwell's mean tells the truth, and quiet dwells pass as quiet."""
+
+import time
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from calib import BadDataset, is_stationary, mean_and_covariance
+from calib.model import Array
+
+
+def noise(rng: np.random.Generator, N: int, rho: Array) -> Array:
+    """AR(1) of unit variance, one rho for each of the six channels."""
+    white = rng.normal(size=(N + 300, 6))
+    return np.column_stack([lfilter([np.sqrt(1 - r**2)], [1, -r], white[:, c])[300:] for c, r in enumerate(rho)])
+
+
+@pytest.mark.parametrize("N", [400, 1500, 7000])
+@pytest.mark.parametrize("rho", [[0.0] * 6, [0.5] * 6, [0.9] * 6, [0, 0.5, 0.9, 0, 0.9, 0.5]])
+def test_the_mean_lies_where_its_covariance_says(N: int, rho: list[float]) -> None:
+    rng = np.random.default_rng(N)
+    z = []
+    for _ in range(250 if N < 5000 else 100):
+        pose = mean_and_covariance(5.0 + noise(rng, N, np.array(rho)))
+        z.append((pose.mean - 5.0) / np.sqrt(np.diag(pose.covariance)))
+    coverage = np.mean(np.abs(z) < 1.96)
+    hard = N == 400 and max(rho) == 0.9  # 21 independent samples: the spread itself is known to 30 %
+    assert (0.88 if hard else 0.92) < coverage < 0.98
+
+
+def test_white_noise_is_not_inflated() -> None:
+    rng = np.random.default_rng(0)
+    ratio = [np.diag(mean_and_covariance(rng.normal(size=(400, 6))).covariance) * 400 for _ in range(300)]
+    assert 0.95 < np.mean(ratio) < 1.12
+    assert 0.95 < np.mean(np.sqrt(ratio)) < 1.06
+    assert 200 < mean_and_covariance(rng.normal(size=(400, 6))).n_effective < 450
+
+
+def test_correlation_between_channels_is_kept() -> None:
+    rng = np.random.default_rng(1)
+    mixing = np.linalg.cholesky(np.array([[1, 0.8], [0.8, 1]]))
+    samples = rng.normal(size=(5000, 6))
+    samples[:, [0, 4]] = samples[:, [0, 4]] @ mixing.T
+    C = mean_and_covariance(samples).covariance
+    assert C[0, 4] / np.sqrt(C[0, 0] * C[4, 4]) == pytest.approx(0.8, abs=0.02)
+    np.testing.assert_array_equal(C, C.T)
+
+
+@pytest.mark.parametrize("sigma", [0.25, 0.4, 0.7, 1.5])
+def test_averaging_cannot_see_through_coarse_steps(sigma: float) -> None:
+    rng = np.random.default_rng(2)
+    z = []
+    for _ in range(150):
+        true = rng.uniform(-5, 5, 6)
+        pose = mean_and_covariance(np.round(true + sigma * rng.normal(size=(400, 6))))
+        z.append((pose.mean - true) / np.sqrt(np.diag(pose.covariance)))
+    assert np.mean(np.abs(z) < 1.96) > 0.92
+    if sigma > 1:
+        assert np.std(z) > 0.9  # and fine steps cost nothing
+
+
+def test_a_channel_that_never_moves_or_copies_another_leaves_a_usable_covariance() -> None:
+    rng = np.random.default_rng(3)
+    samples = rng.normal(size=(200, 6)) * [0.1, 0.1, 0.1, 0.002, 0.002, 0.002] + 3.3
+    samples[:, 1] = 3.3
+    samples[:, 5] = samples[:, 4]
+    C = mean_and_covariance(samples).covariance
+    assert np.linalg.eigvalsh(C).min() > 0
+    assert C[1, 1] == max(C[0, 0], C[2, 2])  # no more trust than its neighbours earn
+    silent = mean_and_covariance(np.full((50, 6), 0.1)).covariance
+    np.testing.assert_allclose(np.sqrt(np.diag(silent)), [1e-3] * 3 + [2.5e-5] * 3)
+
+
+def test_seven_seconds_of_a_2_kHz_sensor_take_milliseconds() -> None:
+    samples = np.random.default_rng(4).normal(size=(14_000, 6))
+    best = float("inf")
+    for _ in range(5):
+        start = time.perf_counter()
+        mean_and_covariance(samples)
+        best = min(best, time.perf_counter() - start)
+    assert best < 0.05  # 5 ms on an idle machine; loose, because tests share theirs
+
+
+@pytest.mark.parametrize(("N", "rho"), [(400, 0.0), (400, 0.5), (1500, 0.0), (1500, 0.5), (1500, 0.9), (7000, 0.9)])
+def test_quiet_dwells_pass(N: int, rho: float) -> None:
+    rng = np.random.default_rng(N)
+    dwells = 1500 if N < 1000 else 600
+    failures = sum(not is_stationary(noise(rng, N, np.full(6, rho))) for _ in range(dwells))
+    assert failures / dwells < 0.01
+
+
+@pytest.mark.parametrize("N", [400, 7000])
+def test_a_drift_or_a_decay_of_any_channel_fails(N: int) -> None:
+    rng = np.random.default_rng(5)
+    t = np.linspace(0, 1, N)
+    standard_error = 1 / np.sqrt(N)
+    for channel in range(6):
+        for disturbance in (t, t > 0.5, np.exp(-t / 0.4)):
+            samples = rng.normal(size=(N, 6))
+            assert is_stationary(samples)
+            samples[:, channel] += 150 * standard_error * disturbance
+            assert not is_stationary(samples)
+
+
+def test_constant_channels_are_quiet_and_a_step_between_constants_is_not() -> None:
+    samples = np.full((100, 6), 0.1)
+    assert is_stationary(samples)
+    samples[50:, 3] = 0.2
+    assert not is_stationary(samples)
+
+
+@pytest.mark.parametrize(
+    ("samples", "words"),
+    [
+        (np.zeros((19, 6)), r"shape \(19, 6\), expected \(N, 6\) with N >= 20: record longer"),
+        (np.zeros((50, 3)), r"shape \(50, 3\)"),
+        (np.where(np.arange(300).reshape(50, 6) == 8, np.nan, 0.0), r"sample 2: wrench\[2\] is nan"),
+    ],
+)
+def test_bad_dwells_are_refused(samples: Array, words: str) -> None:
+    for function in (mean_and_covariance, is_stationary):
+        with pytest.raises(BadDataset, match=words):
+            function(samples)

@@ -1,0 +1,323 @@
+"""Solving: exact without noise, honest with it, invariant, and unwilling where the data do not suffice."""
+
+import os
+import re
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationDataset, CalibrationResult, NotObservable, Parameters, read_csv, solve
+from calib.model import Array, jacobian, predict
+from calib.refine import refine
+from calib.result import Method
+from calib.yu import SPECIAL_R_flange_base
+
+METHODS: tuple[Method, ...] = get_args(Method)
+R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+SIGMA = np.repeat([0.05, 0.05 * 0.025], 3)
+
+# Like a real cell: the sensor is mounted nearly upside down and turned, the base leans a little.
+TRUTH = Parameters(
+    Rotation.from_euler("ZYX", [105, 2, 179], degrees=True).as_matrix(),
+    np.array([0.6, -0.4, -20.0]),
+    np.array([3.0, -5.0, 8.0]),
+    np.array([0.01, -0.02, 0.07]),
+    np.array([0.1, 0.2, -0.3]),
+)
+
+
+def dataset(R_base_flange: Array, wrench: Array, cov: Array | None = None) -> CalibrationDataset:
+    n = len(wrench)
+    return CalibrationDataset(R_base_flange, wrench, cov, np.zeros(n, np.int64), np.full(n, np.nan))
+
+
+def white(n: int, sigma: Array = SIGMA) -> Array:
+    return np.tile(np.diag(sigma**2), (n, 1, 1))
+
+
+def uneven(rng: np.random.Generator, n: int) -> Array:
+    """Covariances with correlated channels, different in every pose."""
+    A = rng.normal(size=(n, 6, 12))
+    C = A @ np.swapaxes(A, 1, 2)
+    d = np.sqrt(np.einsum("nii->ni", C))
+    s = SIGMA * np.exp(0.4 * rng.normal(size=(n, 1)))
+    return np.asarray(C / d[:, :, None] / d[:, None, :] * s[:, :, None] * s[:, None, :])
+
+
+def noisy(rng: np.random.Generator, R_base_flange: Array, cov: Array) -> Array:
+    L = np.linalg.cholesky(cov)
+    return np.asarray(predict(TRUTH, R_base_flange) + (L @ rng.normal(size=(len(cov), 6, 1)))[..., 0])
+
+
+# Yu 2021, Table I: angles of s_eR = Rz Ry Rx in degrees, F_b, P, F0, T0.
+TABLE_I = [
+    ((0, 7, 3), (0, 0, -10), (0, 0, 2), (0, 0, 0), (0, 0, 0)),
+    ((0, 7, 3), (0, 0, 10), (0, 0, 2), (0, 0, 0), (87, 45, 6)),
+    ((0, 7, 3), (0, 0, -10), (0, 0, 2), (63, 5, 21), (87, 45, 6)),
+    ((0, 7, 3), (0, 0, -10), (0.1, 0.1, 1), (63, 5, 21), (87, 45, 6)),
+    ((45, 7, 3), (1, 3, -40), (0.1, 0.1, 1), (63, 5, 21), (87, 45, 6)),
+    ((70, 15, 13), (1, 3, -40), (0.1, 0.1, 1), (63, 5, 21), (87, 45, 6)),
+]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("setup", TABLE_I)
+def test_yu_table_1_is_exact_without_noise(method: Method, measured: bool, setup: tuple[Any, ...]) -> None:
+    angles, F_b, P, F0, T0 = setup
+    s_eR = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
+    truth = Parameters(s_eR.T, *(np.array(v, dtype=float) for v in (F_b, F0, P, T0)))
+    result = solve(dataset(R24, predict(truth, R24), white(24) if measured else None), method)
+    assert np.abs(truth.difference(result.parameters)).max() < 1e-12
+
+    rng = np.random.default_rng(0)
+    R = Rotation.random(200, rng=rng).as_matrix()
+    push = rng.normal(size=(2, 200, 3))
+    push /= np.linalg.norm(push, axis=2, keepdims=True)
+    contact = np.concatenate([1.0 * push[0], 0.5 * push[1]], axis=1)
+    error = result.compensate(predict(truth, R) + contact, R) - contact
+    assert np.abs(error).max() < 1e-12
+
+
+@pytest.mark.parametrize("n", [4, 5, 7, 24])
+def test_any_mounting_is_found_from_any_orientations(n: int) -> None:
+    rng = np.random.default_rng(n)
+    for _ in range(5):
+        R = Rotation.random(n, rng=rng).as_matrix()
+        truth = Parameters(Rotation.random(rng=rng).as_matrix(), *(rng.normal(size=(4, 3)) * [[9], [9], [0.1], [1]]))
+        result = solve(dataset(R, predict(truth, R), white(n)))
+        assert np.abs(truth.difference(result.parameters)).max() < 1e-10
+        assert result.chi2 < 1e-15
+
+
+@pytest.mark.parametrize(("orientations", "seed"), [("24", 1), ("7", 2)])
+def test_the_covariance_is_honest(orientations: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    R = R24 if orientations == "24" else Rotation.random(7, rng=rng).as_matrix()
+    cov = uneven(rng, len(R))
+    distance, chi2, squared, stated = [], [], np.zeros(15), np.zeros(15)
+    for _ in range(200):
+        result = solve(dataset(R, noisy(rng, R, cov), cov))
+        error = result.parameters.difference(TRUTH)
+        distance.append(error @ np.linalg.solve(result.covariance, error))
+        chi2.append(result.chi2)
+        squared += error**2 / 200
+        stated += np.diag(result.covariance) / 200
+    assert stats.kstest(distance, "chi2", args=(15,)).pvalue > 1e-3
+    assert stats.kstest(chi2, "chi2", args=(result.dof,)).pvalue > 1e-3
+    # Efficient: the mean square error of every block is the Cramer-Rao bound at the truth.
+    J = np.linalg.inv(np.linalg.cholesky(cov)) @ jacobian(TRUTH, R)
+    bound = np.diag(np.linalg.inv(np.einsum("nki,nkj->ij", J, J))).reshape(5, 3).sum(axis=1)
+    np.testing.assert_allclose(squared.reshape(5, 3).sum(axis=1) / bound, 1, atol=0.25)
+    np.testing.assert_allclose(stated.reshape(5, 3).sum(axis=1) / bound, 1, atol=0.05)
+
+
+@pytest.mark.parametrize("method", ["srom", "lrom"])
+def test_sigmas_of_the_closed_forms_are_their_own(method: Method) -> None:
+    rng = np.random.default_rng(3)
+    cov = white(24, 4 * SIGMA)
+    squared, stated = np.zeros(15), np.zeros(15)
+    for _ in range(20):
+        result = solve(dataset(R24, noisy(rng, R24, cov), cov), method)
+        squared += result.parameters.difference(TRUTH) ** 2 / 20
+        stated += np.diag(result.covariance) / 20
+    ratio = squared.reshape(5, 3).sum(axis=1) / stated.reshape(5, 3).sum(axis=1)
+    np.testing.assert_allclose(ratio, 1, atol=0.5)
+    best = np.diag(solve(dataset(R24, noisy(rng, R24, cov), cov)).covariance)
+    assert stated[:3].sum() > 2 * best[:3].sum()  # torques tell ML more about the rotation
+
+
+def test_noise_is_estimated_from_the_residuals_when_nobody_measured_it() -> None:
+    rng = np.random.default_rng(4)
+    stated = []
+    for _ in range(30):
+        R = Rotation.random(8, rng=rng).as_matrix()
+        fit = refine(R, noisy(rng, R, white(8)), None)
+        stated.append(np.sqrt(np.diag(fit.wrench_cov[0]))[[0, 3]])
+    np.testing.assert_allclose(np.mean(stated, axis=0), SIGMA[[0, 3]], rtol=0.1)
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(stated), axis=0)), SIGMA[[0, 3]], rtol=0.1)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_turning_base_or_sensor_or_shuffling_rows_turns_and_shuffles_the_answer(method: Method) -> None:
+    rng = np.random.default_rng(5)
+    wrench = noisy(rng, R24, white(24))
+    result = solve(dataset(R24, wrench, white(24)), method)
+    Y, S = Rotation.random(2, rng=rng).as_matrix()
+    tolerance = 1e-9
+    if method != "srom":  # which numbers its 24 orientations by the base axes
+        base = solve(dataset(Y @ R24, wrench, white(24)), method)
+        np.testing.assert_allclose(base.gravity_force_base_N, Y @ result.gravity_force_base_N, atol=tolerance)
+        np.testing.assert_allclose(base.R_flange_sensor, result.R_flange_sensor, atol=tolerance)
+
+    sensor = solve(dataset(R24, np.concatenate([wrench[:, :3] @ S, wrench[:, 3:] @ S], axis=1), white(24)), method)
+    np.testing.assert_allclose(sensor.R_flange_sensor, result.R_flange_sensor @ S, atol=tolerance)
+    np.testing.assert_allclose(sensor.gravity_force_base_N, result.gravity_force_base_N, atol=tolerance)
+    np.testing.assert_allclose(sensor.p_sensor_com_m, S.T @ result.p_sensor_com_m, atol=tolerance)
+
+    order = rng.permutation(24)
+    shuffled = solve(dataset(R24[order], wrench[order], white(24)), method)
+    assert np.abs(result.parameters.difference(shuffled.parameters)).max() < tolerance
+    np.testing.assert_allclose(shuffled.residuals, result.residuals[order], atol=tolerance)
+
+
+def test_a_lost_basin_is_found_again() -> None:
+    rng = np.random.default_rng(6)
+    for _ in range(10):
+        R = Rotation.random(6, rng=rng).as_matrix()
+        wrench = noisy(rng, R, white(6, 10 * SIGMA))
+        good = refine(R, wrench, white(6, 10 * SIGMA))
+        wrong = TRUTH.moved(np.concatenate([[2.5, 0, 0], np.zeros(12)]))
+        again = refine(R, wrench, white(6, 10 * SIGMA), [wrong])
+        assert again.chi2 == pytest.approx(good.chi2)
+        assert np.linalg.norm(TRUTH.difference(again.parameters)[:3]) < 0.3
+
+
+def spin(axis: str, tilt_deg: float, n: int = 8) -> Array:
+    about = Rotation.from_euler(axis, np.arange(n)[:, None] * 360.0 / n, degrees=True)
+    return np.asarray((Rotation.from_euler("y", tilt_deg, degrees=True) * about).as_matrix())
+
+
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize(
+    ("R", "method", "words"),
+    [
+        (R24[:3], "ml", "3 poses are too few, at least 4 are needed: add 3 or more"),
+        (R24[:4], "lrom", "4 poses are too few, at least 5 are needed: add 2 or more"),
+        (np.tile(R24[:1], (9, 1, 1)), "ml", "all 9 poses have the same orientation: turn and tilt"),
+        (np.tile(R24[:3], (3, 1, 1)), "ml", "the 9 poses have only 3 different orientations, at least 4"),
+        (
+            spin("z", 150.0),
+            "ml",
+            "the poses leave 2 of 15 parameters free, mixing R_flange_sensor, gravity_force_base_N",
+        ),
+        (spin("x", 0.0), "ml", "the poses leave 2 of 15 parameters free"),
+        (R24[:23], "srom", "SROM needs its 24 orientations once each: missing 24. Use LROM or ML"),
+    ],
+)
+def test_what_the_poses_cannot_tell_is_refused_in_words(R: Array, method: Method, words: str, measured: bool) -> None:
+    wrench = noisy(np.random.default_rng(7), R, white(len(R)))
+    with pytest.raises(NotObservable, match=words):
+        solve(dataset(R, wrench, white(len(R)) if measured else None), method)
+
+
+def test_a_sensor_that_feels_nothing_is_refused() -> None:
+    with pytest.raises(NotObservable, match="the force is exactly the same in all poses"):
+        solve(dataset(R24, np.tile([1.0, 2, 3, 0, 0, 0], (24, 1))))
+
+
+def test_unknown_methods_and_gravity_are_refused() -> None:
+    data = dataset(R24, predict(TRUTH, R24))
+    with pytest.raises(ValueError, match="method is 'yu'"):
+        solve(data, "yu")  # type: ignore[arg-type]  # the point of the test
+    with pytest.raises(ValueError, match="g_m_s2 is 0"):
+        solve(data, g_m_s2=0)
+
+
+def verdict_of(wrench: Array, R: Array = R24, cov: Array | None = None) -> tuple[str, str]:
+    try:
+        result = solve(dataset(R, wrench, cov))
+    except NotObservable as refusal:
+        return "refused", str(refusal)
+    return result.verdict, " | ".join(result.reasons)
+
+
+def test_a_clean_run_is_good_without_a_word() -> None:
+    rng = np.random.default_rng(8)
+    assert verdict_of(noisy(rng, R24, white(24)), cov=white(24)) == ("good", "")
+
+
+def test_verdicts_give_their_reason() -> None:
+    rng = np.random.default_rng(9)
+    wrench = noisy(rng, R24, white(24))
+
+    verdict, reasons = verdict_of(wrench)
+    assert (verdict, "estimated from the residuals" in reasons) == ("good", True)
+
+    verdict, reasons = verdict_of(wrench, cov=white(24, SIGMA / 20))
+    assert verdict == "usable"
+    assert re.search(r"residuals are (1[7-9]|2[0-3])\.\d times the measured noise", reasons)
+
+    bumps = (
+        wrench + 0.4 * np.eye(24, 6) @ np.diag([1.0, 1, 1, 0, 0, 0]) + rng.normal(size=(24, 6)) * ([0.3] * 3 + [0] * 3)
+    )
+    verdict, reasons = verdict_of(bumps)
+    assert verdict == "usable"
+    assert "the force residual is" in reasons
+    assert "more than 2 %" in reasons
+
+    verdict, reasons = verdict_of(wrench + rng.normal(size=(24, 6)) * ([2.0] * 3 + [0.05] * 3))
+    assert verdict == "rejected"
+    assert "more than 10 %" in reasons
+
+    five = [0, 6, 10, 15, 21]
+    verdict, reasons = verdict_of(wrench[five], R24[five], white(5))
+    assert verdict == "usable"
+    assert "only 5 poses" in reasons
+
+    scale = np.array([1, 1, 1, 1e3, 1e3, 1e3])  # N·mm taken for N·m
+    verdict, reasons = verdict_of(wrench * scale)
+    assert verdict == "rejected"
+    assert "the centre of mass lies" in reasons
+
+
+def test_nothing_on_the_sensor_is_never_a_calibration() -> None:
+    rng = np.random.default_rng(10)
+    for _ in range(5):
+        R = Rotation.random(12, rng=rng).as_matrix()
+        verdict, reasons = verdict_of(rng.normal(size=(12, 6)) * SIGMA + [1, 2, 3, 0, 0, 0], R, white(12))
+        assert verdict in ("rejected", "refused")
+        assert "hang something heavier on the sensor" in reasons
+
+
+def test_poses_of_one_tilt_are_rejected_because_up_and_down_look_alike() -> None:
+    level = Parameters(
+        TRUTH.R_flange_sensor, np.array([0, 0, -20.0]), TRUTH.force_bias_N, TRUTH.p_sensor_com_m, TRUTH.torque_bias_Nm
+    )
+    azimuth = np.arange(8) * np.pi / 4
+    lean = np.deg2rad(40) * np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
+    R = (Rotation.from_rotvec(lean) * Rotation.from_euler("x", 180, degrees=True)).as_matrix()
+    verdict, reasons = verdict_of(predict(level, R), R, white(8))
+    assert verdict == "rejected"
+    assert "a quite different mounting of the sensor explains the data almost as well" in reasons
+
+
+def real(name: str) -> CalibrationDataset:
+    folder = os.environ.get("FTDRIVE_REAL_DATA")
+    if not folder:
+        pytest.skip("FTDRIVE_REAL_DATA is not set")
+    return read_csv(Path(folder) / name / "poses.csv", "R_flange_base")
+
+
+@pytest.mark.parametrize("method", ["ml", "lrom"])
+def test_a_real_session_gives_the_published_answer(method: Method) -> None:
+    result = solve(real("agimus_mini45_b"), method)
+    assert result.mass_kg == pytest.approx(0.788, abs=0.004)
+    # The authors give s_eR, flange to sensor: ours is its transpose.
+    published_R_sensor_flange = np.array(
+        [
+            [-0.26004919774285107, 0.965594118602976, 0.0015533424096047077],
+            [0.9654435503243104, 0.2599794490217805, 0.01815040560214672],
+            [0.017122087795900184, 0.006219662826343693, -0.9998340611840727],
+        ]
+    )
+    angle = Rotation.from_matrix(result.R_flange_sensor @ published_R_sensor_flange).magnitude()
+    assert angle < np.deg2rad(0.7)
+    summary = result.residual_summary()
+    assert summary["force_rms_N"] < 0.25
+    assert summary["torque_rms_Nm"] < (0.007 if method == "ml" else 0.009)
+    np.testing.assert_allclose(result.force_bias_N, [0.121, -0.269, 7.788], atol=0.4)
+    np.testing.assert_allclose(result.torque_bias_Nm, [0.048, -0.037, -0.003], atol=0.006)
+    np.testing.assert_allclose(result.p_sensor_com_m, [0.004, 0.006, -0.050], atol=1.5e-3)
+    assert result.verdict in ("good", "usable")
+
+
+def test_a_real_session_with_drift_is_not_called_good() -> None:
+    result: CalibrationResult = solve(real("foamcutting_2013_06_12"))
+    assert result.verdict != "good"
+    assert any("force residual" in reason for reason in result.reasons)
+    assert result.mass_kg == pytest.approx(0.474, abs=0.02)
