@@ -31,10 +31,8 @@ _POLL_S: Final = 0.01
 _ARRIVED_RAD: Final = 1e-3
 _STANDING_RAD_S: Final = 1e-6
 """Of the set-point, which is exactly zero at rest."""
-_QUIET_RAD_S: Final = 0.002
-_QUIET_S: Final = 0.2
-_STEADY_S: Final = 0.5
-"""The controller calls an arm steady after half a second at zero target velocity."""
+_STILL_RAD_S: Final = 0.002
+_STILL_S: Final = 0.3
 _SIMULATORS: Final = ("localhost", "127.0.0.1", "192.168.56.101")
 """Addresses at which ur_rtde itself does not ask for remote control, because URSim runs there."""
 
@@ -206,22 +204,24 @@ class UrArm(RobotArm):
     def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
         """Return when the joints have been at rest long enough for the structure to stop ringing.
 
-        That is: where `move_to` went, target velocity zero for 0.5 s of the controller's time (its own rule for
-        "steady", so a simulation that runs faster waits less), and measured joint speeds below 0.002 rad/s for 0.2 s
-        of ours. Errors as in `move_to`; without control, safety stops are not errors.
+        That is when the arm is where `move_to` sent it, its target velocity is zero and every measured joint speed is
+        below 0.002 rad/s, all of that for 0.3 s without a break. (The controller's own `is_steady` waits for 0.5 s of
+        zero target velocity; the difference cannot be seen in the mean over a second of force.) Errors as in
+        `move_to`; without control, safety stops are not errors.
         """
-        steady_since_s: float | None = None
-        quiet_since_ns: int | None = None
+        still_since_s: float | None = None
         with self._stopping_on_error():
             for look in self._watch(timeout_s, guard, "the arm has not come to rest"):
-                resting = max(map(abs, look.target_qd_rad_s)) <= _STANDING_RAD_S
-                resting = resting and (self._goal is None or _near(look.target_q_rad, self._goal))
-                quiet = max(map(abs, look.qd_rad_s)) < _QUIET_RAD_S
-                steady_since_s = (look.t_device_s if steady_since_s is None else steady_since_s) if resting else None
-                quiet_since_ns = (look.t_host_ns if quiet_since_ns is None else quiet_since_ns) if quiet else None
-                if steady_since_s is None or quiet_since_ns is None:
-                    continue
-                if look.t_device_s - steady_since_s >= _STEADY_S and look.t_host_ns - quiet_since_ns >= _QUIET_S * 1e9:
+                still = (
+                    max(map(abs, look.target_qd_rad_s)) <= _STANDING_RAD_S
+                    and max(map(abs, look.qd_rad_s)) < _STILL_RAD_S
+                    and (self._goal is None or _near(look.target_q_rad, self._goal))
+                )
+                if not still:
+                    still_since_s = None
+                elif still_since_s is None:
+                    still_since_s = look.t_device_s
+                elif look.t_device_s - still_since_s >= _STILL_S:
                     return
 
     def stop(self) -> None:
