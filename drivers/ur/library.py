@@ -96,6 +96,12 @@ class Dashboard(Protocol):
         """Whether programs sent over the network are accepted (e-Series from 5.6 on)."""
 
 
+def require() -> None:
+    """Raise `ConnectError` where ur_rtde is not installed."""
+    for name in ("rtde_receive", "rtde_control", "dashboard_client"):
+        _load(name)
+
+
 def connect_receive(host: str) -> Receive:
     """Connect to a controller that has just answered over RTDE: a silent one would freeze the interpreter here."""
     try:

@@ -22,7 +22,7 @@ import numpy as np
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from drivers.interfaces import ArmState, DeviceInfo
 from drivers.ur.kinematics import MODELS, Pose, forward, model_named
-from drivers.ur.library import Dashboard, Receive, ask_dashboard, connect_receive, retire
+from drivers.ur.library import Dashboard, Receive, ask_dashboard, connect_receive, require, retire
 from drivers.ur.rtde import TcpOffsetReader
 
 log = logging.getLogger(__name__)
@@ -128,6 +128,7 @@ class Reader:
         self._host = host
         self._tcp = TcpOffsetReader(host)
         self._receive: Receive | None = None
+        require()
         try:
             self._tcp.open(timeout_s=CONNECT_S)
             self.version = self._tcp.version
