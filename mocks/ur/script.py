@@ -7,6 +7,7 @@ replaces the running one, as on a controller, and ends after one cycle without h
 Source: the control script inside ur_rtde 1.6.5 (`ScriptClient.getScript()`), read for behaviour.
 """
 
+import math
 import re
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
@@ -58,7 +59,7 @@ def take_uploads(buffer: bytearray) -> list[Upload]:
     """
     uploads: list[Upload] = []
     while True:
-        text = buffer.decode("utf-8", "replace")
+        text = buffer.decode("latin-1")  # one character per byte
         head = re.match(r"\s*(def|sec)\s+(\w+)\s*\([^)]*\)\s*:[^\n]*\n", text)
         if head:
             whole = re.compile(r"^end\b[^\n]*\n", re.MULTILINE).search(text, head.end())
@@ -71,7 +72,7 @@ def take_uploads(buffer: bytearray) -> list[Upload]:
                 return uploads
         if text[:end].strip():
             uploads.append(Upload(name, text[:end], secondary))
-        del buffer[: len(text[:end].encode("utf-8", "replace"))]
+        del buffer[:end]
 
 
 class ForeignProgram:
@@ -205,7 +206,10 @@ class ControlScript:
         return self._robot.input_int(index + self._int_offset)
 
     def _read(self, index: int) -> float:
-        return self._robot.input_double(index + self._double_offset)
+        value = self._robot.input_double(index + self._double_offset)
+        if not math.isfinite(value):
+            raise ScriptError(f"input_double_register_{index + self._double_offset} holds {value}")
+        return value
 
     def _vector(self, first: int) -> Vector6:
         a, b, c, d, e, f = (self._read(first + i) for i in range(6))

@@ -192,7 +192,7 @@ class RtdeClient(Client):
         self._outputs = recipe if recipe.valid else None
         self._readers = [OUTPUTS[name][1] for name in names] if recipe.valid else []
         base_hz = self.robot.frequency_hz
-        self._every = max(1, int(base_hz / frequency_hz)) if frequency_hz > 0 else 1
+        self._every = max(1, int(base_hz / frequency_hz)) if frequency_hz > 1e-3 else 1
         self._reply(rtde.SETUP_OUTPUTS, recipe.answer())
 
     def _set_up_inputs(self, payload: bytes) -> None:

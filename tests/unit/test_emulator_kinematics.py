@@ -1,0 +1,158 @@
+"""Kinematics of the emulated arms against plain DH products, round trips, and the tour that fits every arm."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mocks.kinematics import (
+    MODELS,
+    Array,
+    closed_form,
+    forward,
+    inverse,
+    inverse_matrix,
+    jacobian,
+    matrix_of,
+    pose_of,
+    rotation,
+    rotvec,
+    vector6,
+)
+
+angles = st.tuples(*[st.floats(-math.pi, math.pi)] * 6)
+models = st.sampled_from(sorted(MODELS))
+
+# psi = q2 + q3 + q4, q5 and q6 in degrees: one wrist table that shows all 24 rotations of the cube on every UR arm
+TOUR = {
+    1: (-90, 90, 45), 19: (-180, 45, 90), 12: (-180, -45, 90), 8: (-180, -45, 0), 16: (-180, -45, -90),
+    14: (-90, -90, -135), 5: (-90, -90, -45), 9: (-90, -90, 45), 2: (-90, -90, 135), 4: (-180, -45, 180),
+    17: (-180, 45, 180), 7: (-180, 135, 180), 15: (-180, 135, 90), 3: (-180, 135, 0), 11: (-180, 135, -90),
+    20: (-180, 45, -90), 18: (-180, 45, 0), 10: (-90, 90, -45), 6: (-90, 90, -135), 24: (0, 135, -90),
+    22: (0, 135, 0), 23: (0, 135, 90), 21: (0, 135, 180), 13: (-90, 90, 135),
+}  # fmt: skip
+
+# Rows of the 24 matrices of Yu et al. 2021, Fig. 3, as signed axes: flange orientation in base, transposed
+YU_ROWS = {
+    1: "+x+y+z", 2: "+x-y-z", 3: "+x-z+y", 4: "+x+z-y", 5: "-x+y-z", 6: "-x-y+z", 7: "-x+z+y", 8: "-x-z-y",
+    9: "+y+x-z", 10: "-y+x+z", 11: "+z+x+y", 12: "-z+x-y", 13: "+y-x+z", 14: "-y-x-z", 15: "-z-x+y", 16: "+z-x-y",
+    17: "+y+z+x", 18: "-y-z+x", 19: "-z+y+x", 20: "+z-y+x", 21: "+y-z-x", 22: "-y+z-x", 23: "+z+y-x", 24: "-z-y-x",
+}  # fmt: skip
+
+
+def matrix_from_rows(text: str) -> Array:
+    out = np.zeros((3, 3))
+    for row in range(3):
+        sign, axis = text[2 * row], text[2 * row + 1]
+        out[row, "xyz".index(axis)] = 1.0 if sign == "+" else -1.0
+    return out
+
+
+def dh_product(name: str, q: tuple[float, ...]) -> Array:
+    """Standard DH written out with 4 x 4 matrices: Rz Tz Tx Rx."""
+    dh, X = MODELS[name], np.eye(4)
+    for i in range(6):
+        turn, shift, twist = np.eye(4), np.eye(4), np.eye(4)
+        turn[:3, :3] = rotation([0, 0, q[i] + dh.theta[i]])
+        shift[:3, 3] = dh.a[i], 0, dh.d[i]
+        twist[:3, :3] = rotation([dh.alpha[i], 0, 0])
+        X = X @ turn @ shift @ twist
+    return X
+
+
+@given(models, angles)
+def test_forward_is_the_dh_product(name: str, q: tuple[float, ...]) -> None:
+    np.testing.assert_allclose(forward(MODELS[name], q), dh_product(name, q), atol=1e-12)
+
+
+def test_ur5e_stretched_out_reaches_the_published_lengths() -> None:
+    np.testing.assert_allclose(
+        forward(MODELS["UR5e"], [0.0] * 6)[:3, 3], [-0.425 - 0.3922, -0.1333 - 0.0996, 0.1625 - 0.0997], atol=1e-12
+    )
+
+
+@given(models, angles)
+def test_every_closed_form_branch_reaches_the_pose(name: str, q: tuple[float, ...]) -> None:
+    dh = MODELS[name]
+    target = forward(dh, q)
+    for solution in closed_form(dh, target):
+        np.testing.assert_allclose(forward(dh, solution), target, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_closed_form_contains_the_posture_it_came_from(name: str) -> None:
+    dh, rng = MODELS[name], np.random.default_rng(1)
+    for q in rng.uniform(-math.pi, math.pi, (100, 6)):
+        solutions = np.array(list(closed_form(dh, forward(dh, q.tolist()))))
+        difference = np.abs(np.angle(np.exp(1j * (solutions - q)))).max(axis=1)
+        assert difference.min() < 1e-7
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_inverse_returns_to_the_nearest_posture(calibrated: bool) -> None:
+    dh = MODELS["UR5e"].disturbed(seed=3) if calibrated else MODELS["UR5e"]
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        q = np.radians([45, -100, 60, -50, 90, 45]) + rng.uniform(-0.5, 0.5, 6)
+        q[5] -= 2 * math.pi  # a joint may stand a turn away
+        solution = inverse(dh, forward(dh, q.tolist()), (q + rng.uniform(-0.05, 0.05, 6)).tolist())
+        assert solution is not None
+        np.testing.assert_allclose(np.array(solution), q, atol=1e-8)
+
+
+def test_inverse_knows_what_is_out_of_reach() -> None:
+    assert inverse(MODELS["UR3e"], matrix_of([0.9, 0.0, 0.3, 0.0, 0.0, 0.0]), [0.1] * 6) is None
+
+
+def test_a_factory_calibration_turns_the_flange_by_a_tenth_of_a_degree() -> None:
+    nominal, real = MODELS["UR5e"], MODELS["UR5e"].disturbed(seed=1)
+    rng = np.random.default_rng(0)
+    turns = [
+        math.degrees(math.hypot(*rotvec(forward(real, q)[:3, :3] @ forward(nominal, q)[:3, :3].T)))
+        for q in rng.uniform(-2, 2, (100, 6)).tolist()
+    ]
+    assert 0.05 < np.median(turns) < 0.4
+    assert MODELS["UR5e"].disturbed(seed=1) == real
+
+
+@given(angles)
+def test_jacobian_is_the_derivative(q: tuple[float, ...]) -> None:
+    dh, h = MODELS["UR10e"], 1e-6
+    for i in range(6):
+        ahead, behind = np.array(q), np.array(q)
+        ahead[i] += h
+        behind[i] -= h
+        A, B = forward(dh, ahead.tolist()), forward(dh, behind.tolist())
+        twist = np.concatenate((A[:3, 3] - B[:3, 3], rotvec(A[:3, :3] @ B[:3, :3].T))) / (2 * h)
+        np.testing.assert_allclose(jacobian(dh, q)[:, i], twist, atol=1e-6)
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 3), st.floats(0, math.pi))
+def test_rotation_vectors_survive_the_round_trip(axis: tuple[float, float, float], angle: float) -> None:
+    norm = math.hypot(*axis)
+    if norm < 1e-3:
+        return
+    R = rotation([angle * a / norm for a in axis])
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(rotation(rotvec(R)), R, atol=1e-9)
+    assert math.hypot(*rotvec(R)) == pytest.approx(angle, abs=1e-7)
+
+
+def test_poses_are_metres_and_a_rotation_vector() -> None:
+    X = matrix_of([0.1, 0.2, 0.3, 0.0, 0.0, math.pi / 2])
+    np.testing.assert_allclose(X[:3, :3] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    assert pose_of(X) == pytest.approx([0.1, 0.2, 0.3, 0.0, 0.0, math.pi / 2])
+    np.testing.assert_allclose(X @ inverse_matrix(X), np.eye(4), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", sorted(MODELS))
+@pytest.mark.parametrize("shoulder", [(-100, 60), (-110, 80), (-90, 60)])
+def test_the_tour_shows_all_cube_rotations(name: str, shoulder: tuple[int, int]) -> None:
+    assert sorted(TOUR) == sorted(YU_ROWS) == list(range(1, 25))
+    for number, (psi, q5, q6) in TOUR.items():
+        q2, q3 = shoulder
+        q = vector6(np.radians([45, q2, q3, psi - q2 - q3, q5, q6]))
+        R = forward(MODELS[name], q)[:3, :3]
+        np.testing.assert_allclose(R.T, matrix_from_rows(YU_ROWS[number]), atol=1e-12)

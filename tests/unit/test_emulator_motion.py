@@ -1,0 +1,200 @@
+"""How the emulated arm moves: trapezoids on time, no jumps whatever is commanded, one owner at a time."""
+
+import math
+from random import Random
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mocks.kinematics import MODELS, Vector6, forward, matrix_of, pose_of, rotvec, vector6
+from mocks.ur.motion import Arm, CannotFollow, JointMove, LineMove, MotionError, Trapezoid
+
+DH = MODELS["UR5e"]
+HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
+DT = 0.002
+
+
+def run(arm: Arm, dt: float = DT, limit_s: float = 30.0) -> float:
+    """Step until the path has ended; return the time it took."""
+    t = 0.0
+    while arm.busy and t < limit_s:
+        arm.step(dt)
+        t += dt
+    return t
+
+
+def shifted(q: Vector6, joint: int, angle_rad: float) -> Vector6:
+    out = list(q)
+    out[joint] += angle_rad
+    return vector6(out)
+
+
+@pytest.mark.parametrize(
+    ("length", "speed", "acceleration", "duration_s"),
+    [(1.0, 0.5, 1.0, 2.5), (2.0, 1.0, 2.0, 2.5), (0.25, 10.0, 1.0, 1.0), (0.0, 1.0, 1.0, 0.0)],
+)
+def test_trapezoid_takes_length_over_speed_plus_one_ramp(
+    length: float, speed: float, acceleration: float, duration_s: float
+) -> None:
+    profile = Trapezoid(length, speed, acceleration)
+    assert profile.duration_s == pytest.approx(duration_s)
+    times = np.linspace(0.0, duration_s, 2001) if duration_s else np.zeros(1)
+    way = np.array([profile.at(t) for t in times])
+    assert way[0] == pytest.approx(0.0)
+    assert way[-1] == pytest.approx(length)
+    if duration_s:
+        rate = np.diff(way) / np.diff(times)
+        assert rate.min() >= -1e-9
+        assert rate.max() <= speed + 1e-9
+        assert np.abs(np.diff(rate)).max() / np.diff(times)[0] <= acceleration * 1.01
+
+
+@pytest.mark.parametrize(("speed", "acceleration"), [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (math.nan, 1.0)])
+def test_impossible_speeds_are_refused(speed: float, acceleration: float) -> None:
+    with pytest.raises(MotionError, match="must be positive"):
+        JointMove(DH, HOME, speed, acceleration)
+
+
+def test_movej_is_led_by_the_longest_way_and_all_joints_arrive_together() -> None:
+    arm = Arm(DH, HOME)
+    goal = shifted(shifted(HOME, 5, 1.5), 3, -0.5)
+    arm.start(JointMove(DH, goal, 1.0, 2.0), "main")
+    assert run(arm) == pytest.approx(1.5 / 1.0 + 1.0 / 2.0, abs=2 * DT)
+    assert arm.q == goal
+    arm.step(DT)
+    assert arm.qd == (0.0,) * 6
+
+
+def test_movej_keeps_every_joint_below_its_own_limit() -> None:
+    arm = Arm(MODELS["UR10e"], HOME)
+    arm.start(JointMove(MODELS["UR10e"], shifted(HOME, 0, 3.0), 3.1, 10.0), "main")
+    fastest = 0.0
+    while arm.busy:
+        arm.step(DT)
+        fastest = max(fastest, abs(arm.qd[0]))
+    assert fastest == pytest.approx(math.radians(120), rel=1e-3)
+
+
+def test_a_slow_slider_stretches_the_motion() -> None:
+    arm = Arm(DH, HOME)
+    arm.speed_fraction = 0.5
+    for _ in range(100):
+        arm.step(DT)
+    arm.start(JointMove(DH, shifted(HOME, 5, 1.0), 1.0, 2.0), "main")
+    assert run(arm) == pytest.approx(2 * 1.5, abs=3 * DT)
+
+
+def test_movel_moves_the_tcp_on_a_straight_line() -> None:
+    arm = Arm(DH, HOME)
+    X_flange_tcp = matrix_of([0.0, 0.02, 0.15, 0.1, 0.2, 0.3])
+    start = forward(DH, HOME) @ X_flange_tcp
+    goal = start.copy()
+    goal[:3, 3] += [0.05, -0.1, -0.05]
+    arm.start(LineMove(DH, X_flange_tcp, goal, 0.25, 1.2), "main")
+    direction = np.array([0.05, -0.1, -0.05]) / math.hypot(0.05, 0.1, 0.05)
+    while arm.busy:
+        arm.step(DT)
+        here = forward(DH, arm.q) @ X_flange_tcp
+        off_line = (here[:3, 3] - start[:3, 3]) - direction * float(direction @ (here[:3, 3] - start[:3, 3]))
+        assert math.hypot(*off_line) < 1e-9
+        assert math.hypot(*rotvec(here[:3, :3] @ start[:3, :3].T)) < 1e-9
+    assert pose_of(forward(DH, arm.q) @ X_flange_tcp) == pytest.approx(pose_of(goal), abs=1e-9)
+
+
+def test_movel_out_of_the_workspace_leaves_the_arm_at_rest() -> None:
+    arm = Arm(DH, HOME)
+    goal = forward(DH, HOME)
+    goal[:3, 3] += [2.0, 0.0, 0.0]
+    arm.start(LineMove(DH, np.eye(4), goal, 1.0, 5.0), "main")
+    with pytest.raises(CannotFollow, match="workspace"):
+        run(arm)
+    assert arm.at_rest
+    assert not arm.busy
+
+
+def test_stopj_takes_speed_over_deceleration() -> None:
+    arm = Arm(DH, HOME)
+    arm.start(JointMove(DH, shifted(HOME, 5, 3.0), 1.0, 2.0), "main")
+    for _ in range(500):
+        arm.step(DT)
+    assert arm.qd[5] == pytest.approx(1.0)
+    arm.stop_joints(2.0, "main")
+    assert run(arm) == pytest.approx(0.5, abs=2 * DT)
+
+
+def test_pausing_stops_on_the_path_and_resuming_finishes_it() -> None:
+    arm = Arm(DH, HOME)
+    goal = shifted(HOME, 5, 1.0)
+    arm.start(JointMove(DH, goal, 1.0, 2.0), "main")
+    for _ in range(250):
+        arm.step(DT)
+    arm.paused = True
+    for _ in range(100):
+        arm.step(DT)
+    assert arm.at_rest
+    assert arm.busy
+    arm.paused = False
+    run(arm)
+    assert arm.q == goal
+
+
+def test_two_threads_of_a_program_cannot_both_move_the_arm() -> None:
+    arm = Arm(DH, HOME)
+    arm.start(JointMove(DH, shifted(HOME, 5, 1.0), 1.0, 2.0), "move")
+    arm.step(DT)
+    with pytest.raises(MotionError, match="already controlling"):
+        arm.start(JointMove(DH, HOME, 1.0, 2.0), "main")
+    arm.release("main")
+    arm.step(DT)
+    assert arm.busy  # only the owner can let go
+    arm.release("move")
+    arm.start(JointMove(DH, HOME, 1.0, 2.0), "main")
+
+
+def test_actual_joints_follow_and_settle_exactly() -> None:
+    arm = Arm(DH, HOME)
+    goal = shifted(HOME, 5, 1.0)
+    arm.start(JointMove(DH, goal, 1.0, 2.0), "main")
+    for _ in range(500):
+        arm.step(DT)
+    assert arm.q[5] - arm.actual_q[5] == pytest.approx(0.004, abs=0.002)  # speed times time constant, about
+    run(arm)
+    for _ in range(100):
+        arm.step(DT)
+    assert arm.actual_q == goal
+    assert arm.actual_qd == (0.0,) * 6
+
+
+commands = st.lists(
+    st.tuples(st.sampled_from(["move", "stop", "release", "pause", "resume", "slow", "line"]), st.integers(0, 60)),
+    max_size=12,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(commands, st.randoms(use_true_random=False))
+def test_the_set_point_never_jumps_whatever_is_commanded(order: list[tuple[str, int]], rng: Random) -> None:
+    arm = Arm(DH, HOME)
+    for what, steps in order:
+        if what == "move":
+            goal = vector6([v + rng.uniform(-1, 1) for v in HOME])
+            arm.start(JointMove(DH, goal, 2.0, 5.0), "main")
+        elif what == "line":
+            X = forward(DH, arm.q)
+            X[2, 3] -= 0.02
+            arm.start(LineMove(DH, np.eye(4), X, 0.1, 0.5), "main")
+        elif what == "stop":
+            arm.stop_joints(5.0, "main")
+        elif what == "release":
+            arm.release()
+        elif what == "slow":
+            arm.speed_fraction = rng.uniform(0.0, 1.0)
+        else:
+            arm.paused = what == "pause"
+        for _ in range(steps):
+            before, before_rate = arm.q, arm.qd
+            arm.step(DT)
+            assert max(abs(a - b) for a, b in zip(arm.q, before, strict=True)) <= 3.0 * DT
+            assert max(abs(a - b) for a, b in zip(arm.qd, before_rate, strict=True)) <= 0.1

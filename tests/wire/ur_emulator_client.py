@@ -1,0 +1,268 @@
+"""Scenarios with the unmodified ur_rtde clients, one per process: ``python ur_emulator_client.py SCENARIO HOST``.
+
+The client may hang or crash (it is C++ and holds the interpreter's lock in its constructors), so it never runs in the
+test process. A scenario prints one line ``@result {...}``; on the way it may ask the station for something with a line
+``@ask {...}`` and reads the answer from standard input.
+"""
+
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+from dashboard_client import DashboardClient
+from rtde_control import RTDEControlInterface
+from rtde_receive import RTDEReceiveInterface
+
+
+def ask(**request: Any) -> dict[str, Any]:
+    """Say something on the station's control channel and return the answer."""
+    sys.stdout.write("@ask " + json.dumps(request) + "\n")
+    sys.stdout.flush()
+    answer: dict[str, Any] = json.loads(sys.stdin.readline())
+    return answer
+
+
+def wait_for(condition: Callable[[], bool], timeout_s: float = 5.0) -> bool:
+    """Wait until the condition holds; False when it does not in time."""
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.002)
+    return False
+
+
+def arrived(receive: Any, goal: list[float]) -> bool:
+    return bool(max(abs(a - b) for a, b in zip(receive.getActualQ(), goal, strict=True)) < 1e-4)
+
+
+def receive(host: str) -> dict[str, Any]:
+    """Everything, and an explicit list at another rate."""
+    everything = RTDEReceiveInterface(host)
+    some = RTDEReceiveInterface(host, 125.0, ["timestamp", "actual_q", "actual_TCP_pose", "payload"])
+    first = everything.getTimestamp()
+    advanced = wait_for(lambda: everything.getTimestamp() > first + 0.1)
+    state = ask(do="state")
+    return {
+        "advanced": advanced,
+        "q": everything.getActualQ(),
+        "same_q": some.getActualQ(),
+        "pose": everything.getActualTCPPose(),
+        "same_pose": some.getActualTCPPose(),
+        "true_q": state["q_rad"],
+        "modes": [everything.getRobotMode(), everything.getSafetyMode(), everything.getRuntimeState()],
+        "payload": [everything.getPayload(), some.getPayload()],
+        "scaling": [everything.getSpeedScaling(), everything.getTargetSpeedFraction()],
+    }
+
+
+def moves(host: str) -> dict[str, Any]:
+    """Blocking and asynchronous moves, both stops, straight lines."""
+    r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
+    q = r.getActualQ()
+    q[5] += 1.0
+    begun = time.monotonic()
+    out: dict[str, Any] = {"moveJ": c.moveJ(q, 1.0, 2.0), "seconds": time.monotonic() - begun}
+    out["moveJ_arrived"] = wait_for(lambda: arrived(r, q))
+    pose = r.getActualTCPPose()
+    pose[2] -= 0.05
+    out["moveL"] = c.moveL(pose, 0.25, 1.2)
+    out["moveL_error_m"] = max(abs(a - b) for a, b in zip(r.getActualTCPPose()[:3], pose[:3], strict=True))
+    out["moveJ_IK"] = c.moveJ_IK(pose, 1.0, 2.0)
+
+    before = c.getAsyncOperationProgressEx()
+    far = r.getActualQ()
+    far[5] -= 2.0
+    out["async"] = c.moveJ(far, 0.05, 2.0, True)
+    out["running"] = wait_for(lambda: bool(c.getAsyncOperationProgressEx().isAsyncOperationRunning()))
+    out["next_operation"] = c.getAsyncOperationProgressEx().operationId() - before.operationId()
+    wait_for(lambda: abs(r.getTargetQd()[5]) > 0.04)
+    c.stopJ(2.0)
+    out["stopped"] = wait_for(lambda: not any(r.getTargetQd()))
+    out["ended"] = wait_for(lambda: not c.getAsyncOperationProgressEx().isAsyncOperationRunning())
+    out["short_of_goal"] = abs(r.getActualQ()[5] - far[5]) > 0.5
+
+    near = r.getActualQ()
+    near[4] += 0.3
+    c.moveJ(near, 1.0, 2.0, True)
+    wait_for(lambda: bool(c.getAsyncOperationProgressEx().isAsyncOperationRunning()))
+    out["async_ended"] = wait_for(lambda: not c.getAsyncOperationProgressEx().isAsyncOperationRunning())
+    out["async_arrived"] = wait_for(lambda: arrived(r, near))
+    out["steady"] = wait_for(c.isSteady)
+    c.stopScript()
+    return out
+
+
+def kinematics(host: str) -> dict[str, Any]:
+    """Everything the controller computes."""
+    r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
+    q, pose = r.getActualQ(), r.getActualTCPPose()
+    # some results are read before the script has run: ask twice, two cycles apart (a trait of the client)
+    c.getActualToolFlangePose()
+    time.sleep(0.02)
+    return {
+        "flange": c.getActualToolFlangePose(),
+        "q": q,
+        "pose": pose,
+        "ik": c.getInverseKinematics(pose),
+        "ik_near": c.getInverseKinematics(pose, q),
+        "has": c.getInverseKinematicsHasSolution(pose),
+        "has_not": c.getInverseKinematicsHasSolution([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        "fk": c.getForwardKinematics(),
+        "fk_of_q": c.getForwardKinematics(q, [1e-12, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        "trans": c.poseTrans([1.0, 2.0, 3.0, 0.0, 0.0, math.pi / 2], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        "joints_safe": c.isJointsWithinSafetyLimits(q),
+        "joints_unsafe": c.isJointsWithinSafetyLimits([7.0, *q[1:]]),
+        "pose_safe": c.isPoseWithinSafetyLimits(pose),
+        "pose_below_plane": c.isPoseWithinSafetyLimits([*pose[:2], 0.05, *pose[3:]]),
+        "pose_unreachable": c.isPoseWithinSafetyLimits([3.0, *pose[1:]]),
+        "script_alive": c.isProgramRunning(),
+        "unreachable_ik": c.getInverseKinematics([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        "script_died": wait_for(lambda: not c.isProgramRunning()),
+    }
+
+
+def settings(host: str) -> dict[str, Any]:
+    """TCP, payload, force sensor, speed slider."""
+    r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
+    io = import_module("rtde_io").RTDEIOInterface(host)
+    c.getActualToolFlangePose()
+    time.sleep(0.02)
+    flange, bare = c.getActualToolFlangePose(), r.getActualTCPPose()
+    out: dict[str, Any] = {"offset_before": c.getTCPOffset(), "setTcp": c.setTcp([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])}
+    out["offset"] = c.getTCPOffset()
+    c.getActualToolFlangePose()
+    time.sleep(0.02)
+    out |= {"flange": flange, "flange_after": c.getActualToolFlangePose(), "bare": bare, "tcp": r.getActualTCPPose()}
+    wait_for(lambda: math.hypot(*r.getActualTCPForce()) < 1e-9)
+    ask(do="push", wrench=[0, 0, 10, 0, 0, 0])
+    out["pushed"] = wait_for(lambda: abs(math.hypot(*r.getActualTCPForce()[:3]) - 10.0) < 1e-6)
+    out["zeroed"] = c.zeroFtSensor() and wait_for(lambda: math.hypot(*r.getActualTCPForce()) < 1e-9)
+    out["setPayload"] = c.setPayload(1.5, [0.0, 0.01, 0.05])
+    out["payload_seen"] = wait_for(lambda: r.getPayload() == 1.5 and r.getPayloadCog() == [0.0, 0.01, 0.05])
+    out["setTargetPayload"] = c.setTargetPayload(2.0, [0.0, 0.0, 0.06], [0.1, 0.2, 0.3, 0.0, 0.0, 0.0])
+    out["inertia_seen"] = wait_for(lambda: r.getPayloadInertia()[:3] == [0.1, 0.2, 0.3])
+    out["setSpeedSlider"] = io.setSpeedSlider(0.25)
+    out["slider_seen"] = wait_for(lambda: r.getTargetSpeedFraction() == 0.25)
+    c.stopScript()
+    return out
+
+
+def program(host: str) -> dict[str, Any]:
+    """The life of the program: dashboard, stop, upload, watchdog."""
+    d = DashboardClient(host)
+    d.connect()
+    out: dict[str, Any] = {
+        "version": d.polyscopeVersion(),
+        "serial": d.getSerialNumber(),
+        "model": d.getRobotModel(),
+        "remote": d.isInRemoteControl(),
+        "mode": d.robotmode(),
+        "safety": d.safetymode(),
+        "running_before": d.running(),
+    }
+    r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
+    out["state"] = d.programState()
+    c.stopScript()
+    out["stopped"] = [c.isProgramRunning(), d.programState().split()[0], r.getRuntimeState()]
+    out["command_when_stopped"] = c.setPayload(1.0, [0.0, 0.0, 0.1])
+    out["reupload"] = c.reuploadScript() and wait_for(c.isProgramRunning)
+    out["alive"] = wait_for(c.isSteady)
+    c.setWatchdog(20.0)
+    for _ in range(10):
+        c.kickWatchdog()
+        time.sleep(0.02)
+    out["kicked"] = c.isProgramRunning()
+    q = r.getActualQ()
+    q[5] += 2.0
+    c.moveJ(q, 0.02, 2.0, True)
+    out["watchdog_bites"] = wait_for(lambda: not c.isProgramRunning(), 2.0)
+    out["arm_stands"] = wait_for(lambda: not any(r.getTargetQd()))
+    out["short_of_goal"] = abs(q[5] - r.getActualQ()[5]) > 0.5
+    c.reuploadScript()
+    out["again"] = wait_for(c.isProgramRunning) and c.moveJ(r.getActualQ(), 1.0, 2.0)
+    out["second"] = _failure(lambda: RTDEControlInterface(host))  # its registers are taken
+    d.stop()
+    out["dashboard_stop"] = wait_for(lambda: not c.isProgramRunning())
+    return out
+
+
+def stops(host: str) -> dict[str, Any]:
+    """Protective stop in motion and recovery, emergency stop and recovery."""
+    d = DashboardClient(host)
+    d.connect()
+    r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
+    q = r.getActualQ()
+    q[5] += 1.0
+    c.moveJ(q, 0.05, 2.0, True)
+    wait_for(lambda: abs(r.getTargetQd()[5]) > 0.04)
+    ask(do="protective-stop")
+    out: dict[str, Any] = {"stop_seen": wait_for(r.isProtectiveStopped)}
+    out["status"] = [r.getSafetyMode(), r.getSafetyStatusBits(), r.getRobotMode(), r.getRuntimeState()]
+    out["stands"] = wait_for(lambda: not any(r.getTargetQd()))
+    out["still_running_says_the_word"] = c.getAsyncOperationProgressEx().isAsyncOperationRunning()
+    out["move_refused"] = c.moveJ(q)
+    out["play"] = _failure(d.play)
+    out["too_early"] = _failure(d.unlockProtectiveStop)
+    out["unlocked"] = wait_for(lambda: _failure(d.unlockProtectiveStop) is None)
+    d.play()
+    out["finishes_the_interrupted_move"] = wait_for(lambda: arrived(r, q))
+
+    out["trigger"] = c.triggerProtectiveStop()
+    out["triggered"] = wait_for(r.isProtectiveStopped)
+    wait_for(lambda: _failure(d.unlockProtectiveStop) is None)
+    d.stop()
+    c.reuploadScript()
+    out["recovered"] = wait_for(c.isProgramRunning) and c.moveJ(q)
+
+    ask(do="emergency-stop")
+    out["estop_seen"] = wait_for(r.isEmergencyStopped)
+    out["estop_status"] = [r.getSafetyMode(), r.getSafetyStatusBits(), r.getRobotMode(), r.getRuntimeState()]
+    out["estop_move"] = c.moveJ(q)
+    ask(do="emergency-stop", on=False)
+    d.powerOn()
+    out["idle"] = wait_for(lambda: d.robotmode() == "Robotmode: IDLE")
+    d.brakeRelease()
+    out["running"] = wait_for(lambda: d.robotmode() == "Robotmode: RUNNING")
+    c.reuploadScript()
+    out["moves_again"] = wait_for(c.isProgramRunning) and c.moveJ(q)
+    c.stopScript()
+    return out
+
+
+def link(host: str) -> dict[str, Any]:
+    """A frozen controller and a dropped connection, seen by the reading client."""
+    r = RTDEReceiveInterface(host)
+    ask(do="freeze", on=True)
+    stamp = r.getTimestamp()
+    time.sleep(0.3)
+    frozen_for = r.getTimestamp() - stamp
+    ask(do="freeze", on=False)
+    out: dict[str, Any] = {"frozen_for": frozen_for, "thawed": wait_for(lambda: r.getTimestamp() > stamp + 0.1)}
+    out["dropped"] = ask(do="drop", what="rtde")
+    out["loss_seen"] = wait_for(lambda: not r.isConnected())
+    out["reconnect"] = r.reconnect()
+    last = r.getTimestamp()
+    out["alive"] = wait_for(lambda: r.getTimestamp() > last)
+    return out
+
+
+def _failure(call: Callable[[], Any]) -> str | None:
+    try:
+        call()
+    except RuntimeError as error:
+        return str(error)
+    return None
+
+
+SCENARIOS: dict[str, Callable[[str], dict[str, Any]]] = {
+    f.__name__: f for f in (receive, moves, kinematics, settings, program, stops, link)
+}
+
+if __name__ == "__main__":
+    sys.stdout.write("@result " + json.dumps(SCENARIOS[sys.argv[1]](sys.argv[2])) + "\n")
+    sys.stdout.flush()
