@@ -133,7 +133,10 @@ class ControlProcess:
 
     def _read_replies(self, pipe: IO[str]) -> None:
         for line in pipe:
-            self._replies.put(json.loads(line))
+            try:
+                self._replies.put(json.loads(line))
+            except ValueError:  # something at the interpreter's start-up may print
+                log.info("not a reply: %s", line.rstrip())
         self._gone.set()
         self._replies.put(None)
 

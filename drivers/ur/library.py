@@ -4,12 +4,13 @@ Ref: ur_rtde 1.6.5, API reference; Universal Robots, "Dashboard Server, e-Series
 Checked on hardware: no.
 
 `RTDEControlInterface` is not here: it may hang or crash its process, so it has one of its own (`control_child.py`).
-What is here always comes back, but only after up to five seconds when the controller is dead: hence `within`.
+What is here always comes back, but only after up to five seconds when the controller is dead: it runs in threads.
 """
 
+import ctypes
 import platform
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from importlib import import_module
 from typing import Final, Protocol, TypeVar, cast
 
@@ -95,6 +96,12 @@ class Dashboard(Protocol):
         """Whether programs sent over the network are accepted (e-Series from 5.6 on)."""
 
 
+def require() -> None:
+    """Raise `ConnectError` where ur_rtde is not installed."""
+    for name in ("rtde_receive", "rtde_control", "dashboard_client"):
+        _load(name)
+
+
 def connect_receive(host: str) -> Receive:
     """Connect to a controller that has just answered over RTDE: a silent one would freeze the interpreter here."""
     try:
@@ -117,20 +124,28 @@ def ask_dashboard(host: str, ask: Callable[[Dashboard], T], *, timeout_s: float)
             dashboard.disconnect()
 
     try:
-        return within(timeout_s, session)
+        return _in_background(session).result(timeout_s)
     except RuntimeError as error:
         raise StreamBroken(f"the dashboard server of {host} says: {error}") from error
     except TimeoutError as error:
         raise DeviceTimeout(f"the dashboard server of {host} did not answer within {timeout_s:.1f} s") from error
 
 
-def within(timeout_s: float, do: Callable[[], T]) -> T:
-    """Wait up to `timeout_s` for a call that cannot be interrupted; after that, TimeoutError: it ends by itself."""
+def retire(receive: Receive) -> None:
+    """Let a connection end by itself, which takes half a second, or three when the controller is silent.
+
+    The object is never destroyed: its destructor would stop the whole interpreter for half a second (measured), long
+    enough for a sensor to look dead. What is lost is a few kilobytes for each time an arm is opened.
+    """
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(receive))
+    _in_background(receive.disconnect)
+
+
+def _in_background(do: Callable[[], T]) -> "Future[T]":
     pool = ThreadPoolExecutor(1, "ur-rtde")  # not a daemon: leaving the interpreter in the middle of C++ would abort it
-    try:
-        return pool.submit(do).result(timeout_s)
-    finally:
-        pool.shutdown(wait=False)
+    future = pool.submit(do)
+    pool.shutdown(wait=False)
+    return future
 
 
 class _Module(Protocol):

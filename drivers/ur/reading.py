@@ -22,7 +22,7 @@ import numpy as np
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from drivers.interfaces import ArmState, DeviceInfo
 from drivers.ur.kinematics import MODELS, Pose, forward, model_named
-from drivers.ur.library import Dashboard, Receive, ask_dashboard, connect_receive, within
+from drivers.ur.library import Dashboard, Receive, ask_dashboard, connect_receive, require, retire
 from drivers.ur.rtde import TcpOffsetReader
 
 log = logging.getLogger(__name__)
@@ -128,6 +128,7 @@ class Reader:
         self._host = host
         self._tcp = TcpOffsetReader(host)
         self._receive: Receive | None = None
+        require()
         try:
             self._tcp.open(timeout_s=CONNECT_S)
             self.version = self._tcp.version
@@ -172,14 +173,11 @@ class Reader:
         return self._tcp.supported
 
     def close(self) -> None:
-        """Let the connections go, within 0.3 s even when the controller is silent. Idempotent."""
+        """Let the connections go. Idempotent."""
         self._tcp.close()
         receive, self._receive = self._receive, None
         if receive is not None:
-            try:
-                within(0.2, receive.disconnect)
-            except (TimeoutError, RuntimeError) as error:
-                log.debug("%s: disconnecting goes on in the background: %s", self._host, error)
+            retire(receive)
 
     def look(self) -> Look:
         """Take the newest sample. Raises `StreamBroken` once the loss of a connection is known."""
