@@ -84,7 +84,9 @@ def test_what_is_wrong_is_said_with_its_row(changes: dict[str, Any], words: str)
 @pytest.mark.parametrize("decimals", [3, 4, 6])
 def test_rounded_rotations_are_put_back_onto_so3(decimals: int) -> None:
     exact = Rotation.random(500, rng=np.random.default_rng(1)).as_matrix()
-    data = CalibrationDataset(exact.round(decimals), np.zeros((500, 6)), None, np.zeros(500), np.full(500, np.nan))  # type: ignore[arg-type]
+    data = CalibrationDataset(
+        exact.round(decimals), np.zeros((500, 6)), None, np.zeros(500, np.int64), np.full(500, np.nan)
+    )
     assert np.abs(np.swapaxes(data.R_base_flange, 1, 2) @ data.R_base_flange - np.eye(3)).max() < 1e-14
     assert np.abs(data.R_base_flange - exact).max() < 10.0**-decimals
 

@@ -20,7 +20,7 @@ TRUTH = Parameters(
 )
 
 
-def turned(axis: str, angle_deg: float) -> Array:
+def turned(axis: str, angle_deg: float | list[float]) -> Array:
     return np.asarray(Rotation.from_euler(axis, angle_deg, degrees=True).as_matrix())
 
 
@@ -48,7 +48,7 @@ def test_srom_knows_its_orientations_in_any_order() -> None:
 
 @pytest.mark.parametrize(
     "Y",
-    [turned("z", 45), turned("z", -45), turned("z", 20), turned("x", 170), turned("ZYX", [10, 20, 30])],  # type: ignore[arg-type]
+    [turned("z", 45), turned("z", -45), turned("z", 20), turned("x", 170), turned("ZYX", [10, 20, 30])],
 )
 def test_srom_works_when_all_orientations_are_turned_by_a_common_rotation(Y: Array) -> None:
     rng = np.random.default_rng(1)
