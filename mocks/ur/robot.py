@@ -1,7 +1,7 @@
 """The controller without its sockets: arm, modes, safety, program and registers, one step per control cycle.
 
-Time: `tick` advances the *wire* by one control period (timestamp, watchdog) and the *physics* by `time_scale` times as
-much (motion, settling, the waiting times of the controller).
+Time: a cycle takes one control period of real time; the controller and its arm live through `time_scale` times as much
+in it (clock, motion, settling, the waiting times of the controller). The watchdog, which watches us, keeps real time.
 """
 
 from collections.abc import Callable
@@ -158,8 +158,8 @@ class Robot:
 
     @property
     def timestamp_s(self) -> float:
-        """Controller clock on the wire: one control period per cycle."""
-        return 100.0 + self.cycle * self.period_s
+        """Controller clock on the wire."""
+        return 100.0 + self.cycle * self.period_s * self.settings.time_scale
 
     def tick(self) -> None:
         """One control cycle: program, then motion."""

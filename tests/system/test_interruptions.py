@@ -23,8 +23,8 @@ class CommandLine(Protocol):
 
 
 @pytest.fixture
-def station() -> Iterator[Station]:
-    with Station("can", ["--seed", "3"]) as station:
+def station(request: pytest.FixtureRequest) -> Iterator[Station]:
+    with Station(getattr(request, "param", "serial"), ["--seed", "3"]) as station:
         yield station
 
 
@@ -64,6 +64,7 @@ def test_ctrl_c_stops_the_arm_and_keeps_the_poses(
     assert "Traceback" not in solved.stderr
 
 
+@pytest.mark.parametrize("station", ["can", "serial"], indirect=True)
 def test_unplugged_sensor_stops_the_arm_and_keeps_the_poses(
     station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine
 ) -> None:

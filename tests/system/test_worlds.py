@@ -17,9 +17,9 @@ class CommandLine(Protocol):
 
 
 WORLDS = {
-    "base tilted by 8 degrees": ["--tilt-deg", "8,0"],
-    "sensor turned 137 degrees about an odd axis": ["--sensor-rotvec-deg", "79.1,-98.9,52.7"],
-    "arm on a wall, with a TCP set": ["--mount", "wall", "--tcp", "0.03,-0.02,0.15,0.4,-0.3,0.9"],
+    "base tilted by 8 degrees": ("can", ["--tilt-deg", "8,0"]),
+    "sensor turned 137 degrees about an odd axis": ("serial", ["--sensor-rotvec-deg", "79.1,-98.9,52.7"]),
+    "arm on a wall, with a TCP set": ("serial", ["--mount", "wall", "--tcp", "0.03,-0.02,0.15,0.4,-0.3,0.9"]),
 }
 
 
@@ -29,7 +29,8 @@ def test_odd_cells_are_recovered_within_their_sigmas(
 ) -> None:
     from calib import CalibrationResult
 
-    with Station("can", ["--seed", "7", *WORLDS[world]]) as station:
+    sensor, options = WORLDS[world]
+    with Station(sensor, ["--seed", "7", *options]) as station:
         answer = ftdrive.json("calibrate", "--config", write_config(station.cell), typed="MOVE\n")
         truth = station.truth
     result = CalibrationResult.load(tmp_path / answer["run"] / "calibration.json")
