@@ -67,9 +67,10 @@ def print_result(
     for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
         if truth is not None or title not in {"truth", "error / sigma"}:
             table.add_column(title, justify="right" if title else "left")
-    for label, scale, unit, key, digits in _ROWS:
+    for label, scale, unit, key in _ROWS:
         estimates, sigmas = (_values(source[key], key) * scale for source in (data, data["sigma"]))
         truths = None if truth is None else _values(truth[key], key) * scale
+        digits = int(np.clip(1 - np.floor(np.log10(max(sigmas.min(), 1e-9))), 0, 7))  # two digits of the smallest sigma
         for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
             cells = [f"{label} {axis}", f"{estimates[i]:.{digits}f} {unit}", f"{sigmas[i]:.{digits}f}"]
             if truths is not None:
@@ -86,16 +87,16 @@ def print_result(
         talk.print(_drift_line(drift))
 
 
-# Label, factor from the file's unit to the screen's, unit on the screen, key, decimals.
-_ROWS: Sequence[tuple[str, float, str, str, int]] = (
-    ("mass", 1.0, "kg", "mass_kg", 5),
-    ("centre of mass", 1e3, "mm", "p_sensor_com_m", 2),
-    ("force bias", 1.0, "N", "force_bias_N", 4),
-    ("torque bias", 1.0, "N·m", "torque_bias_Nm", 5),
-    ("flange to sensor", 180 / np.pi, "deg", "R_flange_sensor", 3),
-    ("gravity in base", 1.0, "N", "gravity_force_base_N", 4),
-    ("base tilt alpha", 180 / np.pi, "deg", "tilt_alpha_rad", 3),
-    ("base tilt beta", 180 / np.pi, "deg", "tilt_beta_rad", 3),
+# Label, factor from the file's unit to the screen's, unit on the screen, key.
+_ROWS: Sequence[tuple[str, float, str, str]] = (
+    ("mass", 1.0, "kg", "mass_kg"),
+    ("centre of mass", 1e3, "mm", "p_sensor_com_m"),
+    ("force bias", 1.0, "N", "force_bias_N"),
+    ("torque bias", 1.0, "N·m", "torque_bias_Nm"),
+    ("flange to sensor", 180 / np.pi, "deg", "R_flange_sensor"),
+    ("gravity in base", 1.0, "N", "gravity_force_base_N"),
+    ("base tilt alpha", 180 / np.pi, "deg", "tilt_alpha_rad"),
+    ("base tilt beta", 180 / np.pi, "deg", "tilt_beta_rad"),
 )
 
 
@@ -113,7 +114,7 @@ def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict
     """
     data = result.to_dict()
     errors = {}
-    for _, _, _, key, _ in _ROWS:
+    for _, _, _, key in _ROWS:
         if key == "R_flange_sensor":
             error = Rotation.from_matrix(result.R_flange_sensor @ np.transpose(truth[key])).as_rotvec()
         else:

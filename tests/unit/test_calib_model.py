@@ -69,7 +69,7 @@ def test_the_jacobian_is_the_derivative(seed: int) -> None:
 def test_difference_undoes_moved(seed: int) -> None:
     rng = np.random.default_rng(seed)
     parameters, step = random_parameters(rng), rng.normal(size=15)
-    step[:3] *= min(1.0, 3.0 / np.linalg.norm(step[:3]))  # half a turn and more has a shorter way round
+    step[:3] *= min(1.0, 3.0 / float(np.linalg.norm(step[:3])))  # half a turn and more has a shorter way round
     np.testing.assert_allclose(parameters.difference(parameters.moved(step)), step, atol=1e-13)
 
 
