@@ -10,6 +10,7 @@ from typing import Any, Literal
 import click
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 
@@ -170,21 +171,20 @@ def _line(reading: dict[str, Any]) -> str:
     return f"F {force} N   T {torque} N·m   ({reading['axes']} axes, about the {reading['about']})"
 
 
-def _screen(reading: dict[str, Any], path: Path) -> Table:
-    table = Table(
-        title=f"raw → bias and gravity taken away ({path.name}, {reading['verdict']})   "
-        f"[bold]{reading['axes']} axes, about the {reading['about']}[/]   {reading['rate_Hz']:.0f} Hz, "
-        f"lost {reading['lost']}   Ctrl-C ends",
-        title_justify="left",
-        box=None,
-    )
+def _screen(reading: dict[str, Any], path: Path) -> Group:
+    table = Table(box=None)
     for title in ("", "raw", "contact", "± 1 sigma", ""):
         table.add_column(title, justify="right")
     columns = [np.r_[reading[key]["force_N"], reading[key]["torque_Nm"]] for key in ("raw", "compensated", "sigma")]
     for i, name in enumerate(_NAMES):
         raw, contact, sigma = (column[i] for column in columns)
-        unit, full, digits = ("N", 20.0, 2) if i < 3 else ("N·m", 2.0, 4)
+        unit, full, digits = ("N", 20.0, 3) if i < 3 else ("N·m", 2.0, 5)
         filled = min(20, round(20 * abs(contact) / full))
         bar = ("[red]" if contact < 0 else "[green]") + "█" * filled + "[/]" + "·" * (20 - filled)
         table.add_row(name, f"{raw:.{digits}f}", f"{contact:.{digits}f} {unit}", f"{sigma:.{digits}f}", bar)
-    return table
+    return Group(
+        f"[bold]{reading['axes']} axes, about the {reading['about']}[/]   raw → bias and weight of the tool taken away",
+        f"{path}, {reading['verdict']}   mean of {_PERIOD_S} s   {reading['rate_Hz']:.0f} Hz, lost {reading['lost']}",
+        table,
+        "Ctrl-C ends",
+    )
