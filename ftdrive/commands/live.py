@@ -167,7 +167,9 @@ def _reading(look: Look, calibration: CalibrationResult, axes: Axes) -> dict[str
 
 def _line(reading: dict[str, Any]) -> str:
     contact = reading["compensated"]
-    force, torque = (" ".join(f"{value:9.4f}" for value in contact[key]) for key in ("force_N", "torque_Nm"))
+    force, torque = (
+        " ".join(f"{value:9.{n}f}" for value in contact[key]) for key, n in (("force_N", 3), ("torque_Nm", 5))
+    )
     return f"F {force} N   T {torque} N·m   ({reading['axes']} axes, about the {reading['about']})"
 
 
