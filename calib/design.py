@@ -32,10 +32,29 @@ SUBSET_8 = (2, 3, 6, 8, 17, 19, 22, 23)
 SUBSET_6 = (9, 10, 16, 19, 21, 22)
 """The best six of the 24 that have one solution: second-basin gap 0.28."""
 AMBIGUOUS_6 = (4, 6, 9, 15, 18, 23)
-"""A-optimal for the forces, but another mounting of the sensor explains them exactly (gap 0): for tests, not for use."""
+"""A-optimal for the forces, but another mounting of the sensor explains them exactly (gap 0): do not use."""
 
 # Found by tests/benchmarks/design_table.py --optimise; rotation vectors in rad of R_base_flange, tool down first.
-_OPTIMISED: Mapping[int, tuple[tuple[float, float, float], ...]] = {}
+_OPTIMISED: Mapping[int, tuple[tuple[float, float, float], ...]] = {
+    6: (
+        (3.141593, 0.000000, 0.000000),
+        (-0.435672, 1.905989, -1.760305),
+        (-1.130622, -1.904908, -1.547113),
+        (0.914169, -0.138790, -1.156033),
+        (-0.774574, 1.437738, 1.067425),
+        (0.000059, -0.860257, 1.088217),
+    ),
+    8: (
+        (3.141593, 0.000000, 0.000000),
+        (0.001302, 3.140850, -0.006137),
+        (1.010150, -0.991248, 1.652328),
+        (-1.184080, 0.401703, 0.653962),
+        (0.490081, 1.439710, -2.023385),
+        (0.793096, -1.522294, -2.392674),
+        (1.096127, 0.574306, 0.209976),
+        (-0.909292, -0.925868, -1.044533),
+    ),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -292,8 +311,9 @@ class _Variance:
 
 def _drift_columns(t_s: ArrayLike) -> Array:
     """Derivative (n, 6, 6) of the whitened wrench by a linear drift of each channel; zero without passing of time."""
-    since = np.asarray(t_s, dtype=np.float64) - np.mean(t_s)
-    return np.multiply.outer(since / (np.abs(since).max() or 1.0), np.eye(6))
+    t = np.asarray(t_s, dtype=np.float64)
+    since = t - t.mean()
+    return np.asarray(np.multiply.outer(since / (np.abs(since).max() or 1.0), np.eye(6)))
 
 
 def _weight_and_tilt_rows(guess: Guess) -> Array:

@@ -4,6 +4,7 @@ Criteria are traces of a covariance C: a pose with whitened Jacobian J lowers tr
 trace((1 + J C J^T)^-1 J C M C J^T), so all candidates are judged at once. Everything is deterministic.
 """
 
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib.design import (
-    TOOL_DOWN_R_base_flange,
     Guess,
     Prediction,
+    TOOL_DOWN_R_base_flange,
     force_rows,
     information,
     prediction_weights,
@@ -36,6 +37,8 @@ LEAST_GAP = 0.05
 RECOMMENDED_POSES = 6
 MOST_SWEEPS = 20
 LEAST_GAIN = 1e-6
+CLEARLY_WIDER = 1.1
+RANDOM_ORDERS = 8
 
 
 def cone_candidates(half_angle_rad: float, spins: int = 8, directions: int = 150) -> Array:
@@ -110,23 +113,29 @@ def choose(
     while len(pinned) <= n // 2:
         chosen = _greedy_and_exchange(terms, n, pinned)
         gap, other = second_basin(R_candidates[chosen], guess)
-        if gap > widest:
+        if gap > CLEARLY_WIDER * widest:
             widest, best = gap, chosen
         if gap >= least_gap or other is None:
             break
         contradiction = _contradiction(R_candidates, guess, other)
+        strong = [int(i) for i in chosen if contradiction[i] > contradiction.max() / 2]
         contradiction[chosen] = -1.0
-        pinned.append(int(contradiction.argmax()))
+        pinned = [*dict.fromkeys([*pinned, *strong, int(contradiction.argmax())])]
     return best
 
 
 def next_pose(
-    R_done: Array, R_candidates: Array, guess: Guess, *, R_workspace: Array | None = None
+    R_done: Array,
+    R_candidates: Array,
+    guess: Guess,
+    *,
+    R_workspace: Array | None = None,
+    least_gap: float = LEAST_GAP,
 ) -> tuple[Indices, Array]:
     """Rank candidates by how much one more pose there would improve the compensation of forces and torques.
 
-    As long as the poses taken fit a second solution almost as well (gap below 0.05), those candidates come first that
-    decide against it.
+    As long as the poses taken fit a second solution almost as well, the improvement is multiplied by how much the
+    candidate contradicts that solution.
 
     Parameters
     ----------
@@ -136,6 +145,8 @@ def next_pose(
     guess : Guess
     R_workspace : array, shape (k, 3, 3), optional
         Where compensation is wanted, everywhere by default.
+    least_gap : float
+        From this gap on (`second_basin_gap`) the second solution is no concern.
 
     Returns
     -------
@@ -150,19 +161,25 @@ def next_pose(
         raise ValueError("there are no candidates for the next pose: give orientations that the arm can reach")
     force, torque = prediction_weights(special(range(1, 25)) if R_workspace is None else R_workspace, guess)
     done = whitened_jacobian(R_done, guess).reshape(-1, 15)
-    C = np.linalg.inv(PRIOR * np.eye(15) + done.T @ done)
+    C = _inverse(PRIOR * np.eye(15) + done.T @ done)
     force_gain, torque_gain = _gains(whitened_jacobian(R_candidates, guess), C, force, torque)
     worth = force_gain + torque_gain
     if len(R_done) >= FEWEST - 1:
         gap, other = second_basin(R_done, guess)
-        if gap < LEAST_GAP and other is not None:
-            worth = _contradiction(R_candidates, guess, other)
+        if gap < least_gap and other is not None:
+            worth = worth * _contradiction(R_candidates, guess, other)
     ranked = np.argsort(-worth, kind="stable")
     variance = np.maximum(np.sum(C * force) - force_gain[ranked], 0.0)
     return ranked, np.asarray(guess.sigma_force_N * np.sqrt(variance))
 
 
-def enough(prediction: Prediction, force_rms_N: float, torque_rms_Nm: float = float("inf")) -> bool:
+def enough(
+    prediction: Prediction,
+    force_rms_N: float,
+    torque_rms_Nm: float = float("inf"),
+    *,
+    least_gap: float = LEAST_GAP,
+) -> bool:
     """Say whether the poses behind a prediction will do: errors as wanted, one clear solution, six poses or more.
 
     Parameters
@@ -171,10 +188,12 @@ def enough(prediction: Prediction, force_rms_N: float, torque_rms_Nm: float = fl
         Of the poses taken.
     force_rms_N, torque_rms_Nm : float
         Wanted errors of compensation, root mean square over all orientations.
+    least_gap : float
+        0.05 is out of reach within about 40° of straight down: ask for 0.02 there, for less in narrower cones.
     """
     return (
         prediction.n_poses >= RECOMMENDED_POSES
-        and prediction.second_basin_gap >= LEAST_GAP
+        and prediction.second_basin_gap >= least_gap
         and prediction.force_rms_N <= force_rms_N
         and prediction.torque_rms_Nm <= torque_rms_Nm
     )
@@ -183,8 +202,8 @@ def enough(prediction: Prediction, force_rms_N: float, torque_rms_Nm: float = fl
 def order(R_base_flange: Array, guess: Guess) -> Indices:
     """Find an order of poses in which the wandering bias of the guess is least confused with the other parameters.
 
-    From the given order on, pairs are exchanged as long as the variances of rotation and gravity force, in the units
-    of `Guess.scale`, fall.
+    Pairs are exchanged as long as the variances of rotation and gravity force, in the units of `Guess.scale`, fall:
+    from the given order on, and from a few random ones.
 
     Parameters
     ----------
@@ -203,11 +222,16 @@ def order(R_base_flange: Array, guess: Guess) -> Indices:
     def cost(arrangement: Indices) -> float:
         return float(np.trace(np.linalg.inv(information(J[arrangement], guess))[:6, :6]))
 
-    best = np.arange(len(J))
+    rng = np.random.default_rng(0)
+    starts = [np.arange(len(J)), *(rng.permutation(len(J)) for _ in range(RANDOM_ORDERS))]
+    return min((_exchange_pairs(start, cost) for start in starts), key=cost)
+
+
+def _exchange_pairs(best: Indices, cost: Callable[[Indices], float]) -> Indices:
     lowest = cost(best)
     for _ in range(MOST_SWEEPS):
         before = lowest
-        for i, j in zip(*np.tril_indices(len(J), -1), strict=True):
+        for i, j in zip(*np.tril_indices(len(best), -1), strict=True):
             trial = best.copy()
             trial[[i, j]] = trial[[j, i]]
             if (value := cost(trial)) < lowest * (1 - LEAST_GAIN):
@@ -228,7 +252,7 @@ class _Term:
     def gains(self, chosen: list[int]) -> Array:
         """(m,) how much each candidate would lower the criterion of the poses chosen."""
         rows = self._rows[chosen].reshape(-1, self._rows.shape[2])
-        return _gains(self._rows, np.linalg.inv(self._prior + rows.T @ rows), self._M)[0]
+        return _gains(self._rows, _inverse(self._prior + rows.T @ rows), self._M)[0]
 
 
 def _terms(R_candidates: Array, guess: Guess, criterion: Criterion, R_workspace: Array | None) -> list[_Term]:
@@ -277,3 +301,7 @@ def _gains(rows: Array, C: Array, *weights: Array) -> list[Array]:
     JC = rows @ C
     solved = np.linalg.solve(JC @ np.swapaxes(rows, 1, 2) + np.eye(rows.shape[1]), JC)
     return [np.einsum("mrp,mrp->m", solved, JC @ M) for M in weights]
+
+
+def _inverse(information: Array) -> Array:
+    return np.asarray(np.linalg.inv(information), dtype=np.float64)
