@@ -173,7 +173,7 @@ def information(J: Array, guess: Guess) -> Array:
     halves = []
     walks = guess.walk_force_N / guess.sigma_force_N, guess.walk_torque_Nm / guess.sigma_torque_Nm
     for walk, rows in zip(walks, (J[:, :3], J[:, 3:]), strict=True):
-        flat = rows.reshape(n, -1)
+        flat = rows.reshape(n, 3 * J.shape[2])
         if walk:
             noise = np.eye(n) + walk**2 * np.minimum.outer(before_last, before_last)
             flat = np.linalg.solve(np.linalg.cholesky(noise), flat)
@@ -277,7 +277,9 @@ def second_basin_gap(R_base_flange: Array, guess: Guess) -> float:
 
 
 def second_basin(R_base_flange: Array, guess: Guess) -> tuple[float, Parameters | None]:
-    """Give the gap of `second_basin_gap` and the other solution; infinite and None where there is none."""
+    """Give the gap of `second_basin_gap` and the other solution, None where there is not just one; infinite if none."""
+    if len(R_base_flange) < 3:
+        return 0.0, None  # there is a continuum of solutions
     wrench = predict(guess.parameters, R_base_flange)
     minima = force_only_minima(R_base_flange, wrench)
     squares = [float(((predict(p, R_base_flange) - wrench)[:, :3] ** 2).sum()) for p in minima]
