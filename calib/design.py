@@ -28,9 +28,9 @@ T12 = (1, 2, 5, 6, 11, 12, 15, 16, 17, 18, 21, 22)
 SUBSET_12 = (2, 4, 5, 7, 10, 12, 13, 15, 18, 20, 21, 23)
 """A-optimal for the forces; with torques 0.96 to 1 of `T12`, depending on where the centre of mass lies."""
 SUBSET_8 = (2, 3, 6, 8, 17, 19, 22, 23)
-"""The best eight of the 24: second-basin gap 0.5."""
+"""As good as eight of the 24 can be: second-basin gap 0.5."""
 SUBSET_6 = (9, 10, 16, 19, 21, 22)
-"""The best six of the 24 that have one solution: second-basin gap 0.28."""
+"""Nearly the best six of the 24 that have one solution, second-basin gap 0.28; `optimised(6)` is better."""
 AMBIGUOUS_6 = (4, 6, 9, 15, 18, 23)
 """A-optimal for the forces, but another mounting of the sensor explains them exactly (gap 0): do not use."""
 
@@ -101,8 +101,11 @@ class Guess:
 
     @property
     def scale(self) -> Array:
-        """(15,) units that make the error coordinates comparable: 1 rad, weight, weight, |P|, weight times |P|."""
-        lever_m = float(np.linalg.norm(self.p_sensor_com_m)) or self.sigma_torque_Nm / self.sigma_force_N
+        """(15,) units that make the error coordinates comparable: 1 rad, weight, weight, lever, weight times lever.
+
+        The lever is |P|, or the ratio of torque to force noise where that is longer.
+        """
+        lever_m = max(float(np.linalg.norm(self.p_sensor_com_m)), self.sigma_torque_Nm / self.sigma_force_N)
         return np.repeat([1.0, self.weight_N, self.weight_N, lever_m, self.weight_N * lever_m], 3)
 
     @property
@@ -150,8 +153,8 @@ def special(numbers: Sequence[int]) -> Array:
 def optimised(n: int) -> Array:
     """Give n orientations R_base_flange (n, 3, 3), n = 6 or 8, nearly as good per pose as the special 24.
 
-    They were found by minimising the error of compensation for centres of mass in all directions. The first has the
-    tool straight down. Turning the whole set about the base's z axis, or in the flange, keeps its worth.
+    They have the least mean of inverse efficiencies for centres of mass in all directions. The first has the tool
+    straight down. Turning the whole set about the vertical, or by one rotation of the flange, keeps its worth.
     """
     if n not in _OPTIMISED:
         raise ValueError(f"there is no stored set of {n} poses: take {' or '.join(map(str, _OPTIMISED))}, or `choose`")

@@ -150,7 +150,7 @@ def test_what_poses_do_not_tell_is_infinite() -> None:
     assert np.isinf(np.atleast_1d(spun.sigma["force_bias_N"])[2])
     assert np.isinf(norm(spun.sigma["mass_kg"]))
     assert np.isinf(spun.force_rms_N)
-    assert np.isfinite(predicted_sigma(ALL[:4], GUESS).force_rms_N)
+    assert np.isfinite(predicted_sigma(special(SUBSET_8[:4]), GUESS).force_rms_N)
 
 
 def test_linear_drift_costs_little_in_a_good_order_and_nothing_without_time() -> None:
@@ -190,6 +190,12 @@ def test_a_guess_of_nothing_is_refused(name: str) -> None:
         replace(GUESS, **{name: 0.0})
     with pytest.raises(ValueError, match="walk_force_N is -1"):
         replace(GUESS, walk_force_N=-1.0)
+
+
+def test_a_centre_of_mass_near_the_sensor_is_observable() -> None:
+    for com_m in (0.0, 1e-7, 1e-3):
+        prediction = predicted_sigma(ALL, replace(GUESS, p_sensor_com_m=(0, 0, com_m)))
+        assert_allclose(prediction.sigma["p_sensor_com_m"], np.sqrt(1.5 / 24) * 0.005 / 20, rtol=1e-3)
 
 
 # ---- the second basin
