@@ -3,6 +3,7 @@
 CalibError
 ├── BadDataset       the data are not what they should be: the message names the row and the reason
 ├── BadCalibration   a file is not a calibration that this version can read
+├── TooFewSamples    the sensor sends too slowly to be averaged
 └── NotObservable    the poses cannot determine the parameters: the message says what is missing
 """
 
@@ -17,6 +18,10 @@ class BadDataset(CalibError):
 
 class BadCalibration(CalibError):
     """A stored calibration cannot be read."""
+
+
+class TooFewSamples(CalibError):
+    """The sensor sends too slowly to be averaged."""
 
 
 class NotObservable(CalibError):

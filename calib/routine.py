@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.dataset import CalibrationDataset
-from calib.errors import CalibError
-from calib.noise import PoseMean, is_stationary, mean_and_covariance
+from calib.errors import CalibError, TooFewSamples
+from calib.noise import LEAST_SAMPLES, PoseMean, is_stationary, mean_and_covariance
 from calib.ports import Arm, ArmReading, Sensor, WrenchSamples
 from calib.tour import TourPose
 
@@ -98,6 +98,8 @@ def run_tour(
 
     Raises
     ------
+    TooFewSamples
+        The sensor is too slow for the time given to a pose.
     Exception
         Whatever the arm or the sensor raises; the records committed so far stand.
     """
@@ -112,9 +114,15 @@ def run_tour(
             before = arm.state()
             samples = sensor.collect(sampling.average_s)
             after = arm.state()
-            steady = turned_rad(before, after) < _MOVED_RAD and is_stationary(samples.wrench)
+            enough = len(samples.wrench) >= LEAST_SAMPLES
+            steady = enough and turned_rad(before, after) < _MOVED_RAD and is_stationary(samples.wrench)
             if steady:
                 break
+        if not enough:
+            raise TooFewSamples(
+                f"the sensor gave {len(samples.wrench)} samples in {sampling.average_s} s, at least {LEAST_SAMPLES} "
+                "are needed: check its rate, or average longer"
+            )
         record = PoseRecord(stop, pose, before, after, samples, steady)
         commit(record)
         yield Progress("taken", stop, len(stops), pose, record)

@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import signal
 
 import click
 
@@ -52,7 +53,7 @@ def cli(verbose: int, quiet: bool) -> None:
 
 def exit_code(error: BaseException) -> int | None:
     """Exit code of an error that a user can mend; None for a defect of ours."""
-    from calib.errors import BadCalibration, BadDataset, NotObservable
+    from calib.errors import BadCalibration, BadDataset, NotObservable, TooFewSamples
     from drivers.errors import ConnectError, DeviceFault, DriverError
     from ftdrive.errors import ConfigError, NotAccepted
 
@@ -61,6 +62,7 @@ def exit_code(error: BaseException) -> int | None:
         (ConnectError, 3),
         (DeviceFault, 5),
         (DriverError, 4),
+        (TooFewSamples, 4),
         (BadDataset, 6),
         (BadCalibration, 6),
         (NotObservable, 7),
@@ -72,6 +74,11 @@ def exit_code(error: BaseException) -> int | None:
 
 def main() -> int:
     """Run the command line; return the exit code."""
+    # Ctrl-C, `kill` and a terminal that closes all end a command the same way: the arm is stopped first. Set even where
+    # they are inherited as ignored, as in a job in the background.
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.default_int_handler)
     try:
         _siblings.check()
         return int(cli.main(prog_name="ftdrive", standalone_mode=False) or 0)

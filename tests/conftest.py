@@ -1,10 +1,14 @@
 """What all levels of tests share."""
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# A test run in the background inherits Ctrl-C as ignored, and so would every process that a test starts and interrupts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile("ftdrive", deadline=None, derandomize=True)
 settings.load_profile("ftdrive")

@@ -19,7 +19,8 @@ from drivers.ur import control_child
 
 log = logging.getLogger(__name__)
 
-_CALL_S: Final = 1.0
+_CALL_S: Final = 2.0
+"""An answer takes 10 ms, or a hundred times that on a busy computer; motion is watched meanwhile by other means."""
 
 
 class ControlProcess:

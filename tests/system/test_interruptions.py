@@ -49,10 +49,11 @@ def end_of(process: subprocess.Popen[str]) -> tuple[int, str]:
     return process.returncode, talk
 
 
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_stops_the_arm_and_keeps_the_poses(
-    station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine
+    station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine, by: signal.Signals
 ) -> None:
-    tour.send_signal(signal.SIGINT)
+    tour.send_signal(by)
     code, talk = end_of(tour)
     assert code == 130, talk
     assert "Traceback" not in talk

@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from calib.errors import TooFewSamples
 from calib.routine import PoseRecord, Progress, Sampling, dataset_from, drift_check, run_tour
 from calib.tour import TourPose
 
@@ -41,6 +42,7 @@ class Cell:
         self.restless = 0
         self.drifting = 0
         self.fails_at: str | None = None
+        self.samples = 300
 
     def _did(self, what: str) -> None:
         self.log.append(what)
@@ -66,9 +68,9 @@ class Cell:
 
     def collect(self, duration_s: float) -> Samples:
         self._did(f"collect {duration_s}")
-        slope = np.linspace(-1, 1, 300)[:, None] if self.drifting else 0.0
+        slope = np.linspace(-1, 1, self.samples)[:, None] if self.drifting else 0.0
         self.drifting -= bool(self.drifting)
-        return Samples(self.rng.normal(0, 0.01, (300, 6)) + slope)
+        return Samples(self.rng.normal(0, 0.01, (self.samples, 6)) + slope)
 
     def check(self) -> None:
         pass
@@ -120,6 +122,14 @@ def test_what_was_committed_before_a_failure_stands(fails_at: str) -> None:
         run(cell, kept)
     assert len(kept) == (2 if fails_at == "move 3" else 0)
     assert not cell.log[-1].startswith("commit")
+
+
+def test_a_sensor_that_is_too_slow_ends_the_tour_with_a_sentence() -> None:
+    cell, kept = Cell(), list[PoseRecord]()
+    cell.samples = 7
+    with pytest.raises(TooFewSamples, match=r"7 samples in 0\.5 s"):
+        run(cell, kept)
+    assert kept == []
 
 
 def test_the_return_serves_the_drift_check_and_stays_out_of_the_dataset() -> None:
