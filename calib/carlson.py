@@ -11,7 +11,7 @@ columns: `vec(X) = R_flange_sensor.T.ravel()`. Without noise all methods find th
 The paper has no sensor bias. Every method here has two forms:
 
 * `bias=False` is the paper's model. A bias then enters the result unnoticed: with 20 N of weight, 24 random poses and
-  0.05 N of noise, a bias of 0, 0.1, 1, 5 and 20 N makes the rotation wrong by 0.07, 0.10, 0.75, 3.7 and 10 to 21 deg
+  0.05 N of noise, a bias of 0, 0.1, 1, 5 and 20 N makes the rotation wrong by 0.07, 0.10, 0.75, 3.7 and 10 to 20 deg
   (rms) and the gravity force by 0.1, 0.14, 1.0, 5 and 21 %, much the same for all methods.
 * `bias=True` estimates the bias too: `X f_i = A_i g + h` with `h = X f_0`. Subtracting the mean over the poses
   eliminates h exactly, so each method runs on `f_i - mean f` and `A_i - mean A`.
