@@ -234,7 +234,7 @@ def iterative(
     Corrections: a matrix with negative determinant is turned to its negative before the projection. As printed, the
     limit is the truth in only 39 % (start at R = I) or 52 % (random gravity) of cases with 100 random orientations;
     with the flip, in all. With few poses there are false resting points even so: from a random gravity, without
-    noise, 38, 16, 4 and 0.5 % of cases with 5, 8, 12 and 24 random poses (and bias) end there. From the gravity of
+    noise, 37, 12, 3 and 0.3 % of cases with 5, 8, 12 and 24 random poses (and bias) end there. From the gravity of
     theorem 1, the default, 1 % with 5 poses and none with more. (A start at zero, which the paper recommends, is the
     start R = I by accident of the singular value decomposition.)
 

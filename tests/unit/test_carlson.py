@@ -141,7 +141,7 @@ def test_exact_with_the_fewest_poses_and_one_less_is_refused(name: str, bias: bo
 # --- what a bias does ---
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", [name for name in METHODS if name != "all pairs"])
 def test_the_original_form_hides_a_bias_in_the_rotation_and_the_other_finds_it(name: str) -> None:
     errors: dict[tuple[float, bool], list[float]] = {(bias_N, bias): [] for bias_N in (0, 1) for bias in (False, True)}
     rng = np.random.default_rng(2)
@@ -217,7 +217,7 @@ def test_nullspace_equals_all_pairwise_differences(n: int, sigma_N: float, bias:
 def test_more_samples_cure_nullspace_but_not_eigen() -> None:
     """Eight lopsided orientations, each measured many times at a signal-to-noise ratio of 10."""
     rng = np.random.default_rng(7)
-    errors: dict[tuple[str, int], list[float]] = {(name, m): [] for name in ("eigen", "nullspace") for m in (50, 2000)}
+    errors: dict[tuple[str, int], list[float]] = {(name, m): [] for name in ("eigen", "nullspace") for m in (50, 1000)}
     for trial in range(12):
         eight, truth = ball(rng, 8, 40), random_truth(rng)
         for (name, repeats), found in errors.items():
@@ -225,9 +225,9 @@ def test_more_samples_cure_nullspace_but_not_eigen() -> None:
             fit = METHODS[name](R, truth.force_N(R, 2.0, seed=trial), np.zeros(3), False)
             found.append(error_deg(fit, truth))
     median = {key: float(np.median(values)) for key, values in errors.items()}
-    assert median["nullspace", 2000] < 0.4 * median["nullspace", 50]
-    assert median["eigen", 2000] > 0.7 * median["eigen", 50]
-    assert median["eigen", 2000] > 4 * median["nullspace", 2000]
+    assert median["nullspace", 1000] < 0.45 * median["nullspace", 50]
+    assert median["eigen", 1000] > 0.6 * median["eigen", 50]
+    assert median["eigen", 1000] > 3 * median["nullspace", 1000]
 
 
 def test_nullspace_takes_many_poses() -> None:
