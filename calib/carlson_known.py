@@ -131,7 +131,7 @@ def similarity(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE PAMI 13(4),
     1991, eqs. 39-42. Not in Carlson's paper and better: the exact least-squares solution for rotation, weight and bias.
     With the tool within 40 deg of straight down its mean square error of R is the smallest possible (0.95-1.02 times
-    the bound), that of `relaxation` 4 to 5 times as large, and that of the total least squares with a bias column in
+    the bound), that of `relaxation` 4 to 6 times as large, and that of the total least squares with a bias column in
     Carlson's Robotlib 6 to 4000 times, depending on the mass it is told and on the size of the bias.
 
     Parameters
