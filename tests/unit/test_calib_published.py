@@ -1,0 +1,57 @@
+"""The published methods behind one shape."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import NotObservable, Parameters
+from calib.model import predict
+from calib.published import LEVEL_BASE, PUBLISHED, published
+from calib.yu import SPECIAL_R_flange_base, mixed
+
+TRUTH = Parameters(
+    Rotation.from_euler("zyx", [70, 15, 13], degrees=True).as_matrix(),
+    np.array([0.0, 0.0, -12.0]),
+    np.array([3.0, -1.0, 2.0]),
+    np.array([0.01, -0.02, 0.08]),
+    np.array([0.1, 0.2, -0.3]),
+)
+SPECIAL = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+R_BASE_FLANGE = np.concatenate([SPECIAL, Rotation.random(6, rng=4).as_matrix()])
+
+
+@pytest.mark.parametrize("method", PUBLISHED)
+def test_every_published_method_is_exact_without_noise(method: str) -> None:
+    R_base_flange = SPECIAL if method == "srom" else R_BASE_FLANGE
+    estimate = published(method, R_base_flange, weight_N=12.0)
+    np.testing.assert_allclose(TRUTH.difference(estimate(predict(TRUTH, R_base_flange))), 0, atol=1e-9)
+
+
+def test_methods_that_know_gravity_are_wrong_on_a_tilted_base_unless_told() -> None:
+    direction = np.array([0.1, 0.0, -1.0]) / np.sqrt(1.01)
+    tilted = Parameters(
+        TRUTH.R_flange_sensor, 12.0 * direction, TRUTH.force_bias_N, TRUTH.p_sensor_com_m, TRUTH.torque_bias_Nm
+    )
+    wrench = predict(tilted, R_BASE_FLANGE)
+    for direction_given, limit in ((LEVEL_BASE, None), (direction, 1e-9)):
+        estimate = published("carlson-relaxation", R_BASE_FLANGE, gravity_direction_base=direction_given)
+        error = np.abs(tilted.difference(estimate(wrench))).max()
+        assert error > 0.05 if limit is None else error < limit
+
+
+def test_cayley_asks_for_the_mass() -> None:
+    with pytest.raises(NotObservable, match="mass"):
+        published("carlson-cayley", R_BASE_FLANGE)
+
+
+def test_mixed_case_takes_gravity_from_the_special_poses_and_the_rest_from_any() -> None:
+    few = R_BASE_FLANGE[24:]
+    exact = mixed(SPECIAL, predict(TRUTH, SPECIAL), few, predict(TRUTH, few))
+    np.testing.assert_allclose(TRUTH.difference(exact), 0, atol=1e-11)
+    # A change of bias between the two recordings is seen by the second one only: gravity comes from the first.
+    moved = Parameters(
+        TRUTH.R_flange_sensor, TRUTH.gravity_force_base_N, np.array([9.0, 9.0, 9.0]), TRUTH.p_sensor_com_m, np.zeros(3)
+    )
+    np.testing.assert_allclose(
+        moved.difference(mixed(SPECIAL, predict(TRUTH, SPECIAL), few, predict(moved, few))), 0, atol=1e-11
+    )
