@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 _CHUNK = 4096
 """Rows per matrix product: 0.4 MB, so that a chunk stays in the cache."""
 _STARTS = 120
-"""Of 16000 problems 24 starts miss some minimum in 93, 60 in 8, 120 in 2; those were not the best, the poses unusable."""
+"""Of 16000 problems 24 starts miss some minimum in 93, 60 in 8, 120 in 2: neither the best, nor of usable poses."""
 _FLAT = 1e-6
 """A curvature below this share of the cost's variation is none: the poses leave that direction open."""
 
