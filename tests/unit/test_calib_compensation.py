@@ -117,6 +117,16 @@ def test_nan_never_turns_into_a_number() -> None:
     assert np.isfinite(many[[0, 2]]).all()
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+def test_what_was_in_the_buffer_does_not_matter(threads: int) -> None:
+    rng = np.random.default_rng(6)
+    compensator = Compensator(random_parameters(rng))
+    wrench, R_base_flange = samples(20, rng)
+    out = np.full((20, 6), np.inf)
+    compensator.batch(wrench, R_base_flange, out, threads)
+    np.testing.assert_allclose(out, compensator.batch(wrench, R_base_flange), atol=1e-14)
+
+
 def test_wrong_shapes_are_refused() -> None:
     rng = np.random.default_rng(5)
     compensator = Compensator(random_parameters(rng))
@@ -134,6 +144,9 @@ def test_wrong_shapes_are_refused() -> None:
         compensator.batch(wrench, R, np.empty((3, 6)))
     with pytest.raises(ValueError, match="out is float32"):
         compensator.batch(wrench, R, np.empty((4, 6), np.float32))
+    for threads in (1, 2):
+        with pytest.raises(ValueError, match="expected a contiguous array"):
+            compensator.batch(wrench, R, np.empty((8, 6))[::2], threads)
     with pytest.raises(ValueError, match="output array"):
         compensator.sample(wrench[0], R[0], np.empty(5))
     with pytest.raises(ValueError, match="threads is 0"):
