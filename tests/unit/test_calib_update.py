@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import BadDataset, NotObservable, Parameters
+from calib import BadDataset, CalibrationDataset, NotObservable, Parameters, solve
 from calib.model import Array, jacobian, predict
 from calib.update import Update, tare, update_payload
 
@@ -134,6 +134,18 @@ def test_updates_can_be_chained_and_keep_what_is_not_updated() -> None:
     np.testing.assert_array_equal(both.parameters.p_sensor_com_m, payload.parameters.p_sensor_com_m)
     np.testing.assert_allclose(both.covariance[:3, :3], start.covariance[:3, :3], rtol=1e-12)
     assert np.linalg.eigvalsh(both.covariance).min() > 0
+
+
+def test_a_solved_calibration_can_be_updated() -> None:
+    rng = np.random.default_rng(11)
+    R = Rotation.random(12, rng=rng).as_matrix()
+    wrench = predict(truth(), R) + rng.multivariate_normal(np.zeros(6), NOISE, size=12)
+    result = solve(CalibrationDataset(R, wrench, noise_of(12), np.zeros(12, np.int64), np.full(12, np.nan)))
+    new = loaded(truth())
+    update = update_payload(result, tilted(0, 60), predict(new, tilted(0, 60)), noise_of(2))
+    error = new.difference(update.parameters)
+    assert error @ np.linalg.solve(update.covariance, error) < 40
+    assert tare(result, R[:1], [dwell(truth(), R[0], rng)]).covariance.shape == (15, 15)
 
 
 def drifted(parameters: Parameters, force_N: Array, torque_Nm: Array) -> Parameters:
