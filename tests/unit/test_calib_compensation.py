@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
 from calib import Parameters
@@ -59,13 +60,20 @@ def test_chunks_and_threads_leave_no_row_out(n: int, threads: int, dtype: type[n
     np.testing.assert_allclose(out, expected, atol=1e-13 if dtype is np.float64 else 1e-5)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_results_have_the_type_asked_for(dtype: type[np.float64 | np.float32]) -> None:
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, "float64", np.dtype("float64"), np.dtype("float32")])
+def test_results_have_the_type_asked_for_however_it_is_named(dtype: DTypeLike) -> None:
     rng = np.random.default_rng(0)
+    parameters = random_parameters(rng)
     wrench, R_base_flange = samples(3, rng)
-    compensator = Compensator(random_parameters(rng), dtype)
-    for result in (compensator.sample(wrench[0], R_base_flange[0]), compensator.batch(wrench, R_base_flange)):
-        assert result.dtype == dtype
+    expected = wrench - predict(parameters, R_base_flange)
+    compensator = Compensator(parameters, dtype)
+    for threads in (1, 2):
+        many = compensator.batch(wrench, R_base_flange, threads=threads)
+        assert many.dtype == dtype
+        np.testing.assert_allclose(many, expected, atol=1e-5)
+    one = compensator.sample(wrench[0], R_base_flange[0])
+    assert one.dtype == dtype
+    np.testing.assert_allclose(one, expected[0], atol=1e-5)
 
 
 def test_the_wrench_can_be_overwritten_with_the_result() -> None:
@@ -151,5 +159,5 @@ def test_wrong_shapes_are_refused() -> None:
         compensator.sample(wrench[0], R[0], np.empty(5))
     with pytest.raises(ValueError, match="threads is 0"):
         compensator.batch(wrench, R, threads=0)
-    with pytest.raises(TypeError, match=r"expected numpy\.float64 or numpy\.float32"):
-        Compensator(random_parameters(rng), np.float16)  # type: ignore[arg-type]  # what a caller might try
+    with pytest.raises(TypeError, match="dtype is float16, expected float64 or float32"):
+        Compensator(random_parameters(rng), np.float16)
