@@ -15,7 +15,6 @@ import time
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mocks.faults import Faults
 from mocks.sensor import Measure, SerialSensor
@@ -112,7 +111,7 @@ class BotaBox(SerialSensor):
         self.calibrated = True
         self._line = b""
         self._boots_at_s: float | None = None
-        self._timestamp_us = 0.0
+        self._powered_s = self._stream_start_us = 0.0
 
     @property
     def sample_s(self) -> float:
@@ -123,14 +122,14 @@ class BotaBox(SerialSensor):
         self._restart()
         if self.streaming_at_start:
             self._boots_at_s = None
-            self._pacer.start(1 / self.sample_s)
+            self._run()
 
     def _restart(self) -> None:
         self._line = b""
         self._wire.clear()
         self._forget_unsent()
         self._pacer.stop()
-        self._timestamp_us = 0.0
+        self._powered_s = time.monotonic()
         self._boots_at_s = time.monotonic() + self.boot_s
 
     def _work(self, now_s: float) -> float | None:
@@ -140,7 +139,7 @@ class BotaBox(SerialSensor):
             return self._boots_at_s - now_s
         self._boots_at_s = None
         self._wire.put([BANNER])
-        self._pacer.start(1 / self.sample_s)
+        self._run()
         return None
 
     def _received(self, data: bytes) -> None:
@@ -180,7 +179,7 @@ class BotaBox(SerialSensor):
             error = 1
         self._answer(command[:1], error=error)
         if command == b"R":
-            self._pacer.start(1 / self.sample_s)
+            self._run()
 
     def _answer(self, letter: bytes, *, error: int = 0) -> None:
         self._wire.put([b"r,%d,%b,0\r\n" % (error, letter)])
@@ -192,20 +191,22 @@ class BotaBox(SerialSensor):
             wrench = wrench.copy()
             wrench[:, self.saturated_axis] = capacity[self.saturated_axis]
         status = self.status | (0 if self.calibrated else RAW_OUTPUT)
-        overrange = (np.abs(wrench) >= capacity).any(axis=1) * OVERRANGE
+        overrange = np.any(np.abs(wrench) >= capacity, axis=1)
+        clipped = np.clip(wrench, -capacity, capacity)
+        first = self._pacer.made - count
         return [
-            self._sample(status | bits, row)
-            for bits, row in zip(overrange.tolist(), self._clipped(wrench), strict=True)
+            self._sample(status | (OVERRANGE if over else 0), row.tolist(), first + i)
+            for i, (over, row) in enumerate(zip(overrange, clipped, strict=True))
         ]
 
-    def _clipped(self, wrench: NDArray[np.float64]) -> list[list[float]]:
-        clipped: list[list[float]] = np.clip(wrench, -np.asarray(self.capacity), self.capacity).tolist()
-        return clipped
-
-    def _sample(self, status: int, wrench: list[float]) -> bytes:
-        timestamp_us = int(self._timestamp_us)
-        self._timestamp_us += 1e6 * self.sample_s
+    def _sample(self, status: int, wrench: list[float], number: int) -> bytes:
+        timestamp_us = int(self._stream_start_us + number * 1e6 * self.sample_s) & 0xFFFFFFFF
         if not self.csv:
             return stream_frame(status, wrench, timestamp_us, self.temperature_C)
-        values = (status, *wrench, timestamp_us & 0xFFFFFFFF, self.temperature_C)
-        return ",".join(f"{value:g}" if isinstance(value, float) else str(value) for value in values).encode() + b"\r\n"
+        numbers = ",".join(f"{value:.6g}" for value in wrench)
+        return f"{status},{numbers},{timestamp_us},{self.temperature_C:.2f}\r\n".encode("ascii")
+
+    def _run(self) -> None:
+        """Stream, with the timestamp that counts since power-up."""
+        self._stream_start_us = (time.monotonic() - self._powered_s) * 1e6
+        self._pacer.start(1 / self.sample_s)

@@ -32,7 +32,8 @@ ONE_G = (0, 0, 1000)
 
 def raw_values(wrench: NDArray[np.float64]) -> NDArray[np.int16]:
     """Counts of (n, 6) wrenches in N and N·m: hundredths of N, thousandths of N·m, clipped."""
-    return np.clip(np.rint(wrench * COUNTS_PER_SI), -32768, 32767).astype(np.int16)
+    counts: NDArray[np.float64] = np.rint(wrench * COUNTS_PER_SI)
+    return counts.clip(-32768, 32767).astype(np.int16)
 
 
 def stream_frame(raw: list[int]) -> bytes:
