@@ -2,8 +2,8 @@
 
     V = blockdiag(D_i) + S (K (x) I6) S + slopes,    S = diag(walk)
 
-K is the covariance of a random walk less its mean over the poses, so that "the bias" is the mean bias. Everything is
-O(n): the inverse of K is tridiagonal, so with Woodbury's identity only a banded matrix is factorised.
+K is the covariance of a random walk less its mean over the poses, so that "the bias" is the mean bias: the pseudo-inverse
+of the path's stiffness matrix. That one is tridiagonal, so with Woodbury's identity everything is O(n).
 """
 
 from functools import cached_property
@@ -13,7 +13,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from calib.model import Array
 
-SHORTEST_STEP = 1e-3  # in mean intervals: two poses at the same time have the same bias, nearly
+SHORTEST_STEP = 1e-3  # in mean intervals: two poses at the same time have nearly the same bias
 
 
 class Noise:
@@ -31,76 +31,74 @@ class Noise:
         Standard deviation of each channel's linear change over the session; infinite = unknown.
     """
 
-    def __init__(self, D: Array, time: Array | None = None, walk: Array | None = None, slope: Array | None = None):
+    def __init__(
+        self, D: Array, time: Array | None = None, walk: Array | None = None, slope: Array | None = None
+    ) -> None:
         self.D = D
         self.n = len(D)
         common = D.strides[0] == 0
         self.W = np.broadcast_to(np.linalg.inv(D[:1]), D.shape) if common else np.linalg.inv(D)
-        self._low_rank: tuple[Array, Array, Array] | None = None
-        self._walking = np.flatnonzero(walk) if walk is not None else np.zeros(0, np.intp)
-        sloping = np.flatnonzero(slope) if slope is not None else np.zeros(0, np.intp)
         logdet = np.linalg.slogdet(D[:1] if common else D)[1]
         self._logdet = float(logdet.sum()) * (self.n if common else 1)
-        if time is None or not (self._walking.size or sloping.size):
-            return
-        k = self._walking.size
-        U, M_inverse = [], []
-        if walk is not None and k:
+        self._low_rank: list[tuple[Array, Array]] = []
+        self._walking = np.zeros(0, np.intp)
+        if time is not None and walk is not None and walk.any():
+            self._walking = np.flatnonzero(walk)
             self._s = walk[self._walking]
-            dt = np.maximum(np.diff(time, prepend=time[0] - 1.0), SHORTEST_STEP)
-            self._factorise(dt)
-            mean = _walk_times(dt, np.ones((self.n, 1)))[:, 0] / self.n
-            for c, s in zip(self._walking, self._s, strict=True):
-                U += [_channel(c, np.full(self.n, s)), _channel(c, s * mean)]
-                M_inverse.append(np.array([[0.0, -1.0], [-1.0, -mean.mean()]]))
-            self._logdet += k * float(np.log(dt).sum())
-        if slope is not None:
-            for c in sloping:
-                U.append(_channel(c, centred(time)))
-                M_inverse.append(np.array([[1.0 / slope[c] ** 2]]))
-                if np.isfinite(slope[c]):
-                    self._logdet += 2 * float(np.log(slope[c]))
-        columns = np.stack(U, axis=-1)
-        Q = self._solve_without_low_rank(columns)
-        core = _block_diagonal(M_inverse) + np.einsum("nik,nil->kl", columns, Q)
-        self._low_rank = columns, Q, np.linalg.inv(core)
-        self._logdet += float(np.linalg.slogdet(core)[1])
+            self._add_walk(steps(time)[1:])
+        if time is not None and slope is not None and slope.any():
+            self._add_slopes(time, slope)
 
-    def _factorise(self, dt: Array) -> None:
-        """Factorise M = S W S + (inverse of the anchored walk's covariance), unknowns ordered by pose, then channel."""
-        k, s = self._walking.size, self._s
-        blocks = s[:, None] * self.W[:, self._walking[:, None], self._walking] * s
+    def _add_walk(self, dt: Array) -> None:
+        """Factorise M = K^+ + S W S, unknowns ordered by pose, then channel; then keep the mean of the walk at zero."""
+        n, k, s = self.n, self._walking.size, self._s
         stiffness = 1 / dt
-        blocks[:, range(k), range(k)] += (stiffness + np.append(stiffness[1:], 0.0))[:, None]
-        banded = np.zeros((k + 1, self.n, k))
+        blocks = s[:, None] * self.W[:, self._walking[:, None], self._walking] * s
+        blocks[:-1, range(k), range(k)] += stiffness[:, None]
+        blocks[1:, range(k), range(k)] += stiffness[:, None]
+        banded = np.zeros((k + 1, n, k))
         for a in range(k):
             for b in range(a, k):
                 banded[k - (b - a), :, b] = blocks[:, a, b]
-        banded[0, 1:] = -stiffness[1:, None]
+        banded[0, 1:] = -stiffness[:, None]
         self._blocks, self._stiffness = blocks, stiffness
         self._cholesky = cholesky_banded(banded.reshape(k + 1, -1), check_finite=False)
-        self._logdet += 2 * float(np.log(self._cholesky[-1]).sum())
+        ones = np.zeros((n, k, k))
+        ones[:, range(k), range(k)] = 1.0
+        M_ones = self._solve_walk(ones)
+        mean = M_ones.sum(axis=0)
+        Q = self.W[:, :, self._walking] @ (s[:, None] * M_ones)
+        self._low_rank.append((Q, np.linalg.inv(mean)))
+        self._logdet += 2 * float(np.log(self._cholesky[-1]).sum()) + float(np.linalg.slogdet(mean)[1])
+        self._logdet += k * (float(np.log(dt).sum()) - 2 * float(np.log(n)))
 
-    def _solve_without_low_rank(self, X: Array) -> Array:
-        WX = np.asarray(self.W @ X)
-        if not self._walking.size:
-            return WX
-        k = self._walking.size
-        right = (self._s[:, None] * WX[:, self._walking]).reshape(self.n * k, -1)
-        Z = cho_solve_banded((self._cholesky, False), right, check_finite=False).reshape(self.n, k, -1)
-        return WX - self.W[:, :, self._walking] @ (self._s[:, None] * Z)
+    def _add_slopes(self, time: Array, slope: Array) -> None:
+        sloping = np.flatnonzero(slope)
+        T = centred(time)[:, None, None] * np.eye(6)[:, sloping]
+        Q = self.solve(T)
+        core = np.diag(1 / slope[sloping] ** 2) + np.einsum("nik,nil->kl", T, Q)
+        self._low_rank.append((Q, -np.linalg.inv(core)))
+        self._logdet += float(np.linalg.slogdet(core)[1])
+        self._logdet += 2 * float(np.log(slope[sloping][np.isfinite(slope[sloping])]).sum())
+
+    def _solve_walk(self, X: Array) -> Array:
+        """Give M^-1 X for X (n, k, m)."""
+        Z = cho_solve_banded((self._cholesky, False), X.reshape(-1, X.shape[2]), check_finite=False)
+        return np.asarray(Z.reshape(X.shape))
 
     def solve(self, X: Array) -> Array:
-        """Give V^-1 X for X (n, 6, k)."""
-        Y = self._solve_without_low_rank(X)
-        if self._low_rank is not None:
-            _, Q, core = self._low_rank
-            Y = Y - Q @ (core @ np.einsum("nik,nil->kl", Q, X))
+        """Give V^-1 X for X (n, 6, m)."""
+        Y = np.asarray(self.W @ X)
+        if self._walking.size:
+            s = self._s[:, None]
+            Y -= self.W[:, :, self._walking] @ (s * self._solve_walk(s * Y[:, self._walking]))
+        for Q, core in self._low_rank:
+            Y += Q @ (core @ np.einsum("nik,nil->kl", Q, X, optimize=True))
         return Y
 
     @property
     def logdet(self) -> float:
-        """Logarithm of the determinant of V; of a slope of infinite variance only what depends on the rest."""
+        """Logarithm of the determinant of V; with slopes of infinite variance what depends on the rest of it."""
         return self._logdet
 
     @cached_property
@@ -110,56 +108,42 @@ class Noise:
         if self._walking.size:
             WS = self.W[:, :, self._walking] * self._s
             W = W - WS @ self._selected_inverse() @ np.swapaxes(WS, 1, 2)
-        if self._low_rank is not None:
-            _, Q, core = self._low_rank
-            W = W - Q @ core @ np.swapaxes(Q, 1, 2)
+        for Q, core in self._low_rank:
+            W = W + Q @ core @ np.swapaxes(Q, 1, 2)
         return W
 
     def _selected_inverse(self) -> Array:
         """Diagonal blocks of M^-1, by elimination forward and substitution back (Takahashi 1973)."""
-        k = self._walking.size
-        pivots = np.empty((self.n, k, k))
+        pivots = np.empty_like(self._blocks)
         pivots[0] = np.linalg.inv(self._blocks[0])
+        squared = self._stiffness**2
         for i in range(1, self.n):
-            pivots[i] = np.linalg.inv(self._blocks[i] - self._stiffness[i] ** 2 * pivots[i - 1])
+            pivots[i] = np.linalg.inv(self._blocks[i] - squared[i - 1] * pivots[i - 1])
         inverse = pivots.copy()
         for i in range(self.n - 2, -1, -1):
-            inverse[i] += self._stiffness[i + 1] ** 2 * pivots[i] @ inverse[i + 1] @ pivots[i]
+            inverse[i] += squared[i] * (pivots[i] @ inverse[i + 1] @ pivots[i])
         return inverse
+
+
+def steps(time: Array) -> Array:
+    """Intervals (n,) before each pose; the first is one unit, which the mean bias takes up."""
+    return np.maximum(np.diff(time, prepend=time[0] - 1.0), SHORTEST_STEP)
 
 
 def walk_times(time: Array, X: Array) -> Array:
     """Multiply X (n, k) by the covariance of a random walk of unit variance per unit time."""
-    return _walk_times(np.maximum(np.diff(time, prepend=time[0] - 1.0), SHORTEST_STEP), X)
+    return np.asarray(np.cumsum(steps(time)[:, None] * _following(X), axis=0))
 
 
 def walk_square(time: Array, X: Array) -> Array:
-    """Give the trace of X' K X over the last axis but one, for X (n, ...) : sum over steps of dt (sum of what follows)²."""
-    dt = np.maximum(np.diff(time, prepend=time[0] - 1.0), SHORTEST_STEP)
-    after = np.cumsum(X[::-1], axis=0)[::-1]
-    return np.einsum("n,n...->...", dt, after**2)
+    """Give the diagonal (k,) of X' K X: the sum over steps of dt (sum of what follows)²."""
+    return np.asarray(steps(time) @ _following(X) ** 2)
 
 
-def _walk_times(dt: Array, X: Array) -> Array:
-    after = np.cumsum(X[::-1], axis=0)[::-1]
-    return np.asarray(np.cumsum(dt[:, None] * after, axis=0))
+def _following(X: Array) -> Array:
+    return np.asarray(np.cumsum(X[::-1], axis=0)[::-1])
 
 
 def centred(time: Array) -> Array:
-    """Scale time to mean zero and unit length."""
+    """Shift and scale time to mean zero and unit length."""
     return np.asarray((time - time.mean()) / max(np.ptp(time), 1e-300))
-
-
-def _channel(c: int, values: Array) -> Array:
-    column = np.zeros((len(values), 6))
-    column[:, c] = values
-    return column
-
-
-def _block_diagonal(blocks: list[Array]) -> Array:
-    size = sum(len(block) for block in blocks)
-    matrix, at = np.zeros((size, size)), 0
-    for block in blocks:
-        matrix[at : at + len(block), at : at + len(block)] = block
-        at += len(block)
-    return matrix

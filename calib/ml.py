@@ -42,11 +42,14 @@ RANK_TOLERANCE = 1e-9
 LEVER_M = 0.025  # usual ratio of torque noise to force noise
 LEVER_BOUNDS_M = (1e-3, 1.0)  # what any sensor has
 FEW_POSES = 6  # fewer cannot tell force noise from torque noise: the usual ratio is taken
+FEW_POSES_WITHOUT_NOISE = 12  # fewer cannot tell drift from noise that nobody measured
 POSES_FOR_EACH_AXIS = 50  # fewer cannot tell the drift of one axis from that of another of its group
 MANY_POSES = 20_000  # from here on single poses are looked at only when chi2 or the farthest of them asks for it
-FLOOR = 0.01  # of the residuals: white noise that is surely there when nobody measured it
+FLOOR = 0.03  # of the residuals: white noise that is surely there when nobody measured it
 SUSPICIOUS = 0.01  # p-value below which more than the measured noise is looked for
 LIGHT_TAIL = 0.6  # the median of squared distances relative to their mean, in units of what Gaussian noise has
+LARGE_ROTATION_RAD = np.deg2rad(1.0)  # no kinematics is worse
+LARGE_WHITE = 3.0  # times the measured variance
 MEDIAN_DISTANCE = float(chi2_distribution.median(6))
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -285,6 +288,7 @@ class _Problem:
         """Keep a share of the residuals as white noise, so that a random walk never explains them all."""
         e = self.wrench - predict(p, self.R)
         force_N, torque_Nm = (FLOOR * float(np.sqrt(np.mean(e[:, c] ** 2))) for c in (slice(0, 3), slice(3, 6)))
+        force_N = max(force_N, torque_Nm / LEVER_BOUNDS_M[1])
         self.cov = np.broadcast_to(_white(force_N, max(torque_Nm, LEVER_BOUNDS_M[0] * force_N)), self.cov.shape)
 
     def _surely_fits(self, minimum: Minimum, weights: Array) -> bool:
@@ -323,9 +327,7 @@ class _Problem:
         if quiet and not reject and not (candidates and predicted_gains(problem, at, candidates)[0].max() > WORTH_A_TRY):
             return everything
         found = [self._explained(p, everything.kept)]
-        if not reject:
-            reject = self._may_reject(self._distances_of(found[0]))
-        if reject:
+        if self._masks_outliers(found[0], reject):
             starts = [m.parameters for m in everything.minima]
             if not self.measured:
                 weights = at.noise.W
@@ -333,7 +335,19 @@ class _Problem:
                 robust = self._agreeing(weights, starts, distances, scaled=scaled)
                 if robust is not None:
                     found.append(self._explained(*robust))
-        return self._with_all_minima(min(found, key=lambda e: e.criterion))
+        return self._with_all_minima(min(found, key=lambda e: e.criterion), everything, weights)
+
+    def _masks_outliers(self, e: _Explanation, suspected: bool) -> bool:
+        """Tell whether noise may have been blamed for what a few bumped poses did."""
+        if self.n < FEWEST_TO_REJECT_FROM:
+            return False
+        if self._may_reject(self._distances_of(e)):
+            return True
+        found = {c.name: v for c, v in zip(e.components, e.theta, strict=True)}
+        measured = np.diagonal(self.cov, axis1=1, axis2=2).mean(axis=0)
+        white = max(found.get("white_force_N", 0.0) / measured[0], found.get("white_torque_Nm", 0.0) / measured[3])
+        inexact = found.get(ROTATION.name, 0.0) > LARGE_ROTATION_RAD**2
+        return suspected and (inexact or (self.measured and white > LARGE_WHITE))
 
     def _may_reject(self, distances: Array) -> bool:
         """Tell whether poses stand out, or so many of them that none does."""
@@ -380,7 +394,6 @@ class _Problem:
                     at = with_slopes_instead(problem, at, len(always))
             else:
                 at = maximise(problem, at.components, at.theta)
-            at = self._with_usual_lever(problem, at)
             distances = self._distances(problem, at)
             criterion = self._criterion(problem, at)
             p = self._moved(p, at.step)
@@ -390,14 +403,6 @@ class _Problem:
             if not choose and float(at.step @ np.linalg.solve(at.C, at.step)) < 1e-4:
                 break
         return _Explanation([Minimum(p, np.nan, np.zeros((15, 15)))], before, at.components, at.theta, criterion)
-
-    def _with_usual_lever(self, problem: Linearised, at: Point) -> Point:
-        """Keep estimated torque noise within what any sensor has."""
-        if self.measured or self.n < FEW_POSES:
-            return at
-        theta = at.theta.copy()
-        theta[1] = np.clip(theta[1], *(theta[0] * np.square(LEVER_BOUNDS_M)))
-        return at if theta[1] == at.theta[1] else point(problem, at.components, theta)
 
     def _moved(self, p: Parameters, step: Array) -> Parameters:
         if not self.constraints.any:
@@ -447,17 +452,14 @@ class _Problem:
         scale = [np.mean(problem.r[problem.kept][:, np.array(c.share) > 0] ** 2) for c in components]
         return np.array([s / (10 * self.n if c.kind == "walk" else 1) for c, s in zip(components, scale, strict=True)])
 
-    def _with_all_minima(self, e: _Explanation) -> _Explanation:
+    def _with_all_minima(self, e: _Explanation, everything: _Explanation, weights: Array) -> _Explanation:
         """Find the minima again, under the noise of the explanation."""
         p = e.minima[0].parameters
-        noise = self._noise(e, p)
-        weights = noise.W * e.kept[:, None, None]
-        starts = [Minimum(p, 0.0, np.zeros((15, 15))), *self.descent.minima(weights)]
-        logdet = noise.logdet
+        others = everything.minima if e.kept.all() else self.descent.minima(weights * e.kept[:, None, None])
+        logdet = self._noise(e, p).logdet
         ends = []
-        for start in starts:
-            q = start.parameters
-            for _ in range(3 if ROTATION in e.components else 1):
+        for q in (p, *(minimum.parameters for minimum in others)):
+            for _ in range(3 if ROTATION in e.components else 1):  # its noise depends on the parameters
                 noise = self._noise(e, q)
                 end, settled = self.descent.down(self._equations(noise), q)
                 q = end.parameters
@@ -547,7 +549,7 @@ class _Problem:
         return always
 
     def _candidates(self) -> list[Component]:
-        if self.n < FEW_POSES:
+        if self.n < (FEW_POSES if self.measured else FEW_POSES_WITHOUT_NOISE):
             return []
         white = [component("white", FORCE), component("white", TORQUE)] if self.measured else []
         walks = [component("walk", group) for group in self._groups()] if self.drift == "auto" else []

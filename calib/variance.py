@@ -165,6 +165,7 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array)
     best = point(problem, components, theta)
     if not components:
         return best
+    least = 1e-3 * NEGLIGIBLE * np.array([_unit(problem, best, c) for c in components])
     caution = 1e-3
     for _ in range(60):
         slope, information = _score(problem, best)
@@ -172,7 +173,7 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array)
         while caution < 1e6:
             damped = information + np.diag(caution * (np.diag(information) + 1e-3))
             step = np.clip(np.linalg.solve(damped, slope), -2.5, 2.5)
-            trial = point(problem, components, best.theta * np.exp(step))
+            trial = point(problem, components, np.maximum(best.theta * np.exp(step), least))
             gained = trial.loglik - best.loglik
             if gained >= 0 or np.abs(step).max() < 1e-4:
                 break
