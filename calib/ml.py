@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import f as f_distribution
 
@@ -93,7 +94,7 @@ class Fit:
     drift: DriftEstimate | None
     noise: Noise
     """Covariance of all wrenches under the noise model, poses in the order of `order`."""
-    order: Array
+    order: NDArray[np.intp]
     """(n,) row numbers by time."""
     R_base_flange: Array
     """(n, 3, 3)"""
@@ -322,7 +323,7 @@ class _Problem:
         if self._masks_outliers(found[0], reject):
             starts = [m.parameters for m in everything.minima]
             if not self.measured:
-                weights = at.noise.W
+                weights = np.asarray(at.noise.W, dtype=np.float64)
             for scaled in (False, True):
                 robust = self._agreeing(weights, starts, distances, scaled=scaled)
                 if robust is not None:
@@ -413,7 +414,7 @@ class _Problem:
     def _distances(self, problem: Linearised, at: Point) -> Array:
         """Squared leave-one-out residuals (n,) in units of their covariance."""
         P = at.noise.blocks - at.WJ @ at.C @ np.swapaxes(at.WJ, 1, 2)
-        S = np.linalg.inv(P)
+        S = np.asarray(np.linalg.inv(P), dtype=np.float64)
         e = (S @ at.u[..., None])[..., 0]
         self._replace_far(problem, at, S)
         return np.asarray((np.linalg.solve(S, e[..., None])[..., 0] * e).sum(axis=1))
@@ -433,7 +434,8 @@ class _Problem:
         rejected = ~problem.kept
         value = -2 * at.loglik
         if rejected.any():
-            S = np.linalg.inv(at.noise.blocks - at.WJ @ at.C @ np.swapaxes(at.WJ, 1, 2))
+            P = at.noise.blocks - at.WJ @ at.C @ np.swapaxes(at.WJ, 1, 2)
+            S = np.asarray(np.linalg.inv(P), dtype=np.float64)
             self._replace_far(problem, at, S)
             far = np.linalg.slogdet(at.noise.D[rejected])[1].sum()
             value += float(np.linalg.slogdet(S[rejected])[1].sum() - far) + FARTHEST * int(rejected.sum())
@@ -450,7 +452,8 @@ class _Problem:
         others = everything.minima if e.kept.all() else self.descent.minima(weights * e.kept[:, None, None])
         logdet = self._noise(e, p).logdet
         ends = []
-        for q in (p, *(minimum.parameters for minimum in others)):
+        for start in (p, *(minimum.parameters for minimum in others)):
+            q = start
             for _ in range(3 if ROTATION in e.components else 1):  # its noise depends on the parameters
                 noise = self._noise(e, q)
                 end = self.descent.down(self._equations(noise), q)
@@ -564,7 +567,7 @@ def _inverses(cov: Array) -> Array:
     """Invert (n, 6, 6) matrices, once when they are all the same."""
     if cov.strides[0] == 0:
         return np.broadcast_to(np.linalg.inv(cov[:1]), cov.shape)
-    return np.linalg.inv(cov)
+    return np.asarray(np.linalg.inv(cov))
 
 
 def _inverse(information: Array) -> Array:

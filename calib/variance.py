@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.covariance import Noise, centred, walk_square, walk_times
 from calib.model import Array
@@ -60,8 +61,8 @@ class Linearised:
     """(n, 6, 6) measured noise of each pose; zero where nobody measured it."""
     time: Array
     """(n,) ascending, in mean intervals."""
-    kept: Array
-    """(n,) bool"""
+    kept: NDArray[np.bool_]
+    """(n,)"""
     slope: Array | None
     """(6,) as in `Noise`, for linear drift that is part of the model."""
 
