@@ -12,6 +12,7 @@ from calib.known import Constraints
 from calib.model import Array, Parameters
 
 MAX_STEPS = 100
+SMALL_STEP = 1e-4  # in standard deviations of the noise: a descent that ends with one is slow, not lost
 MOST_MINIMA = 6
 SAME_ROTATION_RAD = np.deg2rad(1.0)
 
@@ -103,7 +104,7 @@ class Descent:
         b, F0, T0 = p.gravity_force_base_N, p.force_bias_N, p.torque_bias_Nm
         prediction = np.concatenate([np.zeros(3), b, F0, np.zeros(3), T0])  # times the Jacobian is the predicted wrench
         rounding = 1e-14 * float(np.sqrt(max(prediction @ H @ prediction, 0.0)))
-        damping, settled = 0.0, False
+        damping, moved, settled = 0.0, np.inf, False
         for _ in range(steps):
             Z = self.constraints.free(p) if self.constraints.any else None
             Hz, gz = (H, g) if Z is None else (Z.T @ H @ Z, Z.T @ g)
@@ -125,7 +126,7 @@ class Descent:
             settled = moved <= (small if improved else 100 * small)
             if settled:
                 break
-        return Minimum(p, cost, H, settled)
+        return Minimum(p, cost, H, settled or moved < SMALL_STEP)
 
 
 def column_scale(information: Array) -> Array:

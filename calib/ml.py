@@ -50,7 +50,8 @@ MANY_POSES = 20_000  # from here on single poses are looked at only when chi2 or
 FLOOR = 0.03  # of the residuals: white noise that is surely there when nobody measured it
 SUSPICIOUS = 0.01  # p-value below which more than the measured noise is looked for
 LIGHT_TAIL = 0.6  # the median of squared distances relative to their mean, in units of what Gaussian noise has
-LARGE_ROTATION_RAD = np.deg2rad(1.0)  # no kinematics is worse
+LARGE_ROTATION_RAD = np.deg2rad(1.0)  # few kinematics are worse
+WORST_ROTATION_RAD = np.deg2rad(3.0)  # none is
 LARGE_WHITE = 3.0  # times the measured variance
 MEDIAN_DISTANCE = float(chi2_distribution.median(6))
 
@@ -118,8 +119,16 @@ class Fit:
 
     @property
     def second_basin_chi2(self) -> float | None:
-        """How much worse the second best minimum fits: it is right with the odds exp(-half of this). None: no other."""
-        return self.minima[1].chi2 - self.minima[0].chi2 if len(self.minima) > 1 else None
+        """How much worse the second best minimum fits: it is right with the odds exp(-half of this). None: no other.
+
+        Where white noise was estimated from the same residuals a larger one makes up for part of the difference.
+        """
+        if len(self.minima) == 1:
+            return None
+        best, second = self.minima[0].chi2, self.minima[1].chi2
+        if any(name.startswith("white") for name in self.components):
+            return float(self.dof * np.log(second / best))
+        return second - best
 
     @cached_property
     def residuals(self) -> Array:
@@ -382,7 +391,7 @@ class _Problem:
         for _ in range(12):
             problem = self._linearised(p, kept)
             if choose:
-                at = select(problem, always, self._start(problem, always), self._candidates())
+                at = self._selected(problem, always)
                 if self.drift == "auto":
                     at = with_slopes_instead(problem, at, len(always))
             else:
@@ -395,7 +404,22 @@ class _Problem:
             choose = bool((kept != before).any())
             if not choose and float(at.step @ np.linalg.solve(at.C, at.step)) < 1e-4:
                 break
+        if not self.measured and not before.all() and self._white_is_gone(at):
+            criterion = np.inf  # rejecting until the rest fits exactly explains nothing
         return _Explanation([Minimum(p, np.nan, np.zeros((15, 15)))], before, at.components, at.theta, criterion)
+
+    def _white_is_gone(self, at: Point) -> bool:
+        floor = self.cov[0, [0, 3], [0, 3]]
+        white = [value for c, value in zip(at.components, at.theta, strict=True) if c.kind == "white"]
+        return any(value < least for value, least in zip(white, floor, strict=False))
+
+    def _selected(self, problem: Linearised, always: list[Component]) -> Point:
+        start, candidates = self._start(problem, always), self._candidates()
+        at = select(problem, always, start, candidates)
+        found = dict(zip(at.components, at.theta, strict=True))
+        if found.get(ROTATION, 0.0) > WORST_ROTATION_RAD**2:  # something else, which no orientation error explains
+            at = select(problem, always, start, [c for c in candidates if c is not ROTATION])
+        return at
 
     def _moved(self, p: Parameters, step: Array) -> Parameters:
         if not self.constraints.any:
