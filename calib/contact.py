@@ -30,7 +30,7 @@ def contact_chi2(
         Of the error coordinates.
     noise_cov : array, shape (6, 6) or (..., 6, 6)
         Of one reading of `wrench`.
-    tare : tuple of array (6,) and array (3, 3), optional
+    tare : tuple of array (..., 6) and array (..., 3, 3), optional
         Wrench, with the same noise, and R_base_flange of a pose in which nothing touched the tool. Errors common to
         both poses, such as a drifted bias, cancel.
 

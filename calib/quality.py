@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from calib.evidence import Evidence
 from calib.identifiability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
-from calib.ml import Fit
 from calib.model import PARAMETER_NAMES, Array, Parameters, jacobian
 from calib.so3 import force_cost, given_rotation, minima
 from calib.yu import SPECIAL_R_flange_base, com_and_torque_bias
@@ -65,7 +65,7 @@ class Quality:
 
 
 def judge(
-    fit: Fit,
+    fit: Evidence,
     *,
     t_s: Array | None = None,
     farthest_com_m: float = FARTHEST_COM_M,
@@ -79,7 +79,7 @@ def judge(
 
     Parameters
     ----------
-    fit : Fit
+    fit : Evidence
     t_s : array, shape (n,), optional
         When each pose was measured; the order of rows counts where it is missing or not finite.
     farthest_com_m : float
@@ -97,7 +97,7 @@ def judge(
     worst = int(np.argmax(np.where(used, residual_sigma, -1.0)))
     lag1, lag1_p = successive_correlation(fit.standardized_residuals[used], None if t_s is None else t_s[used])
     shares, cross_validated = _shares(fit, used, weight_N)
-    largest = max(share for _, share in shares)
+    largest = shares[0][1]
 
     inexact = [words for words, share in shares if share > USABLE_SHARE]
     explanation = disagreeing_axes(fit.R_base_flange[used], fit.wrench[used]) if inexact else []
@@ -109,8 +109,8 @@ def judge(
         usable += reversed_signs(parameters, fit.covariance, up_in_base)
     noise_factor, chi2_p = None, None
     if np.isfinite(fit.measured_chi2):
-        dof = 6 * n - 15
-        noise_factor, chi2_p = float(np.sqrt(fit.measured_chi2 / dof)), float(stats.chi2.sf(fit.measured_chi2, dof))
+        noise_factor = float(np.sqrt(fit.measured_chi2 / fit.dof))
+        chi2_p = float(stats.chi2.sf(fit.measured_chi2, fit.dof))
         if chi2_p < SURE:
             good = noise_factor <= NOISE_FACTOR and largest <= NOISY_SHARE
             (notes if good else usable).append(_noise_reason(fit, noise_factor))
@@ -150,34 +150,6 @@ def judge(
     )
 
 
-def leave_one_out(residuals: Array, jacobian: Array, noise_cov: Array) -> tuple[Array, Array]:
-    """Predict every pose from all others without fitting again: (I - H_kk)^-1 r_k, exact for a linear model.
-
-    Parameters
-    ----------
-    residuals : array, shape (n, 6)
-        Of the fit to all poses.
-    jacobian : array, shape (n, 6, p)
-    noise_cov : array, shape (n, 6, 6)
-        Noise, independent between poses.
-
-    Returns
-    -------
-    left_out : array, shape (n, 6)
-        Measured minus what the other poses predict.
-    covariance : array, shape (n, 6, 6)
-        Of these. Very large where the others determine nothing.
-    """
-    L = np.linalg.cholesky(noise_cov)
-    J = np.linalg.solve(L, jacobian)
-    information = np.einsum("nki,nkj->ij", J, J)
-    leverage = J @ np.linalg.pinv(information, hermitian=True) @ np.swapaxes(J, 1, 2)
-    free, V = np.linalg.eigh(np.eye(6) - leverage)
-    M = L @ (V / np.maximum(free, 1e-12)[:, None]) @ np.swapaxes(V, 1, 2)
-    left_out = (M @ np.linalg.solve(L, residuals[..., None]))[..., 0]
-    return np.asarray(left_out), np.asarray(M @ np.swapaxes(L, 1, 2))
-
-
 def successive_correlation(standardized: Array, t_s: Array | None = None) -> tuple[float, float]:
     """Correlation of the residuals of successive poses, and the probability of a larger one by chance.
 
@@ -198,6 +170,7 @@ def successive_correlation(standardized: Array, t_s: Array | None = None) -> tup
 def strong_correlations(covariance: Array, least: float = CORRELATED) -> tuple[tuple[str, str, float], ...]:
     """Name the pairs of parameters whose estimates are correlated by more than `least`, strongest first."""
     sigma = np.sqrt(np.diag(covariance))
+    sigma[sigma == 0] = 1.0  # exactly known
     correlation = covariance / np.outer(sigma, sigma)
     pairs = [(float(correlation[i, j]), i, j) for i, j in combinations(range(len(sigma)), 2)]
     strong = sorted((pair for pair in pairs if abs(pair[0]) > least), key=lambda pair: -abs(pair[0]))
@@ -309,7 +282,7 @@ def _inside_m(parameters: Parameters, covariance: Array) -> float:
     return inside_m if inside_m > max(INSIDE_M, 3 * sigma_m) else 0.0
 
 
-def _weight_reasons(fit: Fit, weight_N: float) -> list[str]:
+def _weight_reasons(fit: Evidence, weight_N: float) -> list[str]:
     along = fit.parameters.gravity_force_base_N / (weight_N or 1.0)
     sigma_N = float(np.sqrt(along @ fit.covariance[3:6, 3:6] @ along))
     if weight_N > SIGNIFICANT_SIGMAS * sigma_N:
@@ -320,10 +293,10 @@ def _weight_reasons(fit: Fit, weight_N: float) -> list[str]:
     ]
 
 
-def _second_solution_reasons(fit: Fit) -> list[str]:
-    if len(fit.minima) < 2:
+def _second_solution_reasons(fit: Evidence) -> list[str]:
+    if fit.second_basin_chi2 is None:
         return []
-    delta = (fit.minima[1].chi2 - fit.minima[0].chi2) / max(1.0, fit.chi2 / fit.dof)
+    delta = fit.second_basin_chi2 / max(1.0, fit.chi2 / fit.dof)
     if delta >= ACCEPTED_DELTA_CHI2:
         return []
     odds = 100 * wrong_basin_probability(max(delta, 0.0))
@@ -348,8 +321,10 @@ def _com_reasons(parameters: Parameters, farthest_com_m: float, rejected: list[s
         )
 
 
-def _shares(fit: Fit, used: NDArray[np.bool_], weight_N: float) -> tuple[list[tuple[str, float]], tuple[float, float]]:
-    """Errors relative to the weight with the sentence for each, one for force and one for torque, and the left-out rms.
+def _shares(
+    fit: Evidence, used: NDArray[np.bool_], weight_N: float
+) -> tuple[list[tuple[str, float]], tuple[float, float]]:
+    """Errors relative to the weight with the sentence for each, larger of force and torque first, and the left-out rms.
 
     Of residual, left-out and expected error the first is named that breaks the highest limit.
     """
@@ -374,10 +349,10 @@ def _shares(fit: Fit, used: NDArray[np.bool_], weight_N: float) -> tuple[list[tu
         shares.append(
             (f"{what} is {100 * share:.1f} % of {of} ({error:.2g} {unit}), more than {100 * limit:g} %", share)
         )
-    return shares, left_out
+    return sorted(shares, key=lambda pair: -pair[1]), left_out
 
 
-def _noise_reason(fit: Fit, noise_factor: float) -> str:
+def _noise_reason(fit: Evidence, noise_factor: float) -> str:
     found = ", ".join(f"{name} {value:.2g}" for name, value in fit.components.items() if value > 0)
     included = f": found {found}" if found else ", and the stated uncertainties do not include them"
     return (
@@ -386,7 +361,7 @@ def _noise_reason(fit: Fit, noise_factor: float) -> str:
     )
 
 
-def _indispensable_reasons(fit: Fit, used: NDArray[np.bool_], weight_N: float) -> list[str]:
+def _indispensable_reasons(fit: Evidence, used: NDArray[np.bool_], weight_N: float) -> list[str]:
     uncertain = np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > weight_N**2
     rows = np.flatnonzero(uncertain & used)
     if not 0 < rows.size <= used.sum() / 2:

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.dataset import CalibrationDataset
 from calib.errors import NotObservable
-from calib.ml import Fit, Minimum
-from calib.model import PARAMETER_NAMES, Array, Parameters, jacobian, predict
-from calib.quality import judge, leave_one_out
+from calib.evidence import IndependentFit
+from calib.model import PARAMETER_NAMES, Array, Parameters, predict
+from calib.quality import judge
 from calib.refine import column_scale, refine
 from calib.result import CalibrationResult, Method
 from calib.yu import lrom, special_numbers, srom_numbered
@@ -81,22 +81,15 @@ def solve(
         reasons=(),
         provenance={**(provenance or {}), "dataset_sha256": dataset.sha256()},
     )
-    J = jacobian(parameters, R_base_flange)
-    left_out_residuals, left_out_cov = leave_one_out(residuals, J, fit.wrench_cov)
-    evidence = Fit(
+    evidence = IndependentFit(
         parameters=parameters,
-        information=fit.information,
         covariance=covariance,
-        minima=(Minimum(fit.parameters, fit.chi2), Minimum(fit.parameters, fit.second_chi2)),
-        chi2=result.chi2,
-        dof=result.dof,
-        measured_chi2=result.chi2 if result.noise_source == "measured" else float("nan"),
-        weights=np.ones(len(dataset)),
-        components={},
         R_base_flange=R_base_flange,
         wrench=wrench,
-        left_out_residuals=left_out_residuals,
-        left_out_cov=left_out_cov,
+        wrench_cov=fit.wrench_cov,
+        measured=dataset.wrench_cov is not None,
+        weights=np.ones(len(dataset)),
+        second_basin_chi2=fit.second_chi2 - result.chi2,
     )
     quality = judge(evidence, t_s=dataset.t_s)
     return replace(result, verdict=quality.verdict, reasons=quality.reasons)
