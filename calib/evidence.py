@@ -65,10 +65,6 @@ class Evidence(Protocol):
     def left_out_cov(self) -> Array:
         """(n, 6, 6) covariance of these."""
 
-    @property
-    def standardized_residuals(self) -> Array:
-        """(n, 6) `left_out_residuals` whitened by `left_out_cov`."""
-
 
 @dataclass(frozen=True, eq=False)
 class IndependentFit:
@@ -118,12 +114,6 @@ class IndependentFit:
         return self._left_out[1]
 
     @cached_property
-    def standardized_residuals(self) -> Array:
-        """(n, 6) `left_out_residuals` whitened by `left_out_cov`."""
-        L = np.linalg.cholesky(self.left_out_cov)
-        return np.asarray(np.linalg.solve(L, self.left_out_residuals[..., None])[..., 0])
-
-    @cached_property
     def _left_out(self) -> tuple[Array, Array]:
         J = jacobian(self.parameters, self.R_base_flange)
         return leave_one_out(self.residuals, J, self.wrench_cov, self.weights)
@@ -161,3 +151,15 @@ def leave_one_out(
     M = V / np.maximum(free, 1e-12)[:, None] @ np.swapaxes(V, 1, 2)
     left_out = (L @ M @ np.linalg.solve(L, residuals[..., None]))[..., 0]
     return np.asarray(left_out), np.asarray(L @ (M + explained - shrinking) @ np.swapaxes(L, 1, 2))
+
+
+def standardized(residuals: Array, covariance: Array) -> Array:
+    """Divide residuals (n, 6) by the symmetric root of their covariance (n, 6, 6): independent, of unit variance.
+
+    Directions in which a pose cannot be predicted at all, where the covariance is huge and not exact, count nothing.
+    """
+    sigma = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)))
+    correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
+    values, V = np.linalg.eigh((correlation + np.swapaxes(correlation, 1, 2)) / 2)
+    along = np.einsum("nij,ni->nj", V, residuals / sigma) / np.sqrt(np.maximum(values, 1e-12))
+    return np.asarray(np.einsum("nij,nj->ni", V, along))

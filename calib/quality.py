@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from calib.evidence import Evidence
+from calib.evidence import Evidence, standardized
 from calib.identifiability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
 from calib.model import PARAMETER_NAMES, Array, Parameters, jacobian
 from calib.so3 import force_cost, given_rotation, minima
@@ -93,9 +93,10 @@ def judge(
     parameters, used = fit.parameters, fit.weights > 0.5
     n = int(used.sum())
     weight_N = float(np.linalg.norm(parameters.gravity_force_base_N))
-    residual_sigma = np.sqrt(np.mean(fit.standardized_residuals**2, axis=1))
+    residuals = standardized(fit.left_out_residuals, fit.left_out_cov)
+    residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
     worst = int(np.argmax(np.where(used, residual_sigma, -1.0)))
-    lag1, lag1_p = successive_correlation(fit.standardized_residuals[used], None if t_s is None else t_s[used])
+    lag1, lag1_p = successive_correlation(residuals[used], None if t_s is None else t_s[used])
     shares, cross_validated = _shares(fit, used, weight_N)
     largest = shares[0][1]
 
