@@ -41,15 +41,16 @@ def solve(
     Parameters
     ----------
     dataset : CalibrationDataset
-    method : {"ml", "known-rotation", "yaw-only", "srom", "lrom"}
-        Maximum likelihood, from 4 poses on; the same for a sensor whose mounting is known (`known`, default: axes of
-        sensor and flange agree), or known but for its turn about the flange z axis. Or Yu's closed forms, for
-        comparison: SROM for the 24 special orientations, LROM for 5 or more of any kind.
+    method : Method
+        "ml": maximum likelihood, from 4 poses on; "known-rotation", "yaw-only": the same for a sensor whose mounting is
+        known (`known`, default: axes of sensor and flange agree), or known but for its turn about the flange z axis.
+        Or, for comparison, one of `calib.published.PUBLISHED`.
     drift : {"auto", "none", "linear", "random-walk"}
         How the bias may move while the poses are taken: as the data decide, not at all, or surely so. Poses without
         time count as equally spaced in their order.
     known : Known, optional
-        What is known of mounting, direction of gravity and mass. Not with SROM and LROM.
+        What is known of mounting, direction of gravity and mass. Of the published methods only those take it that ask
+        for gravity.
     g_m_s2 : float
         Gravity, by which the weight is divided to give the mass.
     provenance : mapping, optional
@@ -70,7 +71,7 @@ def solve(
     known = _constrained(method, known)
     _require_orientations(dataset, 5 if method == "lrom" else 4 if known is None else 3)
 
-    estimator = _published(dataset, method, known, g_m_s2) if method in PUBLISHED else None
+    estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2) if method in PUBLISHED else None
     wrench_cov = dataset.wrench_cov
     if wrench_cov is not None:
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
@@ -141,10 +142,11 @@ def _constrained(method: Method, known: Known | None) -> Known | None:
     return known
 
 
-def _published(dataset: CalibrationDataset, method: Method, known: Known | None, g_m_s2: float) -> Estimator:
+def estimator_of(method: Method, R_base_flange: Array, known: Known | None, g_m_s2: float) -> Estimator:
+    """Prepare a published method; gravity is taken from `known` where the method needs it. Raises `NotObservable`."""
     direction = LEVEL_BASE if known is None or known.gravity_direction_base is None else known.gravity_direction_base
     weight_N = None if known is None or known.mass_kg is None else known.mass_kg * g_m_s2
-    return published(method, dataset.R_base_flange, gravity_direction_base=np.asarray(direction), weight_N=weight_N)
+    return published(method, R_base_flange, gravity_direction_base=np.asarray(direction), weight_N=weight_N)
 
 
 def _require_orientations(dataset: CalibrationDataset, least: int) -> None:
