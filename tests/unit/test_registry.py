@@ -28,7 +28,7 @@ def test_serial_addresses() -> None:
     ("url", "message"),
     [
         ("can0", "unknown sensor ''; known: ati-can, ati-serial"),
-        ("bota://dev", "unknown sensor 'bota'"),
+        ("kms40://dev", "unknown sensor 'kms40'"),
         ("ati-can://", "which device"),
         ("ati-can:can0", "which device"),
         ("ati-can://can0#1", "which device"),
