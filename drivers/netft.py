@@ -13,6 +13,7 @@ import logging
 import re
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Self
 
@@ -241,9 +242,7 @@ class NetFtSensor(StreamingSensor):
             try:
                 client.start()
             except pynetft.NetFTError as exc:
-                raise ConnectError(
-                    f"{self.name}: it does not tell its configuration ({exc}); check address, cable and supply"
-                ) from exc
+                raise self._untold(exc) from exc
             if client.wait_for_first_sample(_SILENCE_S):
                 return
             status = client.health().last_status
@@ -291,14 +290,12 @@ class NetFtSensor(StreamingSensor):
 
     def _read_serial(self) -> str:
         """Ask for the serial number of the calibration in use, which pynetft does not."""
-        connection = http.client.HTTPConnection(self._host, self._http_port, timeout=_HTTP_S)
         try:
-            connection.request("GET", "/netftapi2.xml")
-            page = connection.getresponse().read(65536)
-        except (OSError, http.client.HTTPException) as exc:
-            raise ConnectError(
-                f"{self.name}: it does not tell its configuration ({exc}); check address, cable and supply"
-            ) from exc
-        finally:
-            connection.close()
-        return serial_in(page)
+            with closing(http.client.HTTPConnection(self._host, self._http_port, timeout=_HTTP_S)) as connection:
+                connection.request("GET", "/netftapi2.xml")
+                return serial_in(connection.getresponse().read(65536))
+        except (OSError, ValueError, http.client.HTTPException) as exc:
+            raise self._untold(exc) from exc
+
+    def _untold(self, exc: Exception) -> ConnectError:
+        return ConnectError(f"{self.name}: it does not tell its configuration ({exc}); check address, cable and supply")
