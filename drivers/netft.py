@@ -22,7 +22,7 @@ import pynetft
 
 from drivers._stream import NOTHING, StreamingSensor
 from drivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM
-from drivers.errors import ConnectError, DeviceFault, DriverError, StreamBroken
+from drivers.errors import ConnectError, DeviceFault, StreamBroken
 from drivers.interfaces import DeviceInfo, FtSamples
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ _SILENCE_S = 0.25
 _STARTS = 10
 """The request to start is a datagram and can be lost."""
 _HTTP_S = 1.0
+_NEVER_S = 3600.0
 _BATCH_S = 0.002
 _QUEUE = 16_384
 """More than two seconds at 7 kHz; the oldest is dropped then, and its number is missing."""
@@ -186,17 +187,16 @@ class NetFtSensor(StreamingSensor):
             http_port=self._http_port,
             receive_timeout=_SILENCE_S,
             deliver_samples_with_error_status=True,  # so that the fault can be named
-            recovery_policy=pynetft.RecoveryPolicy.FAIL_STOP,
+            # A doubled or late datagram ends a stream that fails at once. So it may recover, but not before we noticed.
+            recovery_policy=pynetft.RecoveryPolicy.RECONNECT,
+            reconnect_initial_delay=_NEVER_S,
+            reconnect_max_delay=_NEVER_S,
             calibration_override=override,
         )
         self._seen_status = 0
         self._newest_number: int | None = None
         self._client = pynetft.Client(config, queue_size=_QUEUE)
-        self._bits = ONROBOT_BITS if self._onrobot else NET_FT_BITS
-        self._start(self._client)
-        told = self._client.health().sensor_configuration
-        if told is None:
-            raise ConnectError(f"{self.name}: the sensor told no scale; open it again")
+        told = self._start(self._client)
         scale = told.calibration
         if scale.force_unit.value not in _FORCE_N or scale.torque_unit.value not in _TORQUE_NM:
             raise ConnectError(
@@ -237,26 +237,34 @@ class NetFtSensor(StreamingSensor):
         if client is not None:
             client.stop()
 
-    def _start(self, client: pynetft.Client) -> None:
+    def _start(self, client: pynetft.Client) -> pynetft.SensorConfiguration:
+        """Ask for the stream until it comes; returns what the sensor tells about itself."""
         for _ in range(_STARTS):
             try:
                 client.start()
             except pynetft.NetFTError as exc:
                 raise self._untold(exc) from exc
-            if client.wait_for_first_sample(_SILENCE_S):
-                return
-            status = client.health().last_status
+            arrived = client.wait_for_first_sample(_SILENCE_S)
+            health = client.health()
+            if health.sensor_configuration is None:
+                raise ConnectError(f"{self.name}: the sensor told no scale; open it again")
+            is_axia = "Axia" in health.sensor_configuration.product_name
+            self._bits = ONROBOT_BITS if self._onrobot else AXIA_BITS if is_axia else NET_FT_BITS
+            self._judge(health.last_status)
+            if arrived:
+                return health.sensor_configuration
             client.stop()
-            self._judge(status)
         raise ConnectError(
-            f"{self.name}: no sample after {_STARTS} requests; is RDT enabled on its communications page?"
+            f"{self.name}: no sample after {_STARTS} requests; check supply and cable; is RDT enabled on its "
+            "communications page?"
         )
 
     def _fetch(self) -> list[pynetft.Sample]:
         """Take everything that has arrived, waiting up to 0.1 s for the first sample and 2 ms for company."""
-        client, samples = self._client, []
+        client = self._client
         if client is None:
             raise StreamBroken(f"{self.name}: closed")
+        samples: list[pynetft.Sample] = []
         try:
             samples += [next(client.samples(timeout=0.1))]
             time.sleep(_BATCH_S)
@@ -265,17 +273,12 @@ class NetFtSensor(StreamingSensor):
             pass
         except StopIteration:
             raise StreamBroken(f"{self.name}: closed") from None
-        except pynetft.SensorFaultError as exc:
-            raise self._ended(exc) from exc
+        if not samples and (health := client.health()).state is not pynetft.ClientState.STREAMING:
+            self._judge(health.last_status)
+            raise StreamBroken(
+                f"{self.name}: the stream has ended ({health.last_error}); check cable and supply, then open it again"
+            )
         return samples
-
-    def _ended(self, exc: pynetft.SensorFaultError) -> DriverError:
-        if exc.fault_code is pynetft.FaultCode.SERIOUS_STATUS:
-            return self._fault(exc.health.last_status)
-        return StreamBroken(
-            f"{self.name}: the stream has ended ({exc.health.last_error or exc.fault_code.value}); check cable and "
-            "supply, then open it again"
-        )
 
     def _judge(self, status: int) -> None:
         """Raise on a fault, log a latched monitor condition once."""

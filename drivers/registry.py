@@ -176,7 +176,7 @@ def _names(group: str, own: Mapping[str, str]) -> list[str]:
 def _load(entry: EntryPoint) -> Any:
     try:
         return entry.load()
-    except (ImportError, AttributeError) as exc:
+    except (ImportError, AttributeError, SyntaxError) as exc:
         extra = _EXTRAS.get(getattr(exc, "name", None) or "")
         cure = f"pip install 'ftdrive[{extra}]'" if extra else f"reinstall {_package(entry)}"
         raise BadUrl(f"the driver '{entry.name}' cannot be imported ({exc}): {cure}") from exc

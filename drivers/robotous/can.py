@@ -25,6 +25,7 @@ class CanLink:
 
     def __init__(self, channel: str, *, interface: str = "socketcan") -> None:
         self.name = f"Robotous sensor on {interface} {channel}"
+        self.fastest_Hz = 1000
         self._bus = CanBus(self.name, channel, interface, _BITRATE, (_FIRST_HALF, _SECOND_HALF))
         self._first: bytes | None = None
         self._number = self._halves_lost = 0

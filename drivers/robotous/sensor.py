@@ -27,6 +27,8 @@ class Link(Protocol):
 
     name: str
     """The device as the user knows it."""
+    fastest_Hz: int
+    """The highest output rate it carries."""
 
     @property
     def damaged(self) -> int:
@@ -67,6 +69,8 @@ class RobotousSensor(StreamingSensor):
         super().__init__(link.name, sign=sign)
         if rate_Hz is not None and rate_Hz not in codec.RATE_CODES:
             raise ValueError(f"rate is {rate_Hz} Hz; the sensor knows {', '.join(map(str, codec.RATE_CODES))}")
+        if rate_Hz is not None and rate_Hz > link.fastest_Hz:
+            raise ValueError(f"rate is {rate_Hz} Hz; at this baud rate {link.fastest_Hz} Hz is the most")
         self._link = link
         self._rate_Hz = rate_Hz
 

@@ -16,7 +16,7 @@ import pytest
 
 from drivers._stream import StreamingSensor
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from drivers.registry import sensor_from_url
+from drivers.registry import BadUrl, sensor_from_url
 
 WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])
 NOISE = np.array([0.03] * 3 + [0.001] * 3)
@@ -40,7 +40,8 @@ devices = []
 for line in sys.stdin:
     word, argument, options = json.loads(line)
     if word == "start":
-        options = {key: parts[key](**value) if key in parts else value for key, value in options.items()}
+        options = {key: parts[key](**value) if key in parts else tuple(value) if isinstance(value, list) else value
+                   for key, value in options.items()}
         devices.append(kinds[argument](measure, seed=2, **options))
         print(json.dumps([len(devices) - 1, devices[-1].start()]), flush=True)
     elif word == "faults":
@@ -270,8 +271,8 @@ def test_a_silent_device_is_no_device(start: Start, scheme: str) -> None:
 
 @pytest.mark.parametrize("fault", ["corrupt", "byte_slip", "drop"])
 def test_damage_is_dropped_and_counted(start: Start, scheme: str, fault: str) -> None:
-    if scheme == "robotous-can" and fault != "drop":
-        pytest.skip("a CAN controller drops damaged frames itself")
+    if scheme in {"robotous-can", "ati-netft"} and fault != "drop":
+        pytest.skip("the CAN controller and UDP drop damaged frames themselves")
     emulator = start(scheme)
     with emulator.sensor() as sensor:
         emulator.faults(**{fault: 0.1})
@@ -327,8 +328,8 @@ def test_robotous_rate(start: Start) -> None:
 
 
 def test_robotous_uart_carries_a_kilohertz_at_921600_only(start: Start) -> None:
-    with pytest.raises(ConnectError, match="value out of range"):
-        start("robotous-serial").sensor("rate=1000").open()
+    with pytest.raises(BadUrl, match="500 Hz is the most"):
+        sensor_from_url("robotous-serial:///dev/x?rate=1000")
     with start("robotous-serial", baud_code=1).sensor("baud=921600&rate=1000") as sensor:
         assert len(sensor.collect(0.3)) == pytest.approx(300, rel=0.15)
 
@@ -370,8 +371,9 @@ def test_bota_that_boots_is_awaited(start: Start) -> None:
 def test_bota_that_restarts_is_broken(start: Start) -> None:
     emulator = start("bota")
     with emulator.sensor() as sensor:
+        sensor.collect(0.2)  # longer than it takes to boot: its clock goes back
         emulator.reset()
-        with pytest.raises((StreamBroken, DeviceTimeout), match=r"restarted|silent"):
+        with pytest.raises(StreamBroken, match="it has restarted"):
             sensor.collect(1.0)
 
 
