@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 _SILENCE_S = 0.25
 """After this the stream has ended; the slowest rate this driver can read is therefore 4 Hz."""
-_STARTS = 10
+_STARTS = 5
 """The request to start is a datagram and can be lost."""
 _HTTP_S = 1.0
 _NEVER_S = 3600.0

@@ -167,14 +167,14 @@ def scheme(request: pytest.FixtureRequest) -> str:
 def test_wrench_counts_and_samples(shared: Emulator) -> None:
     kind = shared.kind
     with shared.sensor() as sensor:
-        samples = sensor.collect(0.6)
+        samples = sensor.collect(0.5)
         info, health = sensor.identify(), sensor.health()
     n = len(samples)
     bound = np.repeat(kind.quantisation, 3) / 2 + 5 * np.hypot(NOISE, np.repeat(kind.quantisation, 3)) / math.sqrt(n)
     assert (np.abs(samples.wrench.mean(axis=0) - WRENCH) < bound).all()
     assert (np.diff(samples.seq) == 1).all()
     assert (np.diff(samples.t_host_ns) >= 0).all()
-    assert n == pytest.approx(0.6 * kind.rate_Hz, rel=0.15)
+    assert n == pytest.approx(0.5 * kind.rate_Hz, rel=0.15)
     assert samples.counts.shape == (n, kind.counts)
     assert (samples.status == 0).all()
     assert info.serial == kind.serial
@@ -260,6 +260,7 @@ def test_silence_is_an_error(start: Start, scheme: str) -> None:
             sensor.collect(2.0)
 
 
+@pytest.mark.parametrize("scheme", sorted(KINDS.keys() - {"bota"}))  # a Bota is given 3 s to boot: see the unit tests
 def test_a_silent_device_is_no_device(start: Start, scheme: str) -> None:
     emulator = start(scheme)
     emulator.faults(stall=True)
@@ -269,14 +270,21 @@ def test_a_silent_device_is_no_device(start: Start, scheme: str) -> None:
     assert time.monotonic() - begin < 4.0
 
 
-@pytest.mark.parametrize("fault", ["corrupt", "byte_slip", "drop"])
+@pytest.mark.parametrize(
+    ("scheme", "fault"),
+    [
+        (scheme, fault)
+        for scheme in KINDS
+        for fault in ("drop", "corrupt", "byte_slip")
+        # CAN controllers and UDP drop damaged frames themselves
+        if fault == "drop" or scheme not in {"robotous-can", "ati-netft"}
+    ],
+)
 def test_damage_is_dropped_and_counted(start: Start, scheme: str, fault: str) -> None:
-    if scheme in {"robotous-can", "ati-netft"} and fault != "drop":
-        pytest.skip("the CAN controller and UDP drop damaged frames themselves")
     emulator = start(scheme)
     with emulator.sensor() as sensor:
-        emulator.faults(**{fault: 0.1})
-        samples = sensor.collect(0.8)
+        emulator.faults(**{fault: 0.2})
+        samples = sensor.collect(0.35)
         health = sensor.health()
     assert np.abs(samples.wrench - WRENCH).max() < 0.3
     gaps = int((np.diff(samples.seq) - 1).sum())
@@ -284,7 +292,7 @@ def test_damage_is_dropped_and_counted(start: Start, scheme: str, fault: str) ->
         assert gaps == 0  # frames carry no number: documented
     else:
         assert 0 < gaps <= health.lost
-    assert len(samples) + gaps >= 0.7 * 0.8 * emulator.kind.rate_Hz
+    assert len(samples) + gaps >= 0.5 * 0.35 * emulator.kind.rate_Hz
 
 
 def test_swapped_and_doubled_frames_are_no_new_samples(start: Start) -> None:
@@ -380,9 +388,9 @@ def test_bota_that_restarts_is_broken(start: Start) -> None:
 def test_bota_is_configured_when_asked(start: Start) -> None:
     emulator = start("bota", sinc_length=512)
     with emulator.sensor("sinc=64") as sensor:
-        assert len(sensor.collect(0.4)) == pytest.approx(0.4 * 800, rel=0.15)
+        assert len(sensor.collect(0.2)) == pytest.approx(0.2 * 800, rel=0.15)
     with emulator.sensor() as sensor:  # and left as it is, streaming
-        assert len(sensor.collect(0.4)) == pytest.approx(0.4 * 800, rel=0.15)
+        assert len(sensor.collect(0.2)) == pytest.approx(0.2 * 800, rel=0.15)
 
 
 @pytest.mark.parametrize(
