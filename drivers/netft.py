@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _SILENCE_S = 0.25
-"""After this the stream has ended; the slowest rate this driver can read is therefore 4 Hz."""
+"""After this the stream has ended: a sensor that is set to less than 10 Hz is too slow for this driver."""
 _STARTS = 5
 """The request to start is a datagram and can be lost."""
 _HTTP_S = 1.0
@@ -193,9 +193,12 @@ class NetFtSensor(StreamingSensor):
             reconnect_max_delay=_NEVER_S,
             calibration_override=override,
         )
-        self._seen_status = 0
+        self._warned = False
         self._newest_number: int | None = None
-        self._client = pynetft.Client(config, queue_size=_QUEUE)
+        try:
+            self._client = pynetft.Client(config, queue_size=_QUEUE)
+        except pynetft.NetFTError as exc:
+            raise self._untold(exc) from exc
         told = self._start(self._client)
         scale = told.calibration
         if scale.force_unit.value not in _FORCE_N or scale.torque_unit.value not in _TORQUE_NM:
@@ -266,9 +269,10 @@ class NetFtSensor(StreamingSensor):
             raise StreamBroken(f"{self.name}: closed")
         samples: list[pynetft.Sample] = []
         try:
-            samples += [next(client.samples(timeout=0.1))]
+            samples.append(next(client.samples(timeout=0.1)))
             time.sleep(_BATCH_S)
-            samples.extend(client.samples(timeout=0.0))
+            for sample in client.samples(timeout=0.0):
+                samples.append(sample)
         except TimeoutError:
             pass
         except StopIteration:
@@ -282,11 +286,11 @@ class NetFtSensor(StreamingSensor):
 
     def _judge(self, status: int) -> None:
         """Raise on a fault, log a latched monitor condition once."""
-        if status & ~MONITOR_LATCHED:
+        if status not in {0, MONITOR_LATCHED}:
             raise self._fault(status)
-        if new := status & ~self._seen_status:
-            log.warning("%s: status %s; measuring goes on", self.name, describe_status(new, self._bits))
-            self._seen_status |= new
+        if status and not self._warned:
+            log.warning("%s: status %s; measuring goes on", self.name, describe_status(status, self._bits))
+            self._warned = True
 
     def _fault(self, status: int) -> DeviceFault:
         return DeviceFault(f"{self.name}: status {describe_status(status, self._bits)}; its data must not be used")

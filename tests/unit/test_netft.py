@@ -153,6 +153,9 @@ def test_nobody_there() -> None:
         NetFtSensor("127.0.0.1", http_port=1).open()
     with pytest.raises(ConnectError, match="does not tell its configuration"):
         NetFtSensor("no such host").open()
+    for nowhere in ("no such host", " "):
+        with pytest.raises(ConnectError, match="check"):
+            NetFtSensor(nowhere, onrobot=True).open()
 
 
 def test_missing_library_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
