@@ -49,6 +49,11 @@ class Faults:
     jitter_s: float = 0.0
     stall: bool = False
 
+    @property
+    def harm_frames(self) -> bool:
+        """Whether frames can differ in their fate: if not, many may be sent as one."""
+        return any((self.drop, self.duplicate, self.corrupt, self.byte_slip, self.swap, self.foreign, self.jitter_s))
+
 
 class FaultyWire(Generic[Frame]):
     """The frames on their way to the client, in order, with the faults that befall them.
@@ -88,7 +93,9 @@ class FaultyWire(Generic[Frame]):
         due_s = time.monotonic() + self._faults.delay_s
         if self._outbox:
             due_s = max(due_s, self._outbox[-1][0])
-        for frame in self._with_faults(frames, stream):
+        if self._held or self._faults.harm_frames:
+            frames = self._with_faults(frames, stream)
+        for frame in frames:
             due_s += self._faults.jitter_s * chance()
             self._outbox.append((due_s, frame))
 

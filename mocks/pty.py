@@ -101,14 +101,17 @@ class PtyDevice(ABC):
         -------
         Number of records dropped.
         """
-        if self._unsent:
-            self._unsent = self._unsent[self._write(self._unsent) :]
+        self._finish_record()
         rest = data if self._unsent else data[self._write(data) :]
         if not rest:
             return 0
         if not self._unsent:
             self._unsent = rest[: len(rest) % record_bytes]
         return len(rest) // record_bytes
+
+    def _finish_record(self) -> None:
+        if self._unsent:
+            self._unsent = self._unsent[self._write(self._unsent) :]
 
     def _forget_unsent(self) -> None:
         """Give up a record that left in part."""
@@ -123,11 +126,15 @@ class PtyDevice(ABC):
     def _serve(self, slave: int) -> None:
         try:
             while True:
-                readable, _, _ = select.select([self._master, self._wake_read], [], [], self._tick())
+                wait_s = self._tick()
+                unfinished = [self._master] if self._unsent else []
+                readable, writable, _ = select.select([self._master, self._wake_read], unfinished, [], wait_s)
                 if self._wake_read in readable:
                     if os.read(self._wake_read, 1) == _END:
                         return
                     self._restart()
+                if self._master in writable:
+                    self._finish_record()
                 if self._master in readable:
                     self._received(os.read(self._master, 4096))
         finally:
