@@ -332,7 +332,6 @@ def test_whatever_ends_or_holds_the_program_ends_the_blocking_move(start: Callab
     states = {
         "crash-script": [1, 1, 7, 0x001],
         "dashboard-stop": [1, 1, 7, 0x001],
-        "foreign-program": [1, 1, 7, 0x001],
         "protective-stop": [4, 3, 7, 0x404],
         "emergency-stop": [1, 7, 3, 0x4C0],
         "safeguard": [4, 5, 7, 0x410],
@@ -343,11 +342,25 @@ def test_whatever_ends_or_holds_the_program_ends_the_blocking_move(start: Callab
         assert [fact["ended"], fact["returned"]] == [True, False], verb
         assert fact["after_s"] < 1.0, verb
         assert fact["state"] == states[verb], verb
-        if verb != "foreign-program":  # which may be playing by now
-            assert fact["next"] == [False, False, "getTCPOffset() function did not succeed!"], verb
+        assert fact["next"] == [False, False, "getTCPOffset() function did not succeed!"], verb
     assert station.events("play") == []
     assert {e["by"] for e in station.events("unlock protective stop") if e["accepted"]} == {"operator"}
     assert {e["by"] for e in station.events("stop")} == {"dashboard", "another dashboard client"}
+
+
+def test_a_foreign_program_ends_the_move_and_then_looks_like_ours(station: Station) -> None:
+    facts = play("foreign_program", station).facts
+    assert facts == {
+        "moving": True,
+        "ended": True,
+        "returned": False,
+        "seems_to_run": True,
+        "stands": True,
+        "answered": False,
+        "moves": False,
+    }
+    assert [e["accepted"] for e in station.events("command 1")][-2:] == [True, False]
+    station.ask(do="dashboard-stop")
 
 
 def test_a_stop_waits_for_a_blocking_move(station: Station) -> None:

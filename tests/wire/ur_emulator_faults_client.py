@@ -22,7 +22,6 @@ from rtde_receive import RTDEReceiveInterface
 BROKEN_PROGRAM: dict[str, dict[str, Any]] = {
     "crash-script": {},
     "dashboard-stop": {},
-    "foreign-program": {"seconds": 1000},
     "protective-stop": {},
     "emergency-stop": {},
     "safeguard": {},
@@ -61,9 +60,11 @@ def failure(call: Callable[[], Any]) -> str | None:
 
 
 class Move(threading.Thread):
-    """A blocking moveJ of the last joint, in a thread of its own; it is under way when the constructor returns."""
+    """A blocking moveJ of the last joint, in a thread of its own; wait until it is under way."""
 
-    def __init__(self, receive: Any, control: Any, way_rad: float = 1.0, speed_rad_s: float = 0.2) -> None:
+    def __init__(
+        self, receive: Any, control: Any, way_rad: float = 1.0, speed_rad_s: float = 0.2, *, wait: bool = True
+    ) -> None:
         super().__init__(daemon=True)
         self._control, self._speed_rad_s = control, speed_rad_s
         self.goal = receive.getTargetQ()
@@ -71,7 +72,8 @@ class Move(threading.Thread):
         self.returned: bool | None = None
         self.ended_s = 0.0
         self.start()
-        tell(moving=wait_for(lambda: abs(receive.getTargetQd()[5]) > 1e-3))
+        if wait:
+            tell(moving=wait_for(lambda: abs(receive.getTargetQd()[5]) > 1e-3))
 
     def run(self) -> None:
         self.returned = self._control.moveJ(self.goal, self._speed_rad_s, 2.0)
@@ -129,7 +131,8 @@ def dropped_moving(host: str) -> None:
     move = Move(r, c, 0.4)
     begun = time.monotonic()
     ask(do="drop", what="rtde", reset=True)
-    tell(ended=move.ends_within(2.0), returned=move.returned, after_s=move.ended_s - begun, lost=not r.isConnected())
+    tell(ended=move.ends_within(2.0), returned=move.returned, after_s=move.ended_s - begun)
+    tell(lost=wait_for(lambda: not r.isConnected()))
     tell(robot_finishes=wait_for(lambda: abs(ask(do="state")["q_rad"][5] - move.goal[5]) < 1e-3))
 
 
@@ -221,8 +224,7 @@ def broken_program(host: str) -> None:
         }
         wait_for(lambda: r.getRuntimeState() != 2)
         facts["state"] = [r.getRuntimeState(), r.getSafetyMode(), r.getRobotMode(), r.getSafetyStatusBits()]
-        if verb != "foreign-program":
-            facts["next"] = [c.moveJ(move.goal), c.isJointsWithinSafetyLimits(move.goal), failure(c.getTCPOffset)]
+        facts["next"] = [c.moveJ(move.goal), c.isJointsWithinSafetyLimits(move.goal), failure(c.getTCPOffset)]
         tell(**{verb: facts})
         if verb == "emergency-stop":
             ask(do="emergency-stop", on=False)
@@ -242,6 +244,17 @@ def broken_program(host: str) -> None:
         if not wait_for(c.isProgramRunning):
             tell(stuck_after=verb)
             return
+
+
+def foreign_program(host: str) -> None:
+    """Another client's program ends the move; while it plays, ours seems to run and a command is never answered."""
+    r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
+    move = Move(r, c)
+    ask(do="foreign-program", seconds=1000)
+    tell(ended=move.ends_within(2.0), returned=move.returned)
+    tell(seems_to_run=wait_for(c.isProgramRunning), stands=wait_for(lambda: not any(r.getTargetQd())))
+    call = Move(r, c, wait=False)
+    tell(answered=call.ends_within(0.5), moves=any(r.getTargetQd()))
 
 
 def stop_of_a_blocking_move(host: str) -> None:
@@ -406,7 +419,7 @@ SCENARIOS: dict[str, Callable[[str], None]] = {
     f.__name__: f
     for f in (
         killed, killed_moving, command_after_loss, dropped_moving, dropped_idle, dropped_without_dashboard,
-        briefly_silent, silent, frozen, disconnect_frozen, broken_program, stop_of_a_blocking_move,
+        briefly_silent, silent, frozen, disconnect_frozen, broken_program, foreign_program, stop_of_a_blocking_move,
         protective_stop_of_an_async_move, constructor, registers, die_in_async_move, die_in_blocking_move,
         die_under_watchdog, generation, variables, variables_refused, local_control, slider,
     )
