@@ -5,7 +5,7 @@ from typing import Any
 
 from mocks.kinematics import vector6
 from mocks.ur import dashboard
-from mocks.ur.modes import RobotMode, SafetyMode
+from mocks.ur.modes import PERMITTED, RobotMode, SafetyMode
 from mocks.ur.robot import Robot
 from mocks.ur.script import Upload
 from mocks.ur.server import UrServer
@@ -77,7 +77,10 @@ class Operator:
             raise KeyError("robot")
         if robot_mode is not None:
             robot.set_mode(robot_mode)
-        if safety_mode == SafetyMode.PROTECTIVE_STOP:
+        if safety_mode in PERMITTED:
+            robot.reduced_mode(safety_mode == SafetyMode.REDUCED)
+            robot.set_safety(SafetyMode.NORMAL, "asked for")
+        elif safety_mode == SafetyMode.PROTECTIVE_STOP:
             robot.protective_stop("asked for")
         elif safety_mode is not None:
             robot.set_safety(safety_mode, "asked for")

@@ -253,6 +253,16 @@ def test_connections_come_and_go_in_the_diary(start: Callable[..., Station]) -> 
     assert before < drop["t_host_ns"] <= gone["t_host_ns"] < time.monotonic_ns()
 
 
+def test_any_mode_can_be_asked_for(start: Callable[..., Station]) -> None:
+    station = start()
+    for number, name in ((2, "REDUCED"), (4, "RECOVERY"), (5, "SAFEGUARD_STOP"), (1, "NORMAL"), (3, "PROTECTIVE_STOP")):
+        assert station.ask(do="mode", safety=number)["safety_mode"] == name
+        assert station.ask(do="state")["robot_mode"] == "RUNNING"
+    assert station.ask(do="mode", safety=9) == {"done": "mode", "robot_mode": "POWER_OFF", "safety_mode": "FAULT"}
+    for number, name in ((-1, "NO_CONTROLLER"), (5, "IDLE"), (7, "RUNNING")):
+        assert station.ask(do="mode", robot=number)["robot_mode"] == name
+
+
 # -- the unmodified ur_rtde: the link ---------------------------------------------------------------------------------
 
 
