@@ -200,9 +200,7 @@ def test_random_plans_sampled_at_half_a_degree_are_clear() -> None:
         tour = np.array([p.q_rad for p in planned(certifier, q, 6 if made % 3 else 24).tour])
         share = np.linspace(0, 1, 361)[:, None, None]
         path = (1 - share) * tour + share * np.roll(tour, -1, axis=0)
-        within, outside = certifier.clearances(path.reshape(-1, 6)[:: 1 if len(tour) == 6 else 4])
-        assert within.min() > 0.02 - 1e-6
-        assert outside.min() > 0.03 - 1e-6
+        assert certifier.free(path.reshape(-1, 6)).all()  # farther away than the margins of 20 and 30 mm
         made += 1
     assert made == 30
 
