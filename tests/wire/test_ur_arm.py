@@ -23,7 +23,7 @@ from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError
 from drivers.ur.arm import UrArm
 from drivers.ur.control import ControlProcess
 from drivers.ur.kinematics import MODELS, forward
-from drivers.ur.rtde import TcpOffsetReader
+from drivers.ur.rtde import LiveReader
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 
@@ -195,7 +195,7 @@ def test_a_tcp_set_on_the_way_does_not_change_the_flange(station: Station, new_a
 def test_old_controllers_need_control_to_tell_the_tcp(
     station: Station, new_arm: Callable[..., UrArm], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(TcpOffsetReader, "_names", ("timestamp", "not_yet_invented"))
+    monkeypatch.setattr(LiveReader, "_names", ("timestamp", "not_yet_invented"))
     arm = new_arm()
     with pytest.raises(ConnectError, match="too old to tell its active TCP"):
         arm.open()
