@@ -1,19 +1,17 @@
 """`UrArm` and the unmodified ur_rtde against the emulated controller, which runs as a process of its own."""
 
-import json
 import logging
 import os
-import select
 import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from math import radians
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pytest
@@ -32,96 +30,17 @@ STEP_RAD = 1.2  # 1.6 s at the speed of these tests: long enough to be interrupt
 TCP = (0.1, -0.02, 0.25, 0.3, -1.2, 0.7)
 
 
-class Station:
-    """The emulator's process and its control lines."""
+class Station(Protocol):
+    """What the tests use of the emulator's process."""
 
-    def __init__(self, *options: str) -> None:
-        command = [sys.executable, "-m", "mocks", "station", "--sensor", "none", *options]
-        self.process = subprocess.Popen(
-            command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
-        self.host: str = self._line()["arm"]["host"]
+    process: subprocess.Popen[str]
+    host: str
 
-    def _line(self) -> dict[str, Any]:
-        assert self.process.stdout
-        assert select.select([self.process.stdout], [], [], 20)[0], "the station says nothing"
-        answer: dict[str, Any] = json.loads(self.process.stdout.readline())
-        assert "error" not in answer, answer
-        return answer
+    def do(self, verb: str, /, **how: object) -> dict[str, Any]: ...
 
-    def do(self, verb: str, /, **how: object) -> dict[str, Any]:
-        assert self.process.stdin
-        self.process.stdin.write(json.dumps({"do": verb} | how) + "\n")
-        self.process.stdin.flush()
-        return self._line()
+    def wait_for(self, condition: Callable[[dict[str, Any]], bool], within_s: float = 2.0) -> None: ...
 
-    def wait_for(self, condition: Callable[[dict[str, Any]], bool], within_s: float = 2.0) -> None:
-        deadline = time.monotonic() + within_s
-        while not condition(state := self.do("state")):
-            assert time.monotonic() < deadline, state
-            time.sleep(0.01)
-
-    def as_new(self) -> bool:
-        if self.process.poll() is not None:
-            return False
-        state = self.do("state")
-        return bool(
-            (state["safety_mode"], state["robot_mode"], state["remote_control"]) == ("NORMAL", "RUNNING", True)
-            and not any(state["tcp_offset"])
-        )
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.communicate()
-
-
-@pytest.fixture(scope="module")
-def start_station() -> Iterator[Callable[..., Station]]:
-    stations: list[Station] = []
-
-    def start(*options: str) -> Station:
-        stations.append(Station(*options))
-        return stations[-1]
-
-    yield start
-    for station in stations:
-        station.close()
-
-
-@pytest.fixture(scope="module")
-def kept() -> list[Station]:
-    """The station at hand, in a list: a test may break it, and the next gets another."""
-    return []
-
-
-@pytest.fixture
-def station(kept: list[Station], start_station: Callable[..., Station]) -> Iterator[Station]:
-    if not kept or not kept[0].as_new():
-        kept[:] = [start_station()]
-    yield kept[0]
-    if kept[0].process.poll() is None:
-        assert kept[0].do("state")["bad_inputs"] == []
-
-
-@pytest.fixture
-def new_arm(station: Station) -> Iterator[Callable[..., UrArm]]:
-    """Make arms at the station, and close them after the test."""
-    arms: list[UrArm] = []
-
-    def make(host: str = station.host, model: str | None = None) -> UrArm:
-        arms.append(UrArm(host, model=model, speed_rad_s=radians(60), acceleration_rad_s2=radians(200)))
-        return arms[-1]
-
-    yield make
-    for arm in arms:
-        closes_quickly(arm)
-
-
-@pytest.fixture
-def arm(new_arm: Callable[..., UrArm]) -> UrArm:
-    arm = new_arm()
-    arm.open(control=True)
-    return arm
+    def dashboard(self, command: str) -> str: ...
 
 
 def closes_quickly(arm: UrArm) -> None:
@@ -413,7 +332,7 @@ def test_safety_stops_are_told_and_never_reset(
 
 
 def test_a_program_stopped_at_the_pendant(station: Station, arm: UrArm) -> None:
-    trigger = Trigger(arm, lambda: dashboard(station, "stop"))
+    trigger = Trigger(arm, lambda: station.dashboard("stop"))
     with pytest.raises(DeviceFault, match="ended or paused by somebody else"):
         arm.move_to(away(arm), timeout_s=10, guard=trigger)
     assert trigger.ago_s() < 0.5
@@ -423,19 +342,11 @@ def test_a_program_stopped_at_the_pendant(station: Station, arm: UrArm) -> None:
 
 
 def test_a_paused_program_is_ended(station: Station, arm: UrArm) -> None:
-    trigger = Trigger(arm, lambda: dashboard(station, "pause"))
+    trigger = Trigger(arm, lambda: station.dashboard("pause"))
     with pytest.raises(DeviceFault, match="paused"):
         arm.move_to(away(arm), timeout_s=10, guard=trigger)
     assert trigger.ago_s() < 0.5
     station.wait_for(lambda state: state["runtime_state"] == "STOPPED", within_s=0.2)
-
-
-def dashboard(station: Station, command: str) -> None:
-    with socket.create_connection((station.host, 29999), timeout=2) as sock, sock.makefile("rw") as lines:
-        lines.readline()
-        lines.write(command + "\n")
-        lines.flush()
-        lines.readline()
 
 
 def test_a_frozen_controller(station: Station, arm: UrArm) -> None:
@@ -545,7 +456,7 @@ def test_remote_control_is_asked_for(station: Station, new_arm: Callable[..., Ur
 
 def test_a_powered_off_arm(station: Station, new_arm: Callable[..., UrArm]) -> None:
     arm = new_arm()
-    dashboard(station, "power off")
+    station.dashboard("power off")
     station.wait_for(lambda state: state["robot_mode"] != "RUNNING")
     with pytest.raises(ConnectError, match="power the arm on"):
         arm.open(control=True)
