@@ -77,8 +77,10 @@ class Calls:
 
     def stop_unwatched(self) -> None:
         """Stop a move that nobody has asked about for `UNWATCHED_S`."""
-        self._unwatched = True
-        self.stop()
+        ended, _ = self.progress()
+        if not ended:
+            self._unwatched = True
+            self.stop()
 
     def stop(self) -> None:
         """Decelerate all joints and wait for standstill.

@@ -5,10 +5,10 @@ known to be finishing the one move it was given; no wait over 5 s, no crash; aft
 `open(control=True)` on the same object moves the arm again within 2 s. We never unlock and never play.
 
 ======================  ================  =============================  ==========================================
-event                   what is told      arm                            states: test of this file
+event                   what is told      arm                            test of this file
 ======================  ================  =============================  ==========================================
-protective stop,        `DeviceFault`     stopped by the controller;     in move, settling, idle: `test_in_move`,
-emergency stop,                           what is left of the program    `test_while_settling`, `test_idle`;
+protective stop,        `DeviceFault`     stopped by the controller;     `test_in_move`,
+emergency stop,                           what is left of the program    settling and idle: `test_at_rest`;
 safeguard, power lost,                    is ended, so that nobody can   opening: `test_while_opening`;
 brakes closed                             resume it                      closing: `test_while_closing`
 program stopped,        `DeviceFault`     stopped by the controller      the same
@@ -33,13 +33,14 @@ suspended while idle    -                 stands                         `test_n
 """
 
 import os
+import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from math import radians
 from pathlib import Path
@@ -49,17 +50,17 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
-from drivers.ur import arm as arm_module
 from drivers.ur.arm import UrArm
 from drivers.ur.control import ControlProcess
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 
 ROOT = Path(__file__).parents[2]
-TIME_SCALE = 4  # a protective stop can be unlocked after 5 s of the controller's time
+TIME_SCALE = 10  # a protective stop can be unlocked after 5 s of the controller's time
 STEP_RAD = 1.2  # 1.3 s
-DETECTED_S = 1.5  # 0.5 s on a computer that is not busy
-RESUMED_S = 4.0  # 2 s on a computer that is not busy
+DETECTED_S = 1.5  # 0.5 s, on a busy computer
+TRIED_S = 2.5  # the same, and a second of trying to stop an arm that cannot be reached
+RESUMED_S = 4.0  # 2 s, on a busy computer
 
 
 class Station(Protocol):
@@ -124,6 +125,8 @@ class Event:
     says: str
     reachable: bool = True
     """Whether the controller can still be told to stop."""
+    hits_opening: bool = True
+    """Whether it matters before a program of ours runs."""
 
     def __str__(self) -> str:
         return self.name
@@ -134,22 +137,58 @@ EVENTS = [
     Event("protective-stop", on("protective-stop"), unlock, DeviceFault, "protective stop: find and remove its cause"),
     Event("emergency-stop", on("emergency-stop", on=True), release, DeviceFault, "emergency stop: make the cell safe"),
     Event(
-        "safeguard", on("safeguard", on=True), on("safeguard", on=False), DeviceFault, "safeguard stop: close the safeguard"
+        "safeguard",
+        on("safeguard", on=True),
+        on("safeguard", on=False),
+        DeviceFault,
+        "safeguard stop: close the safeguard",
     ),
     Event("power-off", lambda s: s.dashboard("power off"), power_up, DeviceFault, "power the arm on and release"),
     Event("brakes", on("mode", robot=5), on("mode", robot=7), DeviceFault, r"\(idle\): release its brakes"),
-    Event("program-stop", on("dashboard-stop"), nothing, DeviceFault, "ended or paused by somebody else"),
-    Event("program-pause", lambda s: s.dashboard("pause"), nothing, DeviceFault, "ended or paused by somebody else"),
-    Event("crash-script", on("crash-script"), nothing, DeviceFault, "ended or paused by somebody else"),
-    Event("foreign-program", on("foreign-program"), on("dashboard-stop"), DeviceFault, "another program; end it"),
+    Event(
+        "program-stop",
+        on("dashboard-stop"),
+        nothing,
+        DeviceFault,
+        "ended or paused by somebody else",
+        hits_opening=False,
+    ),
+    Event(
+        "program-pause",
+        lambda s: s.dashboard("pause"),
+        nothing,
+        DeviceFault,
+        "ended or paused by somebody else",
+        hits_opening=False,
+    ),
+    Event(
+        "crash-script", on("crash-script"), nothing, DeviceFault, "ended or paused by somebody else", hits_opening=False
+    ),
+    Event(
+        "foreign-program",
+        on("foreign-program"),
+        on("dashboard-stop"),
+        DeviceFault,
+        "another program; end it",
+        hits_opening=False,
+    ),
     Event("rtde-fin", on("drop", what="rtde"), nothing, StreamBroken, "check the robot and the cable"),
     Event("rtde-reset", on("drop", what="rtde", reset=True), nothing, StreamBroken, "check the robot and the cable"),
     Event(
-        "rtde-silent", on("silent", what="rtde", on=True), on("silent", what="rtde", on=False), LOST, "press the emergency"
+        "rtde-silent",
+        on("silent", what="rtde", on=True),
+        on("silent", what="rtde", on=False),
+        LOST,
+        "press the emergency",
     ),
     Event("freeze", on("freeze", on=True), on("freeze", on=False), LOST, "stood still", reachable=False),
     Event(
-        "cut", lambda s: cut(s, connected=False), lambda s: cut(s, connected=True), LOST, "check the robot", reachable=False
+        "cut",
+        lambda s: cut(s, connected=False),
+        lambda s: cut(s, connected=True),
+        LOST,
+        "check the robot",
+        reachable=False,
     ),
 ]
 each_event = pytest.mark.parametrize("event", EVENTS, ids=str)
@@ -160,6 +199,12 @@ def station(kept: list[Station], start_station: Callable[..., Station]) -> Itera
     if not kept or kept[0].process.poll() is not None:
         kept[:] = [start_station("--time-scale", str(TIME_SCALE))]
     station = kept[0]
+    for what in ("rtde", "dashboard", "script"):  # a test that failed may have left it like this
+        station.do("listen", what=what, on=True)
+    for what in ("rtde", "dashboard"):
+        station.do("silent", what=what, on=False)
+    station.do("freeze", on=False)
+    station.do("claim-registers", range="lower", on=False)
     before = len(station.do("state")["events"])
     yield station
     if station.process.poll() is None:
@@ -242,7 +287,7 @@ def test_in_move(station: Station, arm: UrArm, event: Event) -> None:
     provoke = Once(lambda: event.do(station), wait_until_moving(arm))
     with pytest.raises(event.error, match=event.says):
         arm.move_to(q, timeout_s=10, guard=provoke)
-    assert provoke.ago_s() < DETECTED_S
+    assert provoke.ago_s() < (DETECTED_S if event.reachable else TRIED_S)
     if event.reachable:
         station.wait_for(lambda state: not state["moving"] and state["runtime_state"] == "STOPPED", within_s=1.0)
         assert abs(station.do("state")["q_rad"][5] - q[5]) > 0.1
@@ -254,55 +299,41 @@ def test_in_move(station: Station, arm: UrArm, event: Event) -> None:
 
 
 @each_event
-def test_while_settling(station: Station, arm: UrArm, event: Event) -> None:
-    provoke = Once(lambda: event.do(station))
-    if event.name == "foreign-program":
-        arm.wait_until_still(timeout_s=5, guard=provoke)  # it stands, whoever's program that is
-    else:
+def test_at_rest(station: Station, arm: UrArm, event: Event) -> None:
+    if event.name != "foreign-program":  # while it stands, it may be anybody's program
+        provoke = Once(lambda: event.do(station))
         with pytest.raises(event.error, match=event.says):
             arm.wait_until_still(timeout_s=5, guard=provoke)
-        assert provoke.ago_s() < DETECTED_S
-    event.cure(station)
-    moves_again(arm)
-
-
-@each_event
-def test_idle(station: Station, arm: UrArm, event: Event) -> None:
+        assert provoke.ago_s() < (DETECTED_S if event.reachable else TRIED_S)
+        event.cure(station)
+        moves_again(arm)
     q = away(arm, 0.05)
-    event.do(station)
+    event.do(station)  # nobody looks
     t0 = time.monotonic()
     with pytest.raises(event.error, match=event.says):
         arm.move_to(q, timeout_s=10, guard=no_guard)
-    assert time.monotonic() - t0 < DETECTED_S
+    assert time.monotonic() - t0 < (DETECTED_S if event.reachable else TRIED_S)
     event.cure(station)
     moves_again(arm)
 
 
-@each_event
+@pytest.mark.parametrize("event", [event for event in EVENTS if event.hits_opening], ids=str)
 def test_while_opening(station: Station, event: Event, monkeypatch: pytest.MonkeyPatch) -> None:
     start = ControlProcess.__init__
     provoke = Once(lambda: event.do(station))
 
     def provoking(self: ControlProcess, host: str, frequency_Hz: float) -> None:
-        provoke()  # all is well, and the control process is about to start
+        provoke()  # all was well, and the control process is about to start
         start(self, host, frequency_Hz)
 
     monkeypatch.setattr(ControlProcess, "__init__", provoking)
     arm = new_arm(station.host)
-    try:
-        with pytest.raises(ConnectError):
-            arm.open(control=True)
-            # Some come too early to be noticed, as long as nothing of ours is there to be hit.
-            assert event.name in {"program-stop", "program-pause", "crash-script", "foreign-program"} | {
-                "rtde-fin",
-                "rtde-reset",
-            }
-            raise ConnectError
-        assert provoke.ago_s() < 5
-        event.cure(station)
-        moves_again(arm)
-    finally:
-        arm.close()
+    with pytest.raises(ConnectError, match=event.says):
+        arm.open(control=True)
+    assert provoke.ago_s() < 5
+    event.cure(station)
+    moves_again(arm)
+    arm.close()
 
 
 @each_event
@@ -358,6 +389,7 @@ def test_a_move_paused_by_a_protective_stop_cannot_be_played(station: Station, a
     provoke = Once(lambda: station.do("protective-stop"), wait_until_moving(arm))
     with pytest.raises(DeviceFault, match="protective stop"):
         arm.move_to(away(arm), timeout_s=10, guard=provoke)
+    station.wait_for(lambda state: not state["moving"])
     where = station.do("state")["q_rad"]
     unlock(station)
     station.do("play")
@@ -454,11 +486,12 @@ def test_services_that_are_off(station: Station, what: str, says: str) -> None:
     station.do("listen", what=what, on=False)
     said = refused(station)
     station.do("listen", what=what, on=True)
-    pytest.raises(ConnectError, match=says, check=None) if False else None
-    assert __import__("re").search(says, said), said
+    assert re.search(says, said), said
 
 
-@pytest.mark.parametrize(("what", "says"), [("rtde", "30004 accepts the connection but did not answer"), ("dashboard", "did not answer")])
+@pytest.mark.parametrize(
+    ("what", "says"), [("rtde", "30004 accepts the connection but did not answer"), ("dashboard", "did not answer")]
+)
 def test_services_that_are_silent(station: Station, what: str, says: str) -> None:
     station.do("silent", what=what, on=True)
     said = refused(station)
@@ -502,16 +535,16 @@ def application(station: Station, tmp_path: Path) -> Iterator[Application]:
     script = tmp_path / "application.py"
     script.write_text(APPLICATION)
     speed = str(radians(60) / TIME_SCALE)
-    process = subprocess.Popen([sys.executable, script, station.host, speed], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    process = subprocess.Popen(
+        [sys.executable, script, station.host, speed], stdout=subprocess.PIPE, text=True, cwd=ROOT
+    )
     assert process.stdout is not None
     application = Application(process, int(process.stdout.readline()))
     station.wait_for(lambda state: state["moving"], within_s=20)
     yield application
     for pid in (process.pid, application.child):
-        try:
+        with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-        except ProcessLookupError:
-            pass
     process.communicate(timeout=10)
 
 
@@ -547,7 +580,7 @@ def test_both_processes_suspended(station: Station, application: Application) ->
     station.wait_for(lambda state: not state["moving"], within_s=5.0)
     for pid in (application.child, application.process.pid):
         os.kill(pid, signal.SIGCONT)
-    assert application.line() == "arrived True"
+    assert re.match("arrived True|DeviceTimeout .*keep the computer awake", application.line())
     assert application.process.wait(10) == 0
 
 
@@ -567,7 +600,11 @@ arm.close()
 
 def test_nothing_old_is_believed(station: Station, arm: UrArm) -> None:
     watcher = subprocess.Popen(
-        [sys.executable, "-c", WATCHER, station.host], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT
+        [sys.executable, "-c", WATCHER, station.host],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
     )
     assert watcher.stdin is not None
     assert watcher.stdout is not None
@@ -592,7 +629,7 @@ def test_a_guard_that_hangs(station: Station, arm: UrArm) -> None:
         station.wait_for(lambda state: not state["moving"], within_s=2.0)
 
     q = away(arm)
-    with pytest.raises(DeviceTimeout, match="nothing was heard from this program for 0.5 s of a move"):
+    with pytest.raises(DeviceTimeout, match=r"nothing was heard .* for 0\.5 s of a move"):
         arm.move_to(q, timeout_s=10, guard=Once(hang, wait_until_moving(arm)))
     assert abs(arm.state().q_rad[5] - q[5]) > 0.1
     arm.move_to(q, timeout_s=10, guard=no_guard)  # and it is still ours
