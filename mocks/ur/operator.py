@@ -131,8 +131,13 @@ class Operator:
         return {"done": "freeze", "on": self._server.frozen}
 
     def _silent(self, request: Request) -> dict[str, Any]:
-        self._server.set_silent(request["what"], _on(request))
-        self._robot.note("network", f"silent {request['what']}", on=_on(request))
+        what, on, answers = request["what"], _on(request), bool(request.get("answers", False))
+        if answers and what != "rtde":
+            raise ValueError(f"only rtde can answer without streaming, not {what!r}")
+        self._server.set_silent(what, on and not answers)
+        if what == "rtde":
+            self._server.streaming = not (on and answers)
+        self._robot.note("network", f"silent {what}", on=on, answers=answers)
         return {"done": "silent"}
 
     def _drop(self, request: Request) -> dict[str, Any]:

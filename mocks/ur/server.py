@@ -267,6 +267,8 @@ class UrServer:
         """Control cycles lost because this process was stalled for too long."""
         self.frozen = False
         """While true nothing runs and nothing is read or sent, but connections stay."""
+        self.streaming = True
+        """While false RTDE clients are answered, but get no samples."""
         self._silent: set[str] = set()
         self._selector = selector
         self._clients: list[Client] = []
@@ -394,5 +396,5 @@ class UrServer:
             if client.kind in self._silent:
                 continue
             client.flush()
-            if isinstance(client, RtdeClient):
+            if self.streaming and isinstance(client, RtdeClient):
                 client.sample(first, self.robot.cycle)
