@@ -407,9 +407,7 @@ class UrArm(RobotArm):
         if self._control is None:
             raise ConnectError(f"the arm at {self._host} was opened for reading only: open it with control.")
         if not self._control.alive:
-            raise StreamBroken(
-                f"the control of {self._host} has ended: close the arm, see to the robot, and open the arm again."
-            )
+            raise StreamBroken(f"the control of {self._host} has ended: see to the robot, then open the arm again.")
         return self._control
 
     def _reading(self) -> Reader:

@@ -139,7 +139,10 @@ class Reader:
             raise ConnectError(f"{error}: enable it under Settings, Security, Services.") from error
         says = model_named(told, major)
         if model is None and says is None:
-            raise ConnectError(f"{self._host} calls itself {told!r}, which is not known: name its model.")
+            raise ConnectError(
+                f"{self._host} says {told!r} to the question for its model, which is no known one (before PolyScope "
+                f"5.6 nothing is): name the model of the arm."
+            )
         if model is not None and says is not None and MODELS[says] != MODELS[model]:
             raise ConnectError(f"{self._host} is a {says}, not a {model}: check the address and the model.")
         return DeviceInfo(model=model or says or told, serial=serial, firmware=polyscope)
