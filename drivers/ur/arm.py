@@ -164,6 +164,7 @@ class UrArm(RobotArm):
         try:
             self._control.wait_until_ready(look_out)
         except (StreamBroken, DeviceTimeout) as error:
+            look_out()  # ur_rtde seldom knows the reason
             raise ConnectError(_advice(self._host, str(error))) from error
 
     def _find_script_port(self) -> None:

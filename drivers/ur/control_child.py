@@ -13,6 +13,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
@@ -77,6 +78,7 @@ class Calls:
 
     def stop_unwatched(self) -> None:
         """Stop a move that nobody has asked about for `UNWATCHED_S`."""
+        time.sleep(0.02)  # when this process was suspended as well, ur_rtde has to catch up
         ended, _ = self.progress()
         if not ended:
             self._unwatched = True
