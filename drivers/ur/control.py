@@ -109,14 +109,16 @@ class ControlProcess:
                 with suppress(OSError):  # a request that was never read
                     pipe.close()
 
-    def _answer(self, to: int, timeout_s: float, look_out: Callable[[], object] | None = None) -> Any:
-        deadline = time.monotonic() + timeout_s
+    def _answer(self, to: int, timeout_s: float, look_out: Callable[[], object] = lambda: None) -> Any:
+        left_s = timeout_s
         while True:
-            left_s = max(deadline - time.monotonic(), 0.0)
+            t0 = time.monotonic()
             try:
-                reply = self._replies.get(timeout=min(left_s, 0.05) if look_out else left_s)
+                reply = self._replies.get(timeout=max(min(left_s, 0.05), 0.0))
             except Empty:
-                if look_out and time.monotonic() < deadline:
+                # A process that was itself suspended has not been waiting: that time does not count in full.
+                left_s -= min(time.monotonic() - t0, 0.1)
+                if left_s > 0:
                     look_out()
                     continue
                 self.kill()
