@@ -169,7 +169,7 @@ EVENTS = [
         on("foreign-program"),
         on("dashboard-stop"),
         DeviceFault,
-        "another program; end it",
+        "another program; end it|ended or paused by somebody else",
         hits_opening=False,
     ),
     Event("rtde-fin", on("drop", what="rtde"), nothing, StreamBroken, "check the robot and the cable"),
