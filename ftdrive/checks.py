@@ -224,7 +224,7 @@ def check_calibration(result: CalibrationResult, serials: Mapping[str, str]) -> 
 
 
 def check_push(
-    change: Array, R_base_flange: Array | None, R_flange_sensor: Array | None
+    change: Array, R_base_flange: Array | None, R_flange_sensor: Array | None, sign: int
 ) -> tuple[Check, dict[str, Any]]:
     """Judge a push along +X of the base.
 
@@ -234,6 +234,8 @@ def check_push(
         Force during the push minus force before, N, sensor axes.
     R_base_flange, R_flange_sensor : array, shape (3, 3), or None
         Where unknown.
+    sign : int
+        As configured now.
 
     Returns
     -------
@@ -259,7 +261,7 @@ def check_push(
         fix = "push along +X of the base; if you did, the mounting is another one: ftdrive calibrate"
         return Check("push.sign", "failed", found, fix), moved
     if base[0] < 0:
-        fix = "set sign = -1 under [sensor] in the configuration (sign = 1 if it is -1), then calibrate again"
+        fix = f"set sign = {-sign} under [sensor] in the configuration, then calibrate again"
         return Check("push.sign", "failed", f"{found}: it reports the reaction", fix), moved
     return Check("push.sign", "ok", found), moved
 

@@ -20,7 +20,8 @@ from ftdrive.simulation import Station
 def devices(simulate: bool, as_json: bool) -> None:
     """List serial ports by id and CAN interfaces.
 
-    No port is opened and no byte is sent. Which sensor is on a port is asked by `ftdrive doctor`, for the one it is told.
+    No port is opened and no byte is sent, so it cannot tell which sensor is where: `ftdrive doctor` asks the one that
+    you name.
     """
     found = _emulated() if simulate else {"serial": _serial_ports(), "can": _can_interfaces()}
     if as_json:
