@@ -1,4 +1,4 @@
-"""`ftdrive devices`: which ports this computer has. Nothing is opened, so no device notices."""
+"""`ftdrive devices`: which ports this computer has, and on request which known sensor is on one."""
 
 import os
 from pathlib import Path
@@ -9,21 +9,30 @@ from rich.console import Console
 from rich.markup import escape
 from serial.tools import list_ports
 
+from drivers.probe import probe
 from ftdrive.checks import DEV, SYS, Check, can_details, can_interfaces, check_serial_port
 from ftdrive.commands.common import JSON, write_json
+from ftdrive.errors import ConfigError
 from ftdrive.simulation import Station
 
 
 @click.command()
+@click.option(
+    "--probe", "ports", multiple=True, metavar="PORT", help="Ask which known sensor is there; may be repeated."
+)
 @click.option("--simulate", is_flag=True, help="Show the ports of an emulated cell instead.")
 @JSON
-def devices(simulate: bool, as_json: bool) -> None:
+def devices(ports: tuple[str, ...], simulate: bool, as_json: bool) -> None:
     """List serial ports by id and CAN interfaces.
 
-    No port is opened and no byte is sent, so it cannot tell which sensor is where: `ftdrive doctor` asks the one that
-    you name.
+    No port is opened and no byte is sent, except to the serial ports named with --probe: there it listens, and then
+    sends requests to read in the protocols of the sensors it knows. Do not probe a port with something else on it.
     """
+    if simulate and ports:
+        raise ConfigError("an emulated cell has just its own ports: give either --simulate or --probe")
     found = _emulated() if simulate else {"serial": _serial_ports(), "can": _can_interfaces()}
+    if ports:
+        found["answers"] = [_answer(port) for port in ports]
     if as_json:
         write_json({"schema_version": 1, **found})
     else:
@@ -58,6 +67,11 @@ def _can_interfaces() -> list[dict[str, Any]]:
     return [{"interface": name, **can_details(name)} for name in can_interfaces()]
 
 
+def _answer(port: str) -> dict[str, Any]:
+    answer = probe(port)
+    return {"port": port, "url": answer and answer.url, "what": answer and answer.what}
+
+
 def _emulated() -> dict[str, Any]:
     with Station("both") as station:
         serial, can = station.endpoints["serial"], station.endpoints["can"]
@@ -84,3 +98,6 @@ def _print(found: dict[str, Any]) -> None:
     for kind, name in (("serial", "serial ports"), ("can", "CAN interfaces of the kernel")):
         if not found[kind]:
             data.print(f" no {name}")
+    for answer in found.get("answers", ()):
+        told = "no known sensor" if answer["url"] is None else f"{answer['what']}   {answer['url']}"
+        data.print(escape(f" probed  {answer['port']}   {told}"))

@@ -113,9 +113,11 @@ def test_a_person_pushes(station: Station, cell: Path, ftdrive: CommandLine) -> 
     assert pushed["base"] is None  # nobody has told how the sensor is mounted
 
 
-def test_devices_of_this_computer_and_of_an_emulated_cell(ftdrive: CommandLine) -> None:
-    own = ftdrive.json("devices")
+def test_devices_of_this_computer_and_of_an_emulated_cell(station: Station, ftdrive: CommandLine) -> None:
+    url = station.cell.sensor.url
+    own = ftdrive.json("devices", "--probe", url.removeprefix("ati-serial://"))
     assert all(port["port"].startswith("/dev/") for port in own["serial"])
+    assert [answer["url"] for answer in own["answers"]] == [url]
     emulated = ftdrive.json("devices", "--simulate")
     assert [port["url"].partition(":")[0] for port in emulated["serial"]] == ["ati-serial", "ati-can"]
 
