@@ -13,6 +13,7 @@ from drivers.errors import ProtocolError
 from drivers.interfaces import ForceTorqueSensor
 from drivers.registry import BadUrl, sensor_from_url
 from drivers.transcript import Player, Transcript, Writer, recording
+from ftdrive.checks import SensorAddress
 from ftdrive.commands.common import JSON, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.report import talk
@@ -52,6 +53,8 @@ def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as
             sensor = station.cell.sensor.url
         if sensor is None:
             raise ConfigError("which sensor? Give --sensor URL or --simulate")
+        if SensorAddress.of(sensor).serial_port is None:
+            raise ConfigError(f"{sensor} is not on a serial port: only what passes one can be recorded")
         device = _sensor(sensor)
         header = {
             "url": sensor,
