@@ -31,6 +31,7 @@ DEV = Path("/dev")
 
 _CAN_INTERFACE = "280"
 """ARPHRD_CAN, in /sys/class/net/*/type."""
+_ON_SERIAL = ("ati-serial", "bota", "robotiq-ft300", "robotous-serial")
 _FREE_BYTES = 1_000_000_000
 _PUSH_N = 2.0
 
@@ -73,7 +74,7 @@ class SensorAddress:
         """The serial port it is on, behind an slcan adapter too."""
         if self.scheme.endswith("-can") and self.options.get("interface") == "slcan":
             return Path(self.address.split("@")[0])
-        return Path(self.address) if self.address.startswith("/") else None
+        return Path(self.address) if self.scheme in _ON_SERIAL or self.address.startswith("/") else None
 
     @property
     def can_interface(self) -> str | None:
@@ -294,11 +295,14 @@ def check_permissions(address: SensorAddress, *, sys: Path = SYS, dev: Path = DE
         return check_serial_port(port, sys=sys, dev=dev)
     if (interface := address.can_interface) is not None:
         return [check_can_interface(interface, address.bitrate, can_details(interface), sys=sys)]
-    return [Check("permissions.port", "skipped", f"not applicable: {address.scheme} is not on a port of this computer")]
+    found = f"not applicable: {address.scheme} at {address.address} is on no serial port and no CAN interface of Linux"
+    return [Check("permissions.port", "skipped", found)]
 
 
 def check_serial_port(port: Path, *, sys: Path = SYS, dev: Path = DEV) -> list[Check]:
     """Judge a serial port: there, permitted, named so that it survives replugging, and quick."""
+    if not dev.is_dir():
+        return [Check("permissions.port", "skipped", f"not applicable: {port} has no file on this system")]
     if not port.exists():
         return [Check("permissions.port", "failed", f"there is no {port}", "plug it in; ftdrive devices")]
     real = Path(os.path.realpath(port))

@@ -10,7 +10,7 @@ from rich.markup import escape
 from serial.tools import list_ports
 
 from drivers.probe import probe
-from ftdrive.checks import DEV, SYS, Check, can_details, can_interfaces, check_serial_port
+from ftdrive.checks import DEV, Check, can_details, can_interfaces, check_serial_port
 from ftdrive.commands.common import JSON, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.simulation import Station
@@ -39,16 +39,17 @@ def devices(ports: tuple[str, ...], simulate: bool, as_json: bool) -> None:
         _print(found)
 
 
-def _serial_ports(*, sys: Path = SYS, dev: Path = DEV) -> list[dict[str, Any]]:
-    by_id = dev / "serial" / "by-id"
+def _serial_ports() -> list[dict[str, Any]]:
+    by_id = DEV / "serial" / "by-id"
     links = {os.path.realpath(link): str(link) for link in by_id.iterdir()} if by_id.is_dir() else {}
     ports = []
     for port in sorted(list_ports.comports()):
-        checks = check_serial_port(Path(port.device), sys=sys, dev=dev)
+        name = links.get(os.path.realpath(port.device))
+        checks = check_serial_port(Path(name or port.device))
         ports.append(
             {
                 "port": port.device,
-                "by_id": links.get(os.path.realpath(port.device)),
+                "by_id": name,
                 "description": None if port.description == "n/a" else port.description,
                 "usb": None if port.vid is None else f"{port.vid:04x}:{port.pid:04x}",
                 "serial_number": port.serial_number,

@@ -55,6 +55,11 @@ def test_a_port_without_id_and_timer_is_not_a_failure(computer: Path) -> None:
     assert [check.state for check in found.values()] == ["ok", "skipped", "skipped"]
 
 
+def test_a_system_without_device_files_is_not_a_failure(tmp_path: Path) -> None:
+    (found,) = checks.check_serial_port(Path("COM3"), sys=tmp_path / "sys", dev=tmp_path / "dev")
+    assert found.state == "skipped"
+
+
 def test_a_port_that_is_not_there(computer: Path) -> None:
     (missing,) = port_checks(computer, "ttyACM9").values()
     assert missing.state == "failed"
@@ -140,6 +145,8 @@ def test_can_details_are_taken_from_what_ip_says(tmp_path: Path, monkeypatch: py
         ("bota:///dev/ttyUSB1?sinc=512", "/dev/ttyUSB1", None, 100.0),
         ("ur-ft://10.0.0.1?counts_per_N=1&counts_per_Nm=1", None, None, 500.0),
         ("ati-netft://192.168.1.1", None, None, None),
+        ("ati-can://PCAN_USBBUS1?interface=pcan", None, None, None),
+        ("bota://COM3", "COM3", None, None),
     ],
 )
 def test_what_an_address_says(url: str, port: str | None, interface: str | None, rate_Hz: float | None) -> None:
