@@ -13,9 +13,12 @@ _COMMANDS = {
     "demo": ("ftdrive.commands.demo", "Calibrate an emulated cell: nothing to connect, half a minute."),
     "plan": ("ftdrive.commands.plan", "Plan a tour that is proven clear; needs no robot."),
     "calibrate": ("ftdrive.commands.calibrate", "Take an arm through the tour, average its sensor, solve."),
+    "doctor": ("ftdrive.commands.doctor", "Is everything connected, quiet and permitted? Moves nothing."),
+    "devices": ("ftdrive.commands.devices", "List serial ports and CAN interfaces."),
     "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
     "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
     "replay": ("ftdrive.commands.replay", "Repeat a recorded run through the same routine and solver."),
+    "transcript": ("ftdrive.commands.transcript", "Record or play the bytes on a sensor's wire."),
 }
 
 _EPILOG = """\b
@@ -56,6 +59,7 @@ def exit_code(error: BaseException) -> int | None:
     """Exit code of an error that a user can mend; None for a defect of ours."""
     from calib.errors import BadCalibration, BadDataset, NotObservable, TooFewSamples
     from drivers.errors import ConnectError, DeviceFault, DriverError
+    from drivers.transcript import BadTranscript
     from ftdrive.errors import ConfigError, NotAccepted
 
     codes: list[tuple[type[BaseException], int]] = [
@@ -66,6 +70,7 @@ def exit_code(error: BaseException) -> int | None:
         (TooFewSamples, 4),
         (BadDataset, 6),
         (BadCalibration, 6),
+        (BadTranscript, 6),
         (NotObservable, 7),
         (NotAccepted, 7),
         (OSError, 6),

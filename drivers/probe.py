@@ -1,0 +1,161 @@
+"""Which known sensor is on a serial port: listen first, then ask for its name. Only for ports that the user names.
+
+Nothing is set, started or stopped: what is sent are requests to read, in the protocols of ATI, Robotiq and Robotous.
+They are still bytes, and what an unknown device makes of them is unknown. CAN is not probed.
+"""
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import serial
+
+from drivers._frames import Deframer
+from drivers._stream import LINK_ERRORS
+from drivers.ati import modbus
+from drivers.bota import codec as bota
+from drivers.errors import ConnectError, ProtocolError
+from drivers.robotiq import codec as robotiq
+from drivers.robotous import codec as robotous
+
+_LISTEN_S = 0.25
+_REPLY_S = 0.25
+_ENOUGH_FRAMES = 5
+"""That fit by their checksums, before a stream is believed to be that sensor's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A sensor that has shown itself."""
+
+    url: str
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    url: str
+    baud: int
+    parity: str
+    streams: Callable[[bytes], bool]
+    request: bytes | None
+    reply: Callable[[bytes], str]
+    """What the device says of itself; raises `ProtocolError`."""
+
+
+def probe(port: str) -> Answer | None:
+    """Tell which known sensor is on this port, or None.
+
+    Raises
+    ------
+    ConnectError
+        The port does not open.
+    """
+    for known in _KNOWN:
+        if known.streams(_hear(port, known, None, _LISTEN_S)):
+            return Answer(known.url.format(port=port), "it streams")
+    for known in _KNOWN:
+        if known.request is not None:
+            try:
+                what = known.reply(_hear(port, known, known.request, _REPLY_S))
+            except ProtocolError:
+                continue
+            return Answer(known.url.format(port=port), what)
+    return None
+
+
+def _hear(port: str, known: _Known, request: bytes | None, duration_s: float) -> bytes:
+    emulated = os.path.realpath(port).startswith("/dev/pts/")  # a pseudo-terminal knows no parity
+    parity = serial.PARITY_NONE if emulated else known.parity
+    try:
+        with serial.Serial(port, known.baud, parity=parity, timeout=0.02, write_timeout=0.2, exclusive=True) as line:
+            if request is not None:
+                line.write(request)
+            data, end = b"", time.monotonic() + duration_s
+            while time.monotonic() < end:
+                data += line.read(4096)
+            return data
+    except (ValueError, *LINK_ERRORS) as exc:
+        raise ConnectError(f"{port} does not open ({exc}); is it plugged in, free, and are you in its group?") from exc
+
+
+def _frames(header: bytes, size: int, is_frame: Callable[[bytes], bool]) -> Callable[[bytes], bool]:
+    return lambda data: len(Deframer(header, size, is_frame).feed(data)) >= _ENOUGH_FRAMES
+
+
+def _ati_streams(data: bytes) -> bool:
+    """Records have neither header nor number: all that follow each other must have a right checksum."""
+    data = data[-100 * modbus.RECORD_SIZE :]
+    if not data.strip(b"\0"):
+        return False
+    for start in range(modbus.RECORD_SIZE):
+        whole = (len(data) - start) // modbus.RECORD_SIZE * modbus.RECORD_SIZE
+        if whole >= 20 * modbus.RECORD_SIZE and modbus.decode_records(data[start : start + whole]).intact.all():
+            return True
+    return False
+
+
+_ATI_REQUEST = modbus.read_registers(modbus.STATUS, 1)
+_ROBOTIQ_REQUEST = robotiq.read_registers(robotiq.SERIAL, 4)
+_ROBOTOUS_REQUEST = robotous.encode_frame(robotous.encode(robotous.Command.MODEL))
+
+
+def _ati_reply(data: bytes) -> str:
+    status = modbus.check_reply(_ATI_REQUEST, data[: modbus.reply_size(_ATI_REQUEST)])
+    return f"ATI Digital F/T, status 0x{status.hex()}"
+
+
+def _robotiq_reply(data: bytes) -> str:
+    registers = robotiq.check_reply(_ROBOTIQ_REQUEST, data[: robotiq.reply_size(_ROBOTIQ_REQUEST)])
+    return f"Robotiq FT 300, serial {robotiq.decode_serial(registers)}"
+
+
+def _robotous_reply(data: bytes) -> str:
+    for _, frame in _robotous_frames().feed(data):
+        field = frame[1:-2]
+        if field[0] == robotous.Command.MODEL:
+            return f"Robotous {robotous.decode_text(field)}"
+    raise ProtocolError("no reply of a Robotous sensor")
+
+
+def _robotous_frames() -> Deframer:
+    return Deframer(bytes([robotous.START_OF_FRAME]), robotous.FRAME_SIZE, robotous.is_frame)
+
+
+def _nothing(_: bytes) -> str:
+    raise ProtocolError("it is not asked")
+
+
+_robotous_streams = _frames(bytes([robotous.START_OF_FRAME]), robotous.FRAME_SIZE, robotous.is_frame)
+
+_KNOWN = (
+    _Known(
+        "bota://{port}",
+        460_800,
+        serial.PARITY_NONE,
+        _frames(bota.HEADER, bota.FRAME_SIZE, bota.is_frame),
+        None,
+        _nothing,
+    ),
+    _Known(
+        "robotiq-ft300://{port}",
+        19_200,
+        serial.PARITY_NONE,
+        _frames(robotiq.HEADER, robotiq.FRAME_SIZE, robotiq.is_frame),
+        _ROBOTIQ_REQUEST,
+        _robotiq_reply,
+    ),
+    _Known(
+        "robotous-serial://{port}", 115_200, serial.PARITY_NONE, _robotous_streams, _ROBOTOUS_REQUEST, _robotous_reply
+    ),
+    _Known(
+        "robotous-serial://{port}?baud=921600",
+        921_600,
+        serial.PARITY_NONE,
+        _robotous_streams,
+        _ROBOTOUS_REQUEST,
+        _robotous_reply,
+    ),
+    _Known("ati-serial://{port}", 1_250_000, serial.PARITY_EVEN, _ati_streams, _ATI_REQUEST, _ati_reply),
+)

@@ -1,0 +1,330 @@
+"""The bytes on the wire of a serial device, kept in a file, and played back to the unmodified driver.
+
+A transcript (``ftdrive.transcript/1``) is JSON lines. The first says which sensor, when and with which versions; then
+come, with `time.monotonic_ns()` as `t_ns`:
+
+{"t_ns", "event": "open", "port", "baudrate", "bytesize", "parity", "stopbits"}
+{"t_ns", "dir": "tx", "hex"}    one write of the driver
+{"t_ns", "dir": "rx", "hex"}    what the driver read within 2 ms, stamped with its first byte
+{"t_ns", "event": "end", ...}   what the driver made of it, or the error it ended with
+
+Sensors behind an slcan adapter are on a serial port too. Other CAN interfaces and Ethernet are not recorded.
+"""
+
+import contextlib
+import json
+import os
+import select
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, Final, Self
+from urllib.parse import urlsplit
+
+import serial
+
+if sys.platform != "win32":
+    import tty
+
+FORMAT: Final = "ftdrive.transcript/1"
+
+_TOGETHER_NS: Final = 2_000_000
+_EARLY_S: Final = 0.05
+"""A driver may ask this much earlier than it did; what the device had sent before is then sent at once."""
+_PORT_CLASS: Final = "Serial"
+
+
+class BadTranscript(Exception):
+    """The file is not a transcript, or a damaged one."""
+
+
+class Writer:
+    """A transcript being written to `path` with ``.partial`` behind it, and renamed by `end`.
+
+    Parameters
+    ----------
+    path : Path
+        Must not exist.
+    header : mapping
+        Goes into the first line.
+
+    Raises
+    ------
+    OSError
+        The file, or one of an unfinished recording, exists already, or cannot be written.
+    """
+
+    def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
+        self._path = path
+        self._partial = path.with_name(path.name + ".partial")
+        for existing in (path, self._partial):
+            if existing.exists():
+                raise FileExistsError(f"{existing} exists already and is not overwritten: give another name")
+        self._lock = threading.Lock()
+        self._received = bytearray()
+        self._received_ns = 0
+        self._file: IO[str] | None = self._partial.open("x", encoding="utf-8")
+        self._line({"format": FORMAT, **header})
+
+    def event(self, name: str, **content: Any) -> None:
+        """Note something that is not bytes."""
+        with self._lock:
+            self._flush_received()
+            self._line({"t_ns": time.monotonic_ns(), "event": name, **content})
+
+    def sent(self, data: bytes) -> None:
+        """Note one write of the driver."""
+        with self._lock:
+            self._flush_received()
+            self._line({"t_ns": time.monotonic_ns(), "dir": "tx", "hex": data.hex()})
+
+    def received(self, data: bytes) -> None:
+        """Note what the driver was given; reads that follow each other closely become one line."""
+        if not data:
+            return
+        now_ns = time.monotonic_ns()
+        with self._lock:
+            if self._received and now_ns - self._received_ns > _TOGETHER_NS:
+                self._flush_received()
+            if not self._received:
+                self._received_ns = now_ns
+            self._received += data
+
+    def end(self, **content: Any) -> None:
+        """Write the last line, and give the file its name."""
+        self.event("end", **content)
+        with self._lock:
+            file, self._file = self._file, None
+        if file is None:
+            return
+        with file:
+            file.flush()
+            os.fsync(file.fileno())
+        if self._path.exists():
+            raise FileExistsError(f"{self._path} appeared meanwhile; the transcript is kept in {self._partial}")
+        self._partial.rename(self._path)
+
+    def _flush_received(self) -> None:
+        if self._received:
+            self._line({"t_ns": self._received_ns, "dir": "rx", "hex": self._received.hex()})
+            self._received.clear()
+
+    def _line(self, content: Mapping[str, Any]) -> None:
+        if self._file is not None:
+            self._file.write(json.dumps(content, ensure_ascii=False) + "\n")
+
+
+@contextlib.contextmanager
+def recording(writer: Writer) -> Iterator[None]:
+    """Write down everything that passes through the serial ports which are opened inside the `with` block.
+
+    The ports are pyserial's own, with the driver's own settings: the device sees no difference.
+    """
+    plain = serial.Serial
+
+    class RecordedPort(serial.Serial):
+        def open(self) -> None:
+            super().open()
+            settings = {key: getattr(self, key) for key in ("baudrate", "bytesize", "parity", "stopbits")}
+            writer.event("open", port=self.port, **settings)
+
+        def read(self, size: int = 1, /) -> bytes:
+            data: bytes = super().read(size)
+            writer.received(data)
+            return data
+
+        def write(self, data: Any, /) -> int | None:
+            writer.sent(bytes(data))
+            written: int | None = super().write(data)
+            return written
+
+        def reset_input_buffer(self) -> None:
+            if waiting := self.in_waiting:  # they were on the wire although the driver does not want them
+                writer.received(super().read(waiting))
+            super().reset_input_buffer()
+
+    setattr(serial, _PORT_CLASS, RecordedPort)
+    try:
+        yield
+    finally:
+        setattr(serial, _PORT_CLASS, plain)
+
+
+@dataclass(frozen=True, slots=True)
+class Passage:
+    """Bytes that went one way."""
+
+    t_ns: int
+    sent: bool
+    """By the driver."""
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Transcript:
+    """A transcript read from a file."""
+
+    header: Mapping[str, Any]
+    opened_ns: int
+    """When the driver had opened its port."""
+    passages: tuple[Passage, ...]
+    end: Mapping[str, Any]
+    """What the driver made of it; empty if the recording was broken off."""
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a file. Raises `BadTranscript`, or `OSError` when it cannot be read."""
+        header: Mapping[str, Any] = {}
+        opened_ns: int | None = None
+        passages: list[Passage] = []
+        end: Mapping[str, Any] = {}
+        number = 0
+        try:
+            with path.open(encoding="utf-8") as file:
+                for number, text in enumerate(file, start=1):
+                    line = json.loads(text)
+                    if number == 1:
+                        header = _checked_header(path, line)
+                    elif "dir" in line:
+                        passages.append(Passage(int(line["t_ns"]), line["dir"] == "tx", bytes.fromhex(line["hex"])))
+                    elif line.get("event") == "open" and opened_ns is None:
+                        opened_ns = int(line["t_ns"])
+                    elif line.get("event") == "end":
+                        end = line
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise BadTranscript(
+                f"{path}, line {number}: not a line of a transcript ({error}): record it anew"
+            ) from error
+        if not header:
+            raise BadTranscript(f"{path} is empty: record it anew")
+        if opened_ns is None:
+            raise BadTranscript(f"{path}: no port was opened in it, there is nothing to play: {end.get('error')}")
+        return cls(header, opened_ns, tuple(passages), end)
+
+    def url_at(self, port: str) -> str:
+        """Give the sensor's address with another port in it."""
+        parts = urlsplit(str(self.header["url"]))
+        return f"{parts.scheme}://{port}" + (f"?{parts.query}" if parts.query else "")
+
+
+def _checked_header(path: Path, line: Any) -> Mapping[str, Any]:
+    found = line.get("format") if isinstance(line, dict) else None
+    if found != FORMAT:
+        raise BadTranscript(f"{path}: the first line must say {FORMAT}, found {found!r}")
+    if not isinstance(line.get("url"), str) or not isinstance(line.get("duration_s"), int | float):
+        raise BadTranscript(f"{path}: the first line must hold url and duration_s")
+    return dict(line)
+
+
+class Player:
+    """A pseudo-terminal behind which the recorded device seems to be, for one driver that opens it once.
+
+    A request is answered as it was in the recording, with the recorded delays; what the device sent by itself comes
+    with the recorded timing. A request that is not in the rest of the recording is a divergence: silence follows.
+    """
+
+    def __init__(self, transcript: Transcript) -> None:
+        self._passages = transcript.passages
+        self._next = 0
+        self._t_ns = transcript.opened_ns  # of the recording, at `_t`
+        self._t = 0.0
+        self._asked = bytearray()
+        self._unsent = b""
+        self._master = -1
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.divergence: str | None = None
+        """What the driver asked that the recording cannot answer."""
+
+    def __enter__(self) -> str:
+        """Open the pseudo-terminal and return its path."""
+        self._master, slave = os.openpty()
+        path = os.ttyname(slave)
+        tty.setraw(slave)
+        os.close(slave)  # so that the master tells when a driver opens and leaves
+        os.set_blocking(self._master, False)
+        self._thread = threading.Thread(target=self._serve, name=f"player on {path}", daemon=True)
+        self._thread.start()
+        return path
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+            os.close(self._master)
+
+    def _serve(self) -> None:
+        poll = select.poll()
+        poll.register(self._master, 0)
+        while poll.poll(0):  # "hung up" until a driver has opened the other end
+            if self._ended.wait(0.005):
+                return
+        self._t = time.monotonic()
+        while not self._ended.is_set():
+            wait_s = min(0.05, max(0.0, self._play()))
+            readable, _, _ = select.select([self._master], [], [], wait_s)
+            if readable:
+                try:
+                    self._asked += os.read(self._master, 4096)
+                except OSError:
+                    return  # the driver has closed the port
+                self._listen()
+
+    def _play(self) -> float:
+        """Send what is due; return the seconds until something else may be."""
+        if self._unsent:
+            self._send(b"")
+        while self._next < len(self._passages) and not self.divergence:
+            passage = self._passages[self._next]
+            if passage.sent:
+                break
+            wait_s = self._due_in_s(passage)
+            if wait_s > 0:
+                return wait_s
+            self._send(passage.data)
+            self._next += 1
+        return 0.001 if self._unsent else 0.05
+
+    def _due_in_s(self, passage: Passage) -> float:
+        return self._t + (passage.t_ns - self._t_ns) / 1e9 - time.monotonic()
+
+    def _send(self, data: bytes) -> None:
+        data = self._unsent + data
+        try:
+            written = os.write(self._master, data)
+        except BlockingIOError:
+            written = 0
+        self._unsent = data[written:]
+
+    def _listen(self) -> None:
+        """Compare what the driver writes with the next request of the recording."""
+        while self._asked and not self.divergence:
+            first = self._request_from(self._next)
+            if first is None:  # a goodbye, or a recording that was broken off
+                self._asked.clear()
+                return
+            expected = self._passages[first].data
+            if len(expected) > len(self._asked) and expected.startswith(self._asked):
+                return
+            found: int | None = first
+            while found is not None and not self._asked.startswith(self._passages[found].data):
+                found = self._request_from(found + 1)
+            if found is None:
+                self.divergence = (
+                    f"the driver sent {self._asked.hex(' ')}, where {expected.hex(' ')} was sent in the recording"
+                )
+                return
+            if found == first:
+                before = self._passages[self._next : found]
+                self._send(b"".join(passage.data for passage in before if self._due_in_s(passage) < _EARLY_S))
+            request = self._passages[found]
+            del self._asked[: len(request.data)]
+            self._next = found + 1
+            self._t, self._t_ns = time.monotonic(), request.t_ns
+
+    def _request_from(self, start: int) -> int | None:
+        return next((i for i in range(start, len(self._passages)) if self._passages[i].sent), None)

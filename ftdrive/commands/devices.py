@@ -1,0 +1,104 @@
+"""`ftdrive devices`: which ports this computer has, and on request which known sensor is on one."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.markup import escape
+from serial.tools import list_ports
+
+from drivers.probe import probe
+from ftdrive.checks import DEV, Check, can_details, can_interfaces, check_serial_port
+from ftdrive.commands.common import JSON, write_json
+from ftdrive.errors import ConfigError
+from ftdrive.simulation import Station
+
+
+@click.command()
+@click.option(
+    "--probe", "ports", multiple=True, metavar="PORT", help="Ask which known sensor is there; may be repeated."
+)
+@click.option("--simulate", is_flag=True, help="Show the ports of an emulated cell instead.")
+@JSON
+def devices(ports: tuple[str, ...], simulate: bool, as_json: bool) -> None:
+    """List serial ports by id and CAN interfaces.
+
+    No port is opened and no byte is sent, except to the serial ports named with --probe: there it listens, and then
+    sends requests to read in the protocols of the sensors it knows. Do not probe a port with something else on it.
+    """
+    if simulate and ports:
+        raise ConfigError("an emulated cell has just its own ports: give either --simulate or --probe")
+    found = _emulated() if simulate else {"serial": _serial_ports(), "can": _can_interfaces()}
+    if ports:
+        found["answers"] = [_answer(port) for port in ports]
+    if as_json:
+        write_json({"schema_version": 1, **found})
+    else:
+        _print(found)
+
+
+def _serial_ports() -> list[dict[str, Any]]:
+    by_id = DEV / "serial" / "by-id"
+    links = {os.path.realpath(link): str(link) for link in by_id.iterdir()} if by_id.is_dir() else {}
+    ports = []
+    for port in sorted(list_ports.comports()):
+        name = links.get(os.path.realpath(port.device))
+        checks = check_serial_port(Path(name or port.device))
+        ports.append(
+            {
+                "port": port.device,
+                "by_id": name,
+                "description": None if port.description == "n/a" else port.description,
+                "usb": None if port.vid is None else f"{port.vid:04x}:{port.pid:04x}",
+                "serial_number": port.serial_number,
+                "findings": _findings(checks),
+            }
+        )
+    return ports
+
+
+def _findings(checks: list[Check]) -> list[dict[str, Any]]:
+    wrong = [check for check in checks if check.state in {"warning", "failed"}]
+    return [{"found": check.found, "fix": check.fix} for check in wrong]
+
+
+def _can_interfaces() -> list[dict[str, Any]]:
+    return [{"interface": name, **can_details(name)} for name in can_interfaces()]
+
+
+def _answer(port: str) -> dict[str, Any]:
+    answer = probe(port)
+    return {"port": port, "url": answer and answer.url, "what": answer and answer.what}
+
+
+def _emulated() -> dict[str, Any]:
+    with Station("both") as station:
+        serial, can = station.endpoints["serial"], station.endpoints["can"]
+        return {
+            "serial": [
+                {"port": serial["port"], "url": f"ati-serial://{serial['port']}"},
+                {"port": can["channel"], "url": f"ati-can://{can['channel']}?interface=slcan&bitrate={can['bitrate']}"},
+            ],
+            "can": [],
+        }
+
+
+def _print(found: dict[str, Any]) -> None:
+    data = Console(highlight=False, soft_wrap=True)
+    for port in found["serial"]:
+        words = [port.get("by_id") or port["port"], *(port.get(key) for key in ("description", "usb", "url"))]
+        data.print(" serial  " + escape("   ".join(word for word in words if word)))
+        for finding in port.get("findings", ()):
+            data.print(f"         [yellow]![/] {escape(finding['found'])}")
+            data.print(f"           fix: {escape(finding['fix'] or '-')}")
+    for interface in found["can"]:
+        words = [str(value) for value in interface.values()]
+        data.print(" can     " + escape("   ".join(words)))
+    for kind, name in (("serial", "serial ports"), ("can", "CAN interfaces of the kernel")):
+        if not found[kind]:
+            data.print(f" no {name}")
+    for answer in found.get("answers", ()):
+        told = "no known sensor" if answer["url"] is None else f"{answer['what']}   {answer['url']}"
+        data.print(escape(f" probed  {answer['port']}   {told}"))

@@ -1,0 +1,257 @@
+"""`ftdrive doctor`: is the cell connected, quiet and permitted? Nothing moves."""
+
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.markup import escape
+
+from calib import CalibrationResult
+from drivers.errors import DriverError
+from drivers.interfaces import ForceTorqueSensor
+from drivers.ur.kinematics import model_named
+from drivers.ur.library import ask_dashboard
+from drivers.ur.reading import CONNECT_S, PROGRAM_STOPPED, Reader
+from ftdrive import checks
+from ftdrive.checks import Check, SensorAddress
+from ftdrive.commands.common import JSON, RUNS, read_cell, write_json
+from ftdrive.config import CellConfig
+from ftdrive.errors import NotAccepted
+from ftdrive.report import talk
+from ftdrive.simulation import Station
+from ftdrive.wiring import build_sensor
+
+Array = NDArray[np.float64]
+
+_DASHBOARD_PORT = 29999
+_CLOCK_S = 1.0
+_LOOK_S = 2.0
+_PUSH_S = 3.0
+_PUSH_WINDOW_S = 0.2
+_SIMULATED_PUSH_N = 15.0
+_MARK = {"ok": "[green]✔[/]", "warning": "[yellow]![/]", "failed": "[red]✘[/]", "skipped": "-"}
+
+
+@click.command()
+@click.option("--config", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="The cell, in TOML.")
+@click.option("--robot", metavar="HOST", help="Address of the controller.")
+@click.option("--sensor", metavar="URL", help="Such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0.")
+@click.option("--simulate", is_flag=True, help="An emulated cell.")
+@click.option(
+    "--calibration", "path", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Does it fit? FILE."
+)
+@click.option(
+    "--mass-kg", type=click.FloatRange(0, min_open=True), default=1.0, show_default=True, help="Expected, of the tool."
+)
+@click.option("--push", is_flag=True, help="Find the sign of the sensor: you push the tool along +X of the base.")
+@RUNS
+@JSON
+def doctor(
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    simulate: bool,
+    path: Path | None,
+    mass_kg: float,
+    push: bool,
+    runs: Path,
+    as_json: bool,
+) -> None:
+    """Check robot, sensor, noise, clocks, disk and permissions, and say what mends each finding.
+
+    The arm is only read, nothing moves, no program is touched. Exit code 7 if a check fails.
+    """
+    calibration = None if path is None else CalibrationResult.load(path)
+    found: list[Check] = []
+    pushed: dict[str, Any] | None = None
+    with ExitStack() as stack:
+        station = stack.enter_context(Station(options=["--time-scale", "1"])) if simulate else None
+        cell = read_cell(config, robot, sensor) if station is None else station.cell
+        address = SensorAddress.of(cell.sensor.url)
+        device = build_sensor(cell)
+
+        reader = _examine_robot(cell, found, stack)
+        alive = _examine_sensor(device, address, cell, mass_kg, found, stack)
+        found += [*checks.check_disk(runs), *checks.check_permissions(address)]
+        if calibration is not None:
+            serials = {"sensor": device.identify().serial} if alive else {}
+            if reader is not None:
+                serials["arm"] = reader.info.serial
+            found.append(checks.check_calibration(calibration, serials))
+        if push:
+            R_flange_sensor = None if calibration is None else calibration.R_flange_sensor
+            if station is not None and calibration is None:
+                R_flange_sensor = np.array(station.truth["R_flange_sensor"])
+            pushed = _examine_push(device if alive else None, reader, R_flange_sensor, cell.sensor.sign, station, found)
+    failed = [check.name for check in found if check.state == "failed"]
+    if as_json:
+        answer = {
+            "schema_version": 1,
+            "checks": [asdict(check) for check in found],
+            "verdict": checks.verdict(found),
+        }
+        write_json(answer if pushed is None else {**answer, "push": pushed})
+    else:
+        _print(found)
+    if failed:
+        raise NotAccepted(f"{len(failed)} of {len(found)} checks failed: {', '.join(failed)}")
+
+
+def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> Reader | None:
+    host = cell.robot.host
+    start = time.perf_counter()
+    try:
+        socket.create_connection((host, _DASHBOARD_PORT), CONNECT_S).close()
+    except OSError as error:
+        fix = f"ping {host}; is the controller on, the cable in, the dashboard server enabled under Security, Services?"
+        found.append(Check("robot.reachable", "failed", f"{host} cannot be reached ({error})", fix))
+        return None
+    took_ms = 1e3 * (time.perf_counter() - start)
+    try:
+        model = cell.robot.model
+        reader = stack.enter_context(closing(Reader(host, None if model is None else model_named(model, 0) or model)))
+        info, look = reader.info, reader.look(limit_s=1.0)
+    except DriverError as error:
+        found.append(Check("robot.reachable", "failed", str(error)))
+        return None
+    found.append(Check("robot.reachable", "ok", f"{host} answers in {took_ms:.1f} ms"))
+    found.append(Check("robot.identity", "ok", f"{info.model}, serial {info.serial}, PolyScope {info.firmware}"))
+    found.append(_remote_control(host, reader.version))
+    fault = look.safety_fault()
+    if fault is None:
+        found.append(Check("robot.safety", "ok", "powered, brakes released, no stop"))
+    else:
+        state, _, cure = fault.partition(": ")
+        found.append(Check("robot.safety", "failed", state, cure))
+    if look.program_state == PROGRAM_STOPPED:
+        found.append(Check("robot.program", "ok", "no program runs; other clients that only read cannot be seen"))
+    else:
+        what = f"a program is on the controller (state {look.program_state})"
+        found.append(Check("robot.program", "warning", what, "stop it at the pendant: calibrate would end it"))
+    found.append(_flange(reader))
+    found.append(_clock(reader))
+    return reader
+
+
+def _remote_control(host: str, version: tuple[int, int, int, int]) -> Check:
+    name = "robot.remote"
+    if version[:2] < (5, 6):
+        return Check(name, "skipped", f"not applicable: PolyScope {version[0]}.{version[1]} does not tell")
+    try:
+        remote = ask_dashboard(host, lambda dashboard: dashboard.isInRemoteControl(), timeout_s=CONNECT_S)
+    except DriverError as error:
+        return Check(name, "failed", str(error), "enable the dashboard server under Settings, Security, Services")
+    if remote:
+        return Check(name, "ok", "remote control on")
+    return Check(name, "failed", "local control", "press Local, Remote Control at the top right of the pendant")
+
+
+def _flange(reader: Reader) -> Check:
+    name = "robot.flange"
+    if not reader.tells_tcp:
+        return Check(name, "skipped", "the controller is too old to tell its TCP: only a calibration can read poses")
+    try:
+        p_mm = 1e3 * reader.state(lambda: ()).p_base_flange_m
+    except DriverError as error:
+        return Check(name, "failed", str(error))
+    where = ", ".join(f"{value:.0f}" for value in p_mm)
+    return Check(name, "ok", f"TCP told; the flange is at ({where}) mm in base, where the model has it")
+
+
+def _clock(reader: Reader) -> Check:
+    host_ns: list[int] = []
+    device_s: list[float] = []
+    try:
+        while not host_ns or host_ns[-1] - host_ns[0] < _CLOCK_S * 1e9:
+            time.sleep(0.02)
+            look = reader.look()
+            host_ns.append(look.t_host_ns)
+            device_s.append(look.t_device_s)
+    except DriverError as error:
+        return Check("clock.pace", "failed", str(error))
+    return checks.check_clock(host_ns, device_s)
+
+
+def _examine_sensor(
+    device: ForceTorqueSensor,
+    address: SensorAddress,
+    cell: CellConfig,
+    mass_kg: float,
+    found: list[Check],
+    stack: ExitStack,
+) -> bool:
+    try:
+        stack.enter_context(device)
+        info = device.identify()
+        found.append(Check("sensor.identity", "ok", f"{info.model}, serial {info.serial}, firmware {info.firmware}"))
+        samples = device.collect(_LOOK_S)
+        health = device.health()
+    except DriverError as error:
+        name = "sensor.stream" if found[-1].name == "sensor.identity" else "sensor.identity"
+        found.append(Check(name, "failed", str(error), "see the permissions below; ftdrive devices lists the ports"))
+        return False
+    found += checks.check_stream(samples, health, address, _LOOK_S)
+    found += checks.check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg)
+    return True
+
+
+def _examine_push(
+    device: ForceTorqueSensor | None,
+    reader: Reader | None,
+    R_flange_sensor: Array | None,
+    sign: int,
+    station: Station | None,
+    found: list[Check],
+) -> dict[str, Any] | None:
+    if device is None:
+        found.append(Check("push.sign", "skipped", "the sensor does not measure"))
+        return None
+    try:
+        R_base_flange = None if reader is None else reader.state(lambda: ()).R_base_flange
+    except DriverError:
+        R_base_flange = None  # said under robot.flange
+    try:
+        before = device.collect(1.0).wrench[:, :3].mean(axis=0)
+        with ExitStack() as stack:
+            if station is None:
+                words = f"Push the tool along +X of the base, about 20 N; press Enter and hold for {_PUSH_S:.0f} s"
+                click.prompt(words, err=True, default="", show_default=False)
+            elif R_base_flange is not None and R_flange_sensor is not None:
+                force = (R_base_flange @ R_flange_sensor).T @ [_SIMULATED_PUSH_N, 0.0, 0.0]
+                station.control(do="push", wrench=[*force.tolist(), 0.0, 0.0, 0.0])
+                stack.callback(station.control, do="push", wrench=[0.0] * 6)
+            changes = [force - before for force in _means(device, _PUSH_S if station is None else 0.5)]
+    except DriverError as error:
+        found.append(Check("push.sign", "failed", str(error)))
+        return None
+    largest = max(changes, key=lambda change: float(np.linalg.norm(change)))
+    check, moved = checks.check_push(largest, R_base_flange, R_flange_sensor, sign)
+    found.append(check)
+    return moved
+
+
+def _means(device: ForceTorqueSensor, duration_s: float) -> Iterator[Array]:
+    end = time.monotonic() + duration_s
+    while time.monotonic() < end:
+        yield device.collect(_PUSH_WINDOW_S).wrench[:, :3].mean(axis=0)
+
+
+def _print(found: list[Check]) -> None:
+    data = Console(highlight=False, soft_wrap=True)
+    subject = ""
+    for check in found:
+        first, _, _ = check.name.partition(".")
+        data.print(f" {'' if first == subject else first:<12}{_MARK[check.state]} {escape(check.found)}")
+        if check.fix is not None and check.state in {"warning", "failed"}:
+            data.print(f"{'':15}fix: {escape(check.fix)}")
+        subject = first
+    worst = checks.verdict(found)
+    talk.print({"ok": " All is well.", "warning": " Usable; see what is marked !", "failed": " Not ready."}[worst])

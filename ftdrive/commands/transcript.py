@@ -1,0 +1,138 @@
+"""`ftdrive transcript`: the bytes of a serial sensor into a file, and back to the driver."""
+
+import time
+from contextlib import ExitStack
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import click
+
+from drivers.errors import ProtocolError
+from drivers.interfaces import ForceTorqueSensor
+from drivers.registry import BadUrl, sensor_from_url
+from drivers.transcript import Player, Transcript, Writer, recording
+from ftdrive.checks import SensorAddress
+from ftdrive.commands.common import JSON, write_json
+from ftdrive.errors import ConfigError
+from ftdrive.report import talk
+from ftdrive.runs import versions
+from ftdrive.simulation import Station
+
+_TAIL_S = 0.3
+"""Recorded beyond the duration, so that a replay which begins a little later still has enough."""
+
+
+@click.group()
+def transcript() -> None:
+    """Record the bytes on the wire of a serial sensor, or play them to the driver: a bug report becomes a test.
+
+    Sensors on a serial port, and on CAN behind an slcan adapter. Other CAN interfaces and Ethernet are not recorded.
+    """
+
+
+@transcript.command()
+@click.option("--sensor", metavar="URL", help="Such as ati-serial:///dev/serial/by-id/NAME.")
+@click.option("--simulate", is_flag=True, help="An emulated ATI sensor on RS-485.")
+@click.option(
+    "-o", "--output", "path", required=True, type=click.Path(dir_okay=False, path_type=Path), help="A new file."
+)
+@click.option(
+    "--duration", "duration_s", type=click.FloatRange(0.1, 600), default=5.0, show_default=True, help="Seconds."
+)
+@JSON
+def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as_json: bool) -> None:
+    """Record what the driver and its sensor say to each other, from opening to closing.
+
+    Nothing is sent but what the driver sends anyway. If the sensor fails, the transcript of the failure is kept.
+    """
+    with ExitStack() as stack:
+        if simulate:
+            station = stack.enter_context(Station("serial"))
+            sensor = station.cell.sensor.url
+        if sensor is None:
+            raise ConfigError("which sensor? Give --sensor URL or --simulate")
+        if SensorAddress.of(sensor).serial_port is None:
+            raise ConfigError(f"{sensor} is not on a serial port: only what passes one can be recorded")
+        device = _sensor(sensor)
+        header = {
+            "url": sensor,
+            "duration_s": duration_s,
+            "utc": datetime.now(UTC).isoformat(),
+            "t_ns": time.monotonic_ns(),
+            "versions": versions(),
+        }
+        writer = Writer(path, header)
+        seen: dict[str, Any] = {"error": "interrupted"}
+        try:
+            with recording(writer):
+                seen = _watch(device, duration_s, tail_s=_TAIL_S)
+        except Exception as error:
+            seen = {"error": f"{type(error).__name__}: {error}"}
+            raise
+        finally:
+            writer.end(**seen)
+            talk.print(f" Saved {path}")
+    if as_json:
+        write_json({"schema_version": 1, "file": str(path), "url": sensor, "recorded": seen})
+    else:
+        talk.print(_words(seen))
+
+
+@transcript.command()
+@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@JSON
+def play(file: Path, as_json: bool) -> None:
+    """Play the transcript FILE to the unmodified driver, and say what the driver makes of it this time."""
+    told = Transcript.load(file)
+    player = Player(told)
+    with player as port:
+        device = _sensor(told.url_at(port))
+        try:
+            played = _watch(device, float(told.header["duration_s"]))
+        except Exception as error:
+            if player.divergence:
+                raise ProtocolError(f"{error}; the transcript does not answer: {player.divergence}") from error
+            raise
+    recorded = {key: value for key, value in told.end.items() if key not in {"event", "t_ns"}}
+    if as_json:
+        write_json({"schema_version": 1, "url": told.header["url"], "recorded": recorded, "played": played})
+    else:
+        talk.print(f" recorded  {_words(recorded)}")
+        talk.print(f" played    {_words(played)}")
+
+
+def _sensor(url: str) -> ForceTorqueSensor:
+    try:
+        return sensor_from_url(url)
+    except BadUrl as error:
+        raise ConfigError(str(error)) from error
+
+
+def _watch(device: ForceTorqueSensor, duration_s: float, *, tail_s: float = 0.0) -> dict[str, Any]:
+    """Open the sensor, collect, close; as measured, with the sign the sensor has."""
+    with device:
+        samples = device.collect(duration_s)
+        if tail_s:
+            device.collect(tail_s)
+        health = device.health()
+        return {
+            "error": None,
+            "identity": asdict(device.identify()),
+            "samples": len(samples),
+            "lost": health.lost,
+            "mean_force_N": samples.wrench[:, :3].mean(axis=0).tolist(),
+            "mean_torque_Nm": samples.wrench[:, 3:].mean(axis=0).tolist(),
+        }
+
+
+def _words(seen: dict[str, Any]) -> str:
+    if "identity" not in seen:
+        return str(seen.get("error", "broken off"))
+    force, torque = (
+        ", ".join(f"{value:.{digits}f}" for value in seen[key])
+        for key, digits in (("mean_force_N", 3), ("mean_torque_Nm", 4))
+    )
+    who = seen["identity"]
+    return f"{who['model']}, serial {who['serial']}: {seen['samples']} samples, mean ({force}) N, ({torque}) N·m"

@@ -1,0 +1,142 @@
+"""`doctor`, `devices` and `transcript` as a user runs them: on a healthy cell, and on two that are not."""
+
+import json
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pytest
+
+from ftdrive.config import CellConfig
+from ftdrive.simulation import Station
+
+
+class CommandLine(Protocol):
+    folder: Path
+
+    def start(self, *arguments: str | Path) -> subprocess.Popen[str]: ...
+    def run(self, *arguments: str | Path, typed: str = "") -> subprocess.CompletedProcess[str]: ...
+    def json(self, *arguments: str | Path, typed: str = "") -> dict[str, Any]: ...
+
+
+NAMED = {
+    *("robot.reachable", "robot.identity", "robot.remote", "robot.safety", "robot.program", "robot.flange"),
+    *("clock.pace", "sensor.identity", "sensor.rate", "sensor.lost", "sensor.age", "sensor.status", "sensor.counts"),
+    *("noise.level", "noise.accuracy", "disk.runs"),
+    *("permissions.port", "permissions.by-id", "permissions.latency_timer"),
+}
+
+
+@pytest.fixture
+def station() -> Iterator[Station]:
+    with Station("serial", ["--seed", "3", "--time-scale", "1"]) as station:
+        yield station
+
+
+@pytest.fixture
+def cell(station: Station, write_config: Callable[[CellConfig], Path]) -> Path:
+    return write_config(station.cell)
+
+
+def checks_of(outcome: subprocess.CompletedProcess[str]) -> dict[str, dict[str, Any]]:
+    return {check["name"]: check for check in json.loads(outcome.stdout)["checks"]}
+
+
+def test_a_healthy_cell(ftdrive: CommandLine) -> None:
+    answer = ftdrive.json("doctor", "--simulate", "--push")
+    checks = {check["name"]: check for check in answer["checks"]}
+    assert checks.keys() == NAMED | {"push.sign"}
+    bad = {name: check for name, check in checks.items() if check["state"] == "failed"}
+    assert not bad
+    assert answer["verdict"] != "failed"
+    assert answer["push"]["base"]["axis"] == "+X"
+    assert answer["push"]["base"]["force_N"] == pytest.approx([15, 0, 0], abs=0.2)
+    assert np.linalg.norm(answer["push"]["sensor"]["force_N"]) == pytest.approx(15, abs=0.2)
+    assert not any(ftdrive.folder.iterdir())  # it only looked
+
+
+def test_a_stopped_arm_in_local_control(station: Station, cell: Path, ftdrive: CommandLine) -> None:
+    station.control(do="protective-stop")
+    station.control(do="remote-control", on=False)
+    before = station.control(do="state")["q_rad"]
+    outcome = ftdrive.run("doctor", "--config", cell, "--json")
+    assert outcome.returncode == 7
+    checks = checks_of(outcome)
+    assert checks["robot.safety"]["state"] == "failed"
+    assert "protective stop" in checks["robot.safety"]["found"]
+    assert "clear it at the pendant" in checks["robot.safety"]["fix"]
+    assert checks["robot.remote"]["state"] == "failed"
+    assert "Remote Control" in checks["robot.remote"]["fix"]
+    assert checks["noise.level"]["state"] == "ok"  # the sensor does not mind
+    assert "robot.safety" in outcome.stderr
+    after = station.control(do="state")
+    assert after["q_rad"] == before
+    assert after["safety_mode"] == "PROTECTIVE_STOP"
+    assert after["bad_inputs"] == []
+
+
+def test_an_unplugged_sensor(station: Station, cell: Path, ftdrive: CommandLine) -> None:
+    station.control(do="unplug", device="sensor")
+    outcome = ftdrive.run("doctor", "--config", cell, "--push")
+    assert outcome.returncode == 7
+    assert "the port does not open" in outcome.stdout
+    assert "fix: plug it in" in outcome.stdout
+    assert "✔ remote control on" in outcome.stdout
+    assert "sensor.identity, permissions.port" in outcome.stderr
+
+
+def test_an_arm_that_is_not_there(station: Station, ftdrive: CommandLine) -> None:
+    url = station.cell.sensor.url
+    outcome = ftdrive.run("doctor", "--robot", "127.0.0.2", "--sensor", url, "--json")
+    assert outcome.returncode == 7
+    checks = checks_of(outcome)
+    assert checks["robot.reachable"]["state"] == "failed"
+    assert "ping 127.0.0.2" in checks["robot.reachable"]["fix"]
+    assert checks["sensor.rate"]["state"] != "skipped"
+
+
+def test_a_person_pushes(station: Station, cell: Path, ftdrive: CommandLine) -> None:
+    process = ftdrive.start("doctor", "--config", cell, "--push", "--json")
+    assert process.stderr is not None
+    said = ""
+    while "press Enter" not in said:
+        said += (letter := process.stderr.read(1))
+        assert letter, said
+    station.control(do="push", wrench=[0, 0, -20, 0, 0, 0])
+    out, err = process.communicate("\n", timeout=60)
+    assert process.returncode == 0, err
+    pushed = json.loads(out)["push"]
+    assert pushed["sensor"]["axis"] == "-Z"
+    assert pushed["sensor"]["force_N"][2] == pytest.approx(-20, abs=0.3)
+    assert pushed["base"] is None  # nobody has told how the sensor is mounted
+
+
+def test_devices_of_this_computer_and_of_an_emulated_cell(station: Station, ftdrive: CommandLine) -> None:
+    url = station.cell.sensor.url
+    own = ftdrive.json("devices", "--probe", url.removeprefix("ati-serial://"))
+    assert all(port["port"].startswith("/dev/") for port in own["serial"])
+    assert [answer["url"] for answer in own["answers"]] == [url]
+    emulated = ftdrive.json("devices", "--simulate")
+    assert [port["url"].partition(":")[0] for port in emulated["serial"]] == ["ati-serial", "ati-can"]
+
+
+def test_transcript_of_a_sensor(ftdrive: CommandLine) -> None:
+    recorded = ftdrive.json("transcript", "record", "--simulate", "-o", "sensor.jsonl", "--duration", "1")["recorded"]
+    played = ftdrive.json("transcript", "play", ftdrive.folder / "sensor.jsonl")
+    assert played["recorded"] == recorded
+    assert played["played"]["identity"] == recorded["identity"]
+    assert played["played"]["mean_force_N"] == pytest.approx(recorded["mean_force_N"], abs=0.02)
+
+
+def test_transcript_of_a_sensor_that_is_gone(station: Station, ftdrive: CommandLine) -> None:
+    url = station.cell.sensor.url
+    station.control(do="unplug", device="sensor")
+    assert ftdrive.run("transcript", "record", "--sensor", url, "-o", "gone.jsonl").returncode == 3
+    last = (ftdrive.folder / "gone.jsonl").read_text().splitlines()[-1]
+    assert "the port does not open" in json.loads(last)["error"]
+    assert ftdrive.run("transcript", "play", ftdrive.folder / "gone.jsonl").returncode == 6
+    refused = ftdrive.run("transcript", "record", "--sensor", "ati-can://can0", "-o", "can.jsonl")
+    assert refused.returncode == 2
+    assert "not on a serial port" in refused.stderr

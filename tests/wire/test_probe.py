@@ -1,0 +1,74 @@
+"""Which sensor is on a port: found by its stream or by its answer, with nothing but requests to read."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers import probe as module
+from drivers.errors import ConnectError
+from drivers.probe import probe
+from mocks.ati_can import AtiCanNode
+from mocks.ati_serial import AtiSerialBox
+from mocks.bota import BotaBox
+from mocks.robotiq import RobotiqBox
+from mocks.robotous import RobotousSerialBox
+
+
+def measure(n: int) -> Any:
+    return np.random.default_rng(n).normal(size=(n, 6)) + 3
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "scheme", "what"),
+    [
+        (AtiSerialBox, {}, "ati-serial", "status 0x0000"),
+        (AtiSerialBox, {"streaming_at_start": True}, "ati-serial", "streams"),
+        (RobotiqBox, {}, "robotiq-ft300", "serial FTS-1234"),
+        (RobotiqBox, {"streaming_at_start": True}, "robotiq-ft300", "streams"),
+        (RobotousSerialBox, {}, "robotous-serial", "Robotous RFT"),
+        (RobotousSerialBox, {"streaming_at_start": True}, "robotous-serial", "streams"),
+        (BotaBox, {}, "bota", "streams"),
+        (AtiCanNode, {}, None, None),  # behind an slcan adapter: not a question for a serial port
+    ],
+)
+def test_a_sensor_shows_itself(kind: Any, options: dict[str, Any], scheme: str | None, what: str | None) -> None:
+    device = kind(measure, seed=1, **options)
+    try:
+        port = device.start()
+        answer = probe(port)
+    finally:
+        device.stop()
+    if scheme is None or what is None:
+        assert answer is None
+    else:
+        assert answer is not None
+        assert answer.url.partition("?")[0] == f"{scheme}://{port}"
+        assert what in answer.what
+
+
+def test_a_silent_port_is_asked_by_readings_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[bytes | None] = []
+
+    def hear(_port: str, _known: Any, request: bytes | None, _duration_s: float) -> bytes:
+        heard.append(request)
+        return b""
+
+    monkeypatch.setattr(module, "_hear", hear)
+    assert probe("/dev/ttyX") is None
+    first_question = next(i for i, request in enumerate(heard) if request)
+    assert all(request is None for request in heard[:first_question])
+    assert first_question >= 4  # it has listened at every speed before
+    modbus_reads, robotous_model = bytes([3]), bytes.fromhex("5501")
+    for request in filter(None, heard):
+        assert request[1:2] == modbus_reads or request.startswith(robotous_model)
+
+
+def test_bytes_of_something_else_are_no_sensor() -> None:
+    for noise in (bytes(20_000), np.random.default_rng(0).bytes(20_000), b"hello\r\n" * 1000):
+        assert not any(known.streams(noise) for known in module._KNOWN)
+
+
+def test_a_port_that_is_not_there() -> None:
+    with pytest.raises(ConnectError, match="does not open"):
+        probe("/dev/no-such-port")

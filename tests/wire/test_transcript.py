@@ -1,0 +1,222 @@
+"""What a serial sensor and its driver say to each other, recorded, and played to the driver again."""
+
+import itertools
+import json
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import serial
+
+from drivers.errors import ConnectError
+from drivers.interfaces import DeviceInfo, ForceTorqueSensor
+from drivers.registry import sensor_from_url
+from drivers.transcript import BadTranscript, Passage, Player, Transcript, Writer, recording
+from mocks.ati_can import AtiCanNode
+from mocks.ati_serial import AtiSerialBox
+from mocks.bota import BotaBox
+from mocks.faults import Faults
+from mocks.robotiq import RobotiqBox
+from mocks.robotous import RobotousSerialBox
+
+WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])
+NOISE = np.array([0.03] * 3 + [0.001] * 3)
+STEPS = np.array([0.02] * 3 + [0.001] * 3)
+"""Of the numbers of the coarsest device."""
+DURATION_S = 0.6
+
+
+def measured() -> Any:
+    rng = np.random.default_rng(5)
+    return lambda n: WRENCH + rng.normal(size=(n, 6)) * NOISE
+
+
+EMULATORS: dict[str, tuple[Any, str]] = {
+    "ati-serial": (AtiSerialBox, ""),
+    "robotous-serial": (RobotousSerialBox, ""),
+    "robotiq-ft300": (RobotiqBox, ""),
+    "bota": (BotaBox, ""),
+    "ati-can": (AtiCanNode, "?interface=slcan"),
+}
+
+
+@pytest.fixture(params=EMULATORS)
+def url(request: pytest.FixtureRequest) -> Iterator[str]:
+    kind, query = EMULATORS[request.param]
+    device = kind(measured(), seed=1)
+    yield f"{request.param}://{device.start()}{query}"
+    device.stop()
+
+
+def look(sensor: ForceTorqueSensor, duration_s: float) -> tuple[DeviceInfo, np.ndarray[Any, Any]]:
+    with sensor:
+        return sensor.identify(), sensor.collect(duration_s).wrench
+
+
+def test_the_driver_sees_in_the_transcript_what_it_saw_on_the_wire(url: str, tmp_path: Path) -> None:
+    path = tmp_path / "sensor.jsonl"
+    writer = Writer(path, {"url": url, "duration_s": DURATION_S})
+    with recording(writer):
+        identity, wrench = look(sensor_from_url(url), DURATION_S + 0.3)
+    assert not path.exists()  # only when it is whole
+    writer.end(error=None)
+    assert [file.name for file in tmp_path.iterdir()] == ["sensor.jsonl"]
+
+    transcript = Transcript.load(path)
+    assert transcript.header["url"] == url
+    player = Player(transcript)
+    with player as port:
+        again, played = look(sensor_from_url(transcript.url_at(port)), DURATION_S)
+    assert player.divergence is None
+    assert again == identity
+    assert len(played) > 0.5 * len(wrench)
+    tolerance = 6 * NOISE / np.sqrt(len(played)) + STEPS
+    assert (np.abs(played.mean(axis=0) - wrench.mean(axis=0)) < tolerance).all()
+    recorded = {row.tobytes() for row in wrench}  # not another noise of the same device but these very samples
+    assert sum(row.tobytes() in recorded for row in played) > 0.7 * len(played)
+
+
+def test_ports_are_plain_again_after_a_recording(tmp_path: Path) -> None:
+    plain = serial.Serial
+    writer = Writer(tmp_path / "a.jsonl", {"url": "x", "duration_s": 1})
+    with recording(writer):
+        assert serial.Serial is not plain
+    assert serial.Serial is plain
+    writer.end()
+
+
+def test_a_sensor_that_fails_leaves_a_transcript_that_fails_alike(tmp_path: Path) -> None:
+    device = RobotiqBox(measured(), seed=1, faults=Faults(stall=True))
+    path = tmp_path / "dead.jsonl"
+    try:
+        url = f"robotiq-ft300://{device.start()}"
+        writer = Writer(path, {"url": url, "duration_s": 1.0})
+        with recording(writer), pytest.raises(ConnectError):
+            look(sensor_from_url(url), 1.0)
+        writer.end(error="ConnectError")
+    finally:
+        device.stop()
+    transcript = Transcript.load(path)
+    assert any(passage.sent for passage in transcript.passages)
+    assert not any(not passage.sent for passage in transcript.passages)
+    with Player(transcript) as port, pytest.raises(ConnectError):
+        look(sensor_from_url(transcript.url_at(port)), 1.0)
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    header = {"url": "x", "duration_s": 1}
+    (tmp_path / "a.jsonl").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"a\.jsonl"):
+        Writer(tmp_path / "a.jsonl", header)
+    first = Writer(tmp_path / "b.jsonl", header)
+    with pytest.raises(FileExistsError, match="partial"):
+        Writer(tmp_path / "b.jsonl", header)
+    (tmp_path / "b.jsonl").write_text("mine")
+    with pytest.raises(FileExistsError, match="partial"):
+        first.end()
+    assert (tmp_path / "b.jsonl").read_text() == "mine"
+    assert (tmp_path / "a.jsonl").read_text() == "mine"
+
+
+def test_bytes_of_both_directions_keep_their_order(tmp_path: Path) -> None:
+    writer = Writer(tmp_path / "a.jsonl", {"url": "x", "duration_s": 1})
+    for data in (b"\x01", b"\x02"):
+        writer.received(data)  # within 2 ms, hence one line
+    writer.sent(b"\x10")
+    writer.sent(b"\x11")
+    writer.received(b"\x03")
+    writer.end(error=None)
+    lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
+    assert lines[0]["format"] == "ftdrive.transcript/1"
+    merged = [(kind, "".join(line["hex"] for line in group)) for kind, group in by_direction(lines)]
+    assert merged == [("rx", "0102"), ("tx", "1011"), ("rx", "03")]
+    assert [line["hex"] for line in lines if line.get("dir") == "tx"] == ["10", "11"]  # one line a write
+    assert [line["t_ns"] for line in lines[1:]] == sorted(line["t_ns"] for line in lines[1:])
+    assert lines[-1]["event"] == "end"
+
+
+def by_direction(lines: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    passages = (line for line in lines if "dir" in line)
+    return ((kind, list(group)) for kind, group in itertools.groupby(passages, key=lambda line: str(line["dir"])))
+
+
+def made_up(*passages: tuple[float, bool, bytes]) -> Transcript:
+    told = tuple(Passage(round(1e9 * t_s), sent, data) for t_s, sent, data in passages)
+    return Transcript({"url": "x:///y", "duration_s": 1.0}, 0, told, {})
+
+
+DIALOGUE = made_up(
+    (0.00, True, b"ab"), (0.05, False, b"1"), (0.10, True, b"cd"), (0.11, False, b"2"), (0.12, True, b"ef")
+)
+
+
+@pytest.fixture
+def dialogue() -> Iterator[tuple[Player, serial.Serial]]:
+    player = Player(DIALOGUE)
+    with player as path, serial.Serial(path, timeout=0.3) as port:
+        yield player, port
+
+
+def test_a_request_is_answered_after_the_recorded_time(dialogue: tuple[Player, serial.Serial]) -> None:
+    _, port = dialogue
+    port.write(b"a")
+    assert port.read(1) == b""  # the request is not whole yet
+    start = time.monotonic()
+    port.write(b"b")
+    assert port.read(1) == b"1"
+    assert time.monotonic() - start >= 0.05
+    port.write(b"cd")
+    assert port.read(1) == b"2"
+
+
+def test_a_request_may_be_left_out(dialogue: tuple[Player, serial.Serial]) -> None:
+    player, port = dialogue
+    port.write(b"cd")
+    assert port.read(1) == b"2"
+    assert player.divergence is None
+
+
+def test_a_request_that_was_not_recorded_ends_in_silence_with_a_reason(dialogue: tuple[Player, serial.Serial]) -> None:
+    player, port = dialogue
+    port.write(b"ab")
+    assert port.read(1) == b"1"
+    port.write(b"xy")
+    assert port.read(1) == b""
+    assert player.divergence is not None
+    assert "78 79" in player.divergence
+    assert "63 64" in player.divergence
+    port.write(b"cd")
+    assert port.read(1) == b""
+
+
+def test_a_player_that_nobody_opens_ends() -> None:
+    before = threading.active_count()
+    with Player(DIALOGUE):
+        pass
+    assert threading.active_count() == before
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "empty"),
+        ('{"format": "ftdrive.transcript/2"}', "first line"),
+        ("[]", "first line"),
+        ('{"format": "ftdrive.transcript/1"}', "url"),
+        ('{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}', "no port"),
+        (
+            '{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns": 1, "dir": "rx", "hex": "0"}',
+            "line 2",
+        ),
+        ('{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns"', "line 2"),
+        ("\x00\x01", "line 1"),
+    ],
+)
+def test_what_is_no_transcript_is_refused(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "bad.jsonl").write_text(text)
+    with pytest.raises(BadTranscript, match=says):
+        Transcript.load(tmp_path / "bad.jsonl")
