@@ -214,7 +214,8 @@ def keep_records(intact: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int, boo
     """Judge n records by their checksums: which to use, how many are settled, and whether the stream has slipped.
 
     The stream has no sync byte, and after a slip one record in 128 still passes. So three damaged records in a row mean
-    a slip, and an intact one between two damaged ones is not believed. Trailing damage waits for what comes next.
+    a slip, and neither an intact one between two damaged ones nor the last one before a slip is believed. So the last
+    record waits for what comes next, and with it the damage around it.
 
     Returns
     -------
@@ -231,8 +232,12 @@ def keep_records(intact: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int, boo
     if slipped:
         settled = int(runs[0])
     else:
-        tail = bad[-2:]
-        settled = n - len(tail) + int(tail.argmax()) if tail.any() else n
+        good = np.flatnonzero(intact)
+        settled = int(good[-1]) if len(good) else 0
+        if settled and bad[settled - 1]:
+            settled -= 1
     keep = intact.copy()
     keep[1:-1] &= ~(bad[:-2] & bad[2:])
+    if slipped and settled:
+        keep[settled - 1] = False
     return keep[:settled], settled, slipped

@@ -76,6 +76,7 @@ class AtiSerialSensor(StreamingSensor):
     def _connect(self) -> DeviceInfo:
         self._seq = self._restarts = 0
         self._slipped, self._last_good_ns = False, None
+        self._nominal_Hz = modbus.NOMINAL_RATE_Hz
         self._port = self._open_port()
         self._status = self._stop_stream()
         if self._status & modbus.CRITICAL:
