@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import math
 import os
 import select
 import struct
@@ -362,7 +363,8 @@ def test_serial_single_bad_records_are_dropped_and_counted() -> None:
         assert START not in peer.requests[len(SERIAL_START_UP) :]
 
 
-def test_serial_slipped_stream_is_restarted() -> None:
+def test_serial_slipped_stream_is_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers._stream._FROZEN_S", math.inf)  # the peer repeats one record
     with SerialPeer() as peer, peer.sensor() as sensor:
         peer.once = b"\x77"
         samples = sensor.collect(0.3)
