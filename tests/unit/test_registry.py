@@ -106,8 +106,8 @@ class Sensor(StreamingSensor):
     def _read_block(self):
         time.sleep(0.005)
         self.seq += 1
-        return FtSamples(np.array([time.monotonic_ns()]), np.array([np.nan]), np.array([self.seq]), np.zeros((1, 0), np.int32),
-                         self.gain * np.ones((1, 6)), np.zeros(1, np.uint32))
+        return FtSamples(np.array([time.monotonic_ns()]), np.array([np.nan]), np.array([self.seq]),
+                         np.zeros((1, 0), np.int32), self.gain * np.ones((1, 6)), np.zeros(1, np.uint32))
 
     def _disconnect(self):
         pass

@@ -58,6 +58,9 @@ class FakeSensor(StreamingSensor):
     def wrench(self, seq: NDArray[np.int64]) -> Array:
         return np.arange(1.0, 7.0) + 1e-3 * seq[:, np.newaxis]
 
+    def await_received(self, samples: int) -> None:
+        wait_for(lambda: self.health().received == samples)
+
     def _disconnect(self) -> None:
         self.disconnects += 1
         if self.disconnect_error:
@@ -293,9 +296,13 @@ def failure_of(sensor: FakeSensor) -> type[Exception] | None:
 
 
 def test_what_came_twice_or_too_late_is_dropped_and_counted(sensor: FakeSensor) -> None:
-    threading.Timer(0.02, lambda: [sensor.feed.put(block(seq)) for seq in ([5, 5, 6], [6, 9, 7, 10], [8])]).start()
-    threading.Timer(0.09, sensor.feed.put, [block([11])]).start()
-    samples = sensor.collect(0.07)
+    def feed(*blocks: list[int]) -> None:
+        for seq in blocks:
+            sensor.feed.put(block(seq))
+
+    threading.Timer(0.02, feed, [[5, 5, 6], [6, 9, 7, 10], [8]]).start()
+    threading.Timer(0.08, feed, [[11]]).start()
+    samples = sensor.collect(0.06)
     health = sensor.health()
     assert samples.seq.tolist() == [5, 6, 9, 10]
     assert (health.duplicated, health.out_of_order) == (2, 2)
@@ -339,7 +346,7 @@ def test_few_identical_samples_or_a_short_while_are_not_frozen() -> None:
     [
         ([1.0, 1.1, 1.09], "back by 0.010 s"),
         ([1.0, 1.1, 0.0], "back by 1.100 s to 0.000 s"),
-        ([1.0, 1.1, 9.1], r"ahead by 7\.9\d+ s to 9.100 s"),
+        ([1.0, 1.1, 9.1], r"ahead by (7\.9\d+|8\.000) s to 9.100 s"),
     ],
 )
 def test_a_jump_of_the_devices_clock_is_named(sensor: FakeSensor, clock: list[float], says: str) -> None:
@@ -369,12 +376,10 @@ def test_a_rate_off_by_more_than_a_tenth_is_said_once(caplog: pytest.LogCaptureF
             for number in range(1, 1001):  # five seconds at 200 Hz
                 made = block([5 + number])
                 sensor.feed.put(replace(made, t_host_ns=np.array([t_ns + number * 5_000_000])))
-            wait_for(lambda sensor=sensor: sensor.health().received == 1001)
+            sensor.await_received(1001)
             health = sensor.health()
         assert caplog.text.count(f"instead of {nominal_Hz:g} Hz; samples are lost") == said
-        assert [what for _, what in health.events if "rate 200.0 Hz" in what] == [
-            "rate 200.0 Hz instead of 1000 Hz"
-        ] * said
+        assert [what for _, what in health.events] == ["rate 200.0 Hz instead of 1000 Hz"] * said
         assert health.nominal_rate_Hz == nominal_Hz
 
 
@@ -382,7 +387,7 @@ def test_silences_are_counted(sensor: FakeSensor) -> None:
     for received in (2, 3):
         time.sleep(0.12)
         sensor.feed.put(1)
-        wait_for(lambda received=received: sensor.health().received == received)
+        sensor.await_received(received)
     assert sensor.health().stale == 2
 
 
