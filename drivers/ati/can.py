@@ -37,6 +37,8 @@ _POLL_S = 0.05
 _GRACE_S = 0.002
 """A last look after the deadline: on a busy host it is often this process that was late, not the answer."""
 _QUIET_S = 0.01
+_STRAGGLER_S = 0.004
+"""How long a reading in the wrong order waits for a frame that would contradict it."""
 _PERIOD_S = 1e-3
 """About what a 250 kbit/s bus carries; polling a faster one, or an emulator, for all it gives would eat a CPU core."""
 
@@ -249,7 +251,7 @@ class AtiCanSensor(StreamingSensor):
             left_s = deadline - time.monotonic()
             message = None
             if left_s > -timeout_s:
-                message = self._receive(_QUIET_S if whole else max(left_s, _GRACE_S))
+                message = self._receive(_STRAGGLER_S if whole else max(left_s, _GRACE_S))
             if message is None and whole:
                 break
             if message is None:
