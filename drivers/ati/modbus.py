@@ -52,6 +52,7 @@ STATUS_BITS: Mapping[int, str] = MappingProxyType(
         15: "any error",
     }
 )
+ANY_ERROR = 0x8000
 CRITICAL = 0x3EFE
 """All but watchdog reset, configuration, CAN and the summary bit."""
 

@@ -393,6 +393,17 @@ def test_serial_error_bit_ends_the_stream_with_the_status_in_words() -> None:
         assert peer.requests[len(SERIAL_START_UP) :] == [JAM, STATUS]
 
 
+def test_serial_error_bit_that_the_status_does_not_confirm_is_damage() -> None:
+    with SerialPeer() as peer, peer.sensor() as sensor:
+        peer.once = RECORD_ERROR
+        samples = sensor.collect(0.1)
+        assert peer.requests[len(SERIAL_START_UP) :] == [JAM, STATUS, START]
+        health = sensor.health()
+    assert (samples.counts == [100, -200, 300, -400, 500, -600]).all()
+    assert health.malformed == 1
+    assert int((samples.seq[1:] - samples.seq[:-1] - 1).sum()) == health.lost > 1
+
+
 def test_serial_saturation_is_a_fault() -> None:
     with SerialPeer() as peer, peer.sensor() as sensor:
         peer.once = RECORD_SATURATED

@@ -5,6 +5,7 @@ never look like one. Every sample the reader thread hands out is compared with i
 """
 
 import json
+import math
 import subprocess
 import sys
 import threading
@@ -88,7 +89,7 @@ KINDS = {
     for kind in (
         Kind("ati-can", "interface=slcan", numbered=True),
         Kind("ati-serial", ""),
-        Kind("robotous-can", "interface=slcan&rate=1000"),
+        Kind("robotous-can", "interface=slcan"),
         Kind("robotous-serial", "baud=921600&rate=1000", {"baud_code": 1}),
         Kind("robotiq-ft300", ""),
         Kind("bota", "sinc=64", numbered=True),
@@ -236,17 +237,19 @@ def scheme(request: pytest.FixtureRequest) -> str:
 
 SCRIPT: dict[str, dict[str, float]] = {
     "drop": {"drop": 0.05},
-    "delay": {"delay_s": 0.02, "jitter_s": 0.01},
+    "delay": {"delay_s": 0.02},
     "corrupt": {"corrupt": 0.05},
     "duplicate": {"duplicate": 0.1},
     "swap": {"swap": 0.1},
     "foreign": {"foreign": 0.2},
-    "byte_slip": {"byte_slip": 0.01},
+    "byte_slip": {"byte_slip": 0.1},
 }
-HEALTHY = {"drop": 0.0, "delay_s": 0.0, "jitter_s": 0.0, "corrupt": 0.0, "duplicate": 0.0, "swap": 0.0} | {
-    "foreign": 0.0,
-    "byte_slip": 0.0,
-}
+HEALTHY = dict.fromkeys([key for fault in SCRIPT.values() for key in fault], 0.0)
+
+
+def chances(scheme: str, fault: str) -> dict[str, float]:
+    """How often a fault strikes: a slip takes the ATI stream 40 ms to mend, so there it is rare."""
+    return {"byte_slip": 0.001} if (scheme, fault) == ("ati-serial", "byte_slip") else SCRIPT[fault]
 
 
 def applies(scheme: str, fault: str) -> bool:
@@ -256,8 +259,11 @@ def applies(scheme: str, fault: str) -> bool:
 
 
 def most_wrong(scheme: str, fault: str, received: int) -> float:
-    """How many wrong samples a protocol cannot tell from right ones: only the 7-bit sum of the ATI stream lets any by."""
-    return 0.25 * SCRIPT["corrupt"]["corrupt"] * received if (scheme, fault) == ("ati-serial", "corrupt") else 0
+    """How many wrong samples a protocol cannot tell from right ones: the 7-bit sum of the ATI stream lets some by."""
+    if (scheme, fault) != ("ati-serial", "corrupt"):
+        return 0
+    expected = SCRIPT["corrupt"]["corrupt"] * received / 128
+    return expected + 5 * math.sqrt(expected) + 1
 
 
 def suffer(sensor: StreamingSensor, seconds: float) -> list[DriverError]:
@@ -274,6 +280,7 @@ def suffer(sensor: StreamingSensor, seconds: float) -> list[DriverError]:
             told.append(exc)
             if sensor._failure is not None:
                 break
+            time.sleep(0.02)
         assert time.monotonic() - begin < 0.2 + 0.1 + 0.5 + 0.5
     return told
 
@@ -285,10 +292,12 @@ def test_no_fault_of_the_wire_delivers_a_wrong_value(emulator: Emulator, fault: 
         pytest.skip(f"{fault} does not happen on the wire of {scheme}")
     with emulator.sensor() as sensor:
         watched = Watched(sensor)
-        emulator.faults(**SCRIPT[fault])
-        told = suffer(sensor, 0.7)
-        emulator.faults(**HEALTHY)
-        health = sensor.health()
+        emulator.faults(**chances(scheme, fault))
+        try:
+            told = suffer(sensor, 0.7)
+            health = sensor.health()
+        finally:
+            emulator.faults(**HEALTHY)
     samples, steps = watched.samples(), watched.steps()
     assert len(samples) >= 20
     assert watched.wrong() <= most_wrong(scheme, fault, len(samples))
