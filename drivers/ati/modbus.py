@@ -202,13 +202,13 @@ def decode_records(data: bytes) -> Records:
     if len(data) % RECORD_SIZE:
         raise ProtocolError(f"{len(data)} bytes are no whole number of {RECORD_SIZE}-byte records")
     raw = np.frombuffer(data, np.uint8).reshape(-1, RECORD_SIZE)
-    gauges = np.ascontiguousarray(raw[:, :12]).view(">i2")
-    last = raw[:, 12]
-    return Records(
-        gauges=gauges[:, [0, 3, 1, 4, 2, 5]].astype(np.int32),
-        intact=raw[:, :12].sum(axis=1, dtype=np.uint16) & 0x7F == last & 0x7F,
-        error=last & 0x80 != 0,
-    )
+    values = np.ascontiguousarray(raw[:, :12]).view(">i2")
+    gauges = np.empty((len(raw), 6), np.int32)
+    gauges[:, 0::2], gauges[:, 1::2] = values[:, :3], values[:, 3:]
+    columns = np.ascontiguousarray(raw.T)  # sums along columns are many times faster than along short rows
+    total = columns[:12].sum(axis=0, dtype=np.uint8)  # wraps at 256, and only seven bits count
+    last = columns[12]
+    return Records(gauges=gauges, intact=(total ^ last) & 0x7F == 0, error=last & 0x80 != 0)
 
 
 def keep_records(intact: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int, bool]:
