@@ -2,6 +2,7 @@
 
 import copy
 import logging
+import math
 import sys
 import threading
 import time
@@ -10,7 +11,7 @@ from collections import deque
 
 import numpy as np
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
 from drivers.interfaces import DeviceInfo, ForceTorqueSensor, FtSamples, Health
 
 if sys.platform == "win32":
@@ -35,6 +36,14 @@ NOTHING = FtSamples(
 
 _JOIN_S = 0.6
 _FIRST_SAMPLE_S = 1.0
+_FROZEN_SAMPLES, _FROZEN_S = 50, 0.2
+"""A living sensor has noise of a count or more: so many identical readings over so long a time are none."""
+_CLOCK_JUMP_S = 0.5
+"""How far the device's clock may gain on ours from one block to the next; a late block makes it fall behind only."""
+_RATE_TOLERANCE, _RATE_WINDOW_S = 0.1, 2.0
+_RECOVER_S = 10.0
+_RETRY_S = 0.2
+_EVENTS = 1000
 
 
 class StreamingSensor(ForceTorqueSensor):
@@ -53,10 +62,19 @@ class StreamingSensor(ForceTorqueSensor):
         The longest silence that still counts as a stream.
     max_collect_samples : int
         What one `collect` may hold; more is an error, never a dropped sample.
+    recover : bool
+        After an interruption or silence connect again, for up to 10 s, instead of ending the stream. Every call made
+        meanwhile is an error all the same, and so is a `collect` with an interruption inside. May be set until `open`.
     """
 
     def __init__(
-        self, name: str, *, sign: int = 1, stale_after_s: float = 0.3, max_collect_samples: int = 1_000_000
+        self,
+        name: str,
+        *,
+        sign: int = 1,
+        stale_after_s: float = 0.3,
+        max_collect_samples: int = 1_000_000,
+        recover: bool = False,
     ) -> None:
         if sign not in {1, -1}:
             raise ValueError(f"sign is {sign}; it is 1, or -1 for a sensor that reports the reaction")
@@ -64,6 +82,9 @@ class StreamingSensor(ForceTorqueSensor):
         self._sign = sign
         self._stale_after_s = stale_after_s
         self._max_collect_samples = max_collect_samples
+        self.recover = recover
+        self._nominal_Hz = math.nan
+        """A subclass that knows its rate sets it in `_connect`."""
         self._thread: threading.Thread | None = None
         self._news = threading.Condition()
         self._info: DeviceInfo | None = None
@@ -143,12 +164,14 @@ class StreamingSensor(ForceTorqueSensor):
             self._check()
             start_ns = time.monotonic_ns()
             end_ns = start_ns + round(duration_s * 1e9)
-            before = self._received
+            before, reconnects = self._received, self._reconnects
             self._taps.append(blocks)
             try:
                 while self._newest_ns < end_ns:
                     self._news.wait(max(0.0, self._stale_after_s - self._age_s()) + 1e-3)
                     self._check()
+                    if self._reconnects != reconnects:
+                        raise StreamBroken(f"{self.name}: the stream was interrupted and came back; collect again")
                     if self._received - before > self._max_collect_samples:
                         raise StreamBroken(
                             f"{self.name}: more than {self._max_collect_samples} samples in one collect of "
@@ -192,10 +215,16 @@ class StreamingSensor(ForceTorqueSensor):
             recent = sum(n for t_ns, n in self._arrivals if t_ns >= since_ns)
             return Health(
                 received=self._received,
-                lost=self._lost,
-                malformed=self._malformed,
+                lost=self._earlier_lost + self._lost,
+                malformed=self._earlier_malformed + self._malformed,
                 rate_Hz=recent / max((now_ns - since_ns) / 1e9, 1e-3),
                 age_s=self._age_s(),
+                duplicated=self._duplicated,
+                out_of_order=self._out_of_order,
+                stale=self._silences,
+                reconnects=self._reconnects,
+                nominal_rate_Hz=self._nominal_Hz,
+                events=tuple(self._events),
             )
 
     def _reset(self) -> None:
@@ -204,36 +233,195 @@ class StreamingSensor(ForceTorqueSensor):
         self._opened_ns = self._newest_ns = time.monotonic_ns()
         self._taps = []
         self._arrivals.clear()
-        self._received = self._lost = self._malformed = 0
+        self._received = self._duplicated = self._out_of_order = self._silences = self._reconnects = 0
+        self._earlier_lost = self._earlier_malformed = 0
+        self._lost = self._malformed = 0
+        """Since the last `_connect`; a subclass may count or assign them."""
+        self._events: deque[tuple[int, str]] = deque(maxlen=_EVENTS)
+        self._rate_warned = False
+        self._seq_offset = 0
+        self._start_watching()
+
+    def _start_watching(self) -> None:
+        """Forget what the checks of a running stream compare with."""
+        self._same_rows, self._same_since_ns = 0, 0
+        self._clock: tuple[float, int] | None = None
+        self._lead_s = 0.0
+        self._rate_since_ns, self._rate_samples = 0, 0
 
     def _run(self) -> None:
-        try:
-            while self._thread is threading.current_thread():
-                block = self._read_block()
-                if len(block):
-                    self._publish(block)
-        except Exception as exc:
-            with self._news:
-                if self._thread is threading.current_thread():
+        cause: Exception | None = None
+        while self._is_mine():
+            try:
+                if cause is not None:
+                    self._reconnect(cause)
+                    cause = None
+                self._pump()
+            except Exception as exc:
+                recoverable = isinstance(exc, StreamBroken | DeviceTimeout) and self.recover and cause is None
+                with self._news:
+                    if not self._is_mine():
+                        return
                     self._failure = exc
+                    if recoverable:
+                        self._failure = StreamBroken(f"{self.name}: interrupted, connecting again ({exc})")
+                    self._note(str(exc) if recoverable else f"ended: {exc}")
                     self._news.notify_all()
+                if not recoverable:
+                    return
+                cause = exc
+
+    def _pump(self) -> None:
+        """Read and publish until `close`."""
+        while self._is_mine():
+            block = self._read_block()
+            if len(block):
+                self._publish(block)
+            elif self.recover and self._age_s() > self._stale_after_s:
+                raise self._stale(self._age_s())
+
+    def _reconnect(self, cause: Exception) -> None:
+        """Connect again to the same device; the first sample that comes then ends the failure."""
+        deadline = time.monotonic() + _RECOVER_S
+        self._earlier_lost += self._lost
+        self._earlier_malformed += self._malformed
+        self._lost = self._malformed = 0
+        while True:
+            self._let_go()
+            try:
+                info = self._connect()
+                break
+            except DeviceFault:
+                raise
+            except DriverError as exc:
+                if not self._is_mine():
+                    return
+                if time.monotonic() > deadline:
+                    raise StreamBroken(f"{cause}; not back within {_RECOVER_S:g} s ({exc})") from exc
+            time.sleep(_RETRY_S)
+        if not self._is_mine():
+            self._let_go()
+            return
+        if info != self._info:
+            raise ConnectError(f"{self.name}: {info} answers where {self._info} was; open it again if that is meant")
+        with self._news:
+            self._start_watching()
+            self._newest_ns = time.monotonic_ns()  # silence is judged anew
+            self._reconnects += 1
+            self._note("connected again")
+
+    def _is_mine(self) -> bool:
+        return self._thread is threading.current_thread()
+
+    def _note(self, what: str) -> None:
+        self._events.append((time.monotonic_ns(), what))
+        log.info("%s: %s", self.name, what)
 
     def _publish(self, block: FtSamples) -> None:
-        block = FtSamples(
-            block.t_host_ns, block.t_device_s, block.seq, block.counts, self._sign * block.wrench, block.status
-        )
-        t_ns = int(block.t_host_ns[-1])
         with self._news:
-            if self._thread is not threading.current_thread():
+            if not self._is_mine():
                 return
+            block = self._newer_rows(block)
+            if not len(block):
+                return
+            t_ns = int(block.t_host_ns[-1])
+            self._judge_wrench(block)
+            self._judge_clock(block.t_device_s, t_ns)
+            self._judge_rate(len(block), t_ns)
+            if self._received and t_ns - self._newest_ns > self._stale_after_s * 1e9:
+                self._silences += 1
             self._received += len(block)
             self._arrivals.append((t_ns, len(block)))
             while self._arrivals[0][0] < t_ns - 1_000_000_000:
                 self._arrivals.popleft()
             self._newest, self._newest_ns = _rows(block, slice(-1, None)), t_ns
+            self._failure = None  # of an interruption that is over
             for tap in self._taps:
                 tap.append(block)
             self._news.notify_all()
+
+    def _newer_rows(self, block: FtSamples) -> FtSamples:
+        """Turn the wrench by the sign, let `seq` go on after a reconnection, drop what came twice or too late."""
+        seq = block.seq + self._seq_offset
+        newest = int(self._newest.seq[-1]) if len(self._newest) else int(seq[0]) - 1
+        if self._failure is not None and seq[0] <= newest:
+            gap_s = (int(block.t_host_ns[0]) - int(self._newest.t_host_ns[-1])) / 1e9
+            missed = 1 if math.isnan(self._nominal_Hz) else max(1, round(gap_s * self._nominal_Hz))
+            self._seq_offset += newest + missed + 1 - int(seq[0])
+            self._earlier_lost += missed
+            seq = block.seq + self._seq_offset
+        block = FtSamples(block.t_host_ns, block.t_device_s, seq, block.counts, self._sign * block.wrench, block.status)
+        top = np.maximum.accumulate(np.concatenate([[newest], seq[:-1]]))
+        newer = seq > top
+        if newer.all():
+            return block
+        self._duplicated += int((seq == top).sum())
+        self._out_of_order += int((seq < top).sum())
+        return _rows(block, newer)
+
+    def _judge_wrench(self, block: FtSamples) -> None:
+        """Raise on numbers that are none, and on a sensor that says the same again and again."""
+        wrench = block.wrench
+        if not np.isfinite(wrench).all():
+            raise ProtocolError(f"{self.name}: the sensor sends a wrench that is not finite; power it off and on")
+        other = np.flatnonzero((wrench != wrench[-1]).any(axis=1))
+        if len(other) or not self._same_rows or (wrench[-1] != self._newest.wrench[-1]).any():
+            first = int(other[-1]) + 1 if len(other) else 0
+            self._same_rows, self._same_since_ns = len(block) - first, int(block.t_host_ns[first])
+        else:
+            self._same_rows += len(block)
+        same_s = (int(block.t_host_ns[-1]) - self._same_since_ns) / 1e9
+        if self._same_rows >= _FROZEN_SAMPLES and same_s >= _FROZEN_S:
+            raise DeviceFault(
+                f"{self.name}: frozen, {self._same_rows} identical samples in {same_s:.2f} s, and a sensor that "
+                "measures has noise; power it off and on"
+            )
+
+    def _judge_clock(self, t_device_s: np.ndarray[tuple[int], np.dtype[np.float64]], t_host_ns: int) -> None:
+        """Raise when the device's clock goes back, or gains on ours in a step. Only durations are compared."""
+        newest_s = float(t_device_s[-1])
+        if math.isnan(newest_s):
+            return
+        if self._clock is None:
+            self._clock = newest_s, t_host_ns
+            before_s = float(t_device_s[0])
+        else:
+            before_s = float(self._newest.t_device_s[-1])
+        lead_s = (newest_s - self._clock[0]) - (t_host_ns - self._clock[1]) / 1e9
+        step_s = lead_s - self._lead_s
+        self._lead_s = max(self._lead_s, lead_s)
+        back_s = -float(np.diff(t_device_s, prepend=before_s).min())
+        if back_s > 0:
+            raise StreamBroken(
+                f"{self.name}: the device's clock jumped back by {back_s:.3f} s to {newest_s:.3f} s: it has "
+                "restarted, open it again"
+            )
+        if step_s > _CLOCK_JUMP_S:
+            raise StreamBroken(
+                f"{self.name}: the device's clock jumped ahead by {step_s:.3f} s to {newest_s:.3f} s; open it again"
+            )
+
+    def _judge_rate(self, samples: int, t_host_ns: int) -> None:
+        """Say once that the rate is not what the device says."""
+        if math.isnan(self._nominal_Hz) or self._rate_warned:
+            return
+        self._rate_samples += samples
+        if not self._rate_since_ns:
+            self._rate_since_ns, self._rate_samples = t_host_ns, 0
+        elapsed_s = (t_host_ns - self._rate_since_ns) / 1e9
+        if elapsed_s < _RATE_WINDOW_S:
+            return
+        rate_Hz = self._rate_samples / elapsed_s
+        self._rate_since_ns, self._rate_samples = t_host_ns, 0
+        if abs(rate_Hz / self._nominal_Hz - 1) > _RATE_TOLERANCE:
+            self._rate_warned = True
+            self._note(f"rate {rate_Hz:.1f} Hz instead of {self._nominal_Hz:g} Hz")
+            log.warning(
+                "%s: %.1f Hz instead of %g Hz; samples are lost or the sensor is set differently, look at health()",
+                self.name,
+                rate_Hz,
+                self._nominal_Hz,
+            )
 
     def _let_go(self) -> None:
         try:

@@ -4,6 +4,7 @@ Constructors only store configuration; `open` talks to the device and `close` is
 device is gone. Every wait has a time-out. An old value is never returned: stale data is an error.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -75,6 +76,18 @@ class Health:
     """Over the last second."""
     age_s: float
     """Since the newest sample."""
+    duplicated: int = 0
+    """Frames or samples that came twice; one of them was kept."""
+    out_of_order: int = 0
+    """Samples that came after a newer one and were thrown away; `lost` counts them too."""
+    stale: int = 0
+    """Silences longer than the stream allows, after which samples came again."""
+    reconnects: int = 0
+    """Interruptions the driver has mended by itself; only where `recover` was asked for."""
+    nominal_rate_Hz: float = math.nan
+    """What the device says or documents about its rate; NaN where it does not."""
+    events: tuple[tuple[int, str], ...] = ()
+    """(`t_host_ns`, what happened): interruptions, reconnections, a wrong rate. A recording stores them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

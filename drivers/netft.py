@@ -14,6 +14,7 @@ import re
 import time
 from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Self
 
@@ -23,7 +24,7 @@ import pynetft
 from drivers._stream import NOTHING, StreamingSensor
 from drivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM
 from drivers.errors import ConnectError, DeviceFault, StreamBroken
-from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.interfaces import DeviceInfo, FtSamples, Health
 
 if TYPE_CHECKING:
     from drivers.registry import Options
@@ -241,6 +242,19 @@ class NetFtSensor(StreamingSensor):
         client, self._client = self._client, None
         if client is not None:
             client.stop()
+
+    def health(self) -> Health:
+        """Counters since `open`; what came twice or too late pynetft has thrown away and counted."""
+        health, client = super().health(), self._client
+        if client is None:
+            return health
+        told = client.health()
+        return replace(
+            health,
+            malformed=told.malformed_count,
+            duplicated=told.duplicate_count,
+            out_of_order=told.out_of_order_count,
+        )
 
     def _start(self, client: pynetft.Client) -> pynetft.SensorConfiguration:
         """Ask for the stream until it comes; returns what the sensor tells about itself."""

@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import Any, Protocol, cast
 from urllib.parse import parse_qsl, unquote, urlsplit
 
+from drivers._stream import StreamingSensor
 from drivers.interfaces import ForceTorqueSensor, RobotArm
 
 SENSORS: Mapping[str, str] = MappingProxyType(
@@ -131,6 +132,7 @@ def sensor_from_url(url: str, *, sign: int = 1) -> ForceTorqueSensor:
         raise BadUrl(f"{url}: which device? Write it like {', '.join(_EXAMPLES)}")
     driver = cast("_FromUrl", _load(entry))
     options = Options(url, parts.query)
+    recover = bool(options.integer("recover", 0, 0, 1))
     try:
         sensor = driver.from_url(address, options, sign=sign)
     except BadUrl:
@@ -138,6 +140,10 @@ def sensor_from_url(url: str, *, sign: int = 1) -> ForceTorqueSensor:
     except ValueError as exc:
         raise BadUrl(f"{url}: {exc}") from exc
     options.reject_others()
+    if recover:
+        if not isinstance(sensor, StreamingSensor):
+            raise BadUrl(f"{url}: this driver cannot recover a stream; leave the option 'recover' out")
+        sensor.recover = True
     return sensor
 
 

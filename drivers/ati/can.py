@@ -21,7 +21,7 @@ from drivers._stream import LINK_ERRORS, NOTHING, StreamingSensor
 from drivers.ati import codec
 from drivers.ati.calibration import NEWTON, NEWTON_METRE, Calibration, saturated_gauges
 from drivers.ati.codec import Op
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import DeviceInfo, FtSamples
 
 if TYPE_CHECKING:
@@ -37,6 +37,8 @@ _POLL_S = 0.05
 _GRACE_S = 0.002
 """A last look after the deadline: on a busy host it is often this process that was late, not the answer."""
 _QUIET_S = 0.01
+_STRAGGLER_S = 0.004
+"""How long a reading in the wrong order waits for a frame that would contradict it."""
 _PERIOD_S = 1e-3
 """About what a 250 kbit/s bus carries; polling a faster one, or an emulator, for all it gives would eat a CPU core."""
 
@@ -116,7 +118,7 @@ class AtiCanSensor(StreamingSensor):
         self._polls += 1
         try:
             first, second = self._exchange(Op.GAUGES, b"", _POLL_S)
-        except DeviceTimeout:
+        except (DeviceTimeout, ProtocolError):
             self._lost += 1
             self._missed += 1
             self._drain(_QUIET_S)  # a late half must not pair up with the next reading
@@ -217,7 +219,7 @@ class AtiCanSensor(StreamingSensor):
     def _ask(self, op: Op, *args: int) -> list[bytes]:
         """Exchange with retries, for the start-up sequence."""
         for _ in range(_ATTEMPTS):
-            with contextlib.suppress(DeviceTimeout):
+            with contextlib.suppress(DeviceTimeout, ProtocolError):
                 return self._exchange(op, bytes(args), _TRANSACTION_S)
         raise DeviceTimeout(
             f"{self.name}: no answer to {op.name} after {_ATTEMPTS} attempts of {_TRANSACTION_S} s; check bit rate, "
@@ -227,8 +229,9 @@ class AtiCanSensor(StreamingSensor):
     def _exchange(self, op: Op, data: bytes, timeout_s: float) -> list[bytes]:
         """Send one request and return the payloads of its reply, or raise `DeviceTimeout`: never half a reply.
 
-        Frames are matched by identifier and length, not by order of arrival. One thread at a time exchanges: the
-        opening one, then the reader.
+        Frames are matched by identifier and length, not by order of arrival. They carry no number: when two differing
+        ones answer, or come in the wrong order with another behind, one belongs to an earlier request, nobody knows
+        which, and that is a `ProtocolError`. One thread at a time exchanges: the opening one, then the reader.
         """
         if self._bus is None:
             raise StreamBroken(f"{self.name}: closed")
@@ -243,9 +246,14 @@ class AtiCanSensor(StreamingSensor):
         except _BUS_ERRORS as exc:
             raise self._broken(exc) from exc
         deadline = time.monotonic() + timeout_s
-        while len(parts) < len(expected):
+        while len(parts) < len(expected) or list(parts) != sorted(parts):
+            whole = len(parts) == len(expected)
             left_s = deadline - time.monotonic()
-            message = self._receive(max(left_s, _GRACE_S)) if left_s > -timeout_s else None
+            message = None
+            if left_s > -timeout_s:
+                message = self._receive(_STRAGGLER_S if whole else max(left_s, _GRACE_S))
+            if message is None and whole:
+                break
             if message is None:
                 raise DeviceTimeout(f"{self.name}: no answer to {op.name} within {timeout_s} s")
             opcode = message.arbitration_id & 0xF
@@ -253,8 +261,9 @@ class AtiCanSensor(StreamingSensor):
             if opcode in expected and len(payload) == expected[opcode]:
                 if skip_echo:
                     skip_echo = False
-                else:
-                    parts[opcode] = payload
+                elif parts.setdefault(opcode, payload) != payload:
+                    self._malformed += 1
+                    raise ProtocolError(f"{self.name}: two different answers to {op.name}")
             elif message.arbitration_id == request_id and payload == data:
                 self._echoes = True
         return [parts[opcode] for opcode in expected]

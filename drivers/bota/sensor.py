@@ -75,6 +75,7 @@ class BotaSensor(StreamingSensor):
         self._period_us = median((b - a) % _CLOCK for a, b in pairwise(times))
         if not self._period_us:
             raise ConnectError(f"{self.name}: the sensor's clock stands still at {times[-1]} µs; power it off and on")
+        self._nominal_Hz = 1e6 / self._period_us
         self._t_us = times[-1]
         self._seq = 0
         return DeviceInfo(model="Bota force/torque sensor", serial="not reported", firmware="not reported")
@@ -146,6 +147,8 @@ class BotaSensor(StreamingSensor):
                 f"{self.name}: the sensor's clock went back to {t_us} µs: it has restarted, open it again"
             )
         self._t_us += step_us
+        if not step_us:
+            return self._t_us, self._seq  # the same sample again
         periods = max(1, round(step_us / self._period_us))
         self._seq += periods
         self._lost += periods - 1

@@ -67,7 +67,8 @@ class RobotiqFt300(StreamingSensor):
             firmware = "not reported"
         self._ask(codec.write_register(codec.STREAM, codec.START_STREAM))
         self._frames = Deframer(codec.HEADER, codec.FRAME_SIZE, codec.is_frame)
-        self._rate_since_ns, self._rate_frames, self._hinted = 0, 0, False
+        self._nominal_Hz = codec.NOMINAL_RATE_Hz
+        self._hint_since_ns, self._hint_frames, self._hinted = 0, 0, False
         return DeviceInfo(model="Robotiq FT 300", serial=serial, firmware=firmware)
 
     def _read_block(self) -> FtSamples:
@@ -139,14 +140,14 @@ class RobotiqFt300(StreamingSensor):
 
     def _watch_rate(self, t_host_ns: int, frames: int) -> None:
         """Once a second compare the rate with what a slow USB adapter makes of it."""
-        self._rate_frames += frames
-        if not self._rate_since_ns:
-            self._rate_since_ns, self._rate_frames = t_host_ns, 0
-        elapsed_s = (t_host_ns - self._rate_since_ns) / 1e9
+        self._hint_frames += frames
+        if not self._hint_since_ns:
+            self._hint_since_ns, self._hint_frames = t_host_ns, 0
+        elapsed_s = (t_host_ns - self._hint_since_ns) / 1e9
         if self._hinted or elapsed_s < 1.0:
             return
-        rate_Hz = self._rate_frames / elapsed_s
-        self._rate_since_ns, self._rate_frames = t_host_ns, 0
+        rate_Hz = self._hint_frames / elapsed_s
+        self._hint_since_ns, self._hint_frames = t_host_ns, 0
         if _LATENT_RATE_Hz[0] < rate_Hz < _LATENT_RATE_Hz[1]:
             self._hinted = True
             log.warning(

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 _COMMAND, _FIRST_HALF, _SECOND_HALF = 0x64, 0x01, 0x02
 _BITRATE = 1_000_000
 _WAIT_S = 0.05
+_TOGETHER_S = 0.003
+"""Both halves leave the sensor together; one that comes later belongs to another field."""
 
 
 class CanLink:
@@ -27,7 +29,6 @@ class CanLink:
         self.name = f"Robotous sensor on {interface} {channel}"
         self.fastest_Hz = 1000
         self._bus = CanBus(self.name, channel, interface, _BITRATE, (_FIRST_HALF, _SECOND_HALF))
-        self._first: bytes | None = None
         self._number = self._halves_lost = 0
 
     @property
@@ -37,7 +38,6 @@ class CanLink:
 
     def open(self) -> None:
         """Join the bus."""
-        self._first = None
         self._bus.open()
 
     def send(self, field: bytes) -> None:
@@ -46,18 +46,17 @@ class CanLink:
 
     def receive(self) -> list[tuple[int, bytes]]:
         """Take the next field, or none after 0.05 s."""
-        while (frame := self._bus.receive(_WAIT_S)) is not None:
+        first = b""
+        while (frame := self._bus.receive(_TOGETHER_S if first else _WAIT_S)) is not None:
             identifier, data = frame
-            first, self._first = self._first, None
-            if identifier == _FIRST_HALF:
-                self._first = data
-                if first is not None:
-                    self._count_lost()
-            elif first is None or len(first + data) != codec.REPLY_SIZE:
-                self._count_lost()
-            else:
+            if identifier == _SECOND_HALF and first and len(first + data) == codec.REPLY_SIZE:
                 self._number += 1
                 return [(self._number, first + data)]
+            if identifier == _SECOND_HALF or first:
+                self._count_lost()
+            first = data if identifier == _FIRST_HALF else b""
+        if first:
+            self._count_lost()
         return []
 
     def close(self) -> None:

@@ -7,6 +7,7 @@ While it streams the sensor hears only stop and bias, so an answer to any other 
 has a bias command; this driver never sends it.
 """
 
+import math
 import time
 from typing import Protocol
 
@@ -85,6 +86,7 @@ class RobotousSensor(StreamingSensor):
             codec.check_set(self._ask(Command.SET_RATE, codec.RATE_CODES[self._rate_Hz]))
         self._link.send(codec.encode(Command.START))
         self._damaged_before = self._link.damaged
+        self._nominal_Hz = self._rate_Hz or math.nan
         return DeviceInfo(model=f"Robotous {model}", serial=serial, firmware=firmware)
 
     def _read_block(self) -> FtSamples:

@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import math
 import os
 import select
 import struct
@@ -362,7 +363,8 @@ def test_serial_single_bad_records_are_dropped_and_counted() -> None:
         assert START not in peer.requests[len(SERIAL_START_UP) :]
 
 
-def test_serial_slipped_stream_is_restarted() -> None:
+def test_serial_slipped_stream_is_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers._stream._FROZEN_S", math.inf)  # the peer repeats one record
     with SerialPeer() as peer, peer.sensor() as sensor:
         peer.once = b"\x77"
         samples = sensor.collect(0.3)
@@ -389,6 +391,17 @@ def test_serial_error_bit_ends_the_stream_with_the_status_in_words() -> None:
         with pytest.raises(DeviceFault, match=r"0x8080 \(bit 7: EEPROM error, bit 15: any error\)"):
             sensor.collect(1.0)
         assert peer.requests[len(SERIAL_START_UP) :] == [JAM, STATUS]
+
+
+def test_serial_error_bit_that_the_status_does_not_confirm_is_damage() -> None:
+    with SerialPeer() as peer, peer.sensor() as sensor:
+        peer.once = RECORD_ERROR
+        samples = sensor.collect(0.1)
+        assert peer.requests[len(SERIAL_START_UP) :] == [JAM, STATUS, START]
+        health = sensor.health()
+    assert (samples.counts == [100, -200, 300, -400, 500, -600]).all()
+    assert health.malformed == 1
+    assert int((samples.seq[1:] - samples.seq[:-1] - 1).sum()) == health.lost > 1
 
 
 def test_serial_saturation_is_a_fault() -> None:

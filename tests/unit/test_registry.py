@@ -63,7 +63,7 @@ def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: st
         ("ati-can:can0", "which device"),
         ("ati-can://can0#1", "which device"),
         ("ati-can://[can0", "write it like"),
-        ("ati-can://can0?bitrat=1", "unknown option bitrat; known: base, bitrate, interface, slot"),
+        ("ati-can://can0?bitrat=1", "unknown option bitrat; known: base, bitrate, interface, recover, slot"),
         ("ati-can://can0?bitrate=fast", "whole number"),
         ("ati-can://can0?base=0x80", "allowed are 0 to 127"),
         ("ati-can://can0?base=", "empty"),
@@ -73,10 +73,10 @@ def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: st
         ("robotous-can://can0?rate=123", "rate is 123 Hz; the sensor knows 10, 20"),
         ("robotous-serial:///dev/x?rate=1000", "at this baud rate 500 Hz is the most"),
         ("robotous-serial:///dev/x?baud=60000", "baud is 60000; the sensor knows"),
-        ("robotiq-ft300:///dev/x?rate=1", "unknown option rate; known: none"),
+        ("robotiq-ft300:///dev/x?rate=1", "unknown option rate; known: recover"),
         ("bota:///dev/x?sinc=513", "allowed are 0 to 512"),
         ("ati-netft://192.168.1.1?onrobot=2", "allowed are 0 to 1"),
-        ("ati-serial:///dev/x?parity=E", "unknown option parity; known: calibration"),
+        ("ati-serial:///dev/x?parity=E", "unknown option parity; known: calibration, recover"),
     ],
 )
 def test_mistakes_are_named(url: str, message: str) -> None:
@@ -100,12 +100,14 @@ class Sensor(StreamingSensor):
         return sensor
 
     def _connect(self):
+        self.seq = 0
         return DeviceInfo("Acme", "1", "1.0")
 
     def _read_block(self):
         time.sleep(0.005)
-        return FtSamples(np.array([time.monotonic_ns()]), np.array([np.nan]), np.array([1]), np.zeros((1, 0), np.int32),
-                         self.gain * np.ones((1, 6)), np.zeros(1, np.uint32))
+        self.seq += 1
+        return FtSamples(np.array([time.monotonic_ns()]), np.array([np.nan]), np.array([self.seq]),
+                         np.zeros((1, 0), np.int32), self.gain * np.ones((1, 6)), np.zeros(1, np.uint32))
 
     def _disconnect(self):
         pass
@@ -141,7 +143,7 @@ def test_another_package_brings_a_sensor_and_an_arm(install: Install) -> None:
         sensor.open()
         assert sensor.identify().model == "Acme"
         assert (sensor.collect(0.05).wrench == -3).all()
-    with pytest.raises(BadUrl, match="unknown option gian; known: gain"):
+    with pytest.raises(BadUrl, match="unknown option gian; known: gain, recover"):
         sensor_from_url("acme-usb:///dev/acme0?gian=3")
     with pytest.raises(BadUrl, match=r"known: ati-can, .*, acme-usb"):
         sensor_from_url("acme:///dev/acme0")

@@ -3,14 +3,16 @@
 import queue
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from drivers._stream import NOTHING, StreamingSensor
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
-from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.interfaces import Array, DeviceInfo, FtSamples
 
 
 class FakeSensor(StreamingSensor):
@@ -18,7 +20,7 @@ class FakeSensor(StreamingSensor):
 
     def __init__(self, *, sign: int = 1, first: int = 1, stale_after_s: float = 0.1, limit: int = 1_000_000) -> None:
         super().__init__("fake", sign=sign, stale_after_s=stale_after_s, max_collect_samples=limit)
-        self.feed: queue.Queue[int | Exception] = queue.Queue()
+        self.feed: queue.Queue[int | FtSamples | Exception] = queue.Queue()
         self.connect_error: Exception | None = None
         self.disconnect_error: Exception | None = None
         self.connects = self.disconnects = 0
@@ -40,6 +42,8 @@ class FakeSensor(StreamingSensor):
             return NOTHING
         if isinstance(item, Exception):
             raise item
+        if isinstance(item, FtSamples):
+            return item
         seq = self.seq + np.arange(item)
         self.seq += item
         return FtSamples(
@@ -47,9 +51,15 @@ class FakeSensor(StreamingSensor):
             t_device_s=np.full(item, np.nan),
             seq=seq,
             counts=np.ones((item, 6), np.int32),
-            wrench=np.tile(np.arange(1.0, 7.0), (item, 1)),
+            wrench=self.wrench(seq),
             status=np.zeros(item, np.uint32),
         )
+
+    def wrench(self, seq: NDArray[np.int64]) -> Array:
+        return np.arange(1.0, 7.0) + 1e-3 * seq[:, np.newaxis]
+
+    def await_received(self, samples: int) -> None:
+        wait_for(lambda: self.health().received == samples)
 
     def _disconnect(self) -> None:
         self.disconnects += 1
@@ -254,3 +264,202 @@ def test_health_counts_and_tells_the_rate(sensor: FakeSensor) -> None:
 def test_a_duration_without_length_is_refused(sensor: FakeSensor, duration_s: float) -> None:
     with pytest.raises(ValueError, match="positive"):
         sensor.collect(duration_s)
+
+
+def block(seq: list[int], *, wrench: float | None = None, t_device_s: float = np.nan) -> FtSamples:
+    """Samples as a driver hands them over; a wrench that is not given is another one in each row."""
+    n = len(seq)
+    rows = np.arange(6.0) + np.array(seq)[:, np.newaxis] if wrench is None else np.full((n, 6), wrench)
+    return FtSamples(
+        t_host_ns=np.full(n, time.monotonic_ns()),
+        t_device_s=np.full(n, t_device_s),
+        seq=np.array(seq),
+        counts=np.zeros((n, 0), np.int32),
+        wrench=rows,
+        status=np.zeros(n, np.uint32),
+    )
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 5.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+def failure_of(sensor: FakeSensor) -> type[Exception] | None:
+    try:
+        sensor.check()
+    except Exception as exc:
+        return type(exc)
+    return None
+
+
+def test_what_came_twice_or_too_late_is_dropped_and_counted(sensor: FakeSensor) -> None:
+    def feed(*blocks: list[int]) -> None:
+        for seq in blocks:
+            sensor.feed.put(block(seq))
+
+    threading.Timer(0.02, feed, [[5, 5, 6], [6, 9, 7, 10], [8]]).start()
+    threading.Timer(0.08, feed, [[11]]).start()
+    samples = sensor.collect(0.06)
+    health = sensor.health()
+    assert samples.seq.tolist() == [5, 6, 9, 10]
+    assert (health.duplicated, health.out_of_order) == (2, 2)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_wrench_that_is_no_number_is_never_delivered(sensor: FakeSensor, bad: float) -> None:
+    sensor.feed.put(block([5, 6], wrench=bad))
+    with pytest.raises(ProtocolError, match="not finite"):
+        sensor.collect(1.0)
+    assert sensor.health().received == 1
+
+
+def test_a_frozen_sensor_is_a_fault() -> None:
+    with FakeSensor(stale_after_s=1.0) as sensor:
+        start = time.monotonic()
+        for seq in range(10, 200, 2):
+            sensor.feed.put(block([seq, seq + 1], wrench=3.0))
+            time.sleep(0.004)
+            if failure_of(sensor):
+                break
+        with pytest.raises(DeviceFault, match=r"frozen, \d+ identical samples in 0\.\d+ s"):
+            sensor.check()
+        assert time.monotonic() - start >= 0.2
+
+
+def test_few_identical_samples_or_a_short_while_are_not_frozen() -> None:
+    with FakeSensor(stale_after_s=1.0) as sensor:
+        sensor.feed.put(block(list(range(10, 1000)), wrench=3.0))  # many, in no time
+        wait_for(lambda: sensor.health().received > 900)
+        sensor.feed.put(block([1000]))
+        for seq in range(1001, 1031):  # a long while, few
+            sensor.feed.put(block([seq], wrench=3.0))
+            time.sleep(0.01)
+        wait_for(lambda: sensor.health().received == 1 + 990 + 1 + 30)
+        sensor.check()
+
+
+@pytest.mark.parametrize(
+    ("clock", "says"),
+    [
+        ([1.0, 1.1, 1.09], "back by 0.010 s"),
+        ([1.0, 1.1, 0.0], "back by 1.100 s to 0.000 s"),
+        ([1.0, 1.1, 9.1], r"ahead by (7\.9\d+|8\.000) s to 9.100 s"),
+    ],
+)
+def test_a_jump_of_the_devices_clock_is_named(sensor: FakeSensor, clock: list[float], says: str) -> None:
+    for number, t_device_s in enumerate(clock):
+        sensor.feed.put(block([5 + number], t_device_s=t_device_s))
+    with pytest.raises(StreamBroken, match=f"clock jumped {says}"):
+        sensor.collect(1.0)
+
+
+def test_a_late_block_or_a_slow_reader_is_no_jump() -> None:
+    with FakeSensor(stale_after_s=1.0) as sensor:
+        sensor.feed.put(block([5], t_device_s=10.0))
+        wait_for(lambda: sensor.health().received == 2)
+        time.sleep(0.6)  # what came meanwhile waits in the port's buffer and is then read in pieces
+        for seq in range(6, 66):
+            sensor.feed.put(block([seq], t_device_s=10.0 + 0.01 * (seq - 5)))
+        wait_for(lambda: sensor.health().received == 62)
+        sensor.check()
+
+
+def test_a_rate_off_by_more_than_a_tenth_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    for nominal_Hz, said in ((1000.0, 1), (200.0, 0)):
+        caplog.clear()
+        with FakeSensor(stale_after_s=1.0) as sensor:
+            sensor._nominal_Hz = nominal_Hz
+            t_ns = time.monotonic_ns()
+            for number in range(1, 1001):  # five seconds at 200 Hz
+                made = block([5 + number])
+                sensor.feed.put(replace(made, t_host_ns=np.array([t_ns + number * 5_000_000])))
+            sensor.await_received(1001)
+            health = sensor.health()
+        assert caplog.text.count(f"instead of {nominal_Hz:g} Hz; samples are lost") == said
+        assert [what for _, what in health.events] == ["rate 200.0 Hz instead of 1000 Hz"] * said
+        assert health.nominal_rate_Hz == nominal_Hz
+
+
+def test_silences_are_counted(sensor: FakeSensor) -> None:
+    for received in (2, 3):
+        time.sleep(0.12)
+        sensor.feed.put(1)
+        sensor.await_received(received)
+    assert sensor.health().stale == 2
+
+
+class TestRecover:
+    @pytest.fixture
+    def sensor(self) -> Iterator[FakeSensor]:
+        fake = FakeSensor()
+        fake.recover = True
+        fake.open()
+        yield fake
+        fake.close()
+
+    def test_a_broken_stream_comes_back_and_says_so(self, sensor: FakeSensor) -> None:
+        sensor.connect_error = ConnectError("not plugged in")
+        sensor.feed.put(StreamBroken("gone"))
+        wait_for(lambda: failure_of(sensor) is StreamBroken)
+        with pytest.raises(StreamBroken, match=r"interrupted, connecting again \(gone\)"):
+            sensor.latest(timeout_s=0.05)
+        wait_for(lambda: sensor.connects >= 3)
+        sensor.connect_error = None
+        wait_for(lambda: failure_of(sensor) is None)
+        health = sensor.health()
+        assert health.reconnects == 1
+        assert [what for _, what in health.events] == ["gone", "connected again"]
+        assert health.events[0][0] < health.events[1][0]
+        assert len(sensor.latest(timeout_s=0.5)) == 1
+
+    def test_a_collect_across_a_quick_reconnection_is_an_error(self, sensor: FakeSensor) -> None:
+        feeder = feeding(sensor, 60, 1)
+        threading.Timer(0.05, sensor.feed.put, [StreamBroken("gone")]).start()
+        with pytest.raises(StreamBroken, match="interrupted"):
+            sensor.collect(0.25)
+        feeder.join()
+        assert sensor.health().reconnects == 1
+
+    def test_silence_is_mended_too(self, sensor: FakeSensor) -> None:
+        wait_for(lambda: sensor.health().reconnects == 1)
+
+    def test_numbers_go_on(self, sensor: FakeSensor) -> None:
+        sensor._nominal_Hz = 1000.0
+        sensor.feed.put(block([40]))
+        wait_for(lambda: sensor.health().received == 2)
+        sensor.seq = 0  # the device counts anew
+        sensor.feed.put(StreamBroken("gone"))
+        wait_for(lambda: sensor.health().reconnects == 1 and sensor.health().received > 2)
+        newest = int(sensor.latest(timeout_s=0.1).seq[0])
+        assert newest - 40 - 1 == sensor.health().lost > 0
+
+    def test_another_device_is_not_the_same_stream(self, sensor: FakeSensor, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(sensor, "_connect", lambda: DeviceInfo("fake", "F2", "1.0"))
+        sensor.feed.put(StreamBroken("gone"))
+        wait_for(lambda: failure_of(sensor) is ConnectError)
+
+    def test_it_gives_up(self, sensor: FakeSensor, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("drivers._stream._RECOVER_S", 0.3)
+        sensor.connect_error = ConnectError("not plugged in")
+        sensor.feed.put(StreamBroken("gone"))
+        reader = sensor._thread
+        assert reader
+        reader.join(2.0)
+        with pytest.raises(StreamBroken, match=r"gone; not back within 0.3 s \(not plugged in\)"):
+            sensor.check()
+
+    @pytest.mark.parametrize("error", [DeviceFault("hot"), ProtocolError("odd")])
+    def test_a_fault_is_final_all_the_same(self, sensor: FakeSensor, error: Exception) -> None:
+        sensor.feed.put(error)
+        wait_for(lambda: failure_of(sensor) is type(error))
+        assert sensor.connects == 1
+
+    def test_close_ends_the_attempts(self, sensor: FakeSensor) -> None:
+        sensor.connect_error = ConnectError("not plugged in")
+        sensor.feed.put(StreamBroken("gone"))
+        wait_for(lambda: sensor.connects > 1)
+        sensor.close()
+        assert not any("fake" in thread.name for thread in threading.enumerate())

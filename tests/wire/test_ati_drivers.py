@@ -253,7 +253,7 @@ def test_can_survives_foreign_late_swapped_and_doubled_frames(start: Start) -> N
         health = sensor.health()
     assert np.abs(samples.wrench - WRENCH).max() < 0.3
     assert len(samples) > 50
-    assert health.lost <= 3  # an answer is late on a busy machine, none is lost
+    assert health.lost <= 3 + health.malformed  # late on a busy machine, or contradicted by another answer
 
 
 def test_can_lost_frames_are_gaps_not_wrong_samples(start: Start) -> None:
@@ -309,7 +309,7 @@ def test_serial_bad_checksums_are_dropped_and_counted(start: Start) -> None:
 
 
 def test_serial_slips_are_noticed_and_the_stream_restarted(start: Start) -> None:
-    with start("serial", faults={"byte_slip": 0.0005}).sensor() as sensor:
+    with start("serial", faults={"byte_slip": 0.001}).sensor() as sensor:
         samples = sensor.collect(1.0)
         health = sensor.health()
     assert (np.abs(samples.wrench - WRENCH).max(axis=1) > 0.3).sum() <= 1  # one in 128 slips passes a checksum

@@ -1,0 +1,206 @@
+"""Random bytes and damaged golden frames into every codec: only documented exceptions, no hang, no growing memory.
+
+    python tests/benchmarks/fuzz.py [--inputs 1000000]
+
+Half of the inputs of each codec are random bytes, half are frames from the vendors' documents with some bytes changed,
+added or missing. Prints for each codec how many inputs were refused, the longest time one took and how much memory
+was kept, and pass or FAIL.
+"""
+
+import argparse
+import random
+import sys
+import time
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from drivers._crc import crc16_modbus, crc16_x25
+from drivers._frames import Deframer
+from drivers.ati import codec as ati
+from drivers.ati import modbus
+from drivers.bota import codec as bota
+from drivers.errors import ProtocolError
+from drivers.netft import serial_in
+from drivers.robotiq import codec as robotiq
+from drivers.robotous import codec as robotous
+
+LONGEST = 400
+SLOWEST_S = 0.5
+"""Of one input: thousands of times what it takes, and still less than a pause of a busy computer."""
+KEPT_BYTES = 100_000
+
+
+@dataclass(frozen=True)
+class Target:
+    """One decoder, and a frame from its document that is intact."""
+
+    name: str
+    decode: Callable[[bytes], object]
+    golden: bytes
+
+
+def halves(*sizes: int) -> Callable[[bytes], list[bytes]]:
+    """Cut bytes into pieces of these sizes; the last one gets the rest."""
+
+    def cut(data: bytes) -> list[bytes]:
+        pieces, at = [], 0
+        for size in sizes[:-1]:
+            pieces.append(data[at : at + size])
+            at += size
+        return [*pieces, data[at:]]
+
+    return cut
+
+
+def reply_to(request: bytes) -> Callable[[bytes], object]:
+    return lambda data: modbus.check_reply(request, data)
+
+
+def robotiq_reply_to(request: bytes) -> Callable[[bytes], object]:
+    return lambda data: robotiq.check_reply(request, data)
+
+
+def targets() -> list[Target]:
+    ati_row = halves(8, 8, 8)
+    ati_pair = halves(8, 6)
+    words = halves(2, 2, 2, 2)
+    robotous_stream = Deframer(bytes([robotous.START_OF_FRAME]), robotous.FRAME_SIZE, robotous.is_frame)
+    robotiq_stream = Deframer(robotiq.HEADER, robotiq.FRAME_SIZE, robotiq.is_frame)
+    bota_stream = Deframer(bota.HEADER, bota.FRAME_SIZE, bota.is_frame)
+    sample = bytes([robotous.Command.START, *range(15)])
+    record = bytes.fromhex("0064012C01F4FF38FE70FDA850")
+    registers = modbus.read_registers(modbus.STATUS, 1)
+    few = robotiq.read_registers(robotiq.SERIAL, 4)
+    calibration = bytes(2 * 117) + bytes.fromhex("000F4240000F4240") + bytes(338 - 2 * 117 - 8)
+    bota_frame = bota.HEADER + with_crc(crc16_x25, bytes(34))
+    frame = robotous.encode_frame(sample)
+
+    def keep(data: bytes) -> object:
+        return modbus.keep_records(modbus.decode_records(data).intact)
+
+    return [
+        Target("ati.codec.decode_gauges", lambda d: ati.decode_gauges(*ati_pair(d)), bytes(14)),
+        Target("ati.codec.decode_matrix_row", lambda d: ati.decode_matrix_row(*ati_row(d)), bytes(24)),
+        Target("ati.codec.decode_serial", ati.decode_serial, b"FT12345\0"),
+        Target("ati.codec.decode_slot", ati.decode_slot, b"\0"),
+        Target("ati.codec.decode_counts_per_unit", ati.decode_counts_per_unit, bytes.fromhex("000F4240000F4240")),
+        Target("ati.codec.decode_unit_codes", ati.decode_unit_codes, b"\x02\x03"),
+        Target("ati.codec.decode_firmware", ati.decode_firmware, b"\x03\x08\x00\x01"),
+        Target("ati.modbus.check_reply", reply_to(registers), modbus.frame(modbus.READ_HOLDING, b"\x02\0\0")),
+        Target("ati.modbus.decode_calibration_block", modbus.decode_calibration_block, calibration),
+        Target("ati.modbus.decode_records", keep, record * 8),
+        Target("robotous.codec.decode_sample", robotous.decode_sample, sample),
+        Target("robotous.codec.decode_text", robotous.decode_text, b"\x01RFT60-HA01".ljust(16, b"\0")),
+        Target("robotous.codec.decode_rate", robotous.decode_rate, bytes([0x10, 5]).ljust(16, b"\0")),
+        Target("robotous.codec.check_set", robotous.check_set, bytes([0x0F, 1]).ljust(16, b"\0")),
+        Target("robotous frames", robotous_stream.feed, frame),
+        Target(
+            "robotiq.codec.check_reply",
+            robotiq_reply_to(few),
+            with_crc(crc16_modbus, bytes.fromhex("090308465453 0004D2 0000")),
+        ),
+        Target("robotiq.codec.decode_frame", robotiq.decode_frame, with_crc(crc16_modbus, robotiq.HEADER + bytes(12))),
+        Target(
+            "robotiq.codec.decode_serial", lambda d: robotiq.decode_serial([*map(big, words(d))]), b"FTS\0\x04\xd2\0\0"
+        ),
+        Target("robotiq frames", robotiq_stream.feed, with_crc(crc16_modbus, robotiq.HEADER + bytes(12))),
+        Target("bota.codec.decode_frame", bota.decode_frame, bota_frame),
+        Target("bota frames", bota_stream.feed, bota_frame),
+        Target("netft.serial_in", serial_in, b"<netft><cfgcalsn>FT12345</cfgcalsn></netft>"),
+    ]
+
+
+def with_crc(crc: Callable[[bytes], int], data: bytes) -> bytes:
+    return data + crc(data).to_bytes(2, "little")
+
+
+def big(data: bytes) -> int:
+    return int.from_bytes(data, "big")
+
+
+def inputs_for(golden: bytes, count: int, rng: random.Random) -> list[bytes]:
+    """Make inputs: random ones, and the golden frame changed in a few places."""
+    made = []
+    for number in range(count):
+        if number % 2:
+            made.append(rng.randbytes(rng.choice([len(golden), rng.randrange(LONGEST)])))
+            continue
+        data = bytearray(golden)
+        for _ in range(rng.randrange(4)):
+            at = rng.randrange(len(data) + 1)
+            match rng.randrange(3):
+                case 0:
+                    data[at : at + 1] = rng.randbytes(1)
+                case 1:
+                    data[at:at] = rng.randbytes(rng.randrange(1, 4))
+                case _:
+                    del data[at : at + rng.randrange(1, 4)]
+        made.append(bytes(data))
+    return made
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of the inputs of one codec."""
+
+    inputs: int
+    refused: int
+    slowest_s: float
+    kept_bytes: int
+    undocumented: str
+
+    @property
+    def passed(self) -> bool:
+        """Whether the codec kept its word."""
+        return not self.undocumented and self.slowest_s < SLOWEST_S and self.kept_bytes < KEPT_BYTES
+
+
+def fuzz(target: Target, count: int, *, seed: int = 1, batch: int = 10_000) -> Outcome:
+    """Feed one codec; stops at the first exception that its document does not name."""
+    rng = random.Random(seed)
+    refused, slowest_s, undocumented, done = 0, 0.0, "", 0
+    tracemalloc.start()
+    before = None
+    try:
+        while done < count and not undocumented:
+            for data in inputs_for(target.golden, min(batch, count - done), rng):
+                begin = time.perf_counter()
+                try:
+                    target.decode(data)
+                except ProtocolError:
+                    refused += 1
+                except Exception as exc:
+                    undocumented = f"{exc!r} for {data.hex()}"
+                    break
+                slowest_s = max(slowest_s, time.perf_counter() - begin)
+                done += 1
+            data = b""
+            if before is None:
+                before = tracemalloc.get_traced_memory()[0]  # what a first use sets up is no growth
+        kept = tracemalloc.get_traced_memory()[0] - (before or 0)
+    finally:
+        tracemalloc.stop()
+    return Outcome(done, refused, slowest_s, kept, undocumented)
+
+
+def main() -> int:
+    """Fuzz all codecs; returns 1 when one fails."""
+    parser = argparse.ArgumentParser(description="Fuzz every codec of the drivers.")
+    parser.add_argument("--inputs", type=int, default=1_000_000, help="for each codec")
+    count = parser.parse_args().inputs
+    failed = False
+    for target in targets():
+        outcome = fuzz(target, count)
+        failed |= not outcome.passed
+        sys.stdout.write(
+            f"{target.name:38} {outcome.inputs:8} inputs, {outcome.refused:8} refused, slowest "
+            f"{outcome.slowest_s * 1e3:7.2f} ms, kept {outcome.kept_bytes:7} bytes   "
+            f"{'pass' if outcome.passed else 'FAIL'} {outcome.undocumented}\n"
+        )
+        sys.stdout.flush()
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,235 @@
+"""What the streams carry, against emulated sensors in processes of their own.
+
+    python tests/benchmarks/streams.py [--seconds 60] [--samples 0]
+
+Prints one line per figure: the figure, the target, pass or FAIL. The ATI serial stream of 7 kHz runs beside a robot
+arm that is read at 500 Hz; our process is measured, not the emulators. The CAN sensor is compared with a bare client
+that writes and reads the adapter's lines itself, at the same 1 kHz the driver allows itself, turn by turn.
+With `--samples 100000` every fault of tests/wire/test_sensor_faults.py befalls every sensor until so many samples have
+come: hours, because some sensors send 100 in a second.
+"""
+
+import argparse
+import json
+import statistics
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+import serial
+
+from drivers.ati import modbus
+from drivers.interfaces import FtSamples
+from drivers.ur.arm import UrArm
+from tests.wire.test_sensor_faults import (
+    HEALTHY,
+    KINDS,
+    SCRIPT,
+    Emulator,
+    Laboratory,
+    Watched,
+    applies,
+    chances,
+    most_wrong,
+    numbers_in,
+    suffer,
+)
+
+PIECE_S = 2.0
+POLL_S = 1e-3
+CPU_TARGET, CAN_TARGET, DECODE_TARGET = 0.40, 0.95, 20.0
+
+
+def report(name: str, figure: str, target: str, passed: bool) -> bool:
+    sys.stdout.write(f"{name:52} {figure:>34}   target {target:16} {'pass' if passed else 'FAIL'}\n")
+    sys.stdout.flush()
+    return passed
+
+
+def serial_beside_an_arm(laboratory: Laboratory, folder: Path, seconds: float) -> bool:
+    """Collect the 7 kHz stream while an arm is read."""
+    emulator = Emulator(laboratory, "ati-serial", folder / "serial")
+    station = subprocess.Popen(
+        [sys.executable, "-m", "mocks", "station", "--seed", "7"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    arm, lost, received, looks = None, 0, 0, 0
+    try:
+        assert station.stdout
+        arm = UrArm(json.loads(station.stdout.readline())["arm"]["host"])
+        arm.open()
+        with emulator.sensor() as sensor:
+            blocks: deque[FtSamples] = deque()
+            cpu, begin = time.process_time(), time.monotonic()
+            with sensor._news:
+                sensor._taps.append(blocks)
+            while time.monotonic() - begin < seconds:
+                arm.state()
+                looks += 1
+                sensor.check()
+                time.sleep(0.01)
+            cpu_s, wall_s = time.process_time() - cpu, time.monotonic() - begin
+            samples = FtSamples.concatenate(list(blocks))
+            health = sensor.health()
+    finally:
+        if arm is not None:
+            arm.close()
+        station.communicate(timeout=10)
+        emulator.unplug()
+    number, right = numbers_in(samples.wrench)
+    received = len(samples)
+    lost = int((np.diff(number) % 160_000 - 1).sum())
+    rate_Hz = received / wall_s
+    passed = report(
+        f"7 kHz serial for {wall_s:.0f} s beside RTDE, lost or wrong",
+        f"{lost} lost, {int((~right).sum())} wrong of {received}",
+        "0",
+        lost == 0 and bool(right.all()) and health.lost == 0,
+    )
+    passed &= report("  rate", f"{rate_Hz:.1f} Hz", "7000 Hz +- 1 %", abs(rate_Hz / 7000 - 1) < 0.01)
+    share = cpu_s / wall_s
+    return passed & report(
+        f"  our process ({looks} looks at the arm)", f"{share:.1%} of a core", f"< {CPU_TARGET:.0%}", share < CPU_TARGET
+    )
+
+
+def bare_can_rate(path: str, seconds: float) -> float:
+    """Poll with as little as possible: one line out, two lines in, at most 1000 times a second."""
+    done, next_s = 0, 0.0
+    with serial.Serial(path, timeout=0.1) as port:
+        port.write(b"C\rS5\rO\r")
+        time.sleep(0.1)
+        port.reset_input_buffer()
+        begin = time.monotonic()
+        while time.monotonic() - begin < seconds:
+            time.sleep(max(0.0, next_s - time.monotonic()))
+            next_s = max(next_s + POLL_S, time.monotonic())
+            port.write(b"t2000\r")
+            port.read_until(b"\r")
+            while not (line := port.read_until(b"\r")).startswith(b"t2016") and line:
+                pass
+            done += 1
+        rate_Hz = done / (time.monotonic() - begin)
+        port.write(b"C\r")
+    return rate_Hz
+
+
+def can_against_ceiling(laboratory: Laboratory, folder: Path, latency_s: float) -> bool:
+    """Compare the driver with the bare client, turn by turn."""
+    emulator = Emulator(laboratory, "ati-can", folder / "can")
+    emulator.faults(delay_s=latency_s)
+    ours, bare = [], []
+    try:
+        for _ in range(5):
+            bare.append(bare_can_rate(str((folder / "can").resolve()), PIECE_S))
+            with emulator.sensor() as sensor:
+                ours.append(len(sensor.collect(PIECE_S)) / PIECE_S)
+    finally:
+        emulator.unplug()
+    share = statistics.median(ours) / statistics.median(bare)
+    return report(
+        f"CAN polls, answers after {latency_s * 1e3:g} ms, at most 1 kHz",
+        f"{statistics.median(ours):.0f} of {statistics.median(bare):.0f} Hz = {share:.1%}",
+        f">= {CAN_TARGET:.0%}",
+        share >= CAN_TARGET,
+    )
+
+
+def struct_loop(data: bytes) -> modbus.Records:
+    """Decode the same to the same, record by record."""
+    gauges, intact, error = [], [], []
+    for at in range(0, len(data), 13):
+        g0, g2, g4, g1, g3, g5, last = struct.unpack(">6hB", data[at : at + 13])
+        gauges.append((g0, g1, g2, g3, g4, g5))
+        intact.append(sum(data[at : at + 12]) & 0x7F == last & 0x7F)
+        error.append(last & 0x80 != 0)
+    return modbus.Records(np.array(gauges, np.int32), np.array(intact), np.array(error))
+
+
+def decode_speed() -> bool:
+    """Compare decoding in batches with a loop over single records."""
+    record = bytes.fromhex("0064012C01F4FF38FE70FDA850")
+    passed = True
+    for batch in (32, 512, 8192):
+        data = record * batch
+        one, other = struct_loop(data), modbus.decode_records(data)
+        assert (one.gauges == other.gauges).all()
+        assert (one.intact == other.intact).all()
+        best = {}
+        for name, decode in (("loop", struct_loop), ("batch", modbus.decode_records)):
+            times = []
+            for _ in range(max(10, 20_000 // batch)):
+                begin = time.perf_counter()
+                decode(data)
+                times.append(time.perf_counter() - begin)
+            best[name] = min(times) / batch
+        ratio = best["loop"] / best["batch"]
+        target = f">= {DECODE_TARGET:g} x" if batch == 8192 else "(told only)"
+        passed &= report(
+            f"decoding {batch} records at once, against a loop",
+            f"{1e-6 / best['batch']:.2f} M/s, {ratio:.1f} x",
+            target,
+            ratio >= DECODE_TARGET or batch < 8192,
+        )
+    return passed
+
+
+def faults(laboratory: Laboratory, folder: Path, samples: int) -> bool:
+    """Let every fault befall every sensor and compare each sample with the truth."""
+    passed = True
+    for scheme in KINDS:
+        emulator = Emulator(laboratory, scheme, folder / scheme)
+        for fault in SCRIPT:
+            if not applies(scheme, fault):
+                continue
+            received = wrong = told = 0
+            while received < samples:
+                with emulator.sensor() as sensor:
+                    watched = Watched(sensor)
+                    emulator.faults(**chances(scheme, fault))
+                    told += len(suffer(sensor, 10.0))
+                    emulator.faults(**HEALTHY)
+                    time.sleep(0.05)  # what was delayed belongs to this stream
+                received += len(watched.samples())
+                wrong += watched.wrong()
+            allowed = most_wrong(scheme, fault, received)
+            passed &= report(
+                f"{scheme}, {fault}",
+                f"{wrong} wrong of {received}, {told} errors",
+                f"<= {allowed:.0f} wrong",
+                wrong <= allowed,
+            )
+        emulator.unplug()
+    return passed
+
+
+def main() -> int:
+    """Run the benchmarks; returns 1 when a target is missed."""
+    parser = argparse.ArgumentParser(description="What the streams carry.")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of the 7 kHz stream")
+    parser.add_argument("--samples", type=int, default=0, help="for each sensor and fault; none without")
+    options = parser.parse_args()
+    laboratory = Laboratory()
+    try:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            passed = decode_speed()
+            passed &= serial_beside_an_arm(laboratory, folder, options.seconds)
+            for latency_s in (0.0, 0.001):
+                passed &= can_against_ceiling(laboratory, folder, latency_s)
+            if options.samples:
+                passed &= faults(laboratory, folder, options.samples)
+    finally:
+        laboratory.close()
+    return 0 if passed else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,23 @@
+"""A small share of tests/benchmarks/fuzz.py: every codec refuses what it does not know, and nothing else happens."""
+
+import pytest
+
+from tests.benchmarks.fuzz import Target, fuzz, targets
+
+
+@pytest.mark.parametrize("target", targets(), ids=lambda target: target.name)
+def test_only_documented_exceptions(target: Target) -> None:
+    outcome = fuzz(target, 1000, seed=2, batch=200)
+    assert outcome.passed, outcome
+    assert outcome.refused < outcome.inputs  # some golden frames stay as they are
+
+
+def test_an_undocumented_exception_is_found() -> None:
+    outcome = fuzz(Target("careless", lambda data: data[12], bytes(13)), 1000)
+    assert "IndexError" in outcome.undocumented
+    assert not outcome.passed
+
+
+def test_growing_memory_is_found() -> None:
+    kept: list[bytes] = []
+    assert not fuzz(Target("hoarder", lambda data: kept.append(data * 10), bytes(13)), 1000, batch=100).passed

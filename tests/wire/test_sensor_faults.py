@@ -1,0 +1,392 @@
+"""What goes wrong on a wire, tried on every sensor: each fault has its outcome in time, and no value is ever wrong.
+
+The emulated sensors measure a number that counts their samples, coded into all six axes so that parts of two samples
+never look like one. Every sample the reader thread hands out is compared with it, also those a failed `collect` drops.
+"""
+
+import json
+import math
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers._stream import StreamingSensor
+from drivers.errors import DeviceTimeout, DriverError, StreamBroken
+from drivers.interfaces import Array, FtSamples
+from drivers.registry import sensor_from_url
+
+STEPS = 400
+UNIT = np.array([0.1] * 3 + [0.01] * 3)
+"""N and N·m per step: more than any sensor's resolution, less than its range when there are 400."""
+
+PROGRAM = """
+import json, sys, threading
+import numpy as np
+from mocks.ati_can import AtiCanNode
+from mocks.ati_serial import AtiSerialBox
+from mocks.bota import BotaBox
+from mocks.faults import Faults
+from mocks.netft import NetFtBox
+from mocks.robotiq import RobotiqBox
+from mocks.robotous import RobotousCanNode, RobotousSerialBox
+
+class Counter:
+    def __init__(self):
+        self.made, self.lock = 0, threading.Lock()
+    def __call__(self, n):
+        with self.lock:
+            number = np.arange(self.made, self.made + n)
+            self.made += n
+        steps = np.column_stack([number, number // 400, number * 137 + 11, number * 173 + 29, number * 211 + 71,
+                                 number * 263 + 113]) % 400
+        return (steps - 200) * ([0.1] * 3 + [0.01] * 3)
+
+kinds = {"ati-can": AtiCanNode, "ati-serial": AtiSerialBox, "robotous-can": RobotousCanNode, "bota": BotaBox,
+         "robotous-serial": RobotousSerialBox, "robotiq-ft300": RobotiqBox, "ati-netft": NetFtBox}
+devices, counters = [], []
+for line in sys.stdin:
+    word, argument, options = json.loads(line)
+    answer = None
+    if word == "start":
+        options = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
+        counters.append(Counter())
+        devices.append(kinds[argument](counters[-1], seed=len(devices), faults=Faults(), **options))
+        answer = [len(devices) - 1, devices[-1].start()]
+    elif word == "faults":
+        for key, value in options.items():
+            setattr(devices[argument].faults, key, value)
+    elif word == "made":
+        answer = counters[argument].made
+    else:
+        getattr(devices[argument], word)()
+    print(json.dumps(answer), flush=True)
+"""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a test must know about one sort of sensor."""
+
+    scheme: str
+    query: str
+    options: dict[str, Any] = field(default_factory=dict)
+    numbered: bool = False
+    """Samples carry a number or time, or are asked for one by one: what came twice is noticed."""
+
+
+KINDS = {
+    kind.scheme: kind
+    for kind in (
+        Kind("ati-can", "interface=slcan", numbered=True),
+        Kind("ati-serial", ""),
+        Kind("robotous-can", "interface=slcan"),
+        Kind("robotous-serial", "baud=921600&rate=1000", {"baud_code": 1}),
+        Kind("robotiq-ft300", ""),
+        Kind("bota", "sinc=64", numbered=True),
+        Kind("ati-netft", "", {"rdt_port": 0, "rate_hz": 1000}, numbered=True),
+    )
+}
+
+
+def numbers_in(wrench: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Tell which sample each row (n, 6) is, modulo 160 000, and whether it is one at all."""
+    steps = wrench / UNIT + STEPS // 2
+    whole = np.rint(steps).astype(np.int64) % STEPS
+    number = whole[:, 0] + STEPS * whole[:, 1]
+    expected = np.column_stack([whole[:, 0], whole[:, 1], *(number * a + b for a, b in MIX)]) % STEPS
+    return number, np.abs(steps - expected).max(axis=1) < 0.5
+
+
+MIX = ((137, 11), (173, 29), (211, 71), (263, 113))
+
+
+class Laboratory:
+    """Emulated sensors in one child process."""
+
+    def __init__(self, program: str = PROGRAM) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        self._lock = threading.Lock()
+
+    def tell(self, word: str, argument: str | int, options: dict[str, Any] | None = None) -> Any:
+        assert self.process.stdin
+        assert self.process.stdout
+        with self._lock:
+            self.process.stdin.write(json.dumps([word, argument, options]) + "\n")
+            self.process.stdin.flush()
+            return json.loads(self.process.stdout.readline())
+
+    def close(self) -> None:
+        self.process.communicate(timeout=5)
+
+
+class Emulator:
+    """One emulated sensor, behind a link that survives its being plugged in again."""
+
+    def __init__(self, laboratory: Laboratory, scheme: str, link: Path, options: dict[str, Any] | None = None) -> None:
+        self.kind = KINDS[scheme]
+        self._laboratory = laboratory
+        self._link = link
+        self._options = self.kind.options | (options or {})
+        self.plug_in()
+
+    def plug_in(self) -> None:
+        self._number, where = self._laboratory.tell("start", self.kind.scheme, self._options)
+        ports: list[str] = []
+        if isinstance(where, dict):
+            ports = [f"{key}={where[key]}" for key in ("rdt_port", "http_port")]
+            self._options |= {key: where[key] for key in ("host", "rdt_port", "http_port")}
+            self._address = where["host"]
+        else:
+            self._link.unlink(missing_ok=True)
+            self._link.symlink_to(where)
+            self._address = str(self._link)
+        self._query = "&".join(filter(None, [self.kind.query, *ports]))
+
+    def sensor(self, options: str = "") -> StreamingSensor:
+        query = "&".join(filter(None, [self._query, options]))
+        sensor = sensor_from_url(f"{self.kind.scheme}://{self._address}?{query}".rstrip("?"))
+        assert isinstance(sensor, StreamingSensor)
+        return sensor
+
+    def faults(self, **options: Any) -> None:
+        self._laboratory.tell("faults", self._number, options)
+
+    def reset(self) -> None:
+        self._laboratory.tell("reset", self._number)
+
+    def unplug(self) -> None:
+        self._laboratory.tell("unplug", self._number)
+
+    def made(self) -> int:
+        return int(self._laboratory.tell("made", self._number))
+
+
+@dataclass
+class Watched:
+    """Everything a sensor has handed out since it was opened."""
+
+    sensor: StreamingSensor
+    blocks: deque[FtSamples] = field(default_factory=deque)
+
+    def __post_init__(self) -> None:
+        with self.sensor._news:
+            self.sensor._taps.append(self.blocks)
+
+    def samples(self) -> FtSamples:
+        with self.sensor._news:
+            return FtSamples.concatenate(list(self.blocks)) if self.blocks else self.sensor._newest
+
+    def wrong(self) -> int:
+        """Count the samples that no sensor has measured."""
+        return int((~numbers_in(self.samples().wrench)[1]).sum())
+
+    def steps(self) -> NDArray[np.int64]:
+        """By how much the numbers of right samples advance from one to the next."""
+        number, right = numbers_in(self.samples().wrench)
+        modulus = STEPS * STEPS
+        return (np.diff(number[right]) + modulus // 2) % modulus - modulus // 2
+
+
+@pytest.fixture(scope="module")
+def laboratory() -> Iterator[Laboratory]:
+    laboratory = Laboratory()
+    yield laboratory
+    laboratory.close()
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def emulator(
+    request: pytest.FixtureRequest, laboratory: Laboratory, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Emulator]:
+    """A healthy sensor, left as it was found."""
+    emulator = Emulator(laboratory, request.param, tmp_path_factory.mktemp("dev") / "sensor")
+    yield emulator
+    emulator.unplug()
+
+
+@pytest.fixture
+def own(laboratory: Laboratory, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Callable[..., Emulator]]:
+    """Sensors that a test may break."""
+    running: list[Emulator] = []
+
+    def start(**options: Any) -> Emulator:
+        running.append(Emulator(laboratory, request.getfixturevalue("scheme"), tmp_path / "sensor", options))
+        return running[-1]
+
+    yield start
+    for emulator in running:
+        emulator.unplug()
+
+
+@pytest.fixture(params=KINDS)
+def scheme(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+SCRIPT: dict[str, dict[str, float]] = {
+    "drop": {"drop": 0.05},
+    "delay": {"delay_s": 0.02},
+    "corrupt": {"corrupt": 0.05},
+    "duplicate": {"duplicate": 0.1},
+    "swap": {"swap": 0.1},
+    "foreign": {"foreign": 0.2},
+    "byte_slip": {"byte_slip": 0.1},
+}
+HEALTHY = dict.fromkeys([key for fault in SCRIPT.values() for key in fault], 0.0)
+
+
+def chances(scheme: str, fault: str) -> dict[str, float]:
+    """How often a fault strikes: a slip takes the ATI stream 40 ms to mend, so there it is rare."""
+    return {"byte_slip": 0.001} if (scheme, fault) == ("ati-serial", "byte_slip") else SCRIPT[fault]
+
+
+def applies(scheme: str, fault: str) -> bool:
+    """Bytes on a serial line stay in order and have one sender; CAN and UDP frames are whole or not there."""
+    packets = scheme.endswith("-can") or scheme == "ati-netft"
+    return packets if fault in {"swap", "foreign"} else not packets if fault in {"corrupt", "byte_slip"} else True
+
+
+def most_wrong(scheme: str, fault: str, received: int) -> float:
+    """How many wrong samples a protocol cannot tell from right ones: the 7-bit sum of the ATI stream lets some by."""
+    if (scheme, fault) != ("ati-serial", "corrupt"):
+        return 0
+    expected = SCRIPT["corrupt"]["corrupt"] * received / 128
+    return expected + 5 * math.sqrt(expected) + 1
+
+
+def suffer(sensor: StreamingSensor, seconds: float) -> list[DriverError]:
+    """Use a sensor for a while as a program would; returns what it was told, and checks that it was told in time."""
+    told: list[DriverError] = []
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        begin = time.monotonic()
+        try:
+            sensor.collect(0.2)
+            newest = sensor.latest(timeout_s=0.1)
+            assert time.monotonic_ns() - newest.t_host_ns[0] < 0.7e9  # 0.3 s, and a busy machine
+        except DriverError as exc:
+            told.append(exc)
+            if sensor._failure is not None:
+                break
+            time.sleep(0.02)
+        assert time.monotonic() - begin < 0.2 + 0.1 + 0.5 + 0.5
+    return told
+
+
+@pytest.mark.parametrize("fault", SCRIPT)
+def test_no_fault_of_the_wire_delivers_a_wrong_value(emulator: Emulator, fault: str) -> None:
+    scheme = emulator.kind.scheme
+    if not applies(scheme, fault):
+        pytest.skip(f"{fault} does not happen on the wire of {scheme}")
+    with emulator.sensor() as sensor:
+        watched = Watched(sensor)
+        emulator.faults(**chances(scheme, fault))
+        try:
+            told = suffer(sensor, 0.7)
+            health, samples, steps = sensor.health(), watched.samples(), watched.steps()
+        finally:
+            emulator.faults(**HEALTHY)
+            time.sleep(0.05)  # what was delayed belongs to this stream, not to the next one
+    assert len(samples) >= 20
+    assert watched.wrong() <= most_wrong(scheme, fault, len(samples))
+    assert (np.diff(samples.seq) >= 1).all()
+    if fault == "duplicate" and not emulator.kind.numbered:
+        assert (steps >= 0).all()
+    elif watched.wrong() == 0:
+        assert (steps >= 1).all()  # nothing twice, nothing late
+    assert told == []  # these faults are survived
+    if fault in {"corrupt", "byte_slip"}:
+        assert health.malformed > 0
+    if fault == "duplicate" and scheme in {"bota", "ati-netft"}:
+        assert health.duplicated > 0
+
+
+def test_stall_is_an_error_in_time_and_ends(emulator: Emulator) -> None:
+    with emulator.sensor() as sensor:
+        watched = Watched(sensor)
+        emulator.faults(stall=True)
+        begin = time.monotonic()
+        try:
+            with pytest.raises((DeviceTimeout, StreamBroken)):
+                sensor.collect(5.0)
+            assert time.monotonic() - begin < 1.5
+            with pytest.raises((DeviceTimeout, StreamBroken)):
+                sensor.latest(timeout_s=0.05)
+        finally:
+            emulator.faults(stall=False)
+    assert watched.wrong() == 0
+
+
+def test_reset_in_mid_stream(own: Callable[..., Emulator], scheme: str) -> None:
+    """Silence or a broken stream, at once; a polled sensor is simply asked again."""
+    emulator = own()
+    with emulator.sensor() as sensor:
+        watched = Watched(sensor)
+        emulator.reset()
+        told = suffer(sensor, 0.8)
+        assert watched.wrong() == 0
+        assert all(isinstance(exc, DeviceTimeout | StreamBroken) for exc in told)
+        assert told or sensor.health().lost or scheme == "ati-netft"
+
+
+def test_already_streaming_when_opened(own: Callable[..., Emulator], scheme: str) -> None:
+    if scheme == "ati-can":
+        pytest.skip("it is polled")
+    emulator = own(streaming_at_start=("127.0.0.1", 9) if scheme == "ati-netft" else True)
+    with emulator.sensor() as sensor:
+        watched = Watched(sensor)
+        sensor.collect(0.2)
+    assert watched.wrong() == 0
+    assert (watched.steps() >= 1).all()
+
+
+def test_unplugged_is_broken_plugged_in_again_it_opens(own: Callable[..., Emulator], scheme: str) -> None:
+    emulator = own()
+    sensor = emulator.sensor()
+    with sensor:
+        begin = time.monotonic()
+        emulator.unplug()
+        with pytest.raises(StreamBroken, match="again"):
+            sensor.collect(5.0)
+        assert time.monotonic() - begin < 1.5, scheme
+    emulator.plug_in()
+    with sensor:
+        watched = Watched(sensor)
+        sensor.collect(0.1)
+    assert watched.wrong() == 0
+
+
+def test_unplugged_and_plugged_in_again_is_mended_on_request(own: Callable[..., Emulator], scheme: str) -> None:
+    emulator = own()
+    with emulator.sensor("recover=1") as sensor:
+        watched = Watched(sensor)
+        sensor.collect(0.05)
+        emulator.unplug()
+        with pytest.raises(StreamBroken, match="interrupted, connecting again"):
+            sensor.collect(5.0)
+        emulator.plug_in()
+        deadline = time.monotonic() + 9.0
+        while sensor._failure is not None:
+            assert time.monotonic() < deadline, scheme
+            with pytest.raises(StreamBroken):
+                sensor.check()
+            time.sleep(0.05)
+        sensor.collect(0.1)
+        health = sensor.health()
+    assert health.reconnects >= 1
+    assert [what for _, what in health.events][-1] == "connected again"
+    samples = watched.samples()
+    assert watched.wrong() == 0
+    assert (np.diff(samples.seq) >= 1).all()
