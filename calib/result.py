@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any, Literal, Self
 
 import numpy as np
+from scipy.special import expit
 
 from calib.errors import BadCalibration
 from calib.files import JSON, check_format, read_object, write_new
@@ -16,9 +17,29 @@ from calib.yu import SPECIAL_R_flange_base, weight_and_tilt
 
 FORMAT = "ftdrive.calibration/1"
 
-Method = Literal["srom", "lrom", "ml"]
+LATER = ("p_value", "measured_sigma", "weights", "components", "drift", "second_basin_chi2")
+"""Fields that the first files of this format do not have."""
+
+Method = Literal["srom", "lrom", "ml", "known-rotation", "yaw-only"]
 Verdict = Literal["good", "usable", "rejected"]
 NoiseSource = Literal["measured", "residuals"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriftResult:
+    """How the bias moved while the poses were taken; arrays are read-only."""
+
+    change: Array
+    """(6,) bias at the last pose minus bias at the first, N and N·m."""
+    sigma: Array
+    """(6,) one standard deviation of that."""
+
+    def __post_init__(self) -> None:
+        for name in ("change", "sigma"):
+            value = read_only(getattr(self, name))
+            if value.shape != (6,) or not np.isfinite(value).all():
+                raise ValueError(f"the drift's {name} must be six finite numbers, got shape {value.shape}")
+            object.__setattr__(self, name, value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +48,12 @@ class CalibrationResult:
 
     parameters: Parameters
     covariance: Array
-    """(15, 15) of the error coordinates `PARAMETER_NAMES`, from the noise alone: never scaled by the residuals."""
+    """(15, 15) of the error coordinates `PARAMETER_NAMES`, from the noise and from what `components` add to it."""
     residuals: Array
-    """(n, 6) measured minus predicted wrench, N and N·m, in the sensor frame."""
+    """(n, 6) measured minus predicted wrench, N and N·m, in the sensor frame: of the plain model, without drift."""
     chi2: float
-    """Residuals squared, weighted by the noise."""
+    """Least squares of the residuals of the poses that count, weighted by the measured noise alone: without drift or
+    `components`. When nobody measured the noise, weighted by what was estimated from them."""
     dof: int
     noise_source: NoiseSource
     """Where the noise comes from: the spread inside each pose, or the residuals of the fit."""
@@ -41,6 +63,20 @@ class CalibrationResult:
     reasons: tuple[str, ...]
     """Plain words: why the verdict is not better, and what else is worth knowing."""
     provenance: Mapping[str, JSON] = field(default_factory=dict)
+    p_value: float | None = None
+    """Probability of a chi2 as large or larger if the measured noise were all there is; None when nobody measured it."""
+    measured_sigma: Array | None = None
+    """(6,) measured standard deviation of a pose's mean, root mean square over the poses, N and N·m; None = unknown."""
+    weights: Array | None = None
+    """(n,) 1 = used, 0 = rejected: it fits none of what the other poses tell. None = all are used."""
+    components: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviations of what the residuals show, by name and unit: beyond the measured noise, or all of the noise
+    when nobody measured it. `walk_…` is the random walk of the bias per mean interval between poses, `slope_…` its
+    linear change over the session, `rotation_rad` the error of each pose's orientation per axis."""
+    drift: DriftResult | None = None
+    """None: no drift was found, or none was looked for."""
+    second_basin_chi2: float | None = None
+    """How much worse the second best solution fits, under the noise model; None: there is no other."""
 
     def __post_init__(self) -> None:
         n = len(self.residuals)
@@ -49,6 +85,15 @@ class CalibrationResult:
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"{name} must be {shape} finite numbers, got shape {value.shape}")
             object.__setattr__(self, name, value)
+        for name, length in (("measured_sigma", 6), ("weights", n)):
+            if getattr(self, name) is not None:
+                value = read_only(getattr(self, name))
+                if value.shape != (length,) or not np.isfinite(value).all():
+                    raise ValueError(f"{name} must be {length} finite numbers, got shape {value.shape}")
+                object.__setattr__(self, name, value)
+        if isinstance(self.drift, Mapping):
+            object.__setattr__(self, "drift", DriftResult(self.drift["change"], self.drift["sigma"]))
+        object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
         object.__setattr__(self, "reasons", tuple(self.reasons))
         try:
             provenance = json.loads(json.dumps(dict(self.provenance), allow_nan=False))
@@ -60,6 +105,21 @@ class CalibrationResult:
     def n_poses(self) -> int:
         """Number of poses behind the result."""
         return len(self.residuals)
+
+    @property
+    def noise_factor(self) -> float:
+        """Goodness of fit: how much larger the residuals are than the measured noise alone explains."""
+        return float(np.sqrt(self.chi2 / self.dof))
+
+    @property
+    def rejected_poses(self) -> tuple[int, ...]:
+        """Rows, counted from 1, that were left out."""
+        return () if self.weights is None else tuple(int(i) + 1 for i in np.flatnonzero(self.weights == 0))
+
+    @property
+    def p_wrong(self) -> float:
+        """Probability that the second best solution is the true one: 1 / (1 + exp(second_basin_chi2 / 2))."""
+        return 0.0 if self.second_basin_chi2 is None else float(expit(-self.second_basin_chi2 / 2))
 
     @property
     def R_flange_sensor(self) -> Array:
@@ -202,7 +262,18 @@ class CalibrationResult:
             "predicted_error": {"force_rms_N": force_N, "torque_rms_Nm": torque_Nm},
             "chi2": self.chi2,
             "dof": self.dof,
+            "p_value": self.p_value,
+            "noise_factor": self.noise_factor,
             "noise_source": self.noise_source,
+            "measured_sigma": None if self.measured_sigma is None else self.measured_sigma.tolist(),
+            "components": dict(self.components),
+            "drift": None
+            if self.drift is None
+            else {"change": self.drift.change.tolist(), "sigma": self.drift.sigma.tolist()},
+            "weights": None if self.weights is None else self.weights.tolist(),
+            "rejected_poses": list(self.rejected_poses),
+            "second_basin_chi2": self.second_basin_chi2,
+            "p_wrong": self.p_wrong,
             "g_m_s2": self.g_m_s2,
             "parameter_names": list(PARAMETER_NAMES),
             "covariance": self.covariance.tolist(),
@@ -217,7 +288,11 @@ class CalibrationResult:
         try:
             return cls(
                 parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
-                **{field.name: document[field.name] for field in fields(cls) if field.name != "parameters"},
+                **{
+                    field.name: document[field.name]
+                    for field in fields(cls)
+                    if field.name != "parameters" and not (field.name in LATER and field.name not in document)
+                },
             )
         except KeyError as exc:
             raise BadCalibration(f"the calibration lacks the field {exc.args[0]}: the file is damaged.") from exc

@@ -3,23 +3,24 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2 as chi2_distribution
 
 from calib.dataset import CalibrationDataset
+from calib.descent import column_scale
 from calib.errors import NotObservable
+from calib.known import Known
+from calib.ml import RANK_TOLERANCE, STANDARD_GRAVITY_M_S2, Drift, Fit, fit
 from calib.model import PARAMETER_NAMES, Array, Parameters, predict
-from calib.refine import column_scale, refine
-from calib.result import CalibrationResult, Method
+from calib.pooling import pooled_covariance
+from calib.result import CalibrationResult, DriftResult, Method
 from calib.verdict import judge
 from calib.yu import lrom, special_numbers, srom_numbered
 
-STANDARD_GRAVITY_M_S2 = 9.80665
-
 SAME_ORIENTATION_RAD = np.deg2rad(0.5)
-RANK_TOLERANCE = 1e-9
 SIMULATIONS = 400
 
 Estimator = Callable[[Array], Parameters]
@@ -29,6 +30,8 @@ def solve(
     dataset: CalibrationDataset,
     method: Method = "ml",
     *,
+    drift: Drift = "auto",
+    known: Known | None = None,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
     provenance: Mapping[str, Any] | None = None,
 ) -> CalibrationResult:
@@ -37,9 +40,15 @@ def solve(
     Parameters
     ----------
     dataset : CalibrationDataset
-    method : {"ml", "srom", "lrom"}
-        Maximum likelihood from 4 poses on; or Yu's closed forms, for comparison: SROM for the 24 special orientations,
-        LROM for 5 or more of any kind.
+    method : {"ml", "known-rotation", "yaw-only", "srom", "lrom"}
+        Maximum likelihood, from 4 poses on; the same for a sensor whose mounting is known (`known`, default: axes of
+        sensor and flange agree), or known but for its turn about the flange z axis. Or Yu's closed forms, for
+        comparison: SROM for the 24 special orientations, LROM for 5 or more of any kind.
+    drift : {"auto", "none", "linear", "random-walk"}
+        How the bias may move while the poses are taken: as the data decide, not at all, or surely so. Poses without
+        time count as equally spaced in their order.
+    known : Known, optional
+        What is known of mounting, direction of gravity and mass. Not with SROM and LROM.
     g_m_s2 : float
         Gravity, by which the weight is divided to give the mass.
     provenance : mapping, optional
@@ -50,38 +59,67 @@ def solve(
     NotObservable
         The poses do not determine the parameters; the message says what is missing and what to add.
     """
-    if method not in ("ml", "srom", "lrom"):
-        raise ValueError(f"method is '{method}', expected 'ml', 'srom' or 'lrom'")
+    for name, value, choices in (("method", method, get_args(Method)), ("drift", drift, get_args(Drift))):
+        if value not in choices:
+            raise ValueError(f"{name} is '{value}', expected one of {', '.join(choices)}")
     if not (np.isfinite(g_m_s2) and g_m_s2 > 0):
         raise ValueError(f"g_m_s2 is {g_m_s2}, expected about 9.8")
-    R_base_flange, wrench = dataset.R_base_flange, dataset.wrench
-    _require_orientations(dataset, 5 if method == "lrom" else 4)
+    if method in ("srom", "lrom") and known is not None:
+        raise ValueError(f"{method} cannot use what is known before: use 'ml'")
+    known = _constrained(method, known)
+    _require_orientations(dataset, 5 if method == "lrom" else 4 if known is None else 3)
 
     estimator = _closed_form(dataset, method)
+    wrench_cov = dataset.wrench_cov
+    if wrench_cov is not None:
+        wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
     # The fit also tells whether the poses are enough, and how large the noise is where it was not measured.
-    fit = refine(R_base_flange, wrench, dataset.wrench_cov, _starts(dataset))
-    covariance = _covariance(fit.information)
-    parameters = fit.parameters
+    best = fit(
+        dataset.R_base_flange, dataset.wrench, wrench_cov, t_s=dataset.t_s, drift=drift, known=known, g_m_s2=g_m_s2
+    )
+    _require_rank(best)
+    parameters, covariance, chi2, dof = best.parameters, best.covariance, best.measured_chi2, best.dof
+    weights, drifted = best.weights, best.drift
+    if wrench_cov is None:
+        chi2 = best.chi2
     if estimator:
-        parameters = estimator(wrench)
-        covariance = _simulated_covariance(estimator, parameters, R_base_flange, fit.wrench_cov)
+        parameters = estimator(dataset.wrench)
+        covariance = _simulated_covariance(estimator, parameters, dataset.R_base_flange, best.wrench_cov)
+        weights, drifted, dof = np.ones(len(dataset)), None, 6 * len(dataset) - 15
+        noise = best.wrench_cov if wrench_cov is None else wrench_cov
+        e = dataset.wrench - predict(parameters, dataset.R_base_flange)
+        chi2 = float(np.einsum("ni,ni->", e, np.linalg.solve(noise, e[..., None])[..., 0]))
 
-    residuals = wrench - predict(parameters, R_base_flange)
     result = CalibrationResult(
         parameters=parameters,
         covariance=covariance,
-        residuals=residuals,
-        chi2=float(np.einsum("ni,ni->", residuals, np.linalg.solve(fit.wrench_cov, residuals[..., None])[..., 0])),
-        dof=6 * len(dataset) - 15,
-        noise_source="residuals" if dataset.wrench_cov is None else "measured",
+        residuals=dataset.wrench - predict(parameters, dataset.R_base_flange),
+        chi2=chi2,
+        dof=dof,
+        noise_source="residuals" if wrench_cov is None else "measured",
         g_m_s2=g_m_s2,
         method=method,
         verdict="rejected",
         reasons=(),
         provenance={**(provenance or {}), "dataset_sha256": dataset.sha256()},
+        p_value=None if wrench_cov is None else float(chi2_distribution.sf(chi2, dof)),
+        measured_sigma=None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0)),
+        weights=weights,
+        components=best.components,
+        drift=None if drifted is None else DriftResult(drifted.change, drifted.sigma),
+        second_basin_chi2=best.second_basin_chi2,
     )
-    verdict, reasons = judge(result, fit.second_chi2)
+    gap = (best.second_basin_chi2 or np.inf) * max(1.0, chi2 / dof)
+    verdict, reasons = judge(result, chi2 + gap)
     return replace(result, verdict=verdict, reasons=reasons)
+
+
+def _constrained(method: Method, known: Known | None) -> Known | None:
+    if method == "known-rotation" and (known is None or known.R_flange_sensor is None):
+        return replace(known or Known(), R_flange_sensor=np.eye(3))
+    if method == "yaw-only":
+        return replace(known or Known(), yaw_only=True)
+    return known
 
 
 def _closed_form(dataset: CalibrationDataset, method: Method) -> Estimator | None:
@@ -91,18 +129,6 @@ def _closed_form(dataset: CalibrationDataset, method: Method) -> Estimator | Non
     if method == "lrom":
         return partial(lrom, dataset.R_base_flange)
     return None
-
-
-def _starts(dataset: CalibrationDataset) -> list[Parameters]:
-    """SROM's result where the 24 orientations are there, else LROM's where it has one."""
-    methods: tuple[Method, ...] = ("srom", "lrom")
-    for method in methods:
-        try:
-            estimator = _closed_form(dataset, method)
-            return [estimator(dataset.wrench)] if estimator else []
-        except NotObservable:
-            continue
-    return []
 
 
 def _require_orientations(dataset: CalibrationDataset, least: int) -> None:
@@ -127,19 +153,20 @@ def _require_orientations(dataset: CalibrationDataset, least: int) -> None:
         raise NotObservable("the force is exactly the same in all poses: the sensor is stuck, or nothing hangs on it.")
 
 
-def _covariance(information: Array) -> Array:
-    """Invert the Fisher information, or name the parameters that trade off against each other."""
+def _require_rank(best: Fit) -> None:
+    """Refuse what the poses leave open, naming the parameters that trade off against each other."""
+    Z = best.free
+    information = Z.T @ best.information @ Z
     scale = column_scale(information)
     eigenvalues, V = np.linalg.eigh(information / np.outer(scale, scale))
     free = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
     if free.any():
-        share = (V[:, free] ** 2).sum(axis=1).reshape(5, 3).sum(axis=1) / free.sum()
+        share = ((Z @ V[:, free]) ** 2).sum(axis=1).reshape(5, 3).sum(axis=1) / free.sum()
         names = [PARAMETER_NAMES[3 * k].partition(".")[0] for k in np.flatnonzero(share > 0.05)]
         raise NotObservable(
-            f"the poses leave {free.sum()} of 15 parameters free, mixing {', '.join(names)}: add poses that tilt the "
-            "tool about two different horizontal axes, and turn it about its own."
+            f"the poses leave {free.sum()} of {len(free)} parameters free, mixing {', '.join(names)}: add poses that "
+            "tilt the tool about two different horizontal axes, and turn it about its own."
         )
-    return np.asarray(V / eigenvalues @ V.T / np.outer(scale, scale))
 
 
 def _simulated_covariance(estimator: Estimator, truth: Parameters, R_base_flange: Array, wrench_cov: Array) -> Array:

@@ -1,0 +1,149 @@
+"""The noise of a whole session: every pose its own, and a bias that drifts from pose to pose.
+
+    V = blockdiag(D_i) + S (K (x) I6) S + slopes,    S = diag(walk)
+
+K is the covariance of a random walk less its mean over the poses, so that "the bias" is the mean bias: the pseudo-inverse
+of the path's stiffness matrix. That one is tridiagonal, so with Woodbury's identity everything is O(n).
+"""
+
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from calib.model import Array
+
+SHORTEST_STEP = 1e-3  # in mean intervals: two poses at the same time have nearly the same bias
+
+
+class Noise:
+    """Covariance of all wrenches, and its inverse applied.
+
+    Parameters
+    ----------
+    D : array, shape (n, 6, 6)
+        Independent noise of each pose.
+    time : array, shape (n,), or None
+        Ascending, in mean intervals between poses. Not needed without drift.
+    walk : array, shape (6,), or None
+        Standard deviation of the change of each channel's bias over one unit of time.
+    slope : array, shape (6,), or None
+        Standard deviation of each channel's linear change over the session; infinite = unknown.
+    """
+
+    def __init__(
+        self, D: Array, time: Array | None = None, walk: Array | None = None, slope: Array | None = None
+    ) -> None:
+        self.D = D
+        self.n = len(D)
+        common = D.strides[0] == 0
+        self.W = np.broadcast_to(np.linalg.inv(D[:1]), D.shape) if common else np.linalg.inv(D)
+        logdet = np.linalg.slogdet(D[:1] if common else D)[1]
+        self._logdet = float(logdet.sum()) * (self.n if common else 1)
+        self._low_rank: list[tuple[Array, Array]] = []
+        self._walking = np.zeros(0, np.intp)
+        if time is not None and walk is not None and walk.any():
+            self._walking = np.flatnonzero(walk)
+            self._s = walk[self._walking]
+            self._add_walk(steps(time)[1:])
+        if time is not None and slope is not None and slope.any():
+            self._add_slopes(time, slope)
+
+    def _add_walk(self, dt: Array) -> None:
+        """Factorise M = K^+ + S W S, unknowns ordered by pose, then channel; then keep the mean of the walk at zero."""
+        n, k, s = self.n, self._walking.size, self._s
+        stiffness = 1 / dt
+        blocks = s[:, None] * self.W[:, self._walking[:, None], self._walking] * s
+        blocks[:-1, range(k), range(k)] += stiffness[:, None]
+        blocks[1:, range(k), range(k)] += stiffness[:, None]
+        banded = np.zeros((k + 1, n, k))
+        for a in range(k):
+            for b in range(a, k):
+                banded[k - (b - a), :, b] = blocks[:, a, b]
+        banded[0, 1:] = -stiffness[:, None]
+        self._blocks, self._stiffness = blocks, stiffness
+        self._cholesky = cholesky_banded(banded.reshape(k + 1, -1), check_finite=False)
+        ones = np.zeros((n, k, k))
+        ones[:, range(k), range(k)] = 1.0
+        M_ones = self._solve_walk(ones)
+        mean = M_ones.sum(axis=0)
+        Q = self.W[:, :, self._walking] @ (s[:, None] * M_ones)
+        self._low_rank.append((Q, np.linalg.inv(mean)))
+        self._logdet += 2 * float(np.log(self._cholesky[-1]).sum()) + float(np.linalg.slogdet(mean)[1])
+        self._logdet += k * (float(np.log(dt).sum()) - 2 * float(np.log(n)))
+
+    def _add_slopes(self, time: Array, slope: Array) -> None:
+        sloping = np.flatnonzero(slope)
+        T = centred(time)[:, None, None] * np.eye(6)[:, sloping]
+        Q = self.solve(T)
+        core = np.diag(1 / slope[sloping] ** 2) + np.einsum("nik,nil->kl", T, Q)
+        self._low_rank.append((Q, -np.linalg.inv(core)))
+        self._logdet += float(np.linalg.slogdet(core)[1])
+        self._logdet += 2 * float(np.log(slope[sloping][np.isfinite(slope[sloping])]).sum())
+
+    def _solve_walk(self, X: Array) -> Array:
+        """Give M^-1 X for X (n, k, m)."""
+        Z = cho_solve_banded((self._cholesky, False), X.reshape(-1, X.shape[2]), check_finite=False)
+        return np.asarray(Z.reshape(X.shape))
+
+    def solve(self, X: Array) -> Array:
+        """Give V^-1 X for X (n, 6, m)."""
+        Y = np.asarray(self.W @ X)
+        if self._walking.size:
+            s = self._s[:, None]
+            Y -= self.W[:, :, self._walking] @ (s * self._solve_walk(s * Y[:, self._walking]))
+        for Q, core in self._low_rank:
+            Y += Q @ (core @ np.einsum("nik,nil->kl", Q, X, optimize=True))
+        return Y
+
+    @property
+    def logdet(self) -> float:
+        """Logarithm of the determinant of V; with slopes of infinite variance what depends on the rest of it."""
+        return self._logdet
+
+    @cached_property
+    def blocks(self) -> Array:
+        """(n, 6, 6) the diagonal blocks of V^-1."""
+        W = self.W
+        if self._walking.size:
+            WS = self.W[:, :, self._walking] * self._s
+            W = W - WS @ self._selected_inverse() @ np.swapaxes(WS, 1, 2)
+        for Q, core in self._low_rank:
+            W = W + Q @ core @ np.swapaxes(Q, 1, 2)
+        return W
+
+    def _selected_inverse(self) -> Array:
+        """Diagonal blocks of M^-1, by elimination forward and substitution back (Takahashi 1973)."""
+        pivots = np.empty_like(self._blocks)
+        pivots[0] = np.linalg.inv(self._blocks[0])
+        squared = self._stiffness**2
+        for i in range(1, self.n):
+            pivots[i] = np.linalg.inv(self._blocks[i] - squared[i - 1] * pivots[i - 1])
+        inverse = pivots.copy()
+        for i in range(self.n - 2, -1, -1):
+            inverse[i] += squared[i] * (pivots[i] @ inverse[i + 1] @ pivots[i])
+        return inverse
+
+
+def steps(time: Array) -> Array:
+    """Intervals (n,) before each pose; the first is one unit, which the mean bias takes up."""
+    return np.maximum(np.diff(time, prepend=time[0] - 1.0), SHORTEST_STEP)
+
+
+def walk_times(time: Array, X: Array) -> Array:
+    """Multiply X (n, k) by the covariance of a random walk of unit variance per unit time."""
+    return np.asarray(np.cumsum(steps(time)[:, None] * _following(X), axis=0))
+
+
+def walk_square(time: Array, X: Array) -> Array:
+    """Give the diagonal (k,) of X' K X: the sum over steps of dt (sum of what follows)²."""
+    return np.asarray(steps(time) @ _following(X) ** 2)
+
+
+def _following(X: Array) -> Array:
+    return np.asarray(np.cumsum(X[::-1], axis=0)[::-1])
+
+
+def centred(time: Array) -> Array:
+    """Shift and scale time to mean zero and unit length."""
+    return np.asarray((time - time.mean()) / max(np.ptp(time), 1e-300))

@@ -1,0 +1,163 @@
+"""Down to every minimum of the joint cost of forces and torques, for noise that is independent from pose to pose."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib import so3
+from calib.errors import NotObservable
+from calib.gram import CHUNK, Statistics, coefficients, features, wrench_gram
+from calib.known import Constraints
+from calib.model import Array, Parameters
+
+MAX_STEPS = 100
+MOST_MINIMA = 6
+SAME_ROTATION_RAD = np.deg2rad(1.0)
+
+Equations = Callable[[Parameters], tuple[Array, Array, float]]
+"""Give information (15, 15), its right-hand side (15,) and the cost at a point."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Minimum:
+    """One solution that fits better than all of its neighbours."""
+
+    parameters: Parameters
+    chi2: float
+    """Under the noise model of the fit, on the same poses for all minima."""
+    information: Array
+    """(15, 15) Fisher information there, priors included."""
+
+
+class Descent:
+    """The ways down for one set of poses.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+    wrench : array, shape (n, 6)
+    constraints : Constraints
+    """
+
+    def __init__(self, R_base_flange: Array, wrench: Array, constraints: Constraints) -> None:
+        self.R, self.wrench, self.constraints = R_base_flange, wrench, constraints
+
+    def minima(self, weights: Array) -> list[Minimum]:
+        """Find all minima of the joint cost that lie below minima of the force cost, lowest first.
+
+        Parameters
+        ----------
+        weights : array, shape (n, 6, 6) or (1, 6, 6)
+            Inverse noise covariances.
+
+        Raises
+        ------
+        NotObservable
+            The lowest point reached is not a minimum.
+        """
+        n = len(self.wrench)
+        reference = np.zeros((6, 10))
+        if len(weights) == 1 and n > CHUNK:
+            reference[:, 9] = self.wrench[:CHUNK].mean(axis=0)
+            gram = wrench_gram(self.R, self.wrench, reference)
+            rows = [0, 1, 2, *range(6, 16)]
+            force_gram = gram[np.ix_(rows, rows)] * np.trace(weights[0, :3, :3]) / 3
+            Q = so3.force_cost_from_gram(force_gram)
+            statistics = Statistics.of_gram(gram, weights[0], reference)
+        else:
+            if len(weights) == 1:
+                weights = np.broadcast_to(weights, (n, 6, 6))
+            Q = so3.force_cost(self.R, self.wrench[:, :3], weights[:, :3, :3])
+            phi = features(self.R)
+            reference[:, 9] = self.wrench.mean(axis=0)
+            statistics = Statistics.of(phi, self.wrench, weights, reference)
+        found = self._from_all(statistics, [m.R.T for m in so3.minima(Q)[:MOST_MINIMA]], Q)
+        if n <= CHUNK:  # once more from close by: without noise every digit counts
+            statistics = Statistics.of(phi, self.wrench, weights, coefficients(found[0].parameters))
+            found[0] = self.down(statistics.normal_equations, found[0].parameters)[0]
+        return found
+
+    def _from_all(self, statistics: Statistics, rotations: Sequence[Array], Q: Array) -> list[Minimum]:
+        ends = []
+        for R_flange_sensor in self.constraints.rotations(list(rotations), Q):
+            start = self.constraints.satisfied(_linear_start(statistics, R_flange_sensor))
+            ends.append(self.down(statistics.normal_equations, start))
+        return self.distinct(ends)
+
+    def distinct(self, ends: list[tuple[Minimum, bool]]) -> list[Minimum]:
+        """Sort, and leave out those that ended in the same minimum."""
+        ends.sort(key=lambda end: end[0].chi2)
+        best, settled = ends[0]
+        if not settled:
+            weight_N = np.linalg.norm(best.parameters.gravity_force_base_N)
+            raise NotObservable(
+                f"the fit has not settled in {MAX_STEPS} steps, at a weight of {weight_N:.2g} N: "
+                "hang something heavier on the sensor, or add poses with other orientations."
+            )
+        found: list[Minimum] = []
+        for end, _ in ends:
+            R = end.parameters.R_flange_sensor
+            if all(_angle(R, other.parameters.R_flange_sensor) > SAME_ROTATION_RAD for other in found):
+                found.append(end)
+        return found
+
+    def normal_equations(self, equations: Equations, p: Parameters) -> tuple[Array, Array, float]:
+        """Add what was known before."""
+        H, g, cost = equations(p)
+        if self.constraints.any:
+            A, residual = self.constraints.measurements(p)
+            return H + A.T @ A, g + A.T @ residual, cost + float(residual @ residual)
+        return H, g, cost
+
+    def down(self, equations: Equations, p: Parameters, steps: int = MAX_STEPS) -> tuple[Minimum, bool]:
+        """Levenberg-Marquardt with scaled columns; tells whether it came to rest."""
+        H, g, cost = self.normal_equations(equations, p)
+        b, F0, T0 = p.gravity_force_base_N, p.force_bias_N, p.torque_bias_Nm
+        prediction = np.concatenate([np.zeros(3), b, F0, np.zeros(3), T0])  # times the Jacobian is the predicted wrench
+        rounding = 1e-14 * float(np.sqrt(max(prediction @ H @ prediction, 0.0)))
+        damping, settled = 0.0, False
+        for _ in range(steps):
+            Z = self.constraints.free(p) if self.constraints.any else None
+            Hz, gz = (H, g) if Z is None else (Z.T @ H @ Z, Z.T @ g)
+            scale = column_scale(Hz)
+            eigenvalues, V = np.linalg.eigh(Hz / np.outer(scale, scale))
+            step = V @ (V.T @ (gz / scale) / np.maximum(eigenvalues + damping, 1e-14 * eigenvalues[-1])) / scale
+            moved = float(np.sqrt(max(step @ Hz @ step, 0.0)))  # in standard deviations of the noise
+            trial = p.moved(step if Z is None else Z @ step)
+            if Z is not None:
+                trial = self.constraints.satisfied(trial)
+            ahead = self.normal_equations(equations, trial)
+            improved = ahead[2] < cost
+            if improved:
+                p, (H, g, cost) = trial, ahead
+                damping = damping / 10 if damping > 1e-6 else 0.0
+            else:
+                damping = max(10 * damping, 1e-3)
+            small = 1e-8 * float(np.sqrt(max(cost, 0.0))) + rounding
+            settled = moved <= (small if improved else 100 * small)
+            if settled:
+                break
+        return Minimum(p, cost, H), settled
+
+
+def column_scale(information: Array) -> Array:
+    """Root of the diagonal, 1 where it vanishes: dividing by it makes eigenvalues independent of units."""
+    diagonal = np.sqrt(np.diag(information))
+    return np.asarray(np.where(diagonal > 0, diagonal, 1.0))
+
+
+def _linear_start(statistics: Statistics, R_flange_sensor: Array) -> Parameters:
+    """For a fixed rotation: gravity force and force bias, then centre of mass and torque bias, each linear."""
+    p = Parameters(R_flange_sensor, *np.zeros((4, 3)))
+    for unknowns in (slice(3, 9), slice(9, 15)):
+        H, g, _ = statistics.normal_equations(p)
+        step = np.zeros(15)
+        step[unknowns] = np.linalg.lstsq(H[unknowns, unknowns], g[unknowns], rcond=1e-12)[0]
+        p = p.moved(step)
+    return p
+
+
+def _angle(R1: Array, R2: Array) -> float:
+    return float(Rotation.from_matrix(R1 @ R2.T).magnitude())

@@ -1,0 +1,47 @@
+"""Covariances of pose means that come from few samples each."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.model import Array
+
+TRUSTED_SAMPLES = 100.0
+"""With this many samples a pose's own covariance counts as much as the shape common to all poses."""
+
+
+def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
+    """Shrink each covariance to the shape common to all poses, times a size of its own.
+
+    From N samples a 6 x 6 covariance is so uncertain that weighting with it does harm: with N = 10 the mean square
+    error of the calibration is 3 times what the data allow, with 50 samples 1.15 times. The common shape has no such
+    error; the size keeps what differs from pose to pose beyond the scatter that N samples explain.
+
+    Parameters
+    ----------
+    wrench_cov : array, shape (n, 6, 6)
+        Covariance of the mean of each pose.
+    n_samples : int array, shape (n,)
+        Samples behind each; 0 = unknown: that covariance is taken as it is.
+
+    Returns
+    -------
+    array, shape (n, 6, 6)
+    """
+    known = n_samples > 1
+    if known.sum() < 2:
+        return wrench_cov
+    S, freedom = wrench_cov[known], n_samples[known] - 1.0
+    size = np.ones(len(S))
+    for _ in range(8):
+        shape = np.average(S / size[:, None, None], axis=0, weights=freedom)
+        size = np.einsum("ij,nji->n", np.linalg.inv(shape), S) / 6
+    # Sizes scatter by 2 / (6 freedom) in the logarithm when nothing differs: remove that share.
+    log_size = np.log(size)
+    scatter = 2 / (6 * freedom)
+    mean = float(np.average(log_size, weights=freedom))
+    real = max(float(np.average((log_size - mean) ** 2 - scatter, weights=freedom)), 0.0)
+    size = np.exp(mean + (log_size - mean) * real / (real + scatter))
+    own = (freedom / (freedom + TRUSTED_SAMPLES))[:, None, None]
+    pooled = wrench_cov.copy()
+    pooled[known] = own * S + (1 - own) * size[:, None, None] * shape
+    return pooled
