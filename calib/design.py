@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from calib.model import Array, Parameters, jacobian, predict, read_only, skew
-from calib.refine import force_only_minima
-from calib.yu import SPECIAL_R_flange_base
+from calib.so3 import force_cost, given_rotation, minima
+from calib.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 OBSERVABLE = 1e-9
@@ -284,12 +284,15 @@ def second_basin(R_base_flange: Array, guess: Guess) -> tuple[float, Parameters 
     if len(R_base_flange) < 3:
         return 0.0, None  # there is a continuum of solutions
     wrench = predict(guess.parameters, R_base_flange)
-    minima = force_only_minima(R_base_flange, wrench)
-    squares = [float(((predict(p, R_base_flange) - wrench)[:, :3] ** 2).sum()) for p in minima]
-    if len(minima) < 2:
+    force_N, equal = wrench[:, :3], np.ones(len(wrench))
+    found = minima(force_cost(R_base_flange, force_N, equal))
+    if len(found) < 2:
         return float("inf"), None
-    second = int(np.argsort(squares)[1])
-    return squares[second] / (len(R_base_flange) * guess.weight_N**2), minima[second]
+    R = found[1].R
+    gravity_N, bias_N = given_rotation(R, R_base_flange, force_N, equal)
+    com_m, torque_bias_Nm = com_and_torque_bias(gravity_N @ R_base_flange @ R.T, wrench[:, 3:])
+    gap = max(found[1].cost, 0.0) / (len(R_base_flange) * guess.weight_N**2)
+    return gap, Parameters(R.T, gravity_N, bias_N, com_m, torque_bias_Nm)
 
 
 def force_rows(R_base_flange: Array, guess: Guess) -> Array:

@@ -25,7 +25,7 @@ TRUTH = Parameters(
     Rotation.from_euler("ZYX", [105, 2, 179], degrees=True).as_matrix(),
     np.array([0.6, -0.4, -20.0]),
     np.array([3.0, -5.0, 8.0]),
-    np.array([0.01, -0.02, 0.07]),
+    np.array([0.01, -0.02, -0.07]),
     np.array([0.1, 0.2, -0.3]),
 )
 

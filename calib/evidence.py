@@ -1,0 +1,165 @@
+"""What a judgement looks at: a fit, and how well each pose is predicted by all others."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from calib.model import Array, Parameters, jacobian, predict
+
+
+class Evidence(Protocol):
+    """What is judged: estimates and how they fit. Left-out poses count nowhere but in arrays with n rows."""
+
+    @property
+    def parameters(self) -> Parameters:
+        """Estimates."""
+
+    @property
+    def covariance(self) -> Array:
+        """(15, 15) of the error coordinates; zero along what is exactly known."""
+
+    @property
+    def R_base_flange(self) -> Array:
+        """(n, 3, 3)."""
+
+    @property
+    def wrench(self) -> Array:
+        """(n, 6) N and N·m, as measured."""
+
+    @property
+    def weights(self) -> Array:
+        """(n,) 1 = used, 0 = left out because it fits none of the others."""
+
+    @property
+    def chi2(self) -> float:
+        """Residuals squared, weighted by the noise model."""
+
+    @property
+    def dof(self) -> int:
+        """Of chi2."""
+
+    @property
+    def measured_chi2(self) -> float:
+        """Weighted by the measured noise alone; NaN when nobody measured it."""
+
+    @property
+    def second_basin_chi2(self) -> float | None:
+        """How much larger chi2 is at the best other solution; None if there is none."""
+
+    @property
+    def components(self) -> Mapping[str, float]:
+        """Standard deviations of what was found beyond the measured noise, by name with unit."""
+
+    @property
+    def residuals(self) -> Array:
+        """(n, 6) measured minus predicted."""
+
+    @property
+    def left_out_residuals(self) -> Array:
+        """(n, 6) measured minus what all other poses predict."""
+
+    @property
+    def left_out_cov(self) -> Array:
+        """(n, 6, 6) covariance of these."""
+
+
+@dataclass(frozen=True, eq=False)
+class IndependentFit:
+    """A fit to poses with independent noise, for methods that do not cross-validate themselves."""
+
+    parameters: Parameters
+    covariance: Array
+    R_base_flange: Array
+    wrench: Array
+    wrench_cov: Array
+    """(n, 6, 6)"""
+    measured: bool
+    """Whether `wrench_cov` was measured, not estimated from the residuals."""
+    weights: Array
+    second_basin_chi2: float | None = None
+    components: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def residuals(self) -> Array:
+        """(n, 6) measured minus predicted."""
+        return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange))
+
+    @cached_property
+    def chi2(self) -> float:
+        """Of the used poses."""
+        r = self.residuals[..., None]
+        return float(self.weights @ np.sum(r * np.linalg.solve(self.wrench_cov, r), axis=(1, 2)))
+
+    @property
+    def measured_chi2(self) -> float:
+        """The same, if the noise was measured."""
+        return self.chi2 if self.measured else float("nan")
+
+    @property
+    def dof(self) -> int:
+        """Of chi2."""
+        return 6 * int(self.weights.sum()) - 15
+
+    @property
+    def left_out_residuals(self) -> Array:
+        """(n, 6) measured minus what all other poses predict."""
+        return self._left_out[0]
+
+    @property
+    def left_out_cov(self) -> Array:
+        """(n, 6, 6) covariance of these."""
+        return self._left_out[1]
+
+    @cached_property
+    def _left_out(self) -> tuple[Array, Array]:
+        J = jacobian(self.parameters, self.R_base_flange)
+        return leave_one_out(self.residuals, J, self.wrench_cov, self.weights)
+
+
+def leave_one_out(
+    residuals: Array, jacobian: Array, wrench_cov: Array, weights: Array | None = None
+) -> tuple[Array, Array]:
+    """Predict every pose from all others without fitting again: (I - H_kk)^-1 r_k, exact for a linear model.
+
+    Parameters
+    ----------
+    residuals : array, shape (n, 6)
+        Of the fit to all poses.
+    jacobian : array, shape (n, 6, p)
+    wrench_cov : array, shape (n, 6, 6)
+        Noise, independent between poses.
+    weights : array, shape (n,), optional
+        0 for poses that the fit did not use; 1 for the others and by default.
+
+    Returns
+    -------
+    left_out : array, shape (n, 6)
+        Measured minus what the other poses predict.
+    covariance : array, shape (n, 6, 6)
+        Of these. Very large where the others determine nothing.
+    """
+    used = np.ones(len(residuals)) if weights is None else weights
+    L = np.linalg.cholesky(wrench_cov)
+    J = np.linalg.solve(L, jacobian)
+    information = np.einsum("n,nki,nkj->ij", used, J, J)
+    explained = J @ np.linalg.pinv(information, hermitian=True) @ np.swapaxes(J, 1, 2)
+    shrinking = np.where(used > 0, 1.0, 0.0)[:, None, None] * explained
+    free, V = np.linalg.eigh(np.eye(6) - shrinking)
+    M = V / np.maximum(free, 1e-12)[:, None] @ np.swapaxes(V, 1, 2)
+    left_out = (L @ M @ np.linalg.solve(L, residuals[..., None]))[..., 0]
+    return np.asarray(left_out), np.asarray(L @ (M + explained - shrinking) @ np.swapaxes(L, 1, 2))
+
+
+def standardized(residuals: Array, covariance: Array) -> Array:
+    """Divide residuals (n, 6) by the symmetric root of their covariance (n, 6, 6): independent, of unit variance.
+
+    Directions in which a pose cannot be predicted at all, where the covariance is huge and not exact, count nothing.
+    """
+    sigma = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)))
+    correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
+    values, V = np.linalg.eigh((correlation + np.swapaxes(correlation, 1, 2)) / 2)
+    along = np.einsum("nij,ni->nj", V, residuals / sigma) / np.sqrt(np.maximum(values, 1e-12))
+    return np.asarray(np.einsum("nij,nj->ni", V, along))
