@@ -2,8 +2,8 @@
 
     V = blockdiag(D_i) + S (K (x) I6) S + slopes,    S = diag(walk)
 
-K is the covariance of a random walk less its mean over the poses, so that "the bias" is the mean bias: the pseudo-inverse
-of the path's stiffness matrix. That one is tridiagonal, so with Woodbury's identity everything is O(n).
+K is the covariance of a random walk less its mean over the poses, so that "the bias" is the mean bias: the
+pseudo-inverse of the path's stiffness matrix. That one is tridiagonal, so with Woodbury's identity all is O(n).
 """
 
 from functools import cached_property
@@ -110,7 +110,7 @@ class Noise:
             W = W - WS @ self._selected_inverse() @ np.swapaxes(WS, 1, 2)
         for Q, core in self._low_rank:
             W = W + Q @ core @ np.swapaxes(Q, 1, 2)
-        return W
+        return np.asarray(W, dtype=np.float64)
 
     def _selected_inverse(self) -> Array:
         """Diagonal blocks of M^-1, by elimination forward and substitution back (Takahashi 1973)."""

@@ -21,6 +21,7 @@ FORMAT = "ftdrive.dataset/1"
 
 ROUNDING = 2e-3  # rounding to three decimals moves an entry of R^T R by at most 1.8e-3
 WRENCH_COLUMNS = ("fx", "fy", "fz", "tx", "ty", "tz")
+SIGMA_COLUMNS = tuple(f"sigma_{name}" for name in WRENCH_COLUMNS)
 MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
 VECTOR_COLUMNS = ("rx", "ry", "rz")
 
@@ -134,7 +135,8 @@ def read_csv(
     """Read poses from a comma-separated table with one header row.
 
     Columns: r11..r33 (rotation matrix, row by row) or rx, ry, rz (rotation vector in rad), fx, fy, fz (N), tx, ty, tz
-    (N·m), and optionally t (s). With both a matrix and a vector the matrix counts. Other columns are ignored.
+    (N·m), and optionally t (s) and sigma_fx .. sigma_tz, the standard error of each pose's mean. With both a matrix and
+    a vector the matrix counts. Other columns are ignored.
 
     Parameters
     ----------
@@ -161,7 +163,8 @@ def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
     names = [name.strip() for name in header]
     vector = any(c in names for c in VECTOR_COLUMNS) and not any(c in names for c in MATRIX_COLUMNS)
     rotation_columns = VECTOR_COLUMNS if vector else MATRIX_COLUMNS
-    wanted = [*rotation_columns, *WRENCH_COLUMNS, *(["t"] if "t" in names else [])]
+    sigmas = SIGMA_COLUMNS if any(c in names for c in SIGMA_COLUMNS) else ()
+    wanted = [*rotation_columns, *WRENCH_COLUMNS, *sigmas, *(["t"] if "t" in names else [])]
     missing = [name for name in wanted if name not in names]
     if missing:
         raise BadDataset(
@@ -188,11 +191,15 @@ def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
                 raise BadDataset(f"row {i + 1}: {name} is {text}, not a finite number.")
 
     k = len(rotation_columns)
+    sigma = table[:, k + 6 : k + 12] if sigmas else None
+    if sigma is not None:
+        for i, j in np.argwhere(sigma <= 0):
+            raise BadDataset(f"row {i + 1}: {SIGMA_COLUMNS[j]} is {sigma[i, j]:g}, a standard error is above 0.")
     R = Rotation.from_rotvec(table[:, :k]).as_matrix() if vector else table[:, :k].reshape(-1, 3, 3)
     return CalibrationDataset(
         R_base_flange=np.swapaxes(R, 1, 2) if orientation == "R_flange_base" else R,
         wrench=table[:, k : k + 6],
-        wrench_cov=None,
+        wrench_cov=None if sigma is None else sigma[:, :, None] ** 2 * np.eye(6),
         n_samples=np.zeros(len(rows), np.int64),
         t_s=table[:, -1] - table[0, -1] if "t" in names else np.full(len(rows), np.nan),
         meta={"source": path.name, "orientation": orientation},

@@ -1,18 +1,18 @@
 """Down to every minimum of the joint cost of forces and torques, for noise that is independent from pose to pose."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib import so3
-from calib.errors import NotObservable
 from calib.gram import CHUNK, Statistics, coefficients, features, wrench_gram
 from calib.known import Constraints
 from calib.model import Array, Parameters
 
 MAX_STEPS = 100
+SMALL_STEP = 1e-4  # in standard deviations of the noise: a descent that ends with one is slow, not lost
 MOST_MINIMA = 6
 SAME_ROTATION_RAD = np.deg2rad(1.0)
 
@@ -29,6 +29,8 @@ class Minimum:
     """Under the noise model of the fit, on the same poses for all minima."""
     information: Array
     """(15, 15) Fisher information there, priors included."""
+    settled: bool = True
+    """Whether the descent came to rest."""
 
 
 class Descent:
@@ -51,53 +53,38 @@ class Descent:
         ----------
         weights : array, shape (n, 6, 6) or (1, 6, 6)
             Inverse noise covariances.
-
-        Raises
-        ------
-        NotObservable
-            The lowest point reached is not a minimum.
         """
         n = len(self.wrench)
         reference = np.zeros((6, 10))
-        if len(weights) == 1 and n > CHUNK:
+        common = len(weights) == 1 or weights.strides[0] == 0
+        separate = _without_correlation(weights[:1] if common else weights)
+        if common and n > CHUNK:
             reference[:, 9] = self.wrench[:CHUNK].mean(axis=0)
             gram = wrench_gram(self.R, self.wrench, reference)
             rows = [0, 1, 2, *range(6, 16)]
-            force_gram = gram[np.ix_(rows, rows)] * np.trace(weights[0, :3, :3]) / 3
-            Q = so3.force_cost_from_gram(force_gram)
-            statistics = Statistics.of_gram(gram, weights[0], reference)
+            Q = so3.force_cost_from_gram(gram[np.ix_(rows, rows)] * np.trace(separate[0, :3, :3]) / 3)
+            statistics, start_from = (Statistics.of_gram(gram, W[0], reference) for W in (weights, separate))
         else:
-            if len(weights) == 1:
-                weights = np.broadcast_to(weights, (n, 6, 6))
-            Q = so3.force_cost(self.R, self.wrench[:, :3], weights[:, :3, :3])
+            weights, separate = (np.broadcast_to(W, (n, 6, 6)) for W in (weights, separate))
+            Q = so3.force_cost(self.R, self.wrench[:, :3], separate[:, :3, :3])
             phi = features(self.R)
             reference[:, 9] = self.wrench.mean(axis=0)
-            statistics = Statistics.of(phi, self.wrench, weights, reference)
-        found = self._from_all(statistics, [m.R.T for m in so3.minima(Q)[:MOST_MINIMA]], Q)
+            statistics, start_from = (Statistics.of(phi, self.wrench, W, reference) for W in (weights, separate))
+        ends = []
+        for R_flange_sensor in self.constraints.rotations([m.R.T for m in so3.minima(Q)[:MOST_MINIMA]], Q):
+            start = self.constraints.satisfied(_linear_start(start_from, R_flange_sensor))
+            ends.append(self.down(statistics.normal_equations, start))
+        found = self.distinct(ends)
         if n <= CHUNK:  # once more from close by: without noise every digit counts
             statistics = Statistics.of(phi, self.wrench, weights, coefficients(found[0].parameters))
-            found[0] = self.down(statistics.normal_equations, found[0].parameters)[0]
+            found[0] = self.down(statistics.normal_equations, found[0].parameters)
         return found
 
-    def _from_all(self, statistics: Statistics, rotations: Sequence[Array], Q: Array) -> list[Minimum]:
-        ends = []
-        for R_flange_sensor in self.constraints.rotations(list(rotations), Q):
-            start = self.constraints.satisfied(_linear_start(statistics, R_flange_sensor))
-            ends.append(self.down(statistics.normal_equations, start))
-        return self.distinct(ends)
-
-    def distinct(self, ends: list[tuple[Minimum, bool]]) -> list[Minimum]:
+    @staticmethod
+    def distinct(ends: list[Minimum]) -> list[Minimum]:
         """Sort, and leave out those that ended in the same minimum."""
-        ends.sort(key=lambda end: end[0].chi2)
-        best, settled = ends[0]
-        if not settled:
-            weight_N = np.linalg.norm(best.parameters.gravity_force_base_N)
-            raise NotObservable(
-                f"the fit has not settled in {MAX_STEPS} steps, at a weight of {weight_N:.2g} N: "
-                "hang something heavier on the sensor, or add poses with other orientations."
-            )
         found: list[Minimum] = []
-        for end, _ in ends:
+        for end in sorted(ends, key=lambda end: end.chi2):
             R = end.parameters.R_flange_sensor
             if all(_angle(R, other.parameters.R_flange_sensor) > SAME_ROTATION_RAD for other in found):
                 found.append(end)
@@ -111,13 +98,13 @@ class Descent:
             return H + A.T @ A, g + A.T @ residual, cost + float(residual @ residual)
         return H, g, cost
 
-    def down(self, equations: Equations, p: Parameters, steps: int = MAX_STEPS) -> tuple[Minimum, bool]:
-        """Levenberg-Marquardt with scaled columns; tells whether it came to rest."""
+    def down(self, equations: Equations, p: Parameters, steps: int = MAX_STEPS) -> Minimum:
+        """Levenberg-Marquardt with scaled columns."""
         H, g, cost = self.normal_equations(equations, p)
         b, F0, T0 = p.gravity_force_base_N, p.force_bias_N, p.torque_bias_Nm
         prediction = np.concatenate([np.zeros(3), b, F0, np.zeros(3), T0])  # times the Jacobian is the predicted wrench
         rounding = 1e-14 * float(np.sqrt(max(prediction @ H @ prediction, 0.0)))
-        damping, settled = 0.0, False
+        damping, moved, settled = 0.0, np.inf, False
         for _ in range(steps):
             Z = self.constraints.free(p) if self.constraints.any else None
             Hz, gz = (H, g) if Z is None else (Z.T @ H @ Z, Z.T @ g)
@@ -139,13 +126,25 @@ class Descent:
             settled = moved <= (small if improved else 100 * small)
             if settled:
                 break
-        return Minimum(p, cost, H), settled
+        return Minimum(p, cost, H, settled or moved < SMALL_STEP)
 
 
 def column_scale(information: Array) -> Array:
     """Root of the diagonal, 1 where it vanishes: dividing by it makes eigenvalues independent of units."""
     diagonal = np.sqrt(np.diag(information))
     return np.asarray(np.where(diagonal > 0, diagonal, 1.0))
+
+
+def _without_correlation(weights: Array) -> Array:
+    """Inverse covariances as they would be for forces alone and torques alone; poses without weight keep none."""
+    if not weights[:, :3, 3:].any():
+        return weights
+    separate = np.zeros_like(weights)
+    for own, other in ((slice(0, 3), slice(3, 6)), (slice(3, 6), slice(0, 3))):
+        between, block = weights[:, own, other], weights[:, other, other]
+        block = block + (np.trace(block, axis1=1, axis2=2) == 0)[:, None, None] * np.eye(3)
+        separate[:, own, own] = weights[:, own, own] - between @ np.linalg.solve(block, np.swapaxes(between, 1, 2))
+    return separate
 
 
 def _linear_start(statistics: Statistics, R_flange_sensor: Array) -> Parameters:

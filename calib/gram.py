@@ -4,7 +4,8 @@ The model is linear in `features`, phi = (R_base_flange row by row, 1): predicte
 
     Theta = [[b^T (x) R, F0], [[P]x (b^T (x) R), T0]]    (6, 10),    R = R_flange_sensor.T, b = gravity_force_base_N
 
-so the weighted squares of a million poses are one 60 x 60 matrix, and a Gauss-Newton step costs the same for any number.
+so the weighted squares of a million poses are one 60 x 60 matrix, and a Gauss-Newton step costs the same for any
+number of them.
 """
 
 from dataclasses import dataclass

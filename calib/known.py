@@ -20,7 +20,7 @@ class Known:
     """
 
     R_flange_sensor: ArrayLike | None = None
-    """(3, 3) how the sensor is mounted; with `yaw_only` but for a turn about the flange z axis (default: not turned)."""
+    """(3, 3) how the sensor is mounted; with `yaw_only` but for a turn about the flange z axis (else the identity)."""
     R_tolerance_rad: float = 0.0
     """Of each of the three angles; with `yaw_only` of the two tilts."""
     yaw_only: bool = False
@@ -81,7 +81,7 @@ class Constraints:
         if not self.yaw_only:
             return [self.R] if self.R_tolerance == 0 else [self.R, *minima]
         angles = np.arange(24) * np.pi / 12  # the cost is a trigonometric polynomial of degree 2
-        turned = Rotation.from_euler("z", angles).as_matrix() @ self.R
+        turned = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_matrix() @ self.R
         r = np.swapaxes(turned, 1, 2).reshape(-1, 9)
         value = np.einsum("ki,ij,kj->k", r, cost, r)
         low = (value <= np.roll(value, 1)) & (value <= np.roll(value, -1))

@@ -10,12 +10,14 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import f as f_distribution
 
 from calib.covariance import Noise
-from calib.descent import Descent, Equations, Minimum, column_scale
-from calib.gram import CHUNK, Statistics, coefficients, features
+from calib.descent import MAX_STEPS, Descent, Equations, Minimum, column_scale
+from calib.errors import NotObservable
+from calib.gram import Statistics, features
 from calib.known import Constraints, Known
 from calib.model import Array, Parameters, jacobian, predict
 from calib.robust import FARTHEST, FEWEST_TO_REJECT_FROM, Kept, agreeing_poses, fewest_kept
@@ -44,15 +46,17 @@ LEVER_BOUNDS_M = (1e-3, 1.0)  # what any sensor has
 FEW_POSES = 6  # fewer cannot tell force noise from torque noise: the usual ratio is taken
 FEW_POSES_WITHOUT_NOISE = 12  # fewer cannot tell drift from noise that nobody measured
 POSES_FOR_EACH_AXIS = 50  # fewer cannot tell the drift of one axis from that of another of its group
-MANY_POSES = 20_000  # from here on single poses are looked at only when chi2 or the farthest of them asks for it
+MANY_POSES = 20_000  # from here on single poses are looked at only when chi2 or `drift` asks for it
 FLOOR = 0.03  # of the residuals: white noise that is surely there when nobody measured it
 SUSPICIOUS = 0.01  # p-value below which more than the measured noise is looked for
 LIGHT_TAIL = 0.6  # the median of squared distances relative to their mean, in units of what Gaussian noise has
-LARGE_ROTATION_RAD = np.deg2rad(1.0)  # no kinematics is worse
+LARGE_ROTATION_RAD = np.deg2rad(1.0)  # few kinematics are worse
+WORST_ROTATION_RAD = np.deg2rad(3.0)  # none is
 LARGE_WHITE = 3.0  # times the measured variance
 MEDIAN_DISTANCE = float(chi2_distribution.median(6))
 
 STANDARD_GRAVITY_M_S2 = 9.80665
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftEstimate:
@@ -91,7 +95,7 @@ class Fit:
     drift: DriftEstimate | None
     noise: Noise
     """Covariance of all wrenches under the noise model, poses in the order of `order`."""
-    order: Array
+    order: NDArray[np.intp]
     """(n,) row numbers by time."""
     R_base_flange: Array
     """(n, 3, 3)"""
@@ -115,8 +119,16 @@ class Fit:
 
     @property
     def second_basin_chi2(self) -> float | None:
-        """How much worse the second best minimum fits: it is right with the odds exp(-half of this). None: no other."""
-        return self.minima[1].chi2 - self.minima[0].chi2 if len(self.minima) > 1 else None
+        """How much worse the second best minimum fits: it is right with the odds exp(-half of this). None: no other.
+
+        Where white noise was estimated from the same residuals a larger one makes up for part of the difference.
+        """
+        if len(self.minima) == 1:
+            return None
+        best, second = self.minima[0].chi2, self.minima[1].chi2
+        if any(name.startswith("white") for name in self.components):
+            return float(self.dof * np.log(second / best))
+        return second - best
 
     @cached_property
     def residuals(self) -> Array:
@@ -258,8 +270,8 @@ class _Problem:
         if not self.measured:
             self._set_floor(best.parameters)
         static_chi2 = best.chi2
-        if self.measured and self.n > MANY_POSES and self.drift == "none" and self._surely_fits(best, weights):
-            return self._fit(everything, static_chi2)
+        if self.measured and self.n > MANY_POSES and self.drift == "none" and self._fits(everything):
+            return self._fit(everything, static_chi2)  # a pose that could do harm among so many would show in chi2
         chosen = self._chosen(everything, weights)
         if self.measured and not chosen.kept.all():
             static_chi2 = self.descent.minima(weights * chosen.kept[:, None, None])[0].chi2
@@ -281,8 +293,10 @@ class _Problem:
         return least_N, LEVER_M * least_N
 
     def _exact(self, p: Parameters) -> bool:
+        if self.measured:
+            return False
         residuals = self.wrench - predict(p, self.R)
-        return not self.measured and float(np.abs(residuals[:, :3]).max()) < 100 * self._least()[0]
+        return float(np.abs(residuals[:, :3]).max()) < 100 * self._least()[0]
 
     def _set_floor(self, p: Parameters) -> None:
         """Keep a share of the residuals as white noise, so that a random walk never explains them all."""
@@ -291,23 +305,9 @@ class _Problem:
         force_N = max(force_N, torque_Nm / LEVER_BOUNDS_M[1])
         self.cov = np.broadcast_to(_white(force_N, max(torque_Nm, LEVER_BOUNDS_M[0] * force_N)), self.cov.shape)
 
-    def _surely_fits(self, minimum: Minimum, weights: Array) -> bool:
-        """Tell whether chi2 and the farthest pose are those of the measured noise."""
-        if minimum.chi2 > chi2_distribution.isf(SUSPICIOUS, self._dof(np.ones(self.n, bool))):
-            return False
-        whiten, Theta = np.linalg.cholesky(weights[0]), coefficients(minimum.parameters)
-        farthest = 0.0
-        for first in range(0, self.n, CHUNK):
-            part = slice(first, first + CHUNK)
-            e = self.wrench[part] - self.R[part].reshape(-1, 9) @ Theta[:, :9].T
-            e -= Theta[:, 9]
-            if weights.strides[0] == 0:
-                e = e @ whiten
-                e *= e
-                farthest = max(farthest, float((e @ np.ones(6)).max()))
-            else:
-                farthest = max(farthest, float(np.einsum("ni,nij,nj->n", e, weights[part], e, optimize=True).max()))
-        return farthest < chi2_distribution.isf(SUSPICIOUS / self.n, 6)
+    def _fits(self, everything: _Explanation) -> bool:
+        """Tell whether the measured noise explains chi2."""
+        return everything.minima[0].chi2 < float(chi2_distribution.isf(SUSPICIOUS, self._dof(everything.kept)))
 
     # Explanations
 
@@ -318,19 +318,21 @@ class _Problem:
         problem = self._linearised(p, everything.kept)
         at = maximise(problem, always, self._start(problem, always))
         plain = self.measured and not always and self.drift != "linear"
-        quiet = plain and everything.minima[0].chi2 < chi2_distribution.isf(
-            SUSPICIOUS, self._dof(everything.kept)
-        )
+        quiet = plain and self._fits(everything)
         distances = self._distances(problem, at)
         reject = self._may_reject(distances)
         candidates = self._candidates()
-        if quiet and not reject and not (candidates and predicted_gains(problem, at, candidates)[0].max() > WORTH_A_TRY):
+        if (
+            quiet
+            and not reject
+            and not (candidates and predicted_gains(problem, at, candidates)[0].max() > WORTH_A_TRY)
+        ):
             return everything
         found = [self._explained(p, everything.kept)]
         if self._masks_outliers(found[0], reject):
             starts = [m.parameters for m in everything.minima]
             if not self.measured:
-                weights = at.noise.W
+                weights = np.asarray(at.noise.W, dtype=np.float64)
             for scaled in (False, True):
                 robust = self._agreeing(weights, starts, distances, scaled=scaled)
                 if robust is not None:
@@ -363,7 +365,7 @@ class _Problem:
         phi = features(self.R)
 
         def down(statistics: Statistics, p: Parameters, steps: int) -> Parameters:
-            return self.descent.down(statistics.normal_equations, p, steps)[0].parameters
+            return self.descent.down(statistics.normal_equations, p, steps).parameters
 
         if not scaled:
             return agreeing_poses(phi, self.wrench, weights, starts, down) if self.measured else None
@@ -389,7 +391,7 @@ class _Problem:
         for _ in range(12):
             problem = self._linearised(p, kept)
             if choose:
-                at = select(problem, always, self._start(problem, always), self._candidates())
+                at = self._selected(problem, always)
                 if self.drift == "auto":
                     at = with_slopes_instead(problem, at, len(always))
             else:
@@ -402,7 +404,22 @@ class _Problem:
             choose = bool((kept != before).any())
             if not choose and float(at.step @ np.linalg.solve(at.C, at.step)) < 1e-4:
                 break
+        if not self.measured and not before.all() and self._white_is_gone(at):
+            criterion = np.inf  # rejecting until the rest fits exactly explains nothing
         return _Explanation([Minimum(p, np.nan, np.zeros((15, 15)))], before, at.components, at.theta, criterion)
+
+    def _white_is_gone(self, at: Point) -> bool:
+        floor = self.cov[0, [0, 3], [0, 3]]
+        white = [value for c, value in zip(at.components, at.theta, strict=True) if c.kind == "white"]
+        return any(value < least for value, least in zip(white, floor, strict=False))
+
+    def _selected(self, problem: Linearised, always: list[Component]) -> Point:
+        start, candidates = self._start(problem, always), self._candidates()
+        at = select(problem, always, start, candidates)
+        found = dict(zip(at.components, at.theta, strict=True))
+        if found.get(ROTATION, 0.0) > WORST_ROTATION_RAD**2:  # something else, which no orientation error explains
+            at = select(problem, always, start, [c for c in candidates if c is not ROTATION])
+        return at
 
     def _moved(self, p: Parameters, step: Array) -> Parameters:
         if not self.constraints.any:
@@ -421,7 +438,7 @@ class _Problem:
     def _distances(self, problem: Linearised, at: Point) -> Array:
         """Squared leave-one-out residuals (n,) in units of their covariance."""
         P = at.noise.blocks - at.WJ @ at.C @ np.swapaxes(at.WJ, 1, 2)
-        S = np.linalg.inv(P)
+        S = np.asarray(np.linalg.inv(P), dtype=np.float64)
         e = (S @ at.u[..., None])[..., 0]
         self._replace_far(problem, at, S)
         return np.asarray((np.linalg.solve(S, e[..., None])[..., 0] * e).sum(axis=1))
@@ -441,7 +458,8 @@ class _Problem:
         rejected = ~problem.kept
         value = -2 * at.loglik
         if rejected.any():
-            S = np.linalg.inv(at.noise.blocks - at.WJ @ at.C @ np.swapaxes(at.WJ, 1, 2))
+            P = at.noise.blocks - at.WJ @ at.C @ np.swapaxes(at.WJ, 1, 2)
+            S = np.asarray(np.linalg.inv(P), dtype=np.float64)
             self._replace_far(problem, at, S)
             far = np.linalg.slogdet(at.noise.D[rejected])[1].sum()
             value += float(np.linalg.slogdet(S[rejected])[1].sum() - far) + FARTHEST * int(rejected.sum())
@@ -458,12 +476,13 @@ class _Problem:
         others = everything.minima if e.kept.all() else self.descent.minima(weights * e.kept[:, None, None])
         logdet = self._noise(e, p).logdet
         ends = []
-        for q in (p, *(minimum.parameters for minimum in others)):
+        for start in (p, *(minimum.parameters for minimum in others)):
+            q = start
             for _ in range(3 if ROTATION in e.components else 1):  # its noise depends on the parameters
                 noise = self._noise(e, q)
-                end, settled = self.descent.down(self._equations(noise), q)
+                end = self.descent.down(self._equations(noise), q)
                 q = end.parameters
-            ends.append((replace(end, chi2=end.chi2 + noise.logdet - logdet), settled))
+            ends.append(replace(end, chi2=end.chi2 + noise.logdet - logdet))
         return replace(e, minima=self.descent.distinct(ends))
 
     def _noise(self, e: _Explanation, p: Parameters) -> Noise:
@@ -481,8 +500,16 @@ class _Problem:
 
     def _fit(self, e: _Explanation, static_chi2: float, sigma: Array | None = None) -> Fit:
         best = e.minima[0]
+        if not best.settled:
+            weight_N = np.linalg.norm(best.parameters.gravity_force_base_N)
+            raise NotObservable(
+                f"the fit has not settled in {MAX_STEPS} steps, at a weight of {weight_N:.2g} N: "
+                "hang something heavier on the sensor, or add poses with other orientations."
+            )
         if sigma is not None:  # exact data
             noise = Noise(np.broadcast_to(sigma, self.cov.shape))
+        elif not e.components and e.kept.all() and self.drift != "linear":
+            noise = Noise(self.cov)
         else:
             noise = self._noise(e, best.parameters)
         weights = np.empty(self.n)
@@ -564,7 +591,7 @@ def _inverses(cov: Array) -> Array:
     """Invert (n, 6, 6) matrices, once when they are all the same."""
     if cov.strides[0] == 0:
         return np.broadcast_to(np.linalg.inv(cov[:1]), cov.shape)
-    return np.linalg.inv(cov)
+    return np.asarray(np.linalg.inv(cov))
 
 
 def _inverse(information: Array) -> Array:

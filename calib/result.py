@@ -64,7 +64,7 @@ class CalibrationResult:
     """Plain words: why the verdict is not better, and what else is worth knowing."""
     provenance: Mapping[str, JSON] = field(default_factory=dict)
     p_value: float | None = None
-    """Probability of a chi2 as large or larger if the measured noise were all there is; None when nobody measured it."""
+    """Probability of a chi2 as large or larger if the measured noise were all there is; None = nobody measured it."""
     measured_sigma: Array | None = None
     """(6,) measured standard deviation of a pose's mean, root mean square over the poses, N and N·m; None = unknown."""
     weights: Array | None = None

@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.covariance import Noise, centred, walk_square, walk_times
 from calib.model import Array
 
 GAIN = 2.0
 """A component stays when it raises the restricted log-likelihood by more than this."""
+SURE = 20.0  # a gain or loss that no other component makes good
 WORTH_A_TRY = 1.0  # gain predicted from slope and curvature at zero
 NEGLIGIBLE = 1e-4  # of the white noise: where slope and curvature "at zero" are taken
 FAR = 1e12  # a rejected pose counts as this much noisier
@@ -59,8 +61,8 @@ class Linearised:
     """(n, 6, 6) measured noise of each pose; zero where nobody measured it."""
     time: Array
     """(n,) ascending, in mean intervals."""
-    kept: Array
-    """(n,) bool"""
+    kept: NDArray[np.bool_]
+    """(n,)"""
     slope: Array | None
     """(6,) as in `Noise`, for linear drift that is part of the model."""
 
@@ -180,7 +182,7 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array)
             caution *= 10
         if gained > 0:
             best, caution = trial, max(caution / 10, 1e-6)
-        if gained < 1e-3 and np.abs(step).max() < 0.05 or gained < 1e-6:
+        if (gained < 1e-3 and np.abs(step).max() < 0.05) or gained < 1e-6:
             break
         # What sinks without changing the likelihood has left: it will be dropped.
         if gained < 1e-2 and (slope < 0.05).all():
@@ -197,8 +199,13 @@ def select(problem: Linearised, always: Sequence[Component], theta: Array, candi
         k = int(np.argmax(gains))
         if gains[k] < WORTH_A_TRY:
             break
-        tried = waiting.pop(k)
-        trial = maximise(problem, [*best.components, tried], np.append(best.theta, start[k]))
+        # Walks that are as good as certain come in together: each channel has its own.
+        certain = gains > SURE if waiting[k].kind == "walk" else np.zeros(len(gains), bool)
+        together = [i for i, c in enumerate(waiting) if i == k or (c.kind == "walk" and certain[i])]
+        trial = maximise(
+            problem, [*best.components, *(waiting[i] for i in together)], np.append(best.theta, start[together])
+        )
+        waiting = [c for i, c in enumerate(waiting) if i not in together]
         if trial.loglik > best.loglik + GAIN:
             best = trial
     return _pruned(problem, best, len(always))
@@ -225,12 +232,20 @@ def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
     k = needed
     while needed < len(best.components) - 1 and k < len(best.components):
         rest = [i for i in range(len(best.components)) if i != k]
+        if best.components[k].kind == "walk" and _loss(problem, best, rest) > SURE:
+            k += 1
+            continue
         without = maximise(problem, [best.components[i] for i in rest], best.theta[rest])
         if without.loglik > best.loglik - GAIN:
             best, k = without, needed
         else:
             k += 1
     return best
+
+
+def _loss(problem: Linearised, best: Point, rest: list[int]) -> float:
+    """How much worse it gets with only the rest of the components, the others as they are."""
+    return best.loglik - point(problem, [best.components[i] for i in rest], best.theta[rest]).loglik
 
 
 def predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Component]) -> tuple[Array, Array]:

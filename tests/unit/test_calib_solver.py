@@ -11,8 +11,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, CalibrationResult, NotObservable, Parameters, read_csv, solve
-from calib.model import Array, jacobian, predict
 from calib.ml import fit
+from calib.model import Array, jacobian, predict
 from calib.result import Method
 from calib.yu import SPECIAL_R_flange_base
 
