@@ -228,6 +228,8 @@ class _Explanation:
 
     minima: list[Minimum]
     kept: Kept
+    cov: Array
+    """(n, 6, 6) measured noise of each pose, or what is surely there when nobody measured it."""
     components: tuple[Component, ...] = ()
     theta: Array = field(default_factory=lambda: np.zeros(0))
     criterion: float = np.inf
@@ -262,13 +264,11 @@ class _Problem:
 
     def solve(self) -> Fit:
         weights = _inverses(self.cov if self.measured else np.broadcast_to(_white(1.0, LEVER_M), self.cov.shape))
-        everything = _Explanation(self.descent.minima(weights), np.ones(self.n, bool))
+        everything = _Explanation(self.descent.minima(weights), np.ones(self.n, bool), self.cov)
         best = everything.minima[0]
         if self._lacks_rank(best) or self._exact(best.parameters):
             sigma = _white(*self._least()) if not self.measured else None
             return self._fit(everything, everything.minima[0].chi2, sigma)
-        if not self.measured:
-            self._set_floor(best.parameters)
         static_chi2 = best.chi2
         if self.measured and self.n > MANY_POSES and self.drift == "none" and self._fits(everything):
             return self._fit(everything, static_chi2)  # a pose that could do harm among so many would show in chi2
@@ -298,12 +298,14 @@ class _Problem:
         residuals = self.wrench - predict(p, self.R)
         return float(np.abs(residuals[:, :3]).max()) < 100 * self._least()[0]
 
-    def _set_floor(self, p: Parameters) -> None:
-        """Keep a share of the residuals as white noise, so that a random walk never explains them all."""
-        e = self.wrench - predict(p, self.R)
+    def _least_noise(self, p: Parameters, kept: Kept) -> Array:
+        """Give the measured noise, or a share of the residuals, so that a random walk never explains them all."""
+        if self.measured:
+            return self.cov
+        e = (self.wrench - predict(p, self.R))[kept]
         force_N, torque_Nm = (FLOOR * float(np.sqrt(np.mean(e[:, c] ** 2))) for c in (slice(0, 3), slice(3, 6)))
         force_N = max(force_N, torque_Nm / LEVER_BOUNDS_M[1])
-        self.cov = np.broadcast_to(_white(force_N, max(torque_Nm, LEVER_BOUNDS_M[0] * force_N)), self.cov.shape)
+        return np.broadcast_to(_white(force_N, max(torque_Nm, LEVER_BOUNDS_M[0] * force_N)), self.cov.shape)
 
     def _fits(self, everything: _Explanation) -> bool:
         """Tell whether the measured noise explains chi2."""
@@ -315,7 +317,7 @@ class _Problem:
         """Take the likeliest explanation; the plain one unless something speaks against it."""
         p = everything.minima[0].parameters
         always = self._always()
-        problem = self._linearised(p, everything.kept)
+        problem = self._linearised(p, everything.kept, self._least_noise(p, everything.kept))
         at = maximise(problem, always, self._start(problem, always))
         plain = self.measured and not always and self.drift != "linear"
         quiet = plain and self._fits(everything)
@@ -337,6 +339,8 @@ class _Problem:
                 robust = self._agreeing(weights, starts, distances, scaled=scaled)
                 if robust is not None:
                     found.append(self._explained(*robust))
+        if all(e.criterion == np.inf for e in found):
+            found = [self._explained(p, everything.kept, may_reject=False)]
         return self._with_all_minima(min(found, key=lambda e: e.criterion), everything, weights)
 
     def _masks_outliers(self, e: _Explanation, suspected: bool) -> bool:
@@ -383,13 +387,14 @@ class _Problem:
                 break
         return found
 
-    def _explained(self, p: Parameters, kept: Kept) -> _Explanation:
+    def _explained(self, p: Parameters, kept: Kept, *, may_reject: bool = True) -> _Explanation:
         """Alternate between parameters, variance components and rejection until they agree."""
         always = self._always()
         readmitted = np.zeros(self.n, bool)
         choose = True
+        cov = self._least_noise(p, kept)
         for _ in range(12):
-            problem = self._linearised(p, kept)
+            problem = self._linearised(p, kept, cov)
             if choose:
                 at = self._selected(problem, always)
                 if self.drift == "auto":
@@ -399,17 +404,20 @@ class _Problem:
             distances = self._distances(problem, at)
             criterion = self._criterion(problem, at)
             p = self._moved(p, at.step)
-            before, kept = kept, self._membership(kept, distances, readmitted, at)
+            before = kept
+            if may_reject:
+                kept = self._membership(kept, distances, readmitted, at)
             readmitted |= kept & ~before
             choose = bool((kept != before).any())
             if not choose and float(at.step @ np.linalg.solve(at.C, at.step)) < 1e-4:
                 break
-        if not self.measured and not before.all() and self._white_is_gone(at):
+        if not self.measured and not before.all() and self._white_is_gone(at, cov):
             criterion = np.inf  # rejecting until the rest fits exactly explains nothing
-        return _Explanation([Minimum(p, np.nan, np.zeros((15, 15)))], before, at.components, at.theta, criterion)
+        return _Explanation([Minimum(p, np.nan, np.zeros((15, 15)))], before, cov, at.components, at.theta, criterion)
 
-    def _white_is_gone(self, at: Point) -> bool:
-        floor = self.cov[0, [0, 3], [0, 3]]
+    @staticmethod
+    def _white_is_gone(at: Point, cov: Array) -> bool:
+        floor = cov[0, [0, 3], [0, 3]]
         white = [value for c, value in zip(at.components, at.theta, strict=True) if c.kind == "white"]
         return any(value < least for value, least in zip(white, floor, strict=False))
 
@@ -451,7 +459,7 @@ class _Problem:
             S[rejected] += at.noise.D[problem.kept].mean(axis=0) - at.noise.D[rejected]
 
     def _distances_of(self, e: _Explanation) -> Array:
-        problem = self._linearised(e.minima[0].parameters, e.kept)
+        problem = self._linearised(e.minima[0].parameters, e.kept, e.cov)
         return self._distances(problem, point(problem, e.components, e.theta))
 
     def _criterion(self, problem: Linearised, at: Point) -> float:
@@ -486,7 +494,7 @@ class _Problem:
         return replace(e, minima=self.descent.distinct(ends))
 
     def _noise(self, e: _Explanation, p: Parameters) -> Noise:
-        return noise_of(self._linearised(p, e.kept), e.components, e.theta)
+        return noise_of(self._linearised(p, e.kept, e.cov), e.components, e.theta)
 
     def _equations(self, noise: Noise) -> Equations:
         """Weighted least squares for any noise."""
@@ -549,7 +557,7 @@ class _Problem:
         change = bias[self.order[-1]] - bias[self.order[0]]
         return DriftEstimate(change, np.sqrt(np.maximum(np.diag(cov), 0.0)), bias)
 
-    def _linearised(self, p: Parameters, kept: Kept) -> Linearised:
+    def _linearised(self, p: Parameters, kept: Kept, cov: Array) -> Linearised:
         J = jacobian(p, self.R)
         turn = J[..., :3]
         r = self.wrench - predict(p, self.R)
@@ -559,8 +567,7 @@ class _Problem:
             Z = self.constraints.free(p)
             J, H, g = J @ Z, Z.T @ A.T @ A @ Z, Z.T @ A.T @ residual
         slope = np.full(6, np.inf) if self.drift == "linear" else None
-        D = np.broadcast_to(self.cov, (self.n, 6, 6))
-        return Linearised(J, r, (H, g), turn, D, self.time, kept, slope)
+        return Linearised(J, r, (H, g), turn, cov, self.time, kept, slope)
 
     def _groups(self) -> list[range]:
         return [range(c, c + 1) for c in range(6)] if self.n >= POSES_FOR_EACH_AXIS else [FORCE, TORQUE]
