@@ -590,7 +590,7 @@ def coefficient_run(
 def _off(A: Array, n2: float, rng: Rng) -> Array:
     """R_base_flange of base-to-flange matrices, each Euler angle off by up to n2 rad."""
     turns = Rotation.from_matrix(A)
-    spun = Rotation.from_rotvec(rng.normal(size=(len(A), 3)) * 1e-9) * turns  # off the singularity
+    spun = Rotation.from_rotvec(rng.normal(size=(len(A), 3)) * 1e-6) * turns  # off the singularity
     angles = spun.as_euler("ZYX") + rng.uniform(-n2, n2, (len(A), 3))
     return np.swapaxes(Rotation.from_euler("ZYX", angles).as_matrix(), 1, 2)
 

@@ -172,7 +172,7 @@ def walk(n: int, q_N: float, rng: Rng) -> tuple[Array, Array]:
 
 def bumps(n: int, rng: Rng) -> Array:
     """Contact wrenches (n, 6): up to the weight of the tool in any direction, some 80 mm away."""
-    force = np.array([rng.uniform(0, WEIGHT_N) * direction(rng) for _ in range(n)])
+    force = np.array([rng.uniform(0, WEIGHT_N) * direction(rng) for _ in range(n)]).reshape(n, 3)
     return np.concatenate([force, np.cross(ARM_M * rng.normal(size=(n, 3)), force)], axis=1)
 
 
