@@ -2,6 +2,7 @@
 
 from calib.dataset import CalibrationDataset, read_csv
 from calib.errors import BadCalibration, BadDataset, CalibError, NotObservable
+from calib.known import Known
 from calib.model import PARAMETER_NAMES, Parameters
 from calib.noise import PoseMean, is_stationary, mean_and_covariance
 from calib.result import CalibrationResult
@@ -14,6 +15,7 @@ __all__ = [
     "CalibError",
     "CalibrationDataset",
     "CalibrationResult",
+    "Known",
     "NotObservable",
     "Parameters",
     "PoseMean",

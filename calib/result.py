@@ -169,7 +169,7 @@ class CalibrationResult:
     @property
     def sigma(self) -> Mapping[str, Array | float]:
         """One standard deviation of every quantity, by its name; `R_flange_sensor`: (3,) rad about the flange axes."""
-        std = np.sqrt(np.diag(self.covariance))
+        std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, self.covariance[3:6, 3:6])
         return {
             "R_flange_sensor": std[0:3],
@@ -324,7 +324,8 @@ def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]
     h = float(np.hypot(x, z))
     out = np.array([x, 0.0, z]) / h if h > 0 else np.array([1.0, 0.0, 0.0])  # away from the base y axis
     gradients = np.array([F_b / weight, (h * np.array([0.0, 1.0, 0.0]) - y * out) / weight**2])
-    weight_sigma, alpha = np.sqrt(np.einsum("ki,ij,kj->k", gradients, cov, gradients)).tolist()
+    variance = np.einsum("ki,ij,kj->k", gradients, cov, gradients)
+    weight_sigma, alpha = np.sqrt(np.maximum(variance, 0.0)).tolist()  # below 0 is rounding of what is exactly known
     along_beta = np.array([z, 0.0, -x])
-    beta = float(np.sqrt(along_beta @ cov @ along_beta)) / h**2 if h > 0 else float("inf")
+    beta = float(np.sqrt(max(along_beta @ cov @ along_beta, 0.0))) / h**2 if h > 0 else float("inf")
     return weight_sigma, min(alpha, float(np.pi)), min(beta, float(np.pi))

@@ -535,6 +535,8 @@ def carlson(lab: Lab) -> Iterator[Row]:
 
 
 FIG_9_METHODS = ("ml", "yaw only", "known rotation")
+FIG_9_YAW_DEG = 30.0
+"""Of the sensor while its roll is varied."""
 
 
 def yaw_run(seed: int, yaw_deg: float, roll_deg: float) -> dict[str, object]:
@@ -552,7 +554,7 @@ def figure_9(lab: Lab) -> dict[tuple[float, float], Array]:
     """Force rms in N of the three methods, by yaw and roll of the sensor in degrees."""
     runs = lab.count(60, 8)
     cells = [(yaw, 0.0) for yaw in (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 45.0)] + [
-        (30.0, roll) for roll in (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)
+        (FIG_9_YAW_DEG, roll) for roll in (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)
     ]
     return {
         cell: np.sqrt(lab.simulate(partial(yaw_run, yaw_deg=cell[0], roll_deg=cell[1]), runs)["force"].mean(axis=0))
@@ -610,10 +612,10 @@ def yu_figures(lab: Lab) -> Iterator[Row]:
     flat = float(ours.max() / ours.min())
     yield most("Yu Fig. 9: ML, largest over smallest error, any mounting", flat, 1.5 if lab.quick else 1.25, runs)
     known = [table[yaw, 0.0][2] for yaw in (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 45.0)]
-    yaw_only = [table[30.0, roll][1] for roll in (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)]
+    yaw_only = [table[FIG_9_YAW_DEG, roll][1] for roll in (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)]
     for name, curve, at in (
         ("known rotation, yaw 10°", known, table[10.0, 0.0][[0, 2]]),
-        ("yaw only, roll 2°", yaw_only, table[30.0, 2.0][[0, 1]]),
+        ("yaw only, roll 2°", yaw_only, table[FIG_9_YAW_DEG, 2.0][[0, 1]]),
     ):
         grows = bool((np.diff(curve[1:]) > 0).all())
         row = band(f"Yu Fig. 9: {name}: error over that of ML", float(at[1] / at[0]), 2, np.inf, runs)

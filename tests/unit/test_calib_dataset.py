@@ -216,6 +216,18 @@ def test_csv_rotation_vector_time_extra_columns_and_any_order(tmp_path: Path) ->
     np.testing.assert_array_equal(data.t_s, [0, 2.5])
 
 
+def test_csv_standard_errors_become_the_covariance(tmp_path: Path) -> None:
+    sigmas = "sigma_fx,sigma_fy,sigma_fz,sigma_tx,sigma_ty,sigma_tz"
+    data = read_csv(csv(tmp_path, f"{sigmas},{MATRIX_HEADER},t", f".1,.2,.3,.01,.02,.03,{IDENTITY},1,2,3,4,5,6,7"))
+    assert data.wrench_cov is not None
+    np.testing.assert_allclose(data.wrench_cov[0], np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2)
+    np.testing.assert_array_equal(data.wrench, [[1, 2, 3, 4, 5, 6]])
+    with pytest.raises(BadDataset, match="missing column sigma_tz"):
+        read_csv(csv(tmp_path, f"{sigmas[:-9]},{MATRIX_HEADER}", f".1,.2,.3,.01,.02,{IDENTITY},1,2,3,4,5,6"))
+    with pytest.raises(BadDataset, match="row 1: sigma_fy is 0, a standard error is above 0"):
+        read_csv(csv(tmp_path, f"{sigmas},{MATRIX_HEADER}", f".1,0,.3,.01,.02,.03,{IDENTITY},1,2,3,4,5,6"))
+
+
 @pytest.mark.parametrize(
     ("lines", "words"),
     [

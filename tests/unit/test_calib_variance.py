@@ -26,7 +26,8 @@ def dense(D: Array, time: Array, walk: Array, slope: Array) -> Array:
     n = len(D)
     tau = np.cumsum(np.diff(time, prepend=time[0] - 1))
     centre = np.eye(n) - 1 / n
-    V = np.kron(centre @ np.minimum.outer(tau, tau) @ centre, np.diag(walk**2))
+    K = centre @ np.minimum.outer(tau, tau) @ centre
+    V = np.asarray(np.kron(K, np.diag(walk**2)), dtype=np.float64)
     V += np.kron(np.outer(centred(time), centred(time)), np.diag(slope**2))
     for i in range(n):
         V[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += D[i]
