@@ -235,8 +235,9 @@ def _gauges(
             f"all poses keep {_axis(normal)} at one angle to gravity, {angle:.0f}° from the vertical",
             "with gravity reversed and the sensor turned by 180° about that axis they are explained as well",
         )
-    middle = gravity_flange.mean(axis=0) / np.linalg.norm(gravity_flange.mean(axis=0))
-    widest = np.rad2deg(np.arccos(np.clip((gravity_flange @ middle).min(), -1, 1)))
+    mean = gravity_flange.mean(axis=0)
+    length = float(np.linalg.norm(mean))  # zero for balanced sets, which point everywhere
+    widest = np.rad2deg(np.arccos(np.clip((gravity_flange @ mean).min() / max(length, _THIN), -1, 1)))
     if widest < _NARROW_DEG:
         return (
             f"gravity stays within {widest:.0f}° of one direction in the tool: mounting of the sensor, weight and bias "

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, Self
@@ -10,17 +11,30 @@ from typing import Any, Literal, Self
 import numpy as np
 from scipy.special import expit
 
+from calib.compensation import Compensator
 from calib.errors import BadCalibration
 from calib.files import JSON, check_format, read_object, write_new
-from calib.model import PARAMETER_NAMES, Array, Parameters, jacobian, predict, read_only
+from calib.model import PARAMETER_NAMES, Array, Parameters, jacobian, read_only
 from calib.yu import SPECIAL_R_flange_base, weight_and_tilt
 
 FORMAT = "ftdrive.calibration/1"
 
-LATER = ("p_value", "measured_sigma", "weights", "components", "drift", "second_basin_chi2")
+LATER = ("p_value", "measured_sigma", "weights", "components", "drift", "second_basin_chi2", "quality")
 """Fields that the first files of this format do not have."""
 
-Method = Literal["srom", "lrom", "ml", "known-rotation", "yaw-only"]
+Method = Literal[
+    "ml",
+    "srom",
+    "lrom",
+    "carlson-relaxation",
+    "carlson-cayley",
+    "carlson-eigen",
+    "carlson-nullspace",
+    "carlson-iterative",
+    "carlson-polynomial",
+    "known-rotation",
+    "yaw-only",
+]
 Verdict = Literal["good", "usable", "rejected"]
 NoiseSource = Literal["measured", "residuals"]
 
@@ -77,6 +91,10 @@ class CalibrationResult:
     """None: no drift was found, or none was looked for."""
     second_basin_chi2: float | None = None
     """How much worse the second best solution fits, under the noise model; None: there is no other."""
+    quality: Mapping[str, JSON] = field(default_factory=dict)
+    """What the verdict rests on: `loo_force_rms_N` and `loo_torque_rms_Nm` (each pose predicted from all others),
+    `worst_pose` (row from 1), `residual_sigma` (n; 1 expected), `lag1` (correlation of successive residuals),
+    `correlations` (pairs of parameters above 0.9)."""
 
     def __post_init__(self) -> None:
         n = len(self.residuals)
@@ -95,11 +113,12 @@ class CalibrationResult:
             object.__setattr__(self, "drift", DriftResult(self.drift["change"], self.drift["sigma"]))
         object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
         object.__setattr__(self, "reasons", tuple(self.reasons))
-        try:
-            provenance = json.loads(json.dumps(dict(self.provenance), allow_nan=False))
-        except (TypeError, ValueError) as exc:
-            raise ValueError(f"provenance cannot be written as JSON ({exc})") from exc
-        object.__setattr__(self, "provenance", MappingProxyType(provenance))
+        for name in ("provenance", "quality"):
+            try:
+                value = json.loads(json.dumps(dict(getattr(self, name)), allow_nan=False))
+            except (TypeError, ValueError) as exc:
+                raise ValueError(f"{name} cannot be written as JSON ({exc})") from exc
+            object.__setattr__(self, name, MappingProxyType(value))
 
     @property
     def n_poses(self) -> int:
@@ -197,13 +216,12 @@ class CalibrationResult:
         array, same shape as `wrench`
             Contact wrench on the sensor, in the sensor frame, about the sensor origin.
         """
-        wrench, R_base_flange = np.asarray(wrench, dtype=np.float64), np.asarray(R_base_flange, dtype=np.float64)
-        if wrench.shape[-1:] != (6,) or R_base_flange.shape != (*wrench.shape[:-1], 3, 3):
-            raise ValueError(
-                f"wrench has shape {wrench.shape} and R_base_flange {R_base_flange.shape}: "
-                "expected (6,) with (3, 3), or (n, 6) with (n, 3, 3)"
-            )
-        return np.asarray(wrench - predict(self.parameters, R_base_flange))
+        return np.asarray(self.compensator(wrench, R_base_flange), dtype=np.float64)
+
+    @cached_property
+    def compensator(self) -> Compensator:
+        """The same for those in a hurry: one sample, into a buffer, or a million at once."""
+        return Compensator(self.parameters)
 
     def wrench_covariance(self, R_base_flange: Array) -> Array:
         """Covariance of the predicted wrench that the uncertainty of the parameters causes.
@@ -274,6 +292,7 @@ class CalibrationResult:
             "rejected_poses": list(self.rejected_poses),
             "second_basin_chi2": self.second_basin_chi2,
             "p_wrong": self.p_wrong,
+            "quality": dict(self.quality),
             "g_m_s2": self.g_m_s2,
             "parameter_names": list(PARAMETER_NAMES),
             "covariance": self.covariance.tolist(),

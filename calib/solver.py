@@ -1,29 +1,30 @@
 """From a dataset to a calibration."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2 as chi2_distribution
 
 from calib.dataset import CalibrationDataset
 from calib.descent import column_scale
 from calib.errors import NotObservable
+from calib.evidence import Evidence, IndependentFit
+from calib.identifiability import require_observable
 from calib.known import Known
 from calib.ml import RANK_TOLERANCE, STANDARD_GRAVITY_M_S2, Drift, Fit, fit
 from calib.model import PARAMETER_NAMES, Array, Parameters, predict
 from calib.pooling import pooled_covariance
+from calib.published import LEVEL_BASE, PUBLISHED, Estimator, published
+from calib.quality import judge
 from calib.result import CalibrationResult, DriftResult, Method
-from calib.verdict import judge
-from calib.yu import lrom, special_numbers, srom_numbered
 
 SAME_ORIENTATION_RAD = np.deg2rad(0.5)
 SIMULATIONS = 400
 
-Estimator = Callable[[Array], Parameters]
+_TOLD = ("carlson-relaxation", "carlson-cayley")
+"""Published methods that take the direction of gravity, or the weight, as known."""
 
 
 def solve(
@@ -40,15 +41,16 @@ def solve(
     Parameters
     ----------
     dataset : CalibrationDataset
-    method : {"ml", "known-rotation", "yaw-only", "srom", "lrom"}
-        Maximum likelihood, from 4 poses on; the same for a sensor whose mounting is known (`known`, default: axes of
-        sensor and flange agree), or known but for its turn about the flange z axis. Or Yu's closed forms, for
-        comparison: SROM for the 24 special orientations, LROM for 5 or more of any kind.
+    method : Method
+        "ml": maximum likelihood, from 4 poses on; "known-rotation", "yaw-only": the same for a sensor whose mounting is
+        known (`known`, default: axes of sensor and flange agree), or known but for its turn about the flange z axis.
+        Or, for comparison, one of `calib.published.PUBLISHED`.
     drift : {"auto", "none", "linear", "random-walk"}
         How the bias may move while the poses are taken: as the data decide, not at all, or surely so. Poses without
         time count as equally spaced in their order.
     known : Known, optional
-        What is known of mounting, direction of gravity and mass. Not with SROM and LROM.
+        What is known of mounting, direction of gravity and mass. Of the published methods only those take it that ask
+        for gravity.
     g_m_s2 : float
         Gravity, by which the weight is divided to give the mass.
     provenance : mapping, optional
@@ -64,54 +66,72 @@ def solve(
             raise ValueError(f"{name} is '{value}', expected one of {', '.join(choices)}")
     if not (np.isfinite(g_m_s2) and g_m_s2 > 0):
         raise ValueError(f"g_m_s2 is {g_m_s2}, expected about 9.8")
-    if method in ("srom", "lrom") and known is not None:
+    if method in PUBLISHED and method not in _TOLD and known is not None:
         raise ValueError(f"{method} cannot use what is known before: use 'ml'")
     known = _constrained(method, known)
     _require_orientations(dataset, 5 if method == "lrom" else 4 if known is None else 3)
 
-    estimator = _closed_form(dataset, method)
+    estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2) if method in PUBLISHED else None
     wrench_cov = dataset.wrench_cov
     if wrench_cov is not None:
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
     # The fit also tells whether the poses are enough, and how large the noise is where it was not measured.
     best = fit(
-        dataset.R_base_flange, dataset.wrench, wrench_cov, t_s=dataset.t_s, drift=drift, known=known, g_m_s2=g_m_s2
+        dataset.R_base_flange,
+        dataset.wrench,
+        wrench_cov,
+        t_s=dataset.t_s,
+        drift=drift,
+        known=None if estimator else known,
+        g_m_s2=g_m_s2,
     )
     _require_rank(best)
-    parameters, covariance, chi2, dof = best.parameters, best.covariance, best.measured_chi2, best.dof
-    weights, drifted = best.weights, best.drift
-    if wrench_cov is None:
-        chi2 = best.chi2
+    if known is None:
+        require_observable(dataset.R_base_flange, best.parameters, best.wrench_cov)
+    evidence: Evidence = best
     if estimator:
         parameters = estimator(dataset.wrench)
-        covariance = _simulated_covariance(estimator, parameters, dataset.R_base_flange, best.wrench_cov)
-        weights, drifted, dof = np.ones(len(dataset)), None, 6 * len(dataset) - 15
         noise = best.wrench_cov if wrench_cov is None else wrench_cov
-        e = dataset.wrench - predict(parameters, dataset.R_base_flange)
-        chi2 = float(np.einsum("ni,ni->", e, np.linalg.solve(noise, e[..., None])[..., 0]))
-
-    result = CalibrationResult(
-        parameters=parameters,
-        covariance=covariance,
-        residuals=dataset.wrench - predict(parameters, dataset.R_base_flange),
+        evidence = IndependentFit(
+            parameters,
+            _simulated_covariance(estimator, parameters, dataset.R_base_flange, best.wrench_cov),
+            dataset.R_base_flange,
+            dataset.wrench,
+            noise,
+            wrench_cov is not None,
+            np.ones(len(dataset)),
+            best.second_basin_chi2,
+        )
+    quality = judge(evidence, t_s=dataset.t_s)
+    chi2 = evidence.chi2 if wrench_cov is None else evidence.measured_chi2
+    drifted = best.drift if estimator is None else None
+    return CalibrationResult(
+        parameters=evidence.parameters,
+        covariance=evidence.covariance,
+        residuals=evidence.residuals,
         chi2=chi2,
-        dof=dof,
+        dof=evidence.dof,
         noise_source="residuals" if wrench_cov is None else "measured",
         g_m_s2=g_m_s2,
         method=method,
-        verdict="rejected",
-        reasons=(),
+        verdict=quality.verdict,
+        reasons=quality.reasons,
         provenance={**(provenance or {}), "dataset_sha256": dataset.sha256()},
-        p_value=None if wrench_cov is None else float(chi2_distribution.sf(chi2, dof)),
+        p_value=quality.chi2_p,
         measured_sigma=None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0)),
-        weights=weights,
-        components=best.components,
+        weights=evidence.weights,
+        components=evidence.components,
         drift=None if drifted is None else DriftResult(drifted.change, drifted.sigma),
         second_basin_chi2=best.second_basin_chi2,
+        quality={
+            "loo_force_rms_N": quality.loo_force_rms_N,
+            "loo_torque_rms_Nm": quality.loo_torque_rms_Nm,
+            "worst_pose": quality.worst_pose + 1,
+            "residual_sigma": quality.residual_sigma.tolist(),
+            "lag1": quality.lag1,
+            "correlations": [list(pair) for pair in quality.correlations],
+        },
     )
-    gap = (best.second_basin_chi2 or np.inf) * max(1.0, chi2 / dof)
-    verdict, reasons = judge(result, chi2 + gap)
-    return replace(result, verdict=verdict, reasons=reasons)
 
 
 def _constrained(method: Method, known: Known | None) -> Known | None:
@@ -122,13 +142,11 @@ def _constrained(method: Method, known: Known | None) -> Known | None:
     return known
 
 
-def _closed_form(dataset: CalibrationDataset, method: Method) -> Estimator | None:
-    if method == "srom":
-        number, Y = special_numbers(dataset.R_base_flange)
-        return partial(srom_numbered, dataset.R_base_flange, number=number, Y=Y)
-    if method == "lrom":
-        return partial(lrom, dataset.R_base_flange)
-    return None
+def estimator_of(method: Method, R_base_flange: Array, known: Known | None, g_m_s2: float) -> Estimator:
+    """Prepare a published method; gravity is taken from `known` where the method needs it. Raises `NotObservable`."""
+    direction = LEVEL_BASE if known is None or known.gravity_direction_base is None else known.gravity_direction_base
+    weight_N = None if known is None or known.mass_kg is None else known.mass_kg * g_m_s2
+    return published(method, R_base_flange, gravity_direction_base=np.asarray(direction), weight_N=weight_N)
 
 
 def _require_orientations(dataset: CalibrationDataset, least: int) -> None:

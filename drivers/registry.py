@@ -2,18 +2,37 @@
 
 The part before ``://`` chooses the driver, which is imported only then; the middle says where the device is; what
 follows the question mark are the driver's options. Anything unknown is an error.
+
+Another package adds drivers by entry points, without a change here: ``scheme = "package.module:Class"`` in the group
+``ftdrive.sensors``, where the class has a `from_url` like those of this project, and ``name = "package.module:Class"``
+in the group ``ftdrive.arms``. What this project brings itself cannot be replaced that way.
 """
 
-from importlib import import_module
-from typing import Protocol, cast
+from collections.abc import Mapping
+from importlib.metadata import EntryPoint, entry_points
+from math import isfinite
+from types import MappingProxyType
+from typing import Any, Protocol, cast
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from drivers.interfaces import ForceTorqueSensor
+from drivers.interfaces import ForceTorqueSensor, RobotArm
 
-SENSORS = {
-    "ati-can": "drivers.ati.can:AtiCanSensor",
-    "ati-serial": "drivers.ati.serial:AtiSerialSensor",
-}
+SENSORS: Mapping[str, str] = MappingProxyType(
+    {
+        "ati-can": "drivers.ati.can:AtiCanSensor",
+        "ati-serial": "drivers.ati.serial:AtiSerialSensor",
+        "ati-netft": "drivers.netft:NetFtSensor",
+        "bota": "drivers.bota.sensor:BotaSensor",
+        "robotiq-ft300": "drivers.robotiq.sensor:RobotiqFt300",
+        "robotous-can": "drivers.robotous.can:RobotousCan",
+        "robotous-serial": "drivers.robotous.serial:RobotousSerial",
+        "ur-ft": "drivers.ur.sensor:UrWristSensor",
+    }
+)
+ARMS: Mapping[str, str] = MappingProxyType({"ur": "drivers.ur.arm:UrArm"})
+
+_EXTRAS: Mapping[str, str] = MappingProxyType({"pynetft": "netft"})
+"""Which optional part of ftdrive brings a library."""
 
 _EXAMPLES = (
     "ati-can://can0?bitrate=250000&base=0x20",
@@ -59,10 +78,24 @@ class Options:
             raise BadUrl(f"{self._url}: option '{key}' is {text}; allowed are {lowest} to {highest}")
         return value
 
+    def positive(self, key: str, why: str) -> float:
+        """Take an option that must be given, as a positive number; `why` tells the user where to get it."""
+        if key not in self._given:
+            raise BadUrl(f"{self._url}: option '{key}' is missing: {why}")
+        text = self.text(key, "")
+        try:
+            value = float(text)
+        except ValueError:
+            value = 0.0
+        if not (isfinite(value) and value > 0):
+            raise BadUrl(f"{self._url}: option '{key}' is '{text}'; it must be a positive number")
+        return value
+
     def reject_others(self) -> None:
         """Refuse options that nobody asked for."""
         if unknown := sorted(self._given.keys() - self._asked):
-            raise BadUrl(f"{self._url}: unknown option {', '.join(unknown)}; known: {', '.join(sorted(self._asked))}")
+            known = ", ".join(sorted(self._asked)) or "none"
+            raise BadUrl(f"{self._url}: unknown option {', '.join(unknown)}; known: {known}")
 
 
 class _FromUrl(Protocol):
@@ -76,27 +109,78 @@ def sensor_from_url(url: str, *, sign: int = 1) -> ForceTorqueSensor:
     ----------
     url : str
         Such as ``ati-can://can0?bitrate=250000&base=0x20``, ``ati-can:///dev/ttyACM0?interface=slcan`` or
-        ``ati-serial:///dev/serial/by-id/NAME?calibration=1``.
+        ``ati-serial:///dev/serial/by-id/NAME?calibration=1``; all are in drivers/README.md.
     sign : int
         -1 for a sensor that reports the reaction.
 
     Raises
     ------
     BadUrl
-        Unknown scheme or option, a value out of range, or no device.
+        Unknown scheme or option, a value out of range, no device, or a driver that cannot be imported.
     """
     try:
         parts = urlsplit(url)
     except ValueError as exc:
         raise BadUrl(f"{url}: {exc}; write it like {', '.join(_EXAMPLES)}") from exc
-    if parts.scheme not in SENSORS:
-        raise BadUrl(f"{url}: unknown sensor '{parts.scheme}'; known: {', '.join(SENSORS)}, as in {_EXAMPLES[0]}")
+    entry = _find("ftdrive.sensors", SENSORS, parts.scheme)
+    if entry is None:
+        known = ", ".join(_names("ftdrive.sensors", SENSORS))
+        raise BadUrl(f"{url}: unknown sensor '{parts.scheme}'; known: {known}, as in {_EXAMPLES[0]}")
     address = unquote(parts.netloc + parts.path)
     if not address or parts.fragment or not url.lower().startswith(f"{parts.scheme}://"):
         raise BadUrl(f"{url}: which device? Write it like {', '.join(_EXAMPLES)}")
-    module, name = SENSORS[parts.scheme].split(":")
-    driver = cast("_FromUrl", getattr(import_module(module), name))
+    driver = cast("_FromUrl", _load(entry))
     options = Options(url, parts.query)
-    sensor = driver.from_url(address, options, sign=sign)
+    try:
+        sensor = driver.from_url(address, options, sign=sign)
+    except BadUrl:
+        raise
+    except ValueError as exc:
+        raise BadUrl(f"{url}: {exc}") from exc
     options.reject_others()
     return sensor
+
+
+def arm_class(name: str = "ur") -> type[RobotArm]:
+    """Find the class of an arm by its name.
+
+    It is built like `drivers.ur.arm.UrArm`: from the host, and by keyword `model`, `speed_rad_s`,
+    `acceleration_rad_s2`.
+
+    Raises
+    ------
+    BadUrl
+        Unknown name, or a driver that cannot be imported.
+    """
+    entry = _find("ftdrive.arms", ARMS, name)
+    if entry is None:
+        raise BadUrl(f"unknown arm '{name}'; known: {', '.join(_names('ftdrive.arms', ARMS))}")
+    return cast("type[RobotArm]", _load(entry))
+
+
+def _find(group: str, own: Mapping[str, str], name: str) -> EntryPoint | None:
+    """Look a name up among our own drivers, then among those of other packages."""
+    if name in own:
+        return EntryPoint(name, own[name], group)
+    found = sorted(entry_points(group=group, name=name), key=lambda entry: entry.value)
+    if len(found) > 1:
+        packages = " and ".join(_package(entry) for entry in found)
+        raise BadUrl(f"'{name}' is offered by {packages}; uninstall one of them")
+    return found[0] if found else None
+
+
+def _names(group: str, own: Mapping[str, str]) -> list[str]:
+    return [*own, *sorted({entry.name for entry in entry_points(group=group)} - own.keys())]
+
+
+def _load(entry: EntryPoint) -> Any:
+    try:
+        return entry.load()
+    except (ImportError, AttributeError, SyntaxError) as exc:
+        extra = _EXTRAS.get(getattr(exc, "name", None) or "")
+        cure = f"pip install 'ftdrive[{extra}]'" if extra else f"reinstall {_package(entry)}"
+        raise BadUrl(f"the driver '{entry.name}' cannot be imported ({exc}): {cure}") from exc
+
+
+def _package(entry: EntryPoint) -> str:
+    return entry.dist.name if entry.dist is not None else "ftdrive"

@@ -10,6 +10,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult
+from calib.compare import Compared
 from calib.routine import DriftCheck, Progress
 from ftdrive.session import Plan
 
@@ -121,6 +122,35 @@ def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict
             error = np.atleast_1d(np.subtract(data[key], truth[key]))
         errors[key] = error / np.atleast_1d(data["sigma"][key])
     return errors
+
+
+def print_comparison(compared: Sequence[Compared]) -> None:
+    """Show all methods side by side."""
+    table = Table(box=None, padding=(0, 1))
+    for title in (
+        *("method", "mass kg", "centre of mass mm", "force bias N", "torque bias N·m", "mounting differs"),
+        *("force rms N", "torque rms N·m", "cross-validated N", "N·m"),
+    ):
+        table.add_column(title, justify="left" if title == "method" else "right")
+    for one in compared:
+        if one.parameters is None:
+            continue
+        com_mm, force_N, torque_Nm = (
+            ", ".join(f"{value:.{digits}f}" for value in vector)
+            for vector, digits in (
+                (1e3 * one.parameters.p_sensor_com_m, 1),
+                (one.parameters.force_bias_N, 3),
+                (one.parameters.torque_bias_Nm, 4),
+            )
+        )
+        angle = f"{np.degrees(one.rotation_difference_rad):.3f}°"
+        rms = (one.force_rms_N, one.torque_rms_Nm, one.cv_force_rms_N, one.cv_torque_rms_Nm)
+        cells = ("-" if np.isnan(value) else f"{value:.5f}" for value in rms)
+        table.add_row(one.method, f"{one.mass_kg:.5f}", com_mm, force_N, torque_Nm, angle, *cells)
+    talk.print(table)
+    for one in compared:
+        if one.reason is not None:
+            talk.print(f" {one.method}: {one.reason}")
 
 
 def _drift_line(drift: DriftCheck) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from calib import CalibrationDataset, CalibrationResult, solve
-from calib.result import Method
 from calib.routine import DriftCheck, PoseRecord, Progress, dataset_from, drift_check, run_tour
 from calib.tour import TourPose, wrist_tour
 from drivers.interfaces import DeviceInfo, ForceTorqueSensor, RobotArm
@@ -86,37 +85,38 @@ def calibrate_cell(
         for progress in run_tour(arm, sensor, plan.tour, cell.sampling, run.commit):
             on_progress(progress)
     # Solved from the files, not from memory: what is on disk is then enough to repeat it.
-    outcome = solve_run(run, "ml")
+    outcome = solve_records(run, run.records())
     outcome.dataset.save(run.folder / "dataset.json")
     if outcome.result.verdict != "rejected":
         outcome.result.save(run.calibration_path)
     return outcome
 
 
-def solve_run(run: Run, method: Method) -> Outcome:
-    """Solve the poses that a run holds."""
-    return solve_records(run, run.records(), method)
+def dataset_of(run: Run) -> tuple[CalibrationDataset, float, dict[str, Any]]:
+    """Read a run as a dataset, with the local gravity it was made at and where a result of it comes from."""
+    return _prepared(run, run.records())
 
 
-def solve_records(run: Run, records: Sequence[PoseRecord], method: Method) -> Outcome:
+def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     """Solve records of a run, as they are on disk or as a replay gives them."""
+    dataset, g_m_s2, provenance = _prepared(run, records)
+    result = solve(dataset, g_m_s2=g_m_s2, provenance=provenance)
+    return Outcome(run, dataset, result, drift_check(records))
+
+
+def _prepared(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, float, dict[str, Any]]:
     header = run.header()
     devices = header.get("devices", {})
     dataset = dataset_from(records, {"run": run.folder.name, "devices": devices})
-    result = solve(
-        dataset,
-        method,
-        g_m_s2=float(header["config"]["site"]["g_m_s2"]),
-        provenance={
-            "created_utc": datetime.now(UTC).isoformat(),
-            "argv": sys.argv,
-            "versions": versions(),
-            "devices": devices,
-            "run": run.folder.name,
-            "station": header.get("station"),
-        },
-    )
-    return Outcome(run, dataset, result, drift_check(records))
+    provenance = {
+        "created_utc": datetime.now(UTC).isoformat(),
+        "argv": sys.argv,
+        "versions": versions(),
+        "devices": devices,
+        "run": run.folder.name,
+        "station": header.get("station"),
+    }
+    return dataset, float(header["config"]["site"]["g_m_s2"]), provenance
 
 
 def _plan(cell: CellConfig, arm: RobotArm, sensor: ForceTorqueSensor) -> Plan:

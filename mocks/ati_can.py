@@ -2,23 +2,23 @@
 
 Ref: ATI 9610-05-1030-04 "F/T CAN Bus and Serial Bus Network Interface for OEM", CAN protocol and section 10 (start-up).
 
-Does not model: bus load and arbitration (an answer takes no bus time, only `latency_s`), the board's internal sampling
-rate, the power-up time of `start`, the serial port of the same board, and whether the real board answers malformed
-requests (this one ignores them).
+Does not model: bus load and arbitration (an answer takes no bus time), the board's internal sampling rate, the power-up
+time of `start`, the serial port of the same board, and whether the real board answers malformed requests (this one
+ignores them).
 """
 
 import random
 import struct
 import time
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mocks.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
-from mocks.pty import PtyDevice
-from mocks.slcan import CanFrame, SlcanAdapter
+from mocks.faults import Faults
+from mocks.sensor import CanSensor, Measure
+from mocks.slcan import CanFrame
 
 EMPTY_SLOT_STATUS = 0x8040  # bad active calibration, any error
 NO_ARGUMENT, ONE_ARGUMENT = (0, 1), (1,)  # accepted data lengths; a superfluous byte is tolerated
@@ -49,7 +49,7 @@ def matrix_row_payloads(row: NDArray[np.float64]) -> list[bytes]:
     return [struct.pack(">2f", *row[i : i + 2]) for i in (0, 2, 4)]
 
 
-class AtiCanNode(PtyDevice):
+class AtiCanNode(CanSensor):
     """The sensor's CAN node and the adapter a client opens.
 
     Public attributes may be changed while the node runs, except `base` and `bitrate`, which show what is in force.
@@ -60,8 +60,8 @@ class AtiCanNode(PtyDevice):
         Returns (n, 6) successive noisy readings in N and N·m, sensor axes; thread-safe.
     base, bitrate
         Base identifier (7 bits) and bit rate; a client at another bit rate gets no answer.
-    seed
-        Of the faults below.
+    seed, faults
+        Of the wire.
     calibrations
         What each slot 0 to 15 holds; a slot not named is empty.
     serial
@@ -78,25 +78,18 @@ class AtiCanNode(PtyDevice):
         Silence after a reset.
     reset_applies_settings
         Whether a reset counts as power-up for a new base identifier and bit rate.
-    latency_s, jitter_s
-        Time before an answer, and the largest random time added before each of its frames.
-    loss, duplicate, foreign
-        Probability that a frame of an answer is lost, sent twice, or preceded by another node's frame.
-    swap
-        Probability that the last two frames of an answer change places.
     wrong_echo
         Slot number echoed in place of the selected one.
-    silent
-        The sensor does not answer (the adapter does).
     """
 
     def __init__(
         self,
-        measure: Callable[[int], NDArray[np.float64]],
+        measure: Measure,
         *,
         base: int = 0x20,
         bitrate: int = 250_000,
         seed: int = 0,
+        faults: Faults | None = None,
         calibrations: Mapping[int, Calibration] | None = None,
         serial: str = "FT12345",
         firmware: tuple[int, int, int] = (3, 8, 2),
@@ -105,19 +98,12 @@ class AtiCanNode(PtyDevice):
         saturated_gauge: int | None = None,
         boot_s: float = 0.2,
         reset_applies_settings: bool = True,
-        latency_s: float = 0.0,
-        jitter_s: float = 0.0,
-        loss: float = 0.0,
-        duplicate: float = 0.0,
-        foreign: float = 0.0,
-        swap: float = 0.0,
         wrong_echo: int | None = None,
-        silent: bool = False,
     ) -> None:
-        super().__init__()
+        super().__init__(seed=seed, faults=faults, bitrate=bitrate)
         self.measure = measure
         self.base = self._next_base = base
-        self.bitrate = self._next_bitrate = bitrate
+        self._next_bitrate = bitrate
         self.calibrations = {0: REFERENCE} if calibrations is None else dict(calibrations)
         self.serial = serial
         self.firmware = firmware
@@ -126,55 +112,31 @@ class AtiCanNode(PtyDevice):
         self.saturated_gauge = saturated_gauge
         self.boot_s = boot_s
         self.reset_applies_settings = reset_applies_settings
-        self.latency_s = latency_s
-        self.jitter_s = jitter_s
-        self.loss = loss
-        self.duplicate = duplicate
-        self.foreign = foreign
-        self.swap = swap
         self.wrong_echo = wrong_echo
-        self.silent = silent
-        self.dropped_messages = 0
-        self._random = random.Random(seed)
-        self._adapter = SlcanAdapter()
-        self._to_host = bytearray()
-        self._outbox: deque[tuple[float, CanFrame]] = deque()
         self._slot = 0
         self._booted_s = 0.0
 
     def _power_up(self) -> None:
-        self._adapter = SlcanAdapter()
-        self._to_host.clear()
-        self._reset(applies_settings=True)
+        super()._power_up()
         self._booted_s = 0.0
+
+    def _boot(self) -> None:
+        self._reset(applies_settings=True)
 
     def _reset(self, *, applies_settings: bool) -> None:
         self._slot = 0
-        self._outbox.clear()
+        self._wire.clear()
         self._booted_s = time.monotonic() + self.boot_s
         if applies_settings:
             self.base, self.bitrate = self._next_base, self._next_bitrate
 
-    def _received(self, data: bytes) -> None:
-        answers, frames = self._adapter.feed(data)
-        self._to_host += answers
-        for frame in frames:
-            if self._adapter.bitrate != self.bitrate:
-                self._adapter.bus_error = True
-            elif not self.silent and time.monotonic() >= self._booted_s:
-                self._queue(self._answer(frame))
-
-    def _tick(self) -> float | None:
-        now_s = time.monotonic()
-        while self._outbox and self._outbox[0][0] <= now_s:
-            self._to_host += self._adapter.line(self._outbox.popleft()[1])
-        if self._to_host:
-            self.dropped_messages += self._send(bytes(self._to_host), len(self._to_host))
-            self._to_host.clear()
-        return self._outbox[0][0] - now_s if self._outbox else None
+    def _samples(self, _count: int) -> list[CanFrame]:
+        return []  # this one only answers
 
     def _answer(self, request: CanFrame) -> list[CanFrame]:
         opcode = request.identifier & 0xF
+        if time.monotonic() < self._booted_s:
+            return []
         if request.extended or request.remote or request.identifier >> 4 != self.base:
             return []
         if len(request.data) not in REQUEST_DLC.get(opcode, ()):
@@ -221,26 +183,10 @@ class AtiCanNode(PtyDevice):
             gauges[self.saturated_gauge] = GAUGE_MAX
         return gauges
 
-    def _queue(self, answer: list[CanFrame]) -> None:
-        """Put an answer on its way, with the faults that befall it; the node answers one request after the other."""
-        chance = self._random.random
-        due_s = max(time.monotonic(), self._outbox[-1][0] if self._outbox else 0.0) + self.latency_s
-        if len(answer) > 1 and chance() < self.swap:
-            answer[-2:] = reversed(answer[-2:])
-        for frame in answer:
-            due_s += self.jitter_s * chance()
-            if chance() < self.foreign:
-                self._outbox.append((due_s, self._foreign_frame()))
-            if chance() < self.loss:
-                continue
-            self._outbox.append((due_s, frame))
-            if chance() < self.duplicate:
-                self._outbox.append((due_s, frame))
-
-    def _foreign_frame(self) -> CanFrame:
+    def _foreign_frame(self, rng: random.Random) -> CanFrame:
         """Another node's frame: a standard identifier that is not ours, or an extended one that looks like ours."""
-        data = self._random.randbytes(self._random.randrange(9))
-        if self._random.random() < 0.5:
-            return CanFrame((self.base << 4) + self._random.randrange(16), data, extended=True)
-        other_base = (self.base + self._random.randrange(1, 0x80)) % 0x80
-        return CanFrame((other_base << 4) + self._random.randrange(16), data)
+        data = rng.randbytes(rng.randrange(9))
+        if rng.random() < 0.5:
+            return CanFrame((self.base << 4) + rng.randrange(16), data, extended=True)
+        other_base = (self.base + rng.randrange(1, 0x80)) % 0x80
+        return CanFrame((other_base << 4) + rng.randrange(16), data)

@@ -9,13 +9,26 @@ registers between two slots do not exist, a read of more than 64 registers is ex
 
 import struct
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mocks.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
+from mocks.faults import Faults, FaultyWire
+from mocks.modbus import (
+    DEVICE_FAILURE,
+    ILLEGAL_ADDRESS,
+    ILLEGAL_FUNCTION,
+    ILLEGAL_VALUE,
+    LONGEST_FRAME,
+    ModbusError,
+    read_registers,
+    reply,
+    written_registers,
+)
 from mocks.pty import PtyDevice
+from mocks.sensor import Measure
 
 ADDRESS = 0x0A
 STREAM_HZ = 7000.0
@@ -25,7 +38,6 @@ CHARACTER_BITS = 11
 JAM_BYTES = 14
 JAM_PAUSE_S = 0.050  # a longer pause and the jam counts from the start again
 FRAME_GAP_S = 1.75e-3  # Modbus RTU: fixed above 19 200 baud
-LONGEST_FRAME = 256
 MAX_READ = 64
 MAX_BACKLOG = 1400  # records, 0.2 s: what the terminal buffers anyway
 
@@ -34,31 +46,6 @@ WRITABLE = {*range(GAINS, SESSION + 1), BAUD_STORE, BAUD}
 CALIBRATION, CALIBRATION_STRIDE, CALIBRATION_SLOTS, CALIBRATION_REGISTERS = 0x00E3, 192, 16, 169
 DIAGNOSTICS = dict(enumerate((0x07FF, 0x0000, 0x0A3C, 0x09C4, 0x0800, 0x0003), start=0x0027))
 BAUD_RATES = (1_250_000, 19_200, 115_200)
-
-ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 2, 3, 4
-
-
-class ModbusError(Exception):
-    """A request answered with an exception code."""
-
-    def __init__(self, code: int) -> None:
-        super().__init__(f"Modbus exception {code}")
-        self.code = code
-
-
-def crc16(data: bytes) -> bytes:
-    """CRC-16/MODBUS as it goes on the wire, low byte first."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc >> 1) ^ (0xA001 if crc & 1 else 0)
-    return crc.to_bytes(2, "little")
-
-
-def with_crc(body: bytes) -> bytes:
-    """Return a frame's body followed by its CRC."""
-    return body + crc16(body)
 
 
 def stream_records(gauges: NDArray[np.int16], *, error: bool = False) -> NDArray[np.uint8]:
@@ -112,8 +99,8 @@ class AtiSerialBox(PtyDevice):
     measure
         Returns (n, 6) successive noisy readings in N and N·m, sensor axes; thread-safe. The stream has no sync byte:
         the noise must reach a gauge count, or shifted records validate.
-    seed
-        Of the faults below.
+    seed, faults
+        Of the wire; a frame is a reply or a record.
     calibrations
         What each slot 1 to 16 holds; a slot not named is empty. The lowest one describes the transducer.
     needs_gains
@@ -128,17 +115,16 @@ class AtiSerialBox(PtyDevice):
         Streams from power-up on, as after a crash of the last client.
     refuse_start
         Answers the start command with "refused".
-    bad_checksum, byte_slip
-        Probability of a record to carry a wrong checksum, and to lose a byte.
-    silent
-        Sends nothing.
+    bad_checksum
+        Probability of a record to carry a wrong checksum and right data.
     """
 
     def __init__(
         self,
-        measure: Callable[[int], NDArray[np.float64]],
+        measure: Measure,
         *,
         seed: int = 0,
+        faults: Faults | None = None,
         calibrations: Mapping[int, Calibration] | None = None,
         needs_gains: bool = True,
         status: int = 0,
@@ -147,11 +133,10 @@ class AtiSerialBox(PtyDevice):
         streaming_at_start: bool = False,
         refuse_start: bool = False,
         bad_checksum: float = 0.0,
-        byte_slip: float = 0.0,
-        silent: bool = False,
     ) -> None:
         super().__init__()
         self.measure = measure
+        self.faults = Faults() if faults is None else faults
         self.calibrations = {1: REFERENCE} if calibrations is None else dict(calibrations)
         self.needs_gains = needs_gains
         self.status = status
@@ -160,12 +145,11 @@ class AtiSerialBox(PtyDevice):
         self.streaming_at_start = streaming_at_start
         self.refuse_start = refuse_start
         self.bad_checksum = bad_checksum
-        self.byte_slip = byte_slip
-        self.silent = silent
         self.streaming = False
         self.produced_records = 0
         self.dropped_records = 0
         self._random = np.random.default_rng(seed)
+        self._wire: FaultyWire[bytes] = FaultyWire(self.faults, seed)
         self._stored_baud_code = 0
         self._registers: dict[int, int] = {}
         self._unlocked = False
@@ -184,6 +168,8 @@ class AtiSerialBox(PtyDevice):
             self._registers |= dict(enumerate(words, start=CALIBRATION + (slot - 1) * CALIBRATION_STRIDE))
         self._unlocked = False
         self._burst.clear()
+        self._wire.clear()
+        self._forget_unsent()
         self.streaming = False
         if self.streaming_at_start:
             self._start_streaming()
@@ -196,41 +182,43 @@ class AtiSerialBox(PtyDevice):
         self._burst += data[: LONGEST_FRAME + 1 - len(self._burst)]  # longer is no frame: remember no more of it
         if self.streaming and len(self._burst) >= JAM_BYTES:
             self.streaming = False  # and what follows without a pause still belongs to the jam
+            self._wire.clear()
             self._forget_unsent()
 
     def _tick(self) -> float | None:
+        wait_s = None if self.streaming else self._take_request()
+        if self.streaming:
+            elapsed_s = max(0.0, time.monotonic() - self._stream_start_s)
+            self._stream(elapsed_s)
+            wait_s = BURST_S - elapsed_s % BURST_S
         now_s = time.monotonic()
-        if not self.streaming and self._burst:
-            wait_s = self._last_byte_s + FRAME_GAP_S - now_s
-            if wait_s > 0:
-                return wait_s
-            request = bytes(self._burst)
-            self._burst.clear()
-            reply = self._reply(request)
-            if reply and not self.silent:
-                self._send(reply, len(reply))
-        if not self.streaming:
+        for data in self._wire.due(now_s):
+            self.dropped_records += self._send(data, RECORD_BYTES if self.streaming else len(data))
+        on_the_way_s = self._wire.wait_s(now_s)
+        return min((s for s in (wait_s, on_the_way_s) if s is not None), default=None)
+
+    def _take_request(self) -> float | None:
+        """Answer what came before a pause; return the seconds until that can be told."""
+        if not self._burst:
             return None
-        elapsed_s = max(0.0, now_s - self._stream_start_s)
-        self._stream(elapsed_s)
-        return BURST_S - elapsed_s % BURST_S
+        wait_s = self._last_byte_s + FRAME_GAP_S - time.monotonic()
+        if wait_s > 0:
+            return wait_s
+        answer = self._reply(bytes(self._burst))
+        self._burst.clear()
+        if answer:
+            self._wire.put([answer])
+        return None
 
     def _reply(self, frame: bytes) -> bytes:
-        """Answer to one frame; nothing when it is damaged or for another device."""
-        if len(frame) < 4 or len(frame) > LONGEST_FRAME or frame[0] != ADDRESS or crc16(frame[:-2]) != frame[-2:]:
-            return b""
-        function, data = frame[1], frame[2:-2]
-        try:
-            return with_crc(bytes((ADDRESS, function)) + self._execute(function, data))
-        except ModbusError as refused:
-            return with_crc(bytes((ADDRESS, function | 0x80, refused.code)))
+        return reply(ADDRESS, frame, self._execute)
 
     def _execute(self, function: int, data: bytes) -> bytes:
         match function:
             case 0x03:
-                return self._read(data, self._registers | {STATUS: self.status})
+                return read_registers(data, self._registers | {STATUS: self.status}, MAX_READ)
             case 0x04:
-                return self._read(data, DIAGNOSTICS)
+                return read_registers(data, DIAGNOSTICS, MAX_READ)
             case 0x10:
                 return self._write_registers(data)
             case 0x46 | 0x6A if len(data) != 1:
@@ -247,29 +235,12 @@ class AtiSerialBox(PtyDevice):
                 return bytes([accepted])
         raise ModbusError(ILLEGAL_FUNCTION)
 
-    def _read(self, data: bytes, registers: Mapping[int, int]) -> bytes:
-        if len(data) != 4:
-            raise ModbusError(ILLEGAL_VALUE)
-        first, count = struct.unpack(">2H", data)
-        if not 1 <= count <= MAX_READ:
-            raise ModbusError(ILLEGAL_VALUE)
-        if any(address not in registers for address in range(first, first + count)):
-            raise ModbusError(ILLEGAL_ADDRESS)
-        values = [registers[address] for address in range(first, first + count)]
-        return struct.pack(f">B{count}H", 2 * count, *values)
-
     def _write_registers(self, data: bytes) -> bytes:
-        if len(data) < 5:
-            raise ModbusError(ILLEGAL_VALUE)
-        first, count, size = struct.unpack(">2HB", data[:5])
-        if count == 0 or size != 2 * count or len(data) != 5 + size:
-            raise ModbusError(ILLEGAL_VALUE)
-        addresses = range(first, first + count)
-        if any(address not in WRITABLE for address in addresses):
+        values = written_registers(data)
+        if not values.keys() <= WRITABLE:
             raise ModbusError(ILLEGAL_ADDRESS)
-        if first < SESSION and not self._unlocked:
+        if min(values) < SESSION and not self._unlocked:
             raise ModbusError(DEVICE_FAILURE)
-        values = dict(zip(addresses, struct.unpack(f">{count}H", data[5:]), strict=True))
         if values.get(BAUD, 0) >= len(BAUD_RATES):
             raise ModbusError(ILLEGAL_VALUE)
         self._registers |= values
@@ -289,16 +260,14 @@ class AtiSerialBox(PtyDevice):
         if due <= 0:
             return
         self.produced_records += due
-        if self.silent:
-            return
         count = min(due, MAX_BACKLOG)
+        self.dropped_records += due - count
         records = stream_records(self._gauges(count), error=bool(self.status & 0x8000))
         if self.bad_checksum:
             records[self._random.random(count) < self.bad_checksum, 12] ^= 0x01
         data = records.tobytes()
-        if self.byte_slip and self._random.random() < self.byte_slip * count:
-            data = data[1:]
-        self.dropped_records += due - count + self._send(data, RECORD_BYTES)
+        size = RECORD_BYTES if self.faults.harm_frames else len(data)
+        self._wire.put([data[i : i + size] for i in range(0, len(data), size)])
 
     def _gauges(self, count: int) -> NDArray[np.int16]:
         """(count, 6) gauges at the gains and offsets in force, which are right only when they are the calibration's."""

@@ -11,6 +11,8 @@ import threading
 import tty
 from abc import ABC, abstractmethod
 
+_END, _RESET = b"!", b"r"
+
 
 class PtyDevice(ABC):
     """Base of the emulated serial devices: opening, unplugging, reading, and writing that never blocks.
@@ -54,7 +56,7 @@ class PtyDevice(ABC):
         """Close the pseudo-terminal as a pulled cable does: the client's next read or write fails."""
         if self._thread is None:
             return
-        os.write(self._wake_write, b"!")
+        os.write(self._wake_write, _END)
         self._thread.join()
         self._thread = None
         os.close(self._wake_write)
@@ -64,9 +66,18 @@ class PtyDevice(ABC):
         """End the device; harmless when it has ended already."""
         self.unplug()
 
+    def reset(self) -> None:
+        """Interrupt the device's supply for a moment: it starts anew behind the same pseudo-terminal."""
+        if self._thread is not None:
+            os.write(self._wake_write, _RESET)
+
     @abstractmethod
     def _power_up(self) -> None:
         """Set the state the device has after power-up."""
+
+    def _restart(self) -> None:
+        """Set the state after the supply was interrupted."""
+        self._power_up()
 
     @abstractmethod
     def _received(self, data: bytes) -> None:
@@ -90,14 +101,17 @@ class PtyDevice(ABC):
         -------
         Number of records dropped.
         """
-        if self._unsent:
-            self._unsent = self._unsent[self._write(self._unsent) :]
+        self._finish_record()
         rest = data if self._unsent else data[self._write(data) :]
         if not rest:
             return 0
         if not self._unsent:
             self._unsent = rest[: len(rest) % record_bytes]
         return len(rest) // record_bytes
+
+    def _finish_record(self) -> None:
+        if self._unsent:
+            self._unsent = self._unsent[self._write(self._unsent) :]
 
     def _forget_unsent(self) -> None:
         """Give up a record that left in part."""
@@ -112,9 +126,15 @@ class PtyDevice(ABC):
     def _serve(self, slave: int) -> None:
         try:
             while True:
-                readable, _, _ = select.select([self._master, self._wake_read], [], [], self._tick())
+                wait_s = self._tick()
+                unfinished = [self._master] if self._unsent else []
+                readable, writable, _ = select.select([self._master, self._wake_read], unfinished, [], wait_s)
                 if self._wake_read in readable:
-                    return
+                    if os.read(self._wake_read, 1) == _END:
+                        return
+                    self._restart()
+                if self._master in writable:
+                    self._finish_record()
                 if self._master in readable:
                     self._received(os.read(self._master, 4096))
         finally:

@@ -10,6 +10,7 @@ import os
 import selectors
 import signal
 import sys
+import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -19,6 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mocks.kinematics import MODELS, Array, Vector6, rotation, vector6
+from mocks.ur.operator import Operator
 from mocks.ur.robot import Robot, RobotSettings
 from mocks.ur.server import UrServer
 from mocks.world import MOUNTS_RAD, Truth, World
@@ -104,6 +106,7 @@ class Station:
 
     def __init__(self, options: Namespace) -> None:
         self._options = options
+        options.model = options.model or ("UR5" if options.polyscope[0] <= 3 else "UR5e")
         nominal = MODELS[options.model]
         dh = nominal.disturbed(options.seed, 1e-3 * options.dh_noise, 3e-4 * options.dh_noise)
         self.world = World(truth_from(options), dh, start_posture(options), options.seed)
@@ -117,6 +120,7 @@ class Station:
                 payload_kg=options.payload,
                 joint_limit_rad=math.radians(options.joint_limit_deg),
                 plane=options.plane,
+                unknown_outputs=frozenset({"tcp_offset"} if options.no_tcp_offset else ()),
                 time_scale=options.time_scale,
             ),
         )
@@ -127,14 +131,9 @@ class Station:
         self._line = bytearray()
         self._verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
             "unplug": self._unplug,
-            "protective-stop": self._protective_stop,
-            "emergency-stop": self._emergency_stop,
-            "freeze": self._freeze,
-            "drop": self._drop,
-            "remote-control": self._remote_control,
-            "set-tcp": self._set_tcp,
             "push": self._push,
             "state": self._state,
+            **Operator(self.robot, self.server).verbs,
         }
 
     def run(self) -> int:
@@ -219,7 +218,7 @@ class Station:
             return {"error": f'not understood: {line.decode("utf-8", "replace")}; say {{"do": …}} with {known}'}
         try:
             return verb(request)
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, OSError) as error:
             return {"error": f"{request['do']}: {error!r}"}
 
     def _unplug(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -229,35 +228,11 @@ class Station:
             self._sensors[name][0].unplug()
         return {"done": "unplug", "devices": names}
 
-    def _protective_stop(self, _request: dict[str, Any]) -> dict[str, Any]:
-        self.robot.protective_stop("asked for")
-        return {"done": "protective-stop"}
-
-    def _emergency_stop(self, request: dict[str, Any]) -> dict[str, Any]:
-        self.robot.emergency_stop(bool(request.get("on", True)))
-        return {"done": "emergency-stop"}
-
-    def _freeze(self, request: dict[str, Any]) -> dict[str, Any]:
-        self.server.frozen = bool(request.get("on", True))
-        return {"done": "freeze", "on": self.server.frozen}
-
-    def _drop(self, request: dict[str, Any]) -> dict[str, Any]:
-        count = self.server.drop(request["what"], reset=bool(request.get("reset", False)))
-        return {"done": "drop", "connections": count}
-
-    def _remote_control(self, request: dict[str, Any]) -> dict[str, Any]:
-        self.robot.remote_control = bool(request.get("on", True))
-        return {"done": "remote-control", "on": self.robot.remote_control}
-
-    def _set_tcp(self, request: dict[str, Any]) -> dict[str, Any]:
-        self.robot.tcp_offset = vector6(request["tcp"])
-        return {"done": "set-tcp"}
-
     def _push(self, request: dict[str, Any]) -> dict[str, Any]:
         self.world.push(request["wrench"])
         return {"done": "push"}
 
-    def _state(self, _request: dict[str, Any]) -> dict[str, Any]:
+    def _state(self, request: dict[str, Any]) -> dict[str, Any]:
         robot, arm = self.robot, self.robot.arm
         return {
             "q_rad": list(arm.actual_q),
@@ -273,10 +248,12 @@ class Station:
             "payload_kg": robot.payload_kg,
             "payload_cog_m": list(robot.payload_cog_m),
             "speed_fraction": arm.speed_fraction,
+            "speed_scaling": arm.pace,
             "true_wrench": self.world.true_wrench().tolist(),
             "bad_inputs": self.server.bad_inputs,
             "dropped_cycles": self.server.dropped_cycles,
-            "events": robot.events,
+            "t_host_ns": time.monotonic_ns(),
+            "events": [event.to_json() for event in robot.events[int(request.get("since", 0)) :]],
         }
 
 

@@ -10,6 +10,9 @@ from hypothesis import settings
 # A test run in the background inherits Ctrl-C as ignored, and so would every process that a test starts and interrupts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Before numpy is loaded: matrices are small, and the threads of two workers would only wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 settings.register_profile("ftdrive", deadline=None, derandomize=True)
 settings.load_profile("ftdrive")
 

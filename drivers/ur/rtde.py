@@ -14,7 +14,9 @@ import socket
 import struct
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Final
 
 from drivers.errors import ConnectError, DeviceTimeout, DriverError, ProtocolError, StreamBroken
@@ -145,6 +147,86 @@ class _Connection:
         self._socket.close()
 
 
+class Subscription:
+    """Outputs of one controller, sent `frequency_Hz` times a second; connected while it exists.
+
+    Parameters
+    ----------
+    host : str
+        Address of the controller.
+    outputs : mapping of str to str
+        Name and type of every output, such as ``{"timestamp": "DOUBLE"}``.
+    frequency_Hz : float
+        How often; at most the controller's own rate.
+    timeout_s : float
+        For the whole greeting.
+
+    Raises
+    ------
+    ConnectError
+        Nobody there, no RTDE, or outputs of other types.
+    """
+
+    def __init__(self, host: str, outputs: Mapping[str, str], frequency_Hz: float, *, timeout_s: float) -> None:
+        where = f"{host}:{PORT}"
+        self.version = (0, 0, 0, 0)
+        """Of the controller: major, minor, bugfix, build."""
+        self.missing: list[str] = []
+        """Outputs this controller does not know; if there are any, the stream has not been started."""
+        try:
+            self._connection = _Connection(socket.create_connection((host, PORT), timeout=timeout_s))
+        except OSError as error:
+            raise ConnectError(
+                f"{where} cannot be reached ({error}): check the address and the cable, that the robot controller is "
+                f"switched on, and that no firewall stands between."
+            ) from error
+        try:
+            self._greet(outputs, frequency_Hz, time.monotonic() + timeout_s)
+        except TimeoutError as error:
+            self.close()
+            raise ConnectError(
+                f"{where} accepts the connection but did not answer within {timeout_s:.1f} s: check that this is a "
+                f"robot controller and that it has finished starting."
+            ) from error
+        except (OSError, ProtocolError, StreamBroken) as error:
+            self.close()
+            raise ConnectError(
+                f"{where} does not speak RTDE ({error}): check that this is a robot controller and that RTDE is "
+                f"enabled under Settings, Security, Services."
+            ) from error
+
+    def read(self, timeout_s: float | None) -> list[tuple[float, ...]]:
+        """Read the next sample: one tuple for each output.
+
+        Raises `TimeoutError` when none comes, `OSError` or `StreamBroken` when the connection is lost, `ProtocolError`.
+        """
+        while True:
+            kind, payload = self._connection.read(timeout_s)
+            if kind == DATA:
+                return self._recipe.unpack(payload)
+
+    def close(self) -> None:
+        """Let the connection go, and wake a thread that reads. Idempotent."""
+        self._connection.close()
+
+    def _greet(self, outputs: Mapping[str, str], frequency_Hz: float, deadline: float) -> None:
+        ask = self._connection.ask
+        if ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02"), deadline) != b"\x01":
+            raise ProtocolError("protocol version 2 is refused")
+        self.version = decode_version(ask(encode(GET_CONTROLLER_VERSION), deadline))
+        names = tuple(outputs)
+        self._recipe = Recipe.decode(ask(encode_setup_outputs(frequency_Hz, names), deadline))
+        types = self._recipe.types
+        if len(types) == len(names):
+            self.missing = [name for name, kind in zip(names, types, strict=True) if kind == "NOT_FOUND"]
+        if self.missing:
+            return
+        if types != tuple(outputs.values()):
+            raise ProtocolError(f"{', '.join(names)} come as {', '.join(types)}")
+        if ask(encode(START), deadline) != b"\x01":
+            raise ProtocolError("the controller does not start the stream")
+
+
 class TcpOffsetReader:
     """The controller's version, and its active TCP offset kept current by a thread.
 
@@ -152,12 +234,12 @@ class TcpOffsetReader:
     with the offset that was active when it was taken.
     """
 
-    _names = ("timestamp", "tcp_offset")
+    _outputs: Final = MappingProxyType({"timestamp": "DOUBLE", "tcp_offset": "VECTOR6D"})
     _frequency_Hz = 125.0  # the full rate of the CB3 generation; e-Series arms send every fourth cycle
 
     def __init__(self, host: str) -> None:
         self._host = host
-        self._connection: _Connection | None = None
+        self._stream: Subscription | None = None
         self._thread: threading.Thread | None = None
         self._changed = threading.Condition()
         self._newest: tuple[float, tuple[float, ...]] | None = None
@@ -169,40 +251,20 @@ class TcpOffsetReader:
 
     def open(self, *, timeout_s: float) -> None:
         """Say hello and start to follow the offset. Raises `ConnectError`."""
-        where = f"{self._host}:{PORT}"
-        try:
-            self._connection = _Connection(socket.create_connection((self._host, PORT), timeout=timeout_s))
-        except OSError as error:
-            raise ConnectError(
-                f"{where} cannot be reached ({error}): check the address and the cable, that the robot controller is "
-                f"switched on, and that no firewall stands between."
-            ) from error
-        try:
-            recipe = self._greet(self._connection, time.monotonic() + timeout_s)
-        except TimeoutError as error:
-            raise ConnectError(
-                f"{where} accepts the connection but did not answer within {timeout_s:.1f} s: check that this is a "
-                f"robot controller and that it has finished starting."
-            ) from error
-        except (OSError, ProtocolError, StreamBroken) as error:
-            raise ConnectError(
-                f"{where} does not speak RTDE ({error}): check that this is a robot controller and that RTDE is "
-                f"enabled under Settings, Security, Services."
-            ) from error
-        if recipe is None:
+        self._stream = Subscription(self._host, self._outputs, self._frequency_Hz, timeout_s=timeout_s)
+        self.version = self._stream.version
+        if self._stream.missing:
             self.close()
             return
         self.supported = True
-        self._thread = threading.Thread(
-            target=self._run, args=(self._connection, recipe), name="ur-tcp-offset", daemon=True
-        )
+        self._thread = threading.Thread(target=self._run, args=(self._stream,), name="ur-tcp-offset", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Let the connection go. Idempotent."""
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
         if self._thread is not None:
             self._thread.join(timeout=1.0)
             self._thread = None
@@ -229,31 +291,14 @@ class TcpOffsetReader:
     def _is_since(self, since_s: float) -> bool:
         return self._newest is not None and self._newest[0] >= since_s
 
-    def _greet(self, connection: _Connection, deadline: float) -> Recipe | None:
-        """Shake hands; the recipe of the running stream, or None where the controller does not know `tcp_offset`."""
-        if connection.ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02"), deadline) != b"\x01":
-            raise ProtocolError("protocol version 2 is refused")
-        self.version = decode_version(connection.ask(encode(GET_CONTROLLER_VERSION), deadline))
-        answer = connection.ask(encode_setup_outputs(self._frequency_Hz, self._names), deadline)
-        recipe = Recipe.decode(answer)
-        if "NOT_FOUND" in recipe.types:
-            return None
-        if recipe.types != ("DOUBLE", "VECTOR6D"):
-            raise ProtocolError(f"time and TCP offset come as {', '.join(recipe.types)}")
-        if connection.ask(encode(START), deadline) != b"\x01":
-            raise ProtocolError("the controller does not start the stream")
-        return recipe
-
-    def _run(self, connection: _Connection, recipe: Recipe) -> None:
+    def _run(self, stream: Subscription) -> None:
         """Follow the stream until it ends; what ended it is raised by `offset`."""
         try:
             while True:
-                kind, payload = connection.read(None)
-                if kind == DATA:
-                    (t_s,), tcp_offset = recipe.unpack(payload)
-                    with self._changed:
-                        self._newest = (t_s, tcp_offset)
-                        self._changed.notify_all()
+                (t_s,), tcp_offset = stream.read(None)
+                with self._changed:
+                    self._newest = (t_s, tcp_offset)
+                    self._changed.notify_all()
         except (OSError, StreamBroken) as error:
             failure: DriverError = StreamBroken(
                 f"the RTDE connection to {self._host} was lost ({error}): check the robot and the cable, then open "

@@ -29,7 +29,7 @@ def replay(folder: Path, as_json: bool) -> None:
                 talk.print(describe(progress))
     except EndOfRecording:
         talk.print(f"the run was broken off after {len(records)} poses")
-    outcome = solve_records(run, records, "ml")
+    outcome = solve_records(run, records)
     if as_json:
         write_json(outcome.result.to_dict())
     else:

@@ -1,25 +1,37 @@
 """`ftdrive solve`: from data on disk to a calibration, without any device."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import click
+import numpy as np
+from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, read_csv
+from calib import CalibrationDataset, CalibrationResult, Known, read_csv
 from calib import solve as solve_dataset
+from calib.compare import compare
+from calib.errors import CalibError
+from calib.ml import STANDARD_GRAVITY_M_S2, Drift
 from calib.result import Method
+from ftdrive.cli import exit_code
 from ftdrive.commands.common import JSON, stop_unless_accepted, write_json
-from ftdrive.errors import ConfigError
-from ftdrive.report import print_result, talk
+from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.report import print_comparison, print_result, talk
 from ftdrive.runs import Run, versions
-from ftdrive.session import solve_run
+from ftdrive.session import dataset_of
 
 Orientation = Literal["R_base_flange", "R_flange_base"]
 
+_METHODS = (
+    *("ml", "srom", "lrom", "carlson-relaxation", "carlson-cayley", "carlson-eigen", "carlson-nullspace"),
+    *("carlson-iterative", "carlson-polynomial", "known-rotation", "yaw-only", "all"),
+)
+
 
 @click.command()
-@click.argument("source", metavar="DATASET", type=click.Path(exists=True, path_type=Path))
-@click.option("--method", type=click.Choice(["srom", "lrom", "ml"]), default="ml", show_default=True)
+@click.argument("sources", metavar="DATASET...", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.option("--method", type=click.Choice(_METHODS), default="ml", show_default=True, help="all: side by side.")
 @click.option(
     "--orientation",
     type=click.Choice(["R_base_flange", "R_flange_base"]),
@@ -27,29 +39,110 @@ Orientation = Literal["R_base_flange", "R_flange_base"]
     show_default=True,
     help="What the rotation of a CSV maps: flange to base coordinates, or the other way (as in the papers).",
 )
+@click.option(
+    "--drift",
+    type=click.Choice(["auto", "none", "linear", "random-walk"]),
+    default="auto",
+    show_default=True,
+    help="How the bias may move during the poses; the order of rows stands in for missing times.",
+)
+@click.option("--mass-kg", type=float, help="Known mass of what hangs on the sensor.")
+@click.option("--level-deg", type=float, help="The base is level within this many degrees (one sigma).")
+@click.option("--mounting-deg", metavar="RX,RY,RZ", help="Known rotation vector of the sensor in the flange.")
 @click.option("--output", "-o", type=click.Path(dir_okay=False, path_type=Path), help="Save the calibration here.")
+@click.option("--force", is_flag=True, help="Save even a rejected result; it stays marked as rejected.")
 @JSON
-def solve(source: Path, method: Method, orientation: Orientation, output: Path | None, as_json: bool) -> None:
-    """Solve DATASET: a run folder, a dataset.json, or a CSV file.
+def solve(
+    sources: Sequence[Path],
+    method: str,
+    orientation: Orientation,
+    drift: Drift,
+    mass_kg: float | None,
+    level_deg: float | None,
+    mounting_deg: str | None,
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Solve each DATASET: a run folder, a dataset.json, or a CSV file.
 
     A CSV has a header with r11..r33 (or the rotation vector rx,ry,rz), fx,fy,fz,tx,ty,tz in N and N·m, and optionally
-    t in seconds.
+    t in seconds and sigma_fx..sigma_tz, the standard error of each pose's mean. With --json, one object a line.
     """
-    if output is not None and output.exists():
-        raise ConfigError(f"{output} exists and is never overwritten: choose another name")
-    result = _solve(source, method, orientation)
-    if as_json:
-        write_json(result.to_dict())
-    else:
-        print_result(result)
-    stop_unless_accepted(result)
-    if output is not None:
-        result.save(output)
-        talk.print(f" Saved {output}")
+    if output is not None and (output.exists() or len(sources) > 1 or method == "all"):
+        raise ConfigError(
+            f"{output} exists and is never overwritten: choose another name"
+            if output.exists()
+            else "--output takes one result: give one dataset and one method"
+        )
+    options = {"drift": drift, "known": _known(mass_kg, level_deg, mounting_deg)}
+    first_failure: CalibError | NotAccepted | None = None
+    for source in sources:
+        try:
+            dataset, g_m_s2, provenance = _read(source, orientation)
+            if method == "all":
+                _show_all(source, dataset, {**options, "g_m_s2": g_m_s2}, as_json)
+                continue
+            result = _solve(dataset, method, {**options, "g_m_s2": g_m_s2, "provenance": provenance})
+            if as_json:
+                write_json({"source": str(source), **result.to_dict()})
+            else:
+                print_result(result)
+            if not force:
+                stop_unless_accepted(result)
+            if output is not None:
+                result.save(output)
+                talk.print(f" Saved {output}")
+        except (CalibError, NotAccepted) as error:
+            if len(sources) == 1:
+                raise
+            first_failure = first_failure or error
+            if as_json and not isinstance(error, NotAccepted):
+                write_json({"schema_version": 1, "source": str(source), "error": str(error)})
+            click.echo(f"error: {source}: {error}", err=True)
+    if first_failure is not None:
+        raise SystemExit(exit_code(first_failure))
 
 
-def _solve(source: Path, method: Method, orientation: Orientation) -> CalibrationResult:
+def _read(source: Path, orientation: Orientation) -> tuple[CalibrationDataset, float, dict[str, Any]]:
     if source.is_dir():
-        return solve_run(Run(source), method).result
+        return dataset_of(Run(source))
     dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
-    return solve_dataset(dataset, method, provenance={"source": source.name, "versions": versions()})
+    return dataset, STANDARD_GRAVITY_M_S2, {"source": source.name, "versions": versions()}
+
+
+def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) -> CalibrationResult:
+    chosen: Method = method
+    try:
+        return solve_dataset(dataset, chosen, **options)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _show_all(source: Path, dataset: CalibrationDataset, options: dict[str, Any], as_json: bool) -> None:
+    compared = compare(dataset, **options)
+    if as_json:
+        write_json({"schema_version": 1, "source": str(source), "methods": [one.to_dict() for one in compared]})
+    else:
+        print_comparison(compared)
+
+
+def _known(mass_kg: float | None, level_deg: float | None, mounting_deg: str | None) -> Known | None:
+    if mass_kg is None and level_deg is None and mounting_deg is None:
+        return None
+    R_flange_sensor = None
+    if mounting_deg is not None:
+        try:
+            rotation_vector = [float(angle) for angle in mounting_deg.split(",")]
+            R_flange_sensor = Rotation.from_rotvec(rotation_vector, degrees=True).as_matrix()
+        except ValueError as error:
+            raise ConfigError(f"--mounting-deg takes three numbers such as 0,0,45, not {mounting_deg!r}") from error
+    try:
+        return Known(
+            R_flange_sensor=R_flange_sensor,
+            gravity_direction_base=None if level_deg is None else (0.0, 0.0, -1.0),
+            direction_tolerance_rad=0.0 if level_deg is None else float(np.radians(level_deg)),
+            mass_kg=mass_kg,
+        )
+    except ValueError as error:
+        raise ConfigError(str(error)) from error

@@ -1,74 +1,136 @@
 """The dashboard server's answers: one line in, one line out.
 
-Source: Universal Robots, "Dashboard Server e-Series, port 29999". Wording matters: clients compare it.
+Source: Universal Robots, "Dashboard Server e-Series, port 29999" and its CB-Series page. Wording matters: clients
+compare it.
 """
 
-from mocks.ur.robot import Robot, Runtime, SafetyMode
+from collections.abc import Callable
+
+from mocks.ur.modes import Runtime
+from mocks.ur.robot import Robot
 
 BANNER = "Connected: Universal Robots Dashboard Server"
 BUILD = 1261331
 
-_TOO_EARLY = (
+TOO_EARLY = (
     "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop before unlocking"
 )
+LOCAL_CONTROL = (
+    "Command is not allowed due to safety reasons, "
+    "please switch robot to Remote Control mode and reconnect to port 29999"
+)
+
+_QUERIES: dict[str, Callable[[Robot], str]] = {
+    "polyscopeversion": lambda r: f"URSoftware {'.'.join(map(str, r.settings.polyscope))}.{BUILD} (Mar 24 2022)",
+    "get serial number": lambda r: r.settings.serial_number,
+    "get robot model": lambda r: r.settings.model.rstrip("e"),
+    "is in remote control": lambda r: str(r.remote_control).lower(),
+    "robotmode": lambda r: f"Robotmode: {r.robot_mode.name}",
+    "safetymode": lambda r: f"Safetymode: {r.safety_mode.name}",
+    "safetystatus": lambda r: f"Safetystatus: {r.safety_mode.name}",
+    "running": lambda r: f"Program running: {str(r.runtime == Runtime.PLAYING).lower()}",
+    "programstate": lambda r: f"{r.runtime.name} {r.program_name}",
+    "isprogramsaved": lambda r: f"true {r.program_name}",
+    "get loaded program": lambda r: f"Loaded program: {r.loaded_program}" if r.loaded_program else "No program loaded",
+}
+
+_TALK = {
+    "popup": "showing popup",
+    "close popup": "closing popup",
+    "close safety popup": "closing safety popup",
+    "addtolog": "Added log message",
+    "quit": "Disconnected",
+    "shutdown": "Shutting down",
+}
+
+_SINCE = {
+    "get serial number": {3: 12, 5: 6},
+    "get robot model": {3: 12, 5: 6},
+    "is in remote control": {5: 6},
+    "safetystatus": {3: 11, 5: 4},
+}
+"""First minor version of each major one that knows a command."""
 
 
-def answer(robot: Robot, line: str) -> str:
-    """Carry out one dashboard command and return the reply, without line end."""
+def _play(robot: Robot) -> str | None:
+    return "Starting program" if robot.play() else None
+
+
+def _stop(robot: Robot) -> str | None:
+    robot.stop_program("dashboard stop")
+    return "Stopped"
+
+
+def _pause(robot: Robot) -> str | None:
+    return "Pausing program" if robot.pause("dashboard pause") else None
+
+
+def _unlock(robot: Robot) -> str | None:
+    return "Protective stop releasing" if robot.unlock() else None
+
+
+def _power_on(robot: Robot) -> str | None:
+    return "Powering on" if robot.power_on() else None
+
+
+def _power_off(robot: Robot) -> str | None:
+    robot.power_off()
+    return "Powering off"
+
+
+def _brake_release(robot: Robot) -> str | None:
+    return "Brake releasing" if robot.brake_release() else None
+
+
+def _restart_safety(robot: Robot) -> str | None:
+    robot.restart_safety()
+    return "Restarting safety"
+
+
+_COMMANDS: dict[str, Callable[[Robot], str | None]] = {
+    "play": _play,
+    "stop": _stop,
+    "pause": _pause,
+    "unlock protective stop": _unlock,
+    "power on": _power_on,
+    "power off": _power_off,
+    "brake release": _brake_release,
+    "restart safety": _restart_safety,
+}
+"""Commands that change something: the reply, or None when the controller refuses."""
+
+
+def answer(robot: Robot, line: str, *, by: str = "dashboard", trusted: bool = True) -> str:
+    """Carry out one dashboard command and return the reply, without line end.
+
+    Parameters
+    ----------
+    by
+        Who says it, for the diary.
+    trusted
+        Whether this connection may do more than ask: since it was opened the pendant was in remote control.
+    """
     command = line.strip()
     verb = command.lower()
-    queries = {
-        "polyscopeversion": lambda: f"URSoftware {'.'.join(map(str, robot.settings.polyscope))}.{BUILD} (Mar 24 2022)",
-        "get serial number": lambda: robot.settings.serial_number,
-        "get robot model": lambda: robot.settings.model.rstrip("e"),
-        "is in remote control": lambda: str(robot.remote_control).lower(),
-        "robotmode": lambda: f"Robotmode: {robot.robot_mode.name}",
-        "safetymode": lambda: f"Safetymode: {robot.safety_mode.name}",
-        "safetystatus": lambda: f"Safetystatus: {robot.safety_mode.name}",
-        "running": lambda: f"Program running: {str(robot.runtime == Runtime.PLAYING).lower()}",
-        "programstate": lambda: f"{robot.runtime.name} {robot.program_name}",
-        "isprogramsaved": lambda: f"true {robot.program_name}",
-        "get loaded program": lambda: (
-            f"Loaded program: {robot.loaded_program}" if robot.loaded_program else "No program loaded"
-        ),
-    }
-    if verb in queries:
-        return queries[verb]()
-    if verb == "stop":
-        robot.stop_program("dashboard stop")
-        return "Stopped"
-    if verb == "play":
-        return "Starting program" if robot.play() else "Failed to execute: play"
-    if verb == "pause":
-        return "Pausing program" if robot.pause() else "Failed to execute: pause"
-    if verb == "unlock protective stop":
-        return "Protective stop releasing" if robot.unlock() else _TOO_EARLY
-    if verb == "power on":
-        robot.power_on()
-        return "Powering on"
-    if verb == "power off":
-        robot.power_off()
-        return "Powering off"
-    if verb == "brake release":
-        robot.brake_release()
-        return "Brake releasing"
-    if verb == "restart safety":
-        if robot.safety_mode != SafetyMode.NORMAL:
-            robot.power_off()
-        return "Restarting safety"
-    if verb.startswith("load "):
-        robot.stop_program("another program loaded")
-        robot.loaded_program = command[5:].strip()
-        return f"Loading program: {robot.loaded_program}"
-    talk = {
-        "popup": "showing popup",
-        "close popup": "closing popup",
-        "close safety popup": "closing safety popup",
-        "addtolog": "Added log message",
-        "quit": "Disconnected",
-        "shutdown": "Shutting down",
-    }
-    for start, reply in talk.items():
+    major, minor, _bugfix = robot.settings.polyscope
+    since = _SINCE.get(verb)
+    if verb in _QUERIES and (since is None or minor >= since.get(major, minor + 1)):
+        return _QUERIES[verb](robot)
+    for start, reply in _TALK.items():
         if verb == start or verb.startswith(start + " "):
             return reply
-    return f"could not understand: '{command}'"
+    loads = verb.startswith("load ")
+    if verb not in _COMMANDS and not loads:
+        return f"could not understand: '{command}'"
+    if not trusted:
+        robot.note(by, verb, accepted=False, why=LOCAL_CONTROL)
+        return LOCAL_CONTROL
+    if loads:
+        robot.stop_program("another program loaded")
+        robot.loaded_program = command[5:].strip()
+        said: str | None = f"Loading program: {robot.loaded_program}"
+    else:
+        said = _COMMANDS[verb](robot)
+    refusal = TOO_EARLY if verb == "unlock protective stop" else f"Failed to execute: {verb}"
+    robot.note(by, verb, accepted=said is not None, why=said or refusal)
+    return said or refusal

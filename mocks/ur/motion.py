@@ -193,10 +193,12 @@ class Arm:
         self.qd = self.actual_qd = self.qdd = ZERO6
         self.speed_fraction = 1.0
         """Speed slider, 0 to 1."""
+        self.scaling = 1.0
+        """What the trajectory limiter leaves of the speed, 0 to 1."""
         self.paused = False
         """Whether the arm should stand still on its path."""
         self.pace = 1.0
-        """Present speed of path time, without the slider: 1 running, 0 paused, between while it changes."""
+        """Present speed of path time, without the slider: `scaling` running, 0 paused, between while it changes."""
         self.still_s = 0.0
         """How long the set-point has stood still."""
         self._slider = 1.0
@@ -250,7 +252,7 @@ class Arm:
             When the path leads out of the workspace; the arm stands where it is.
         """
         change = dt / PAUSE_TIME_S
-        self.pace = _towards(0.0 if self.paused else 1.0, self.pace, change)
+        self.pace = _towards(0.0 if self.paused else self.scaling, self.pace, change)
         self._slider = _towards(self.speed_fraction, self._slider, change)
         q, qd = self.q, ZERO6
         if self._paths:

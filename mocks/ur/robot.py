@@ -6,52 +6,26 @@ in it (clock, motion, settling, the waiting times of the controller). The watchd
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
 from mocks.kinematics import ZERO6, Array, Dh, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
+from mocks.ur.events import Event, happened
+from mocks.ur.modes import PAUSING, PERMITTED, POWERED, POWERLESS, RobotMode, Runtime, SafetyMode
 from mocks.ur.motion import Arm, CannotFollow, MotionError
 from mocks.ur.rtde import Value
-from mocks.ur.script import ControlScript, ForeignProgram, ScriptError, Upload
+from mocks.ur.script import STOP_SCRIPT, ControlScript, ForeignProgram, ScriptError, Upload
 from mocks.world import World
 
 UNLOCK_AFTER_S = 5.0
 STEADY_AFTER_S = 0.5
 PROGRAM_START_S = 0.1
 POWER_STEP_S = 0.5
+COMMAND_REGISTERS = {"input_int_register_0", "input_int_register_24"}
 WATCHDOG_STEP_S = 0.01  # a stall of this process may age the watchdog by no more than this
 
 Vector3 = tuple[float, float, float]
-
-
-class Runtime(IntEnum):
-    """RTDE runtime_state."""
-
-    STOPPED = 1
-    PLAYING = 2
-    PAUSED = 4
-
-
-class RobotMode(IntEnum):
-    """RTDE robot_mode, as far as modelled."""
-
-    POWER_OFF = 3
-    POWER_ON = 4
-    IDLE = 5
-    RUNNING = 7
-
-
-class SafetyMode(IntEnum):
-    """RTDE safety_mode, as far as modelled."""
-
-    NORMAL = 1
-    PROTECTIVE_STOP = 3
-    ROBOT_EMERGENCY_STOP = 7
-
-
-SAFETY_BITS = {SafetyMode.NORMAL: 0x001, SafetyMode.PROTECTIVE_STOP: 0x404, SafetyMode.ROBOT_EMERGENCY_STOP: 0x4C0}
-"""RTDE safety_status_bits of each mode."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +70,8 @@ class RobotSettings:
         Software version, three numbers.
     tcp
         Active TCP at power-up as a UR pose, m and rad.
+    unknown_outputs
+        RTDE outputs this controller answers with NOT_FOUND although its version knows them.
     time_scale
         How many times faster than real the physics runs.
     """
@@ -108,6 +84,7 @@ class RobotSettings:
     payload_cog_m: Vector3 = (0.0, 0.0, 0.0)
     joint_limit_rad: float = 2 * np.pi
     plane: tuple[float, float, float, float] | None = None
+    unknown_outputs: frozenset[str] = frozenset()
     time_scale: float = 1.0
 
 
@@ -131,7 +108,8 @@ class Robot:
         self.runtime = Runtime.STOPPED
         self.robot_mode = RobotMode.RUNNING
         self.safety_mode = SafetyMode.NORMAL
-        self.remote_control = True
+        self.remote_switches = 0
+        """How often the pendant changed between local and remote control."""
         self.loaded_program: str | None = None
         self.payload_kg = settings.payload_kg
         self.payload_cog_m = settings.payload_cog_m
@@ -142,12 +120,14 @@ class Robot:
         self.inputs: dict[str, Value] = {}
         self.output_ints = [0] * 48
         self.output_doubles = [0.0] * 48
-        self.events: list[str] = []
-        """What happened, newest last: program starts, stops and errors, safety stops."""
+        self.events: list[Event] = []
+        """What happened, newest last: commands taken and refused, program, safety, the arm starting and stopping."""
+        self._remote_control = True
+        self._reduced = False
         self._program: ControlScript | ForeignProgram | None = None
         self._physical_s = 0.0
         self._stopped_at_s = 0.0
-        self._later: list[tuple[float, Callable[[], None]]] = []
+        self._later: list[tuple[float, Callable[[], object]]] = []
         self._watchdog: tuple[str, float] | None = None
         self._watchdog_age_s = 0.0
         self._ft_zero = np.zeros(6)
@@ -176,14 +156,20 @@ class Robot:
                     self.stop_program("ended")
             except (ScriptError, MotionError, ArithmeticError, ValueError) as error:
                 self.stop_program(f"run-time error: {error}")
-        before = self.arm.q
+        before, stood = self.arm.q, self.arm.at_rest
         try:
             self.arm.step(dt)
         except CannotFollow as error:
             self.protective_stop(str(error))
         if self.arm.q is not before and self._leaves_limits(before):
             self.protective_stop("safety limit reached")
+        if stood != self.arm.at_rest:
+            self.note("arm", "moves" if stood else "stands", q_rad=list(self.arm.q))
         self.world.q = self.arm.actual_q
+
+    def note(self, by: str, what: str, *, accepted: bool = True, why: str = "", **detail: Any) -> None:
+        """Write into the diary."""
+        self.events.append(happened(self.timestamp_s, by, what, accepted, why, detail))
 
     def _leaves_limits(self, before: Vector6) -> bool:
         """Whether the last step crossed a safety limit outwards; the way back is free."""
@@ -203,7 +189,7 @@ class Robot:
         if self._watchdog_age_s > period_s:
             self.stop_program(f"watchdog: {name} not written for {period_s:.3f} s")
 
-    def _after(self, seconds: float, action: Callable[[], None]) -> None:
+    def _after(self, seconds: float, action: Callable[[], object]) -> None:
         self._later.append((self._physical_s + seconds, action))
 
     # -- program ------------------------------------------------------------------------------------------------------
@@ -214,121 +200,186 @@ class Robot:
         return self._program.name if self._program is not None else self.loaded_program or "unnamed"
 
     @property
-    def can_run(self) -> bool:
-        """Whether a program may start: powered, brakes released, no safety stop, remote control."""
-        return self.robot_mode == RobotMode.RUNNING and self.safety_mode == SafetyMode.NORMAL and self.remote_control
+    def remote_control(self) -> bool:
+        """Whether the pendant is switched to remote control."""
+        return self._remote_control
 
-    def upload(self, upload: Upload) -> None:
-        """Take a program from the script port: it replaces the running one."""
+    @remote_control.setter
+    def remote_control(self, on: bool) -> None:
+        self.remote_switches += on != self._remote_control
+        self._remote_control = on
+
+    @property
+    def obstacle(self) -> str | None:
+        """Why no program may start now; None when one may."""
+        if self.robot_mode != RobotMode.RUNNING:
+            return f"robot mode {self.robot_mode.name}"
+        if self.safety_mode not in PERMITTED:
+            return f"safety mode {self.safety_mode.name}"
+        return None
+
+    def upload(self, upload: Upload, *, by: str = "script port", seconds: float = 0.0) -> bool:
+        """Take a program from the script port: it replaces the running one. False when it is refused.
+
+        Parameters
+        ----------
+        seconds
+            How long a program that is not interpreted keeps running, in the controller's time.
+        """
         if upload.secondary:
-            self.events.append(f"secondary program {upload.name} not interpreted")
-            return
-        if not self.can_run:
-            self.events.append(f"program {upload.name} refused")
-            return
+            self.note(by, f"secondary program {upload.name}", accepted=False, why="not interpreted")
+            return False
+        obstacle = self.obstacle if self.remote_control else "local control"
+        self.note(by, f"program {upload.name}", accepted=obstacle is None, why=obstacle or "")
+        if obstacle:
+            return False
         self.stop_program("replaced")
         program: ControlScript | ForeignProgram
         if upload.is_control_script:
             program = ControlScript(self, upload.register_offset("int"), upload.register_offset("float"))
         else:
-            program = ForeignProgram()
-        self._after(PROGRAM_START_S, lambda: self._start(program, upload.name))
+            program = ForeignProgram(upload.name, int(seconds / (self.period_s * self.settings.time_scale)))
+        self._after(PROGRAM_START_S, lambda: self._start(program))
+        return True
 
-    def _start(self, program: ControlScript | ForeignProgram, name: str) -> None:
-        if self.can_run:
-            self.stop_program("replaced")
-            self._program = program
-            self.runtime = Runtime.PLAYING
-            self.arm.paused = False
-            self.zero_ft()  # e-Series zeroes its sensor at every program start
-            self.events.append(f"program {name} started")
+    def _start(self, program: ControlScript | ForeignProgram) -> None:
+        if self.obstacle is not None:
+            self.note("program", f"started {program.name}", accepted=False, why=self.obstacle)
+            return
+        self.stop_program("replaced")
+        self._program = program
+        self.runtime = Runtime.PLAYING
+        self.arm.paused = False
+        self.zero_ft()  # e-Series zeroes its sensor at every program start
+        self.note("program", f"started {program.name}")
 
-    def stop_program(self, reason: str) -> None:
-        """End the program if there is one; a moving arm comes to rest by itself."""
-        if self._program is not None:
-            self._program.close()
-            self._program = None
-            self.events.append(f"program stopped: {reason}")
+    def stop_program(self, reason: str) -> bool:
+        """End the program; a moving arm comes to rest by itself. False when there was none."""
+        program, self._program = self._program, None
+        if program is not None:
+            program.close()
+            self.note("program", f"stopped {program.name}", why=reason)
         self.arm.release()
-        self.arm.paused = self.safety_mode != SafetyMode.NORMAL
+        self.arm.paused = self.safety_mode not in PERMITTED
         self.runtime = Runtime.STOPPED
         self._watchdog = None
+        return program is not None
 
-    def pause(self) -> bool:
-        """Dashboard pause; False when no program plays."""
+    def pause(self, reason: str) -> bool:
+        """Hold the program where it is, and the arm on its path; False when no program plays."""
         if self.runtime != Runtime.PLAYING:
             return False
         self.runtime = Runtime.PAUSED
         self.arm.paused = True
+        self.note("program", f"paused {self.program_name}", why=reason)
         return True
 
     def play(self) -> bool:
-        """Dashboard play: go on where the program paused, or start the loaded one; False when it cannot."""
-        if not self.can_run:
+        """Go on where the program paused, or start the loaded one; False when it cannot."""
+        if self.obstacle is not None:
             return False
         if self.runtime == Runtime.PAUSED:
             self.runtime = Runtime.PLAYING
             self.arm.paused = False
+            self.note("program", f"resumed {self.program_name}")
             return True
-        if self.loaded_program is None:
+        if self.loaded_program is None or self.runtime == Runtime.PLAYING:
             return False
-        self._start(ForeignProgram(), self.loaded_program)
+        self._start(ForeignProgram(self.loaded_program))
         return True
 
     # -- safety and power ---------------------------------------------------------------------------------------------
 
     def protective_stop(self, reason: str) -> None:
         """Come to rest on the path and pause the program."""
-        if self.safety_mode != SafetyMode.NORMAL:
-            return
-        self.events.append(f"protective stop: {reason}")
-        self.safety_mode = SafetyMode.PROTECTIVE_STOP
-        self._stopped_at_s = self._physical_s
-        self.arm.paused = True
-        if self.runtime == Runtime.PLAYING:
-            self.runtime = Runtime.PAUSED
+        if self.safety_mode in PERMITTED:
+            self._stopped_at_s = self._physical_s
+            self.set_safety(SafetyMode.PROTECTIVE_STOP, reason)
 
     def unlock(self) -> bool:
-        """Leave the protective stop; False when it is too early."""
+        """Leave the protective stop, with the program still paused; False when it is too early."""
         if self.safety_mode != SafetyMode.PROTECTIVE_STOP:
             return True
         if self._physical_s - self._stopped_at_s < UNLOCK_AFTER_S:
             return False
-        self.events.append("protective stop unlocked")
-        self.safety_mode = SafetyMode.NORMAL
-        self.arm.paused = self.runtime == Runtime.PAUSED
+        self.set_safety(SafetyMode.NORMAL, "unlocked")
         return True
+
+    def safeguard_stop(self, on: bool) -> None:
+        """Open or close the safeguard input. Closed again, the paused program goes on by itself."""
+        if on and self.safety_mode in PERMITTED:
+            self.set_safety(SafetyMode.SAFEGUARD_STOP, "safeguard opened")
+        elif not on and self.safety_mode == SafetyMode.SAFEGUARD_STOP:
+            self.set_safety(SafetyMode.NORMAL, "safeguard closed")
+            if self.runtime == Runtime.PAUSED:
+                self.play()
+
+    def reduced_mode(self, on: bool) -> None:
+        """Switch to the reduced safety limits or back; programs go on."""
+        self._reduced = on
+        if self.safety_mode in PERMITTED:
+            self.set_safety(SafetyMode.NORMAL, "reduced limits" if on else "normal limits")
 
     def emergency_stop(self, pressed: bool) -> None:
         """Press or release the emergency stop: power is gone, the program has ended."""
-        self.events.append(f"emergency stop {'pressed' if pressed else 'released'}")
         if pressed:
-            self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
-            self.power_off()
+            self.set_safety(SafetyMode.ROBOT_EMERGENCY_STOP, "emergency stop pressed")
         elif self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP:
-            self.safety_mode = SafetyMode.NORMAL
-            self.arm.paused = False
+            self.set_safety(SafetyMode.NORMAL, "emergency stop released")
+
+    def restart_safety(self) -> None:
+        """After a violation or fault: everything starts again, without power."""
+        if self.safety_mode in (SafetyMode.VIOLATION, SafetyMode.FAULT):
+            self.set_safety(SafetyMode.NORMAL, "safety restarted")
+            self.set_mode(RobotMode.POWER_OFF)
+
+    def set_safety(self, mode: SafetyMode, reason: str) -> None:
+        """Enter a safety mode, with what it does to program and power; NORMAL means REDUCED when that is on."""
+        if mode in PERMITTED:
+            mode = SafetyMode.REDUCED if self._reduced else SafetyMode.NORMAL
+        self.safety_mode = mode
+        self.note("safety", mode.name, why=reason)
+        if mode in PERMITTED:
+            self.arm.paused = self.runtime == Runtime.PAUSED
+        elif mode in PAUSING:
+            self.arm.paused = True
+            self.pause(mode.name)
+        elif mode in POWERLESS:
+            self.set_mode(RobotMode.POWER_OFF)
+        else:
+            self.stop_program(mode.name)
+
+    def set_mode(self, mode: RobotMode) -> None:
+        """Enter a robot mode; any but RUNNING ends the program, without power nothing that was under way goes on."""
+        if mode != RobotMode.RUNNING:
+            self.stop_program(f"robot mode {mode.name}")
+        if mode not in POWERED:
+            self._later.clear()
+        self.robot_mode = mode
+        self.note("power", mode.name)
 
     def power_off(self) -> None:
         """Stop the program, brake, cut the power."""
-        self.stop_program("power off")
-        self.robot_mode = RobotMode.POWER_OFF
-        self._later.clear()
+        self.set_mode(RobotMode.POWER_OFF)
 
-    def power_on(self) -> None:
-        """From off to idle, brakes still closed."""
-        if self.robot_mode == RobotMode.POWER_OFF and self.safety_mode != SafetyMode.ROBOT_EMERGENCY_STOP:
-            self.robot_mode = RobotMode.POWER_ON
-            self._after(POWER_STEP_S, lambda: self._set_mode(RobotMode.IDLE))
+    def power_on(self) -> bool:
+        """From off to idle, brakes still closed; False when safety does not let it."""
+        if self.safety_mode in POWERLESS:
+            return False
+        if self.robot_mode == RobotMode.POWER_OFF:
+            self.set_mode(RobotMode.POWER_ON)
+            self._after(POWER_STEP_S, lambda: self.set_mode(RobotMode.IDLE))
+        return True
 
-    def brake_release(self) -> None:
-        """Up to running, from wherever it is."""
-        self.power_on()
-        if self.robot_mode in (RobotMode.POWER_ON, RobotMode.IDLE):
-            self._after(2 * POWER_STEP_S, lambda: self._set_mode(RobotMode.RUNNING))
-
-    def _set_mode(self, mode: RobotMode) -> None:
-        self.robot_mode = mode
+    def brake_release(self) -> bool:
+        """Up to running, from wherever it is; False when safety does not let it."""
+        if not self.power_on():
+            return False
+        if self.robot_mode == RobotMode.POWER_ON:
+            self._after(POWER_STEP_S, self.brake_release)
+        elif self.robot_mode == RobotMode.IDLE:
+            self._after(POWER_STEP_S, lambda: self.set_mode(RobotMode.RUNNING))
+        return True
 
     def set_watchdog(self, name: str, min_frequency_hz: float) -> None:
         """Stop the program when input `name` is not written at least this often (Hz)."""
@@ -341,12 +392,22 @@ class Robot:
 
     def write_inputs(self, fields: dict[str, Value]) -> None:
         """Take over input variables from a client."""
+        self._note_lost_command(fields)
         self.inputs.update(fields)
         if self._watchdog is not None and self._watchdog[0] in fields:
             self._watchdog_age_s = 0.0
         fraction = fields.get("speed_slider_fraction")
         if isinstance(fraction, float) and fields.get("speed_slider_mask"):
             self.arm.speed_fraction = min(1.0, max(0.0, fraction))
+
+    def _note_lost_command(self, fields: dict[str, Value]) -> None:
+        """A command that no program will read is worth a line."""
+        for name in COMMAND_REGISTERS & fields.keys():
+            command = fields[name]
+            listening = self.runtime == Runtime.PLAYING and isinstance(self._program, ControlScript)
+            if not listening and command not in (0, STOP_SCRIPT, self.inputs.get(name)):
+                why = f"nobody reads it: {self.runtime.name} {self.program_name}"
+                self.note("rtde", f"command {command}", accepted=False, why=why)
 
     def input_int(self, index: int) -> int:
         """Present value of input_int_register_`index`."""

@@ -24,6 +24,12 @@ STOP_SCRIPT = 255
 REALTIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71})
 """Commands executed in every cycle as long as the register holds their number."""
 
+MOVING = {1: "moveJ", 2: "moveJ_IK", 3: "moveL", 4: "moveL_FK", 33: "stopL", 34: "stopJ"}
+SETTING = {8: "zeroFtSensor", 17: "setPayload", 29: "setTcp", 31: "triggerProtectiveStop", 35: "setWatchdog"}
+SETTING |= {59: "setGravity", 65: "setTargetPayload", STOP_SCRIPT: "stopScript"}
+DIARY = MOVING | SETTING
+"""Commands that go into the diary: those that move the arm or change something."""
+
 Steps = Generator[None, None, None]
 """A thread of a program: one `next()` is one control cycle."""
 
@@ -76,13 +82,24 @@ def take_uploads(buffer: bytearray) -> list[Upload]:
 
 
 class ForeignProgram:
-    """A program nobody interprets: it runs for one cycle."""
+    """A program nobody interprets: it runs for some cycles and touches nothing.
 
-    name = "unnamed"
+    Parameters
+    ----------
+    name
+        As the dashboard shows it.
+    cycles
+        How long it keeps the controller busy after its first cycle.
+    """
+
+    def __init__(self, name: str, cycles: int = 0) -> None:
+        self.name = name
+        self._left = cycles
 
     def step(self) -> bool:
         """One control cycle; False when the program has ended."""
-        return False
+        self._left -= 1
+        return self._left >= 0
 
     def close(self) -> None:
         """End the program."""
@@ -182,6 +199,8 @@ class ControlScript:
                 self._write_int(0, READY)
             else:
                 if not executing:
+                    if command in DIARY:
+                        self._robot.note("rtde", f"command {command}", why=DIARY[command])
                     if command == STOP_SCRIPT:
                         return
                     yield from self._execute(command)

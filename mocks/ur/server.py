@@ -30,6 +30,8 @@ class Client:
         self.server = server
         self.robot = server.robot
         self.open = True
+        self.greeted = False
+        """Whether `on_open` has run."""
         self._socket = connection
         self._in = bytearray()
         self._out = bytearray()
@@ -116,6 +118,16 @@ class DashboardClient(Client):
 
     kind = "dashboard"
 
+    def __init__(self, server: "UrServer", connection: socket.socket) -> None:
+        super().__init__(server, connection)
+        self._switches = self.robot.remote_switches
+        self._opened_remote = self.robot.remote_control
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the pendant was in remote control ever since this client connected; else it can only ask."""
+        return self._opened_remote and self._switches == self.robot.remote_switches
+
     def on_open(self) -> None:
         """Send the banner."""
         self.send(dashboard.BANNER.encode() + b"\n")
@@ -126,7 +138,7 @@ class DashboardClient(Client):
             line, _, rest = bytes(buffer).partition(b"\n")
             buffer[:] = rest
             text = line.decode("utf-8", "replace")
-            self.send(dashboard.answer(self.robot, text).encode() + b"\n")
+            self.send(dashboard.answer(self.robot, text, trusted=self.trusted).encode() + b"\n")
             if text.strip().lower() == "quit":
                 self.close()
 
@@ -200,7 +212,8 @@ class RtdeClient(Client):
         owners = self.server.input_owners
         types = []
         for name in names:
-            taken = owners.get(name, self) is not self
+            owner = owners.get(name)
+            taken = owner is not self and (owner is not None or name in self.server.claimed)
             types.append("IN_USE" if taken else INPUTS.get(name, "NOT_FOUND"))
         recipe = rtde.Recipe(len(self._inputs) + 1, names, types)
         self._inputs.append(recipe)
@@ -246,15 +259,20 @@ class UrServer:
         self.robot = robot
         self.host = host
         self.input_owners: dict[str, RtdeClient] = {}
+        self.claimed: set[str] = set()
+        """Input variables that a fieldbus holds, as far as no client had them before."""
         self.bad_inputs: list[str] = []
         """Packages a well-behaved client would not have sent."""
         self.dropped_cycles = 0
         """Control cycles lost because this process was stalled for too long."""
         self.frozen = False
         """While true nothing runs and nothing is read or sent, but connections stay."""
+        self.streaming = True
+        """While false RTDE clients are answered, but get no samples."""
+        self._silent: set[str] = set()
         self._selector = selector
         self._clients: list[Client] = []
-        self._listeners: list[socket.socket] = []
+        self._listeners: dict[int, socket.socket] = {}
         try:
             for port, kind in PORTS.items():
                 self._listen(port, kind)
@@ -264,13 +282,18 @@ class UrServer:
         self._next_s = time.monotonic() + robot.period_s
 
     def _listen(self, port: int, kind: str) -> None:
-        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        self._listeners.append(listener)
+        self._listeners[port] = listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((self.host, port))
         listener.listen(16)
         listener.setblocking(False)
         self._selector.register(listener, selectors.EVENT_READ, lambda: self._accept(listener, kind))
+
+    def _close_listener(self, port: int) -> None:
+        listener = self._listeners.pop(port)
+        if listener in self._selector.get_map():
+            self._selector.unregister(listener)
+        listener.close()
 
     def _accept(self, listener: socket.socket, kind: str) -> None:
         try:
@@ -281,14 +304,23 @@ class UrServer:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client = CLIENTS[kind](self, connection)
         self._clients.append(client)
+        self.robot.note(kind, "connected")
+        if kind not in self._silent:
+            self._wake(client)
+
+    def _wake(self, client: Client) -> None:
         self._selector.register(client, selectors.EVENT_READ, client.on_ready)
-        client.on_open()
+        if not client.greeted:
+            client.greeted = True
+            client.on_open()
 
     def forget(self, client: Client) -> None:
         """A client hung up: its input variables are free again."""
-        self._selector.unregister(client)
+        if client in self._selector.get_map():
+            self._selector.unregister(client)
         self._clients.remove(client)
         self.input_owners = {name: owner for name, owner in self.input_owners.items() if owner is not client}
+        self.robot.note(client.kind, "disconnected")
 
     def reject(self, what: str) -> None:
         """Note a package that breaks the protocol."""
@@ -296,19 +328,43 @@ class UrServer:
 
     def drop(self, kind: str, *, reset: bool = False) -> int:
         """Hang up on all clients of a kind (rtde, dashboard, script); the port goes on listening."""
-        clients = [client for client in self._clients if client.kind == kind]
+        clients = self._of_kind(kind)
         for client in clients:
             client.close(reset=reset)
         return len(clients)
+
+    def set_listening(self, kind: str, on: bool) -> None:
+        """Open or close the ports of a kind; who is connected stays connected."""
+        self._of_kind(kind)
+        for port in [port for port, its_kind in PORTS.items() if its_kind == kind]:
+            if on and port not in self._listeners:
+                self._listen(port, kind)
+            elif not on and port in self._listeners:
+                self._close_listener(port)
+
+    def set_silent(self, kind: str, on: bool) -> None:
+        """While on, clients of a kind are accepted, but nothing is read from them or sent; afterwards it is."""
+        clients = self._of_kind(kind)
+        if on and kind not in self._silent:
+            self._silent.add(kind)
+            for client in clients:
+                self._selector.unregister(client)
+        elif not on and kind in self._silent:
+            self._silent.remove(kind)
+            for client in clients:
+                self._wake(client)
+
+    def _of_kind(self, kind: str) -> list[Client]:
+        if kind not in CLIENTS:
+            raise ValueError(f"{kind!r} is none of {', '.join(CLIENTS)}")
+        return [client for client in self._clients if client.kind == kind]
 
     def close(self) -> None:
         """Hang up and stop listening."""
         for client in list(self._clients):
             client.close()
-        for listener in self._listeners:
-            if listener in self._selector.get_map():
-                self._selector.unregister(listener)
-            listener.close()
+        for port in list(self._listeners):
+            self._close_listener(port)
 
     def run(self, ended: Callable[[], bool]) -> None:
         """Serve until `ended()`: it is asked once per control cycle."""
@@ -337,6 +393,8 @@ class UrServer:
             self.robot.tick()
         self.robot.watch(due * period_s)
         for client in list(self._clients):
+            if client.kind in self._silent:
+                continue
             client.flush()
-            if isinstance(client, RtdeClient):
+            if self.streaming and isinstance(client, RtdeClient):
                 client.sample(first, self.robot.cycle)

@@ -8,23 +8,20 @@ from collections.abc import Callable
 import numpy as np
 
 from mocks.kinematics import ZERO6, forward, vector6
-from mocks.ur.robot import SAFETY_BITS, Robot, RobotMode, Runtime
+from mocks.ur.modes import JOINT_MODES, JOINT_POWER_OFF, POWERED, SAFETY_BITS, Runtime
+from mocks.ur.robot import Robot
 from mocks.ur.rtde import Value
 
 Reader = Callable[[Robot], Value]
 
-_JOINT_RUNNING = 253
-_JOINT_POWER_OFF = 239
-
 
 def _status_bits(robot: Robot) -> int:
     """Bit 0 power on, bit 1 program running, bit 3 power button pressed."""
-    powered = robot.robot_mode != RobotMode.POWER_OFF
-    return int(powered) | (robot.runtime == Runtime.PLAYING) << 1
+    return int(robot.robot_mode in POWERED) | (robot.runtime == Runtime.PLAYING) << 1
 
 
 def _joint_mode(robot: Robot) -> Value:
-    return (_JOINT_RUNNING if robot.robot_mode == RobotMode.RUNNING else _JOINT_POWER_OFF,) * 6
+    return (JOINT_MODES.get(robot.robot_mode, JOINT_POWER_OFF),) * 6
 
 
 def _accelerometer(robot: Robot) -> Value:
@@ -109,14 +106,14 @@ def _register_readers() -> None:
 
 _register_readers()
 
-_SINCE = {
-    "ft_raw_wrench": {5: 9},
-    "payload": {3: 11, 5: 6},
-    "payload_cog": {3: 11, 5: 6},
-    "payload_inertia": {3: 15, 5: 11},
-    "actual_current_as_torque": {5: 23},
+_SINCE: dict[str, dict[int, tuple[int, int]]] = {
+    "ft_raw_wrench": {5: (9, 0)},
+    "payload": {3: (11, 0), 5: (5, 1)},
+    "payload_cog": {3: (11, 0), 5: (5, 1)},
+    "payload_inertia": {3: (15, 0), 5: (11, 0)},
+    "actual_current_as_torque": {5: (23, 0)},
 }
-"""First minor version of each major one that knows an output."""
+"""First minor version and bug fix of each major one that knows an output."""
 
 INPUTS: dict[str, str] = {
     "speed_slider_mask": "UINT32",
@@ -140,10 +137,10 @@ INPUTS: dict[str, str] = {
 
 def output_type(robot: Robot, name: str) -> str:
     """RTDE type of an output in the robot's software version, or NOT_FOUND."""
-    if name not in OUTPUTS:
+    if name not in OUTPUTS or name in robot.settings.unknown_outputs:
         return "NOT_FOUND"
-    major, minor, _bugfix = robot.settings.polyscope
+    major, *release = robot.settings.polyscope
     since = _SINCE.get(name)
-    if since is not None and (major not in since or minor < since[major]):
+    if since is not None and (major not in since or tuple(release) < since[major]):
         return "NOT_FOUND"
     return OUTPUTS[name][0]

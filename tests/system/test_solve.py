@@ -81,6 +81,51 @@ def test_output_is_a_calibration_that_is_never_overwritten(tmp_path: Path) -> No
     assert output.read_bytes() == saved
 
 
+def test_several_files_give_a_line_each_and_one_bad_file_does_not_hide_the_others(tmp_path: Path) -> None:
+    good, bad = tmp_path / "good.csv", tmp_path / "bad.csv"
+    good.write_text("\n".join([HEADER, *rows(12)]))
+    bad.write_text(HEADER)
+    outcome = solve(bad, good, good, "--json")
+    assert outcome.returncode == 6
+    answers = [json.loads(line) for line in outcome.stdout.splitlines()]
+    assert [answer["source"] for answer in answers] == [str(bad), str(good), str(good)]
+    assert "error" in answers[0]
+    assert answers[1]["mass_kg"] == answers[2]["mass_kg"]
+
+
+def test_all_methods_side_by_side_each_with_a_result_or_a_reason(tmp_path: Path) -> None:
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join([HEADER, *rows(12)]))
+    outcome = solve(path, "--method", "all", "--json")
+    assert outcome.returncode == 0, outcome.stderr
+    methods = {one["method"]: one for one in json.loads(outcome.stdout)["methods"]}
+    assert set(methods) == {
+        *("ml", "srom", "lrom", "carlson-relaxation", "carlson-cayley", "carlson-eigen", "carlson-nullspace"),
+        *("carlson-iterative", "carlson-polynomial", "known-rotation", "yaw-only"),
+    }
+    assert "24 orientations" in methods["srom"]["reason"]
+    assert "mass" in methods["carlson-cayley"]["reason"]
+    for name in ("ml", "lrom", "carlson-eigen", "carlson-polynomial", "yaw-only"):
+        assert methods[name]["mass_kg"] == pytest.approx(1.2, abs=0.002)
+        assert methods[name]["cross_validated"]["force_rms_N"] < 0.003
+    assert methods["known-rotation"]["residual"]["force_rms_N"] > 1  # the sensor is turned by 40 degrees
+    told = solve(path, "--method", "carlson-cayley", "--mass-kg", "1.2", "--level-deg", "0", "--json")
+    assert told.returncode == 0, told.stderr
+    assert json.loads(told.stdout)["mass_kg"] == pytest.approx(1.2)
+
+
+def test_a_rejected_result_is_saved_only_by_force_and_stays_marked(tmp_path: Path) -> None:
+    path, output = tmp_path / "poses.csv", tmp_path / "calibration.json"
+    rng = np.random.default_rng(1)
+    noisy = [",".join([*row.split(",")[:9], *(f"{v:.3f}" for v in rng.normal(0, 5, 6))]) for row in rows(12)]
+    path.write_text("\n".join([HEADER, *noisy]))
+    refused = solve(path, "-o", output)
+    assert refused.returncode == 7, refused.stderr
+    assert not output.exists()
+    assert solve(path, "-o", output, "--force").returncode == 0
+    assert json.loads(output.read_text())["verdict"] == "rejected"
+
+
 def _replaced(row: str, column: int, value: str) -> str:
     cells = row.split(",")
     cells[column] = value

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from mocks.ati_gauges import REFERENCE
-from mocks.ati_serial import AtiSerialBox, calibration_block, crc16, stream_records, with_crc
+from mocks.ati_serial import AtiSerialBox, calibration_block, stream_records
+from mocks.modbus import crc16, with_crc
 
 V1 = [100, -200, 300, -400, 500, -600]
 V2 = [221, -926, 69, -1086, 2342, 1266]

@@ -31,7 +31,7 @@ def dense(D: Array, time: Array, walk: Array, slope: Array) -> Array:
     V += np.kron(np.outer(centred(time), centred(time)), np.diag(slope**2))
     for i in range(n):
         V[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += D[i]
-    return V
+    return np.asarray(V, dtype=np.float64)
 
 
 def covariances(rng: np.random.Generator, n: int = N) -> Array:

@@ -1,10 +1,22 @@
 """Addresses of sensors: what they build, and what is refused before any device is touched."""
 
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+
 import pytest
 
+from drivers._stream import StreamingSensor
 from drivers.ati.can import AtiCanSensor
 from drivers.ati.serial import AtiSerialSensor
-from drivers.registry import BadUrl, sensor_from_url
+from drivers.bota.sensor import BotaSensor
+from drivers.netft import NetFtSensor
+from drivers.registry import BadUrl, arm_class, sensor_from_url
+from drivers.robotiq.sensor import RobotiqFt300
+from drivers.robotous.can import RobotousCan
+from drivers.robotous.serial import RobotousSerial
+from drivers.ur.arm import UrArm
+from drivers.ur.sensor import UrWristSensor
 
 
 def test_can_addresses() -> None:
@@ -25,10 +37,28 @@ def test_serial_addresses() -> None:
 
 
 @pytest.mark.parametrize(
+    ("url", "kind", "name"),
+    [
+        ("robotous-can://can0?rate=500", RobotousCan, "Robotous sensor on socketcan can0"),
+        ("robotous-serial:///dev/ttyUSB0?baud=921600&rate=1000", RobotousSerial, "Robotous sensor on /dev/ttyUSB0"),
+        ("robotiq-ft300:///dev/ttyUSB0", RobotiqFt300, "Robotiq FT 300 on /dev/ttyUSB0"),
+        ("bota:///dev/ttyUSB0?sinc=512", BotaSensor, "Bota sensor on /dev/ttyUSB0"),
+        ("ati-netft://192.168.1.1", NetFtSensor, "ATI Ethernet sensor at 192.168.1.1"),
+        ("ati-netft://192.168.1.1?onrobot=1", NetFtSensor, "OnRobot Ethernet sensor at 192.168.1.1"),
+        ("ur-ft://10.0.0.2?counts_per_N=1&counts_per_Nm=1", UrWristSensor, "wrist sensor of the arm at 10.0.0.2"),
+    ],
+)
+def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: str) -> None:
+    sensor = sensor_from_url(url, sign=-1)
+    assert isinstance(sensor, kind)
+    assert (sensor.name, sensor._sign) == (name, -1)
+
+
+@pytest.mark.parametrize(
     ("url", "message"),
     [
         ("can0", "unknown sensor ''; known: ati-can, ati-serial"),
-        ("bota://dev", "unknown sensor 'bota'"),
+        ("kms40://dev", "unknown sensor 'kms40'"),
         ("ati-can://", "which device"),
         ("ati-can:can0", "which device"),
         ("ati-can://can0#1", "which device"),
@@ -40,6 +70,12 @@ def test_serial_addresses() -> None:
         ("ati-can://can0?base", "key=value"),
         ("ati-can://can0?base=1&base=2", "twice"),
         ("ati-serial:///dev/x?calibration=0", "allowed are 1 to 16"),
+        ("robotous-can://can0?rate=123", "rate is 123 Hz; the sensor knows 10, 20"),
+        ("robotous-serial:///dev/x?rate=1000", "at this baud rate 500 Hz is the most"),
+        ("robotous-serial:///dev/x?baud=60000", "baud is 60000; the sensor knows"),
+        ("robotiq-ft300:///dev/x?rate=1", "unknown option rate; known: none"),
+        ("bota:///dev/x?sinc=513", "allowed are 0 to 512"),
+        ("ati-netft://192.168.1.1?onrobot=2", "allowed are 0 to 1"),
         ("ati-serial:///dev/x?parity=E", "unknown option parity; known: calibration"),
     ],
 )
@@ -47,3 +83,94 @@ def test_mistakes_are_named(url: str, message: str) -> None:
     with pytest.raises(BadUrl, match=message.replace("?", r"\?")) as caught:
         sensor_from_url(url)
     assert url in str(caught.value)
+
+
+ACME = """
+import time
+import numpy as np
+from drivers._stream import StreamingSensor
+from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.ur.arm import UrArm
+
+class Sensor(StreamingSensor):
+    @classmethod
+    def from_url(cls, address, options, *, sign=1):
+        sensor = cls(f"Acme sensor on {address}", sign=sign)
+        sensor.gain = options.integer("gain", 1, 1, 10)
+        return sensor
+
+    def _connect(self):
+        return DeviceInfo("Acme", "1", "1.0")
+
+    def _read_block(self):
+        time.sleep(0.005)
+        return FtSamples(np.array([time.monotonic_ns()]), np.array([np.nan]), np.array([1]), np.zeros((1, 0), np.int32),
+                         self.gain * np.ones((1, 6)), np.zeros(1, np.uint32))
+
+    def _disconnect(self):
+        pass
+
+class Arm(UrArm):
+    pass
+"""
+
+Install = Callable[..., None]
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
+    """Put a package in place as pip would: a module, and its metadata with entry points."""
+
+    def install(name: str, entry_points: str, source: str = "") -> None:
+        site = tmp_path / name
+        metadata = site / f"{name}-1.0.dist-info"
+        metadata.mkdir(parents=True)
+        (site / f"{name}.py").write_text(source, encoding="utf-8")
+        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", encoding="utf-8")
+        (metadata / "entry_points.txt").write_text(entry_points, encoding="utf-8")
+        monkeypatch.syspath_prepend(site)
+
+    return install
+
+
+def test_another_package_brings_a_sensor_and_an_arm(install: Install) -> None:
+    points = "[ftdrive.sensors]\nacme-usb = acme_ft:Sensor\n[ftdrive.arms]\nacme = acme_ft:Arm\n"
+    install("acme_ft", points, ACME)
+    sensor = sensor_from_url("acme-usb:///dev/acme0?gain=3", sign=-1)
+    with contextlib.closing(sensor):
+        sensor.open()
+        assert sensor.identify().model == "Acme"
+        assert (sensor.collect(0.05).wrench == -3).all()
+    with pytest.raises(BadUrl, match="unknown option gian; known: gain"):
+        sensor_from_url("acme-usb:///dev/acme0?gian=3")
+    with pytest.raises(BadUrl, match=r"known: ati-can, .*, acme-usb"):
+        sensor_from_url("acme:///dev/acme0")
+    assert issubclass(arm_class("acme"), UrArm)
+    assert arm_class("acme") is not UrArm
+
+
+def test_arms() -> None:
+    assert arm_class() is UrArm
+    assert arm_class("ur") is UrArm
+    with pytest.raises(BadUrl, match=r"unknown arm 'kuka'; known: ur$"):
+        arm_class("kuka")
+
+
+def test_our_own_names_cannot_be_taken(install: Install) -> None:
+    install("thief", "[ftdrive.sensors]\nbota = thief:Sensor\n")
+    assert isinstance(sensor_from_url("bota:///dev/x"), BotaSensor)
+
+
+def test_two_packages_with_one_name_are_both_named(install: Install) -> None:
+    install("first_ft", "[ftdrive.sensors]\nshared = first_ft:Sensor\n")
+    install("other_ft", "[ftdrive.sensors]\nshared = other_ft:Sensor\n")
+    with pytest.raises(BadUrl, match="'shared' is offered by first_ft and other_ft"):
+        sensor_from_url("shared://x")
+
+
+@pytest.mark.parametrize("source", ["import no_such_library", "", "def broken(:"])
+def test_a_package_that_cannot_be_imported_is_named(install: Install, source: str) -> None:
+    name = f"broken_ft_{len(source)}"
+    install(name, f"[ftdrive.sensors]\nbroken = {name}:Sensor\n", source)
+    with pytest.raises(BadUrl, match=f"the driver 'broken' cannot be imported .*: reinstall {name}"):
+        sensor_from_url("broken://x")

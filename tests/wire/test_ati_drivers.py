@@ -27,6 +27,7 @@ import json, sys
 import numpy as np
 from mocks.ati_can import AtiCanNode
 from mocks.ati_serial import AtiSerialBox
+from mocks.faults import Faults
 
 wrench = np.array(json.loads(sys.argv[1]))
 rng = np.random.default_rng(1)
@@ -36,7 +37,8 @@ devices = []
 for line in sys.stdin:
     word, argument, options = json.loads(line)
     if word == "start":
-        devices.append(kinds[argument](measure, seed=2, **options))
+        faults = Faults(**options.pop("faults", {}))
+        devices.append(kinds[argument](measure, seed=2, faults=faults, **options))
         print(len(devices) - 1, devices[-1].start(), flush=True)
     else:
         getattr(devices[argument], word)()
@@ -225,7 +227,7 @@ def test_unplugged_is_a_broken_stream_at_once(start: Start, wire: str) -> None:
 
 def test_silent_device_is_no_device(start: Start, wire: str) -> None:
     with pytest.raises(ConnectError, match="supply"):
-        start(wire, silent=True).sensor().open()
+        start(wire, faults={"stall": True}).sensor().open()
 
 
 def test_saturated_gauge_is_a_fault(start: Start, wire: str) -> None:
@@ -245,7 +247,7 @@ def test_can_error_bit_alone_is_only_a_warning(start: Start, wire: str, caplog: 
 
 
 def test_can_survives_foreign_late_swapped_and_doubled_frames(start: Start) -> None:
-    emulator = start("can", foreign=0.3, swap=0.2, duplicate=0.2, latency_s=0.001, jitter_s=0.002)
+    emulator = start("can", faults={"foreign": 0.3, "swap": 0.2, "duplicate": 0.2, "delay_s": 0.001, "jitter_s": 0.002})
     with emulator.sensor() as sensor:
         samples = sensor.collect(0.5)
         health = sensor.health()
@@ -255,7 +257,7 @@ def test_can_survives_foreign_late_swapped_and_doubled_frames(start: Start) -> N
 
 
 def test_can_lost_frames_are_gaps_not_wrong_samples(start: Start) -> None:
-    with start("can", loss=0.02).sensor() as sensor:
+    with start("can", faults={"drop": 0.02}).sensor() as sensor:
         samples = sensor.collect(0.5)
         health = sensor.health()
     assert np.abs(samples.wrench - WRENCH).max() < 0.3
@@ -307,7 +309,7 @@ def test_serial_bad_checksums_are_dropped_and_counted(start: Start) -> None:
 
 
 def test_serial_slips_are_noticed_and_the_stream_restarted(start: Start) -> None:
-    with start("serial", byte_slip=0.0005).sensor() as sensor:
+    with start("serial", faults={"byte_slip": 0.0005}).sensor() as sensor:
         samples = sensor.collect(1.0)
         health = sensor.health()
     assert (np.abs(samples.wrench - WRENCH).max(axis=1) > 0.3).sum() <= 1  # one in 128 slips passes a checksum

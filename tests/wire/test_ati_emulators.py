@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from mocks.ati_can import AtiCanNode
 from mocks.ati_gauges import REFERENCE
-from mocks.ati_serial import AtiSerialBox, calibration_block, with_crc
+from mocks.ati_serial import AtiSerialBox, calibration_block
+from mocks.modbus import with_crc
 
 V1 = np.array([-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608])
 V2 = np.array([10, -5, 20, 0.5, -0.25, 0.1])
@@ -229,14 +230,14 @@ def test_can_gauge_offset(node: AtiCanNode, client: CanClient) -> None:
 
 
 def test_can_lost_doubled_and_swapped_frames(node: AtiCanNode, client: CanClient) -> None:
-    node.swap = 1.0
+    node.faults.swap = 1.0
     assert client.ask("200#", 2) == V1_FRAMES[::-1]
-    node.swap, node.duplicate = 0.0, 1.0
+    node.faults.swap, node.faults.duplicate = 0.0, 1.0
     assert client.ask("200#", 4) == [V1_FRAMES[0], V1_FRAMES[0], V1_FRAMES[1], V1_FRAMES[1]]
-    node.duplicate, node.loss = 0.0, 1.0
+    node.faults.duplicate, node.faults.drop = 0.0, 1.0
     client.bus.send(frame("200#"))
     assert client.bus.recv(0.05) is None
-    node.loss = 0.3
+    node.faults.drop = 0.3
     for _ in range(200):
         client.bus.send(frame("200#"))
     heard = 0
@@ -246,7 +247,7 @@ def test_can_lost_doubled_and_swapped_frames(node: AtiCanNode, client: CanClient
 
 
 def test_can_foreign_traffic_stands_between_the_halves_and_is_not_ours(node: AtiCanNode, client: CanClient) -> None:
-    node.foreign = 1.0
+    node.faults.foreign = 1.0
     for _ in range(50):
         client.bus.send(frame("200#"))
         foreign_1, first, foreign_2, second = client.collect(4)
@@ -256,7 +257,7 @@ def test_can_foreign_traffic_stands_between_the_halves_and_is_not_ours(node: Ati
 
 
 def test_can_latency_and_jitter_delay_the_answer(node: AtiCanNode, client: CanClient) -> None:
-    node.latency_s, node.jitter_s = 0.03, 0.005
+    node.faults.delay_s, node.faults.jitter_s = 0.03, 0.005
     start_s = time.monotonic()
     assert client.ask("200#", 2) == V1_FRAMES
     assert time.monotonic() - start_s >= 0.03
@@ -265,7 +266,7 @@ def test_can_latency_and_jitter_delay_the_answer(node: AtiCanNode, client: CanCl
 def test_can_wrong_echo_and_silent_sensor(node: AtiCanNode, client: CanClient) -> None:
     node.wrong_echo = 7
     assert client.ask("206#00", 1) == ["206#07"]
-    node.silent = True
+    node.faults.stall = True
     client.bus.send(frame("205#"))
     assert client.bus.recv(0.05) is None
 
@@ -292,10 +293,10 @@ def test_can_client_may_leave_and_come_back(node: AtiCanNode) -> None:
 def test_can_host_that_never_reads_costs_frames_not_memory(node: AtiCanNode) -> None:
     with serial.Serial(node.start(), timeout=2.0) as port:
         port.write(b"S5\rO\r")
-        while not node.dropped_messages:
+        while not node.dropped_frames:
             port.write(b"t2000\r" * 50)
             port.flush()
-        assert len(node._to_host) + len(node._unsent) < 40_000, "the answers to one read of 4096 bytes"
+        assert len(node._answers) + len(node._unsent) < 40_000, "the answers to one read of 4096 bytes"
         port.timeout = 0.1
         stuck = b""
         while some := port.read(4096):
@@ -567,10 +568,10 @@ def test_serial_byte_slip_shifts_the_records(box: AtiSerialBox, line: SerialClie
     box.measure = noisy(V2)
     assert line.ask(START, 5) == STARTED
     assert checksums_are_right(line.records(100)).all()
-    box.byte_slip = 1.0
+    box.faults.byte_slip = 1.0
     wait_until(lambda: bool((~checksums_are_right(line.records(20))).sum() > 10))
     line.stop()
-    box.byte_slip = 0.0
+    box.faults.byte_slip = 0.0
     assert line.ask(START, 5) == STARTED
     assert checksums_are_right(line.records(100)).all()
 
@@ -579,7 +580,7 @@ def test_serial_refused_start_and_silent_box(box: AtiSerialBox, line: SerialClie
     box.refuse_start = True
     assert line.ask(START, 5) == bytes.fromhex("0A 46 00 63 A2")
     assert line.ask(READ_STATUS, 7) == STATUS_OK, "no stream"
-    box.silent = True
+    box.faults.stall = True
     assert line.is_silent_to(READ_STATUS)
 
 

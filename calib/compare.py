@@ -1,0 +1,130 @@
+"""Every method on the same data, side by side."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib.dataset import CalibrationDataset
+from calib.errors import BadDataset, NotObservable
+from calib.files import JSON
+from calib.known import Known
+from calib.ml import STANDARD_GRAVITY_M_S2, Drift
+from calib.model import Array, Parameters, predict
+from calib.published import PUBLISHED
+from calib.result import Method
+from calib.solver import estimator_of, solve
+
+_MOST_FOLDS = 50
+"""More poses are left out in this many groups instead of one by one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Compared:
+    """One method's outcome, or the reason why there is none."""
+
+    method: Method
+    reason: str | None = None
+    parameters: Parameters | None = None
+    mass_kg: float = np.nan
+    rotation_difference_rad: float = np.nan
+    """Angle to the mounting that the default method finds."""
+    force_rms_N: float = np.nan
+    torque_rms_Nm: float = np.nan
+    cv_force_rms_N: float = np.nan
+    """Cross-validated: each pose predicted from all others; NaN where the method cannot do without a pose."""
+    cv_torque_rms_Nm: float = np.nan
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Give what `ftdrive solve --method all --json` prints of a method."""
+        if self.parameters is None:
+            return {"method": self.method, "reason": self.reason}
+        cross_validated = (self.cv_force_rms_N, self.cv_torque_rms_Nm)
+        force, torque = (None if np.isnan(rms) else rms for rms in cross_validated)
+        return {
+            "method": self.method,
+            "mass_kg": self.mass_kg,
+            "p_sensor_com_m": self.parameters.p_sensor_com_m.tolist(),
+            "force_bias_N": self.parameters.force_bias_N.tolist(),
+            "torque_bias_Nm": self.parameters.torque_bias_Nm.tolist(),
+            "gravity_force_base_N": self.parameters.gravity_force_base_N.tolist(),
+            "R_flange_sensor": self.parameters.R_flange_sensor.tolist(),
+            "rotation_difference_rad": self.rotation_difference_rad,
+            "residual": {"force_rms_N": self.force_rms_N, "torque_rms_Nm": self.torque_rms_Nm},
+            "cross_validated": {"force_rms_N": force, "torque_rms_Nm": torque},
+        }
+
+
+def compare(
+    dataset: CalibrationDataset,
+    *,
+    drift: Drift = "auto",
+    known: Known | None = None,
+    g_m_s2: float = STANDARD_GRAVITY_M_S2,
+) -> list[Compared]:
+    """Run all methods; those that cannot run on these data say why.
+
+    Parameters
+    ----------
+    dataset : CalibrationDataset
+    drift, known, g_m_s2
+        As for `solve`. The published methods that take gravity as known find it in `known`, or assume a level base.
+
+    Raises
+    ------
+    NotObservable
+        Not even the default method can be used.
+    """
+    default = solve(dataset, "ml", drift=drift, known=known, g_m_s2=g_m_s2).R_flange_sensor
+    compared = []
+    for method in get_args(Method):
+        try:
+            if method in PUBLISHED:
+                found = _published(dataset, method, known, g_m_s2)
+            else:
+                found = _fitted(dataset, method, drift, known, g_m_s2)
+        except (NotObservable, BadDataset) as error:
+            compared.append(Compared(method, str(error)))
+            continue
+        parameters, cv_force, cv_torque = found
+        force, torque = _rms(dataset.wrench - predict(parameters, dataset.R_base_flange))
+        angle_rad = float(Rotation.from_matrix(parameters.R_flange_sensor @ default.T).magnitude())
+        mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / g_m_s2
+        compared.append(Compared(method, None, parameters, mass_kg, angle_rad, force, torque, cv_force, cv_torque))
+    return compared
+
+
+def _fitted(
+    dataset: CalibrationDataset, method: Method, drift: Drift, known: Known | None, g_m_s2: float
+) -> tuple[Parameters, float, float]:
+    result = solve(dataset, method, drift=drift, known=known, g_m_s2=g_m_s2)
+    return result.parameters, result.quality["loo_force_rms_N"], result.quality["loo_torque_rms_Nm"]
+
+
+def _published(
+    dataset: CalibrationDataset, method: Method, known: Known | None, g_m_s2: float
+) -> tuple[Parameters, float, float]:
+    R_base_flange, wrench = dataset.R_base_flange, dataset.wrench
+    parameters = estimator_of(method, R_base_flange, known, g_m_s2)(wrench)
+    left_out = np.empty_like(wrench)
+    try:
+        for out in _folds(len(wrench)):
+            without = estimator_of(method, R_base_flange[~out], known, g_m_s2)(wrench[~out])
+            left_out[out] = wrench[out] - predict(without, R_base_flange[out])
+    except NotObservable:
+        return parameters, np.nan, np.nan
+    return parameters, *_rms(left_out)
+
+
+def _folds(n: int) -> Iterator[NDArray[np.bool_]]:
+    folds = min(n, _MOST_FOLDS)
+    for fold in range(folds):
+        yield np.arange(n) % folds == fold
+
+
+def _rms(residuals: Array) -> tuple[float, float]:
+    force, torque = (np.sqrt(np.mean(np.sum(part**2, axis=1))) for part in (residuals[:, :3], residuals[:, 3:]))
+    return float(force), float(torque)

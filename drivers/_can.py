@@ -1,0 +1,116 @@
+"""A CAN bus that fails in our words, on any adapter python-can knows."""
+
+import contextlib
+import os
+import time
+from collections.abc import Iterable
+from typing import Any
+
+import can
+
+from drivers._stream import LINK_ERRORS
+from drivers.errors import ConnectError, StreamBroken
+
+_BUS_ERRORS = (can.CanError, ValueError, *LINK_ERRORS)
+_SEND_S = 0.1
+
+
+class CanBus:
+    """The way to one device on a CAN bus with 11-bit identifiers.
+
+    Parameters
+    ----------
+    owner : str
+        The device as the user knows it; begins every error message.
+    channel, interface : str
+        As python-can names them: ``can0`` and ``socketcan``, or a serial port and ``slcan``.
+    bitrate : int
+        Bit/s; on socketcan it is set with ``ip link`` and this value is not used.
+    identifiers : iterable of int
+        What the device sends; everything else is ignored.
+    """
+
+    def __init__(self, owner: str, channel: str, interface: str, bitrate: int, identifiers: Iterable[int]) -> None:
+        self._owner = owner
+        self._channel = channel
+        self._interface = interface
+        self._bitrate = bitrate
+        self._identifiers = frozenset(identifiers)
+        self._bus: can.BusABC | None = None
+        self.malformed = 0
+        """Lines of an slcan adapter that are no frame."""
+
+    def open(self) -> None:
+        """Join the bus. Raises `ConnectError`."""
+        options: dict[str, Any] = {}
+        if self._interface == "slcan":
+            # python-can waits 2 s for adapters that reboot when their port is opened; a pseudo-terminal does not
+            tty = os.path.realpath(self._channel.split("@")[0])
+            if not os.access(tty, os.R_OK | os.W_OK):
+                raise ConnectError(f"{self._owner}: there is no {self._channel} that may be read and written")
+            if tty.startswith("/dev/pts/"):
+                options["sleep_after_open"] = 0.0
+        filters: list[can.typechecking.CanFilter] = [
+            {"can_id": identifier, "can_mask": 0x7FF, "extended": False} for identifier in self._identifiers
+        ]
+        try:
+            self._bus = can.Bus(
+                self._channel,
+                interface=self._interface,
+                bitrate=self._bitrate,
+                can_filters=filters,
+                ignore_config=True,
+                **options,
+            )
+        except (NotImplementedError, *_BUS_ERRORS) as exc:
+            raise ConnectError(
+                f"{self._owner}: the bus does not open ({exc}); is the adapter plugged in, and on socketcan "
+                f"'ip link set {self._channel} up type can bitrate {self._bitrate}' done?"
+            ) from exc
+
+    def close(self) -> None:
+        """Leave the bus. Idempotent."""
+        bus, self._bus = self._bus, None
+        if bus is None:
+            return
+        try:
+            with contextlib.suppress(*_BUS_ERRORS):
+                bus.shutdown()
+        finally:
+            # the slcan bus says goodbye before it closes its port, and skips the second when the first fails
+            if port := getattr(bus, "serialPortOrig", None):
+                with contextlib.suppress(*LINK_ERRORS):
+                    port.close()
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """Send one data frame. Raises `StreamBroken`."""
+        if self._bus is None:
+            raise StreamBroken(f"{self._owner}: closed")
+        try:
+            self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=_SEND_S)
+        except _BUS_ERRORS as exc:
+            raise self._broken(exc) from exc
+
+    def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
+        """Wait for the next data frame of the device as (identifier, data). Raises `StreamBroken`."""
+        if self._bus is None:
+            raise StreamBroken(f"{self._owner}: closed")
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                message = self._bus.recv(timeout=max(0.0, deadline - time.monotonic()))
+            except (ValueError, LookupError):
+                self.malformed += 1
+                if time.monotonic() < deadline:
+                    continue
+                return None
+            except (can.CanError, *LINK_ERRORS) as exc:
+                raise self._broken(exc) from exc
+            if message is None:
+                return None
+            strange = message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd
+            if not strange and message.arbitration_id in self._identifiers:
+                return message.arbitration_id, bytes(message.data)
+
+    def _broken(self, exc: Exception) -> StreamBroken:
+        return StreamBroken(f"{self._owner}: the CAN interface is gone ({exc}); plug it in and open it again")

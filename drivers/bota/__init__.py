@@ -1,0 +1,1 @@
+"""Bota Systems SensONE and Rokubi force/torque sensors on a serial port."""

@@ -1,0 +1,76 @@
+"""Bota SensONE and Rokubi: the 37-byte stream frame and the set-up commands, as pure functions on bytes.
+
+Ref: Bota Systems, serial interface of SensONE and Rokubi, as in the vendor's example programs.
+Checked on hardware: no. Verified against: tests/unit/test_bota_codec.py.
+
+A decoder returns a value or raises `ProtocolError`, never anything else. All numbers are little-endian.
+"""
+
+import math
+import struct
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+from drivers._crc import crc16_x25
+from drivers.errors import ProtocolError
+
+HEADER = b"\xaa"
+_PAYLOAD = struct.Struct("<H6fIf")
+FRAME_SIZE = 1 + _PAYLOAD.size + 2
+
+STATUS_BITS: Mapping[int, str] = MappingProxyType(
+    {0: "application too slow", 1: "overrange", 2: "invalid measurement", 3: "raw measurement"}
+)
+TOO_SLOW, OVERRANGE, INVALID, RAW = 1, 2, 4, 8
+
+SINC_PERIOD_S = 19.53125e-6
+"""Sample period per unit of sinc length: 512 gives 10 ms."""
+
+ENTER_SETUP, ENTER_RUN = b"C", b"R"
+BINARY_AND_CALIBRATED = b"c,0,1,0,4"
+"""No temperature compensation (the vendor's advice), calibrated, binary, 460800 baud."""
+
+
+class Frame(NamedTuple):
+    """One sample."""
+
+    status: int
+    wrench: tuple[float, ...]
+    """(6,) N and N·m."""
+    t_us: int
+    """The sensor's clock, which wraps at 2**32 µs, that is every 71.6 minutes."""
+    temperature_C: float
+
+
+def is_frame(data: bytes) -> bool:
+    """Tell whether bytes are a whole frame: length, header and checksum."""
+    return (
+        len(data) == FRAME_SIZE and data.startswith(HEADER) and crc16_x25(data[1:-2]).to_bytes(2, "little") == data[-2:]
+    )
+
+
+def decode_frame(data: bytes) -> Frame:
+    """Decode a whole frame."""
+    if not is_frame(data):
+        raise ProtocolError(f"these bytes are no frame: {data.hex(' ')}")
+    status, *wrench, t_us, temperature_C = _PAYLOAD.unpack_from(data, 1)
+    if not all(map(math.isfinite, wrench)):
+        raise ProtocolError(f"the sensor sends {wrench}, which is no wrench; power it off and on")
+    return Frame(status, tuple(wrench), t_us, temperature_C)
+
+
+def filter_command(sinc: int) -> bytes:
+    """Command that sets the sinc length: no chopping, no fast mode, FIR off (the vendor's example)."""
+    return f"f,{sinc},0,0,1".encode("ascii")
+
+
+def success(command: bytes) -> bytes:
+    """Tell how the sensor confirms a command."""
+    return b"r,0," + command[:1] + b",0"
+
+
+def describe_status(status: int) -> str:
+    """Put a status word in words, e.g. ``0x0002 (bit 1: overrange)``."""
+    words = [f"bit {n}: {STATUS_BITS.get(n, 'reserved')}" for n in range(16) if status >> n & 1]
+    return f"0x{status:04X} ({', '.join(words) or 'ok'})"

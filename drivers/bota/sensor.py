@@ -1,0 +1,166 @@
+"""Bota SensONE or Rokubi force/torque sensor on a serial port.
+
+Ref: Bota Systems, serial interface of SensONE and Rokubi, as in the vendor's example programs.
+Checked on hardware: no. Verified against: tests/unit/test_bota_codec.py and the emulator (tests/wire).
+
+The sensor streams from power-up for ever. The driver listens, and sends something only when it was asked to configure;
+closing leaves the stream running. The text a sensor prints when it boots is not waited for: it may have been hours ago.
+"""
+
+import logging
+import time
+from itertools import pairwise
+from statistics import median
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from drivers._frames import Deframer
+from drivers._serial import SerialPort
+from drivers._stream import NOTHING, StreamingSensor
+from drivers.bota import codec
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from drivers.interfaces import DeviceInfo, FtSamples
+
+if TYPE_CHECKING:
+    from drivers.registry import Options
+
+log = logging.getLogger(__name__)
+
+_BAUD = 460_800
+_FIRST_FRAMES = 8
+"""The median of their spacing is the sample period."""
+_FIRST_FRAMES_S = 3.0
+"""A sensor that was switched on this moment boots meanwhile."""
+_REPLY_S = 1.0
+_ATTEMPTS = 3
+_CLOCK = 1 << 32
+
+
+class BotaSensor(StreamingSensor):
+    """A Bota SensONE or Rokubi with the serial interface of 37-byte frames.
+
+    `t_device_s` is the sensor's clock, `seq` counts sample periods on it, so that gaps are visible. The sensor sends
+    N and N·m: `counts` are empty. Overrange, invalid and uncalibrated samples are a `DeviceFault`.
+
+    Parameters
+    ----------
+    port : str
+        The serial port; ``/dev/serial/by-id/…`` survives replugging.
+    sinc : int, optional
+        Filter length, such as 512: the sample period is 19.53125 µs times this. Given, the sensor is configured to
+        stream calibrated binary frames; otherwise nothing is ever sent to it.
+    sign : int
+        -1 for a sensor mounted or wired to report the reaction.
+    """
+
+    def __init__(self, port: str, *, sinc: int | None = None, sign: int = 1) -> None:
+        super().__init__(f"Bota sensor on {port}", sign=sign)
+        self._port = SerialPort(self.name, port, _BAUD)
+        self._sinc = sinc
+
+    @classmethod
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
+        """Build from ``bota:///dev/serial/by-id/…?sinc=512``."""
+        return cls(address, sinc=options.integer("sinc", 0, 0, 512) or None, sign=sign)
+
+    def _connect(self) -> DeviceInfo:
+        self._port.open()
+        self._seen_status = 0
+        if self._sinc is not None:
+            self._configure(self._sinc)
+        self._frames = Deframer(codec.HEADER, codec.FRAME_SIZE, codec.is_frame)
+        first = self._first_frames()
+        times = [frame.t_us for frame in first]
+        self._period_us = median((b - a) % _CLOCK for a, b in pairwise(times))
+        if not self._period_us:
+            raise ConnectError(f"{self.name}: the sensor's clock stands still at {times[-1]} µs; power it off and on")
+        self._t_us = times[-1]
+        self._seq = 0
+        return DeviceInfo(model="Bota force/torque sensor", serial="not reported", firmware="not reported")
+
+    def _read_block(self) -> FtSamples:
+        received = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))
+        t_host_ns = time.monotonic_ns()
+        self._malformed = self._frames.damaged
+        if not received:
+            return NOTHING
+        frames = [codec.decode_frame(frame) for _, frame in received]
+        times = [self._elapse(frame.t_us) for frame in frames]
+        status = np.array([frame.status for frame in frames], np.uint32)
+        self._judge(int(np.bitwise_or.reduce(status)))
+        n = len(frames)
+        return FtSamples(
+            t_host_ns=np.full(n, t_host_ns, np.int64),
+            t_device_s=np.array([t_us for t_us, _ in times]) * 1e-6,
+            seq=np.array([seq for _, seq in times], np.int64),
+            counts=np.zeros((n, 0), np.int32),
+            wrench=np.array([frame.wrench for frame in frames]),
+            status=status,
+        )
+
+    def _disconnect(self) -> None:
+        self._port.close()
+
+    def _configure(self, sinc: int) -> None:
+        """Enter set-up, ask for calibrated binary frames and the filter, and let it run again."""
+        for command in (
+            codec.ENTER_SETUP,
+            codec.BINARY_AND_CALIBRATED,
+            codec.filter_command(sinc),
+            codec.ENTER_RUN,
+        ):
+            self._command(command)
+
+    def _command(self, command: bytes) -> None:
+        for _ in range(_ATTEMPTS):
+            self._port.write(command)
+            answer = b""  # until it listens the sensor streams: its answer comes somewhere behind the frames
+            deadline = time.monotonic() + _REPLY_S
+            while time.monotonic() < deadline:
+                answer = answer[-len(codec.success(command)) :] + self._port.read_all(1)
+                if codec.success(command) in answer:
+                    return
+        raise DeviceTimeout(
+            f"{self.name}: '{command.decode()}' was not confirmed within {_ATTEMPTS} times {_REPLY_S} s; "
+            "check supply and wiring, power it off and on"
+        )
+
+    def _first_frames(self) -> list[codec.Frame]:
+        frames: list[codec.Frame] = []
+        deadline = time.monotonic() + _FIRST_FRAMES_S
+        while len(frames) < _FIRST_FRAMES:
+            if time.monotonic() > deadline:
+                raise ConnectError(
+                    f"{self.name}: {len(frames)} intact frames within {_FIRST_FRAMES_S} s; check supply and wiring; a "
+                    "sensor that was left in set-up, in text mode or at another rate is put right by ?sinc=512"
+                )
+            frames += [codec.decode_frame(frame) for _, frame in self._frames.feed(self._port.read_all(1))]
+        return frames
+
+    def _elapse(self, t_us: int) -> tuple[int, int]:
+        """Follow the sensor's clock over its wraps; returns (time in µs, sequence number)."""
+        step_us = (t_us - self._t_us) % _CLOCK
+        if step_us > _CLOCK // 2:
+            raise StreamBroken(
+                f"{self.name}: the sensor's clock went back to {t_us} µs: it has restarted, open it again"
+            )
+        self._t_us += step_us
+        periods = max(1, round(step_us / self._period_us))
+        self._seq += periods
+        self._lost += periods - 1
+        return self._t_us, self._seq
+
+    def _judge(self, status: int) -> None:
+        """Raise on what makes a sample unusable, log the rest of a status word once."""
+        if status & codec.RAW:
+            raise DeviceFault(
+                f"{self.name}: status {codec.describe_status(status)}: these are no newtons; ?sinc=512 configures it"
+            )
+        if status & (codec.OVERRANGE | codec.INVALID):
+            raise DeviceFault(
+                f"{self.name}: status {codec.describe_status(status)}; take the load off, check the cable"
+            )
+        if new := status & ~self._seen_status:
+            log.warning("%s: status %s; measuring goes on", self.name, codec.describe_status(new))
+            self._seen_status |= new

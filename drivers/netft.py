@@ -1,0 +1,310 @@
+"""ATI Net F/T, Ethernet Axia and OnRobot HEX force/torque sensors over Ethernet (RDT), through pynetft.
+
+Ref: ATI, "Net F/T User Manual" 9620-05-Net FT, and "Ethernet Axia" 9610-05-Ethernet Axia: RDT and netftapi2.xml, as in
+public drivers; OptoForce, "Ethernet Converter" manual, version 2.0.
+Checked on hardware: no. Verified against: tests/unit/test_netft.py and the emulator (tests/wire).
+
+pynetft discovers the scale, keeps the socket drained and says why a stream has ended. It could also set the software
+bias; this driver never does.
+"""
+
+import http.client
+import logging
+import re
+import time
+from collections.abc import Mapping
+from contextlib import closing
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+import pynetft
+
+from drivers._stream import NOTHING, StreamingSensor
+from drivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM
+from drivers.errors import ConnectError, DeviceFault, StreamBroken
+from drivers.interfaces import DeviceInfo, FtSamples
+
+if TYPE_CHECKING:
+    from drivers.registry import Options
+
+log = logging.getLogger(__name__)
+
+_SILENCE_S = 0.3
+"""After this the stream has ended: a sensor that is set to less than 10 Hz is too slow for this driver."""
+_STARTS = 5
+"""The request to start is a datagram and can be lost."""
+_HTTP_S = 1.0
+_NEVER_S = 3600.0
+_BATCH_S = 0.002
+_QUEUE = 16_384
+"""More than two seconds at 7 kHz; the oldest is dropped then, and its number is missing."""
+_ONROBOT_COUNTS = (10_000, 100_000)
+"""Per N and per N·m, fixed by the manual: an OnRobot box does not tell."""
+
+MONITOR_LATCHED = 0x80010000
+"""A monitored threshold was crossed some time ago: says nothing about the data."""
+
+NET_FT_BITS: Mapping[int, str] = MappingProxyType(
+    {
+        1: "HTTP",
+        2: "temperature",
+        3: "reference voltage",
+        4: "no data from the transducer",
+        5: "supply too low",
+        6: "supply too high",
+        7: "artificial analog ground",
+        8: "excitation current low",
+        9: "excitation current high",
+        10: "analog watchdog",
+        11: "flash",
+        12: "EEPROM",
+        13: "stack",
+        14: "watchdog",
+        16: "monitor condition latched",
+        17: "transducer saturated or A/D error",
+        18: "DeviceNet",
+        19: "EtherNet/IP",
+        20: "RDT",
+        21: "CAN",
+        22: "network",
+        23: "configuration does not fit the calibration",
+        24: "settings invalid",
+        25: "halted by a configuration error",
+        26: "program memory",
+        27: "link to the transducer",
+        28: "analog board",
+        29: "digital board",
+        30: "CPU or RAM",
+        31: "any error",
+    }
+)
+AXIA_BITS: Mapping[int, str] = MappingProxyType(
+    {
+        0: "temperature",
+        1: "supply voltage",
+        2: "broken gauge",
+        3: "busy",
+        5: "hardware",
+        16: "monitor condition latched",
+        26: "gauge near its limit",
+        27: "gauge out of range",
+        28: "simulated error",
+        29: "calibration checksum",
+        30: "force or torque out of range",
+        31: "any error",
+    }
+)
+ONROBOT_BITS: Mapping[int, str] = MappingProxyType(
+    {
+        3: "several sensors failed",
+        4: "overload Fx",
+        5: "overload Fy",
+        6: "overload Fz",
+        7: "overload Tx",
+        8: "overload Ty",
+        9: "overload Tz",
+        10: "sensor not detected",
+        11: "sensor failure",
+        12: "sensor temperature",
+        13: "converter failure",
+        14: "converter communication",
+        15: "converter error",
+    }
+)
+
+_FORCE_N = {"lbf": FORCE_UNITS_N[1], "N": FORCE_UNITS_N[2], "klbf": FORCE_UNITS_N[3], "kN": FORCE_UNITS_N[4]}
+_FORCE_N |= {"kgf": FORCE_UNITS_N[5]}
+_TORQUE_NM = {
+    "lbf-in": TORQUE_UNITS_NM[1],
+    "lbf-ft": TORQUE_UNITS_NM[2],
+    "N-m": TORQUE_UNITS_NM[3],
+    "N-mm": TORQUE_UNITS_NM[4],
+    "kgf-cm": TORQUE_UNITS_NM[5],
+    "kN-m": TORQUE_UNITS_NM[6],
+}
+
+
+def describe_status(status: int, bits: Mapping[int, str]) -> str:
+    """Put a status word in words, e.g. ``0x80020000 (bit 17: …, bit 31: any error)``."""
+    words = [f"bit {n}: {bits.get(n, 'reserved')}" for n in range(32) if status >> n & 1]
+    return f"0x{status:08X} ({', '.join(words) or 'ok'})"
+
+
+def serial_in(page: bytes) -> str:
+    """Find the serial number of the active calibration in ``netftapi2.xml``."""
+    match = re.search(rb"<cfgcalsn>\s*([\x20-\x3b\x3d-\x7e]{1,32}?)\s*</cfgcalsn>", page)
+    return match[1].decode("ascii") if match else "not reported"
+
+
+class NetFtSensor(StreamingSensor):
+    """A sensor that speaks ATI's RDT.
+
+    `counts` are the six values as sent, `seq` is the RDT sequence number, `t_device_s` is NaN: the sensor numbers its
+    internal samples but does not tell their rate. Every status but a latched monitor condition is a `DeviceFault`.
+
+    Parameters
+    ----------
+    host : str
+        Address of the sensor; ATI's factory setting is 192.168.1.1.
+    onrobot : bool
+        An OnRobot HEX or OptoForce converter: scale and status bits as its manual fixes them.
+    rdt_port, http_port : int
+        Where a sensor listens for RDT (UDP) and serves its configuration.
+    sign : int
+        -1 for a sensor that reports the reaction.
+    """
+
+    def __init__(
+        self, host: str, *, onrobot: bool = False, rdt_port: int = 49152, http_port: int = 80, sign: int = 1
+    ) -> None:
+        name = f"{'OnRobot' if onrobot else 'ATI'} Ethernet sensor at {host}"
+        # UDP has no cable that breaks: pynetft notices the silence, and that is to be heard before we call it stale
+        super().__init__(name, sign=sign, stale_after_s=_SILENCE_S + 0.15)
+        self._host = host
+        self._onrobot = onrobot
+        self._rdt_port = rdt_port
+        self._http_port = http_port
+        self._client: pynetft.Client | None = None
+
+    @classmethod
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
+        """Build from ``ati-netft://192.168.1.1?onrobot=0&rdt_port=49152&http_port=80``."""
+        return cls(
+            address,
+            onrobot=bool(options.integer("onrobot", 0, 0, 1)),
+            rdt_port=options.integer("rdt_port", 49152, 1, 65535),
+            http_port=options.integer("http_port", 80, 1, 65535),
+            sign=sign,
+        )
+
+    def _connect(self) -> DeviceInfo:
+        serial = "not reported" if self._onrobot else self._read_serial()
+        override = None
+        if self._onrobot:
+            override = pynetft.Calibration(*_ONROBOT_COUNTS, pynetft.ForceUnit.NEWTON, pynetft.TorqueUnit.NEWTON_METER)
+        config = pynetft.Config(
+            sensor_host=self._host,
+            rdt_port=self._rdt_port,
+            http_port=self._http_port,
+            receive_timeout=_SILENCE_S,
+            deliver_samples_with_error_status=True,  # so that the fault can be named
+            # A doubled or late datagram ends a stream that fails at once. So it may recover, but not before we noticed.
+            recovery_policy=pynetft.RecoveryPolicy.RECONNECT,
+            reconnect_initial_delay=_NEVER_S,
+            reconnect_max_delay=_NEVER_S,
+            calibration_override=override,
+        )
+        self._warned = False
+        self._newest_number: int | None = None
+        try:
+            self._client = pynetft.Client(config, queue_size=_QUEUE)
+        except pynetft.NetFTError as exc:
+            raise self._untold(exc) from exc
+        told = self._start(self._client)
+        scale = told.calibration
+        if scale.force_unit.value not in _FORCE_N or scale.torque_unit.value not in _TORQUE_NM:
+            raise ConnectError(
+                f"{self.name}: it measures in {scale.force_unit.value} and {scale.torque_unit.value}; "
+                "choose N and Nm on its configuration page"
+            )
+        self._unit_per_count = np.array(
+            [_FORCE_N[scale.force_unit.value] / scale.counts_per_force_unit] * 3
+            + [_TORQUE_NM[scale.torque_unit.value] / scale.counts_per_torque_unit] * 3
+        )
+        model = "OnRobot HEX (Ethernet)" if self._onrobot else told.product_name or "ATI Net F/T"
+        return DeviceInfo(model=model, serial=serial, firmware="not reported")
+
+    def _read_block(self) -> FtSamples:
+        samples = self._fetch()
+        t_host_ns = time.monotonic_ns()
+        if not samples:
+            return NOTHING
+        numbers = [sample.rdt_sequence for sample in samples]
+        before = numbers[0] - 1 if self._newest_number is None else self._newest_number
+        self._lost += max(0, numbers[-1] - before - len(numbers))
+        self._newest_number = numbers[-1]
+        status = np.array([sample.status for sample in samples], np.uint32)
+        self._judge(int(np.bitwise_or.reduce(status)))
+        counts = np.array([sample.raw_wrench for sample in samples], np.int32)
+        n = len(samples)
+        return FtSamples(
+            t_host_ns=np.full(n, t_host_ns, np.int64),
+            t_device_s=np.full(n, np.nan),
+            seq=np.array(numbers, np.int64),
+            counts=counts,
+            wrench=counts * self._unit_per_count,
+            status=status,
+        )
+
+    def _disconnect(self) -> None:
+        client, self._client = self._client, None
+        if client is not None:
+            client.stop()
+
+    def _start(self, client: pynetft.Client) -> pynetft.SensorConfiguration:
+        """Ask for the stream until it comes; returns what the sensor tells about itself."""
+        for _ in range(_STARTS):
+            try:
+                client.start()
+            except pynetft.NetFTError as exc:
+                raise self._untold(exc) from exc
+            arrived = client.wait_for_first_sample(_SILENCE_S)
+            health = client.health()
+            if health.sensor_configuration is None:
+                raise ConnectError(f"{self.name}: the sensor told no scale; open it again")
+            is_axia = "Axia" in health.sensor_configuration.product_name
+            self._bits = ONROBOT_BITS if self._onrobot else AXIA_BITS if is_axia else NET_FT_BITS
+            self._judge(health.last_status)
+            if arrived:
+                return health.sensor_configuration
+            client.stop()
+        raise ConnectError(
+            f"{self.name}: no sample after {_STARTS} requests; check supply and cable; is RDT enabled on its "
+            "communications page?"
+        )
+
+    def _fetch(self) -> list[pynetft.Sample]:
+        """Take everything that has arrived, waiting up to 0.05 s for the first sample and 2 ms for company."""
+        client = self._client
+        if client is None:
+            raise StreamBroken(f"{self.name}: closed")
+        samples: list[pynetft.Sample] = []
+        try:
+            samples.append(next(client.samples(timeout=0.05)))
+            time.sleep(_BATCH_S)
+            for sample in client.samples(timeout=0.0):
+                samples.append(sample)
+        except TimeoutError:
+            pass
+        except StopIteration:
+            raise StreamBroken(f"{self.name}: closed") from None
+        if not samples and (health := client.health()).state is not pynetft.ClientState.STREAMING:
+            self._judge(health.last_status)
+            raise StreamBroken(
+                f"{self.name}: the stream has ended ({health.last_error}); check cable and supply, then open it again"
+            )
+        return samples
+
+    def _judge(self, status: int) -> None:
+        """Raise on a fault, log a latched monitor condition once."""
+        if status not in {0, MONITOR_LATCHED}:
+            raise self._fault(status)
+        if status and not self._warned:
+            log.warning("%s: status %s; measuring goes on", self.name, describe_status(status, self._bits))
+            self._warned = True
+
+    def _fault(self, status: int) -> DeviceFault:
+        return DeviceFault(f"{self.name}: status {describe_status(status, self._bits)}; its data must not be used")
+
+    def _read_serial(self) -> str:
+        """Ask for the serial number of the calibration in use, which pynetft does not."""
+        try:
+            with closing(http.client.HTTPConnection(self._host, self._http_port, timeout=_HTTP_S)) as connection:
+                connection.request("GET", "/netftapi2.xml")
+                return serial_in(connection.getresponse().read(65536))
+        except (OSError, ValueError, http.client.HTTPException) as exc:
+            raise self._untold(exc) from exc
+
+    def _untold(self, exc: Exception) -> ConnectError:
+        return ConnectError(f"{self.name}: it does not tell its configuration ({exc}); check address, cable and supply")

@@ -1,0 +1,111 @@
+"""Robotiq FT 300: Modbus RTU requests and the 16-byte stream frame, as pure functions on bytes.
+
+Ref: Robotiq, "FT 300 Force Torque Sensor" instruction manual, control over Modbus RTU; the layout of serial number and
+firmware as in Robotiq's own C driver.
+Checked on hardware: no. Verified against: tests/unit/test_robotiq_codec.py.
+
+A decoder returns a value or raises `ProtocolError`, never anything else. Registers are big-endian, the stream is
+little-endian.
+"""
+
+import struct
+from collections.abc import Sequence
+
+from drivers._crc import crc16_modbus
+from drivers.errors import ProtocolError
+
+ADDRESS = 9
+READ_HOLDING, WRITE_MULTIPLE = 0x03, 0x10
+
+STREAM, FIRMWARE, SERIAL = 410, 500, 510
+START_STREAM = 0x0200
+
+STOP = b"\xff" * 50
+"""Ends a running stream; the sensor may take half a second to do so."""
+
+HEADER = b"\x20\x4e"
+FRAME_SIZE = 16
+NOMINAL_RATE_Hz = 100.0
+COUNTS_PER_UNIT = (100, 100, 100, 1000, 1000, 1000)
+"""Per N and per N·m."""
+
+
+class Refused(ProtocolError):
+    """The sensor understood a request and refused it."""
+
+
+def read_registers(register: int, count: int) -> bytes:
+    """Request `count` holding registers."""
+    return _frame(READ_HOLDING, struct.pack(">HH", register, count))
+
+
+def write_register(register: int, value: int) -> bytes:
+    """Request to write one holding register."""
+    return _frame(WRITE_MULTIPLE, struct.pack(">HHBH", register, 1, 2, value))
+
+
+def reply_size(request: bytes) -> int:
+    """Length in bytes of the success reply to a request; a refusal has 5."""
+    return 5 + 2 * int.from_bytes(request[4:6], "big") if request[1] == READ_HOLDING else 8
+
+
+def check_reply(request: bytes, reply: bytes) -> tuple[int, ...]:
+    """Check a whole reply against its request and return the registers it carries; none for a write."""
+    text = reply.hex(" ")
+    if len(reply) < 5 or _crc(reply[:-2]) != reply[-2:]:
+        raise ProtocolError(f"reply is damaged ({text or 'empty'}); check wiring and termination")
+    if len(reply) == 5 and reply[0] == ADDRESS and reply[1] == request[1] | 0x80:
+        raise Refused(f"the sensor refused function 0x{request[1]:02X} with Modbus exception {reply[2]}")
+    is_read = request[1] == READ_HOLDING
+    head = bytes([ADDRESS, READ_HOLDING, len(reply) - 5]) if is_read else request[:6]
+    if len(reply) != reply_size(request) or not reply.startswith(head):
+        raise ProtocolError(f"reply {text} does not belong to request {request.hex(' ')}")
+    return struct.unpack(f">{(len(reply) - 5) // 2}H", reply[3:-2]) if is_read else ()
+
+
+def is_frame(data: bytes) -> bool:
+    """Tell whether bytes are a whole stream frame: length, header and checksum."""
+    return len(data) == FRAME_SIZE and data.startswith(HEADER) and _crc(data[:-2]) == data[-2:]
+
+
+def decode_frame(data: bytes) -> tuple[int, ...]:
+    """Decode a stream frame: six counts Fx..Tz."""
+    if not is_frame(data):
+        raise ProtocolError(f"these bytes are no stream frame: {data.hex(' ')}")
+    return struct.unpack_from("<6h", data, len(HEADER))
+
+
+def decode_serial(registers: Sequence[int]) -> str:
+    """Decode registers 510 to 513: three letters, and a number whose low word comes first."""
+    first, second, low, high = _words(registers, 4)
+    number = high << 16 | low
+    letters = _letters(first >> 8, first & 0xFF, second >> 8)
+    return f"{letters}-{number:04d}" if number and letters else f"{number:04d}" if number else "unknown"
+
+
+def decode_firmware(registers: Sequence[int]) -> str:
+    """Decode registers 500 to 502: three letters and three numbers."""
+    first, second, third = _words(registers, 3)
+    letters = _letters(first >> 8, first & 0xFF, second >> 8)
+    version = f"{second & 0xFF}.{third >> 8}.{third & 0xFF}"
+    return f"{letters}-{version}" if letters else version
+
+
+def _words(registers: Sequence[int], count: int) -> Sequence[int]:
+    if len(registers) != count or not all(0 <= word <= 0xFFFF for word in registers):
+        raise ProtocolError(f"expected {count} registers, got {list(registers)}")
+    return registers
+
+
+def _letters(*codes: int) -> str:
+    """Text of character codes; none where one of them is not printable."""
+    return bytes(codes).decode("ascii") if all(0x20 < code < 0x7F for code in codes) else ""
+
+
+def _frame(function: int, payload: bytes) -> bytes:
+    body = bytes([ADDRESS, function]) + payload
+    return body + _crc(body)
+
+
+def _crc(data: bytes) -> bytes:
+    return crc16_modbus(data).to_bytes(2, "little")

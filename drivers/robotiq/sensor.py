@@ -1,0 +1,158 @@
+"""Robotiq FT 300 and FT 300-S force/torque sensor on a serial port.
+
+Ref: Robotiq, "FT 300 Force Torque Sensor" instruction manual, control over Modbus RTU and data stream.
+Checked on hardware: no. Verified against: tests/unit/test_robotiq_codec.py and the emulator (tests/wire).
+
+Modbus RTU for set-up, then a bare stream at 100 Hz which only 50 bytes of 0xFF end, and which may already run when the
+sensor has booted. The sensor has no zero command: what others call zeroing is done on the host.
+"""
+
+import logging
+import time
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from drivers._frames import Deframer
+from drivers._serial import SerialPort
+from drivers._stream import NOTHING, StreamingSensor
+from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
+from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.robotiq import codec
+
+if TYPE_CHECKING:
+    from drivers.registry import Options
+
+log = logging.getLogger(__name__)
+
+_BAUD = 19_200
+_REPLY_S = 0.2
+_STOP_S = 1.0
+_ATTEMPTS = 3
+_LATENT_RATE_Hz = (55.0, 70.0)
+"""Around 62.5 Hz, one answer in each 16 ms of an FTDI adapter's latency timer."""
+
+
+class RobotiqFt300(StreamingSensor):
+    """A Robotiq FT 300 or FT 300-S, 100 Hz.
+
+    `counts` are the six raw values (0.01 N and 0.001 N·m), `t_device_s` is NaN, `status` is 0: the sensor tells none.
+    A value at the end of its 16 bits is a `DeviceFault`. Frames carry no number: `seq` counts what arrived, damaged
+    frames included, so a frame the wire swallowed whole shows only in the rate.
+
+    Parameters
+    ----------
+    port : str
+        The serial port; ``/dev/serial/by-id/…`` survives replugging.
+    sign : int
+        -1 for a sensor mounted or wired to report the reaction.
+    """
+
+    def __init__(self, port: str, *, sign: int = 1) -> None:
+        super().__init__(f"Robotiq FT 300 on {port}", sign=sign)
+        self._port = SerialPort(self.name, port, _BAUD)
+
+    @classmethod
+    def from_url(cls, address: str, _options: "Options", *, sign: int = 1) -> Self:
+        """Build from ``robotiq-ft300:///dev/serial/by-id/…``."""
+        return cls(address, sign=sign)
+
+    def _connect(self) -> DeviceInfo:
+        self._port.open()
+        self._stop_stream()
+        serial = codec.decode_serial(self._ask(codec.read_registers(codec.SERIAL, 4)))
+        try:
+            firmware = codec.decode_firmware(self._ask(codec.read_registers(codec.FIRMWARE, 3)))
+        except codec.Refused:
+            firmware = "not reported"
+        self._ask(codec.write_register(codec.STREAM, codec.START_STREAM))
+        self._frames = Deframer(codec.HEADER, codec.FRAME_SIZE, codec.is_frame)
+        self._rate_since_ns, self._rate_frames, self._hinted = 0, 0, False
+        return DeviceInfo(model="Robotiq FT 300", serial=serial, firmware=firmware)
+
+    def _read_block(self) -> FtSamples:
+        frames = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))
+        t_host_ns = time.monotonic_ns()
+        self._lost = self._malformed = self._frames.damaged
+        if not frames:
+            return NOTHING
+        counts = np.array([codec.decode_frame(frame) for _, frame in frames], np.int32)
+        if (np.abs(counts + 0.5) > 32767).any():
+            raise DeviceFault(f"{self.name}: a value is at the end of its range; take the load off, check the cable")
+        self._watch_rate(t_host_ns, len(frames))
+        n = len(frames)
+        return FtSamples(
+            t_host_ns=np.full(n, t_host_ns, np.int64),
+            t_device_s=np.full(n, np.nan),
+            seq=np.array([number for number, _ in frames], np.int64),
+            counts=counts,
+            wrench=counts / codec.COUNTS_PER_UNIT,
+            status=np.zeros(n, np.uint32),
+        )
+
+    def _disconnect(self) -> None:
+        if not self._port.is_open:
+            return
+        try:
+            self._port.write(codec.STOP)
+        finally:
+            self._port.close()
+
+    def _stop_stream(self) -> None:
+        """End a stream and wait for silence."""
+        self._port.write(codec.STOP)
+        deadline = time.monotonic() + _STOP_S
+        while self._port.read(64) and time.monotonic() < deadline:
+            pass
+
+    def _ask(self, request: bytes) -> tuple[int, ...]:
+        """Exchange with retries, each after another stop: a stream may run that we did not start."""
+        for _ in range(_ATTEMPTS - 1):
+            try:
+                return self._exchange(request)
+            except codec.Refused:
+                raise
+            except (DeviceTimeout, ProtocolError):
+                self._stop_stream()
+        return self._exchange(request)
+
+    def _exchange(self, request: bytes) -> tuple[int, ...]:
+        self._port.write(request)
+        deadline = time.monotonic() + _REPLY_S
+        reply = self._read_exactly(5, deadline)
+        if not reply[1] & 0x80:
+            reply += self._read_exactly(codec.reply_size(request) - 5, deadline)
+        try:
+            return codec.check_reply(request, reply)
+        except ProtocolError as exc:
+            raise type(exc)(f"{self.name}: {exc}") from exc
+
+    def _read_exactly(self, size: int, deadline: float) -> bytes:
+        data = b""
+        while len(data) < size:
+            data += self._port.read(size - len(data))
+            if len(data) < size and time.monotonic() > deadline:
+                raise DeviceTimeout(
+                    f"{self.name}: no reply within {_REPLY_S} s ({len(data)} of {size} bytes); check supply and wiring"
+                )
+        return data
+
+    def _watch_rate(self, t_host_ns: int, frames: int) -> None:
+        """Once a second compare the rate with what a slow USB adapter makes of it."""
+        self._rate_frames += frames
+        if not self._rate_since_ns:
+            self._rate_since_ns, self._rate_frames = t_host_ns, 0
+        elapsed_s = (t_host_ns - self._rate_since_ns) / 1e9
+        if self._hinted or elapsed_s < 1.0:
+            return
+        rate_Hz = self._rate_frames / elapsed_s
+        self._rate_since_ns, self._rate_frames = t_host_ns, 0
+        if _LATENT_RATE_Hz[0] < rate_Hz < _LATENT_RATE_Hz[1]:
+            self._hinted = True
+            log.warning(
+                "%s: %.1f Hz instead of %.0f Hz; the USB adapter waits 16 ms before it delivers: "
+                "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer (with the name of your port)",
+                self.name,
+                rate_Hz,
+                codec.NOMINAL_RATE_Hz,
+            )

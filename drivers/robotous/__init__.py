@@ -1,0 +1,1 @@
+"""Robotous RFT force/torque sensors: one driver, two wires."""

@@ -1,0 +1,134 @@
+"""Robotous RFT force/torque sensor, whatever the wire.
+
+Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7.
+Checked on hardware: no. Verified against: tests/unit/test_robotous_codec.py and the emulator (tests/wire).
+
+While it streams the sensor hears only stop and bias, so an answer to any other question proves that it has stopped. It
+has a bias command; this driver never sends it.
+"""
+
+import time
+from typing import Protocol
+
+import numpy as np
+
+from drivers._stream import NOTHING, StreamingSensor
+from drivers.errors import DeviceFault, DeviceTimeout
+from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.robotous import codec
+from drivers.robotous.codec import Command
+
+_REPLY_S = 0.15
+_ATTEMPTS = 3
+
+
+class Link(Protocol):
+    """What carries fields: a CAN bus or a UART."""
+
+    name: str
+    """The device as the user knows it."""
+    fastest_Hz: int
+    """The highest output rate it carries."""
+
+    @property
+    def damaged(self) -> int:
+        """How many fields arrived damaged or in part."""
+
+    def open(self) -> None:
+        """Open the wire."""
+
+    def send(self, field: bytes) -> None:
+        """Send a command field (8 bytes)."""
+
+    def receive(self) -> list[tuple[int, bytes]]:
+        """Take the fields (16 bytes) that come within about 0.05 s, with a number that counts damaged ones too."""
+
+    def close(self) -> None:
+        """Free the wire. Idempotent."""
+
+
+class RobotousSensor(StreamingSensor):
+    """A Robotous RFT on a `Link`.
+
+    `counts` are the six raw values, `t_device_s` is NaN, `status` holds the overload bits (5 for Fx down to 0 for Tz);
+    any of them set is a `DeviceFault`. Samples carry no number: `seq` counts what arrived, damaged fields included, so
+    a sample the wire swallowed whole shows only in the rate.
+
+    Parameters
+    ----------
+    link : Link
+        `drivers.robotous.can.CanLink` or `drivers.robotous.serial.SerialLink`.
+    rate_Hz : int, optional
+        10, 20, 50, 100, 200, 333, 500 or 1000, which a UART carries at 921600 baud only. Without it the sensor keeps
+        the rate it has.
+    sign : int
+        -1 for a sensor mounted or wired to report the reaction.
+    """
+
+    def __init__(self, link: Link, *, rate_Hz: int | None = None, sign: int = 1) -> None:
+        super().__init__(link.name, sign=sign)
+        if rate_Hz is not None and rate_Hz not in codec.RATE_CODES:
+            raise ValueError(f"rate is {rate_Hz} Hz; the sensor knows {', '.join(map(str, codec.RATE_CODES))}")
+        if rate_Hz is not None and rate_Hz > link.fastest_Hz:
+            raise ValueError(f"rate is {rate_Hz} Hz; at this baud rate {link.fastest_Hz} Hz is the most")
+        self._link = link
+        self._rate_Hz = rate_Hz
+
+    def _connect(self) -> DeviceInfo:
+        self._link.open()
+        model = codec.decode_text(self._ask(Command.MODEL))
+        force, torque = codec.counts_per_unit(model)
+        self._unit_per_count = 1 / np.array([force] * 3 + [torque] * 3)
+        serial = codec.decode_text(self._ask(Command.SERIAL))
+        firmware = codec.decode_text(self._ask(Command.FIRMWARE))
+        if self._rate_Hz is not None and codec.decode_rate(self._ask(Command.GET_RATE)) != self._rate_Hz:
+            codec.check_set(self._ask(Command.SET_RATE, codec.RATE_CODES[self._rate_Hz]))
+        self._link.send(codec.encode(Command.START))
+        self._damaged_before = self._link.damaged
+        return DeviceInfo(model=f"Robotous {model}", serial=serial, firmware=firmware)
+
+    def _read_block(self) -> FtSamples:
+        received = self._link.receive()
+        t_host_ns = time.monotonic_ns()
+        self._lost = self._malformed = self._link.damaged - self._damaged_before
+        samples = [
+            (number, codec.decode_sample(field)) for number, field in received if field[0] == Command.START
+        ]  # a late reply is no sample
+        if not samples:
+            return NOTHING
+        overload = np.array([sample.overload for _, sample in samples], np.uint32)
+        if axes := codec.overloaded_axes(int(np.bitwise_or.reduce(overload))):
+            raise DeviceFault(
+                f"{self.name}: overload of {', '.join(axes)}; take the load off, then check the zero of the sensor"
+            )
+        counts = np.array([sample.counts for _, sample in samples], np.int32)
+        n = len(samples)
+        return FtSamples(
+            t_host_ns=np.full(n, t_host_ns, np.int64),
+            t_device_s=np.full(n, np.nan),
+            seq=np.array([number for number, _ in samples], np.int64),
+            counts=counts,
+            wrench=counts * self._unit_per_count,
+            status=overload,
+        )
+
+    def _disconnect(self) -> None:
+        try:
+            self._link.send(codec.encode(Command.STOP))
+        finally:
+            self._link.close()
+
+    def _ask(self, command: Command, *parameters: int) -> bytes:
+        """Stop whatever streams, send a command and return the field that answers it."""
+        for _ in range(_ATTEMPTS):
+            self._link.send(codec.encode(Command.STOP))
+            self._link.send(codec.encode(command, *parameters))
+            deadline = time.monotonic() + _REPLY_S
+            while time.monotonic() < deadline:
+                for _, field in self._link.receive():
+                    if field[0] == command:
+                        return field
+        raise DeviceTimeout(
+            f"{self.name}: no answer to {command.name} after {_ATTEMPTS} attempts of {_REPLY_S} s; check supply, "
+            "wiring, bit rate and, on CAN, that the identifiers are the factory's"
+        )

@@ -1,0 +1,66 @@
+"""Robotous fields over RS-232, RS-422 or USB: each in a frame with a sum.
+
+Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7: 8N1, 115200 baud from the factory.
+"""
+
+from typing import TYPE_CHECKING, Self
+
+from drivers._frames import Deframer
+from drivers._serial import SerialPort
+from drivers.robotous import codec
+from drivers.robotous.sensor import RobotousSensor
+
+if TYPE_CHECKING:
+    from drivers.registry import Options
+
+BAUDS = (57_600, 115_200, 230_400, 460_800, 921_600)
+
+
+class SerialLink:
+    """The wire of a Robotous sensor on a serial port."""
+
+    def __init__(self, path: str, *, baud: int = 115_200) -> None:
+        if baud not in BAUDS:
+            raise ValueError(f"baud is {baud}; the sensor knows {', '.join(map(str, BAUDS))}")
+        self.name = f"Robotous sensor on {path}"
+        # 1 kHz needs 921600 baud (manual); below, a frame of 19 bytes takes 190 bits
+        self.fastest_Hz = 1000 if baud == 921_600 else min(500, baud // 190)
+        self._port = SerialPort(self.name, path, baud)
+        self._frames = _new_deframer()
+
+    @property
+    def damaged(self) -> int:
+        """Frames thrown away."""
+        return self._frames.damaged
+
+    def open(self) -> None:
+        """Open the port."""
+        self._frames = _new_deframer()
+        self._port.open()
+
+    def send(self, field: bytes) -> None:
+        """Send a command field."""
+        self._port.write(codec.encode_frame(field))
+
+    def receive(self) -> list[tuple[int, bytes]]:
+        """Take the fields that have come, waiting up to 0.05 s for the first."""
+        frames = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))
+        return [(number, frame[1:-2]) for number, frame in frames]
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+
+class RobotousSerial(RobotousSensor):
+    """A Robotous RFT on a serial port."""
+
+    @classmethod
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
+        """Build from ``robotous-serial:///dev/serial/by-id/…?baud=921600&rate=1000``."""
+        link = SerialLink(address, baud=options.integer("baud", 115_200, BAUDS[0], BAUDS[-1]))
+        return cls(link, rate_Hz=options.integer("rate", 0, 0, 1000) or None, sign=sign)
+
+
+def _new_deframer() -> Deframer:
+    return Deframer(bytes([codec.START_OF_FRAME]), codec.FRAME_SIZE, codec.is_frame)

@@ -1,0 +1,114 @@
+"""The force/torque sensor inside an e-Series wrist, as far as it can honestly be read.
+
+The controller tells two wrenches. `actual_TCP_force` is what is left after the controller has subtracted the payload it
+was told and the reading at its last zeroing, in base axes at the active TCP: it contains nothing a gravity calibration
+could find, and nobody can take the subtraction back. `ft_raw_wrench` (PolyScope 5.9 and later) is not compensated and
+is not touched by zeroing; its axes are those of the tool flange. Universal Robots documents neither its unit nor its
+reference point, and a user has seen values above 20 000. So this driver reads `ft_raw_wrench` and nothing else, and
+insists on being told the scale by somebody who has hung a known weight on the flange.
+
+Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": `ft_raw_wrench`, `actual_TCP_force`.
+Checked on hardware: no. Verified against: tests/unit/test_ur_sensor.py.
+"""
+
+import math
+import time
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from drivers._stream import NOTHING, StreamingSensor
+from drivers.errors import ConnectError, ProtocolError, StreamBroken
+from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.ur.rtde import Subscription
+
+if TYPE_CHECKING:
+    from drivers.registry import Options
+
+_CONNECT_S = 2.0
+_RATE_Hz = 500.0
+
+
+class UrWristSensor(StreamingSensor):
+    """The wrist sensor of an e-Series arm through its controller, 500 Hz.
+
+    The wrench is `ft_raw_wrench` divided by the scale given, in flange axes; that it is taken at the flange is an
+    assumption. `counts` are empty, because the controller tells floating-point numbers. `t_device_s` is the
+    controller's time and `seq` counts its cycles of 2 ms, so that gaps are visible. `status` is 0: whether the sensor
+    measures well is not told.
+
+    Parameters
+    ----------
+    host : str
+        Address of the controller.
+    counts_per_N, counts_per_Nm : float
+        What `ft_raw_wrench` tells for 1 N and for 1 N·m. Measure them: see drivers/README.md.
+    sign : int
+        -1 for a sensor that reports the reaction.
+    """
+
+    def __init__(self, host: str, *, counts_per_N: float, counts_per_Nm: float, sign: int = 1) -> None:
+        super().__init__(f"wrist sensor of the arm at {host}", sign=sign)
+        self._host = host
+        self._counts_per_unit = np.array([counts_per_N] * 3 + [counts_per_Nm] * 3)
+        self._stream: Subscription | None = None
+
+    @classmethod
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
+        """Build from ``ur-ft://192.168.1.10?counts_per_N=…&counts_per_Nm=…``; both are required."""
+        why = "the unit of ft_raw_wrench is not documented, measure it as drivers/README.md says"
+        return cls(
+            address,
+            counts_per_N=options.positive("counts_per_N", why),
+            counts_per_Nm=options.positive("counts_per_Nm", why),
+            sign=sign,
+        )
+
+    def _connect(self) -> DeviceInfo:
+        outputs = {"timestamp": "DOUBLE", "ft_raw_wrench": "VECTOR6D"}
+        self._stream = Subscription(self._host, outputs, _RATE_Hz, timeout_s=_CONNECT_S)
+        version = ".".join(map(str, self._stream.version))
+        if self._stream.missing:
+            raise ConnectError(
+                f"{self.name}: PolyScope {version} does not tell {', '.join(self._stream.missing)}; it needs an "
+                "e-Series arm with PolyScope 5.9 or later"
+            )
+        self._seq: int | None = None
+        return DeviceInfo(model="UR e-Series wrist sensor (ft_raw_wrench)", serial="not reported", firmware=version)
+
+    def _read_block(self) -> FtSamples:
+        stream = self._stream
+        if stream is None:
+            raise StreamBroken(f"{self.name}: closed")
+        try:
+            (t_device_s,), raw = stream.read(0.1)
+        except TimeoutError:
+            return NOTHING
+        except (OSError, StreamBroken) as exc:
+            raise StreamBroken(
+                f"{self.name}: the connection was lost ({exc}); check the robot and the cable, then open it again"
+            ) from exc
+        t_host_ns = time.monotonic_ns()
+        if not (math.isfinite(t_device_s) and all(map(math.isfinite, raw))):
+            raise ProtocolError(f"{self.name}: at {t_device_s} s the controller tells {raw}, which is no wrench")
+        seq = round(t_device_s * _RATE_Hz)
+        if self._seq is not None:
+            if seq <= self._seq:
+                raise StreamBroken(
+                    f"{self.name}: the controller's clock went back to {t_device_s:.3f} s; open it again"
+                )
+            self._lost += seq - self._seq - 1
+        self._seq = seq
+        return FtSamples(
+            t_host_ns=np.array([t_host_ns], np.int64),
+            t_device_s=np.array([t_device_s]),
+            seq=np.array([seq], np.int64),
+            counts=np.zeros((1, 0), np.int32),
+            wrench=(np.array(raw) / self._counts_per_unit)[np.newaxis],
+            status=np.zeros(1, np.uint32),
+        )
+
+    def _disconnect(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.close()

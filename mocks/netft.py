@@ -1,0 +1,412 @@
+"""An emulated ATI Net F/T box (or Ethernet Axia): samples over UDP (RDT), configuration over HTTP.
+
+Ref: ATI 9620-05-Net FT, sections "UDP Interface Using RDT" and "XML"; 9610-05-Ethernet Axia, sections 9 and 10.
+
+Does not model: the TCP interface, multi-unit mode, filters, tool transformation, monitor conditions, more than one
+configuration, the web pages, DHCP, and that a real box answers only a few HTTP requests in a row. Chosen here, because
+the sources leave it open: a new request of samples replaces the running one and takes over its address; "one-shot"
+sends its count of samples, one for count 0, at the set rate; a reading at its rating sets the summary and saturation
+bits; what is no request is ignored.
+"""
+
+import contextlib
+import os
+import select
+import socket
+import struct
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import TypedDict
+from urllib.parse import parse_qsl, urlsplit
+from xml.sax.saxutils import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mocks.ati_gauges import UNIT_N, UNIT_NM
+from mocks.faults import Faults, FaultyWire
+from mocks.sensor import Measure, Pacer
+
+RDT_PORT = 49152
+REQUEST = struct.Struct(">HHI")
+RECORD = np.dtype([("rdt", ">u4"), ("ft", ">u4"), ("status", ">u4"), ("counts", ">i4", 6)])
+REQUEST_HEADER = 0x1234
+INTERNAL_HZ = 7000
+MAX_BUFFER = 40
+SUMMARY, LATCH, SATURATED = 0x8000_0000, 0x0001_0000, 0x8002_0000
+FORCE_UNITS = {1: "lbf", 2: "N", 3: "klbf", 4: "kN", 5: "kgf", 6: "gf"}
+TORQUE_UNITS = {1: "lbf-in", 2: "lbf-ft", 3: "Nm", 4: "Nmm", 5: "kgf-cm", 6: "kNm"}
+_END, _RESET = b"!", b"r"
+
+
+class Command(IntEnum):
+    """What a request asks for."""
+
+    STOP = 0x0000
+    ONE_SHOT = 0x0001
+    REAL_TIME = 0x0002
+    BUFFERED = 0x0003
+    RESET_LATCH = 0x0041
+    BIAS = 0x0042
+
+
+class Endpoint(TypedDict):
+    """Where a client finds the box."""
+
+    host: str
+    rdt_port: int
+    http_port: int
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the box tells over HTTP about its transducer.
+
+    Parameters
+    ----------
+    counts_per_force, counts_per_torque
+        Counts per force unit and per torque unit.
+    force_unit, torque_unit
+        ATI unit codes 1 to 6.
+    serial, part_number
+        Of the transducer.
+    rating
+        (6,) in N and N·m; readings are clipped there.
+    """
+
+    counts_per_force: int = 1_000_000
+    counts_per_torque: int = 1_000_000
+    force_unit: int = 2
+    torque_unit: int = 3
+    serial: str = "FT12345"
+    part_number: str = "SI-130-10"
+    rating: Sequence[float] = (130.0, 130.0, 400.0, 10.0, 10.0, 10.0)
+
+    @property
+    def counts_per_SI(self) -> NDArray[np.float64]:
+        """(6,) counts per newton (three) and per newton metre (three)."""
+        force = self.counts_per_force / UNIT_N[self.force_unit]
+        torque = self.counts_per_torque / UNIT_NM[self.torque_unit]
+        return np.array([force] * 3 + [torque] * 3)
+
+
+def rdt_records(first: int, ft: NDArray[np.int64], status: NDArray[np.int64], counts: NDArray[np.float64]) -> bytes:
+    """Consecutive 36-byte records, big-endian.
+
+    Parameters
+    ----------
+    first
+        RDT sequence number of the first one.
+    ft, status, counts
+        (n,) internal sequence numbers, (n,) status words, (n, 6) counts.
+    """
+    records = np.empty(len(counts), dtype=RECORD)
+    records["rdt"] = (first + np.arange(len(counts))) & 0xFFFFFFFF
+    records["ft"] = ft & 0xFFFFFFFF
+    records["status"] = status
+    records["counts"] = np.clip(np.rint(counts), -(2**31), 2**31 - 1)
+    return records.tobytes()
+
+
+class NetFtBox:
+    """The box: one thread for RDT, one for HTTP.
+
+    Public attributes may be changed while it runs, except addresses.
+
+    Parameters
+    ----------
+    measure
+        Returns (n, 6) successive noisy readings in N and N·m, sensor axes; called for every sample that is made.
+    seed, faults
+        Of the UDP datagrams; a stalled box does not answer HTTP either.
+    host
+        Address to listen at.
+    rdt_port, http_port
+        0 picks a free one. The real ones are 49152 and 80, which needs privileges.
+    calibration
+        Scale and identity.
+    product
+        Name the box gives itself.
+    rate_hz
+        Of samples, 1 to 7000.
+    buffer_size
+        Records in a datagram of the buffered mode, 1 to 40.
+    rdt_enabled
+        Whether the box answers at its UDP port at all.
+    status
+        Status bits sent with every sample.
+    saturated_axis
+        Number of an axis, 0 to 5, that always reads its rating.
+    streaming_at_start
+        Address and port of a client that asked for a stream before it died.
+    """
+
+    def __init__(
+        self,
+        measure: Measure,
+        *,
+        seed: int = 0,
+        faults: Faults | None = None,
+        host: str = "127.0.0.1",
+        rdt_port: int = RDT_PORT,
+        http_port: int = 0,
+        calibration: Calibration | None = None,
+        product: str = "Net F/T",
+        rate_hz: int = INTERNAL_HZ,
+        buffer_size: int = 5,
+        rdt_enabled: bool = True,
+        status: int = 0,
+        saturated_axis: int | None = None,
+        streaming_at_start: tuple[str, int] | None = None,
+    ) -> None:
+        self.measure = measure
+        self.faults = Faults() if faults is None else faults
+        self.calibration = calibration or Calibration()
+        self.product = product
+        self.rate_hz = rate_hz
+        self.buffer_size = buffer_size
+        self.rdt_enabled = rdt_enabled
+        self.status = status
+        self.saturated_axis = saturated_axis
+        self.streaming_at_start = streaming_at_start
+        self._ports = (host, rdt_port, http_port)
+        self._wire: FaultyWire[bytes] = FaultyWire(self.faults, seed)
+        self._pacer = Pacer()
+        self._client: tuple[str, int] | None = None
+        self._left: int | None = None
+        self._buffer = b""
+        self._buffered = False
+        self._stream_hz = float(rate_hz)
+        self._bias = np.zeros(6)
+        self._booted_s = 0.0
+        self._ft_start = 0
+        self._threads: list[threading.Thread] = []
+
+    @property
+    def streaming(self) -> bool:
+        """Whether samples are being sent."""
+        return self._pacer.running
+
+    def start(self) -> Endpoint:
+        """Power the box up.
+
+        Raises
+        ------
+        RuntimeError
+            If it is running already.
+        OSError
+            If a port cannot be had.
+        """
+        if self._threads:
+            raise RuntimeError("NetFtBox runs already: stop it before starting it again")
+        host, rdt_port, http_port = self._ports
+        with contextlib.ExitStack() as stack:
+            self._socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            self._socket.bind((host, rdt_port))
+            self._socket.setblocking(False)
+            self._http = stack.enter_context(_HttpServer((host, http_port), self))
+            stack.pop_all()
+        self._wake_read, self._wake_write = os.pipe()
+        self._boot()
+        targets = {"RDT": self._serve, "HTTP": lambda: self._http.serve_forever(poll_interval=0.1)}
+        for name, target in targets.items():
+            self._threads.append(threading.Thread(target=target, name=f"NetFtBox {name}", daemon=True))
+            self._threads[-1].start()
+        return {"host": host, "rdt_port": self._socket.getsockname()[1], "http_port": self._http.server_port}
+
+    def unplug(self) -> None:
+        """Take the supply away: nobody listens at the ports; a pulled network cable is `Faults.stall`."""
+        if not self._threads:
+            return
+        os.write(self._wake_write, _END)
+        self._http.shutdown()
+        for thread in self._threads:
+            thread.join()
+        self._threads.clear()
+        self._http.server_close()
+        self._socket.close()
+        os.close(self._wake_write)
+        os.close(self._wake_read)
+
+    def stop(self) -> None:
+        """End the box; harmless when it has ended already."""
+        self.unplug()
+
+    def reset(self) -> None:
+        """Interrupt the supply for a moment: the stream ends, the bias is gone, sequence numbers begin anew."""
+        if self._threads:
+            os.write(self._wake_write, _RESET)
+
+    # -- RDT ----------------------------------------------------------------------------------------------------------
+
+    def _boot(self) -> None:
+        self._wire.clear()
+        self._pacer.stop()
+        self._bias = np.zeros(6)
+        self._booted_s = time.monotonic()
+        if self.streaming_at_start:
+            self._request(Command.REAL_TIME, 0, self.streaming_at_start)
+
+    def _serve(self) -> None:
+        while True:
+            readable, _, _ = select.select([self._socket.fileno(), self._wake_read], [], [], self._tick())
+            if self._wake_read in readable:
+                if os.read(self._wake_read, 1) == _END:
+                    return
+                self._boot()
+            if self._socket.fileno() in readable:
+                with contextlib.suppress(OSError):  # a client that is gone is reported as a refused connection
+                    data, client = self._socket.recvfrom(256)
+                    if len(data) == REQUEST.size and self.rdt_enabled:
+                        header, command, count = REQUEST.unpack(data)
+                        if header == REQUEST_HEADER:
+                            self._request(command, count, client)
+
+    def _request(self, command: int, count: int, client: tuple[str, int]) -> None:
+        match command:
+            case Command.STOP:
+                self._pacer.stop()
+            case Command.ONE_SHOT | Command.REAL_TIME | Command.BUFFERED:
+                self._client = client
+                self._left = count or (1 if command == Command.ONE_SHOT else None)
+                self._buffered, self._buffer = command == Command.BUFFERED, b""
+                self._ft_start = int((time.monotonic() - self._booted_s) * INTERNAL_HZ)
+                self._stream_hz = float(min(max(self.rate_hz, 1), INTERNAL_HZ))
+                self._pacer.start(self._stream_hz)
+            case Command.RESET_LATCH if self.status & LATCH:
+                self.status &= ~LATCH
+                self.status = 0 if self.status == SUMMARY else self.status
+            case Command.BIAS:
+                self._bias = self._counts(1)[0][0]
+
+    def _tick(self) -> float | None:
+        now_s = time.monotonic()
+        count = self._pacer.due(now_s)
+        if count:
+            self._sample(count)
+        for datagram in self._wire.due(time.monotonic()):
+            with contextlib.suppress(OSError):  # no room, or nobody there: a datagram is lost
+                if self._client is not None:
+                    self._socket.sendto(datagram, self._client)
+        now_s = time.monotonic()
+        waits_s = (self._pacer.wait_s(now_s), self._wire.wait_s(now_s))
+        return min((wait_s for wait_s in waits_s if wait_s is not None), default=None)
+
+    def _sample(self, count: int) -> None:
+        first = self._pacer.made - count  # of this stream, from 0
+        if self._left is not None:
+            count = max(0, min(count, self._left - first))
+        if count:
+            counts, saturated = self._counts(count)
+            ft = self._ft_start + ((first + np.arange(count)) * (INTERNAL_HZ / self._stream_hz)).astype(np.int64)
+            status = np.where(saturated, SATURATED, 0) | self.status
+            records = rdt_records(first + 1, ft, status, counts - self._bias)
+            self._send(records, last=self._left is not None and first + count >= self._left)
+        if self._left is not None and first + count >= self._left:
+            self._pacer.stop()
+
+    def _counts(self, count: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """(count, 6) counts before bias, and (count,) whether a reading is at its rating."""
+        rating = np.asarray(self.calibration.rating)
+        wrench = self.measure(count)
+        if self.saturated_axis is not None:
+            wrench = wrench.copy()
+            wrench[:, self.saturated_axis] = rating[self.saturated_axis]
+        saturated = np.any(np.abs(wrench) >= rating, axis=1)
+        return np.clip(wrench, -rating, rating) * self.calibration.counts_per_SI, saturated
+
+    def _send(self, records: bytes, *, last: bool) -> None:
+        data = self._buffer + records
+        size = RECORD.itemsize * (min(max(self.buffer_size, 1), MAX_BUFFER) if self._buffered else 1)
+        full = len(data) if last else len(data) - len(data) % size
+        self._wire.put([data[i : min(i + size, full)] for i in range(0, full, size)], stream=not last)
+        self._buffer = data[full:]
+
+    # -- HTTP ---------------------------------------------------------------------------------------------------------
+
+    def page(self, path: str) -> bytes | None:
+        """Content of a page, None when there is none; pages that set something do so."""
+        url = urlsplit(path)
+        query = dict(parse_qsl(url.query))
+        match url.path:
+            case "/netftapi2.xml":
+                return _xml("netft", self._configuration())
+            case "/netftcalapi.xml":
+                return _xml("netftCalibration", self._calibration())
+            case "/comm.cgi" if query.keys() <= {"comrdte", "comrdtrate", "comrdtbsiz"}:
+                return self._communication(query)
+        return None
+
+    def _communication(self, query: dict[str, str]) -> bytes | None:
+        if not all(value.isdecimal() for value in query.values()):
+            return None
+        self.rdt_enabled = query.get("comrdte", str(int(self.rdt_enabled))) != "0"
+        self.rate_hz = min(max(int(query.get("comrdtrate", self.rate_hz)), 1), INTERNAL_HZ)
+        self.buffer_size = min(max(int(query.get("comrdtbsiz", self.buffer_size)), 1), MAX_BUFFER)
+        return b"<html><body>Communications</body></html>"
+
+    def _configuration(self) -> dict[str, object]:
+        calibration = self.calibration
+        return {
+            "runstat": f"0x{self.status:08X}",
+            "cfgcalsel": 0,
+            "cfgcalsn": calibration.serial,
+            "cfgfu": calibration.force_unit,
+            "scfgfu": FORCE_UNITS[calibration.force_unit],
+            "cfgtu": calibration.torque_unit,
+            "scfgtu": TORQUE_UNITS[calibration.torque_unit],
+            "cfgcpf": calibration.counts_per_force,
+            "cfgcpt": calibration.counts_per_torque,
+            "comrdte": "Enabled" if self.rdt_enabled else "Disabled",
+            "comrdtrate": self.rate_hz,
+            "comrdtbsiz": self.buffer_size,
+            "setrate": INTERNAL_HZ,
+            "prodname": self.product,
+        }
+
+    def _calibration(self) -> dict[str, object]:
+        calibration = self.calibration
+        units = [UNIT_N[calibration.force_unit]] * 3 + [UNIT_NM[calibration.torque_unit]] * 3
+        return {
+            "calsn": calibration.serial,
+            "calpn": calibration.part_number,
+            "calfu": calibration.force_unit,
+            "caltu": calibration.torque_unit,
+            "calcpf": calibration.counts_per_force,
+            "calcpt": calibration.counts_per_torque,
+            "calmr": ";".join(f"{rating / unit:g}" for rating, unit in zip(calibration.rating, units, strict=True)),
+        }
+
+
+def _xml(root: str, elements: dict[str, object]) -> bytes:
+    body = "".join(f"<{name}>{escape(str(value))}</{name}>\r\n" for name, value in elements.items())
+    return f'<?xml version="1.0" encoding="ISO-8859-1"?>\r\n<{root}>\r\n{body}</{root}>\r\n'.encode("latin-1")
+
+
+class _HttpServer(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def __init__(self, address: tuple[str, int], box: NetFtBox) -> None:
+        super().__init__(address, _HttpHandler)
+        self.box = box
+
+
+class _HttpHandler(BaseHTTPRequestHandler):
+    server: _HttpServer
+
+    def do_GET(self) -> None:
+        if self.server.box.faults.stall:
+            return  # the connection closes without an answer
+        content = self.server.box.page(self.path)
+        self.send_response(404 if content is None else 200)
+        self.send_header("Content-Type", "text/xml" if self.path.endswith("xml") else "text/html")
+        self.send_header("Content-Length", str(len(content or b"")))
+        self.end_headers()
+        self.wfile.write(content or b"")
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Keep quiet."""

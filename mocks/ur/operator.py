@@ -1,0 +1,171 @@
+"""What people, other machines and the network do to a controller: the arm's verbs of the control channel."""
+
+from collections.abc import Callable
+from typing import Any
+
+from mocks.kinematics import vector6
+from mocks.ur import dashboard
+from mocks.ur.modes import PERMITTED, RobotMode, SafetyMode
+from mocks.ur.robot import Robot
+from mocks.ur.script import Upload
+from mocks.ur.server import UrServer
+
+Request = dict[str, Any]
+Verb = Callable[[Request], dict[str, Any]]
+
+FOREIGN_PROGRAM_S = 5.0
+
+
+class Operator:
+    """Everybody but the client under test.
+
+    Parameters
+    ----------
+    robot, server
+        The controller and its network side.
+    """
+
+    def __init__(self, robot: Robot, server: UrServer) -> None:
+        self._robot = robot
+        self._server = server
+        self.verbs: dict[str, Verb] = {
+            "protective-stop": self._protective_stop,
+            "emergency-stop": self._emergency_stop,
+            "safeguard": self._safeguard,
+            "reduced": self._reduced,
+            "mode": self._mode,
+            "unlock": lambda _request: self._pendant("unlock", "unlock protective stop"),
+            "play": lambda _request: self._pendant("play", "play"),
+            "dashboard-stop": self._dashboard_stop,
+            "crash-script": self._crash_script,
+            "foreign-program": self._foreign_program,
+            "slider": self._slider,
+            "speed-scaling": self._speed_scaling,
+            "remote-control": self._remote_control,
+            "set-tcp": self._set_tcp,
+            "freeze": self._freeze,
+            "silent": self._silent,
+            "drop": self._drop,
+            "listen": self._listen,
+            "claim-registers": self._claim_registers,
+        }
+        """Requests by the value of "do". A wrong request raises ValueError, TypeError or KeyError and does nothing."""
+
+    # -- people -------------------------------------------------------------------------------------------------------
+
+    def _protective_stop(self, _request: Request) -> dict[str, Any]:
+        self._robot.protective_stop("asked for")
+        return {"done": "protective-stop"}
+
+    def _emergency_stop(self, request: Request) -> dict[str, Any]:
+        self._robot.emergency_stop(_on(request))
+        return {"done": "emergency-stop"}
+
+    def _safeguard(self, request: Request) -> dict[str, Any]:
+        self._robot.safeguard_stop(_on(request))
+        return {"done": "safeguard"}
+
+    def _reduced(self, request: Request) -> dict[str, Any]:
+        self._robot.reduced_mode(_on(request))
+        return {"done": "reduced"}
+
+    def _mode(self, request: Request) -> dict[str, Any]:
+        robot = self._robot
+        robot_mode = RobotMode(request["robot"]) if "robot" in request else None
+        safety_mode = SafetyMode(request["safety"]) if "safety" in request else None
+        if robot_mode is None and safety_mode is None:
+            raise KeyError("robot")
+        if robot_mode is not None:
+            robot.set_mode(robot_mode)
+        if safety_mode in PERMITTED:
+            robot.reduced_mode(safety_mode == SafetyMode.REDUCED)
+            robot.set_safety(SafetyMode.NORMAL, "asked for")
+        elif safety_mode == SafetyMode.PROTECTIVE_STOP:
+            robot.protective_stop("asked for")
+        elif safety_mode is not None:
+            robot.set_safety(safety_mode, "asked for")
+        return {"done": "mode", "robot_mode": robot.robot_mode.name, "safety_mode": robot.safety_mode.name}
+
+    def _pendant(self, done: str, command: str) -> dict[str, Any]:
+        reply = dashboard.answer(self._robot, command, by="operator")
+        return {"done": done, "accepted": self._robot.events[-1].accepted, "reply": reply}
+
+    def _slider(self, request: Request) -> dict[str, Any]:
+        self._robot.arm.speed_fraction = _fraction(request)
+        self._robot.note("operator", "slider", why=f"{request['fraction']}")
+        return {"done": "slider"}
+
+    def _remote_control(self, request: Request) -> dict[str, Any]:
+        robot = self._robot
+        if robot.settings.polyscope[0] < 5:
+            raise ValueError("a CB-Series pendant has no local and remote control")
+        robot.remote_control = _on(request)
+        robot.note("operator", f"{'remote' if robot.remote_control else 'local'} control")
+        return {"done": "remote-control", "on": robot.remote_control}
+
+    def _set_tcp(self, request: Request) -> dict[str, Any]:
+        self._robot.tcp_offset = vector6(request["tcp"])
+        self._robot.note("operator", "set-tcp", tcp=list(self._robot.tcp_offset))
+        return {"done": "set-tcp"}
+
+    # -- other clients, and the controller's own trouble --------------------------------------------------------------
+
+    def _dashboard_stop(self, _request: Request) -> dict[str, Any]:
+        return {"done": "dashboard-stop", "reply": dashboard.answer(self._robot, "stop", by="another dashboard client")}
+
+    def _crash_script(self, _request: Request) -> dict[str, Any]:
+        return {"done": "crash-script", "accepted": self._robot.stop_program("run-time error: asked for")}
+
+    def _foreign_program(self, request: Request) -> dict[str, Any]:
+        seconds = float(request.get("seconds", FOREIGN_PROGRAM_S))
+        upload = Upload("other", "", secondary=False)
+        accepted = self._robot.upload(upload, by="another script client", seconds=seconds)
+        return {"done": "foreign-program", "accepted": accepted}
+
+    def _speed_scaling(self, request: Request) -> dict[str, Any]:
+        self._robot.arm.scaling = _fraction(request)
+        return {"done": "speed-scaling"}
+
+    # -- network ------------------------------------------------------------------------------------------------------
+
+    def _freeze(self, request: Request) -> dict[str, Any]:
+        self._server.frozen = _on(request)
+        self._robot.note("network", "freeze", on=self._server.frozen)
+        return {"done": "freeze", "on": self._server.frozen}
+
+    def _silent(self, request: Request) -> dict[str, Any]:
+        what, on, answers = request["what"], _on(request), bool(request.get("answers", False))
+        if answers and what != "rtde":
+            raise ValueError(f"only rtde can answer without streaming, not {what!r}")
+        self._server.set_silent(what, on and not answers)
+        if what == "rtde":
+            self._server.streaming = not (on and answers)
+        self._robot.note("network", f"silent {what}", on=on, answers=answers)
+        return {"done": "silent"}
+
+    def _drop(self, request: Request) -> dict[str, Any]:
+        reset = bool(request.get("reset", False))
+        self._robot.note("network", f"drop {request['what']}", reset=reset)
+        return {"done": "drop", "connections": self._server.drop(request["what"], reset=reset)}
+
+    def _listen(self, request: Request) -> dict[str, Any]:
+        self._server.set_listening(request["what"], _on(request))
+        self._robot.note("network", f"listen {request['what']}", on=_on(request))
+        return {"done": "listen"}
+
+    def _claim_registers(self, request: Request) -> dict[str, Any]:
+        first = {"lower": 0, "upper": 24}[request["range"]]
+        names = {f"input_{kind}_register_{first + i}" for kind in ("int", "double") for i in range(24)}
+        self._server.claimed = self._server.claimed | names if _on(request) else self._server.claimed - names
+        return {"done": "claim-registers"}
+
+
+def _on(request: Request) -> bool:
+    return bool(request.get("on", True))
+
+
+def _fraction(request: Request) -> float:
+    fraction = float(request["fraction"])
+    if not 0.0 <= fraction <= 1.0:
+        raise ValueError(f"fraction {fraction} is not between 0 and 1")
+    return fraction

@@ -1,0 +1,66 @@
+"""Bota frames and commands: golden vector, and totality."""
+
+import contextlib
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers._crc import crc16_x25
+from drivers.bota import codec
+from drivers.errors import ProtocolError
+
+FRAME = bytes.fromhex("AA 0000 0000803F 000000C0 C3F51C41 CDCCCC3D CDCC4CBE 9A99993E 40420F00 0000CC41 3D0D")
+f32 = st.floats(width=32)
+
+
+def frame(*values: float | int) -> bytes:
+    payload = struct.pack("<H6fIf", *values)
+    return b"\xaa" + payload + crc16_x25(payload).to_bytes(2, "little")
+
+
+def test_frame() -> None:
+    assert len(FRAME) == codec.FRAME_SIZE == 37
+    sample = codec.decode_frame(FRAME)
+    assert sample.status == 0
+    assert sample.wrench == pytest.approx((1, -2, 9.81, 0.1, -0.2, 0.3), rel=1e-6)
+    assert sample.t_us == 1_000_000
+    assert sample.temperature_C == 25.5
+
+
+@pytest.mark.parametrize("at", range(37))
+def test_a_changed_byte_is_noticed(at: int) -> None:
+    damaged = bytearray(FRAME)
+    damaged[at] ^= 0x80
+    assert not codec.is_frame(bytes(damaged))
+
+
+@given(st.integers(0, 0xFFFF), st.tuples(f32, f32, f32, f32, f32, f32), st.integers(0, 2**32 - 1), f32)
+def test_frames_round_trip_or_are_no_wrench(status: int, wrench: tuple[float, ...], t_us: int, celsius: float) -> None:
+    data = frame(status, *wrench, t_us, celsius)
+    if all(abs(value) < float("inf") for value in wrench):
+        assert codec.decode_frame(data)[:3] == (status, wrench, t_us)
+    else:
+        with pytest.raises(ProtocolError, match="no wrench"):
+            codec.decode_frame(data)
+
+
+@given(st.binary(max_size=40) | st.binary(min_size=36, max_size=36).map(lambda rest: b"\xaa" + rest))
+def test_decoding_is_total(data: bytes) -> None:
+    with contextlib.suppress(ProtocolError):
+        codec.decode_frame(data)
+
+
+def test_commands_and_their_confirmations() -> None:
+    assert codec.ENTER_SETUP == b"C"
+    assert codec.success(b"C") == b"r,0,C,0"
+    assert codec.BINARY_AND_CALIBRATED == b"c,0,1,0,4"
+    assert codec.success(codec.BINARY_AND_CALIBRATED) == b"r,0,c,0"
+    assert codec.filter_command(512) == b"f,512,0,0,1"
+    assert codec.success(codec.ENTER_RUN) == b"r,0,R,0"
+
+
+def test_status_in_words() -> None:
+    assert codec.describe_status(0) == "0x0000 (ok)"
+    assert codec.describe_status(6) == "0x0006 (bit 1: overrange, bit 2: invalid measurement)"

@@ -1,0 +1,69 @@
+"""The Bota emulator without a wire: CRC and frames."""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mocks.bota import BotaBox, crc16_x25, stream_frame
+
+WRENCH = [1, -2, 9.81, 0.1, -0.2, 0.3]
+FRAME = "AA 0000 0000803F 000000C0 C3F51C41 CDCCCC3D CDCC4CBE 9A99993E 40420F00 0000CC41 3D0D"
+
+
+def test_crc_check_value() -> None:
+    assert crc16_x25(b"123456789") == bytes.fromhex("6E 90")
+
+
+def test_documented_frame() -> None:
+    assert stream_frame(0, WRENCH, 1_000_000, 25.5) == bytes.fromhex(FRAME)
+
+
+@given(
+    st.integers(0, 0xFFFF),
+    st.lists(st.floats(width=32, allow_nan=False), min_size=6, max_size=6),
+    st.integers(0, 2**32 - 1),
+    st.floats(-40, 85, width=32),
+)
+def test_frames_hold_their_values(status: int, wrench: list[float], timestamp_us: int, temperature_C: float) -> None:
+    frame = stream_frame(status, wrench, timestamp_us, temperature_C)
+    assert len(frame) == 37
+    assert struct.unpack("<cH6fIf", frame[:-2]) == (b"\xaa", status, *wrench, timestamp_us, temperature_C)
+    assert crc16_x25(frame[1:-2]) == frame[-2:]
+
+
+@pytest.fixture
+def box() -> BotaBox:
+    box = BotaBox(lambda n: np.tile(WRENCH, (n, 1)))
+    box._power_up()
+    return box
+
+
+def test_samples_carry_time_status_and_temperature(box: BotaBox) -> None:
+    box.temperature_C = 31.25
+    box.status = 0x0001
+    box._stream_start_us = 2**32 - 10_000
+    box._pacer.made = 3
+    fields = [struct.unpack("<H6fIf", frame[1:-2]) for frame in box._samples(3)]
+    assert [f[7] for f in fields] == [2**32 - 10_000, 0, 10_000], "the counter wraps"
+    assert {f[0] for f in fields} == {1}
+    assert {f[8] for f in fields} == {31.25}
+
+
+def test_overrange_and_uncalibrated_bits(box: BotaBox) -> None:
+    box.measure = lambda n: np.tile([0, 0, -1300.0, 0, 0, 0], (n, 1))
+    status, *values = struct.unpack("<H6f", box._samples(1)[0][1:27])
+    assert status == 0x0002
+    assert values[2] == -1200
+    box.measure = lambda n: np.tile(WRENCH, (n, 1))
+    box.calibrated, box.saturated_axis = False, 4
+    status, *values = struct.unpack("<H6f", box._samples(1)[0][1:27])
+    assert status == 0x000A
+    assert values[4] == 15
+
+
+@pytest.mark.parametrize(("sinc", "rate_hz"), [(512, 100), (256, 200), (128, 400), (64, 800), (51, 1004)])
+def test_sampling_time_follows_the_filter(sinc: int, rate_hz: float) -> None:
+    assert 1 / BotaBox(lambda n: np.zeros((n, 6)), sinc_length=sinc).sample_s == pytest.approx(rate_hz, rel=1e-3)

@@ -1,0 +1,230 @@
+"""The emulated controller without sockets: what stops a program, what holds it, what lets it go on, and who did it."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from mocks.kinematics import MODELS, vector6
+from mocks.ur.dashboard import LOCAL_CONTROL, TOO_EARLY, answer
+from mocks.ur.events import Event
+from mocks.ur.modes import RobotMode, Runtime, SafetyMode
+from mocks.ur.robot import Robot, RobotSettings
+from mocks.ur.script import Upload
+from mocks.ur.variables import OUTPUTS, output_type
+from mocks.world import Truth, World
+
+HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
+GOAL = vector6([*HOME[:5], HOME[5] + 1.0])
+CONTROL = Upload("rtde_control", "", secondary=False)
+OTHER = Upload("other", "", secondary=False)
+
+
+def new_robot(polyscope: tuple[int, int, int] = (5, 15, 0)) -> Robot:
+    return Robot(World(Truth.drawn(0), MODELS["UR5e"], HOME, 0), RobotSettings(polyscope=polyscope))
+
+
+def run(robot: Robot, seconds: float) -> None:
+    for _ in range(round(seconds * robot.frequency_hz)):
+        robot.tick()
+
+
+def moving_robot() -> Robot:
+    """Its program runs, an asynchronous moveJ of 1 rad is under way at 0.2 rad/s."""
+    robot = new_robot()
+    robot.upload(CONTROL)
+    run(robot, 0.15)
+    doubles = {f"input_double_register_{i}": v for i, v in enumerate([*GOAL, 0.2, 2.0])}
+    robot.write_inputs({"input_int_register_0": 1, **doubles, "input_int_register_1": 1})
+    run(robot, 0.3)
+    assert robot.runtime == Runtime.PLAYING
+    assert not robot.arm.at_rest
+    return robot
+
+
+def found(robot: Robot, what: str, *, by: str | None = None) -> Event:
+    """The last event of that name."""
+    return next(e for e in reversed(robot.events) if e.what == what and by in (None, e.by))
+
+
+STOPPING: dict[str, Callable[[Robot], object]] = {
+    "dashboard stop": lambda r: answer(r, "stop"),
+    "power off": lambda r: answer(r, "power off"),
+    "emergency stop": lambda r: r.emergency_stop(True),
+    "idle": lambda r: r.set_mode(RobotMode.IDLE),
+    "recovery": lambda r: r.set_safety(SafetyMode.RECOVERY, "asked for"),
+    "fault": lambda r: r.set_safety(SafetyMode.FAULT, "asked for"),
+    "another program": lambda r: r.upload(OTHER, by="another script client"),
+}
+
+
+@pytest.mark.parametrize("how", STOPPING)
+def test_what_ends_the_program_brings_the_arm_to_rest_for_good(how: str) -> None:
+    robot = moving_robot()
+    STOPPING[how](robot)
+    assert robot.runtime == Runtime.STOPPED
+    assert found(robot, "stopped rtde_control", by="program")
+    run(robot, 1.0)
+    stands = found(robot, "stands", by="arm")
+    assert stands.detail["q_rad"] == list(robot.arm.q)
+    assert robot.arm.at_rest
+    q = robot.arm.q
+    robot.emergency_stop(False)
+    robot.set_safety(SafetyMode.NORMAL, "asked for")
+    robot.set_mode(RobotMode.RUNNING)
+    answer(robot, "play")
+    run(robot, 1.0)
+    assert robot.arm.q == q
+    assert abs(q[5] - GOAL[5]) > 0.5
+
+
+def test_only_unlock_and_play_continue_after_a_protective_stop() -> None:
+    robot = moving_robot()
+    robot.protective_stop("asked for")
+    run(robot, 4.9)
+    assert robot.arm.at_rest
+    assert answer(robot, "unlock protective stop") == TOO_EARLY
+    assert not robot.events[-1].accepted
+    assert answer(robot, "play") == "Failed to execute: play"
+    run(robot, 0.2)
+    assert answer(robot, "unlock protective stop", by="operator") == "Protective stop releasing"
+    assert (robot.events[-1].by, robot.events[-1].accepted) == ("operator", True)
+    run(robot, 1.0)
+    assert (robot.runtime, robot.arm.at_rest) == (Runtime.PAUSED, True)
+    assert answer(robot, "play") == "Starting program"
+    run(robot, 6.0)
+    assert robot.arm.q == GOAL
+
+
+def test_a_closed_safeguard_lets_a_held_program_go_on_but_not_a_stopped_one() -> None:
+    robot = moving_robot()
+    robot.safeguard_stop(True)
+    run(robot, 1.0)
+    assert (robot.runtime, robot.arm.at_rest) == (Runtime.PAUSED, True)
+    robot.safeguard_stop(False)
+    run(robot, 1.0)
+    assert not robot.arm.at_rest
+    robot.safeguard_stop(True)
+    answer(robot, "load another.urp")
+    robot.safeguard_stop(False)
+    run(robot, 1.0)
+    assert (robot.runtime, robot.arm.at_rest) == (Runtime.STOPPED, True)
+
+
+def test_reduced_mode_stops_nothing_and_outlives_a_protective_stop() -> None:
+    robot = moving_robot()
+    robot.reduced_mode(True)
+    run(robot, 0.1)
+    assert (robot.safety_mode, robot.runtime, robot.arm.at_rest) == (SafetyMode.REDUCED, Runtime.PLAYING, False)
+    robot.protective_stop("asked for")
+    run(robot, 5.1)
+    assert robot.unlock()
+    assert robot.safety_mode == SafetyMode.REDUCED
+    robot.reduced_mode(False)
+    assert answer(robot, "safetymode") == "Safetymode: NORMAL"
+
+
+@pytest.mark.parametrize("mode", [m for m in SafetyMode if m not in (SafetyMode.NORMAL, SafetyMode.REDUCED)])
+def test_no_program_starts_in_any_other_safety_mode(mode: SafetyMode) -> None:
+    robot = new_robot()
+    robot.set_safety(mode, "asked for")
+    assert robot.upload(CONTROL) is False
+    assert not found(robot, "program rtde_control").accepted
+    run(robot, 0.3)
+    assert robot.runtime == Runtime.STOPPED
+
+
+def test_a_program_whose_start_was_under_way_does_not_start_in_a_stopped_robot() -> None:
+    robot = new_robot()
+    assert robot.upload(CONTROL)
+    robot.protective_stop("asked for")
+    run(robot, 0.3)
+    assert robot.runtime == Runtime.STOPPED
+    assert not found(robot, "started rtde_control").accepted
+
+
+@pytest.mark.parametrize("late", [0.0, 0.25])
+def test_power_comes_back_step_by_step(late: float) -> None:
+    robot = new_robot()
+    robot.emergency_stop(True)
+    assert answer(robot, "power on") == "Failed to execute: power on"
+    robot.emergency_stop(False)
+    if late:
+        assert answer(robot, "power on") == "Powering on"
+        run(robot, late)
+    assert answer(robot, "brake release") == "Brake releasing"
+    run(robot, 2.0)
+    assert robot.robot_mode == RobotMode.RUNNING
+    assert [e.what for e in robot.events if e.by == "power"] == ["POWER_OFF", "POWER_ON", "IDLE", "RUNNING"]
+
+
+def test_a_command_to_a_foreign_program_is_noted_as_lost() -> None:
+    robot = moving_robot()
+    robot.upload(OTHER, by="another script client", seconds=2.0)
+    run(robot, 0.2)
+    assert (robot.runtime, robot.program_name) == (Runtime.PLAYING, "other")
+    robot.write_inputs({"input_int_register_0": 34})
+    lost = robot.events[-1]
+    assert (lost.by, lost.what, lost.accepted) == ("rtde", "command 34", False)
+    assert "other" in lost.why
+    robot.write_inputs({"input_int_register_0": 34})
+    robot.write_inputs({"input_int_register_0": 0})
+    assert robot.events[-1] is lost
+    run(robot, 2.0)
+    assert robot.runtime == Runtime.STOPPED
+
+
+def test_an_untrusted_connection_can_only_ask() -> None:
+    robot = moving_robot()
+    for command in ("stop", "play", "pause", "load x", "unlock protective stop", "power off", "brake release"):
+        assert answer(robot, command, trusted=False) == LOCAL_CONTROL
+        assert not robot.events[-1].accepted
+    assert answer(robot, "robotmode", trusted=False) == "Robotmode: RUNNING"
+    assert robot.runtime == Runtime.PLAYING
+
+
+def test_limiter_and_slider_multiply_and_only_the_slider_is_the_fraction() -> None:
+    robot = moving_robot()
+    robot.arm.speed_fraction, robot.arm.scaling = 0.5, 0.5
+    run(robot, 0.3)
+    assert robot.arm.qd[5] == pytest.approx(0.05)
+    assert OUTPUTS["speed_scaling"][1](robot) == pytest.approx(0.5)
+    assert OUTPUTS["target_speed_fraction"][1](robot) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("polyscope", "unknown"),
+    [
+        ((3, 15, 0), {"ft_raw_wrench", "actual_current_as_torque"}),
+        ((5, 4, 0), {"ft_raw_wrench", "actual_current_as_torque", "payload", "payload_inertia"}),
+        ((5, 5, 0), {"ft_raw_wrench", "actual_current_as_torque", "payload", "payload_inertia"}),
+        ((5, 5, 1), {"ft_raw_wrench", "actual_current_as_torque", "payload_inertia"}),
+        ((5, 9, 0), {"actual_current_as_torque", "payload_inertia"}),
+        ((5, 10, 0), {"actual_current_as_torque", "payload_inertia"}),
+        ((5, 15, 0), {"actual_current_as_torque"}),
+        ((5, 23, 0), set()),
+    ],
+)
+def test_outputs_of_a_version(polyscope: tuple[int, int, int], unknown: set[str]) -> None:
+    robot = new_robot(polyscope=polyscope)
+    candidates = {"ft_raw_wrench", "actual_current_as_torque", "payload", "payload_inertia", "tcp_offset"}
+    assert {name for name in candidates if output_type(robot, name) == "NOT_FOUND"} == unknown
+    assert robot.frequency_hz == (125 if polyscope[0] == 3 else 500)
+
+
+@pytest.mark.parametrize(
+    ("polyscope", "understood"), [((3, 15, 0), "0111"), ((5, 4, 0), "0001"), ((5, 6, 0), "1111"), ((5, 26, 0), "1111")]
+)
+def test_dashboard_of_a_version(polyscope: tuple[int, int, int], understood: str) -> None:
+    robot = new_robot(polyscope=polyscope)
+    queries = ("is in remote control", "get serial number", "get robot model", "safetystatus")
+    known = ["could not understand" not in answer(robot, query) for query in queries]
+    assert known == [mark == "1" for mark in understood]
+
+
+def test_event_times_are_those_of_the_host_and_of_the_controller() -> None:
+    robot = moving_robot()
+    times = [(event.t_host_ns, event.t_robot_s) for event in robot.events]
+    assert times == sorted(times)
+    assert math.isclose(found(robot, "started rtde_control").t_robot_s, 100.1, abs_tol=0.01)

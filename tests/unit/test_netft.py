@@ -1,0 +1,179 @@
+"""RDT through pynetft: golden datagrams against a small scripted box, and what is done with its oddities."""
+
+import socket
+import struct
+import sys
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from typing import Self
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConnectError, DeviceFault, StreamBroken
+from drivers.netft import AXIA_BITS, NET_FT_BITS, ONROBOT_BITS, NetFtSensor, describe_status, serial_in
+from drivers.registry import BadUrl, sensor_from_url
+
+START, STOP = bytes.fromhex("1234 0002 0000 0000"), bytes.fromhex("1234 0000 0000 0000")
+RECORD = bytes.fromhex("00000001 000003E8 00000000 0016E360 FFDDAAF0 00989680 000186A0 FFFF3CB0 000061A8")
+PAGE = (
+    b"<netft><prodname>Ethernet Axia</prodname><cfgcpf>1000000</cfgcpf><cfgcpt>1000000</cfgcpt>"
+    b"<scfgfu>N</scfgfu><scfgtu>Nm</scfgtu><cfgcalsn>FT12345</cfgcalsn></netft>"
+)
+
+
+def record(number: int, status: int = 0) -> bytes:
+    return struct.pack(">III", number, 999 + number, status) + RECORD[12:]
+
+
+class Box:
+    """Sends the records it is given after START, then one each 2 ms; ignores the first `deaf` requests to start."""
+
+    def __init__(self, *records: bytes, deaf: int = 0) -> None:
+        self._records = list(records)
+        self._deaf = deaf
+        self.heard: list[bytes] = []
+        self.mute = False
+        self._end = threading.Event()
+
+        class Pages(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Length", str(len(PAGE)))
+                self.end_headers()
+                self.wfile.write(PAGE)
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self._http = HTTPServer(("127.0.0.1", 0), Pages)
+        self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._udp.bind(("127.0.0.1", 0))
+        self._udp.settimeout(0.002)
+        self._threads = [
+            threading.Thread(target=self._http.serve_forever, kwargs={"poll_interval": 0.01}),
+            threading.Thread(target=self._run),
+        ]
+
+    def sensor(self, *, onrobot: bool = False) -> NetFtSensor:
+        return NetFtSensor(
+            "127.0.0.1", onrobot=onrobot, rdt_port=self._udp.getsockname()[1], http_port=self._http.server_port
+        )
+
+    def __enter__(self) -> Self:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._http.shutdown()
+        for thread in self._threads:
+            thread.join()
+        self._http.server_close()
+        self._udp.close()
+
+    def _run(self) -> None:
+        client, number = None, 0
+        while not self._end.is_set():
+            try:
+                request, who = self._udp.recvfrom(100)
+                self.heard.append(request)
+                if request == START and self._deaf:
+                    self._deaf -= 1
+                else:
+                    client = who if request == START else None
+            except TimeoutError:
+                pass
+            if client is not None and not self.mute:
+                waiting, self._records = self._records, []
+                number += len(waiting) or 1
+                for datagram in waiting or [record(number)]:
+                    self._udp.sendto(datagram, client)
+
+
+def test_start_stop_and_record_are_golden() -> None:
+    with Box(RECORD) as box:
+        with box.sensor() as sensor:
+            first = sensor.latest(timeout_s=0.5)
+            samples = sensor.collect(0.1)
+            info = sensor.identify()
+        deadline = time.monotonic() + 1
+        while len(box.heard) < 2 and time.monotonic() < deadline:
+            time.sleep(0.005)
+    assert box.heard == [START, STOP]  # no bias, 0x0042
+    np.testing.assert_allclose(first.wrench[0], [1.5, -2.25, 10, 0.1, -0.05, 0.025])
+    assert first.counts[0].tolist() == [1_500_000, -2_250_000, 10_000_000, 100_000, -50_000, 25_000]
+    assert (np.diff(samples.seq) == 1).all()
+    assert (info.model, info.serial) == ("Ethernet Axia", "FT12345")
+
+
+def test_onrobot_scale_is_the_manuals() -> None:
+    with Box() as box, box.sensor(onrobot=True) as sensor:
+        np.testing.assert_allclose(sensor.latest(timeout_s=0.5).wrench[0], [150, -225, 1000, 1, -0.5, 0.25])
+        assert sensor.identify().model == "OnRobot HEX (Ethernet)"
+
+
+def test_lost_requests_are_repeated() -> None:
+    with Box(deaf=2) as box, box.sensor() as sensor:
+        sensor.collect(0.05)
+
+
+def test_gaps_are_lost_and_doubled_or_late_datagrams_are_no_samples() -> None:
+    with Box(*map(record, [1, 2, 2, 3, 5, 4, 6, 10, 11])) as box, box.sensor() as sensor:
+        samples = sensor.collect(0.1)
+        health = sensor.health()
+    assert (np.diff(samples.seq) >= 1).all()
+    assert health.lost == 4  # 7, 8, 9, and 4, which came late
+
+
+@pytest.mark.parametrize(
+    ("status", "says"),
+    [(0x88000000, r"0x88000000 \(bit 27: gauge out of range, bit 31: any error\)"), (0x04000000, "gauge near")],
+)
+def test_a_fault_in_the_stream_is_named(status: int, says: str) -> None:
+    with Box() as box, box.sensor() as sensor:
+        box._records = [record(100_000, status)]
+        with pytest.raises(DeviceFault, match=says):
+            sensor.collect(1.0)
+
+
+def test_silence_ends_the_stream() -> None:
+    with Box() as box, box.sensor() as sensor:
+        box.mute = True
+        begin = time.monotonic()
+        with pytest.raises((StreamBroken, TimeoutError), match=r"ended|silent"):
+            sensor.collect(5.0)
+        assert time.monotonic() - begin < 0.6
+
+
+def test_nobody_there() -> None:
+    with pytest.raises(ConnectError, match="does not tell its configuration"):
+        NetFtSensor("127.0.0.1", http_port=1).open()
+    with pytest.raises(ConnectError, match="does not tell its configuration"):
+        NetFtSensor("no such host").open()
+    for nowhere in ("no such host", " "):
+        with pytest.raises(ConnectError, match="check"):
+            NetFtSensor(nowhere, onrobot=True).open()
+
+
+def test_missing_library_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pynetft", None)
+    monkeypatch.delitem(sys.modules, "drivers.netft")
+    with pytest.raises(BadUrl, match=r"pip install 'ftdrive\[netft\]'"):
+        sensor_from_url("ati-netft://192.168.1.1")
+
+
+def test_serial_number_of_the_page() -> None:
+    assert serial_in(PAGE) == "FT12345"
+    assert serial_in(b"<cfgcalsn> FT 1 </cfgcalsn>") == "FT 1"
+    for page in (b"", b"<cfgcalsn></cfgcalsn>", b"<cfgcalsn><b>x</b></cfgcalsn>", b"\xff" * 99):
+        assert serial_in(page) == "not reported"
+
+
+def test_status_in_words() -> None:
+    assert describe_status(0, NET_FT_BITS) == "0x00000000 (ok)"
+    assert describe_status(0x80020000, NET_FT_BITS).startswith("0x80020000 (bit 17: transducer saturated")
+    assert "bit 30: force or torque out of range" in describe_status(0x40000000, AXIA_BITS)
+    assert describe_status(0x10, ONROBOT_BITS) == "0x00000010 (bit 4: overload Fx)"

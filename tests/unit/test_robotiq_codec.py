@@ -1,0 +1,107 @@
+"""Robotiq FT 300 frames: golden vectors, headers inside the data, and totality."""
+
+import contextlib
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers._crc import crc16_modbus
+from drivers._frames import Deframer
+from drivers.errors import ProtocolError
+from drivers.robotiq import codec
+
+FRAME = bytes.fromhex("20 4E D2 04 C9 FD 10 27 96 00 E7 FF E8 03 86 DC")
+START, STARTED = bytes.fromhex("09 10 01 9A 00 01 02 02 00 CD CA"), bytes.fromhex("09 10 01 9A 00 01 21 52")
+READ = bytes.fromhex("09 03 00 B4 00 06 84 A6")
+
+
+def with_crc(body: bytes) -> bytes:
+    return body + crc16_modbus(body).to_bytes(2, "little")
+
+
+def test_requests() -> None:
+    assert codec.write_register(codec.STREAM, codec.START_STREAM) == START
+    assert codec.read_registers(180, 6) == READ
+    assert codec.STOP == b"\xff" * 50
+
+
+def test_frame() -> None:
+    assert codec.is_frame(FRAME)
+    counts = codec.decode_frame(FRAME)
+    assert counts == (1234, -567, 10000, 150, -25, 1000)
+    scaled = [count / unit for count, unit in zip(counts, codec.COUNTS_PER_UNIT, strict=True)]
+    assert scaled == [12.34, -5.67, 100, 0.15, -0.025, 1]
+
+
+@pytest.mark.parametrize("at", range(16))
+def test_a_changed_byte_is_noticed(at: int) -> None:
+    damaged = bytearray(FRAME)
+    damaged[at] ^= 0x01
+    assert not codec.is_frame(bytes(damaged))
+    with pytest.raises(ProtocolError, match="no stream frame"):
+        codec.decode_frame(bytes(damaged))
+
+
+@given(st.lists(st.sampled_from([0x4E20, 20000, 0x204E, -1, 0]), min_size=6, max_size=6), st.integers(0, 15))
+def test_a_header_in_the_data_does_not_mislead(counts: list[int], joined_at: int) -> None:
+    """20000 counts (200 N) look exactly like a header: whatever the byte one joins at, every whole frame is found."""
+    frame = with_crc(codec.HEADER + struct.pack("<6h", *counts))
+    frames = Deframer(codec.HEADER, codec.FRAME_SIZE, codec.is_frame)
+    found = frames.feed((frame * 4)[joined_at:])
+    assert [one for _, one in found] == [frame] * (4 if joined_at == 0 else 3)
+
+
+def test_replies_are_checked_against_their_request() -> None:
+    assert codec.check_reply(START, STARTED) == ()
+    assert codec.check_reply(READ, with_crc(bytes.fromhex("09 03 0C 0001 0002 0003 0004 0005 FFFF"))) == (
+        *(1, 2, 3, 4, 5),
+        0xFFFF,
+    )
+    assert codec.reply_size(READ) == 17
+    assert codec.reply_size(START) == len(STARTED)
+
+
+@pytest.mark.parametrize(
+    ("reply", "says"),
+    [
+        (b"", "empty"),
+        (STARTED[:-1] + b"\0", "damaged"),
+        (with_crc(bytes.fromhex("0A 10 01 9A 00 01")), "does not belong"),
+        (with_crc(bytes.fromhex("09 10 01 9B 00 01")), "does not belong"),
+        (with_crc(bytes.fromhex("09 03 02 00 01")), "does not belong"),
+    ],
+)
+def test_foreign_and_damaged_replies(reply: bytes, says: str) -> None:
+    with pytest.raises(ProtocolError, match=says):
+        codec.check_reply(START, reply)
+
+
+def test_refusal() -> None:
+    with pytest.raises(codec.Refused, match="function 0x10 with Modbus exception 2"):
+        codec.check_reply(START, with_crc(bytes.fromhex("09 90 02")))
+
+
+def test_identity() -> None:
+    letters = [0x4654, 0x5300]
+    assert codec.decode_serial([*letters, 1234, 0]) == "FTS-1234"
+    assert codec.decode_serial([*letters, 1, 1]) == "FTS-65537"
+    assert codec.decode_serial([0, 0, 7, 0]) == "0007"
+    assert codec.decode_serial([0, 0, 0, 0]) == "unknown"
+    assert codec.decode_firmware([0x4654, 0x5302, 0x0001]) == "FTS-2.0.1"
+    assert codec.decode_firmware([0, 2, 0x0001]) == "2.0.1"
+
+
+@given(st.binary(max_size=20), st.lists(st.integers(-1, 0x10000), max_size=5))
+def test_decoders_return_or_raise_protocol_error(data: bytes, registers: list[int]) -> None:
+    for request in (START, READ):
+        with contextlib.suppress(ProtocolError):
+            codec.check_reply(request, data)
+        with contextlib.suppress(ProtocolError):
+            codec.check_reply(request, with_crc(data))
+    with contextlib.suppress(ProtocolError):
+        codec.decode_frame(data)
+    for decode in (codec.decode_serial, codec.decode_firmware):
+        with contextlib.suppress(ProtocolError):
+            decode(registers)

@@ -1,0 +1,99 @@
+"""The Robotiq emulator without a wire: registers and stream frames."""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mocks.modbus import crc16, reply, with_crc
+from mocks.robotiq import RobotiqBox, raw_values, stream_frame
+
+WRENCH = np.array([12.34, -5.67, 100, 0.15, -0.025, 1])
+
+
+@pytest.fixture
+def box() -> RobotiqBox:
+    return RobotiqBox(lambda n: np.tile(WRENCH, (n, 1)))
+
+
+def ask(box: RobotiqBox, request: str) -> str:
+    return reply(9, bytes.fromhex(request), box._execute).hex(" ").upper()
+
+
+def read(box: RobotiqBox, first: int, count: int) -> tuple[int, ...]:
+    answer = reply(9, with_crc(struct.pack(">BBHH", 9, 3, first, count)), box._execute)
+    assert with_crc(answer[:-2]) == answer
+    return struct.unpack(f">{count}H", answer[3:-2])
+
+
+def test_crc_check_value() -> None:
+    assert crc16(b"123456789") == bytes.fromhex("37 4B")
+
+
+def test_documented_frame() -> None:
+    frame = stream_frame(raw_values(WRENCH[None])[0].tolist())
+    assert frame == bytes.fromhex("20 4E D2 04 C9 FD 10 27 96 00 E7 FF E8 03 86 DC")
+
+
+def test_documented_requests(box: RobotiqBox) -> None:
+    assert ask(box, "09 10 01 9A 00 01 02 02 00 CD CA") == "09 10 01 9A 00 01 21 52"
+    answer = ask(box, "09 03 00 B4 00 06 84 A6")
+    assert answer.startswith("09 03 0C 04 D2 FD C9 27 10 00 96 FF E7 03 E8")
+
+
+@given(st.lists(st.integers(-32768, 32767), min_size=6, max_size=6))
+def test_frames_hold_their_values(raw: list[int]) -> None:
+    frame = stream_frame(raw)
+    assert len(frame) == 16
+    assert struct.unpack("<2s6h", frame[:14]) == (b"\x20\x4e", *raw)
+    assert crc16(frame) == b"\0\0"
+
+
+def test_header_bytes_can_stand_in_the_payload() -> None:
+    frame = stream_frame(raw_values(np.array([[200.0, 0, 200.0, 20.0, 0, 0]]))[0].tolist())
+    assert [i for i in range(14) if frame[i : i + 2] == b"\x20\x4e"] == [0, 2, 6, 8]
+
+
+def test_registers(box: RobotiqBox) -> None:
+    assert read(box, 190, 3) == (0, 0, 1000)
+    assert read(box, 500, 3) == (0x4654, 0x5302, 0x0001)  # "FTS", 2.0.1
+    assert read(box, 510, 4) == (0x4654, 0x5300, 1234, 0)
+    assert read(box, 514, 1) == (2022,)
+    assert read(box, 410, 1) == (0,)
+    box.serial = ("FTS", 0x12345)
+    assert read(box, 510, 5) == (0x4654, 0x5300, 0x2345, 0x0001, 2022)
+
+
+@pytest.mark.parametrize(
+    ("body", "code"),
+    [
+        ("09 04 00 B4 00 06", 1),
+        ("09 06 01 9A 02 00", 1),
+        ("09 03 00 B3 00 01", 2),
+        ("09 03 00 B4 00 07", 2),
+        ("09 03 00 B4 00 00", 3),
+        ("09 03 00 B4 00 7E", 3),
+        ("09 03 00 B4", 3),
+        ("09 10 00 B4 00 01 02 00 00", 2),
+        ("09 10 01 9A 00 02 04 02 00 00 00", 2),
+        ("09 10 01 9A 00 01 02 02", 3),
+    ],
+)
+def test_exceptions(box: RobotiqBox, body: str, code: int) -> None:
+    request = bytes.fromhex(body)
+    assert reply(9, with_crc(request), box._execute) == with_crc(bytes([9, request[1] | 0x80, code]))
+
+
+def test_others_and_damaged_requests_are_met_with_silence(box: RobotiqBox) -> None:
+    assert ask(box, "09 03 00 B4 00 06 84 A7") == ""
+    assert reply(9, with_crc(bytes.fromhex("0A 03 00 B4 00 06")), box._execute) == b""
+    assert reply(9, b"\xff" * 50, box._execute) == b""
+
+
+def test_saturation(box: RobotiqBox) -> None:
+    box.measure = lambda n: np.tile([500.0, -500, 0, 0, 0, 0], (n, 1))
+    box.saturated_axis = 5
+    assert read(box, 180, 6) == (0x7FFF, 0x8000, 0, 0, 0, 0x7FFF)
+    assert box._samples(1)[0][2:14] == bytes.fromhex("FF7F 0080 0000 0000 0000 FF7F")

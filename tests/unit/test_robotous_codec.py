@@ -1,0 +1,127 @@
+"""Robotous RFT fields and frames: golden vectors of the manual, and totality."""
+
+import contextlib
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers._frames import Deframer
+from drivers.errors import ProtocolError
+from drivers.robotous import codec
+from drivers.robotous.codec import Command
+from drivers.robotous.serial import SerialLink
+
+SAMPLE = bytes.fromhex("55 0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000 3F AA")
+
+
+def reply(text: str) -> bytes:
+    return bytes.fromhex(text).ljust(16, b"\0")
+
+
+@pytest.mark.parametrize(
+    ("command", "parameters", "frame"),
+    [
+        (Command.START, (), "55 0B 00 00 00 00 00 00 00 0B AA"),
+        (Command.STOP, (), "55 0C 00 00 00 00 00 00 00 0C AA"),
+        (Command.SET_RATE, (8,), "55 0F 08 00 00 00 00 00 00 17 AA"),
+        (Command.MODEL, (), "55 01 00 00 00 00 00 00 00 01 AA"),
+    ],
+)
+def test_commands(command: Command, parameters: tuple[int, ...], frame: str) -> None:
+    assert codec.encode_frame(codec.encode(command, *parameters)) == bytes.fromhex(frame)
+
+
+def test_there_is_no_bias_command() -> None:
+    assert 0x11 not in list(Command)
+
+
+def test_sample() -> None:
+    assert codec.is_frame(SAMPLE)
+    sample = codec.decode_sample(SAMPLE[1:-2])
+    assert sample.counts == (500, -250, 1000, 2000, -1000, 100)
+    assert sample.overload == 0
+    force, torque = codec.counts_per_unit("RFT60-HA01")
+    assert [count / force for count in sample.counts[:3]] == [10, -5, 20]
+    assert [count / torque for count in sample.counts[3:]] == [1, -0.5, 0.05]
+
+
+@pytest.mark.parametrize("at", range(19))
+def test_a_changed_byte_is_noticed(at: int) -> None:
+    damaged = bytearray(SAMPLE)
+    damaged[at] ^= 0x10
+    assert not codec.is_frame(bytes(damaged))
+
+
+def test_marks_in_the_data_are_data() -> None:
+    """Nothing is escaped: 0x55 and 0xAA are ordinary values."""
+    field = bytes.fromhex("0B 5555 AAAA 55AA AA55 0055 AA00 00 0000")
+    frame = codec.encode_frame(field)
+    frames = Deframer(b"\x55", codec.FRAME_SIZE, codec.is_frame)
+    assert frames.feed(frame[7:] + frame * 2) == [(1, frame), (2, frame)]
+    assert codec.decode_sample(field).counts == (21845, -21846, 21930, -21931, 85, -22016)
+
+
+@pytest.mark.parametrize(
+    ("overload", "axes"), [(0x20, ["Fx"]), (0x01, ["Tz"]), (0x12, ["Fy", "Ty"]), (0, []), (0xC0, [])]
+)
+def test_overload_bits(overload: int, axes: list[str]) -> None:
+    assert codec.overloaded_axes(overload) == axes
+
+
+@pytest.mark.parametrize(
+    ("model", "torque"),
+    [
+        ("RFT40-SA01", 2000),
+        ("RFT44-SB01", 2000),
+        ("RFT60-HA01", 2000),
+        ("RFT64-6A01", 2000),
+        ("RFT76-HA01", 2000),
+        ("RFT80-6A01", 1000),
+        ("RFT82-HA01", 1000),
+    ],
+)
+def test_scale_of_each_model(model: str, torque: int) -> None:
+    assert codec.counts_per_unit(model) == (50, torque)
+
+
+@pytest.mark.parametrize("model", ["", "RFT", "RFT90-A", "X RFT60", "rft60"])
+def test_unknown_scale_is_refused(model: str) -> None:
+    with pytest.raises(ProtocolError, match="scale of model"):
+        codec.counts_per_unit(model)
+
+
+def test_rates() -> None:
+    rates = [codec.decode_rate(reply(f"10 0{code}")) for code in range(9)]
+    assert rates == [200, 10, 20, 50, 100, 200, 333, 500, 1000]
+    with pytest.raises(ProtocolError, match="code 9"):
+        codec.decode_rate(reply("10 09"))
+
+
+def test_settings_are_confirmed_or_refused() -> None:
+    codec.check_set(reply("0F 01"))
+    with pytest.raises(ProtocolError, match="2 \\(value out of range\\)"):
+        codec.check_set(reply("0F 00 02"))
+
+
+def test_text() -> None:
+    assert codec.decode_text(b"\x01RFT60-HA01\0\0\0\0\0") == "RFT60-HA01"
+    assert codec.decode_text(b"\x02A1 " + b" " * 12) == "A1"
+    for bad in (bytes(16), b"\x01\xff" + bytes(14)):
+        with pytest.raises(ProtocolError, match="no text"):
+            codec.decode_text(bad)
+
+
+@pytest.mark.parametrize(
+    "decode", [codec.decode_text, codec.decode_rate, codec.check_set, codec.decode_sample, codec.is_frame]
+)
+@given(data=st.binary(max_size=20) | st.binary(min_size=16, max_size=16))
+def test_decoders_return_or_raise_protocol_error(decode: Callable[[bytes], object], data: bytes) -> None:
+    with contextlib.suppress(ProtocolError):
+        decode(data)
+
+
+@pytest.mark.parametrize(("baud", "fastest_Hz"), [(57_600, 303), (115_200, 500), (460_800, 500), (921_600, 1000)])
+def test_what_a_uart_carries(baud: int, fastest_Hz: int) -> None:
+    assert SerialLink("/dev/x", baud=baud).fastest_Hz == fastest_Hz

@@ -1,0 +1,640 @@
+"""The emulated Robotous, Robotiq, Bota and Net F/T sensors, as python-can, pyserial and sockets see them."""
+
+import socket
+import struct
+import termios
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+import serial
+from numpy.typing import NDArray
+
+from mocks.bota import BotaBox, crc16_x25, stream_frame
+from mocks.faults import Faults
+from mocks.modbus import crc16, with_crc
+from mocks.netft import RECORD, NetFtBox
+from mocks.robotiq import RobotiqBox
+from mocks.robotous import RobotousCanNode, RobotousSerialBox, packet
+
+UNPLUGGED = (serial.SerialException, can.CanError, OSError, termios.error)
+RFT_WRENCH = np.array([10, -5, 20, 1, -0.5, 0.05])
+RFT_START = bytes.fromhex("55 0B 00 00 00 00 00 00 00 0B AA")
+RFT_STOP = bytes.fromhex("55 0C 00 00 00 00 00 00 00 0C AA")
+RFT_RATE_1_KHZ = bytes.fromhex("55 0F 08 00 00 00 00 00 00 17 AA")
+RFT_SAMPLE = bytes.fromhex("55 0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000 3F AA")
+FT300_WRENCH = np.array([12.34, -5.67, 100, 0.15, -0.025, 1])
+FT300_START = bytes.fromhex("09 10 01 9A 00 01 02 02 00 CD CA")
+FT300_STARTED = bytes.fromhex("09 10 01 9A 00 01 21 52")
+FT300_FRAME = bytes.fromhex("20 4E D2 04 C9 FD 10 27 96 00 E7 FF E8 03 86 DC")
+FT300_READ = bytes.fromhex("09 03 00 B4 00 06 84 A6")
+BOTA_WRENCH = np.array([1, -2, 9.81, 0.1, -0.2, 0.3])
+RDT_START = bytes.fromhex("12 34 00 02 00 00 00 00")
+RDT_STOP = bytes.fromhex("12 34 00 00 00 00 00 00")
+RDT_ONE = bytes.fromhex("12 34 00 02 00 00 00 01")
+RDT_BIAS = bytes.fromhex("12 34 00 42 00 00 00 00")
+RDT_WRENCH = np.array([1.5, -2.25, 10, 0.1, -0.05, 0.025])
+
+
+def constant(wrench: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:
+    return lambda n: np.tile(wrench, (n, 1))
+
+
+class Counter:
+    """Readings that carry their number on the x axis, in steps that every sensor resolves."""
+
+    step_N = 0.02
+
+    def __init__(self) -> None:
+        self.made = 0
+
+    def __call__(self, count: int) -> NDArray[np.float64]:
+        readings = np.zeros((count, 6))
+        readings[:, 0] = np.arange(self.made, self.made + count) * self.step_N
+        self.made += count
+        return readings
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, "the condition never came true"
+        time.sleep(0.002)
+
+
+@contextmanager
+def serial_client(device: RobotousSerialBox | RobotiqBox | BotaBox, timeout_s: float = 2.0) -> Iterator[serial.Serial]:
+    with serial.Serial(device.start(), timeout=timeout_s) as port:
+        yield port
+    device.stop()
+
+
+def until_silence(port: serial.Serial, silence_s: float = 0.05) -> bytes:
+    port.timeout = silence_s
+    data = b""
+    while piece := port.read(4096):
+        data += piece
+    port.timeout = 2.0
+    return data
+
+
+# ---------------------------------------------------------------- Robotous, CAN
+
+
+@pytest.fixture
+def node() -> Iterator[RobotousCanNode]:
+    node = RobotousCanNode(constant(RFT_WRENCH))
+    yield node
+    node.stop()
+
+
+@contextmanager
+def can_client(node: RobotousCanNode, bitrate: int = 1_000_000) -> Iterator[can.BusABC]:
+    bus = can.Bus(interface="slcan", channel=node.start(), bitrate=bitrate, sleep_after_open=0)
+    try:
+        yield bus
+    finally:
+        with suppress(*UNPLUGGED):
+            bus.shutdown()
+        node.stop()
+
+
+def tell(bus: can.BusABC, command: str, identifier: int = 0x64) -> None:
+    data = bytes.fromhex(command).ljust(8, b"\0")
+    bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+
+def hear(bus: can.BusABC, count: int, timeout_s: float = 2.0) -> list[tuple[int, str]]:
+    messages = [bus.recv(timeout_s) for _ in range(count)]
+    return [(m.arbitration_id, m.data.hex().upper()) for m in messages if m is not None]
+
+
+CAN_SAMPLE = [(1, "0B01F4FF0603E807"), (2, "D0FC180064000000")]
+
+
+def test_robotous_can_commands_and_stream(node: RobotousCanNode) -> None:
+    with can_client(node) as bus:
+        tell(bus, "01")
+        assert hear(bus, 2) == [(1, "015246543630" + "2D48"), (2, "4130310000000000")]
+        tell(bus, "0A")
+        assert hear(bus, 2) == [(1, "0A01F4FF0603E807"), CAN_SAMPLE[1]]
+        tell(bus, "0F 08")
+        assert hear(bus, 2)[0] == (1, "0F01000000000000")
+        tell(bus, "0B")
+        start_s = time.monotonic()
+        assert hear(bus, 800) == CAN_SAMPLE * 400
+        assert 0.35 < time.monotonic() - start_s < 0.8
+        tell(bus, "01")
+        tell(bus, "0C")
+        wait_until(lambda: not node.streaming)
+        while bus.recv(0.02):
+            pass
+        tell(bus, "10")
+        assert hear(bus, 2)[0] == (1, "1008000000000000")
+
+
+def test_robotous_can_ignores_what_is_no_command(node: RobotousCanNode) -> None:
+    with can_client(node) as bus:
+        tell(bus, "01", identifier=0x65)
+        bus.send(can.Message(arbitration_id=0x64, data=b"\x01", is_extended_id=False))
+        bus.send(can.Message(arbitration_id=0x64, data=b"\x01".ljust(8, b"\0"), is_extended_id=True))
+        bus.send(can.Message(arbitration_id=0x64, dlc=8, is_remote_frame=True, is_extended_id=False))
+        assert bus.recv(0.03) is None
+
+
+def test_robotous_can_at_another_bit_rate_is_silent(node: RobotousCanNode) -> None:
+    node.streaming_at_start = True
+    with can_client(node, bitrate=500_000) as bus:
+        tell(bus, "01")
+        assert bus.recv(0.05) is None
+
+
+def test_robotous_can_faults(node: RobotousCanNode) -> None:
+    node.faults.swap = 1.0
+    with can_client(node) as bus:
+        tell(bus, "0A")
+        assert [i for i, _ in hear(bus, 2)] == [2, 1]
+        node.faults.swap, node.faults.foreign = 0.0, 1.0
+        tell(bus, "0A")
+        messages = [bus.recv(1.0) for _ in range(4)]
+        seen = [(m.arbitration_id, m.is_extended_id) for m in messages if m]
+        assert seen[1::2] == [(1, False), (2, False)]
+        assert not {(1, False), (2, False)} & set(seen[::2])
+        node.faults.foreign, node.faults.stall = 0.0, True
+        tell(bus, "0A")
+        assert bus.recv(0.03) is None
+
+
+def test_robotous_can_identifiers_change_with_a_reset(node: RobotousCanNode) -> None:
+    with can_client(node) as bus:
+        tell(bus, "04 70 71 72")
+        assert hear(bus, 2) == [(1, "0401000000000000"), (2, "0" * 16)]
+        tell(bus, "0B")
+        assert hear(bus, 2) == CAN_SAMPLE
+        node.reset()
+        wait_until(lambda: not node.streaming)
+        while bus.recv(0.02):
+            pass
+        tell(bus, "0A", identifier=0x70)
+        assert [i for i, _ in hear(bus, 2)] == [0x71, 0x72]
+
+
+# ---------------------------------------------------------------- Robotous, UART
+
+
+def test_robotous_uart_stream_is_paced_and_stops() -> None:
+    box = RobotousSerialBox(constant(RFT_WRENCH), baud_code=1)
+    with serial_client(box) as port:
+        port.write(RFT_RATE_1_KHZ)
+        assert port.read(19) == packet(bytes.fromhex("0F 01").ljust(16, b"\0"))
+        port.write(RFT_START)
+        start_s = time.monotonic()
+        assert port.read(19 * 500) == RFT_SAMPLE * 500
+        assert 0.45 < time.monotonic() - start_s < 0.8
+        port.write(packet(b"\x02".ljust(8, b"\0")) + RFT_STOP)
+        rest = until_silence(port)
+        assert rest == RFT_SAMPLE * (len(rest) // 19), "nothing else is answered, and no frame is cut"
+        port.write(b"\x55\x55" + packet(b"\x0a".ljust(8, b"\0"))[:-1] + b"\0" + packet(b"\x10".ljust(8, b"\0")))
+        assert port.read(19)[:3] == b"\x55\x10\x08"
+
+
+def test_robotous_uart_delivers_every_reading_once() -> None:
+    counter = Counter()
+    box = RobotousSerialBox(counter)
+    with serial_client(box) as port:
+        port.write(RFT_START)
+        frames = port.read(19 * 50)
+        port.write(RFT_STOP)
+        frames += until_silence(port)
+    numbers = [struct.unpack(">h", frames[i + 2 : i + 4])[0] for i in range(0, len(frames), 19)]
+    assert numbers == list(range(counter.made))
+
+
+def test_robotous_uart_streaming_at_start_and_reset() -> None:
+    box = RobotousSerialBox(constant(RFT_WRENCH), streaming_at_start=True)
+    with serial_client(box) as port:
+        assert port.read(19) == RFT_SAMPLE
+        box.streaming_at_start = False
+        box.reset()
+        wait_until(lambda: not box.streaming)
+        until_silence(port)
+        port.write(packet(b"\x10".ljust(8, b"\0")))
+        assert port.read(19)[1] == 0x10
+
+
+@pytest.mark.parametrize("fault", ["corrupt", "byte_slip", "drop", "duplicate"])
+def test_robotous_uart_faults_hit_some_frames(fault: str) -> None:
+    box = RobotousSerialBox(Counter(), baud_code=1)
+    setattr(box.faults, fault, 0.2)
+    box.rate_code = 8
+    with serial_client(box) as port:
+        port.write(RFT_START)
+        data = port.read(19 * 300)
+    whole = [data[i : i + 19] for i in range(len(data) - 18) if data[i] == 0x55 and data[i + 18] == 0xAA]
+    good = [frame for frame in whole if packet(frame[1:-2]) == frame]
+    distinct = sorted(set(good))
+    assert (len(good) == 300) == (fault in ("drop", "duplicate"))
+    assert (len(good) > len(distinct) > 200) == (fault == "duplicate")
+    assert 200 < len(good) <= 300
+
+
+# ---------------------------------------------------------------- Robotiq
+
+
+def test_robotiq_start_stream_stop() -> None:
+    box = RobotiqBox(constant(FT300_WRENCH))
+    with serial_client(box) as port:
+        for _ in range(2):
+            port.write(FT300_READ)
+            assert port.read(17) == with_crc(bytes.fromhex("09 03 0C 04D2 FDC9 2710 0096 FFE7 03E8"))
+            port.write(FT300_START)
+            assert port.read(8) == FT300_STARTED
+            start_s = time.monotonic()
+            assert port.read(16 * 30) == FT300_FRAME * 30
+            assert 0.28 < time.monotonic() - start_s < 0.6
+            port.write(FT300_READ)
+            assert port.read(32) == FT300_FRAME * 2, "no reply in the stream"
+            port.write(b"\xff" * 50)
+            rest = until_silence(port)
+            assert rest == FT300_FRAME * (len(rest) // 16)
+
+
+def test_robotiq_needs_the_whole_stop_sequence() -> None:
+    box = RobotiqBox(constant(FT300_WRENCH), streaming_at_start=True)
+    with serial_client(box) as port:
+        port.write(b"\xff" * 49 + b"\0" + b"\xff" * 49)
+        assert port.read(160) == FT300_FRAME * 10
+        port.write(b"\xff" * 300)
+        wait_until(lambda: not box.streaming)
+        until_silence(port)
+        port.write(FT300_START)
+        assert port.read(8) == FT300_STARTED
+
+
+def test_robotiq_header_in_the_payload_and_corruption() -> None:
+    box = RobotiqBox(constant(np.array([200.0, 200, 200, 20, 20, 20])), streaming_at_start=True)
+    with serial_client(box) as port:
+        frame = port.read(16)
+        assert frame[:14] == b"\x20\x4e" * 7
+        assert crc16(frame) == b"\0\0"
+        box.faults.corrupt = 1.0
+        until = time.monotonic() + 2
+        while crc16(frame := port.read(16)) == b"\0\0":
+            assert time.monotonic() < until
+        assert len(frame) == 16
+
+
+# ---------------------------------------------------------------- Bota
+
+
+def bota_fields(frame: bytes) -> tuple[Any, ...]:
+    assert frame[0] == 0xAA
+    assert crc16_x25(frame[1:-2]) == frame[-2:]
+    return struct.unpack("<H6fIf", frame[1:-2])
+
+
+def test_bota_streams_when_opened_and_can_be_configured_at_once() -> None:
+    box = BotaBox(constant(BOTA_WRENCH))
+    with serial_client(box) as port:
+        frames = [bota_fields(port.read(37)) for _ in range(10)]
+        assert [round(x, 5) for x in frames[0][1:7]] == BOTA_WRENCH.tolist()
+        assert np.diff([f[7] for f in frames]).tolist() == [10_000] * 9
+        port.write(b"C")
+        assert until_silence(port).endswith(b"r,0,C,0\r\n")
+        for command, answer in (
+            (b"c,0,1,0,4", b"r,0,c,0\r\n"),
+            (b"f,64,0,0,0", b"r,0,f,0\r\n"),
+            (b"R", b"r,0,R,0\r\n"),
+        ):
+            for byte in command:
+                port.write(bytes([byte]))
+            assert port.read(len(answer)) == answer
+        start_s = time.monotonic()
+        frames = [bota_fields(port.read(37)) for _ in range(240)]
+        assert 0.28 < time.monotonic() - start_s < 0.6, "800 Hz"
+        assert np.diff([f[7] for f in frames]).tolist() == [1250] * 239
+
+
+def test_bota_banner_at_power_up_and_after_a_reset() -> None:
+    box = BotaBox(constant(BOTA_WRENCH), streaming_at_start=False)
+    with serial_client(box) as port:
+        for _ in range(2):
+            assert port.read_until(b"App Init").endswith(b"App Init")
+            port.read_until(b"\n")
+            assert bota_fields(port.read(37))[7] < 1e6, "time since power-up"
+            box.reset()
+
+
+@pytest.mark.parametrize(
+    ("written", "answers"),
+    [
+        (b"f,0,0,0,0", b"r,1,f,0\r\n"),
+        (b"c,0,1,0,9", b"r,1,c,0\r\n"),
+        (b"x", b"r,1,x,0\r\n"),
+        (b"C", b"r,0,C,0\r\n"),
+        (b"\r\n c,1,1,0,4 f,512,0,0,0\r\n", b"r,0,c,0\r\nr,0,f,0\r\n"),
+        (b"c,what", b""),
+        (b"cccccccccccccccccc", b"r,1,c,0\r\n"),
+    ],
+)
+def test_bota_configuration_answers(written: bytes, answers: bytes) -> None:
+    box = BotaBox(constant(BOTA_WRENCH))
+    with serial_client(box) as port:
+        port.write(b"garbage C")
+        wait_until(lambda: not box.streaming)
+        until_silence(port)
+        port.write(written)
+        assert until_silence(port) == answers
+
+
+def test_bota_text_and_uncalibrated_output() -> None:
+    box = BotaBox(constant(BOTA_WRENCH))
+    with serial_client(box) as port:
+        port.write(b"C")
+        wait_until(lambda: not box.streaming)
+        until_silence(port)
+        port.write(b"c,0,0,1,4R")
+        assert port.read_until(b"r,0,R,0\r\n") == b"r,0,c,0\r\nr,0,R,0\r\n"
+        values = port.read_until(b"\n").decode().split(",")
+        assert values[:7] == ["8", "1", "-2", "9.81", "0.1", "-0.2", "0.3"]
+
+
+def test_bota_client_that_does_not_read_loses_whole_frames() -> None:
+    box = BotaBox(constant(BOTA_WRENCH), sinc_length=51)
+    with serial_client(box) as port:
+        wait_until(lambda: box.dropped_frames > 20)
+        frames = [bota_fields(port.read(37)) for _ in range(600)]
+        assert np.diff([f[7] for f in frames]).max() > 2000, "a gap, and the frames after it are whole"
+
+
+# ---------------------------------------------------------------- Net F/T
+
+
+class RdtClient:
+    """A UDP socket that talks to the box."""
+
+    def __init__(self, box: NetFtBox) -> None:
+        self.endpoint = box.start()
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 21)
+        self.socket.settimeout(2.0)
+        self.socket.connect((self.endpoint["host"], self.endpoint["rdt_port"]))
+
+    def datagrams(self, count: int) -> list[bytes]:
+        return [self.socket.recv(2048) for _ in range(count)]
+
+    def records(self, count: int) -> NDArray[np.void]:
+        return np.frombuffer(b"".join(self.datagrams(count)), dtype=RECORD)
+
+    def is_silent(self, silence_s: float = 0.05) -> bool:
+        self.socket.settimeout(silence_s)
+        with suppress(TimeoutError):
+            self.socket.recv(2048)
+            return False
+        self.socket.settimeout(2.0)
+        return True
+
+    def page(self, path: str) -> bytes:
+        url = f"http://{self.endpoint['host']}:{self.endpoint['http_port']}{path}"
+        with urllib.request.urlopen(url, timeout=2.0) as answer:
+            content: bytes = answer.read()
+        return content
+
+
+@contextmanager
+def rdt_client(box: NetFtBox) -> Iterator[RdtClient]:
+    client = RdtClient(box)
+    with client.socket:
+        yield client
+    box.stop()
+
+
+@pytest.fixture
+def net_box() -> Iterator[NetFtBox]:
+    box = NetFtBox(constant(RDT_WRENCH), rdt_port=0, rate_hz=1000)
+    yield box
+    box.stop()
+
+
+def test_rdt_documented_sample(net_box: NetFtBox) -> None:
+    with rdt_client(net_box) as client:
+        client.socket.send(RDT_ONE)
+        data = client.socket.recv(2048)
+        assert data[:4] == bytes.fromhex("00000001")
+        assert data[8:].hex(" ", 4).upper() == "00000000 0016E360 FFDDAAF0 00989680 000186A0 FFFF3CB0 000061A8"
+        assert client.is_silent()
+
+
+def test_rdt_listens_at_its_documented_port() -> None:
+    box = NetFtBox(constant(RDT_WRENCH), host="127.83.91.7")
+    with rdt_client(box) as client:
+        assert client.endpoint["rdt_port"] == 49152
+        client.socket.send(RDT_ONE)
+        assert len(client.socket.recv(2048)) == 36
+
+
+@pytest.mark.parametrize(("rate_hz", "count"), [(500, 150), (1000, 300), (7000, 2100)])
+def test_rdt_real_time_stream(net_box: NetFtBox, rate_hz: int, count: int) -> None:
+    net_box.rate_hz = rate_hz
+    with rdt_client(net_box) as client:
+        client.socket.send(RDT_START)
+        start_s = time.monotonic()
+        records = client.records(count)
+        assert 0.27 < time.monotonic() - start_s < 0.6
+        assert records["rdt"].tolist() == list(range(1, count + 1))
+        assert (np.diff(records["ft"].astype(int)) == 7000 // rate_hz).all()
+        client.socket.send(RDT_STOP)
+        wait_until(lambda: not net_box.streaming)
+
+
+@pytest.mark.parametrize(("command", "count", "sent"), [(1, 0, 1), (1, 3, 3), (2, 25, 25), (3, 12, 12)])
+def test_rdt_count_is_honoured(net_box: NetFtBox, command: int, count: int, sent: int) -> None:
+    with rdt_client(net_box) as client:
+        client.socket.send(struct.pack(">HHI", 0x1234, command, count))
+        records = client.records(3 if command == 3 else sent)
+        assert records["rdt"].tolist() == list(range(1, sent + 1))
+        assert client.is_silent()
+        assert not net_box.streaming
+
+
+def test_rdt_buffered_datagrams(net_box: NetFtBox) -> None:
+    net_box.buffer_size = 40
+    with rdt_client(net_box) as client:
+        client.socket.send(struct.pack(">HHI", 0x1234, 3, 0))
+        data = client.datagrams(3)
+        assert [len(datagram) for datagram in data] == [1440] * 3
+        records = np.frombuffer(b"".join(data), dtype=RECORD)
+        assert records["rdt"].tolist() == list(range(1, 121))
+
+
+def test_rdt_ignores_what_is_no_request_and_a_new_request_starts_anew(net_box: NetFtBox) -> None:
+    with rdt_client(net_box) as client:
+        for junk in (
+            b"",
+            b"\x12",
+            RDT_START[:-1],
+            RDT_START + b"\0",
+            b"\x43\x21" + RDT_START[2:],
+            b"\x12\x34\x00\x99\0\0\0\0",
+        ):
+            client.socket.send(junk)
+        assert client.is_silent()
+        client.socket.send(RDT_START)
+        client.records(10)
+        client.socket.send(RDT_ONE)
+        wait_until(lambda: not net_box.streaming)
+        rest: list[int] = []
+        while not rest or rest[-1] != 1:
+            rest.append(int(client.records(1)["rdt"][0]))
+        assert client.is_silent()
+
+
+def test_rdt_bias_status_latch_and_reset(net_box: NetFtBox) -> None:
+    net_box.status = 0x80010000
+    with rdt_client(net_box) as client:
+        client.socket.send(RDT_BIAS)
+        client.socket.send(RDT_ONE)
+        record = client.records(1)[0]
+        assert record["counts"].tolist() == [0] * 6
+        assert record["status"] == 0x80010000
+        client.socket.send(bytes.fromhex("12 34 00 41 00 00 00 00"))
+        client.socket.send(RDT_START)
+        assert client.records(1)["status"][0] == 0
+        net_box.reset()
+        wait_until(lambda: not net_box.streaming)
+        while not client.is_silent():
+            pass
+        net_box.saturated_axis = 2
+        client.socket.send(RDT_ONE)
+        record = client.records(1)[0]
+        assert record["status"] == 0x80020000
+        assert record["counts"].tolist() == [1_500_000, -2_250_000, 400_000_000, 100_000, -50_000, 25_000]
+        assert record["ft"] < 7000, "counts since the reset"
+
+
+def test_rdt_every_reading_is_in_one_record_and_faults_show(net_box: NetFtBox) -> None:
+    counter = Counter()
+    net_box.measure = counter
+    with rdt_client(net_box) as client:
+        client.socket.send(struct.pack(">HHI", 0x1234, 2, 100))
+        assert np.rint(client.records(100)["counts"][:, 0] / (1e6 * counter.step_N)).tolist() == list(range(100))
+        net_box.faults.drop, net_box.faults.duplicate, net_box.faults.swap = 0.1, 0.1, 0.1
+        client.socket.send(struct.pack(">HHI", 0x1234, 2, 500))
+        client.socket.settimeout(0.3)
+        sequence: list[int] = []
+        with suppress(TimeoutError):
+            while True:
+                sequence += client.records(1)["rdt"].tolist()
+        client.socket.settimeout(2.0)
+        assert 420 < len(sequence) < 580
+        steps = np.diff(sequence)
+        assert (steps == 2).any()
+        assert (steps == 0).any()
+        assert (steps < 0).any()
+        net_box.faults.drop = net_box.faults.duplicate = net_box.faults.swap = 0.0
+        net_box.faults.stall = True
+        client.socket.send(RDT_ONE)
+        assert client.is_silent()
+        with pytest.raises(OSError, match=r"closed|reset"):
+            client.page("/netftapi2.xml")
+
+
+def test_rdt_left_streaming_to_a_dead_client() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heir:
+        heir.bind(("127.0.0.1", 0))
+        heir.settimeout(2.0)
+        box = NetFtBox(constant(RDT_WRENCH), rdt_port=0, rate_hz=1000, streaming_at_start=heir.getsockname())
+        with rdt_client(box) as client:
+            assert len(heir.recv(2048)) == 36
+            client.socket.send(RDT_START)
+            assert client.records(20)["rdt"].tolist() == list(range(1, 21)), "the new client takes over"
+
+
+def test_net_box_pages(net_box: NetFtBox) -> None:
+    with rdt_client(net_box) as client:
+        assert b"<cfgcpf>1000000</cfgcpf>" in client.page("/netftapi2.xml")
+        assert b"<calsn>FT12345</calsn>" in client.page("/netftcalapi.xml?index=0")
+        client.page("/comm.cgi?comrdtrate=700")
+        assert b"<comrdtrate>700</comrdtrate>" in client.page("/netftapi2.xml")
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            client.page("/index.htm")
+
+
+def test_net_box_unplugged_leaves_its_ports_and_starts_again(net_box: NetFtBox) -> None:
+    with rdt_client(net_box) as client:
+        client.socket.send(RDT_START)
+        client.records(5)
+        net_box.unplug()
+        with pytest.raises(OSError, match="refused"):
+            client.page("/netftapi2.xml")
+        with pytest.raises(ConnectionRefusedError):
+            wait_until(lambda: client.socket.send(RDT_ONE) == 0)
+    with rdt_client(net_box) as client:
+        client.socket.send(RDT_ONE)
+        assert client.records(1)["rdt"] == 1
+
+
+def test_pynetft_reads_the_box(net_box: NetFtBox) -> None:
+    """What the published client asks for: the configuration page, a real-time stream, bias, and the stream again."""
+    pynetft = pytest.importorskip("pynetft")
+    endpoint = net_box.start()
+    config = pynetft.Config(
+        sensor_host=endpoint["host"], rdt_port=endpoint["rdt_port"], http_port=endpoint["http_port"]
+    )
+    with pynetft.Client(config, queue_size=1000) as client:
+        samples = client.samples(timeout=2.0)
+        first = next(samples)
+        np.testing.assert_allclose(first.wrench, RDT_WRENCH)
+        assert first.force_unit is pynetft.ForceUnit.NEWTON
+        assert first.torque_unit is pynetft.TorqueUnit.NEWTON_METER
+        following = [next(samples).rdt_sequence for _ in range(100)]
+        assert following == list(range(first.rdt_sequence + 1, first.rdt_sequence + 101))
+        health = client.health()
+        assert (health.lost_count, health.malformed_count, health.device_error_count) == (0, 0, 0)
+        client.bias()
+        wait_until(lambda: not any(next(samples).wrench))
+    wait_until(lambda: not net_box.streaming)
+
+
+# ---------------------------------------------------------------- all of them
+
+
+@pytest.mark.parametrize(
+    "device",
+    [
+        lambda: RobotousSerialBox(constant(RFT_WRENCH), streaming_at_start=True),
+        lambda: RobotiqBox(constant(FT300_WRENCH), streaming_at_start=True),
+        lambda: BotaBox(constant(BOTA_WRENCH)),
+    ],
+    ids=["robotous", "robotiq", "bota"],
+)
+def test_serial_sensors_stall_and_are_unplugged(device: Callable[[], RobotousSerialBox | RobotiqBox | BotaBox]) -> None:
+    box = device()
+    with serial_client(box) as port:
+        assert len(port.read(37)) == 37
+        box.faults.stall = True
+        until_silence(port)
+        assert box.streaming
+        box.faults.stall = False
+        assert len(port.read(37)) == 37
+        box.unplug()
+        with pytest.raises(UNPLUGGED):
+            wait_until(lambda: not port.read(4096))
+
+
+def test_delay_shifts_the_stream_in_time() -> None:
+    box = BotaBox(constant(BOTA_WRENCH), faults=Faults(delay_s=0.15))
+    start_s = time.monotonic()
+    with serial_client(box) as port:
+        assert port.read(37) == stream_frame(0, BOTA_WRENCH.tolist(), bota_fields_time(box), 25.5)
+        assert 0.14 < time.monotonic() - start_s < 0.4
+
+
+def bota_fields_time(box: BotaBox) -> int:
+    return int(box._stream_start_us) & 0xFFFFFFFF
