@@ -211,27 +211,28 @@ def lowest(
         starts = [*starts, Truth(R, b, mean[:3] - u.mean(axis=0), P, mean[3:] - np.cross(P, u.mean(axis=0)))]
     R, b, F0, P, T0 = (np.array(values) for values in zip(*(astuple(s) for s in starts), strict=True))
     linear = np.concatenate([b, F0, P, T0], axis=1)
-    cost = np.full(len(R), np.inf)
     damping = np.full(len(R), 1e-3)
     r, J = _residual(R, linear, triangle, y, noise)
     cost = (r**2).sum(axis=1)
+    moving = np.arange(len(R))
     for _ in range(60):
         H = np.swapaxes(J, 1, 2) @ J
         diagonal = np.einsum("bii->bi", H)
         g = np.einsum("bki,bk->bi", J, r)
-        damped = H + (damping[:, None] * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True))[:, :, None] * np.eye(
-            15
-        )
-        step = -np.linalg.solve(damped, g[..., None])[..., 0]
-        R_trial = R @ Rotation.from_rotvec(step[:, :3]).as_matrix()
-        r_trial, J_trial = _residual(R_trial, linear + step[:, 3:], triangle, y, noise)
+        ridge = damping[moving, None] * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True)
+        step = -np.linalg.solve(H + ridge[:, :, None] * np.eye(15), g[..., None])[..., 0]
+        R_trial = R[moving] @ Rotation.from_rotvec(step[:, :3]).as_matrix()
+        linear_trial = linear[moving] + step[:, 3:]
+        r_trial, J_trial = _residual(R_trial, linear_trial, triangle, y, noise)
         trial = (r_trial**2).sum(axis=1)
-        better = trial < cost
-        done = bool((np.abs(cost - trial) < 1e-9 * (rest + cost)).all())
-        R, linear = np.where(better[:, None, None], R_trial, R), np.where(better[:, None], linear + step[:, 3:], linear)
+        better = trial < cost[moving]
+        arrived = np.abs(cost[moving] - trial) < 1e-9 * (rest + trial)
+        won = moving[better]
+        R[won], linear[won], cost[won] = R_trial[better], linear_trial[better], trial[better]
+        damping[moving] *= np.where(better, 0.1, 5.0)
         r, J = np.where(better[:, None], r_trial, r), np.where(better[:, None, None], J_trial, J)
-        cost, damping = np.where(better, trial, cost), np.where(better, damping / 10, damping * 5)
-        if done:
+        moving, r, J = moving[~arrived], r[~arrived], J[~arrived]
+        if not len(moving):
             break
     i = int(cost.argmin())
     return float(cost[i]) + rest, Truth(R[i], *linear[i].reshape(4, 3))
