@@ -127,9 +127,11 @@ def exactness(lab: Lab) -> Iterator[Row]:
     for name, limit in (("srom24", 1e-11), ("haar7", 1e-10), ("haar4", 1e-7)):
         runs = lab.count(300, 30)
         worst = lab.simulate(partial(exact_run, name=name), runs)["error"].max()
-        refused = f", {lab.refused} refused" if lab.refused else ""
         row = most(f"noise-free, {name}, largest error", worst, limit, runs, digits=2)
-        yield Row(row.name, row.figure + refused, row.target, row.passed and not lab.refused, runs)
+        # Of sets of four, one in some hundreds is so near a constant tilt that it is rightly refused.
+        ok = row.passed and lab.refused <= (0.01 * runs if name == "haar4" else 0)
+        figure = row.figure + (f", {lab.refused} refused" if lab.refused else "")
+        yield Row(row.name, figure, row.target, ok, runs)
     for method, error in yu_table_1().items():
         yield most(f"Yu Table I, {method}, parameters and compensation", error, 1e-12, 6, digits=2)
 
