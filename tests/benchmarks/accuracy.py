@@ -10,6 +10,7 @@ import argparse
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,6 +37,8 @@ from tests.benchmarks.scenarios import Array, Rng, Truth
 GROSS_RAD = np.deg2rad(20.0)
 RANDOM_STARTS = 12
 DELTA_BINS = (0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 12.0)
+ENOUGH_WRONG = 15
+"""Wrong answers to be expected in a bin whose share is judged."""
 SROM_POSES = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
 YU_MOUNT = Rotation.from_euler("ZYX", [45, 7, 3], degrees=True).as_matrix()
 YU_F0, YU_T0, YU_P = np.array([63.0, 5, 21]), np.array([87.0, 45, 6]), np.array([0.1, 0.1, 0.1])
@@ -437,9 +440,9 @@ def degenerate(lab: Lab) -> Iterator[Row]:
 
 
 ODDS_CELLS = (
-    ("ball20_24", 5), ("ball20_24", 10), ("ball20_24", 20), ("ball40_12", 5), ("ball40_12", 10), ("ball40_12", 20),
-    ("haar6", 3), ("haar6", 5), ("ball40_24", 5), ("cone40_24", 4), ("cone20_24", 6), ("cone20_24", 10),
-    ("cone40_08", 10), ("cone40_08", 20),
+    ("ball20_24", 5), ("ball20_24", 8), ("ball20_24", 10), ("ball20_24", 15), ("ball40_12", 5), ("ball40_12", 8),
+    ("haar6", 3), ("haar6", 4), ("ball40_24", 4), ("cone40_24", 4), ("cone20_24", 6), ("cone20_24", 8),
+    ("cone20_24", 10), ("cone40_08", 8),
 )  # fmt: skip
 
 
@@ -457,7 +460,7 @@ def odds_run(seed: int, name: str, snr: float) -> dict[str, object]:
 
 def odds(lab: Lab) -> Record:
     """Gap to the second minimum, and whether that was the right one, of calibrations with far too much noise."""
-    runs = lab.count(700, 30)
+    runs = lab.count(900, 20)
     cells = [lab.simulate(partial(odds_run, name=name, snr=snr), runs) for name, snr in ODDS_CELLS]
     return {key: np.concatenate([cell[key] for cell in cells]) for key in ("gap", "wrong")}
 
@@ -479,7 +482,7 @@ def odds_rows(record: Record) -> Iterator[Row]:
         figure = f"{observed:.2g} of {stated:.2g} stated"
         if high == np.inf:
             yield Row(name, figure, "<= 0.001", observed <= 1e-3, n)
-        elif n * stated >= 15:
+        elif n * stated >= ENOUGH_WRONG:
             yield Row(name, figure, "within x1.5", stated / 1.5 <= observed <= 1.5 * stated, n)
 
 
@@ -593,9 +596,9 @@ def coefficient_run(
 
 def _off(A: Array, n2: float, rng: Rng) -> Array:
     """R_base_flange of base-to-flange matrices, each Euler angle off by up to n2 rad."""
-    turns = Rotation.from_matrix(A)
-    spun = Rotation.from_rotvec(rng.normal(size=(len(A), 3)) * 1e-6) * turns  # off the singularity
-    angles = spun.as_euler("ZYX") + rng.uniform(-n2, n2, (len(A), 3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # at the singularity any of the possible angles will do
+        angles = Rotation.from_matrix(A).as_euler("ZYX") + rng.uniform(-n2, n2, (len(A), 3))
     return np.swapaxes(Rotation.from_euler("ZYX", angles).as_matrix(), 1, 2)
 
 
