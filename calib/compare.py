@@ -6,14 +6,13 @@ from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from calib.dataset import CalibrationDataset
 from calib.errors import BadDataset, NotObservable
 from calib.files import JSON
 from calib.known import Known
 from calib.ml import STANDARD_GRAVITY_M_S2, Drift
-from calib.model import Array, Parameters, predict
+from calib.model import Array, Parameters, angle_between, predict
 from calib.published import PUBLISHED
 from calib.result import Method
 from calib.solver import estimator_of, solve
@@ -91,7 +90,7 @@ def compare(
             continue
         parameters, cv_force, cv_torque = found
         force, torque = _rms(dataset.wrench - predict(parameters, dataset.R_base_flange))
-        angle_rad = float(Rotation.from_matrix(parameters.R_flange_sensor @ default.T).magnitude())
+        angle_rad = float(angle_between(parameters.R_flange_sensor, default))
         mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / g_m_s2
         compared.append(Compared(method, None, parameters, mass_kg, angle_rad, force, torque, cv_force, cv_torque))
     return compared

@@ -4,12 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib import so3
 from calib.gram import CHUNK, Statistics, coefficients, features, wrench_gram
 from calib.known import Constraints
-from calib.model import Array, Parameters
+from calib.model import Array, Parameters, angle_between
 
 MAX_STEPS = 100
 SMALL_STEP = 1e-4  # in standard deviations of the noise: a descent that ends with one is slow, not lost
@@ -86,7 +85,7 @@ class Descent:
         found: list[Minimum] = []
         for end in sorted(ends, key=lambda end: end.chi2):
             R = end.parameters.R_flange_sensor
-            if all(_angle(R, other.parameters.R_flange_sensor) > SAME_ROTATION_RAD for other in found):
+            if all(angle_between(R, other.parameters.R_flange_sensor) > SAME_ROTATION_RAD for other in found):
                 found.append(end)
         return found
 
@@ -156,7 +155,3 @@ def _linear_start(statistics: Statistics, R_flange_sensor: Array) -> Parameters:
         step[unknowns] = np.linalg.lstsq(H[unknowns, unknowns], g[unknowns], rcond=1e-12)[0]
         p = p.moved(step)
     return p
-
-
-def _angle(R1: Array, R2: Array) -> float:
-    return float(Rotation.from_matrix(R1 @ R2.T).magnitude())

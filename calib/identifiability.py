@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.errors import NotObservable
-from calib.model import Array, Parameters, jacobian, predict
+from calib.model import Array, Parameters, angle_between, jacobian, predict
 from calib.so3 import force_cost, minima
 
 LEAST_POSES = 4
@@ -106,32 +106,15 @@ def assess(
     return replace(found, gauges=gauges, advice=words, advised_R_base_flange=poses)
 
 
-def require_observable(
-    R_base_flange: Array,
-    parameters: Parameters | None = None,
-    wrench_cov: Array | None = None,
-    *,
-    least: int = LEAST_POSES,
-) -> None:
-    """Refuse poses that cannot determine the parameters.
-
-    Parameters
-    ----------
-    R_base_flange : array, shape (n, 3, 3)
-    parameters : Parameters, optional
-        As estimated. Without them only the number of different orientations is checked: what else a set can tell
-        depends on where gravity points.
-    wrench_cov : array, shape (n, 6, 6), optional
-    least : int
-        Different orientations that the method needs, at least 4.
+def require_orientations(R_base_flange: Array, least: int = LEAST_POSES) -> None:
+    """Refuse fewer than `least` different orientations.
 
     Raises
     ------
     NotObservable
-        One sentence: what is mixed and which poses to add.
+        One sentence: how many there are, and what to add.
     """
     n, different = len(R_base_flange), different_orientations(R_base_flange)
-    least = max(least, LEAST_POSES)
     if n < least:
         raise NotObservable(
             f"{n} poses are too few, at least {least} are needed: add {max(RECOMMENDED_POSES - n, 1)} or more."
@@ -143,8 +126,24 @@ def require_observable(
             f"the {n} poses have only {different} different orientations, at least {least} are needed: "
             "turn and tilt the tool to others."
         )
-    if parameters is None:
-        return
+
+
+def require_observable(R_base_flange: Array, parameters: Parameters, wrench_cov: Array | None = None) -> None:
+    """Refuse poses that cannot determine the parameters.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+    parameters : Parameters
+        As estimated: what a set of poses can tell depends on where gravity points.
+    wrench_cov : array, shape (n, 6, 6), optional
+
+    Raises
+    ------
+    NotObservable
+        One sentence: what is mixed and which poses to add.
+    """
+    require_orientations(R_base_flange)
     found = assess(R_base_flange, parameters, wrench_cov, advise=False)
     if found.rank < 15 or found.second_gap < AMBIGUOUS_GAP:
         raise NotObservable(assess(R_base_flange, parameters, wrench_cov).sentence())
@@ -177,7 +176,7 @@ def second_basin_gap(R_base_flange: Array, parameters: Parameters = NOMINAL) -> 
     """
     force_N = predict(parameters, R_base_flange)[:, :3] - parameters.force_bias_N
     found = minima(force_cost(R_base_flange, force_N, np.ones(len(force_N))))
-    others = [m.cost for m in found if _angle(m.R @ parameters.R_flange_sensor) > _SAME_MINIMUM_RAD]
+    others = [m.cost for m in found if angle_between(m.R.T, parameters.R_flange_sensor) > _SAME_MINIMUM_RAD]
     weight_N2 = float(parameters.gravity_force_base_N @ parameters.gravity_force_base_N)
     return max(0.0, min(others, default=float("inf")) / (len(force_N) * weight_N2))
 
@@ -192,10 +191,10 @@ def wrong_basin_probability(delta_chi2: float) -> float:
 
 def different_orientations(R_base_flange: Array) -> int:
     """Count orientations that differ by more than half a degree; stops counting at 24."""
-    kept: list[Array] = []
+    kept = np.empty((0, 3, 3))
     for R in R_base_flange:
-        if all(_angle(R @ other.T) > SAME_ORIENTATION_RAD for other in kept):
-            kept.append(R)
+        if np.all(angle_between(kept, R) > SAME_ORIENTATION_RAD):
+            kept = np.concatenate([kept, R[None]])
             if len(kept) == 24:
                 break
     return len(kept)
@@ -336,7 +335,3 @@ def _worth(R_base_flange: Array, parameters: Parameters) -> float:
     spread = np.linalg.svd(gravity_flange - gravity_flange.mean(axis=0), compute_uv=False)
     spread = spread / float(np.linalg.norm(parameters.gravity_force_base_N))
     return float(np.log(np.linalg.eigvalsh(information) + 1e-3).sum() + 4 * np.log(spread + 1e-3).sum())
-
-
-def _angle(R: Array) -> float:
-    return float(Rotation.from_matrix(R).magnitude())

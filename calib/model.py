@@ -6,6 +6,7 @@
 Source: Yu, Shi, Lou 2021, eqs 12-13, with e_bR = R_base_flange.T and s_eR = R_flange_sensor.T.
 """
 
+import math
 from dataclasses import dataclass, fields
 from typing import Self
 
@@ -56,7 +57,7 @@ class Parameters:
             flange axes: s_eR <- s_eR exp([delta]x), which is R_flange_sensor <- exp([delta]x).T R_flange_sensor.
         """
         return type(self)(
-            Rotation.from_rotvec(-step[:3]).as_matrix() @ self.R_flange_sensor,
+            rotation_of(-step[:3]) @ self.R_flange_sensor,
             self.gravity_force_base_N + step[3:6],
             self.force_bias_N + step[6:9],
             self.p_sensor_com_m + step[9:12],
@@ -146,6 +147,21 @@ def skew(v: Array) -> Array:
     matrix = np.zeros((*v.shape[:-1], 3, 3))
     matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     return matrix - np.swapaxes(matrix, -1, -2)
+
+
+def rotation_of(vector: Array) -> Array:
+    """Rotation matrix of a rotation vector (3,): scipy's in a tenth of the time, for inner loops."""
+    angle = math.sqrt(float(vector @ vector))
+    K = skew(vector)
+    if angle < 1e-4:  # series: both coefficients lose their digits
+        return np.asarray(np.eye(3) + (1 - angle**2 / 6) * K + (0.5 - angle**2 / 24) * (K @ K))
+    return np.asarray(np.eye(3) + math.sin(angle) / angle * K + (1 - math.cos(angle)) / angle**2 * (K @ K))
+
+
+def angle_between(R1: Array, R2: Array) -> Array:
+    """Angle in rad, shape (...), between rotations of shape (..., 3, 3) each; accurate for small angles too."""
+    chord = np.linalg.norm(np.asarray(R1) - R2, axis=(-2, -1)) / math.sqrt(8)
+    return np.asarray(2 * np.arcsin(np.minimum(chord, 1.0)))
 
 
 def nearest_rotation(M: Array) -> Array:

@@ -5,13 +5,12 @@ from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib.dataset import CalibrationDataset
 from calib.descent import column_scale
 from calib.errors import NotObservable
 from calib.evidence import Evidence, IndependentFit
-from calib.identifiability import require_observable
+from calib.identifiability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
 from calib.known import Known
 from calib.ml import RANK_TOLERANCE, STANDARD_GRAVITY_M_S2, Drift, Fit, fit
 from calib.model import PARAMETER_NAMES, Array, Parameters, predict
@@ -20,7 +19,6 @@ from calib.published import LEVEL_BASE, PUBLISHED, Estimator, published
 from calib.quality import judge
 from calib.result import CalibrationResult, DriftResult, Method
 
-SAME_ORIENTATION_RAD = np.deg2rad(0.5)
 SIMULATIONS = 400
 
 _TOLD = ("carlson-relaxation", "carlson-cayley")
@@ -69,7 +67,9 @@ def solve(
     if method in PUBLISHED and method not in _TOLD and known is not None:
         raise ValueError(f"{method} cannot use what is known before: use 'ml'")
     known = _constrained(method, known)
-    _require_orientations(dataset, 5 if method == "lrom" else 4 if known is None else 3)
+    require_orientations(dataset.R_base_flange, 5 if method == "lrom" else 4 if known is None else 3)
+    if np.ptp(dataset.wrench[:, :3], axis=0).max() == 0:
+        raise NotObservable("the force is exactly the same in all poses: the sensor is stuck, or nothing hangs on it.")
 
     estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2) if method in PUBLISHED else None
     wrench_cov = dataset.wrench_cov
@@ -85,9 +85,7 @@ def solve(
         known=None if estimator else known,
         g_m_s2=g_m_s2,
     )
-    _require_rank(best)
-    if known is None:
-        require_observable(dataset.R_base_flange, best.parameters, best.wrench_cov)
+    _require_determined(dataset.R_base_flange, best, known)
     evidence: Evidence = best
     if estimator:
         parameters = estimator(dataset.wrench)
@@ -149,35 +147,16 @@ def estimator_of(method: Method, R_base_flange: Array, known: Known | None, g_m_
     return published(method, R_base_flange, gravity_direction_base=np.asarray(direction), weight_N=weight_N)
 
 
-def _require_orientations(dataset: CalibrationDataset, least: int) -> None:
-    """Refuse what no fit can save, in terms of poses."""
-    n = len(dataset)
-    if n < least:
-        raise NotObservable(f"{n} poses are too few, at least {least} are needed: add {max(6 - n, 1)} or more.")
-    kept: list[Array] = []
-    for R in dataset.R_base_flange:
-        if all(Rotation.from_matrix(R @ other.T).magnitude() > SAME_ORIENTATION_RAD for other in kept):
-            kept.append(R)
-            if len(kept) == least:
-                break
-    if len(kept) == 1:
-        raise NotObservable(f"all {n} poses have the same orientation: turn and tilt the tool between poses.")
-    if len(kept) < least:
-        raise NotObservable(
-            f"the {n} poses have only {len(kept)} different orientations, at least {least} are needed: "
-            "turn and tilt the tool to others."
-        )
-    if np.ptp(dataset.wrench[:, :3], axis=0).max() == 0:
-        raise NotObservable("the force is exactly the same in all poses: the sensor is stuck, or nothing hangs on it.")
-
-
-def _require_rank(best: Fit) -> None:
-    """Refuse what the poses leave open, naming the parameters that trade off against each other."""
+def _require_determined(R_base_flange: Array, best: Fit, known: Known | None) -> None:
+    """Refuse what the poses leave open, in words wherever the poses alone are the reason."""
     Z = best.free
     information = Z.T @ best.information @ Z
     scale = column_scale(information)
     eigenvalues, V = np.linalg.eigh(information / np.outer(scale, scale))
     free = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
+    ambiguous = best.second_basin_chi2 is not None and best.second_basin_chi2 < ACCEPTED_DELTA_CHI2
+    if known is None and (free.any() or ambiguous):
+        require_observable(R_base_flange, best.parameters, best.wrench_cov)
     if free.any():
         share = ((Z @ V[:, free]) ** 2).sum(axis=1).reshape(5, 3).sum(axis=1) / free.sum()
         names = [PARAMETER_NAMES[3 * k].partition(".")[0] for k in np.flatnonzero(share > 0.05)]

@@ -11,6 +11,7 @@ from ftdrive import __version__, _siblings
 # A command, its module, its line in the help. The module is imported only when the command is called: help is fast.
 _COMMANDS = {
     "demo": ("ftdrive.commands.demo", "Calibrate an emulated cell: nothing to connect, half a minute."),
+    "plan": ("ftdrive.commands.plan", "Plan a tour that is proven clear; needs no robot."),
     "calibrate": ("ftdrive.commands.calibrate", "Take an arm through the tour, average its sensor, solve."),
     "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
     "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),

@@ -1,5 +1,7 @@
 """What can go wrong in the application itself."""
 
+from calib.errors import CalibError
+
 
 class ConfigError(Exception):
     """The configuration or the combination of options cannot be used."""
@@ -7,3 +9,7 @@ class ConfigError(Exception):
 
 class NotAccepted(Exception):
     """The result is not good enough to be kept, or differs from what it must equal."""
+
+
+class PlanRefused(NotAccepted, CalibError):
+    """No motion is proven clear, or a plan was made for something else than what is there now."""

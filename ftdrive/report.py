@@ -64,16 +64,16 @@ def print_result(
     for reason in result.reasons:
         talk.print(f"   {reason}")
     errors = {} if truth is None else errors_in_sigma(result, truth)
-    table = Table(box=None, padding=(0, 2))
+    table = Table(box=None, padding=(0, 1))
     for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
         if truth is not None or title not in {"truth", "error / sigma"}:
-            table.add_column(title, justify="right" if title else "left")
+            table.add_column(title, justify="right" if title else "left", no_wrap=True)
     for label, scale, unit, key in _ROWS:
         estimates, sigmas = (_values(source[key], key) * scale for source in (data, data["sigma"]))
         truths = None if truth is None else _values(truth[key], key) * scale
         digits = int(np.clip(1 - np.floor(np.log10(max(sigmas.min(), 1e-9))), 0, 7))  # two digits of the smallest sigma
         for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
-            cells = [f"{label} {axis}", f"{estimates[i]:.{digits}f} {unit}", f"{sigmas[i]:.{digits}f}"]
+            cells = [f"{label} {axis}".strip() + f", {unit}", f"{estimates[i]:.{digits}f}", f"{sigmas[i]:.{digits}f}"]
             if truths is not None:
                 cells.insert(1, f"{truths[i]:.{digits}f}")
                 cells.append(f"{errors[key][i]:+.1f}")

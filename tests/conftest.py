@@ -13,7 +13,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # Before numpy is loaded: matrices are small, and the threads of two workers would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-settings.register_profile("ftdrive", deadline=None, derandomize=True)
+settings.register_profile("ftdrive", deadline=None, derandomize=True, max_examples=60)
 settings.load_profile("ftdrive")
 
 

@@ -10,6 +10,7 @@ Checked on hardware: no.
 
 import logging
 import math
+import socket
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -20,16 +21,22 @@ from typing import Final
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import ArmState, DeviceInfo, Guard, RobotArm
 from drivers.ur.control import ControlProcess
-from drivers.ur.control_child import DECELERATION_RAD_S2
+from drivers.ur.control_child import DECELERATION_RAD_S2, UNWATCHED_S
 from drivers.ur.kinematics import MODELS, model_named
 from drivers.ur.library import FREQUENCY_HZ, Dashboard, ask_dashboard
-from drivers.ur.reading import CONNECT_S, PROGRAM_STOPPED, ROBOT_RUNNING, Freshness, Look, Reader
+from drivers.ur.reading import CONNECT_S, PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Look, Reader
+from drivers.ur.rtde import CONTROL_REGISTERS, registers_in_use
 
 log = logging.getLogger(__name__)
 
-_POLL_S: Final = 0.01
 _PROGRESS_S: Final = 0.4
 """A read of memory in the control process, done in 0.03 ms; the guard is not called meanwhile."""
+_OURS_EVERY_S: Final = 0.1
+_OURS_S: Final = 0.4
+"""A question to our program on the controller, which answers within two control cycles."""
+_SCRIPT_PORT: Final = 30003
+_RELEASE_S: Final = 1.0
+"""A control process whose parent was killed needs half of that to stop the arm and let the registers go."""
 _ARRIVED_RAD: Final = 1e-3
 _STANDING_RAD_S: Final = 1e-6
 """Of the set-point, which is exactly zero at rest."""
@@ -75,18 +82,21 @@ class UrArm(RobotArm):
         self._acceleration_rad_s2 = float(acceleration_rad_s2)
         self._reader: Reader | None = None
         self._control: ControlProcess | None = None
+        self._left_behind = False  # a program of ours may be on the controller without us
         self._goal: list[float] | None = None
         self._stop_requested = threading.Event()
 
     # ------------------------------------------------------------------ opening and closing
 
     def open(self, *, control: bool = False) -> None:
-        """Connect, read-only unless `control` is asked for. Idempotent.
+        """Connect, read-only unless `control` is asked for; what was lost since the last time is opened again.
 
         Reading disturbs nothing and needs no remote control. Taking control ends the program that runs on the
-        controller, if one does. Raises `ConnectError`, and the arm is closed then.
+        controller, if one does. After a stop of the safety system it works once the operator has cleared it; the
+        interrupted move is gone. Raises `ConnectError`, and the arm is closed then. Within 5 s, all in all.
         """
         try:
+            self._drop_what_is_lost(control)
             self._connect(control)
         except (StreamBroken, DeviceTimeout, DeviceFault) as error:
             self.close()
@@ -94,6 +104,19 @@ class UrArm(RobotArm):
         except BaseException:
             self.close()
             raise
+
+    def _drop_what_is_lost(self, control: bool) -> None:
+        if self._reader is None:
+            return
+        try:
+            look = self._reader.look()
+        except DriverError as error:
+            log.info("%s is opened again: %s", self._host, error)
+            self.close()
+            return
+        if control and self._control is not None and (not self._control.alive or look.program_fault()):
+            self._control.kill()
+            self._control = None
 
     def _connect(self, control: bool) -> None:
         if self._reader is None:
@@ -109,11 +132,19 @@ class UrArm(RobotArm):
             self.state()  # is it the right model?
 
     def _open_control(self, reader: Reader) -> None:
-        if fault := reader.look().safety_fault():
-            raise ConnectError(f"the arm at {self._host} cannot move: {fault}.")
+        major, minor = reader.version[:2]
+        if minor < 4:
+            raise ConnectError(
+                f"{self._host} runs PolyScope {major}.{minor}, which ur_rtde cannot control: update it to {major}.4 or "
+                f"later."
+            )
+
+        def look_out() -> None:
+            if fault := reader.look().safety_fault():
+                raise ConnectError(f"the arm at {self._host} cannot move: {fault}.")
 
         def prepare(dashboard: Dashboard) -> None:
-            asks = reader.version[0] == 5 and reader.version[1] > 5 and self._host not in _SIMULATORS
+            asks = major == 5 and minor > 5 and self._host not in _SIMULATORS
             if asks and not dashboard.isInRemoteControl():
                 raise ConnectError(
                     f"{self._host} is not in remote control: press Local, Remote Control at the top right of the "
@@ -124,23 +155,62 @@ class UrArm(RobotArm):
                 log.warning("ending the program that runs on %s", self._host)
                 dashboard.stop()
 
+        look_out()
+        self._find_script_port()
+        self._claim_nothing_of_others()
         ask_dashboard(self._host, prepare, timeout_s=CONNECT_S)
+        self._left_behind = True
         self._control = ControlProcess(self._host, FREQUENCY_HZ)
         try:
-            self._control.wait_until_ready()
-        except DriverError as error:
+            self._control.wait_until_ready(look_out)
+        except (StreamBroken, DeviceTimeout) as error:
+            look_out()  # ur_rtde seldom knows the reason
             raise ConnectError(_advice(self._host, str(error))) from error
+
+    def _find_script_port(self) -> None:
+        try:
+            socket.create_connection((self._host, _SCRIPT_PORT), timeout=CONNECT_S).close()
+        except OSError as error:
+            raise ConnectError(
+                f"{self._host}:{_SCRIPT_PORT}, which takes programs, cannot be reached ({error}): enable the real-time "
+                f"client interface under Settings, Security, Services, and look for a firewall between."
+            ) from error
+
+    def _claim_nothing_of_others(self) -> None:
+        """Raise `ConnectError` when somebody else has the registers, before anything of theirs is stopped."""
+        deadline = time.monotonic() + _RELEASE_S
+        while taken := registers_in_use(self._host, CONTROL_REGISTERS, timeout_s=CONNECT_S):
+            if time.monotonic() > deadline:
+                raise ConnectError(_taken(self._host, f"{taken[0]} and {len(taken) - 1} more"))
+            time.sleep(0.05)
 
     def close(self) -> None:
         """Let the arm go, stopping it and its control script first. Idempotent; within 1.5 s even when all is lost."""
         control, self._control = self._control, None
         reader, self._reader = self._reader, None
         self._goal = None
-        if control is not None and not (control.alive and control.quit(timeout_s=0.7)):
-            control.kill()
+        if control is not None:
+            self._end_program(control, reader)
+        if self._left_behind:
             self._stop_program(timeout_s=0.4)
+            self._left_behind = False
         if reader is not None:
             reader.close()
+
+    def _end_program(self, control: ControlProcess, reader: Reader | None) -> None:
+        """End our program in its own way, if it can be confirmed that this works."""
+        try:
+            look = None if reader is None else reader.look(limit_s=0.1)
+            if look and control.alive and look.program_state == PROGRAM_PLAYING and not look.safety_fault():
+                if self._is_ours(control, timeout_s=0.3):
+                    self._left_behind = not control.quit(timeout_s=0.7)
+                else:
+                    log.warning("%s runs a program of somebody else: it is left alone", self._host)
+                    self._left_behind = False
+        except DriverError as error:
+            log.info("%s: %s", self._host, error)
+        finally:
+            control.kill()
 
     def identify(self) -> DeviceInfo:
         """Tell model, serial number and PolyScope version, as read when the arm was opened."""
@@ -174,7 +244,7 @@ class UrArm(RobotArm):
     def move_to(self, q_rad: Sequence[float], *, timeout_s: float, guard: Guard) -> None:
         """Move all joints to `q_rad` (6,) and return when they have arrived.
 
-        `guard` is called about 90 times a second. Whatever ends the wait early stops the arm first and is raised after:
+        `guard` is called about 60 times a second. Whatever ends the wait early stops the arm first and is raised after:
         `DeviceFault` (protective, emergency or safeguard stop, program ended, not arrived), `StreamBroken`,
         `DeviceTimeout` (silent controller, or `timeout_s` is over), an exception of the guard, KeyboardInterrupt.
         A stop of the safety system is never reset; what is left of the move is taken from the controller, so that
@@ -186,17 +256,27 @@ class UrArm(RobotArm):
         self._goal = None
         with self._stopping_on_error():
             self._look_out()
-            accepted, before = control.call("move", q, self._speed_rad_s, self._acceleration_rad_s2)
-            if not accepted:
+        self._check_ours(control)  # a program of somebody else is not stopped
+        with self._stopping_on_error():
+            if not control.call("move", q, self._speed_rad_s, self._acceleration_rad_s2):
                 raise self._fault() or DeviceFault(f"the controller did not accept the move to {_degrees(q)}.")
+            checked = time.monotonic()
             for look in self._watch(timeout_s, guard, f"the move to {_degrees(q)} has not ended"):
                 if self._stop_requested.is_set():
                     raise DeviceFault("the arm was told to stop before it had arrived.")
-                operation, running = control.call("progress", timeout_s=_PROGRESS_S)
-                if operation == before or running:
+                ended, unwatched = control.call("progress", timeout_s=_PROGRESS_S)
+                if unwatched:
+                    raise DeviceTimeout(
+                        f"nothing was heard from this program for {UNWATCHED_S} s of a move, so the arm was stopped: "
+                        f"keep the computer awake and give it less to do, then move on."
+                    )
+                if not ended:
+                    if time.monotonic() - checked > _OURS_EVERY_S:
+                        self._check_ours(control)
+                        checked = time.monotonic()
                     continue
                 # The end may be told by one connection a cycle before the set-points come by the other.
-                end = look if _near(look.target_q_rad, q) else self._reading().next_look()
+                end = look if _near(look.target_q_rad, q) else self._reading().look()
                 if not _near(end.target_q_rad, q):
                     raise self._fault() or DeviceFault(
                         f"the move ended at {_degrees(end.target_q_rad)} instead of {_degrees(q)}: see the pendant "
@@ -235,12 +315,10 @@ class UrArm(RobotArm):
             self._halt()
 
     def _watch(self, timeout_s: float, guard: Guard, what: str) -> Iterator[Look]:
-        """Yield a look about 100 times a second, raising whatever is wrong with the arm, until the time is over."""
-        fresh = Freshness(self._host)
+        """Yield each new look, raising whatever is wrong with the arm, until the time is over."""
         deadline = time.monotonic() + timeout_s
         while True:
             look = self._look_out()
-            fresh.check(look)
             guard()
             yield look
             if time.monotonic() > deadline:
@@ -248,7 +326,6 @@ class UrArm(RobotArm):
                     f"{what} within {timeout_s:.1f} s; set-points are at {_degrees(look.target_q_rad)}: check the "
                     f"speed slider, and whether something else moves the arm."
                 )
-            time.sleep(_POLL_S)
 
     def _look_out(self) -> Look:
         """Look, and raise whatever is wrong with the arm, its program or the connections."""
@@ -265,7 +342,7 @@ class UrArm(RobotArm):
         look = look or reader.look()
         deadline = time.monotonic() + 0.05
         while not look.safety_fault() and look.program_fault() and time.monotonic() < deadline:
-            look = reader.next_look()  # the program may end some cycles before its reason is told
+            look = reader.look()  # the program may end some cycles before its reason is told
         fault = look.safety_fault() or look.program_fault()
         return DeviceFault(f"the arm at {self._host} stopped: {fault}; then open the arm again.") if fault else None
 
@@ -292,12 +369,12 @@ class UrArm(RobotArm):
 
     def _stop_softly(self, control: ControlProcess) -> bool:
         try:
-            look = self._reading().next_look(limit_s=0.05)
+            look = self._reading().look(limit_s=0.1)
             if not control.alive or look.safety_fault() or look.program_fault():
                 return False
             control.call("stop", timeout_s=0.5 + self._speed_rad_s / DECELERATION_RAD_S2)
             for _ in range(10):  # ur_rtde does not say whether it was done
-                if max(map(abs, self._reading().next_look(limit_s=0.05).target_qd_rad_s)) <= _STANDING_RAD_S:
+                if max(map(abs, self._reading().look(limit_s=0.1).target_qd_rad_s)) <= _STANDING_RAD_S:
                     return True
         except DriverError as error:
             log.info("%s: cannot be stopped softly: %s", self._host, error)
@@ -306,16 +383,32 @@ class UrArm(RobotArm):
     def _stop_program(self, *, timeout_s: float) -> None:
         try:
             ask_dashboard(self._host, lambda dashboard: dashboard.stop(), timeout_s=timeout_s)
+            self._left_behind = False
         except DriverError as error:
             log.warning("%s could not be told to stop, press the emergency stop if it moves: %s", self._host, error)
+
+    def _check_ours(self, control: ControlProcess) -> None:
+        """Raise `DeviceFault` when the program that runs is not ours: its registers would say nothing."""
+        if not self._is_ours(control, timeout_s=_OURS_S):
+            self._left_behind = False
+            raise self._fault() or DeviceFault(
+                f"the control program on {self._host} does not answer: somebody has started another program; end it, "
+                f"then open the arm again."
+            )
+
+    def _is_ours(self, control: ControlProcess, *, timeout_s: float) -> bool:
+        try:
+            control.call("tcp_offset", timeout_s=timeout_s)
+        except DriverError as error:
+            log.info("%s: the control program does not answer: %s", self._host, error)
+            return False
+        return True
 
     def _in_control(self) -> ControlProcess:
         if self._control is None:
             raise ConnectError(f"the arm at {self._host} was opened for reading only: open it with control.")
         if not self._control.alive:
-            raise StreamBroken(
-                f"the control of {self._host} has ended: close the arm, see to the robot, and open the arm again."
-            )
+            raise StreamBroken(f"the control of {self._host} has ended: see to the robot, then open the arm again.")
         return self._control
 
     def _reading(self) -> Reader:
@@ -345,13 +438,17 @@ def _degrees(q_rad: Sequence[float]) -> str:
 def _advice(host: str, words: str) -> str:
     """Turn ur_rtde's words into what to do."""
     if "already in use" in words:
-        return (
-            f"another client controls {host} and holds its RTDE registers: end it, or disable EtherNet/IP, PROFINET "
-            f"and other fieldbuses on the controller."
-        )
+        return _taken(host, "registers")
     if "remote control" in words:
         return f"{host} is not in remote control: press Local, Remote Control at the top right of the pendant."
     return (
         f"ur_rtde cannot control {host}: {words}. Check at the pendant that no message waits for an answer and that no "
         f"other program starts by itself."
+    )
+
+
+def _taken(host: str, what: str) -> str:
+    return (
+        f"another client controls {host} and holds its RTDE registers ({what}): end it, or disable EtherNet/IP, "
+        f"PROFINET and other fieldbuses on the controller; after a cut cable wait for half a minute."
     )

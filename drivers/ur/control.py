@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import IO, Any, Final, cast
@@ -19,6 +20,7 @@ from drivers.ur import control_child
 
 log = logging.getLogger(__name__)
 
+_STARTING_S: Final = 4.5
 _CALL_S: Final = 2.0
 """An answer takes 10 ms, or a hundred times that on a busy computer; motion is watched meanwhile by other means."""
 
@@ -62,9 +64,12 @@ class ControlProcess:
         """Whether it can still be called."""
         return not self._gone.is_set()
 
-    def wait_until_ready(self) -> None:
-        """Return when the control script runs on the controller. Raises what `call` raises."""
-        self._answer(0, control_child.STARTING_S + 1.0)
+    def wait_until_ready(self, look_out: Callable[[], object]) -> None:
+        """Return when the control script runs on the controller. Raises what `call` and `look_out` raise.
+
+        `look_out` is called about 20 times a second.
+        """
+        self._answer(0, _STARTING_S, look_out)
 
     def call(self, name: str, *args: object, timeout_s: float = _CALL_S) -> Any:
         """Call one of `control_child.Calls`.
@@ -104,12 +109,18 @@ class ControlProcess:
                 with suppress(OSError):  # a request that was never read
                     pipe.close()
 
-    def _answer(self, to: int, timeout_s: float) -> Any:
-        deadline = time.monotonic() + timeout_s
+    def _answer(self, to: int, timeout_s: float, look_out: Callable[[], object] = lambda: None) -> Any:
+        left_s = timeout_s
         while True:
+            t0 = time.monotonic()
             try:
-                reply = self._replies.get(timeout=max(deadline - time.monotonic(), 0.0))
+                reply = self._replies.get(timeout=max(min(left_s, 0.05), 0.0))
             except Empty:
+                # A process that was itself suspended has not been waiting: that time does not count in full.
+                left_s -= min(time.monotonic() - t0, 0.1)
+                if left_s > 0:
+                    look_out()
+                    continue
                 self.kill()
                 raise DeviceTimeout(
                     f"ur_rtde did not answer within {timeout_s:.1f} s and its process was ended: check the robot and "

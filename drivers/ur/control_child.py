@@ -1,7 +1,8 @@
 """The process that holds ur_rtde's `RTDEControlInterface`. Run by its path; imports nothing of ours.
 
 Requests and replies are lines of JSON on stdin and stdout. When stdin ends, for whatever reason, the arm is stopped,
-the control script is ended and the process exits; SIGALRM ends it when ur_rtde hangs, whatever locks it holds.
+the control script is ended and the process exits; SIGALRM ends it when ur_rtde hangs, whatever locks it holds. When the
+parent lives but asks nothing for half a second of a move (it is suspended, or hangs), the arm is stopped.
 
 Ref: ur_rtde 1.6.5, API reference of `RTDEControlInterface`.
 Checked on hardware: no.
@@ -12,14 +13,16 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Final, Protocol, cast
 
 STARTING_S: Final = 9  # uploading the script and seeing it run takes 0.1 s, and ur_rtde gives up after 5 s
 LEAVING_S: Final = 3
+UNWATCHED_S: Final = 0.5
 DECELERATION_RAD_S2: Final = 4.0  # UR's own external-control program stops with this
 
 
@@ -52,24 +55,41 @@ class Calls:
 
     def __init__(self, control: _Control) -> None:
         self._control = control
+        self._before = 0
+        self._unwatched = False
+        self.moving = False
+        """Whether the parent has to go on asking for `progress`."""
 
-    def move(self, q_rad: list[float], speed_rad_s: float, acceleration_rad_s2: float) -> tuple[bool, int]:
-        """Begin a move; whether it was accepted, and the id of the operation before it."""
-        before = self._control.getAsyncOperationProgressEx().operationId()
-        return self._control.moveJ(q_rad, speed_rad_s, acceleration_rad_s2, True), before
+    def move(self, q_rad: list[float], speed_rad_s: float, acceleration_rad_s2: float) -> bool:
+        """Begin a move; whether it was accepted."""
+        self._before = self._control.getAsyncOperationProgressEx().operationId()
+        self._unwatched = False
+        self.moving = self._control.moveJ(q_rad, speed_rad_s, acceleration_rad_s2, True)
+        return self.moving
 
-    def progress(self) -> tuple[int, bool]:
-        """Id of the newest operation, and whether it is running."""
+    def progress(self) -> tuple[bool, bool]:
+        """Whether the move has ended, and whether it was stopped because nobody watched it."""
         progress = self._control.getAsyncOperationProgressEx()
         if not self._control.isConnected():  # a lost link looks like an arm that has arrived
             raise RuntimeError("the control connection was lost")
-        return progress.operationId(), progress.isAsyncOperationRunning()
+        ended = progress.operationId() != self._before and not progress.isAsyncOperationRunning()
+        self.moving = self.moving and not ended
+        return ended, self._unwatched
+
+    def stop_unwatched(self) -> None:
+        """Stop a move that nobody has asked about for `UNWATCHED_S`."""
+        time.sleep(0.02)  # when this process was suspended as well, ur_rtde has to catch up
+        ended, _ = self.progress()
+        if not ended:
+            self._unwatched = True
+            self.stop()
 
     def stop(self) -> None:
         """Decelerate all joints and wait for standstill.
 
         Not the asynchronous way: that decelerates the tool instead of the joints, which a singularity forbids.
         """
+        self.moving = False
         self._control.stopJ(DECELERATION_RAD_S2)
 
     def within_safety_limits(self, q_rad: list[float]) -> bool:
@@ -107,7 +127,9 @@ def main() -> None:
     try:
         interface = import_module("rtde_control").RTDEControlInterface
         # rt_priority: the library's default would put this thread under real-time scheduling, where it spins.
-        control = cast(_Control, interface(hostname=host, frequency=frequency_Hz, rt_priority=-1))
+        # FLAG_NO_EXT_FT: that input may well belong to whoever feeds a wrist sensor's readings to the controller.
+        flags = int(interface.FLAG_UPLOAD_SCRIPT) | int(interface.FLAG_NO_EXT_FT)
+        control = cast(_Control, interface(hostname=host, frequency=frequency_Hz, flags=flags, rt_priority=-1))
     except Exception as error:
         reply(id=0, error=str(error))
         os._exit(1)
@@ -117,7 +139,15 @@ def main() -> None:
 
     requests: SimpleQueue[str | None] = SimpleQueue()
     threading.Thread(target=_listen, args=(requests,), daemon=True).start()
-    while (line := requests.get()) is not None:
+    while True:
+        try:
+            line = requests.get(timeout=UNWATCHED_S if calls.moving else None)
+        except Empty:
+            with suppress(Exception):  # then the parent will stop it in its own way, once it is back
+                calls.stop_unwatched()
+            continue
+        if line is None:
+            break
         request = json.loads(line)
         call = cast(Callable[..., object], getattr(calls, request["call"]))
         try:

@@ -1,8 +1,9 @@
 """Looking at a Universal Robots arm: fresh, consistent samples and a flange pose that no TCP setting can spoil.
 
-ur_rtde repeats the last values for ever once a link is lost, so nothing is believed unless the controller's clock
-advances. The TCP offset is read with the controller's time stamp before and after each pose and taken off again, and
-the flange pose that results is compared with the nominal forward kinematics.
+ur_rtde repeats the last values for ever once a link is lost, and goes through old ones after this process has been
+suspended. So a sample is believed only if it is as new as one that a reader of our own has waited for. The TCP offset
+is read with the controller's time stamp before and after each pose and taken off again, and the flange pose that
+results is compared with the nominal forward kinematics.
 
 Ref: ur_rtde 1.6.5, API reference of `RTDEReceiveInterface`; Universal Robots, "Real-Time Data Exchange (RTDE) Guide"
 (modes, states and safety status bits).
@@ -23,7 +24,7 @@ from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroke
 from drivers.interfaces import ArmState, DeviceInfo
 from drivers.ur.kinematics import MODELS, Pose, forward, model_named
 from drivers.ur.library import Dashboard, Receive, ask_dashboard, connect_receive, require, retire
-from drivers.ur.rtde import TcpOffsetReader
+from drivers.ur.rtde import LiveReader
 
 log = logging.getLogger(__name__)
 
@@ -34,8 +35,9 @@ _MODEL_ANGLE_RAD: Final = radians(0.5)
 
 PROGRAM_STOPPED: Final = 1
 PROGRAM_PLAYING: Final = 2
+ROBOT_IDLE: Final = 5
 ROBOT_RUNNING: Final = 7
-_MEASURING: Final = (5, 6, ROBOT_RUNNING)
+_MEASURING: Final = (ROBOT_IDLE, 6, ROBOT_RUNNING)
 _ROBOT_MODES: Final = {
     -1: "no controller",
     0: "disconnected",
@@ -81,7 +83,8 @@ class Look:
                 return f"{meaning} (safety status bits 0x{self.safety_bits:x})"
         if self.robot_mode != ROBOT_RUNNING:
             mode = _ROBOT_MODES.get(self.robot_mode, "unknown")
-            return f"robot mode {self.robot_mode} ({mode}): power the arm on and release its brakes at the pendant"
+            cure = "release its brakes" if self.robot_mode == ROBOT_IDLE else "power the arm on and release its brakes"
+            return f"robot mode {self.robot_mode} ({mode}): {cure} at the pendant"
         return None
 
     def program_fault(self) -> str | None:
@@ -92,32 +95,6 @@ class Look:
         return f"the control program was ended or paused by somebody else (state {self.program_state}, {state})"
 
 
-class Freshness:
-    """Judges by the controller's clock whether samples still arrive."""
-
-    def __init__(self, host: str, limit_s: float = STALE_S) -> None:
-        self._host = host
-        self._limit_s = limit_s
-        self._t_device_s = math.nan
-        self._t_look = time.monotonic()
-        self._silent_s = 0.0
-
-    def check(self, look: Look) -> None:
-        """Raise `DeviceTimeout` when this look and those before it show that the controller is silent."""
-        now = time.monotonic()
-        if look.t_device_s != self._t_device_s:
-            self._silent_s = 0.0
-        else:
-            # A process that was itself suspended has not been looking: that time does not count in full.
-            self._silent_s += min(now - self._t_look, 0.05)
-        self._t_device_s, self._t_look = look.t_device_s, now
-        if self._silent_s > self._limit_s:
-            raise DeviceTimeout(
-                f"the clock of {self._host} has stood still at {look.t_device_s:.3f} s for {self._silent_s:.2f} s: "
-                f"check the robot and the network, and press the emergency stop if the arm moves."
-            )
-
-
 class Reader:
     """The reading side of one arm; connected while it exists.
 
@@ -126,12 +103,12 @@ class Reader:
 
     def __init__(self, host: str, model: str | None) -> None:
         self._host = host
-        self._tcp = TcpOffsetReader(host)
+        self._live = LiveReader(host)
         self._receive: Receive | None = None
         require()
         try:
-            self._tcp.open(timeout_s=CONNECT_S)
-            self.version = self._tcp.version
+            self._live.open(timeout_s=CONNECT_S)
+            self.version = self._live.version
             """Of the controller: major, minor, bugfix, build."""
             self.info = self._identify(model)
             self._receive = connect_receive(host)
@@ -162,7 +139,10 @@ class Reader:
             raise ConnectError(f"{error}: enable it under Settings, Security, Services.") from error
         says = model_named(told, major)
         if model is None and says is None:
-            raise ConnectError(f"{self._host} calls itself {told!r}, which is not known: name its model.")
+            raise ConnectError(
+                f"{self._host} says {told!r} to the question for its model, which is no known one (before PolyScope "
+                f"5.6 nothing is): name the model of the arm."
+            )
         if model is not None and says is not None and MODELS[says] != MODELS[model]:
             raise ConnectError(f"{self._host} is a {says}, not a {model}: check the address and the model.")
         return DeviceInfo(model=model or says or told, serial=serial, firmware=polyscope)
@@ -170,23 +150,42 @@ class Reader:
     @property
     def tells_tcp(self) -> bool:
         """Whether the controller tells its TCP offset without being controlled; old ones do not."""
-        return self._tcp.supported
+        return self._live.tells_tcp
 
     def close(self) -> None:
         """Let the connections go. Idempotent."""
-        self._tcp.close()
+        self._live.close()
         receive, self._receive = self._receive, None
         if receive is not None:
             retire(receive)
 
-    def look(self) -> Look:
-        """Take the newest sample. Raises `StreamBroken` once the loss of a connection is known."""
+    def look(self, *, since_s: float | None = None, limit_s: float = STALE_S) -> Look:
+        """Wait for a sample taken after this call, or at `since_s` or later.
+
+        Raises `StreamBroken` once the loss of a connection is known, and `DeviceTimeout` when the controller is silent
+        for `limit_s`.
+        """
+        if since_s is None:
+            since_s = self._live.now_s(limit_s=limit_s)
+        silent_s = 0.0
+        while (look := self._newest()).t_device_s < since_s:
+            if silent_s > limit_s:
+                raise DeviceTimeout(
+                    f"samples of {self._host} have stayed away for {silent_s:.2f} s: check the robot and the network, "
+                    f"and press the emergency stop if the arm moves."
+                )
+            t0 = time.monotonic()
+            time.sleep(0.001)
+            silent_s += min(time.monotonic() - t0, 0.05)  # as in `LiveReader`
+        return look
+
+    def _newest(self) -> Look:
         receive = self._receive
         if receive is None or not receive.isConnected():
             raise StreamBroken(
                 f"the connection to {self._host} was lost: check the robot and the cable, then open the arm again."
             )
-        self._tcp.check()
+        self._live.check()
         for _ in range(100):  # ur_rtde has no snapshot: read again when a new sample came in between
             t_device_s = receive.getTimestamp()
             look = Look(
@@ -205,24 +204,11 @@ class Reader:
                 return look
         raise DeviceTimeout(f"no consistent sample of {self._host} could be read: this computer is too busy.")
 
-    def next_look(self, *, since_s: float = -math.inf, limit_s: float = STALE_S) -> Look:
-        """Wait for a sample newer than the present one, taken at `since_s` or later.
-
-        Raises `DeviceTimeout` when the controller's clock stands still for `limit_s`.
-        """
-        fresh = Freshness(self._host, limit_s)
-        first = look = self.look()
-        while look.t_device_s == first.t_device_s or look.t_device_s < since_s:
-            fresh.check(look)
-            time.sleep(0.001)
-            look = self.look()
-        return look
-
     def state(self, ask_tcp: Callable[[], Sequence[float]]) -> ArmState:
         """Read a state; `ask_tcp` tells the TCP offset (6,) where the controller does not. Errors as `UrArm.state`."""
         for _ in range(5):
-            t_before_s, before = self._tcp_offset(-math.inf, ask_tcp)
-            look = self.next_look(since_s=t_before_s)
+            t_before_s, before = self._tcp_offset(self._live.now_s(limit_s=STALE_S), ask_tcp)
+            look = self.look(since_s=t_before_s)
             _, after = self._tcp_offset(look.t_device_s, ask_tcp)
             if tuple(before) == tuple(after):  # so this TCP was active when the pose was taken
                 break
@@ -242,8 +228,8 @@ class Reader:
         )
 
     def _tcp_offset(self, since_s: float, ask_tcp: Callable[[], Sequence[float]]) -> tuple[float, Sequence[float]]:
-        if self._tcp.supported:
-            return self._tcp.offset(since_s=since_s, timeout_s=STALE_S)
+        if self._live.tells_tcp:
+            return self._live.offset(since_s=since_s, limit_s=STALE_S)
         return since_s, ask_tcp()
 
     def _check_model(self, look: Look, flange: Pose) -> None:

@@ -1,8 +1,9 @@
 """A small RTDE client of our own, for what ur_rtde cannot do.
 
 ur_rtde's constructors freeze the whole interpreter when the controller accepts and stays silent, so somebody has to
-say hello first with a time-out; and ur_rtde cannot parse `tcp_offset`, without which a TCP pose says nothing about the
-flange. Only outputs are read here: this client can never disturb a program.
+say hello first with a time-out. ur_rtde cannot parse `tcp_offset`, without which a TCP pose says nothing about the
+flange. And it does not tell a sample that has just been taken from one that has waited in the socket while this process
+was suspended. Nothing is ever written to the controller's registers here: this client cannot disturb a program.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
 Checked on hardware: no.
@@ -12,9 +13,10 @@ import contextlib
 import logging
 import socket
 import struct
+import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
@@ -28,6 +30,7 @@ PORT: Final = 30004
 REQUEST_PROTOCOL_VERSION: Final = ord("V")
 GET_CONTROLLER_VERSION: Final = ord("v")
 SETUP_OUTPUTS: Final = ord("O")
+SETUP_INPUTS: Final = ord("I")
 START: Final = ord("S")
 DATA: Final = ord("U")
 TEXT: Final = ord("M")
@@ -55,6 +58,11 @@ def encode(kind: int, payload: bytes = b"") -> bytes:
 def encode_setup_outputs(frequency_Hz: float, names: tuple[str, ...]) -> bytes:
     """Frame the request for one recipe of outputs."""
     return encode(SETUP_OUTPUTS, struct.pack(">d", frequency_Hz) + ",".join(names).encode("ascii"))
+
+
+def encode_setup_inputs(names: tuple[str, ...]) -> bytes:
+    """Frame the request for one recipe of inputs."""
+    return encode(SETUP_INPUTS, ",".join(names).encode("ascii"))
 
 
 def take_package(buffer: bytearray) -> tuple[int, bytes] | None:
@@ -172,7 +180,7 @@ class Subscription:
         self.version = (0, 0, 0, 0)
         """Of the controller: major, minor, bugfix, build."""
         self.missing: list[str] = []
-        """Outputs this controller does not know; if there are any, the stream has not been started."""
+        """Outputs this controller does not know: the samples come without them."""
         try:
             self._connection = _Connection(socket.create_connection((host, PORT), timeout=timeout_s))
         except OSError as error:
@@ -214,28 +222,65 @@ class Subscription:
         if ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02"), deadline) != b"\x01":
             raise ProtocolError("protocol version 2 is refused")
         self.version = decode_version(ask(encode(GET_CONTROLLER_VERSION), deadline))
-        names = tuple(outputs)
-        self._recipe = Recipe.decode(ask(encode_setup_outputs(frequency_Hz, names), deadline))
-        types = self._recipe.types
-        if len(types) == len(names):
-            self.missing = [name for name, kind in zip(names, types, strict=True) if kind == "NOT_FOUND"]
-        if self.missing:
+        self._recipe = Recipe.decode(ask(encode_setup_outputs(frequency_Hz, tuple(outputs)), deadline))
+        if len(self._recipe.types) == len(outputs):
+            self.missing = [name for name, kind in zip(outputs, self._recipe.types, strict=True) if kind == "NOT_FOUND"]
+        known = {name: kind for name, kind in outputs.items() if name not in self.missing}
+        if not known:
             return
-        if types != tuple(outputs.values()):
-            raise ProtocolError(f"{', '.join(names)} come as {', '.join(types)}")
+        if self.missing:
+            self._recipe = Recipe.decode(ask(encode_setup_outputs(frequency_Hz, tuple(known)), deadline))
+        if self._recipe.types != tuple(known.values()):
+            raise ProtocolError(f"{', '.join(known)} come as {', '.join(self._recipe.types)}")
         if ask(encode(START), deadline) != b"\x01":
             raise ProtocolError("the controller does not start the stream")
 
 
-class TcpOffsetReader:
-    """The controller's version, and its active TCP offset kept current by a thread.
+CONTROL_REGISTERS: Final = (
+    *(f"input_int_register_{k}" for k in range(8)),
+    *(f"input_double_register_{k}" for k in range(18)),
+)
+"""What ur_rtde's control interface writes to, and nobody else may."""
+
+
+def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float) -> list[str]:
+    """Tell which of these inputs belong to another client or a fieldbus, leaving all of them as they are.
+
+    Raises `StreamBroken` or `DeviceTimeout`.
+    """
+    try:
+        connection = _Connection(socket.create_connection((host, PORT), timeout=timeout_s))
+        try:
+            deadline = time.monotonic() + timeout_s
+            connection.ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02"), deadline)
+            recipe = Recipe.decode(connection.ask(encode_setup_inputs(names), deadline))
+        finally:
+            connection.close()
+    except TimeoutError as error:
+        raise DeviceTimeout(f"{host}:{PORT} did not answer within {timeout_s:.1f} s: check the robot.") from error
+    except OSError as error:
+        raise StreamBroken(f"{host}:{PORT} was lost ({error}): check the robot and the cable.") from error
+    return [name for name, kind in zip(names, recipe.types, strict=False) if kind == "IN_USE"]
+
+
+def _awake_s() -> float:
+    """Seconds of a clock that goes on while the computer sleeps, where there is one."""
+    if sys.platform == "linux":
+        return time.clock_gettime(time.CLOCK_BOOTTIME)
+    return time.monotonic()
+
+
+class LiveReader:
+    """The controller's version, and its clock and active TCP offset kept current by a thread.
 
     Every offset carries the controller's time, the same clock the poses of ur_rtde carry, so that a pose can be matched
     with the offset that was active when it was taken.
     """
 
-    _outputs: Final = MappingProxyType({"timestamp": "DOUBLE", "tcp_offset": "VECTOR6D"})
+    _outputs: Mapping[str, str] = MappingProxyType({"timestamp": "DOUBLE", "tcp_offset": "VECTOR6D"})
     _frequency_Hz = 125.0  # the full rate of the CB3 generation; e-Series arms send every fourth cycle
+    _live_s = (0.002, 0.1)
+    """How long one waits for a sample that has just been taken: 8 ms. What has piled up comes without waiting."""
 
     def __init__(self, host: str) -> None:
         self._host = host
@@ -243,21 +288,19 @@ class TcpOffsetReader:
         self._thread: threading.Thread | None = None
         self._changed = threading.Condition()
         self._newest: tuple[float, tuple[float, ...]] | None = None
+        self._live_count = 0
         self._failure: DriverError | None = None
         self.version = (0, 0, 0, 0)
         """Of the controller, after `open`: major, minor, bugfix, build."""
-        self.supported = False
+        self.tells_tcp = False
         """Whether this controller tells its TCP offset; older ones do not."""
 
     def open(self, *, timeout_s: float) -> None:
-        """Say hello and start to follow the offset. Raises `ConnectError`."""
+        """Say hello and start to follow. Raises `ConnectError`."""
         self._stream = Subscription(self._host, self._outputs, self._frequency_Hz, timeout_s=timeout_s)
         self.version = self._stream.version
-        if self._stream.missing:
-            self.close()
-            return
-        self.supported = True
-        self._thread = threading.Thread(target=self._run, args=(self._stream,), name="ur-tcp-offset", daemon=True)
+        self.tells_tcp = not self._stream.missing
+        self._thread = threading.Thread(target=self._run, args=(self._stream,), name="ur-live", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -269,35 +312,53 @@ class TcpOffsetReader:
             self._thread.join(timeout=1.0)
             self._thread = None
 
-    def offset(self, *, since_s: float, timeout_s: float) -> tuple[float, tuple[float, ...]]:
-        """Controller time and TCP offset (6,) of the newest sample, waiting for one taken at `since_s` or later.
+    def now_s(self, *, limit_s: float) -> float:
+        """Controller time of a sample taken after this call.
 
-        Raises `StreamBroken` when the connection is lost and `DeviceTimeout` when no such sample comes.
+        However much has piled up in the sockets while this process was suspended: ur_rtde's samples of this time or
+        later are new. Raises `StreamBroken` when the connection is lost and `DeviceTimeout` when the controller is
+        silent for `limit_s`.
         """
+        before = self._live_count
+        return self._wait(lambda: self._live_count != before, limit_s)[0]
+
+    def offset(self, *, since_s: float, limit_s: float) -> tuple[float, tuple[float, ...]]:
+        """Controller time and TCP offset (6,) of the newest sample, taken at `since_s` or later. Raises as `now_s`."""
+        return self._wait(lambda: self._newest is not None and self._newest[0] >= since_s, limit_s)
+
+    def _wait(self, done: Callable[[], bool], limit_s: float) -> tuple[float, tuple[float, ...]]:
+        silent_s = 0.0
         with self._changed:
-            self._changed.wait_for(lambda: self._failure or self._is_since(since_s), timeout_s)
-            self.check()
-            if self._newest is None or not self._is_since(since_s):
-                raise DeviceTimeout(
-                    f"{self._host} has not told its TCP offset for {timeout_s:.1f} s: check the network and the robot."
-                )
-            return self._newest
+            while True:
+                self.check()
+                if self._newest is not None and done():
+                    return self._newest
+                if silent_s > limit_s:
+                    stands = "" if self._newest is None else f" at {self._newest[0]:.3f} s"
+                    raise DeviceTimeout(
+                        f"the clock of {self._host} has stood still{stands} for {silent_s:.2f} s: check the robot and "
+                        f"the network, and press the emergency stop if the arm moves."
+                    )
+                t0 = time.monotonic()
+                self._changed.wait(0.02)
+                # A process that was itself suspended has not been listening: that time does not count in full.
+                silent_s += min(time.monotonic() - t0, 0.05)
 
     def check(self) -> None:
         """Raise what ended the stream, if it has ended."""
         if self._failure:
             raise type(self._failure)(str(self._failure)) from self._failure
 
-    def _is_since(self, since_s: float) -> bool:
-        return self._newest is not None and self._newest[0] >= since_s
-
     def _run(self, stream: Subscription) -> None:
-        """Follow the stream until it ends; what ended it is raised by `offset`."""
+        """Follow the stream until it ends; what ended it is raised to whoever asks."""
         try:
             while True:
-                (t_s,), tcp_offset = stream.read(None)
+                t0 = _awake_s()
+                (t_s,), *rest = stream.read(None)
+                waited_s = _awake_s() - t0
                 with self._changed:
-                    self._newest = (t_s, tcp_offset)
+                    self._newest = (t_s, rest[0] if rest else ())
+                    self._live_count += self._live_s[0] <= waited_s <= self._live_s[1]
                     self._changed.notify_all()
         except (OSError, StreamBroken) as error:
             failure: DriverError = StreamBroken(

@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -50,28 +51,26 @@ def best_seconds(repeats: int, *calls: Callable[[], object]) -> list[float]:
     return best
 
 
-def ten_columns(dataset: CalibrationDataset) -> tuple[sim.Array, sim.Array]:
-    """One plain least-squares problem of the same data."""
-    return np.random.default_rng(0).normal(size=(6 * len(dataset), 10)), dataset.wrench.ravel()
-
-
 def few_poses(repeats: int) -> Iterator[Figure]:
+    """Time nine calibrations: how long one takes depends a little on its noise."""
     rng = np.random.default_rng(0)
-    truth, s = sim.tool(rng), sim.sigma(100)
-    y = sim.readings(truth, sim.CUBE) + s * rng.normal(size=(24, 6))
+    R, s = np.swapaxes(sim.CUBE, 1, 2), sim.sigma(100)
     cov = np.broadcast_to(np.diag(s**2), (24, 6, 6))
-    dataset = CalibrationDataset(np.swapaxes(sim.CUBE, 1, 2), y, cov, np.full(24, 500), np.arange(24.0))
-    y[:] = sim.readings(truth, dataset.R_base_flange) + s * rng.normal(size=(24, 6))
-    dataset = CalibrationDataset(dataset.R_base_flange, y, cov, np.full(24, 500), np.arange(24.0))
-    columns, target = ten_columns(dataset)
+    datasets = []
+    for _ in range(9):
+        y = sim.readings(sim.tool(rng), R) + s * rng.normal(size=(24, 6))
+        datasets.append(CalibrationDataset(R, y, cov, np.full(24, 500), np.arange(24.0)))
+    columns, target = rng.normal(size=(144, 10)), datasets[0].wrench.ravel()
 
     def hundred_lstsq() -> None:
         for _ in range(100):
             np.linalg.lstsq(columns, target, rcond=None)
 
-    whole, plain = best_seconds(repeats, lambda: solve(dataset), hundred_lstsq)
+    *solves, plain = best_seconds(repeats, *(partial(solve, dataset) for dataset in datasets), hundred_lstsq)
+    whole = float(np.median(solves))
     ratio = whole / (plain / 100)
     yield Figure("whole solve, 24 poses", f"{1e3 * whole:.1f} ms", "<= 10 ms", whole <= 10e-3, repeats)
+    yield Figure("  the slowest of nine", f"{1e3 * max(solves):.1f} ms", "<= 40 ms", max(solves) <= 40e-3, repeats)
     yield Figure("  over one plain 10-parameter lstsq", f"{ratio:.0f}", "<= 300", ratio <= 300, repeats)
 
 
@@ -104,7 +103,7 @@ def compensation(rows: int) -> Iterator[Figure]:
 
 def measure(*, quick: bool = False) -> Iterator[Figure]:
     """Measure everything."""
-    yield from few_poses(10 if quick else 60)
+    yield from few_poses(5 if quick else 30)
     yield from many_poses(3 if quick else 10)
     yield from compensation(200_000 if quick else 1_000_000)
 

@@ -13,6 +13,7 @@ from calib.identifiability import (
     assess,
     different_orientations,
     require_observable,
+    require_orientations,
     second_basin_gap,
     wrong_basin_probability,
 )
@@ -199,7 +200,7 @@ def test_three_orientations_are_never_enough_although_their_rank_is_full() -> No
     assert not found.sound
     assert assess(np.concatenate([R, found.advised_R_base_flange])).sound
     with pytest.raises(NotObservable, match="the 6 poses have only 3 different orientations, at least 4"):
-        require_observable(R)
+        require_orientations(R)
 
 
 @pytest.mark.parametrize(
@@ -219,9 +220,9 @@ def test_refusals_are_one_sentence_with_the_cure(R: Array, words: str) -> None:
 
 
 def test_without_parameters_only_the_count_is_checked() -> None:
-    require_observable(leaning(40))
+    require_orientations(leaning(40))
     with pytest.raises(NotObservable, match="4 poses are too few, at least 5 are needed: add 2 or more"):
-        require_observable(ANY[:4], least=5)
+        require_orientations(ANY[:4], least=5)
 
 
 def test_orientations_are_counted_with_half_a_degree() -> None:

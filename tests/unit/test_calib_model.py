@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from calib import PARAMETER_NAMES, Parameters
-from calib.model import Array, gravity_wrench, jacobian, nearest_rotation, predict, skew
+from calib.model import Array, angle_between, gravity_wrench, jacobian, nearest_rotation, predict, rotation_of, skew
 
 SENSOR_Z_DOWN = Rotation.from_euler("x", 180, degrees=True).as_matrix()
 
@@ -91,3 +91,14 @@ def test_parameters_are_frozen_copies_of_the_right_shape() -> None:
         parameters.force_bias_N[0] = 1
     with pytest.raises(ValueError, match=r"force_bias_N has shape \(2,\), expected \(3,\)"):
         Parameters(np.eye(3), np.zeros(3), np.zeros(2), np.zeros(3), np.zeros(3))
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-3, 3), min_size=3, max_size=3), st.sampled_from([1.0, 1e-3, 1e-5, 1e-9, 0.0]))
+def test_quick_rotations_and_angles_are_scipys(vector: list[float], size: float) -> None:
+    turn = size * np.array(vector)
+    ours, theirs = rotation_of(turn), Rotation.from_rotvec(turn).as_matrix()
+    np.testing.assert_allclose(ours, theirs, atol=1e-15)
+    R = Rotation.random(rng=1).as_matrix()
+    expected = Rotation.from_rotvec(turn).magnitude()
+    np.testing.assert_allclose(angle_between(R, ours @ R), expected, rtol=1e-6, atol=1e-15)

@@ -101,10 +101,10 @@ class Server:
         except OSError:
             pass
 
-    def tell(self, t_s: float, offset: list[float]) -> None:
+    def tell(self, *values: float) -> None:
         assert self.started.wait(5)
         assert self.client is not None
-        self.client.sendall(rtde.encode(rtde.DATA, b"\x01" + struct.pack(">7d", t_s, *offset)))
+        self.client.sendall(rtde.encode(rtde.DATA, b"\x01" + struct.pack(f">{len(values)}d", *values)))
 
     def close(self) -> None:
         for sock in (self._listener, self.client):
@@ -115,10 +115,12 @@ class Server:
         self._thread.join(5)
 
 
+ANSWERS = {"V": ANSWER_PROTOCOL, "v": ANSWER_VERSION, "S": ANSWER_START}
+
+
 @contextmanager
 def served(types: bytes = b"DOUBLE,VECTOR6D", **replace: bytes) -> Iterator[Server]:
-    answers = {"V": ANSWER_PROTOCOL, "v": ANSWER_VERSION, "S": ANSWER_START}
-    answers |= {"O": rtde.encode(rtde.SETUP_OUTPUTS, b"\x01" + types)} | replace
+    answers = ANSWERS | {"O": rtde.encode(rtde.SETUP_OUTPUTS, b"\x01" + types)} | replace
     server = Server(lambda request: answers[chr(request[2])])
     try:
         yield server
@@ -126,43 +128,104 @@ def served(types: bytes = b"DOUBLE,VECTOR6D", **replace: bytes) -> Iterator[Serv
         server.close()
 
 
+@contextmanager
+def opened(server: Server) -> Iterator[rtde.LiveReader]:
+    reader = rtde.LiveReader(server.host)
+    try:
+        reader.open(timeout_s=2.0)
+        yield reader
+    finally:
+        reader.close()
+        reader.close()
+
+
 def test_the_newest_offset_is_told_with_its_time() -> None:
-    with served() as server:
-        reader = rtde.TcpOffsetReader(server.host)
-        try:
-            reader.open(timeout_s=2.0)
-            assert reader.supported
-            assert reader.version == (5, 15, 0, 1)
-            server.tell(1.0, [0.0] * 6)
-            server.tell(2.0, [0.1, 0, 0.2, 0, 0, 1])
-            assert reader.offset(since_s=1.5, timeout_s=2.0) == (2.0, (0.1, 0, 0.2, 0, 0, 1))
-            with pytest.raises(DeviceTimeout, match="TCP offset"):
-                reader.offset(since_s=2.001, timeout_s=0.05)
-        finally:
-            reader.close()
-            reader.close()
+    with served() as server, opened(server) as reader:
+        assert reader.tells_tcp
+        assert reader.version == (5, 15, 0, 1)
+        server.tell(1.0, *[0.0] * 6)
+        server.tell(2.0, 0.1, 0, 0.2, 0, 0, 1)
+        assert reader.offset(since_s=1.5, limit_s=2.0) == (2.0, (0.1, 0, 0.2, 0, 0, 1))
 
 
 def test_a_lost_connection_is_raised_at_the_consumer() -> None:
-    with served() as server:
-        reader = rtde.TcpOffsetReader(server.host)
-        reader.open(timeout_s=2.0)
-        server.tell(1.0, [0.0] * 6)
-        reader.offset(since_s=1.0, timeout_s=2.0)
+    with served() as server, opened(server) as reader:
+        server.tell(1.0, *[0.0] * 6)
+        reader.offset(since_s=1.0, limit_s=2.0)
         server.close()
         for _ in range(2):
             with pytest.raises(StreamBroken, match="open the arm again"):
-                reader.offset(since_s=5.0, timeout_s=2.0)
-        reader.close()
+                reader.offset(since_s=5.0, limit_s=2.0)
+            with pytest.raises(StreamBroken):
+                reader.now_s(limit_s=2.0)
 
 
-def test_an_old_controller_is_still_greeted() -> None:
-    with served(b"DOUBLE,NOT_FOUND") as server:
-        reader = rtde.TcpOffsetReader(server.host)
+def test_an_old_controller_tells_at_least_its_time() -> None:
+    def answer(request: bytes) -> bytes:
+        known = b"DOUBLE,NOT_FOUND" if request.endswith(b",tcp_offset") else b"DOUBLE"
+        return {**ANSWERS, "O": rtde.encode(rtde.SETUP_OUTPUTS, b"\x01" + known)}[chr(request[2])]
+
+    server = Server(answer)
+    reader = rtde.LiveReader(server.host)
+    try:
         reader.open(timeout_s=2.0)
-        assert not reader.supported
+        assert not reader.tells_tcp
         assert reader.version[:2] == (5, 15)
+        server.tell(7.0)
+        assert reader.offset(since_s=7.0, limit_s=2.0) == (7.0, ())
+    finally:
         reader.close()
+        server.close()
+
+
+def test_what_has_piled_up_is_not_now() -> None:
+    with served() as server, opened(server) as reader:
+        server.tell(1.0, *[0.0] * 6)
+        reader.offset(since_s=1.0, limit_s=2.0)
+        told: list[float] = []
+        asking = threading.Thread(target=lambda: told.append(reader.now_s(limit_s=5.0)))
+        asking.start()
+        time.sleep(0.15)  # a pause far longer than between two samples, then what a socket held back
+        for k in range(100):
+            server.tell(2.0 + 0.008 * k, *[0.0] * 6)
+        t_s = 3.0
+        while asking.is_alive():
+            time.sleep(0.008)
+            server.tell(t_s := t_s + 0.008, *[0.0] * 6)
+        assert told[0] > 3.0
+
+
+def test_a_clock_that_stands_still_is_found_after_a_fifth_of_a_second() -> None:
+    with served() as server, opened(server) as reader:
+        server.tell(1.0, *[0.0] * 6)
+        t0 = time.monotonic()
+        with pytest.raises(DeviceTimeout, match=r"stood still at 1\.000 s"):
+            reader.offset(since_s=1.001, limit_s=0.2)
+        assert 0.2 < time.monotonic() - t0 < 1.0
+
+
+def test_our_own_pause_is_not_the_controllers(monkeypatch: pytest.MonkeyPatch) -> None:
+    with served() as server, opened(server) as reader:
+        server.tell(1.0, *[0.0] * 6)
+        reader.offset(since_s=1.0, limit_s=2.0)
+        pauses = iter(range(0, 10**9, 30))  # 30 s between any two looks at the clock: the computer sleeps all the time
+        monkeypatch.setattr(time, "monotonic", lambda: float(next(pauses)))
+        later = threading.Timer(0.04, server.tell, (2.0, *[0.0] * 6))
+        later.start()
+        assert reader.offset(since_s=2.0, limit_s=0.2)[0] == 2.0
+        later.join()
+
+
+@pytest.mark.parametrize(
+    ("types", "taken"), [(b"INT32,DOUBLE", []), (b"IN_USE,DOUBLE", ["a"]), (b"NOT_FOUND,IN_USE", ["b"])]
+)
+def test_inputs_of_others_are_told(types: bytes, taken: list[str]) -> None:
+    with served(I=rtde.encode(rtde.SETUP_INPUTS, b"\x01" + types)) as server:
+        assert rtde.registers_in_use(server.host, ("a", "b"), timeout_s=2.0) == taken
+    with served(I=b"") as server, pytest.raises(DeviceTimeout, match="did not answer"):
+        rtde.registers_in_use(server.host, ("a", "b"), timeout_s=0.1)
+    with pytest.raises(StreamBroken, match="was lost"):
+        rtde.registers_in_use("127.83.7.2", ("a", "b"), timeout_s=0.1)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +241,7 @@ def test_an_old_controller_is_still_greeted() -> None:
 )
 def test_whoever_does_not_speak_rtde_is_refused_in_time(replace: dict[str, bytes], says: str) -> None:
     with served(**replace) as server:
-        reader = rtde.TcpOffsetReader(server.host)
+        reader = rtde.LiveReader(server.host)
         t0 = time.monotonic()
         with pytest.raises(ConnectError, match=says):
             reader.open(timeout_s=0.2)
@@ -188,4 +251,4 @@ def test_whoever_does_not_speak_rtde_is_refused_in_time(replace: dict[str, bytes
 
 def test_nobody_there() -> None:
     with pytest.raises(ConnectError, match=r"cannot be reached .*switched on"):
-        rtde.TcpOffsetReader("127.83.7.2").open(timeout_s=0.5)
+        rtde.LiveReader("127.83.7.2").open(timeout_s=0.5)

@@ -60,7 +60,10 @@ class Controller:
                     if not request:
                         return
                     self.heard.append(request)
-                    client.sendall(self._answers[chr(request[2])])
+                    answer = self._answers[chr(request[2])]
+                    if request[2:3] == b"O" and b"ft_raw_wrench" not in request:
+                        answer = rtde.encode(rtde.SETUP_OUTPUTS, b"\x01DOUBLE")
+                    client.sendall(answer)
                 t_s = 100.0
                 while not self._end.wait(0.002):
                     t_s = self._times.pop(0) if self._times else t_s + 0.002

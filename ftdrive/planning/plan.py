@@ -1,0 +1,212 @@
+"""A plan: where the joints go, how fast, how clear of everything, what it will be worth, and what it was made for."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.design import Guess, Prediction, predicted_sigma, special
+from calib.files import check_format, read_object, write_new
+from calib.tour import TourPose
+from drivers.ur.kinematics import Array
+from ftdrive.errors import PlanRefused
+from ftdrive.planning.certify import Certificate, Certifier
+from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
+
+PLAN_FORMAT = "ftdrive.plan/1"
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One pose, and the move from it to the next one; the last move leads back to the first pose."""
+
+    number: int
+    """Of the orientation in the paper."""
+    q_rad: tuple[float, ...]
+    R_base_flange: tuple[tuple[float, ...], ...]
+    turn_rad: float
+    """Of the leading joint in the move."""
+    speed_rad_s: float
+    """Of the leading joint."""
+    duration_s: float
+    certified: bool
+    clearance_m: float
+    limited_by: str
+    """The two bodies that come closest to their margin."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """See `to_dict` for the file."""
+
+    kind: str
+    """constant, wrist or posture."""
+    why: tuple[str, ...]
+    """What was tried, and what the choice costs."""
+    made_for: Mapping[str, str]
+    """SHA-256 of model, tool, scene (with the margins)."""
+    steps: tuple[Step, ...]
+    acceleration_rad_s2: float
+    ball_m: float
+    predicted: Mapping[str, Any]
+    description: Mapping[str, Any]
+    """Model, tool, scene and speeds in words and numbers."""
+
+    @property
+    def tour(self) -> tuple[TourPose, ...]:
+        """The poses as the routine takes them."""
+        return tuple(TourPose(step.number, np.array(step.q_rad)) for step in self.steps)
+
+    @property
+    def certified(self) -> bool:
+        """Whether every move, the last one back included, is proven clear."""
+        return all(step.certified for step in self.steps)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give the contents of the file; its hash over all the rest shows a change by hand."""
+        document: dict[str, Any] = {
+            "format": PLAN_FORMAT,
+            "kind": self.kind,
+            "why": list(self.why),
+            "poses": len(self.steps),
+            "certified": self.certified,
+            "uncertified_segments": sum(not step.certified for step in self.steps),
+            "max_move_deg": float(np.degrees(max(step.turn_rad for step in self.steps))),
+            "motion_time_s": float(sum(step.duration_s for step in self.steps)),
+            "min_clearance_mm": 1e3 * min(step.clearance_m for step in self.steps),
+            "ball_m": self.ball_m,
+            "predicted_sigma": dict(self.predicted),
+            "acceleration_rad_s2": self.acceleration_rad_s2,
+            "made_for": dict(self.made_for),
+            "description": dict(self.description),
+            "steps": [asdict(step) for step in self.steps],
+        }
+        document = json.loads(json.dumps(document))  # tuples become lists, as they come back from a file
+        return document | {"sha256": digest(document)}
+
+    def save(self, path: Path) -> None:
+        """Write a new file."""
+        write_new(path, json.dumps(self.to_dict(), indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: Path) -> "Plan":
+        """Read a file; raises `PlanRefused` when it is no plan or was changed since it was made."""
+        try:
+            document = read_object(path, PlanRefused)
+            check_format(document, PLAN_FORMAT, PlanRefused)
+        except PlanRefused as error:
+            raise PlanRefused(f"{path}: {error}") from error
+        found = document.pop("sha256", None)
+        if found != digest(document):
+            raise PlanRefused(f"{path} was changed after it was made: make a new plan with `ftdrive plan`")
+        steps = tuple(
+            Step(**{**step, "q_rad": tuple(step["q_rad"]), "R_base_flange": tuple(map(tuple, step["R_base_flange"]))})
+            for step in document["steps"]
+        )
+        return cls(
+            document["kind"],
+            tuple(document["why"]),
+            document["made_for"],
+            steps,
+            document["acceleration_rad_s2"],
+            document["ball_m"],
+            document["predicted_sigma"],
+            document["description"],
+        )
+
+    def require(self, certifier: Certifier) -> None:
+        """Raise `PlanRefused` unless the plan was made for this model, tool and scene, and is still proven clear."""
+        now = fingerprints(certifier)
+        changed = [name for name in now if self.made_for.get(name) != now[name]]
+        if changed:
+            raise PlanRefused(f"the plan was made for another {' and another '.join(changed)}: make a new one")
+        q = np.array([step.q_rad for step in self.steps])
+        if not certifier.certify(q, np.roll(q, -1, axis=0), tight=False).clear.all():
+            raise PlanRefused("a move of the plan cannot be proven clear: make a new plan")
+
+
+def make_plan(
+    kind: str,
+    why: Sequence[str],
+    certifier: Certifier,
+    numbers: Sequence[int],
+    q_rad: Array,
+    speeds: Speeds,
+    guess: Guess,
+) -> Plan:
+    """Certify and price a closed tour through joint vectors (n, 6)."""
+    arm, following = certifier.arm, np.roll(q_rad, -1, axis=0)
+    certificate: Certificate = certifier.certify(q_rad, following)
+    R = arm.frames(q_rad).R_base_flange
+    turn = np.abs(following - q_rad).max(axis=1)
+    speed = speed_of_leading_joint(arm, q_rad, following, speeds)
+    duration = move_duration_s(turn, speed, speeds.joint_rad_s2)
+    prediction = predicted_sigma(R, guess)
+    cost = prediction.force_rms_N / predicted_sigma(special(range(1, 25)), guess).force_rms_N
+    steps = tuple(
+        Step(
+            int(numbers[i]),
+            tuple(q_rad[i].tolist()),
+            tuple(tuple(row) for row in R[i].tolist()),
+            float(turn[i]),
+            float(speed[i]),
+            float(duration[i]),
+            bool(certificate.clear[i]),
+            float(certificate.clearance_m[i]),
+            certificate.limited_by[i],
+        )
+        for i in range(len(q_rad))
+    )
+    return Plan(
+        kind,
+        (*why, f"Predicted error of force compensation: {cost:.2f} times that of all 24 poses."),
+        fingerprints(certifier),
+        steps,
+        speeds.joint_rad_s2,
+        arm.ball_m,
+        _as_json(prediction),
+        {
+            "model": arm.name,
+            "tool": [asdict(part) for part in arm.tool],
+            "scene": certifier.scene.describe(),
+            "margins": asdict(certifier.margins),
+            "speeds": asdict(speeds),
+            "guess": {
+                "mass_kg": guess.mass_kg,
+                "sigma_force_N": guess.sigma_force_N,
+                "sigma_torque_Nm": guess.sigma_torque_Nm,
+            },
+        },
+    )
+
+
+def fingerprints(certifier: Certifier) -> dict[str, str]:
+    """SHA-256 of all that a proof of clearance rests on."""
+    return {
+        "model": digest(certifier.arm.describe()),
+        "tool": digest([asdict(part) for part in certifier.arm.tool]),
+        "scene": digest([certifier.scene.describe(), asdict(certifier.margins)]),
+    }
+
+
+def digest(value: Any) -> str:
+    """SHA-256 of a value's JSON with sorted keys."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def _as_json(prediction: Prediction) -> dict[str, Any]:
+    """One standard deviation of each estimate; null where the poses do not tell."""
+    values: dict[str, Any] = {name: np.asarray(sigma).tolist() for name, sigma in prediction.sigma.items()}
+    for name in ("force_rms_N", "torque_rms_Nm", "cond9", "cond_u1", "second_basin_gap"):
+        values[name] = getattr(prediction, name)
+
+    def finite(value: Any) -> Any:
+        if isinstance(value, list):
+            return [finite(one) for one in value]
+        return value if np.isfinite(value) else None
+
+    return {name: finite(value) for name, value in values.items()}

@@ -1,0 +1,85 @@
+"""`ftdrive plan` as a person and as a script calls it."""
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from ftdrive.cli import cli, exit_code
+from ftdrive.planning.plan import Plan
+
+UR5E = ["plan", "--model", "ur5e", "--tool", "0:200:100"]
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, arguments)
+
+
+def test_json_holds_the_figures() -> None:
+    outcome = run(*UR5E, "--tip-speed-limit", "none", "--json")
+    assert outcome.exit_code == 0, outcome.output
+    document = json.loads(outcome.stdout)
+    assert document["schema_version"] == 1
+    assert document["poses"] == len(document["steps"]) == 24
+    assert document["certified"] is True
+    assert document["max_move_deg"] <= 90.1
+    assert document["motion_time_s"] <= 54.1
+    assert document["min_clearance_mm"] > 0
+    assert document["ball_m"] == pytest.approx(0.35, abs=0.005)
+    assert document["predicted_sigma"]["mass_kg"] > 0
+
+
+@pytest.mark.parametrize(("option", "poses"), [("--quick", 12), ("--minimal", 6)])
+def test_fewer_poses(option: str, poses: int) -> None:
+    document = json.loads(run(*UR5E, option, "--json").stdout)
+    assert document["poses"] == poses
+    assert document["certified"] is True
+    assert document["motion_time_s"] < 45
+
+
+def test_table_is_talk_and_the_file_is_the_plan(tmp_path: Path) -> None:
+    path = tmp_path / "plan.json"
+    outcome = run(*UR5E, "--mounting", "ceiling", "--box", "600:600:0:800:800:200", "--output", str(path))
+    assert outcome.exit_code == 0, outcome.output
+    assert outcome.stdout == ""
+    for word in ("wrist 3", "ball of 0.35 m", "proven clear", "Predicted"):
+        assert word in outcome.stderr
+    assert len(Plan.load(path).tour) == 24
+    assert isinstance(run(*UR5E, "--output", str(path)).exception, FileExistsError)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--tool", "0:200"], "3 or 5 numbers"),
+        (["--tool", "200:100:50"], "cylinder of the tool"),
+        (["--quick", "--minimal"], "not both"),
+        (["--mounting", "sideways"], "mounting"),
+        (["--plane", "0:0:0:1"], "no direction"),
+        (["--tip-speed-limit", "-1"], "above zero"),
+        (["--posture", "45,-100"], "3 numbers"),
+        (["--mass", "0"], "above zero"),
+    ],
+)
+def test_what_cannot_be_used_is_said_in_a_sentence(arguments: list[str], said: str) -> None:
+    error = run(*UR5E, *arguments).exception
+    assert error is not None
+    assert said in str(error)
+    assert exit_code(error) == 2
+
+
+def test_no_way_is_exit_code_7() -> None:
+    error = run(*UR5E, "--plane", "0:0:1:500").exception
+    assert error is not None
+    assert exit_code(error) == 7
+
+
+def test_picture_or_what_to_install(tmp_path: Path) -> None:
+    path = tmp_path / "plan.png"
+    outcome = run(*UR5E, "--png", str(path))
+    if find_spec("matplotlib") is None:
+        assert "ftdrive[viz]" in str(outcome.exception)
+    else:
+        assert path.read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,210 @@
+"""The choice of a plan, its file, its speeds, and when it is refused."""
+
+import itertools
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.design import special
+from drivers.ur.kinematics import Array
+from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.planning.arm_model import ArmModel, Cylinder
+from ftdrive.planning.certify import Certifier, Margins
+from ftdrive.planning.motion import Speeds, move_duration_s, tips
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import NUMBERS, USUAL_POSTURE_RAD, guess_of, plan_tour
+from ftdrive.planning.scene import Box, Plane, Scene
+from ftdrive.planning.tours import shortest_tour
+
+MODELS = ("UR3e", "UR5e", "UR10e", "UR16e", "UR20", "UR30")
+TOOLS = (
+    (Cylinder(0, 0.15, 0.1),),
+    (Cylinder(0, 0.2, 0.1),),
+    (Cylinder(0, 0.25, 0.1),),
+    (Cylinder(0, 0.05, 0.08), Cylinder(0.05, 0.2, 0.15)),
+)
+NO_TIP_LIMIT = Speeds(tip_m_s=None)
+
+
+def certifier_of(
+    model: str = "UR5e",
+    tool: tuple[Cylinder, ...] = TOOLS[1],
+    scene: Scene | None = None,
+    margins: Margins | None = None,
+) -> Certifier:
+    return Certifier(ArmModel(model, tool), scene or Scene(), margins)
+
+
+def planned(certifier: Certifier, q: Array = USUAL_POSTURE_RAD, poses: int = 24, speeds: Speeds | None = None) -> Plan:
+    return plan_tour(certifier, q, poses, speeds=speeds or Speeds(), guess=guess_of(certifier))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_figures_of_the_constant_tour(model: str) -> None:
+    plan = planned(certifier_of(model), speeds=NO_TIP_LIMIT)
+    document = plan.to_dict()
+    assert (document["kind"], document["poses"], document["uncertified_segments"]) == ("constant", 24, 0)
+    assert document["certified"]
+    assert document["max_move_deg"] <= 90.1
+    assert document["motion_time_s"] == pytest.approx(54.0)  # 24 moves of 90 degrees at 60 degrees/s and 80 degrees/s2
+    assert document["min_clearance_mm"] > 20
+    assert planned(certifier_of(model)).to_dict()["motion_time_s"] <= 62
+
+
+def test_ball_holds_every_point_of_the_tool() -> None:
+    certifier = certifier_of(tool=(Cylinder(0, 0.2, 0.1), Cylinder(0.02, 0.1, 0.04, 0.09, 0.03)))
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (2000, 6))
+    at = certifier.arm.frames(q)
+    turn = np.linspace(0, 2 * np.pi, 40)
+    rim = np.column_stack([0.05 * np.cos(turn), 0.05 * np.sin(turn), np.full(40, 0.2)])
+    points = at.flange_m[:, None] + rim @ np.swapaxes(at.R_base_flange, 1, 2)
+    reach = np.linalg.norm(points - at.wrist_m[:, None], axis=2).max()
+    assert certifier.arm.ball_m - 0.016 < reach <= certifier.arm.ball_m - 0.015 + 1e-9
+
+
+@pytest.mark.parametrize("poses", [12, 6])
+def test_fewer_poses_have_one_solution_and_say_what_they_cost(poses: int) -> None:
+    plan = planned(certifier_of(), poses=poses)
+    document = plan.to_dict()
+    R = np.array([step.R_base_flange for step in plan.steps])
+    assert sorted(step.number for step in plan.steps) == sorted(NUMBERS[poses])
+    assert np.allclose(R, special([step.number for step in plan.steps]), atol=1e-9)  # base at 45 degrees: no turn
+    assert plan.certified
+    assert document["predicted_sigma"]["second_basin_gap"] > 0.2
+    assert any("times that of all 24" in sentence for sentence in plan.why)
+    assert document["motion_time_s"] < planned(certifier_of()).to_dict()["motion_time_s"]
+
+
+@pytest.mark.parametrize("pan_deg", [-120.0, 0.0, 33.0])
+def test_any_pan_serves(pan_deg: float) -> None:
+    q = USUAL_POSTURE_RAD.copy()
+    q[0] = np.radians(pan_deg)
+    assert planned(certifier_of(), q).kind == "constant"
+    assert planned(certifier_of(), q, 12).certified
+
+
+def test_another_posture_is_proposed_where_the_arm_stands_badly() -> None:
+    q = USUAL_POSTURE_RAD.copy()
+    q[1:3] = np.radians([-30, 20])  # stretched over the table
+    certifier = certifier_of()
+    plan = planned(certifier, q)
+    assert plan.kind == "posture"
+    assert plan.certified
+    assert "jog there" in " ".join(plan.why)
+    plan.require(certifier)
+
+
+def test_no_room_at_all_is_refused_in_a_sentence() -> None:
+    walls = [Plane((x, y, 0.0), -0.15) for x, y in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
+    certifier = certifier_of(scene=Scene(planes=(*Scene().planes, *walls)))
+    with pytest.raises(PlanRefused, match="proven clear"):
+        planned(certifier)
+
+
+def test_plan_is_deterministic_and_comes_back_from_its_file(tmp_path: Path) -> None:
+    certifier = certifier_of(scene=Scene(boxes=(Box((0.6, 0.6, 0.0), (0.8, 0.8, 0.2)),)))
+    plan = planned(certifier, poses=6)
+    assert planned(certifier, poses=6).to_dict() == plan.to_dict()
+    plan.save(tmp_path / "plan.json")
+    again = Plan.load(tmp_path / "plan.json")
+    assert again.to_dict() == plan.to_dict()
+    assert np.array_equal(again.tour[3].q_rad, plan.tour[3].q_rad)
+    again.require(certifier)
+
+
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        (certifier_of(model="UR10e"), "model"),
+        (certifier_of(tool=TOOLS[0]), "tool"),
+        (certifier_of(scene=Scene(lean_rad=np.pi)), "scene"),
+        (certifier_of(margins=Margins(scene_m=0.01)), "scene"),
+    ],
+)
+def test_plan_is_refused_for_anything_else_than_it_was_made_for(other: Certifier, named: str) -> None:
+    with pytest.raises(PlanRefused, match=f"another {named}"):
+        planned(certifier_of()).require(other)
+
+
+def test_plan_changed_by_hand_is_refused(tmp_path: Path) -> None:
+    plan = planned(certifier_of())
+    path = tmp_path / "plan.json"
+    document = plan.to_dict()
+    document["steps"][3]["q_rad"][4] += 0.1
+    path.write_text(json.dumps(document))
+    with pytest.raises(PlanRefused, match="changed after it was made"):
+        Plan.load(path)
+
+
+def test_a_forged_plan_that_collides_is_refused() -> None:
+    certifier = certifier_of()
+    plan = planned(certifier)
+    q = [tuple(np.add(step.q_rad, [0, 1.5, 0, 0, 0, 0])) for step in plan.steps]
+    forged = replace(plan, steps=tuple(replace(step, q_rad=one) for step, one in zip(plan.steps, q, strict=True)))
+    with pytest.raises(PlanRefused, match="cannot be proven clear"):
+        forged.require(certifier)
+
+
+def test_no_point_of_the_tool_exceeds_its_speed() -> None:
+    certifier = certifier_of("UR20")
+    plan = planned(certifier)
+    following = (*plan.steps[1:], plan.steps[0])
+    for step, after in zip(plan.steps, following, strict=True):
+        share = np.linspace(0, 1, 2000)[:, None]
+        path = tips(certifier.arm, (1 - share) * step.q_rad + share * np.array(after.q_rad))
+        cruise_s = step.turn_rad / step.speed_rad_s / (len(share) - 1)
+        assert np.linalg.norm(np.diff(path, axis=0), axis=2).max() / cruise_s < 0.2505
+    assert {round(float(np.degrees(step.speed_rad_s))) for step in plan.steps} & {
+        60
+    }  # spins of the last joint are not slowed
+
+
+def test_duration_of_short_and_long_moves_by_hand() -> None:
+    # 60 degrees/s and 80 degrees/s2: the ramps take 45 degrees together.
+    found = move_duration_s(np.radians([90, 20, 0]), np.radians(60), np.radians(80))
+    assert np.allclose(found, [90 / 60 + 60 / 80, 2 * np.sqrt(20 / 80), 0])
+
+
+def test_shortest_tour_is_the_best_of_all() -> None:
+    rng = np.random.default_rng(5)
+    q = rng.uniform(-2, 2, (15, 6))
+    group = np.repeat(np.arange(5), 3)
+    allowed = np.asarray(rng.random((15, 15)) < 0.9)
+    allowed &= allowed.T & (group[:, None] != group)
+    turn = np.abs(q[:, None] - q)
+    cost = move_duration_s(turn.max(axis=2), NO_TIP_LIMIT.joint_rad_s, NO_TIP_LIMIT.joint_rad_s2)
+    cost = np.where(allowed, cost + 0.02 * turn.sum(axis=2), 1e6)
+    best = min(
+        sum(cost[3 * a + i, 3 * b + j] for (a, i), (b, j) in itertools.pairwise([*closed, closed[0]]))
+        for order in itertools.permutations(range(1, 5))
+        for picks in itertools.product(range(3), repeat=5)
+        for closed in [list(zip((0, *order), picks, strict=True))]
+    )
+    tour = shortest_tour(q, group, allowed, NO_TIP_LIMIT)
+    assert tour is not None
+    assert sorted(group[tour]) == [0, 1, 2, 3, 4]
+    assert cost[tour, np.roll(tour, -1)].sum() == pytest.approx(best)
+    allowed[group == 2] = allowed[:, group == 2] = False
+    assert shortest_tour(q, group, allowed, NO_TIP_LIMIT) is None
+
+
+def test_random_plans_sampled_at_half_a_degree_are_clear() -> None:
+    rng = np.random.default_rng(7)
+    made = 0
+    for model in MODELS * 5:
+        certifier = certifier_of(model, TOOLS[rng.integers(4)])
+        q = USUAL_POSTURE_RAD + np.concatenate([rng.uniform(-0.4, 0.4, 3), np.zeros(3)])
+        tour = np.array([p.q_rad for p in planned(certifier, q, 6 if made % 3 else 24).tour])
+        share = np.linspace(0, 1, 361)[:, None, None]
+        path = (1 - share) * tour + share * np.roll(tour, -1, axis=0)
+        assert certifier.free(path.reshape(-1, 6)).all()  # farther away than the margins of 20 and 30 mm
+        made += 1
+    assert made == 30
+
+
+def test_posture_that_cannot_be_is_refused() -> None:
+    with pytest.raises(ConfigError, match="degrees"):
+        planned(certifier_of(), np.full(6, np.nan))
