@@ -539,7 +539,6 @@ def carlson(lab: Lab) -> Iterator[Row]:
     yield most("Carlson Fig. 2: error of gravity, 95 %", at_95, 0.45 if lab.quick else 0.32, runs, " %")
 
 
-FIG_9_METHODS = ("ml", "yaw only", "known rotation")
 FIG_9_YAW_DEG = 30.0
 """Of the sensor while its roll is varied."""
 
@@ -568,7 +567,7 @@ def figure_9(lab: Lab) -> dict[tuple[float, float], Array]:
 
 
 def coefficient_run(
-    seed: int, n1: float, n2: float, com: tuple[float, float, float] = (0.1, 0.1, 0.1), *, exact_test: bool = False
+    seed: int, n1: float, n2: float, com: tuple[float, float, float] = (0.1, 0.1, 0.1)
 ) -> dict[str, object]:
     """Yu Figs 14 and 15: slopes (2, 6) of the largest error of each channel over its range, for SROM and ML.
 
@@ -583,7 +582,7 @@ def coefficient_run(
         truth = Truth(YU_MOUNT, a * YU_WEIGHT_N, YU_F0, np.array(com), YU_T0)
         y = sim.readings(truth, _off(nominal, n2, rng)) + rng.uniform(-n1, n1, (24, 6))
         test = Rotation.random(500, rng=rng).as_matrix()
-        measured = sim.readings(truth, _off(test, 0.0 if exact_test else n2, rng))
+        measured = sim.readings(truth, _off(test, n2, rng))
         R = np.swapaxes(nominal, 1, 2)
         fits = srom(R, y), ml.fit(R, y, np.eye(6) * n1**2 / 3, drift="none").parameters
         for k, p in enumerate(fits):
@@ -602,11 +601,9 @@ def _off(A: Array, n2: float, rng: Rng) -> Array:
     return np.swapaxes(Rotation.from_euler("ZYX", angles).as_matrix(), 1, 2)
 
 
-def coefficients(
-    lab: Lab, n1: float, n2: float, com: tuple[float, float, float] = (0.1, 0.1, 0.1), *, exact_test: bool = False
-) -> Array:
+def coefficients(lab: Lab, n1: float, n2: float, com: tuple[float, float, float] = (0.1, 0.1, 0.1)) -> Array:
     """Mean slopes (2, 6) of SROM and ML."""
-    worker = partial(coefficient_run, n1=n1, n2=n2, com=com, exact_test=exact_test)
+    worker = partial(coefficient_run, n1=n1, n2=n2, com=com)
     return np.asarray(lab.simulate(worker, lab.count(24, 4))["slope"].mean(axis=0))
 
 
