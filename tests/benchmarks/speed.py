@@ -1,0 +1,129 @@
+"""How fast a calibration is solved and a wrench compensated: times, and ratios to numpy measured in the same run.
+
+    uv run python tests/benchmarks/speed.py [--quick]
+
+Every ratio is of two times measured alternately, the best of several, so that what else runs on the machine cancels as
+far as it can. Linear algebra has one thread.
+"""
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationDataset, ml, solve
+from tests.benchmarks import scenarios as sim
+
+MANY = 1_000_000
+COMPENSATION = re.compile(
+    r"^(.*?)\s+([\d.]+) (µs|M samples/s)\s+ratio\s+([\d.]+)\s+target (\S+ \S+)\s+(pass|FAIL)$", re.MULTILINE
+)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One line of the table."""
+
+    name: str
+    value: str
+    target: str
+    passed: bool
+    repeats: int
+
+
+def best_seconds(repeats: int, *calls: Callable[[], object]) -> list[float]:
+    """Shortest time of each call over rounds in which each runs once."""
+    best = [float("inf")] * len(calls)
+    for _ in range(repeats):
+        for i, call in enumerate(calls):
+            start = time.perf_counter()
+            call()
+            best[i] = min(best[i], time.perf_counter() - start)
+    return best
+
+
+def few_poses(repeats: int) -> Iterator[Figure]:
+    """Time nine calibrations: how long one takes depends a little on its noise."""
+    rng = np.random.default_rng(0)
+    R, s = np.swapaxes(sim.CUBE, 1, 2), sim.sigma(100)
+    cov = np.broadcast_to(np.diag(s**2), (24, 6, 6))
+    datasets = []
+    for _ in range(9):
+        y = sim.readings(sim.tool(rng), R) + s * rng.normal(size=(24, 6))
+        datasets.append(CalibrationDataset(R, y, cov, np.full(24, 500), np.arange(24.0)))
+    columns, target = rng.normal(size=(144, 10)), datasets[0].wrench.ravel()
+
+    def hundred_lstsq() -> None:
+        for _ in range(100):
+            np.linalg.lstsq(columns, target, rcond=None)
+
+    *solves, plain = best_seconds(repeats, *(partial(solve, dataset) for dataset in datasets), hundred_lstsq)
+    whole = float(np.median(solves))
+    ratio = whole / (plain / 100)
+    yield Figure("whole solve, 24 poses", f"{1e3 * whole:.1f} ms", "<= 10 ms", whole <= 10e-3, repeats)
+    yield Figure("  the slowest of nine", f"{1e3 * max(solves):.1f} ms", "<= 40 ms", max(solves) <= 40e-3, repeats)
+    yield Figure("  over one plain 10-parameter lstsq", f"{ratio:.0f}", "<= 300", ratio <= 300, repeats)
+
+
+def many_poses(repeats: int) -> Iterator[Figure]:
+    rng = np.random.default_rng(0)
+    truth, s = sim.tool(rng), sim.sigma(100)
+    R = np.tile(Rotation.random(1000, rng=rng).as_matrix(), (MANY // 1000, 1, 1))
+    y = sim.readings(truth, R) + s * rng.normal(size=(MANY, 6))
+    source = np.ones(R.size + y.size)
+    copy = np.empty_like(source)
+    cov = np.diag(s**2)
+    whole, plain = best_seconds(repeats, lambda: ml.fit(R, y, cov, drift="none"), lambda: np.copyto(copy, source))
+    yield Figure("10⁶ poses, covariance given, no drift", f"{1e3 * whole:.0f} ms", "<= 60 ms", whole <= 60e-3, repeats)
+    ratio = whole / plain
+    yield Figure("  over np.copyto of the same bytes", f"{ratio:.1f}", "<= 8", ratio <= 8, repeats)
+
+
+def compensation() -> Iterator[Figure]:
+    """What compensation_speed.py says, and its absolute figures for one sample and for float64."""
+    script = Path(__file__).with_name("compensation_speed.py")
+    out = subprocess.run([sys.executable, str(script)], check=True, capture_output=True, text=True).stdout
+    for name, value, unit, ratio, target, verdict in COMPENSATION.findall(out):
+        yield Figure(f"compensation, {name}, ratio", ratio, target, verdict == "pass", 40)
+        if unit == "µs" and "buffer" in name:
+            yield Figure(f"compensation, {name}", f"{value} µs", "<= 1.5 µs", float(value) <= 1.5, 40)
+        if name.startswith("float64"):
+            least = 70.0 if "1 thread" in name else 120.0
+            yield Figure(f"compensation, {name}", f"{value} M/s", f">= {least:.0f} M/s", float(value) >= least, 40)
+
+
+def measure(*, quick: bool = False) -> Iterator[Figure]:
+    """Measure everything."""
+    yield from few_poses(5 if quick else 30)
+    yield from many_poses(3 if quick else 10)
+    yield from compensation()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Speed of calibration and compensation.")
+    parser.add_argument("--quick", action="store_true", help="fewer repetitions")
+    options = parser.parse_args()
+    failed = 0
+    for figure in measure(quick=options.quick):
+        failed += not figure.passed
+        sys.stdout.write(
+            f"{figure.name:66} {figure.value:>28}   {figure.target:24} {'pass' if figure.passed else 'FAIL'}\n"
+        )
+        sys.stdout.flush()
+    return failed
+
+
+if __name__ == "__main__":
+    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
+        os.environ["OPENBLAS_NUM_THREADS"] = "1"
+        os.execv(sys.executable, [sys.executable, *sys.argv])
+    sys.exit(main())
