@@ -124,9 +124,17 @@ class CalibrationDataset:
             raise BadDataset(f"{path.name}: {exc}") from exc
 
     def sha256(self) -> str:
-        """Hash the content, independent of spacing and order of fields in the file."""
-        canonical = json.dumps(self.to_dict(), allow_nan=False, sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(canonical.encode()).hexdigest()
+        """Hash the content, independent of spacing and order of fields in the file.
+
+        Over the meta data as JSON with sorted keys, then each array: its name, shape, and numbers as little-endian
+        float64 row by row (a covariance that is not known has no shape and no numbers).
+        """
+        digest = hashlib.sha256(json.dumps(dict(self.meta), allow_nan=False, sort_keys=True).encode())
+        for name in ("R_base_flange", "wrench", "wrench_cov", "n_samples", "t_s"):
+            array = getattr(self, name)
+            digest.update(f"{name} {None if array is None else array.shape}".encode())
+            digest.update(b"" if array is None else np.ascontiguousarray(array, dtype="<f8").tobytes())
+        return digest.hexdigest()
 
 
 def read_csv(

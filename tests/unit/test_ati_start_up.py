@@ -266,6 +266,12 @@ RECORD_SATURATED = bytes.fromhex("0064012C01F4FF38FE707FFF") + bytes(
 )
 
 
+@pytest.fixture(autouse=True)
+def _peers_repeat_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scripted peers send one record over and over: on a busy computer for long enough to look frozen."""
+    monkeypatch.setattr("drivers._stream._FROZEN_S", math.inf)
+
+
 class SerialPeer:
     """Answers requests from a table on a pseudo-terminal and, once started, streams what the test says."""
 
@@ -363,8 +369,7 @@ def test_serial_single_bad_records_are_dropped_and_counted() -> None:
         assert START not in peer.requests[len(SERIAL_START_UP) :]
 
 
-def test_serial_slipped_stream_is_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers._stream._FROZEN_S", math.inf)  # the peer repeats one record
+def test_serial_slipped_stream_is_restarted() -> None:
     with SerialPeer() as peer, peer.sensor() as sensor:
         peer.once = b"\x77"
         samples = sensor.collect(0.3)
