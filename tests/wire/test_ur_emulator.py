@@ -490,7 +490,7 @@ def test_stops(fresh: Station) -> None:
 
 def test_link(fresh: Station) -> None:
     out = run_client("link", fresh)
-    assert out["frozen_for"] <= 0.02
+    assert out["frozen_for"] <= 20 * 0.02  # time-scale 20
     assert out["thawed"]
     assert out["dropped"]["connections"] == 1
     assert [out["loss_seen"], out["reconnect"], out["alive"]] == [True, True, True]
