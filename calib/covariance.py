@@ -93,7 +93,7 @@ class Noise:
             s = self._s[:, None]
             Y -= self.W[:, :, self._walking] @ (s * self._solve_walk(s * Y[:, self._walking]))
         for Q, core in self._low_rank:
-            Y += Q @ (core @ np.einsum("nik,nil->kl", Q, X, optimize=True))
+            Y += Q @ (core @ summed_products(Q, X))
         return Y
 
     @property
@@ -123,6 +123,11 @@ class Noise:
         for i in range(self.n - 2, -1, -1):
             inverse[i] += squared[i] * (pivots[i] @ inverse[i + 1] @ pivots[i])
         return inverse
+
+
+def summed_products(X: Array, Y: Array) -> Array:
+    """Sum of X_i' Y_i over the poses, shape (k, l), for X (n, m, k) and Y (n, m, l)."""
+    return np.asarray(X.reshape(-1, X.shape[-1]).T @ Y.reshape(-1, Y.shape[-1]))
 
 
 def steps(time: Array) -> Array:

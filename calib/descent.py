@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
 from calib import so3
 from calib.gram import CHUNK, Statistics, coefficients, features, wrench_gram
@@ -108,9 +109,8 @@ class Descent:
             Z = self.constraints.free(p) if self.constraints.any else None
             Hz, gz = (H, g) if Z is None else (Z.T @ H @ Z, Z.T @ g)
             scale = column_scale(Hz)
-            eigenvalues, V = np.linalg.eigh(Hz / np.outer(scale, scale))
-            step = V @ (V.T @ (gz / scale) / np.maximum(eigenvalues + damping, 1e-14 * eigenvalues[-1])) / scale
-            moved = float(np.sqrt(max(step @ Hz @ step, 0.0)))  # in standard deviations of the noise
+            step = np.asarray(_solved(Hz / np.outer(scale, scale), gz / scale, damping) / scale)
+            moved = float(np.sqrt(max(float(step @ Hz @ step), 0.0)))  # in standard deviations of the noise
             trial = p.moved(step if Z is None else Z @ step)
             if Z is not None:
                 trial = self.constraints.satisfied(trial)
@@ -126,6 +126,15 @@ class Descent:
             if settled:
                 break
         return Minimum(p, cost, H, settled or moved < SMALL_STEP)
+
+
+def _solved(H: Array, g: Array, damping: float) -> Array:
+    """Solve `(H + damping) x = g`; where the matrix lacks rank, the shortest such step."""
+    _, x, failed = dposv(H + damping * np.eye(len(H)), g)
+    if failed:
+        eigenvalues, V = np.linalg.eigh(H)
+        x = V @ (V.T @ g / np.maximum(eigenvalues + damping, 1e-14 * eigenvalues[-1]))
+    return np.asarray(x)
 
 
 def column_scale(information: Array) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import f as f_distribution
 
-from calib.covariance import Noise
+from calib.covariance import Noise, summed_products
 from calib.descent import MAX_STEPS, Descent, Equations, Minimum, column_scale
 from calib.errors import NotObservable
 from calib.gram import Statistics, features
@@ -501,7 +501,7 @@ class _Problem:
 
         def equations(p: Parameters) -> tuple[Array, Array, float]:
             X = np.concatenate([jacobian(p, self.R), (self.wrench - predict(p, self.R))[..., None]], axis=2)
-            G = np.einsum("nik,nil->kl", X, noise.solve(X), optimize=True)
+            G = summed_products(X, noise.solve(X))
             return G[:15, :15], G[:15, 15], float(G[15, 15])
 
         return equations

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.covariance import Noise, centred, walk_square, walk_times
+from calib.covariance import Noise, centred, summed_products, walk_square, walk_times
 from calib.model import Array
 
 GAIN = 2.0
@@ -91,7 +91,7 @@ def point(problem: Linearised, components: Sequence[Component], theta: Array) ->
     m = problem.J.shape[2]
     X = np.concatenate([problem.J, problem.r[..., None]], axis=2)
     WX = noise.solve(X)
-    G = np.einsum("nik,nil->kl", X, WX, optimize=True)
+    G = summed_products(X, WX)
     H, g = G[:m, :m] + problem.prior[0], G[:m, m] + problem.prior[1]
     scale = np.sqrt(np.diag(H))
     value, vector = np.linalg.eigh(H / np.outer(scale, scale))
@@ -157,8 +157,8 @@ def _score(problem: Linearised, at: Point) -> tuple[Array, Array]:
         slope.append(theta * (square - trace) / 2)
     X = np.stack(Vu, axis=-1)
     WX = noise.solve(X)
-    JWX = np.einsum("nik,nil->kl", WJ, X, optimize=True)
-    information = (np.einsum("nik,nil->kl", X, WX, optimize=True) - JWX.T @ C @ JWX) / 2
+    JWX = summed_products(WJ, X)
+    information = (summed_products(X, WX) - JWX.T @ C @ JWX) / 2
     return np.array(slope), np.asarray(information)
 
 
