@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from calib import so3
 from calib.errors import BadDataset, NotObservable
+from calib.model import skew
 
 Array = NDArray[np.float64]
 
@@ -321,11 +322,6 @@ def polynomial(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
 def kron_identity(f: Array) -> Array:
     """(3n, 9) stack of `f_i^T (x) I` for (n, 3) vectors: times vec(X) it gives the stack of `X f_i`."""
     return np.asarray(np.einsum("nj,ik->nijk", f, np.eye(3)).reshape(-1, 9))
-
-
-def skew(v: Array) -> Array:
-    """(n, 3, 3) matrices of the cross product with (n, 3) vectors."""
-    return np.cross(np.eye(3), v[:, None, :])
 
 
 def _rotation_of_vec(r: Array) -> Array:

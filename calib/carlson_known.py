@@ -17,10 +17,10 @@ from calib.carlson import (
     force_equations,
     project_to_so3,
     require_weight,
-    skew,
     spanned_dimensions,
 )
 from calib.errors import BadDataset, NotObservable
+from calib.model import skew
 
 
 def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Array, *, bias: bool) -> ForceFit:

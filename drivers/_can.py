@@ -11,8 +11,42 @@ import can
 from drivers._stream import LINK_ERRORS
 from drivers.errors import ConnectError, StreamBroken
 
-_BUS_ERRORS = (can.CanError, ValueError, *LINK_ERRORS)
+BUS_ERRORS = (can.CanError, ValueError, *LINK_ERRORS)
 _SEND_S = 0.1
+
+
+def open_bus(
+    owner: str, channel: str, interface: str, bitrate: int, filters: list[can.typechecking.CanFilter]
+) -> can.BusABC:
+    """Open a bus of python-can for a device called `owner`. Raises `ConnectError`."""
+    options: dict[str, Any] = {}
+    if interface == "slcan":
+        # python-can waits 2 s for adapters that reboot when their port is opened; a pseudo-terminal does not
+        tty = os.path.realpath(channel.split("@", maxsplit=1)[0])
+        if not os.access(tty, os.R_OK | os.W_OK):
+            raise ConnectError(f"{owner}: there is no {channel} that may be read and written")
+        if tty.startswith("/dev/pts/"):
+            options["sleep_after_open"] = 0.0
+    try:
+        return can.Bus(
+            channel, interface=interface, bitrate=bitrate, can_filters=filters, ignore_config=True, **options
+        )
+    except (NotImplementedError, *BUS_ERRORS) as exc:
+        raise ConnectError(
+            f"{owner}: the bus does not open ({exc}); is the adapter plugged in, and on socketcan "
+            f"'ip link set {channel} up type can bitrate {bitrate}' done?"
+        ) from exc
+
+
+def close_bus(bus: can.BusABC) -> None:
+    """Close a bus, and its serial port in any case."""
+    try:
+        bus.shutdown()
+    finally:
+        # the slcan bus says goodbye before it closes its port, and skips the second when the first fails
+        if port := getattr(bus, "serialPortOrig", None):
+            with contextlib.suppress(*LINK_ERRORS):
+                port.close()
 
 
 class CanBus:
@@ -42,45 +76,17 @@ class CanBus:
 
     def open(self) -> None:
         """Join the bus. Raises `ConnectError`."""
-        options: dict[str, Any] = {}
-        if self._interface == "slcan":
-            # python-can waits 2 s for adapters that reboot when their port is opened; a pseudo-terminal does not
-            tty = os.path.realpath(self._channel.split("@")[0])
-            if not os.access(tty, os.R_OK | os.W_OK):
-                raise ConnectError(f"{self._owner}: there is no {self._channel} that may be read and written")
-            if tty.startswith("/dev/pts/"):
-                options["sleep_after_open"] = 0.0
         filters: list[can.typechecking.CanFilter] = [
             {"can_id": identifier, "can_mask": 0x7FF, "extended": False} for identifier in self._identifiers
         ]
-        try:
-            self._bus = can.Bus(
-                self._channel,
-                interface=self._interface,
-                bitrate=self._bitrate,
-                can_filters=filters,
-                ignore_config=True,
-                **options,
-            )
-        except (NotImplementedError, *_BUS_ERRORS) as exc:
-            raise ConnectError(
-                f"{self._owner}: the bus does not open ({exc}); is the adapter plugged in, and on socketcan "
-                f"'ip link set {self._channel} up type can bitrate {self._bitrate}' done?"
-            ) from exc
+        self._bus = open_bus(self._owner, self._channel, self._interface, self._bitrate, filters)
 
     def close(self) -> None:
         """Leave the bus. Idempotent."""
         bus, self._bus = self._bus, None
-        if bus is None:
-            return
-        try:
-            with contextlib.suppress(*_BUS_ERRORS):
-                bus.shutdown()
-        finally:
-            # the slcan bus says goodbye before it closes its port, and skips the second when the first fails
-            if port := getattr(bus, "serialPortOrig", None):
-                with contextlib.suppress(*LINK_ERRORS):
-                    port.close()
+        if bus is not None:
+            with contextlib.suppress(*BUS_ERRORS):
+                close_bus(bus)
 
     def send(self, identifier: int, data: bytes) -> None:
         """Send one data frame. Raises `StreamBroken`."""
@@ -88,7 +94,7 @@ class CanBus:
             raise StreamBroken(f"{self._owner}: closed")
         try:
             self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=_SEND_S)
-        except _BUS_ERRORS as exc:
+        except BUS_ERRORS as exc:
             raise self._broken(exc) from exc
 
     def receive(self, timeout_s: float) -> tuple[int, bytes] | None:

@@ -9,14 +9,14 @@ report saturation, and falls back to calibration slot 0 after every reset: all t
 
 import contextlib
 import logging
-import os
 import time
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import can
 import numpy as np
 from can.interfaces.slcan import slcanBus
 
+from drivers._can import BUS_ERRORS, close_bus, open_bus
 from drivers._stream import LINK_ERRORS, NOTHING, StreamingSensor
 from drivers.ati import codec
 from drivers.ati.calibration import NEWTON, NEWTON_METRE, Calibration, saturated_gauges
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_BUS_ERRORS = (can.CanError, ValueError, *LINK_ERRORS)
 _TRANSACTION_S = 0.1
 _ATTEMPTS = 3
 _POLL_S = 0.05
@@ -98,7 +97,13 @@ class AtiCanSensor(StreamingSensor):
         )
 
     def _connect(self) -> DeviceInfo:
-        self._bus = self._open_bus()
+        self._bus = open_bus(
+            self.name,
+            self._channel,
+            self._interface,
+            self._bitrate,
+            [{"can_id": self._base << 4, "can_mask": 0x7F0, "extended": False}],
+        )
         self._echoes = False
         self._polls = self._missed = self._seen_status = 0
         serial = codec.decode_serial(*self._ask(Op.SERIAL))
@@ -141,42 +146,8 @@ class AtiCanSensor(StreamingSensor):
 
     def _disconnect(self) -> None:
         bus, self._bus = self._bus, None
-        if bus is None:
-            return
-        try:
-            bus.shutdown()
-        finally:
-            # the slcan bus says goodbye before it closes its port, and skips the second when the first fails
-            if port := getattr(bus, "serialPortOrig", None):
-                with contextlib.suppress(*LINK_ERRORS):
-                    port.close()
-
-    def _open_bus(self) -> can.BusABC:
-        options: dict[str, Any] = {}
-        if self._interface == "slcan":
-            # python-can waits 2 s for adapters that reboot when their port is opened; a pseudo-terminal does not
-            tty = os.path.realpath(self._channel.split("@")[0])
-            if not os.access(tty, os.R_OK | os.W_OK):
-                raise ConnectError(f"{self.name}: there is no {self._channel} that may be read and written")
-            if tty.startswith("/dev/pts/"):
-                options["sleep_after_open"] = 0.0
-        filters: list[can.typechecking.CanFilter] = [
-            {"can_id": self._base << 4, "can_mask": 0x7F0, "extended": False},
-        ]
-        try:
-            return can.Bus(
-                self._channel,
-                interface=self._interface,
-                bitrate=self._bitrate,
-                can_filters=filters,
-                ignore_config=True,
-                **options,
-            )
-        except (NotImplementedError, *_BUS_ERRORS) as exc:
-            raise ConnectError(
-                f"{self.name}: the bus does not open ({exc}); is the adapter plugged in, and on socketcan "
-                f"'ip link set {self._channel} up type can bitrate {self._bitrate}' done?"
-            ) from exc
+        if bus is not None:
+            close_bus(bus)
 
     def _select_slot(self) -> None:
         echo = codec.decode_slot(*self._ask(Op.SELECT_SLOT, self._slot))
@@ -243,7 +214,7 @@ class AtiCanSensor(StreamingSensor):
         self._drain()
         try:
             self._bus.send(can.Message(arbitration_id=request_id, data=data, is_extended_id=False), timeout=timeout_s)
-        except _BUS_ERRORS as exc:
+        except BUS_ERRORS as exc:
             raise self._broken(exc) from exc
         deadline = time.monotonic() + timeout_s
         while len(parts) < len(expected) or list(parts) != sorted(parts):

@@ -14,6 +14,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers._crc import crc16_modbus
 from drivers.ati.codec import decode_text
 from drivers.errors import ProtocolError
 from drivers.interfaces import Array
@@ -63,27 +64,10 @@ class Refused(ProtocolError):
     """The device understood a request and refused it; asking again does not help."""
 
 
-def _crc_entry(byte: int) -> int:
-    for _ in range(8):
-        byte = byte >> 1 ^ (0xA001 if byte & 1 else 0)
-    return byte
-
-
-_CRC_TABLE = tuple(_crc_entry(byte) for byte in range(256))
-
-
-def crc16(data: bytes) -> int:
-    """CRC-16/MODBUS; sent low byte first."""
-    crc = 0xFFFF
-    for byte in data:
-        crc = crc >> 8 ^ _CRC_TABLE[(crc ^ byte) & 0xFF]
-    return crc
-
-
 def frame(function: int, payload: bytes) -> bytes:
     """Build a frame to or from the sensor."""
     body = bytes([ADDRESS, function]) + payload
-    return body + crc16(body).to_bytes(2, "little")
+    return body + crc16_modbus(body).to_bytes(2, "little")
 
 
 UNLOCK = frame(STORAGE, b"\xaa")
@@ -122,7 +106,7 @@ def check_reply(request: bytes, reply: bytes) -> bytes:
         Damaged, not the reply to this request, or a refusal (`Refused`).
     """
     text = reply.hex(" ")
-    if len(reply) < 5 or crc16(reply[:-2]) != int.from_bytes(reply[-2:], "little"):
+    if len(reply) < 5 or crc16_modbus(reply[:-2]) != int.from_bytes(reply[-2:], "little"):
         raise ProtocolError(f"reply is damaged ({text or 'empty'}); check baud rate, parity and termination")
     function = request[1]
     if reply[0] == ADDRESS and reply[1] == function | 0x80 and len(reply) == 5:

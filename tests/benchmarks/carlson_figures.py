@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib import carlson, carlson_known
+from calib.model import skew
 
 Array = NDArray[np.float64]
 
@@ -241,7 +242,7 @@ def report_known_direction(report: Report, quick: bool) -> None:
                 )
                 force_N = forces(X, R, 20 * down, 5 * direction(rng), 20 / snr, rng)
                 a = 20 * down @ R - np.mean(20 * down @ R, axis=0)
-                J = np.concatenate([carlson.skew(a), a[:, :, None]], axis=2).reshape(-1, 4)
+                J = np.concatenate([skew(a), a[:, :, None]], axis=2).reshape(-1, 4)
                 bound += np.trace(np.linalg.inv(J.T @ J)[:3, :3]) * (20 / snr) ** 2
                 fits = (
                     carlson_known.similarity(R, force_N, down, bias=True).R_flange_sensor,

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers._crc import crc16_modbus
 from drivers.ati import modbus
 from drivers.errors import ProtocolError
 
@@ -17,7 +18,7 @@ i16 = st.integers(-32768, 32767)
 
 
 def test_crc() -> None:
-    assert modbus.crc16(b"123456789") == 0x4B37
+    assert crc16_modbus(b"123456789") == 0x4B37
 
 
 @pytest.mark.parametrize(
