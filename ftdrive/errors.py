@@ -13,3 +13,7 @@ class NotAccepted(Exception):
 
 class PlanRefused(NotAccepted, CalibError):
     """No motion is proven clear, or a plan was made for something else than what is there now."""
+
+
+class Declined(Exception):
+    """A person said no to what was asked, or nobody was there to answer."""

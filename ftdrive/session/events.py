@@ -1,0 +1,156 @@
+"""What a session tells while it runs: the screen shows these, `--json` writes them, the run folder keeps them."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+SCHEMA_VERSION = 1
+
+
+class State(StrEnum):
+    """Where a session is. Any guard leads from anywhere to STOP, then HOLD, where a person decides."""
+
+    IDLE = "idle"
+    PREFLIGHT = "preflight"
+    APPROACH = "approach"
+    MOVE = "move"
+    SETTLE = "settle"
+    SAMPLE = "sample"
+    CLOSE = "close"
+    REPORT = "report"
+    STOP = "stop"
+    HOLD = "hold"
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Event:
+    """Anything a session tells."""
+
+    t_utc: str = field(default_factory=_now)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give what `--json` writes, one object a line; arrays become lists, NaN and infinity null."""
+        name = "".join(f"-{c.lower()}" if c.isupper() else c for c in type(self).__name__).lstrip("-")
+        return {"schema_version": SCHEMA_VERSION, "event": name} | {
+            key: _plain(value) for key, value in asdict(self).items()
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StateChanged(Event):
+    """The session is in another state."""
+
+    state: State
+    stop: int | None = None
+    """Place in the tour, from 1; the return to the first pose comes last."""
+    stops: int | None = None
+    number: int | None = None
+    """Of the orientation."""
+    words: str = ""
+    """Why, for STOP and HOLD."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Checked(Event):
+    """A preflight check."""
+
+    name: str
+    passed: bool
+    words: str
+    """What was found; for one that failed, what to do."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Noted(Event):
+    """Something a person should know that has no form of its own."""
+
+    words: str
+    warning: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseTaken(Event):
+    """A pose is on disk."""
+
+    stop: int
+    stops: int
+    number: int
+    gravity_flange: Array
+    """(3,) unit vector down, in the flange frame, for a level base."""
+    mean: Array
+    """(6,) N and N·m, as measured."""
+    sigma: Array
+    """(6,) of the mean, N and N·m."""
+    samples: int
+    settle_s: float
+    average_s: float
+    attempts: int
+    steady: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimated(Event):
+    """The running fit over the poses so far. Before it is possible, only the coverage is told."""
+
+    poses: int
+    values: Mapping[str, Any]
+    """By the names of `Parameters` and its derived quantities, SI units; empty before four distinct poses."""
+    sigma: Mapping[str, Any]
+    """One standard deviation each, same names."""
+    residual_sigma: float | None
+    """Of the newest pose: largest of its six residuals over its standard deviation."""
+    residual_force_N: float | None
+    """Of the newest pose: norm."""
+    faces: tuple[int, int, int, int, int, int]
+    """Poses by the flange axis that gravity is nearest to: +x -x +y -y +z -z."""
+    cond9: float
+    cond_u1: float
+    empty_cap_deg: float
+    """Largest angle from any direction of gravity to the nearest one seen."""
+    light: str
+    """green, amber or red: is what was seen enough?"""
+    hint: str
+    """The next pose that would help most, in words; empty when the light is green."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GuardTripped(Event):
+    """A guard has stopped the arm; told after it was stopped."""
+
+    hazard: int
+    """Row of the hazard table."""
+    words: str
+    """What was seen, with the value, and what to do next."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Asked(Event):
+    """A person was asked, and answered."""
+
+    question: str
+    answer: str
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,42 @@
+"""The person beside the robot, as a session sees them: a terminal, a script in a test, or nobody."""
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+from ftdrive.session.events import Event
+
+
+class Key(Enum):
+    """What a person can ask for at any time; the values are the keys of the live screen."""
+
+    KEEP = "k"
+    REDO = "r"
+    SKIP = "s"
+    PAUSE = "p"
+    STOP = "q"
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question that the session waits for."""
+
+    text: str
+    """Complete, with what the answers mean."""
+    answers: tuple[str, ...] = ("yes", "no")
+    """What may be answered; a single one must be typed in full and is never assumed."""
+    assumed: str | None = None
+    """What `--yes` answers; None when a person must."""
+
+
+class Operator(Protocol):
+    """Whoever runs the session."""
+
+    def tell(self, event: Event) -> None:
+        """Show an event; returns at once."""
+
+    def ask(self, question: Question) -> str:
+        """Return one of the question's answers, waiting as long as it takes; raises `Declined` when there is nobody."""
+
+    def pressed(self) -> Key | None:
+        """Take the oldest key that was pressed and not yet taken; returns at once."""
