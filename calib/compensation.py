@@ -7,19 +7,19 @@ For given parameters the expected wrench is affine in the nine entries of R_base
 which is `wrench - predict(parameters, R_base_flange)` of `calib.model` with everything constant computed once.
 """
 
+import ctypes
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-from scipy.linalg.blas import dgemm, sgemm
+from scipy.linalg import cython_blas
 
 from calib.model import Parameters, skew
 
 Reals = NDArray[np.floating[Any]]
 
-CHUNK_ROWS = 4096  # in and out stay in the second-level cache, and OpenBLAS does not wake its threads for it
+CHUNK_ROWS = 9600  # in and out stay in the caches of one core, and OpenBLAS does not wake its threads for it
 
 
 class Compensator:
@@ -54,9 +54,8 @@ class Compensator:
         self.offset: Reals = offset.astype(self.dtype)
         self.matrix.setflags(write=False)
         self.offset.setflags(write=False)
-        self._transposed: Reals = np.ascontiguousarray(self.matrix.T)
         self._tiled_offset: Reals = np.tile(self.offset, (CHUNK_ROWS, 1))  # broadcasting six numbers is slow
-        self._gemm = dgemm if self.dtype == np.float64 else sgemm
+        self._subtract_product = _SubtractProduct(np.ascontiguousarray(self.matrix.T))
         # One sample is a single product with (wrench, vec(R_base_flange), 1).
         self._product = np.concatenate([np.eye(6), -matrix, -offset[:, None]], axis=1).astype(self.dtype).dot
         self._operand: Reals = np.zeros(16, self.dtype)
@@ -141,32 +140,51 @@ class Compensator:
         if not out.flags.c_contiguous:
             raise ValueError(f"out has strides {out.strides}, expected a contiguous array")
         entries = R_base_flange.reshape(n, 9)
-        if threads == 1:
-            self._rows(wrench, entries, out)
-            return out
+        wrench, entries = np.ascontiguousarray(wrench), np.ascontiguousarray(entries)
+        first, *others = (slice(n * k // threads, n * (k + 1) // threads) for k in range(threads))
         with ThreadPoolExecutor(threads) as pool:
-            bounds = [n * k // threads for k in range(threads + 1)]
-            spans = [slice(start, stop) for start, stop in pairwise(bounds)]
-            jobs = [pool.submit(self._rows_beside_others, wrench[s], entries[s], out[s]) for s in spans]
+            jobs = [pool.submit(self._rows, wrench[rows], entries[rows], out[rows]) for rows in others]
+            self._rows(wrench[first], entries[first], out[first])
             for job in jobs:
                 job.result()
         return out
 
     def _rows(self, wrench: Reals, entries: Reals, out: Reals) -> None:
-        """One subtraction and one product a chunk; BLAS adds the product to what is there. Holds the interpreter."""
+        """One subtraction and one product a chunk; other threads run beside both."""
+        at_entries, at_out = entries.ctypes.data, out.ctypes.data
         for i in range(0, len(out), CHUNK_ROWS):
             part = out[i : i + CHUNK_ROWS]
             np.subtract(wrench[i : i + CHUNK_ROWS], self._tiled_offset[: len(part)], out=part)
-            self._gemm(-1.0, self._transposed.T, entries[i : i + CHUNK_ROWS].T, 1.0, part.T, overwrite_c=True)
+            self._subtract_product(at_entries + i * entries.strides[0], len(part), at_out + i * out.strides[0])
 
-    def _rows_beside_others(self, wrench: Reals, entries: Reals, out: Reals) -> None:
-        """The same with a product that lets other threads run, which is a pass over the chunk slower on its own."""
-        expected = np.empty((min(CHUNK_ROWS, len(out)), 6), self.dtype)
-        for i in range(0, len(out), CHUNK_ROWS):
-            part = expected[: len(out) - i]
-            np.matmul(entries[i : i + CHUNK_ROWS], self._transposed, out=part)
-            np.add(part, self._tiled_offset[: len(part)], out=part)
-            np.subtract(wrench[i : i + CHUNK_ROWS], part, out=out[i : i + CHUNK_ROWS])
+
+class _SubtractProduct:
+    """`out -= rows @ matrix`, by the BLAS that SciPy brings, for contiguous arrays of one type.
+
+    Through the function pointer that `scipy.linalg.cython_blas` exports: ctypes lets other threads run during the call,
+    which SciPy's own wrappers do not, and numpy's product cannot add to what is there.
+    """
+
+    def __init__(self, matrix: Reals) -> None:
+        exported, real = cython_blas.__pyx_capi__, ctypes.c_double if matrix.dtype == np.float64 else ctypes.c_float
+        capsule = exported["dgemm"] if real is ctypes.c_double else exported["sgemm"]
+        python = ctypes.pythonapi
+        name_of = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(("PyCapsule_GetName", python))
+        address_of = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
+            ("PyCapsule_GetPointer", python)
+        )
+        self._gemm = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 13)(address_of(capsule, name_of(capsule)))
+        k, m = matrix.shape
+        # On a little-endian machine 64 bits hold sizes for a BLAS of either width.
+        self._kept = matrix, ctypes.c_char(b"N"), ctypes.c_int64(k), ctypes.c_int64(m), real(-1), real(1)
+        self._at = matrix.ctypes.data, *map(ctypes.addressof, self._kept[1:])
+
+    def __call__(self, at_rows: int, n: int, at_out: int) -> None:
+        """Subtract for n rows, both arrays given by their addresses."""
+        # BLAS counts by columns: it sees the transposed arrays, and the product with its factors exchanged.
+        matrix, no, k, m, minus, one = self._at
+        count = ctypes.c_int64(n)  # lives until the call has ended
+        self._gemm(no, no, m, ctypes.addressof(count), k, minus, matrix, m, at_rows, k, one, at_out, m)
 
 
 def _check_shapes(wrench: Reals, R_base_flange: Reals) -> None:
