@@ -10,6 +10,8 @@ from calib.model import Array
 
 LEAST_SAMPLES = 20
 
+CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
+
 # What a sensor that shows no noise at all is still trusted to: 1 mN, and as much torque at 25 mm, the usual ratio.
 RESOLUTION = np.repeat([1e-3, 2.5e-5], 3)
 
@@ -51,7 +53,7 @@ def mean_and_covariance(wrench: Array) -> PoseMean:
     BadDataset
         Too few samples, or a value that is not finite.
     """
-    wrench = _checked(wrench)
+    wrench = checked(wrench)
     N = len(wrench)
     mean = wrench.mean(axis=0)
     noise = wrench - mean
@@ -59,7 +61,7 @@ def mean_and_covariance(wrench: Array) -> PoseMean:
     S = noise.T @ noise / (N - 1)
     std = np.sqrt(np.diag(S))
     tau = _autocorrelation_time(noise)
-    variance = tau * std**2 / N + _quantisation_variance(wrench, std)
+    variance = tau * std**2 / N + quantisation_variance(wrench, std)
     for kind in (slice(0, 3), slice(3, 6)):  # a channel without noise is trusted like its noisiest neighbour
         silent = variance[kind] == 0
         variance[kind][silent] = variance[kind].max() or RESOLUTION[kind][silent] ** 2
@@ -88,7 +90,7 @@ def is_stationary(wrench: Array) -> bool:
     BadDataset
         Too few samples, or a value that is not finite.
     """
-    wrench = _checked(wrench)
+    wrench = checked(wrench)
     size = len(wrench) // 20
     batches = wrench[: 20 * size].reshape(2, 10, size, 6).mean(axis=2)
     difference = np.abs(np.diff(batches.mean(axis=1), axis=0)[0])
@@ -97,7 +99,8 @@ def is_stationary(wrench: Array) -> bool:
     return bool((difference <= QUIET * standard_error + rounding).all())
 
 
-def _checked(wrench: Array) -> Array:
+def checked(wrench: Array) -> Array:
+    """Give (N, 6) samples that can be judged, N >= 20 and all finite; raises `BadDataset`."""
     wrench = np.asarray(wrench, dtype=np.float64)
     if wrench.ndim != 2 or wrench.shape[1] != 6 or len(wrench) < LEAST_SAMPLES:
         raise BadDataset(f"a dwell has shape {wrench.shape}, expected (N, 6) with N >= {LEAST_SAMPLES}: record longer.")
@@ -121,7 +124,7 @@ def _autocorrelation_time(noise: Array) -> Array:
     return np.maximum(tau, 0.1)
 
 
-def _quantisation_variance(wrench: Array, std: Array) -> Array:
+def quantisation_variance(wrench: Array, std: Array) -> Array:
     """Variance (6,) of the error that rounding to steps leaves in a mean: q²/12 without noise, none with enough of it.
 
     Gaussian noise of sigma dithers the error away by exp(-4 pi² sigma² / q²) (Widrow, Kollar, Quantization Noise,
