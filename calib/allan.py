@@ -136,7 +136,7 @@ def averaging_time(wrench: Array, rate_Hz: float, *, target_force_N: float, targ
             words += f"that would take {needed_s:.2g} s; take more poses"
         else:
             words += f"a record of {len(wrench) / rate_Hz:.0f} s judges no longer averages; take 30 s or more"
-    return AveragingTime(float(times_s[best]), sigma[best], floor, reached, words)
+    return AveragingTime(round(float(times_s[best]), 1), sigma[best], floor, reached, words)
 
 
 def _in_words(sigma: Array) -> str:
