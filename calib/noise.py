@@ -129,9 +129,9 @@ def noise_level(wrench: Array, window: int) -> Array:
 def is_quiet(wrench: Array, level: Array) -> bool:
     """Tell whether a dwell is stationary and scatters no more than twice as much as the sensor left alone.
 
-    The scatter shows what equal halves hide: a vibration, a hand on the tool, a short jolt. Pure noise never doubles, so
-    quiet dwells fail as seldom as in `is_stationary`: of 2 s at 500 Hz 0.15 % of white noise, 0.4 % behind a low-pass
-    of 10 Hz, 0.9 % of 5 Hz, 6 % of 2 Hz, where 2 s hold few independent samples.
+    The scatter shows what equal halves hide: a vibration, a hand on the tool, a short jolt. Pure noise never doubles,
+    so quiet dwells fail as seldom as in `is_stationary`: of 2 s at 500 Hz 0.15 % of white noise, 0.4 % behind a
+    low-pass of 10 Hz, 0.9 % of 5 Hz, 6 % of 2 Hz, where 2 s hold few independent samples.
 
     Parameters
     ----------
