@@ -13,8 +13,7 @@ from calib import solve
 from calib.routine import PoseRecord, dataset_from, drift_check
 from calib.tour import TourPose, wrist_tour
 from drivers.errors import StreamBroken
-from drivers.interfaces import ArmState
-from drivers.ur.arm import UrArm
+from drivers.interfaces import ArmState, RobotArm
 from ftdrive.report import errors_in_sigma
 from ftdrive.runs import Run
 from ftdrive.session.events import Estimated, Event, PoseTaken
@@ -40,7 +39,7 @@ class Program:
 class Mover:
     """The other client: takes the arm from pose to pose, and on as soon as each was measured."""
 
-    def __init__(self, arm: UrArm, stops: Sequence[TourPose]) -> None:
+    def __init__(self, arm: RobotArm, stops: Sequence[TourPose]) -> None:
         self._arm, self._stops = arm, stops
         self._taken = threading.Semaphore(0)
         self._over = threading.Event()
@@ -73,7 +72,7 @@ class Mover:
 class Spectator:
     """Our arm, for reading only."""
 
-    def __init__(self, arm: UrArm, mover: Mover) -> None:
+    def __init__(self, arm: RobotArm, mover: Mover) -> None:
         self._arm, self._mover = arm, mover
 
     def state(self) -> ArmState:

@@ -313,8 +313,9 @@ def test_a_hand_on_the_tool_is_named_and_the_pose_taken_again() -> None:
     outcome = Outcome([Dwell(UP), Dwell(DOWN, 9.0, wrench=trembling), Dwell(LEFT)])
     assert outcome.stops == [1, 2, 3]
     assert all(record.steady for record in outcome.kept)
-    assert re.search(r"Pose 2 is not quiet: fy scatters by 1\.\d N, at its quietest by 0\.0[45]", outcome.person.words())
-    assert "Let go of tool and cable." in outcome.person.words()
+    words = outcome.person.words()
+    assert re.search(r"Pose 2 is not quiet: fy scatters by 1\.\d N, at its quietest by 0\.0[45]", words)
+    assert "Let go of tool and cable." in words
     assert [event.attempts for event in outcome.person.told if isinstance(event, PoseTaken)] == [1, 2, 1]
     assert np.abs(outcome.kept[1].mean.mean[1] - BIAS[1]) < 0.05  # without the hand
 
