@@ -8,6 +8,7 @@ from scipy.signal import lfilter
 
 from calib import BadDataset, is_stationary, mean_and_covariance
 from calib.model import Array
+from calib.noise import QUIET, is_quiet, noise_level, restless_channels
 
 
 def noise(rng: np.random.Generator, N: int, rho: Array) -> Array:
@@ -108,6 +109,83 @@ def test_constant_channels_are_quiet_and_a_step_between_constants_is_not() -> No
     assert is_stationary(samples)
     samples[50:, 3] = 0.2
     assert not is_stationary(samples)
+
+
+def filtered(rng: np.random.Generator, seconds: float, corner_Hz: float) -> Array:
+    """White noise of a 500 Hz sensor behind a low-pass of first order; the beginning is forgotten."""
+    keep = np.exp(-2 * np.pi * corner_Hz / 500)
+    samples: Array = lfilter([1 - keep], [1, -keep], rng.normal(size=(int(500 * (seconds + 2)), 6)), axis=0)[1000:]
+    return samples
+
+
+@pytest.mark.parametrize("corner_Hz", [1e9, 20, 10, 5])
+def test_a_sensor_left_alone_is_quiet(corner_Hz: float) -> None:
+    rng = np.random.default_rng(17)
+    level = noise_level(filtered(rng, 20, corner_Hz), 1000)
+    alarms = np.mean([not is_quiet(filtered(rng, 2, corner_Hz), level) for _ in range(600)])
+    assert alarms < 0.015
+
+
+def test_three_standard_errors_would_reject_too_many_quiet_dwells() -> None:
+    """Why the threshold is wider than that."""
+    rng = np.random.default_rng(18)
+
+    def alarms(threshold: float, corner_Hz: float) -> float:
+        found = 0
+        for _ in range(500):
+            halves = filtered(rng, 2, corner_Hz).reshape(2, 10, 50, 6).mean(axis=2)
+            error = np.sqrt(halves.var(axis=1, ddof=1).sum(axis=0) / 10)
+            found += bool((np.abs(np.diff(halves.mean(axis=1), axis=0)[0]) > threshold * error).any())
+        return found / 500
+
+    assert alarms(3, 1e9) > 0.02
+    assert alarms(3, 5) > 0.08
+    assert alarms(QUIET, 1e9) < 0.01
+    assert alarms(QUIET, 5) < 0.02
+
+
+@pytest.mark.parametrize(
+    "disturbance",
+    [
+        4 * np.sin(2 * np.pi * 7 * np.arange(1000) / 500),  # vibration
+        np.where(np.arange(1000) // 50 == 4, 15.0, 0.0),  # a jolt of a tenth of a second
+        6 * np.sin(2 * np.pi * np.arange(1000) / 1000) ** 2 * np.sin(np.arange(1000) / 20),  # a hand
+    ],
+)
+def test_what_stationary_halves_hide_is_not_quiet(disturbance: Array) -> None:
+    rng = np.random.default_rng(19)
+    level = noise_level(rng.normal(size=(10_000, 6)), 1000)
+    for channel in range(6):
+        samples = rng.normal(size=(1000, 6))
+        assert is_quiet(samples, level)
+        samples[:, channel] += disturbance
+        assert is_stationary(samples)
+        assert not is_quiet(samples, level)
+        assert np.flatnonzero(restless_channels(samples, level)).tolist() == [channel]
+
+
+def test_the_noise_level_ignores_a_touch_and_a_slow_drift() -> None:
+    rng = np.random.default_rng(20)
+    samples = rng.normal(size=(30_000, 6)) + np.linspace(0, 10, 30_000)[:, None]
+    samples[4000:7000, 2] += 40 * rng.normal(size=3000)
+    np.testing.assert_allclose(noise_level(samples, 1000), 1.0, atol=0.1)
+
+
+def test_a_coarse_sensor_may_flicker_between_two_numbers() -> None:
+    level = noise_level(np.full((1000, 6), 0.3), 100)
+    np.testing.assert_allclose(level, 0, atol=1e-12)
+    samples = np.full((200, 6), 0.3)
+    samples[::7, 4] = 0.4
+    assert is_quiet(samples, level)
+    samples[::14, 4] = 0.2
+    samples[3::14, 4] = 0.6
+    assert not is_quiet(samples, level)
+
+
+@pytest.mark.parametrize("window", [19, 201])
+def test_a_window_must_fit_the_record(window: int) -> None:
+    with pytest.raises(BadDataset, match="record of 200"):
+        noise_level(np.zeros((200, 6)), window)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,176 @@
+"""Somebody else moves the emulated arm while the session only looks: over real wires, to a result within its sigmas."""
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import solve
+from calib.routine import PoseRecord, dataset_from, drift_check
+from calib.tour import TourPose, wrist_tour
+from drivers.errors import StreamBroken
+from drivers.interfaces import ArmState, RobotArm
+from ftdrive.report import errors_in_sigma
+from ftdrive.runs import Run
+from ftdrive.session.events import Estimated, Event, PoseTaken
+from ftdrive.session.manual import collect_manually
+from ftdrive.session.operator import Key, Question
+from ftdrive.simulation import Station
+from ftdrive.wiring import build_arm, build_sensor
+
+pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
+
+QUICK = (2, 4, 5, 7, 10, 12, 13, 15, 18, 20, 21, 23)
+"""Of the paper's 24 orientations, as well conditioned as all of them."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """What the controller says of it."""
+
+    program: str
+    fault: str | None = None
+
+
+class Mover:
+    """The other client: takes the arm from pose to pose, and on as soon as each was measured."""
+
+    def __init__(self, arm: RobotArm, stops: Sequence[TourPose]) -> None:
+        self._arm, self._stops = arm, stops
+        self._taken = threading.Semaphore(0)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="mover")
+
+    def _run(self) -> None:
+        for stop in self._stops:
+            self._arm.move_to([float(angle) for angle in stop.q_rad], timeout_s=10, guard=lambda: None)
+            if not self._taken.acquire(timeout=10) or self._over.is_set():
+                return
+        self._over.wait(10)
+
+    @property
+    def plays(self) -> bool:
+        return self._thread.is_alive()
+
+    def measured(self) -> None:
+        self._taken.release()
+
+    def __enter__(self) -> "Mover":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._taken.release()
+        self._thread.join(15)
+
+
+class Spectator:
+    """Our arm, for reading only."""
+
+    def __init__(self, arm: RobotArm, mover: Mover) -> None:
+        self._arm, self._mover = arm, mover
+
+    def state(self) -> ArmState:
+        return self._arm.state()
+
+    def status(self) -> Program:
+        return Program("playing" if self._mover.plays else "stopped")
+
+
+class Person:
+    """Lets the mover go on after each pose, and presses k when `enough` were taken."""
+
+    def __init__(self, taken: Callable[[], None], enough: int | None) -> None:
+        self._taken, self._enough = taken, enough
+        self.poses = 0
+
+    def tell(self, event: Event) -> None:
+        if isinstance(event, PoseTaken):
+            self.poses += 1
+            self._taken()
+
+    def ask(self, question: Question) -> str:
+        raise AssertionError(question)
+
+    def pressed(self) -> Key | None:
+        return Key.KEEP if self.poses == self._enough else None
+
+
+class Fit:
+    """Enough from the sixth pose on."""
+
+    def __init__(self) -> None:
+        self._poses = 0
+
+    def add(self, record: PoseRecord) -> Estimated:
+        self._poses = max(self._poses, record.stop)
+        return Estimated(
+            poses=self._poses,
+            values={},
+            sigma={},
+            residual_sigma=None,
+            residual_force_N=None,
+            faces=(0, 0, 0, 0, 0, 0),
+            cond9=1.0,
+            cond_u1=1.0,
+            empty_cap_deg=1.0,
+            light="green" if self._poses >= 6 else "amber",
+            hint="",
+        )
+
+
+@pytest.fixture
+def station() -> Iterator[Station]:
+    with Station("can", ["--seed", "11"]) as station:
+        yield station
+
+
+def watch(station: Station, run: Run, *, listen: bool, commit: Callable[[PoseRecord], None] | None = None) -> None:
+    """Collect while the other client takes the arm through some poses and back to the first."""
+    cell = station.cell
+    with closing(build_arm(cell)) as theirs, closing(build_arm(cell)) as ours, build_sensor(cell) as sensor:
+        theirs.open(control=True)
+        ours.open()
+        tour = [pose for pose in wrist_tour(ours.state().q_rad) if pose.number in QUICK][: 12 if listen else 8]
+        mover = Mover(theirs, [*tour, tour[0]])
+        person = Person(mover.measured, None if listen else len(tour))
+        with mover:
+            arm = Spectator(ours, mover)
+            collect_manually(arm, sensor, cell.sampling, person, Fit(), commit or run.commit, listen=listen)
+            assert mover.plays  # it was we who found the end
+
+
+@pytest.mark.parametrize("listen", [True, False])
+def test_watching_finds_the_truth(station: Station, listen: bool, tmp_path: Path) -> None:
+    run = Run.create(tmp_path, "manual", {})
+    watch(station, run, listen=listen)
+    records = run.records()
+    assert all(record.steady for record in records)
+    assert [record.stop for record in records] == list(range(1, 14 if listen else 9))
+    dataset = dataset_from(records, {})
+    assert len(dataset) == (12 if listen else 8)
+    result = solve(dataset)
+    for name, errors in errors_in_sigma(result, station.truth).items():
+        assert np.abs(errors).max() < 4, name
+    drift = drift_check(records)
+    assert (drift is not None) == listen
+    if drift is not None:
+        assert np.all(np.abs(drift.change) < 4.5 * drift.sigma)
+
+
+def test_a_lost_sensor_ends_it_with_the_poses_on_disk(station: Station, tmp_path: Path) -> None:
+    run = Run.create(tmp_path, "manual", {})
+
+    def commit(record: PoseRecord) -> None:
+        run.commit(record)
+        if record.stop == 2:
+            station.control(do="unplug", device="sensor")
+
+    with pytest.raises(StreamBroken):
+        watch(station, run, listen=True, commit=commit)
+    assert len(run.records()) == 2
