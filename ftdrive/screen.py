@@ -1,0 +1,403 @@
+"""The live screen of a session: where it stands, what it knows by now, what it lacks, and the keys."""
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, field
+from threading import RLock
+from types import TracebackType
+from typing import Self, TextIO
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from rich.console import Console, Group
+from rich.live import Live
+from rich.text import Text
+from scipy.spatial.transform import Rotation
+
+from calib.routine import DriftCheck
+from ftdrive.keyboard import Keyboard
+from ftdrive.report import drift_in_words
+from ftdrive.session.events import (
+    Checked,
+    Estimated,
+    Event,
+    GuardTripped,
+    Noted,
+    PoseTaken,
+    RunOpened,
+    State,
+    StateChanged,
+)
+from ftdrive.session.operator import Key, Operator, Question
+from ftdrive.session.operators import JsonOperator, PlainOperator, choices, in_words, match, read_line, rms_sigma
+from ftdrive.session.running import GREEN
+
+Array = NDArray[np.float64]
+
+REFRESH_HZ = 4
+KEYS = {Key.KEEP: "keep", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "stop"}
+
+# Label and unit, factor from SI to it, name.
+_ROWS = (
+    ("mass kg", 1.0, "mass_kg"),
+    ("centre mm", 1e3, "p_sensor_com_m"),
+    ("F bias N", 1.0, "force_bias_N"),
+    ("T bias N·m", 1.0, "torque_bias_Nm"),
+    ("mounting deg", 180 / np.pi, "R_flange_sensor"),
+    ("tilt a deg", 180 / np.pi, "tilt_alpha_rad"),
+    ("tilt b deg", 180 / np.pi, "tilt_beta_rad"),
+)
+_COLOUR = {"green": "bold green", "amber": "bold yellow", "red": "bold red"}
+_FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
+_CUBE_WIDTH = 25
+_TABLE_WIDTH = 53
+_ASCII = str.maketrans(
+    dict(zip("┌┐└┘├┤┬┴┼─│", "+++++++++-|", strict=True)) | {"±": "+-", "°": " deg", "·": ".", "…": "~"}
+)
+
+
+@dataclass
+class View:
+    """What the screen knows."""
+
+    now: StateChanged | None = None
+    since_s: float = 0.0
+    """When the state began, of the clock that `frame` is given."""
+    folder: str = ""
+    resume: str = ""
+    taken: dict[int, tuple[PoseTaken, float]] = field(default_factory=dict)
+    """By stop, with the time."""
+    last: PoseTaken | None = None
+    estimated: Estimated | None = None
+    drift: DriftCheck | None = None
+    note: str = ""
+    waiting: tuple[Key, ...] = ()
+
+    def update(self, event: Event, now_s: float) -> None:
+        """Take an event in."""
+        match event:
+            case RunOpened():
+                self.folder, self.resume = event.folder, event.resume
+            case StateChanged():
+                self.now, self.since_s = event, now_s
+            case PoseTaken():
+                self._take(event, now_s)
+            case Estimated():
+                self.estimated = event
+            case Noted(warning=True) | GuardTripped():
+                self.note = in_words(event)
+
+    def _take(self, event: PoseTaken, now_s: float) -> None:
+        self.taken[event.stop] = event, now_s
+        self.last = event
+        first, first_s = self.taken[min(self.taken)]
+        if event.number == first.number and event.stop != first.stop:
+            sigma = np.hypot(first.sigma, event.sigma)
+            self.drift = DriftCheck(np.subtract(event.mean, first.mean), sigma, now_s - first_s)
+
+
+def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Group:
+    """Draw the screen: never wider than `width`, never higher than `height` less one line for the cursor.
+
+    Where there is not enough room the picture of the coverage goes first, then what is said elsewhere too.
+    """
+    wide = width >= _TABLE_WIDTH + 1 + _CUBE_WIDTH
+    blocks: list[tuple[int, list[Text]]] = [
+        (0, [_title(view, now_s, width)]),
+        (0, [_state(view, now_s)]),
+        (2, _last(view)),
+        (6, [_rule(width)]),
+        *_estimates(view, with_cube=wide and height > 20),
+        (1, _coverage(view)),
+        (4, [_drift(view)]),
+        (3, [Text(view.note, "bold red" if view.note.startswith("STOP") else "yellow")] if view.note else []),
+        (6, [_rule(width)]),
+        (0, [_keys(view)]),
+        (0, _kept(view, width)),
+    ]
+    while sum(len(lines) for _, lines in blocks) > height - 1 and max(importance for importance, _ in blocks) > 0:
+        least = max(range(len(blocks)), key=lambda k: blocks[k][0])
+        del blocks[least]
+    lines = [line for _, some in blocks for line in some]
+    for line in lines:
+        line.no_wrap, line.overflow = True, "crop"
+        line.truncate(width, overflow="ellipsis")
+    return Group(*lines)
+
+
+def _title(view: View, now_s: float, width: int) -> Text:
+    times_s = sorted(at_s for _, at_s in view.taken.values())
+    right = f"{len(view.taken)} kept"
+    stops = view.last.stops if view.last else 0
+    left = stops - len(view.taken)
+    if len(times_s) > 2 and left > 0:
+        rest_s = max((times_s[-1] - times_s[0]) / (len(times_s) - 1) * left - (now_s - times_s[-1]), 0.0)
+        right += f", about {_minutes(rest_s)} left"
+    name = "ftdrive calibrate"
+    return Text.assemble((name, "bold"), " " * max(width - len(name) - len(right), 2), right)
+
+
+def _state(view: View, now_s: float) -> Text:
+    now = view.now
+    if now is None:
+        return Text("starting")
+    line = Text()
+    if now.stop is not None:
+        line.append(f"pose {now.stop}/{now.stops}" if now.stops is not None else f"pose {now.stop}", "bold")
+        line.append(f" R{now.number:02d}  " if now.number is not None else "  ")
+    stopped = now.state in {State.STOP, State.HOLD}
+    line.append(now.state.upper(), "bold red" if stopped else "bold cyan")
+    line.append(f"  {_minutes(now_s - view.since_s)}" if now.state is not State.HOLD else "")
+    line.append(f"  {now.words}" if now.words else "")
+    return line
+
+
+def _last(view: View) -> list[Text]:
+    pose, fit = view.last, view.estimated
+    if pose is None:
+        return []
+    force_N, torque_Nm = rms_sigma(pose)
+    line = Text(
+        f"R{pose.number:02d}: settled {pose.settle_s:.1f} s, {pose.samples} samples, "
+        f"sigma {force_N:.2g} N {torque_Nm:.2g} N·m"
+    )
+    if pose.attempts > 1:
+        line.append(f", {pose.attempts} tries")
+    if not pose.steady:
+        line.append(", NOT STEADY", "bold yellow")
+    if fit is None or fit.residual_sigma is None or fit.residual_force_N is None:
+        return [line, Text("     residual: no fit before it", "dim")]
+    off = fit.residual_sigma > 5
+    residual = Text("     residual ")
+    residual.append(f"{fit.residual_force_N:.3f} N, {fit.residual_sigma:.1f} sigma", "bold yellow" if off else "")
+    residual.append(" OUT OF LINE: press r to redo" if off else " against the fit before it")
+    return [line, residual]
+
+
+def _estimates(view: View, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
+    """Estimates at the left; the cube beside them, or its counts in a line below."""
+    fit = view.estimated
+    rows = [Text(f"{'estimate':<13}{'':27}{'± 1 sigma':>12}", "dim")]
+    rows += [_estimate(fit, *row) for row in _ROWS]
+    newest = view.last.gravity_flange if view.last else None
+    counts = (0,) * 6 if fit is None else fit.faces
+    if with_cube:
+        cube = [Text("gravity by flange axis", "dim"), *(Text(line) for line in _cube(counts, newest))]
+        for row, picture in zip(rows, cube, strict=True):
+            row.truncate(_TABLE_WIDTH, pad=True)
+            row.append(" ")
+            row.append_text(picture)
+        return [(0, rows)]
+    seen = "   ".join(f"{name} {count}" for name, count in zip(_FACES, counts, strict=True))
+    return [(5, rows[:1]), (0, rows[1:]), (2, [Text(f"gravity by flange axis:  {seen}")])]
+
+
+def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Text:
+    if fit is None or name not in fit.values:
+        return Text(f"{label:<13}{'-':>9}")
+    value: ArrayLike = fit.values[name]
+    if name == "R_flange_sensor":
+        value = Rotation.from_matrix(np.asarray(value)).as_rotvec()
+    values, sigma = factor * np.atleast_1d(value), factor * float(np.max(fit.sigma[name]))
+    digits = int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 5))
+    numbers = "".join(f"{one:9.{digits}f}" for one in values)
+    return Text(f"{label:<13}{numbers:<27}  ± {sigma:<.{digits}f}")
+
+
+def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
+    """Unfold the cube of the flange axes: how many poses had gravity along each; `*` is the newest."""
+    face = None
+    if newest is not None:
+        axis = int(np.abs(newest).argmax())
+        face = 2 * axis + int(newest[axis] < 0)
+    cells = {
+        name: f"{name}{count or '-':>2}{'*' if k == face else ' '}"
+        for k, (name, count) in enumerate(zip(_FACES, counts, strict=True))
+    }
+    return [
+        "      ┌─────┐",
+        f"      │{cells['+y']}│",
+        "┌─────┼─────┼─────┬─────┐",
+        f"│{cells['-x']}│{cells['+z']}│{cells['+x']}│{cells['-z']}│",
+        "└─────┼─────┼─────┴─────┘",
+        f"      │{cells['-y']}│",
+        "      └─────┘",
+    ]
+
+
+def _coverage(view: View) -> list[Text]:
+    fit = view.estimated
+    if fit is None:
+        return [Text("coverage  nothing yet", "dim")]
+    line = Text("coverage  ")
+    line.append(fit.light.upper(), _COLOUR.get(fit.light, "bold"))
+    for name, what in (("cond9", "condition"), ("cond_u1", "out of plane")):
+        value, goal = getattr(fit, name), GREEN[name]
+        line.append(f"   {what} {value:.1f}" if np.isfinite(value) else f"   {what} none")
+        line.append("" if value <= goal else f" (goal {goal:g})")
+    line.append(f"   gap {fit.empty_cap_deg:.0f}°")
+    return [line, Text(f"helps most: {fit.hint}", "italic")] if fit.hint else [line]
+
+
+def _drift(view: View) -> Text:
+    fit = view.estimated
+    if view.drift is not None:
+        words, bad = drift_in_words(view.drift)
+        return Text(f"drift  {words}", "bold yellow" if bad else "")
+    if fit is None or not fit.values:
+        return Text("drift  not known before the fit", "dim")
+    if "drift" not in fit.values:
+        return Text("drift  none seen so far")
+    change, sigma = fit.values["drift"], fit.sigma["drift"]
+    force_N, torque_Nm = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
+    return Text(f"drift  {force_N:.3f} ± {np.max(sigma[:3]):.3f} N, {torque_Nm:.4f} N·m since the first pose", "yellow")
+
+
+def _keys(view: View) -> Text:
+    line = Text()
+    for key, word in KEYS.items():
+        line.append(f" {key.value} ", "reverse")
+        line.append(f" {word.upper()} asked  " if key in view.waiting else f" {word}  ")
+    line.append("Ctrl-C ends, poses are kept")
+    return line
+
+
+def _kept(view: View, width: int) -> list[Text]:
+    if not view.folder:
+        return [Text("nothing is kept yet: there is no run", "dim")]
+    return [
+        Text("kept in " + _end_of(view.folder, width - 8)),
+        Text("resume  " + _end_of(view.resume, width - 8)),
+    ]
+
+
+def _rule(width: int) -> Text:
+    return Text("─" * width, "dim")
+
+
+def _end_of(text: str, width: int) -> str:
+    """Shorten a path at its beginning: the end tells runs apart."""
+    return text if len(text) <= width else "…" + text[len(text) - width + 1 :]
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds:.1f} s" if seconds < 59.95 else f"{int(seconds) // 60}:{int(seconds) % 60:02d} min"
+
+
+class Screen:
+    """An operator at a terminal: the frame below, what happened above it, questions in between.
+
+    Parameters
+    ----------
+    console : rich Console
+        Where it is drawn; a terminal.
+    keyboard : Keyboard, optional
+        None: no keys; questions are answered by lines all the same.
+    yes : bool
+        Take what questions assume, where they assume something.
+    """
+
+    def __init__(
+        self,
+        console: Console,
+        keyboard: Keyboard | None = None,
+        *,
+        yes: bool = False,
+        stdin: TextIO | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._console, self._keyboard, self._yes, self._stdin = console, keyboard, yes, stdin or sys.stdin
+        self._clock = clock
+        self._view = View()
+        self._lock = RLock()
+        self._live = Live(console=console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            if self._keyboard is not None:
+                stack.enter_context(self._keyboard)
+            stack.callback(self._live.stop)
+            self._live.start()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def tell(self, event: Event) -> None:
+        """Show an event."""
+        with self._lock:
+            self._view.update(event, self._clock())
+        if _history(event) and (words := in_words(event)):
+            style = "bold red" if isinstance(event, GuardTripped) else ""
+            self._console.print(self._plain(Text(words, style)))
+
+    def ask(self, question: Question) -> str:
+        """Take the frame away, ask, and draw it again."""
+        if self._yes and question.assumed is not None:
+            return question.assumed
+        self._live.transient = True
+        self._live.stop()
+        try:
+            with self._keyboard.suspended() if self._keyboard is not None else nullcontext():
+                return self._answer(question)
+        finally:
+            self._live.transient = False
+            self._live.start(refresh=True)
+
+    def pressed(self) -> Key | None:
+        """Take the oldest key that was pressed and not yet taken."""
+        return None if self._keyboard is None else self._keyboard.pressed()
+
+    def _answer(self, question: Question) -> str:
+        while True:
+            prompt = Text.assemble((question.text, "bold"), f" [{choices(question)}] ")
+            self._console.print(self._plain(prompt), end="")
+            typed = read_line(self._stdin, question)
+            if (answer := match(question, typed)) is not None:
+                return answer
+            self._console.print(self._plain(Text(f"'{typed.strip()}' is none of the answers.")))
+
+    def _frame(self) -> Group:
+        size = self._console.size
+        with self._lock:
+            self._view.waiting = () if self._keyboard is None else self._keyboard.waiting
+            group = frame(self._view, self._clock(), width=size.width, height=size.height)
+        return Group(*(self._plain(line) for line in group.renderables if isinstance(line, Text)))
+
+    def _plain(self, text: Text) -> Text:
+        """Replace what the terminal's encoding lacks."""
+        if self._console.options.ascii_only:
+            text.plain = text.plain.translate(_ASCII)
+        return text
+
+
+def _history(event: Event) -> bool:
+    """Tell whether an event is worth a line above the frame."""
+    if isinstance(event, StateChanged):
+        return event.state in {State.STOP, State.HOLD}
+    return isinstance(event, Checked | Noted | PoseTaken | GuardTripped)
+
+
+@contextmanager
+def open_operator(*, as_json: bool = False, yes: bool = False) -> Iterator[Operator]:
+    """Give the operator that fits: JSON where asked for, a live screen at a terminal, else plain lines.
+
+    The screen goes to stderr, like everything said to a person; a dumb terminal gets plain lines.
+    """
+    if as_json:
+        yield JsonOperator(yes=yes)
+        return
+    console = Console(stderr=True, highlight=False)
+    if not console.is_terminal or console.is_dumb_terminal or not os.isatty(0):
+        yield PlainOperator(yes=yes)
+        return
+    keyboard = Keyboard(0) if Keyboard.usable(0) else None
+    with Screen(console, keyboard, yes=yes) as screen:
+        yield screen
