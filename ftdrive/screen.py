@@ -2,16 +2,18 @@
 
 import os
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from threading import RLock
 from types import TracebackType
-from typing import Self, TextIO
+from typing import Literal, Self, TextIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from rich.cells import cell_len
 from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
@@ -21,6 +23,7 @@ from calib.routine import DriftCheck
 from ftdrive.keyboard import Keyboard
 from ftdrive.report import drift_in_words
 from ftdrive.session.events import (
+    Asked,
     Checked,
     Estimated,
     Event,
@@ -75,6 +78,8 @@ class View:
     drift: DriftCheck | None = None
     note: str = ""
     waiting: tuple[Key, ...] = ()
+    keys: Literal["live", "asking", "over"] = "live"
+    """Whether keys do anything now."""
 
     def update(self, event: Event, now_s: float) -> None:
         """Take an event in."""
@@ -92,7 +97,7 @@ class View:
 
     def _take(self, event: PoseTaken, now_s: float) -> None:
         self.taken[event.stop] = event, now_s
-        self.last = event
+        self.last, self.note = event, ""
         first, first_s = self.taken[min(self.taken)]
         if event.number == first.number and event.stop != first.stop:
             sigma = np.hypot(first.sigma, event.sigma)
@@ -105,17 +110,19 @@ def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Gro
     Where there is not enough room the picture of the coverage goes first, then what is said elsewhere too.
     """
     wide = width >= _TABLE_WIDTH + 1 + _CUBE_WIDTH
-    blocks: list[tuple[int, list[Text]]] = [
-        (0, [_title(view, now_s, width)]),
-        (0, [_state(view, now_s)]),
-        (2, _last(view)),
+    blocks: list[tuple[int, list[Text]]] = [(0, [_title(view, now_s, width), *_state(view, now_s, width)])]
+    if view.folder or view.last is not None:
+        blocks += [
+            (2, _last(view)),
+            (6, [_rule(width)]),
+            *_estimates(view, with_cube=wide and height > 20),
+            (1, _coverage(view, width)),
+            (4, [_drift(view)]),
+        ]
+    blocks += [
+        (3, _folded(view.note, width, "bold red" if view.note.startswith("STOP") else "yellow")),
         (6, [_rule(width)]),
-        *_estimates(view, with_cube=wide and height > 20),
-        (1, _coverage(view)),
-        (4, [_drift(view)]),
-        (3, [Text(view.note, "bold red" if view.note.startswith("STOP") else "yellow")] if view.note else []),
-        (6, [_rule(width)]),
-        (0, [_keys(view)]),
+        (0, _keys(view)),
         (0, _kept(view, width)),
     ]
     while sum(len(lines) for _, lines in blocks) > height - 1 and max(importance for importance, _ in blocks) > 0:
@@ -140,10 +147,10 @@ def _title(view: View, now_s: float, width: int) -> Text:
     return Text.assemble((name, "bold"), " " * max(width - len(name) - len(right), 2), right)
 
 
-def _state(view: View, now_s: float) -> Text:
+def _state(view: View, now_s: float, width: int) -> list[Text]:
     now = view.now
     if now is None:
-        return Text("starting")
+        return [Text("starting")]
     line = Text()
     if now.stop is not None:
         line.append(f"pose {now.stop}/{now.stops}" if now.stops is not None else f"pose {now.stop}", "bold")
@@ -151,8 +158,10 @@ def _state(view: View, now_s: float) -> Text:
     stopped = now.state in {State.STOP, State.HOLD}
     line.append(now.state.upper(), "bold red" if stopped else "bold cyan")
     line.append(f"  {_minutes(now_s - view.since_s)}" if now.state is not State.HOLD else "")
+    if len(line) + 2 + len(now.words) > width:
+        return [line, *_folded(now.words, width)]
     line.append(f"  {now.words}" if now.words else "")
-    return line
+    return [line]
 
 
 def _last(view: View) -> list[Text]:
@@ -191,8 +200,8 @@ def _estimates(view: View, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
             row.append(" ")
             row.append_text(picture)
         return [(0, rows)]
-    seen = "   ".join(f"{name} {count}" for name, count in zip(_FACES, counts, strict=True))
-    return [(5, rows[:1]), (0, rows[1:]), (2, [Text(f"gravity by flange axis:  {seen}")])]
+    seen = " ".join(f"{name} {count}" for name, count in zip(_FACES, counts, strict=True))
+    return [(5, rows[:1]), (0, rows[1:]), (2, [Text(f"gravity along {seen}")])]
 
 
 def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Text:
@@ -228,7 +237,7 @@ def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
     ]
 
 
-def _coverage(view: View) -> list[Text]:
+def _coverage(view: View, width: int) -> list[Text]:
     fit = view.estimated
     if fit is None:
         return [Text("coverage  nothing yet", "dim")]
@@ -239,7 +248,7 @@ def _coverage(view: View) -> list[Text]:
         line.append(f"   {what} {value:.1f}" if np.isfinite(value) else f"   {what} none")
         line.append("" if value <= goal else f" (goal {goal:g})")
     line.append(f"   gap {fit.empty_cap_deg:.0f}°")
-    return [line, Text(f"helps most: {fit.hint}", "italic")] if fit.hint else [line]
+    return [line, *_folded(f"helps most: {fit.hint}", width)] if fit.hint else [line]
 
 
 def _drift(view: View) -> Text:
@@ -253,16 +262,20 @@ def _drift(view: View) -> Text:
         return Text("drift  none seen so far")
     change, sigma = fit.values["drift"], fit.sigma["drift"]
     force_N, torque_Nm = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
-    return Text(f"drift  {force_N:.3f} ± {np.max(sigma[:3]):.3f} N, {torque_Nm:.4f} N·m since the first pose", "yellow")
+    sure = bool(np.max(np.abs(change) / sigma) > 4)
+    words = f"drift  {force_N:.3f} ± {np.max(sigma[:3]):.3f} N, {torque_Nm:.4f} N·m since the first pose"
+    return Text(words if sure else f"{words}, perhaps", "yellow" if sure else "")
 
 
-def _keys(view: View) -> Text:
+def _keys(view: View) -> list[Text]:
+    if view.keys != "live":
+        return [Text("Enter sends the answer; Ctrl-C ends, poses are kept", "dim")] if view.keys == "asking" else []
     line = Text()
     for key, word in KEYS.items():
         line.append(f" {key.value} ", "reverse")
         line.append(f" {word.upper()} asked  " if key in view.waiting else f" {word}  ")
     line.append("Ctrl-C ends, poses are kept")
-    return line
+    return [line]
 
 
 def _kept(view: View, width: int) -> list[Text]:
@@ -278,13 +291,17 @@ def _rule(width: int) -> Text:
     return Text("─" * width, "dim")
 
 
+def _folded(text: str, width: int, style: str = "") -> list[Text]:
+    return [Text(line, style) for line in textwrap.wrap(text, width, max_lines=3, placeholder=" …")]
+
+
 def _end_of(text: str, width: int) -> str:
     """Shorten a path at its beginning: the end tells runs apart."""
     return text if len(text) <= width else "…" + text[len(text) - width + 1 :]
 
 
 def _minutes(seconds: float) -> str:
-    return f"{seconds:.1f} s" if seconds < 59.95 else f"{int(seconds) // 60}:{int(seconds) % 60:02d} min"
+    return f"{seconds:.0f} s" if seconds < 59.5 else f"{int(seconds) // 60}:{int(seconds) % 60:02d} min"
 
 
 class Screen:
@@ -328,6 +345,7 @@ class Screen:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._view.keys = "over"
         self._stack.__exit__(kind, error, trace)
 
     def tell(self, event: Event) -> None:
@@ -339,30 +357,37 @@ class Screen:
             self._console.print(self._plain(Text(words, style)))
 
     def ask(self, question: Question) -> str:
-        """Take the frame away, ask, and draw it again."""
+        """Ask below the frame, which stands still meanwhile."""
         if self._yes and question.assumed is not None:
             return question.assumed
-        self._live.transient = True
+        self._view.keys = "asking"
         self._live.stop()
-        try:
-            with self._keyboard.suspended() if self._keyboard is not None else nullcontext():
-                return self._answer(question)
-        finally:
-            self._live.transient = False
-            self._live.start(refresh=True)
+        with self._keyboard.suspended() if self._keyboard is not None else nullcontext():
+            answer = self._answer(question)
+        self._view.keys = "live"
+        self._live.start(refresh=True)
+        return answer
 
     def pressed(self) -> Key | None:
         """Take the oldest key that was pressed and not yet taken."""
         return None if self._keyboard is None else self._keyboard.pressed()
 
     def _answer(self, question: Question) -> str:
+        """Ask until there is an answer, then take questions and frame away: the next one is drawn in their place."""
+        used = len(self._frame().renderables)
         while True:
-            prompt = Text.assemble((question.text, "bold"), f" [{choices(question)}] ")
-            self._console.print(self._plain(prompt), end="")
+            prompt = self._plain(Text.assemble((question.text, "bold"), f" [{choices(question)}] "))
+            self._console.print(prompt, end="", soft_wrap=True)
             typed = read_line(self._stdin, question)
+            used += (prompt.cell_len + cell_len(typed.rstrip("\n"))) // self._console.width + 1
             if (answer := match(question, typed)) is not None:
-                return answer
-            self._console.print(self._plain(Text(f"'{typed.strip()}' is none of the answers.")))
+                break
+            self._console.print(
+                self._plain(Text(f"'{typed.strip()}' is none of the answers.")), crop=True, no_wrap=True
+            )
+            used += 1
+        self._console.file.write(f"\x1b[{used}F\x1b[J")
+        return answer
 
     def _frame(self) -> Group:
         size = self._console.size
@@ -382,7 +407,7 @@ def _history(event: Event) -> bool:
     """Tell whether an event is worth a line above the frame."""
     if isinstance(event, StateChanged):
         return event.state in {State.STOP, State.HOLD}
-    return isinstance(event, Checked | Noted | PoseTaken | GuardTripped)
+    return isinstance(event, Asked | Checked | Noted | PoseTaken | GuardTripped)
 
 
 @contextmanager

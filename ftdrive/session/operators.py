@@ -48,7 +48,8 @@ def read_line(stdin: TextIO, question: Question) -> str:
     line = stdin.readline()
     if not line:
         raise Declined(
-            f"nobody answered '{question.text}': run it in a terminal, or give {choices(question)} on standard input"
+            f"nobody answered '{question.text}' [{choices(question)}]: run it in a terminal, or put the answer on "
+            "standard input"
         )
     return line
 
@@ -118,9 +119,12 @@ class PlainOperator:
         self._yes = yes
         self._stdin, self._stderr = stdin or sys.stdin, stderr or sys.stderr
         self._lock = Lock()
+        self._asked = ""
 
     def tell(self, event: Event) -> None:
         """Write the event in words, if it is worth a line."""
+        if isinstance(event, Asked) and event.question == self._asked:
+            return  # stands there already
         if words := in_words(event):
             self._write(words + "\n")
 
@@ -128,9 +132,12 @@ class PlainOperator:
         """Answer from stdin; raises `Declined` at its end."""
         if self._yes and question.assumed is not None:
             return question.assumed
+        self._asked = question.text
         while True:
             self._write(f"{question.text} [{choices(question)}] ")
             typed = read_line(self._stdin, question)
+            if not self._stdin.isatty():
+                self._write(typed)
             if (answer := match(question, typed)) is not None:
                 return answer
             self._write(f"'{typed.strip()}' is none of the answers.\n")
@@ -174,8 +181,8 @@ def pose_in_words(event: PoseTaken) -> str:
     """Say how a pose was taken."""
     force_N, torque_Nm = rms_sigma(event)
     words = (
-        f"pose {event.stop}/{event.stops} R{event.number:02d}: settled in {event.settle_s:.1f} s, "
-        f"{event.samples} samples in {event.average_s:.1f} s, mean ± {force_N:.2g} N ± {torque_Nm:.2g} N·m"
+        f"{event.stop}/{event.stops} R{event.number:02d}: settled {event.settle_s:.1f} s, {event.samples} samples in "
+        f"{event.average_s:.1f} s, sigma {force_N:.2g} N {torque_Nm:.2g} N·m"
     )
     if event.attempts > 1:
         words += f", {event.attempts} attempts"
