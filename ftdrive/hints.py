@@ -17,19 +17,11 @@ SURE = 1e-3
 """Probability of a false remark."""
 FEWEST_ON_A_SIDE = 3
 """Poses before and after something that changed for good."""
-CLEARLY = 10.0
-"""How much likelier, in units of twice the logarithm, a change must be than all that explains the poses otherwise."""
+CLEARLY = 0.5
+"""A lasting change must bring the mean square misfit below this share of what any other explanation leaves."""
 
 _STILL_RAD = np.radians(0.05)
 _SIGNIFICANT = 4.0
-
-# What can change for good between two poses, by the error coordinates of `calib.model.PARAMETER_NAMES`.
-_CHANGES: tuple[tuple[str, tuple[int, ...]], ...] = (
-    ("centre of mass", (9, 10, 11)),
-    ("force bias", (6, 7, 8)),
-    ("torque bias", (12, 13, 14)),
-    ("mounting", (0, 1, 2)),
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +29,8 @@ class _Change:
     what: str
     row: int
     step: Array
-    evidence: float
+    misfit: float
+    criterion: float
 
 
 def names_of(records: Sequence[PoseRecord]) -> tuple[str, ...]:
@@ -124,62 +117,73 @@ def _pulled(result: CalibrationResult, row: int) -> bool:
 
 
 def _lasting_change(result: CalibrationResult, records: Sequence[PoseRecord]) -> _Change | None:
-    """Find what changed for good between two poses, if that explains the residuals better than anything else.
+    """Find what changed for good between two poses, if that explains the residuals far better than anything else.
 
-    Linear least squares of the residuals, with the parameters free and some of them different from a pose on, compared
-    by the Bayesian information criterion with no change, with a steady drift, and with single poses that are off.
+    Linear least squares of the residuals with the parameters free, and some of them different from a pose on. It must
+    beat no change, a steady drift, and single poses that are off, unless those are all at one end of the tour.
     """
-    n, r = len(records), result.residuals
-    sigma = result.measured_sigma
+    n, sigma = len(records), result.measured_sigma
     if sigma is None or n < 2 * FEWEST_ON_A_SIDE + 2:
         return None
+    y = result.residuals / sigma
     J = jacobian(result.parameters, np.array([record.before.R_base_flange for record in records])) / sigma[:, None]
-    y = r / sigma
-    price = float(np.log(6 * n))
+    everything = np.ones(n, bool)
 
-    def misfit(columns: Array, rows: NDArray[np.bool_] | None = None) -> tuple[float, Array]:
-        X, target = np.concatenate([J, columns], axis=2), y
-        if rows is not None:
-            X, target = X[rows], y[rows]
-        X, flat = X.reshape(-1, X.shape[2]), target.ravel()
+    def fit(columns: Array, rows: NDArray[np.bool_] = everything) -> tuple[float, Array]:
+        """Mean square misfit per degree of freedom, and the estimates of the added columns."""
+        X = np.concatenate([J, columns], axis=2)[rows].reshape(6 * int(rows.sum()), -1)
         scale = np.linalg.norm(X, axis=0)
         scale[scale == 0] = 1.0
-        x, *_ = np.linalg.lstsq(X / scale, flat, rcond=1e-10)
-        return float(np.sum((flat - X / scale @ x) ** 2)), (x / scale)[15:]
+        x, *_ = np.linalg.lstsq(X / scale, y[rows].ravel(), rcond=1e-10)
+        left = y[rows].ravel() - X / scale @ x
+        return float(left @ left) / max(len(X) - X.shape[1], 1), (x / scale)[15:]
 
-    nothing = np.zeros((n, 6, 0))
     t = np.array([record.t_mid_ns for record in records], dtype=np.float64)
     ramp = ((t - t.mean()) / (np.ptp(t) or 1.0))[:, None, None] * (np.eye(6) / sigma[:, None])
-    others = [misfit(nothing)[0], misfit(ramp)[0] + 6 * price]
-    out = np.zeros(n, bool)
-    out[_out_of_line(result)] = True
-    if 0 < out.sum() < n - FEWEST_ON_A_SIDE:
-        others.append(misfit(nothing, ~out)[0] + 6 * int(out.sum()) * price)
-    best = None
+    others = [fit(np.zeros((n, 6, 0)))[0], fit(ramp)[0]]
+    used = everything.copy()
+    used[_out_of_line(result)] = False
+    at_one_end = np.count_nonzero(np.diff(used)) == 1 and np.count_nonzero(~used) >= FEWEST_ON_A_SIDE
+    if not at_one_end and not used.all() and used.sum() > FEWEST_ON_A_SIDE:
+        others.append(fit(np.zeros((n, 6, 0)), used)[0])
+
+    changes = _changes(result)
+    found = []
     for row in range(FEWEST_ON_A_SIDE, n - FEWEST_ON_A_SIDE + 1):
         after = (np.arange(n) >= row)[:, None, None]
-        for what, coordinates in _CHANGES:
-            chi2, step = misfit(J[:, :, coordinates] * after)
-            score = chi2 + (len(coordinates) + 1) * price
-            if best is None or score < best.evidence:
-                best = _Change(what, row, step, score)
-    # Measured noise is less than all noise: differences count in units of what the best explanation leaves.
-    if best is None:
-        return None
-    unit = max(best.evidence / (6 * n), 1.0)
-    return best if (min(others) - best.evidence) / unit > CLEARLY else None
+        for what, directions in changes.items():
+            misfit, step = fit(J @ directions * after)
+            criterion = 6 * n * np.log(misfit) + directions.shape[1] * np.log(6 * n)
+            found.append(_Change(what, row, step, misfit, float(criterion)))
+    best = min(found, key=lambda change: change.criterion)
+    return best if max(best.misfit, 1.0) < CLEARLY * min(others) else None
+
+
+def _changes(result: CalibrationResult) -> dict[str, Array]:
+    """What can change between two poses: directions (15, k) in the error coordinates of the model."""
+    e = np.eye(15)
+    down = result.gravity_force_base_N / (result.weight_N or 1.0)
+    return {
+        "centre of mass": e[:, 9:12],
+        "load": np.column_stack([e[:, 3:6] @ down, e[:, 9:12]]),
+        "force": e[:, 6:9],
+        "torque": e[:, 12:15],
+        "force and torque": e[:, [6, 7, 8, 12, 13, 14]],
+        "mounting": e[:, 0:3],
+    }
 
 
 def _change_in_words(change: _Change, names: Sequence[str]) -> str:
-    size = float(np.linalg.norm(change.step))
-    since = f"from {names[change.row]} on"
-    return {
-        "centre of mass": f"{since} the centre of mass is {1e3 * size:.2g} mm elsewhere: did the load shift in the "
-        "gripper? Fix it and calibrate again",
-        "force bias": f"{since} the force reads {size:.2g} N more or less: was the sensor tared, or knocked, or does "
-        "something touch it? Calibrate again",
-        "torque bias": f"{since} the torque reads {size:.2g} N·m more or less: does a cable pull since then, or was "
-        "the sensor tared? Calibrate again",
-        "mounting": f"{since} the sensor sits {np.degrees(size):.2g}° otherwise: is a screw loose? Fasten it and "
-        "calibrate again",
+    step, size = change.step, float(np.linalg.norm(change.step))
+    tared = "was the sensor tared, or does a cable pull? Check it"
+    what = {
+        "centre of mass": f"the centre of mass is {1e3 * size:.2g} mm elsewhere: did the load shift? Fix it",
+        "load": f"the load weighs {abs(step[0]):.2g} N {'less' if step[0] < 0 else 'more'}: was something lost or "
+        "picked up? Check the tool",
+        "force": f"the force reads {size:.2g} N otherwise: {tared}",
+        "torque": f"the torque reads {size:.2g} N·m otherwise: {tared}",
+        "force and torque": f"force and torque read {np.linalg.norm(step[:3]):.2g} N and "
+        f"{np.linalg.norm(step[3:]):.2g} N·m otherwise: {tared}",
+        "mounting": f"the sensor sits {np.degrees(size):.2g}° otherwise: is a screw loose? Fasten it",
     }[change.what]
+    return f"from {names[change.row]} on {what} and calibrate again"

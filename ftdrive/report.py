@@ -108,6 +108,12 @@ def print_result(
     if drift is not None:
         words, bad = drift_in_words(drift)
         talk.print(f" drift: {words}", style="yellow" if bad else None)
+    if result.drift is not None:
+        change, sigma = result.drift.change, result.drift.sigma
+        talk.print(
+            f" drift in the fit: {np.linalg.norm(change[:3]):.3f} ± {np.max(sigma[:3]):.3f} N, "
+            f"{np.linalg.norm(change[3:]):.4f} ± {np.max(sigma[3:]):.4f} N·m from the first pose to the last"
+        )
     if records:
         for hint in hints(result, records):
             talk.print(f" ? {hint}", style="yellow", markup=False)

@@ -1,7 +1,9 @@
-"""The running fit: equal to the solver's, honest about what the poses cover, and hints that lead somewhere."""
+"""The fit while poses come in, what is said about what is missing, and what is said at the end about odd poses."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +13,11 @@ from scipy.spatial.transform import Rotation
 from calib import Parameters, solve
 from calib.design import AMBIGUOUS_6, T12, TOOL_DOWN_R_base_flange, special
 from calib.model import predict
-from calib.routine import PoseRecord, dataset_from
+from calib.routine import PoseRecord, dataset_from, drift_check
 from calib.selection import cone_candidates
 from calib.tour import TourPose, wrist_tour
+from ftdrive.hints import hints
+from ftdrive.report import print_result
 from ftdrive.session.events import Estimated
 from ftdrive.session.running import Running, empty_cap_deg, faces
 
@@ -255,3 +259,108 @@ def test_drift_is_told_with_the_estimates() -> None:
 
 def test_the_empty_cap_of_one_direction_is_half_a_turn() -> None:
     assert empty_cap_deg(np.array([[0.0, 0.0, 1.0]])) == pytest.approx(180, abs=2)
+
+
+# At the end: what happened at which pose.
+
+Disturbed = Callable[[int, Array, np.random.Generator], Array]
+
+
+def disturbed(wrench_of: Disturbed, seed: int = 0) -> list[PoseRecord]:
+    """Take the tour with wrenches (6,) that depend on the stop, the orientation and chance."""
+    rng = np.random.default_rng(seed)
+    taken = []
+    for one in tour():
+        noise = one.samples.wrench - one.samples.wrench.mean(axis=0) + rng.normal(size=6) * SIGMA / np.sqrt(SAMPLES)
+        wrench = wrench_of(one.stop, one.before.R_base_flange, rng) + noise
+        taken.append(replace(one, samples=Samples(wrench, one.samples.t_host_ns)))
+    return taken
+
+
+def said(taken: list[PoseRecord]) -> tuple[str, ...]:
+    return hints(solve(dataset_from(taken, {})), taken)
+
+
+def name(stop: int) -> str:
+    return f"R{TOUR[stop - 1]:02d}"
+
+
+def test_nothing_is_said_of_quiet_runs_of_inexact_arms_and_of_wandering_sensors() -> None:
+    def rough(_: int, R: Array, rng: np.random.Generator) -> Array:
+        return predict(TRUTH, R @ Rotation.from_rotvec(rng.normal(size=3) * 0.002).as_matrix())
+
+    def drifting(stop: int, R: Array, _: np.random.Generator) -> Array:
+        return np.asarray(predict(TRUTH, R) + 0.5 * stop / 25 * np.eye(6)[0])
+
+    def wandering(_: int, R: Array, rng: np.random.Generator) -> Array:
+        bias[:] += rng.normal(size=6) * np.repeat([0.03, 0.0005], 3)
+        return np.asarray(predict(TRUTH, R) + bias)
+
+    for seed in range(4):
+        bias = np.zeros(6)
+        for wrench_of in (lambda _, R, __: predict(TRUTH, R), rough, drifting, wandering):
+            assert said(disturbed(wrench_of, seed)) == ()
+
+
+def test_a_bumped_pose_is_named() -> None:
+    (words,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 8) * np.array([0.8, 0, 0, 0, 0.03, 0])))
+    assert words.startswith(f"{name(8)} is off by 0.8")
+    assert "bumped" in words
+
+
+def test_a_cable_that_pulls_in_three_poses_is_named_with_them() -> None:
+    pull = np.array([0.3, 0.2, 0.4, 0.01, -0.03, 0.03])
+    words = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop in {5, 6, 14}) * pull))
+    assert f"something pulls in {name(5)}, {name(6)}, {name(14)}: a cable" in words[-1]
+
+
+@pytest.mark.parametrize("since", [6, 12, 20])
+def test_a_load_that_shifts_is_named_with_the_pose_from_which_on(since: int) -> None:
+    shifted = replace(TRUTH, p_sensor_com_m=TRUTH.p_sensor_com_m + np.array([0.004, 0.002, 0]))
+    (words,) = said(disturbed(lambda stop, R, _: predict(shifted if stop >= since else TRUTH, R)))
+    assert words.startswith(f"from {name(since)} on the centre of mass is 4.")
+    assert "did the load shift" in words
+
+
+def test_a_tare_and_a_lost_part_in_mid_tour_are_told_apart() -> None:
+    step = np.array([0.3, 0, 0.2, 0, 0, 0])
+    (words,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop >= 10) * step))
+    assert words.startswith(f"from {name(10)} on the force reads 0.36 N otherwise: was the sensor tared")
+    lighter = replace(TRUTH, gravity_force_base_N=0.95 * TRUTH.gravity_force_base_N)
+    (words,) = said(disturbed(lambda stop, R, _: predict(lighter if stop >= 14 else TRUTH, R)))
+    assert words.startswith(f"from {name(14)} on the load weighs 0.5")
+    assert " N less: was something lost" in words
+
+
+def test_a_pose_that_moved_is_named_and_not_explained_otherwise() -> None:
+    taken = tour()
+    turned = Reading(0, np.zeros(6), taken[6].before.R_base_flange @ Rotation.from_rotvec([0, 0, 0.01]).as_matrix())
+    taken[6] = replace(record(7, taken[6].before.R_base_flange, TOUR[6], bump_N=1.0), after=turned, steady=False)
+    taken[8] = replace(taken[8], steady=False)
+    assert [words.split(" while")[0] for words in said(taken)] == [
+        f"{name(7)} turned by 0.57°",
+        f"{name(9)} was not steady",
+    ]
+
+
+def test_hints_refuse_records_of_another_run() -> None:
+    with pytest.raises(ValueError, match="23 records do not belong to a result of 24 poses"):
+        hints(solve(dataset_from(tour(), {})), tour()[:23])
+
+
+def test_the_report_names_poses_says_the_drift_and_ends_with_the_file(capsys: pytest.CaptureFixture[str]) -> None:
+    pull = np.array([1.0, 0, 0, 0, 0, 0])
+    taken = disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 8) * pull + stop / 25 * np.eye(6)[1])
+    result = solve(dataset_from(taken, {}))
+    path = Path("runs") / "x [1]" / "calibration.json"
+    print_result(result, drift=drift_check(taken), records=taken, saved=path)
+    lines = capsys.readouterr().err.rstrip().splitlines()
+    assert lines[-1] == f" Saved {path}"
+    text = "\n".join(lines)
+    assert "USABLE" in text
+    assert "worst pose R" in text
+    assert "each pose predicted by the others: 0." in text
+    assert f"? {name(8)} is off by" in text
+    assert "0.6 N/min, let the sensor warm up" in text
+    assert " drift in the fit: " in text
+    assert "1.12" in next(line for line in lines if "mass, kg" in line)
