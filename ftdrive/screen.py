@@ -43,15 +43,15 @@ Array = NDArray[np.float64]
 REFRESH_HZ = 4
 KEYS = {Key.KEEP: "keep", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "stop"}
 
-# Label and unit, factor from SI to it, name.
+# Label and unit, factor from SI to it, name; and what goes first where there is no room, see `frame`.
 _ROWS = (
-    ("mass kg", 1.0, "mass_kg"),
-    ("centre mm", 1e3, "p_sensor_com_m"),
-    ("F bias N", 1.0, "force_bias_N"),
-    ("T bias N·m", 1.0, "torque_bias_Nm"),
-    ("mounting deg", 180 / np.pi, "R_flange_sensor"),
-    ("tilt a deg", 180 / np.pi, "tilt_alpha_rad"),
-    ("tilt b deg", 180 / np.pi, "tilt_beta_rad"),
+    ("mass kg", 1.0, "mass_kg", 1),
+    ("centre mm", 1e3, "p_sensor_com_m", 2),
+    ("F bias N", 1.0, "force_bias_N", 2),
+    ("T bias N·m", 1.0, "torque_bias_Nm", 3),
+    ("mounting deg", 180 / np.pi, "R_flange_sensor", 4),
+    ("tilt a deg", 180 / np.pi, "tilt_alpha_rad", 6),
+    ("tilt b deg", 180 / np.pi, "tilt_beta_rad", 6),
 )
 _COLOUR = {"green": "bold green", "amber": "bold yellow", "red": "bold red"}
 _FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
@@ -107,27 +107,26 @@ class View:
 def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Group:
     """Draw the screen: never wider than `width`, never higher than `height` less one line for the cursor.
 
-    Where there is not enough room the picture of the coverage goes first, then what is said elsewhere too.
+    Blocks of lines go by their number where there is not enough room, the highest first; those of 0 stay.
     """
     wide = width >= _TABLE_WIDTH + 1 + _CUBE_WIDTH
     blocks: list[tuple[int, list[Text]]] = [(0, [_title(view, now_s, width), *_state(view, now_s, width)])]
     if view.folder or view.last is not None:
         blocks += [
-            (2, _last(view)),
-            (6, [_rule(width)]),
+            (3, _last(view)),
+            (9, [_rule(width)]),
             *_estimates(view, with_cube=wide and height > 20),
-            (1, _coverage(view, width)),
-            (4, [_drift(view)]),
+            *_coverage(view, width),
+            (5, [_drift(view)]),
         ]
     blocks += [
-        (3, _folded(view.note, width, "bold red" if view.note.startswith("STOP") else "yellow")),
-        (6, [_rule(width)]),
+        (1, _folded(view.note, width, "bold red" if view.note.startswith("STOP") else "yellow")),
+        (9, [_rule(width)]),
         (0, _keys(view)),
         (0, _kept(view, width)),
     ]
-    while sum(len(lines) for _, lines in blocks) > height - 1 and max(importance for importance, _ in blocks) > 0:
-        least = max(range(len(blocks)), key=lambda k: blocks[k][0])
-        del blocks[least]
+    while sum(len(lines) for _, lines in blocks) > height - 1 and max(number for number, _ in blocks) > 0:
+        blocks.remove(max(blocks, key=lambda block: block[0]))
     lines = [line for _, some in blocks for line in some]
     for line in lines:
         line.no_wrap, line.overflow = True, "crop"
@@ -190,7 +189,7 @@ def _estimates(view: View, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
     """Estimates at the left; the cube beside them, or its counts in a line below."""
     fit = view.estimated
     rows = [Text(f"{'estimate':<13}{'':27}{'± 1 sigma':>12}", "dim")]
-    rows += [_estimate(fit, *row) for row in _ROWS]
+    rows += [_estimate(fit, label, factor, name) for label, factor, name, _ in _ROWS]
     newest = view.last.gravity_flange if view.last else None
     counts = (0,) * 6 if fit is None else fit.faces
     if with_cube:
@@ -201,7 +200,8 @@ def _estimates(view: View, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
             row.append_text(picture)
         return [(0, rows)]
     seen = " ".join(f"{name} {count}" for name, count in zip(_FACES, counts, strict=True))
-    return [(5, rows[:1]), (0, rows[1:]), (2, [Text(f"gravity along {seen}")])]
+    each = [(number, [row]) for row, (*_, number) in zip(rows[1:], _ROWS, strict=True)]
+    return [(7, rows[:1]), *each, (4, [Text(f"gravity along {seen}")])]
 
 
 def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Text:
@@ -237,10 +237,10 @@ def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
     ]
 
 
-def _coverage(view: View, width: int) -> list[Text]:
+def _coverage(view: View, width: int) -> list[tuple[int, list[Text]]]:
     fit = view.estimated
     if fit is None:
-        return [Text("coverage  nothing yet", "dim")]
+        return [(1, [Text("coverage  nothing yet", "dim")])]
     line = Text("coverage  ")
     line.append(fit.light.upper(), _COLOUR.get(fit.light, "bold"))
     for name, what in (("cond9", "condition"), ("cond_u1", "out of plane")):
@@ -248,7 +248,7 @@ def _coverage(view: View, width: int) -> list[Text]:
         line.append(f"   {what} {value:.1f}" if np.isfinite(value) else f"   {what} none")
         line.append("" if value <= goal else f" (goal {goal:g})")
     line.append(f"   gap {fit.empty_cap_deg:.0f}°")
-    return [line, *_folded(f"helps most: {fit.hint}", width)] if fit.hint else [line]
+    return [(1, [line]), (4, _folded(f"helps most: {fit.hint}" if fit.hint else "", width))]
 
 
 def _drift(view: View) -> Text:
