@@ -35,7 +35,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Key, Operator, Question
-from ftdrive.session.operators import JsonOperator, PlainOperator, choices, in_words, match, read_line, rms_sigma
+from ftdrive.session.operators import JsonOperator, PlainOperator, in_words, match, prompt, read_line, rms_sigma
 from ftdrive.session.running import GREEN
 
 Array = NDArray[np.float64]
@@ -136,9 +136,9 @@ def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Gro
 
 def _title(view: View, now_s: float, width: int) -> Text:
     times_s = sorted(at_s for _, at_s in view.taken.values())
-    right = f"{len(view.taken)} kept"
-    stops = view.last.stops if view.last else 0
-    left = stops - len(view.taken)
+    kept = max(len(view.taken), view.estimated.poses if view.estimated else 0)  # those of a resumed run were not told
+    right = f"{kept} kept"
+    left = view.last.stops - kept if view.last else 0
     if len(times_s) > 2 and left > 0:
         rest_s = max((times_s[-1] - times_s[0]) / (len(times_s) - 1) * left - (now_s - times_s[-1]), 0.0)
         right += f", about {_minutes(rest_s)} left"
@@ -376,10 +376,10 @@ class Screen:
         """Ask until there is an answer, then take questions and frame away: the next one is drawn in their place."""
         used = len(self._frame().renderables)
         while True:
-            prompt = self._plain(Text.assemble((question.text, "bold"), f" [{choices(question)}] "))
-            self._console.print(prompt, end="", soft_wrap=True)
+            asked = self._plain(Text(prompt(question), "bold"))
+            self._console.print(asked, end="", soft_wrap=True)
             typed = read_line(self._stdin, question)
-            used += (prompt.cell_len + cell_len(typed.rstrip("\n"))) // self._console.width + 1
+            used += (asked.cell_len + cell_len(typed.rstrip("\n"))) // self._console.width + 1
             if (answer := match(question, typed)) is not None:
                 break
             self._console.print(
@@ -406,7 +406,7 @@ class Screen:
 def _history(event: Event) -> bool:
     """Tell whether an event is worth a line above the frame."""
     if isinstance(event, StateChanged):
-        return event.state in {State.STOP, State.HOLD}
+        return event.state is State.HOLD
     return isinstance(event, Asked | Checked | Noted | PoseTaken | GuardTripped)
 
 

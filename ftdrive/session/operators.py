@@ -26,21 +26,26 @@ from ftdrive.session.operator import Key, Question
 
 
 def match(question: Question, typed: str) -> str | None:
-    """Find the answer that was typed: in full, or by its beginning where there are several; None for no answer."""
+    """Find the answer that was typed; None for no answer.
+
+    In full, but for y and n; a word that must be typed exactly can be refused with no, which raises `Declined`.
+    """
     typed = typed.strip()
     if typed in question.answers:
         return typed
-    if len(question.answers) == 1 or not typed:
-        return None
-    meant = [answer for answer in question.answers if answer.lower().startswith(typed.lower())]
-    return meant[0] if len(meant) == 1 else None
+    if len(question.answers) > 1:
+        meant = {"y": "yes", "n": "no"}.get(typed.lower(), typed.lower())
+        return meant if meant in question.answers else None
+    if typed.lower() in {"n", "no"}:
+        raise Declined(f"the answer was no: {question.text}")
+    return None
 
 
-def choices(question: Question) -> str:
-    """Say what may be typed."""
-    if len(question.answers) == 1:
-        return f"type {question.answers[0] or 'Enter'}"
-    return "/".join(answer or "Enter" for answer in question.answers)
+def prompt(question: Question) -> str:
+    """Say the question, and what may be typed where it does not say so itself."""
+    if len(question.answers) == 1 and question.answers[0] in question.text:
+        return f"{question.text}: "
+    return f"{question.text} [{'/'.join(answer or 'Enter' for answer in question.answers)}] "
 
 
 def read_line(stdin: TextIO, question: Question) -> str:
@@ -48,8 +53,7 @@ def read_line(stdin: TextIO, question: Question) -> str:
     line = stdin.readline()
     if not line:
         raise Declined(
-            f"nobody answered '{question.text}' [{choices(question)}]: run it in a terminal, or put the answer on "
-            "standard input"
+            f"nobody answered '{prompt(question).strip()}': run it in a terminal, or put the answer on standard input"
         )
     return line
 
@@ -134,7 +138,7 @@ class PlainOperator:
             return question.assumed
         self._asked = question.text
         while True:
-            self._write(f"{question.text} [{choices(question)}] ")
+            self._write(prompt(question))
             typed = read_line(self._stdin, question)
             if not self._stdin.isatty():
                 self._write(typed)
@@ -157,7 +161,7 @@ def in_words(event: Event) -> str:
     match event:
         case RunOpened():
             return f"kept in {event.folder}; to continue after a stop: {event.resume}"
-        case StateChanged(state=State.STOP | State.HOLD):
+        case StateChanged(state=State.HOLD):  # has all that STOP said
             return f"{event.state.upper()}: {event.words}"
         case StateChanged(state=State.PREFLIGHT | State.APPROACH | State.CLOSE):
             return f"{event.state}{': ' if event.words else ''}{event.words}"

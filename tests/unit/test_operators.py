@@ -25,7 +25,7 @@ from ftdrive.session.operator import Operator, Question
 from ftdrive.session.operators import JsonOperator, PlainOperator, match
 
 FREE = Question("Is the tool free?", assumed="yes")
-MOVE = Question("Type MOVE to let the arm move.", ("MOVE",))
+MOVE = Question("Type MOVE to let the arm move", ("MOVE",))
 STEP = Question("Next pose?", ("", "stop"))
 
 
@@ -74,12 +74,17 @@ POSE = PoseTaken(
         (MOVE, "M", None),
         (MOVE, "", None),
         (STEP, "\n", ""),
-        (STEP, "s", "stop"),
-        (Question("?", ("stop", "step")), "st", None),
+        (STEP, "Stop", "stop"),
+        (Question("?", ("resume", "quit")), "r", None),  # one letter moves no arm
     ],
 )
 def test_what_counts_as_an_answer(question: Question, typed: str, answer: str | None) -> None:
     assert match(question, typed) == answer
+
+
+def test_a_word_that_must_be_typed_can_be_refused() -> None:
+    with pytest.raises(Declined, match="the answer was no: Type MOVE"):
+        match(MOVE, "no")
 
 
 def test_a_script_reads_events_and_answers_questions() -> None:
@@ -128,7 +133,7 @@ def plain_operator(typed: str, *, yes: bool = False) -> Operator:
 
 @pytest.mark.parametrize("operator", [json_operator, plain_operator])
 def test_nobody_to_answer_is_no_consent(operator: Callable[..., Operator]) -> None:
-    with pytest.raises(Declined, match=r"nobody answered 'Type MOVE.*' \[type MOVE\]"):
+    with pytest.raises(Declined, match=r"nobody answered 'Type MOVE to let the arm move:'"):
         operator("", yes=True).ask(MOVE)  # --yes is not enough for what must be typed
     with pytest.raises(Declined):
         operator("maybe\n").ask(FREE)
@@ -163,9 +168,9 @@ def test_plain_lines_tell_what_is_worth_a_line() -> None:
         "! [bold] stays as it is",
         "STOPPED by guard 7: 31 N: look at the tool",
         "HOLD: contact",
-        "Type MOVE to let the arm move. [type MOVE] what",
+        "Type MOVE to let the arm move: what",
         "'what' is none of the answers.",
-        "Type MOVE to let the arm move. [type MOVE] MOVE",
+        "Type MOVE to let the arm move: MOVE",
         "Is the tool free? yes",
     ]
     assert "\x1b" not in stderr.getvalue()

@@ -193,6 +193,10 @@ def test_the_first_pose_seen_again_tells_the_drift() -> None:
     assert any("drift  0.520 ± 0.020 N" in line for line in drawn(view(*MIDDLE, fitted)))
 
 
+def test_a_resumed_run_counts_the_poses_it_had() -> None:
+    assert drawn(view(MIDDLE[0], estimated(poses=12)))[0].endswith("12 kept")
+
+
 def test_a_warning_stays_until_the_next_pose() -> None:
     warned = view(*MIDDLE, Noted(words="wait", warning=True))
     assert "! wait" in drawn(warned)
@@ -316,9 +320,9 @@ def test_the_screen_draws_asks_and_goes_on() -> None:
             eventually(lambda: "SETTLE" in shown.text and RESUME in shown.text)
             assert "6/25 R14: settled 0.9 s" in shown.text  # above the frame, to stay
             answers: list[str] = []
-            asking = threading.Thread(target=lambda: answers.append(operator.ask(Question("Go?", ("MOVE",)))))
+            asking = threading.Thread(target=lambda: answers.append(operator.ask(Question("Go? Type MOVE", ("MOVE",)))))
             asking.start()
-            eventually(lambda: "Go? [type MOVE]" in shown.text)
+            eventually(lambda: "Go? Type MOVE: " in shown.text)
             assert termios.tcgetattr(program)[3] & termios.ECHO
             os.write(person, b"move\n")
             eventually(lambda: "'move' is none of the answers" in shown.text)
