@@ -56,6 +56,7 @@ _ROWS = (
 _COLOUR = {"green": "bold green", "amber": "bold yellow", "red": "bold red"}
 _FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _CUBE_WIDTH = 25
+_NUMBER_WIDTH = 9
 _TABLE_WIDTH = 53
 _ASCII = str.maketrans(
     dict(zip("┌┐└┘├┤┬┴┼─│", "+++++++++-|", strict=True)) | {"±": "+-", "°": " deg", "·": ".", "…": "~"}
@@ -212,7 +213,9 @@ def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Te
         value = Rotation.from_matrix(np.asarray(value)).as_rotvec()
     values, sigma = factor * np.atleast_1d(value), factor * float(np.max(fit.sigma[name]))
     digits = int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 5))
-    numbers = "".join(f"{one:9.{digits}f}" for one in values)
+    while digits and len(f"{-np.abs(values).max():.{digits}f}") > _NUMBER_WIDTH - 1:
+        digits -= 1
+    numbers = "".join(f"{one:{_NUMBER_WIDTH}.{digits}f}" for one in values)
     return Text(f"{label:<13}{numbers:<27}  ± {sigma:<.{digits}f}")
 
 
@@ -245,7 +248,7 @@ def _coverage(view: View, width: int) -> list[tuple[int, list[Text]]]:
     line.append(fit.light.upper(), _COLOUR.get(fit.light, "bold"))
     for name, what in (("cond9", "condition"), ("cond_u1", "out of plane")):
         value, goal = getattr(fit, name), GREEN[name]
-        line.append(f"   {what} {value:.1f}" if np.isfinite(value) else f"   {what} none")
+        line.append(f"   {what} {value:.1f}" if value < 100 else f"   {what} >100")
         line.append("" if value <= goal else f" (goal {goal:g})")
     line.append(f"   gap {fit.empty_cap_deg:.0f}°")
     return [(1, [line]), (4, _folded(f"helps most: {fit.hint}" if fit.hint else "", width))]
@@ -280,7 +283,7 @@ def _keys(view: View) -> list[Text]:
 
 def _kept(view: View, width: int) -> list[Text]:
     if not view.folder:
-        return [Text("nothing is kept yet: there is no run", "dim")]
+        return [] if view.taken else [Text("nothing is kept yet: there is no run", "dim")]
     return [
         Text("kept in " + _end_of(view.folder, width - 8)),
         Text("resume  " + _end_of(view.resume, width - 8)),

@@ -171,7 +171,7 @@ def test_a_first_pose_shows_its_coverage_and_no_numbers() -> None:
         values={}, sigma={}, residual_sigma=None, residual_force_N=None, cond9=np.inf, cond_u1=np.inf, light="red"
     )
     text = "\n".join(drawn(view(MIDDLE[0], pose(1, 1), first)))
-    assert "coverage  RED   condition none (goal 4)   out of plane none (goal 8)" in text
+    assert "coverage  RED   condition >100 (goal 4)   out of plane >100 (goal 8)   gap 95°" in text
     assert "residual: no fit before it" in text
     assert "drift  not known before the fit" in text
     assert "nan" not in text
@@ -191,6 +191,12 @@ def test_the_first_pose_seen_again_tells_the_drift() -> None:
     assert any("0.500 N" in line and "15 N/min" in line for line in drawn(drifted))
     fitted = estimated(values=VALUES | {"drift": np.full(6, 0.3)}, sigma=SIGMA | {"drift": np.full(6, 0.02)})
     assert any("drift  0.520 ± 0.020 N" in line for line in drawn(view(*MIDDLE, fitted)))
+
+
+def test_numbers_never_touch() -> None:
+    precise = {name: np.full(np.shape(sigma), 1e-6) for name, sigma in SIGMA.items()}
+    lines = drawn(view(*MIDDLE, estimated(sigma=precise)))
+    assert "F bias N       -3.2100   7.9000 -112.0400" in "\n".join(lines)
 
 
 def test_a_resumed_run_counts_the_poses_it_had() -> None:
