@@ -216,7 +216,7 @@ def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Te
     while digits and len(f"{-np.abs(values).max():.{digits}f}") > _NUMBER_WIDTH - 1:
         digits -= 1
     numbers = "".join(f"{one:{_NUMBER_WIDTH}.{digits}f}" for one in values)
-    return Text(f"{label:<13}{numbers:<27}  ± {sigma:<.{digits}f}")
+    return Text(f"{label:<13}{numbers:<27}  ± {sigma:.2g}")
 
 
 def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:

@@ -123,12 +123,12 @@ def test_everything_needed_is_on_a_screen_of_80_by_24() -> None:
         "─" * 80,
         "estimate                                   ± 1 sigma  gravity by flange axis",
         "mass kg         1.1870                    ± 0.0011          ┌─────┐",
-        "centre mm        12.30    -4.10    61.80  ± 0.20            │+y 2 │",
+        "centre mm        12.30    -4.10    61.80  ± 0.2             │+y 2 │",
         "F bias N        -3.210    7.900 -112.040  ± 0.021     ┌─────┼─────┼─────┬─────┐",
-        "T bias N·m      0.1200  -0.0800   0.0300  ± 0.0010    │-x - │+z - │+x 1 │-z12 │",
-        "mounting deg      0.00     0.00    90.00  ± 0.10      └─────┼─────┼─────┴─────┘",
-        "tilt a deg       1.800                    ± 0.060           │-y 3*│",
-        "tilt b deg      -0.400                    ± 0.050           └─────┘",
+        "T bias N·m      0.1200  -0.0800   0.0300  ± 0.001     │-x - │+z - │+x 1 │-z12 │",
+        "mounting deg      0.00     0.00    90.00  ± 0.1       └─────┼─────┼─────┴─────┘",
+        "tilt a deg       1.800                    ± 0.06            │-y 3*│",
+        "tilt b deg      -0.400                    ± 0.05            └─────┘",
         "coverage  AMBER   condition 5.1 (goal 4)   out of plane 12.0 (goal 8)   gap 95°",
         "helps most: point the middle of the tool's -x, -y and -z axes down: tilt it",
         "about its own x axis by -45°",
@@ -196,7 +196,7 @@ def test_the_first_pose_seen_again_tells_the_drift() -> None:
 def test_numbers_never_touch() -> None:
     precise = {name: np.full(np.shape(sigma), 1e-6) for name, sigma in SIGMA.items()}
     lines = drawn(view(*MIDDLE, estimated(sigma=precise)))
-    assert "F bias N       -3.2100   7.9000 -112.0400" in "\n".join(lines)
+    assert "F bias N        -3.210    7.900 -112.040  ± 1e-06" in "\n".join(lines)
 
 
 def test_a_resumed_run_counts_the_poses_it_had() -> None:
