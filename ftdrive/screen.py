@@ -333,14 +333,13 @@ class Screen:
         self._clock = clock
         self._view = View()
         self._lock = RLock()
-        self._live = Live(console=console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
+        self._live = self._new_live()
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             if self._keyboard is not None:
                 stack.enter_context(self._keyboard)
-            stack.callback(self._live.stop)
             self._live.start()
             self._stack = stack.pop_all()
         return self
@@ -349,7 +348,8 @@ class Screen:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._view.keys = "over"
-        self._stack.__exit__(kind, error, trace)
+        with self._stack:
+            self._live.stop()
 
     def tell(self, event: Event) -> None:
         """Show an event."""
@@ -368,12 +368,16 @@ class Screen:
         with self._keyboard.suspended() if self._keyboard is not None else nullcontext():
             answer = self._answer(question)
         self._view.keys = "live"
+        self._live = self._new_live()  # the old one would erase as many lines as it had drawn
         self._live.start(refresh=True)
         return answer
 
     def pressed(self) -> Key | None:
         """Take the oldest key that was pressed and not yet taken."""
         return None if self._keyboard is None else self._keyboard.pressed()
+
+    def _new_live(self) -> Live:
+        return Live(console=self._console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
 
     def _answer(self, question: Question) -> str:
         """Ask until there is an answer, then take questions and frame away: the next one is drawn in their place."""

@@ -336,6 +336,11 @@ def test_the_screen_draws_asks_and_goes_on() -> None:
             asking.join(10)
             assert answers == ["MOVE"]
             eventually(lambda: not termios.tcgetattr(program)[3] & termios.ECHO)
+            eventually(lambda: "ftdrive calibrate" in shown.text.split("\x1b[J")[-1])
+            erased, drawn_again = shown.text.split("\x1b[J")
+            used = len(drawn(view(*MIDDLE))) + 3  # the question twice, and a line about the wrong answer
+            assert erased.endswith(f"\x1b[{used}F")
+            assert "\x1b[1A" not in drawn_again.split("ftdrive calibrate")[0]  # what stands above stays
             os.write(person, b"p")
             eventually(lambda: "PAUSE asked" in shown.text)
             assert operator.pressed() is Key.PAUSE
