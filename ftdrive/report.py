@@ -1,6 +1,7 @@
 """Results and plans as text for a person."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult
 from calib.compare import Compared
-from calib.routine import DriftCheck, Progress
+from calib.routine import DriftCheck, PoseRecord, Progress
+from ftdrive.hints import hints, names_of
 from ftdrive.session import Plan
 
 Array = NDArray[np.float64]
@@ -52,9 +54,26 @@ def describe(progress: Progress) -> str:
 
 
 def print_result(
-    result: CalibrationResult, *, truth: Mapping[str, Any] | None = None, drift: DriftCheck | None = None
+    result: CalibrationResult,
+    *,
+    truth: Mapping[str, Any] | None = None,
+    drift: DriftCheck | None = None,
+    records: Sequence[PoseRecord] = (),
+    saved: Path | None = None,
 ) -> None:
-    """Show verdict, estimates with one sigma, and the truth and the error where the truth is known."""
+    """Show verdict, estimates with one sigma, how well poses fit, what probably happened, and where the file is.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+    truth : mapping, optional
+        By the names of the result: truth and error are shown beside the estimates.
+    drift : DriftCheck, optional
+    records : sequence of PoseRecord
+        Of the result's dataset: poses are named by their orientation, and those that fit badly are explained.
+    saved : Path, optional
+        The calibration file, told in the last line.
+    """
     data = result.to_dict()
     force_N, torque_Nm = result.predicted_error()
     talk.print(
@@ -84,8 +103,42 @@ def print_result(
         f" residuals: force {residual['force_rms_N']:.4f} N rms, {residual['force_max_N']:.4f} max; "
         f"torque {residual['torque_rms_Nm']:.5f} N·m rms, {residual['torque_max_Nm']:.5f} max"
     )
+    if (poses := poses_in_words(result, names_of(records))) is not None:
+        talk.print(f" {poses}")
     if drift is not None:
-        talk.print(_drift_line(drift))
+        words, bad = drift_in_words(drift)
+        talk.print(f" drift: {words}", style="yellow" if bad else None)
+    if result.drift is not None:
+        change, sigma = result.drift.change, result.drift.sigma
+        talk.print(
+            f" drift in the fit: {np.linalg.norm(change[:3]):.3f} ± {np.max(sigma[:3]):.3f} N, "
+            f"{np.linalg.norm(change[3:]):.4f} ± {np.max(sigma[3:]):.4f} N·m from the first pose to the last"
+        )
+    if records:
+        for hint in hints(result, records):
+            talk.print(f" ? {hint}", style="yellow", markup=False)
+    if saved is not None:
+        talk.print(f" Saved {saved}", markup=False)
+
+
+def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:
+    """Say which pose fits worst and how well each is predicted by the others; None for results that do not know.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+    names : sequence of str
+        Of the rows of its dataset; their numbers where there are none.
+    """
+    quality = result.quality
+    if not quality:
+        return None
+    row = int(quality["worst_pose"])
+    worst = names[row - 1] if names else f"pose {row}"
+    return (
+        f"worst pose {worst}, {quality['residual_sigma'][row - 1]:.1f} sigma; each pose predicted by the others: "
+        f"{quality['loo_force_rms_N']:.4f} N, {quality['loo_torque_rms_Nm']:.5f} N·m rms"
+    )
 
 
 # Label, factor from the file's unit to the screen's, unit on the screen, key.
@@ -153,8 +206,12 @@ def print_comparison(compared: Sequence[Compared]) -> None:
             talk.print(f" {one.method}: {one.reason}")
 
 
-def _drift_line(drift: DriftCheck) -> str:
+def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
+    """Say how the first pose reads at the end; true where that is more than noise."""
     worst = float(np.max(np.abs(drift.change) / drift.sigma))
     force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
-    said = "no drift seen" if worst < 4 else "[yellow]the sensor drifts: let it warm up, then calibrate again[/]"
-    return f" drift: pose 1 again after {drift.elapsed_s:.0f} s, {force_N:.4f} N, {torque_Nm:.5f} N·m away: {said}"
+    words = f"first pose again after {drift.elapsed_s:.0f} s, {force_N:.3f} N, {torque_Nm:.4f} N·m away: "
+    if worst < 4:
+        return words + "none seen", False
+    per_minute_N = 60 * force_N / max(drift.elapsed_s, 1.0)
+    return words + f"{per_minute_N:.2g} N/min, let the sensor warm up for 15 to 30 min, then calibrate again", True

@@ -48,6 +48,15 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunOpened(Event):
+    """There is a run folder; every pose from here on is kept in it."""
+
+    folder: str
+    resume: str
+    """The command that continues it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StateChanged(Event):
     """The session is in another state."""
 

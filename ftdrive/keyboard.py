@@ -1,0 +1,115 @@
+"""Single keys from a terminal, without Enter, while Ctrl-C works as ever."""
+
+import atexit
+import os
+import re
+import select
+import termios
+import tty
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from threading import Thread
+from types import TracebackType
+from typing import Self
+
+from ftdrive.session.operator import Key
+
+_ESCAPE = re.compile(rb"\x1b(\[[0-?]*[ -/]*[@-~]|O.|.)?")
+"""Arrows and function keys arrive as escape, then letters that would be read as keys."""
+
+
+class Keyboard:
+    """Keys of the live screen, read by a thread; the terminal is as before on every way out of the context.
+
+    Parameters
+    ----------
+    fd : int
+        Of a terminal, see `usable`.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._keys: deque[Key] = deque()
+        self._before: list[int | list[bytes | int]] | None = None
+        self._thread: Thread | None = None
+        self._wake = -1
+
+    @staticmethod
+    def usable(fd: int) -> bool:
+        """Tell whether this is a terminal whose keys are ours: not a pipe, and not that of a job in the background."""
+        try:
+            return os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp()
+        except OSError:
+            return False
+
+    def __enter__(self) -> Self:
+        self._start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop()
+
+    def pressed(self) -> Key | None:
+        """Take the oldest key that was not yet taken."""
+        return self._keys.popleft() if self._keys else None
+
+    @property
+    def waiting(self) -> tuple[Key, ...]:
+        """Keys that were pressed and not yet taken."""
+        return tuple(self._keys)
+
+    @contextmanager
+    def suspended(self) -> Iterator[None]:
+        """Give the terminal back for a typed answer; keys pressed before are thrown away, they were no answer."""
+        self._stop()
+        try:
+            yield
+        finally:
+            self._start()
+
+    def _start(self) -> None:
+        self._before = termios.tcgetattr(self._fd)
+        atexit.register(self._restore)
+        tty.setcbreak(self._fd, termios.TCSANOW)
+        wake, self._wake = os.pipe()
+        self._thread = Thread(target=self._read, args=(wake,), name="keyboard", daemon=True)
+        self._thread.start()
+
+    def _stop(self) -> None:
+        self._restore()
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            os.close(self._wake)
+            thread.join()
+        self._keys.clear()
+
+    def _restore(self) -> None:
+        if self._before is None:
+            return
+        with suppress(termios.error):  # a terminal that was closed needs nothing
+            termios.tcsetattr(
+                self._fd, termios.TCSANOW, self._before
+            )  # at once: draining waits for Ctrl-Q after Ctrl-S
+            termios.tcflush(self._fd, termios.TCIFLUSH)
+        self._before = None
+        atexit.unregister(self._restore)
+
+    def _read(self, wake: int) -> None:
+        known = {key.value.encode(): key for key in Key}
+        try:
+            while True:
+                ready, _, _ = select.select([self._fd, wake], [], [])
+                if wake in ready:
+                    return
+                typed = os.read(self._fd, 64)
+                if not typed:
+                    return
+                letters = _ESCAPE.sub(b"", typed).lower()
+                self._keys.extend(known[letter] for k in range(len(letters)) if (letter := letters[k : k + 1]) in known)
+        except OSError:
+            return  # the terminal is gone: SIGHUP says so to everybody
+        finally:
+            os.close(wake)

@@ -1,0 +1,209 @@
+"""Operators without a screen: a script that reads JSON, and plain lines for a log, a pipe or a dumb terminal."""
+
+import json
+import sys
+from collections.abc import Mapping
+from threading import Lock
+from typing import Any, TextIO
+
+import numpy as np
+
+from ftdrive.errors import Declined
+from ftdrive.session.events import (
+    SCHEMA_VERSION,
+    Asked,
+    Checked,
+    Estimated,
+    Event,
+    GuardTripped,
+    Noted,
+    PoseTaken,
+    RunOpened,
+    State,
+    StateChanged,
+)
+from ftdrive.session.operator import Key, Question
+
+
+def match(question: Question, typed: str) -> str | None:
+    """Find the answer that was typed; None for no answer.
+
+    In full, but for y and n; a word that must be typed exactly can be refused with no, which raises `Declined`.
+    """
+    typed = typed.strip()
+    if typed in question.answers:
+        return typed
+    if len(question.answers) > 1:
+        meant = {"y": "yes", "n": "no"}.get(typed.lower(), typed.lower())
+        return meant if meant in question.answers else None
+    if typed.lower() in {"n", "no"}:
+        raise Declined(f"the answer was no: {question.text}")
+    return None
+
+
+def prompt(question: Question) -> str:
+    """Say the question, and what may be typed where it does not say so itself."""
+    if len(question.answers) == 1 and question.answers[0] in question.text:
+        return f"{question.text}: "
+    return f"{question.text} [{'/'.join(answer or 'Enter' for answer in question.answers)}] "
+
+
+def read_line(stdin: TextIO, question: Question) -> str:
+    """Read one line; raises `Declined` where there is no more."""
+    line = stdin.readline()
+    if not line:
+        raise Declined(
+            f"nobody answered '{prompt(question).strip()}': run it in a terminal, or put the answer on standard input"
+        )
+    return line
+
+
+class JsonOperator:
+    """One JSON object a line on stdout: every event, and every question before it is answered from stdin.
+
+    A question is told as `{"event": "question", "text", "answers", "error"}`; the next line of stdin is its answer,
+    `error` says why the last one was none.
+
+    Parameters
+    ----------
+    yes : bool
+        Take what questions assume, where they assume something.
+    """
+
+    def __init__(self, *, yes: bool = False, stdin: TextIO | None = None, stdout: TextIO | None = None) -> None:
+        self._yes = yes
+        self._stdin, self._stdout = stdin or sys.stdin, stdout or sys.stdout
+        self._lock = Lock()
+
+    def tell(self, event: Event) -> None:
+        """Write the event."""
+        self._write(event.to_dict())
+
+    def ask(self, question: Question) -> str:
+        """Answer from stdin; raises `Declined` at its end."""
+        if self._yes and question.assumed is not None:
+            return question.assumed
+        error = None
+        while True:
+            self._write(
+                {
+                    "schema_version": SCHEMA_VERSION,
+                    "event": "question",
+                    "text": question.text,
+                    "answers": list(question.answers),
+                    "error": error,
+                }
+            )
+            typed = read_line(self._stdin, question)
+            if (answer := match(question, typed)) is not None:
+                return answer
+            error = f"'{typed.strip()}' is none of the answers"
+
+    def pressed(self) -> Key | None:
+        """Nothing: a script stops a session with SIGINT."""
+        return None
+
+    def _write(self, value: Mapping[str, Any]) -> None:
+        line = json.dumps(value, allow_nan=False) + "\n"
+        with self._lock:
+            self._stdout.write(line)
+            self._stdout.flush()
+
+
+class PlainOperator:
+    """One line for everything worth reading later, without colour and without keys.
+
+    Parameters
+    ----------
+    yes : bool
+        Take what questions assume, where they assume something.
+    """
+
+    def __init__(self, *, yes: bool = False, stdin: TextIO | None = None, stderr: TextIO | None = None) -> None:
+        self._yes = yes
+        self._stdin, self._stderr = stdin or sys.stdin, stderr or sys.stderr
+        self._lock = Lock()
+        self._asked = ""
+
+    def tell(self, event: Event) -> None:
+        """Write the event in words, if it is worth a line."""
+        if isinstance(event, Asked) and event.question == self._asked:
+            return  # stands there already
+        if words := in_words(event):
+            self._write(words + "\n")
+
+    def ask(self, question: Question) -> str:
+        """Answer from stdin; raises `Declined` at its end."""
+        if self._yes and question.assumed is not None:
+            return question.assumed
+        self._asked = question.text
+        while True:
+            self._write(prompt(question))
+            typed = read_line(self._stdin, question)
+            if not self._stdin.isatty():
+                self._write(typed)
+            if (answer := match(question, typed)) is not None:
+                return answer
+            self._write(f"'{typed.strip()}' is none of the answers.\n")
+
+    def pressed(self) -> Key | None:
+        """Nothing: Ctrl-C stops a session."""
+        return None
+
+    def _write(self, text: str) -> None:
+        with self._lock:
+            self._stderr.write(text)
+            self._stderr.flush()
+
+
+def in_words(event: Event) -> str:
+    """Say an event in a line; nothing for those that only a screen can show."""
+    match event:
+        case RunOpened():
+            return f"kept in {event.folder}; to continue after a stop: {event.resume}"
+        case StateChanged(state=State.HOLD):  # has all that STOP said
+            return f"{event.state.upper()}: {event.words}"
+        case StateChanged(state=State.PREFLIGHT | State.APPROACH | State.CLOSE):
+            return f"{event.state}{': ' if event.words else ''}{event.words}"
+        case Checked():
+            return f"{'ok  ' if event.passed else 'FAIL'} {event.name}: {event.words}"
+        case Noted():
+            return f"{'! ' if event.warning else ''}{event.words}"
+        case PoseTaken():
+            return pose_in_words(event)
+        case Estimated():
+            return estimate_in_words(event)
+        case GuardTripped():
+            return f"STOPPED by guard {event.hazard}: {event.words}"
+        case Asked():
+            return f"{event.question} {event.answer}"
+        case _:
+            return ""
+
+
+def pose_in_words(event: PoseTaken) -> str:
+    """Say how a pose was taken."""
+    force_N, torque_Nm = rms_sigma(event)
+    words = (
+        f"{event.stop}/{event.stops} R{event.number:02d}: settled {event.settle_s:.1f} s, {event.samples} samples in "
+        f"{event.average_s:.1f} s, sigma {force_N:.2g} N {torque_Nm:.2g} N·m"
+    )
+    if event.attempts > 1:
+        words += f", {event.attempts} attempts"
+    return words if event.steady else words + ", NOT STEADY"
+
+
+def estimate_in_words(event: Estimated) -> str:
+    """Say where the calibration stands."""
+    words = f"  coverage {event.light}"
+    if "mass_kg" in event.values:
+        words += f", mass {event.values['mass_kg']:.4f} ± {event.sigma['mass_kg']:.4f} kg"
+    if event.residual_sigma is not None and event.residual_force_N is not None:
+        words += f", {event.residual_force_N:.3f} N from the fit before, {event.residual_sigma:.1f} sigma"
+    return f"{words}; helps most: {event.hint}" if event.hint else words
+
+
+def rms_sigma(event: PoseTaken) -> tuple[float, float]:
+    """Standard deviation of one axis of the mean: force, N, and torque, N·m."""
+    variance = np.square(event.sigma)
+    return float(np.sqrt(variance[:3].mean())), float(np.sqrt(variance[3:].mean()))

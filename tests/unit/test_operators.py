@@ -1,0 +1,176 @@
+"""Operators without a screen: JSON for scripts, plain lines for logs; what counts as an answer."""
+
+import io
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ftdrive.errors import Declined
+from ftdrive.session.events import (
+    Asked,
+    Checked,
+    Estimated,
+    Event,
+    GuardTripped,
+    Noted,
+    PoseTaken,
+    RunOpened,
+    State,
+    StateChanged,
+)
+from ftdrive.session.operator import Operator, Question
+from ftdrive.session.operators import JsonOperator, PlainOperator, match
+
+FREE = Question("Is the tool free?", assumed="yes")
+MOVE = Question("Type MOVE to let the arm move", ("MOVE",))
+STEP = Question("Next pose?", ("", "stop"))
+
+
+def estimated(**changes: Any) -> Estimated:
+    fields: dict[str, Any] = {
+        "poses": 5,
+        "values": {"mass_kg": 1.2},
+        "sigma": {"mass_kg": 0.003},
+        "residual_sigma": 1.5,
+        "residual_force_N": 0.06,
+        "faces": (1, 0, 2, 0, 1, 1),
+        "cond9": 5.1,
+        "cond_u1": float("inf"),
+        "empty_cap_deg": 95.0,
+        "light": "amber",
+        "hint": "point the tool's +x axis down: turn the last joint by +90°",
+    }
+    return Estimated(**(fields | changes))
+
+
+POSE = PoseTaken(
+    stop=7,
+    stops=25,
+    number=5,
+    gravity_flange=np.array([0.0, 0.0, 1.0]),
+    mean=np.zeros(6),
+    sigma=np.repeat([0.031, 0.0012], 3),
+    samples=2000,
+    settle_s=0.9,
+    average_s=2.0,
+    attempts=2,
+    steady=False,
+)
+
+
+@pytest.mark.parametrize(
+    ("question", "typed", "answer"),
+    [
+        (FREE, "yes\n", "yes"),
+        (FREE, "Y", "yes"),
+        (FREE, " no ", "no"),
+        (FREE, "", None),
+        (FREE, "maybe", None),
+        (MOVE, "MOVE\n", "MOVE"),
+        (MOVE, "move", None),  # typed in full, as it stands
+        (MOVE, "M", None),
+        (MOVE, "", None),
+        (STEP, "\n", ""),
+        (STEP, "Stop", "stop"),
+        (Question("?", ("resume", "quit")), "r", None),  # one letter moves no arm
+    ],
+)
+def test_what_counts_as_an_answer(question: Question, typed: str, answer: str | None) -> None:
+    assert match(question, typed) == answer
+
+
+def test_a_word_that_must_be_typed_can_be_refused() -> None:
+    with pytest.raises(Declined, match="the answer was no: Type MOVE"):
+        match(MOVE, "no")
+
+
+def test_a_script_reads_events_and_answers_questions() -> None:
+    stdin, stdout = io.StringIO("no idea\nMOVE\n"), io.StringIO()
+    operator: Operator = JsonOperator(yes=True, stdin=stdin, stdout=stdout)
+    operator.tell(StateChanged(state=State.MOVE, stop=1, stops=25, number=19))
+    assert operator.ask(FREE) == "yes"  # nothing is asked
+    assert operator.ask(MOVE) == "MOVE"
+    operator.tell(estimated())
+    operator.tell(POSE)
+    lines = [json.loads(line) for line in stdout.getvalue().splitlines()]
+    assert [line["event"] for line in lines] == ["state-changed", "question", "question", "estimated", "pose-taken"]
+    assert all(line["schema_version"] == 1 for line in lines)
+    assert lines[1]["answers"] == ["MOVE"]
+    assert lines[1]["error"] is None
+    assert lines[2]["error"] == "'no idea' is none of the answers"
+    assert lines[3]["cond_u1"] is None  # JSON has no infinity
+    assert lines[3]["values"] == {"mass_kg": 1.2}
+    assert lines[4]["sigma"] == POSE.sigma.tolist()
+    assert operator.pressed() is None
+
+
+def test_every_event_is_one_line_of_json_and_arrives_at_once() -> None:
+    class Pipe(io.StringIO):
+        flushed = ""
+
+        def flush(self) -> None:
+            self.flushed = self.getvalue()
+
+    stdout = Pipe()
+    operator = JsonOperator(stdin=io.StringIO(), stdout=stdout)
+    for event in (Noted(words="two\nlines"), GuardTripped(hazard=7, words="31 N"), Asked(question="?", answer="yes")):
+        operator.tell(event)
+        assert stdout.flushed.endswith("}\n")
+    assert len(stdout.flushed.splitlines()) == 3
+    assert json.loads(stdout.flushed.splitlines()[0])["words"] == "two\nlines"
+
+
+def json_operator(typed: str, *, yes: bool = False) -> Operator:
+    return JsonOperator(yes=yes, stdin=io.StringIO(typed), stdout=io.StringIO())
+
+
+def plain_operator(typed: str, *, yes: bool = False) -> Operator:
+    return PlainOperator(yes=yes, stdin=io.StringIO(typed), stderr=io.StringIO())
+
+
+@pytest.mark.parametrize("operator", [json_operator, plain_operator])
+def test_nobody_to_answer_is_no_consent(operator: Callable[..., Operator]) -> None:
+    with pytest.raises(Declined, match=r"nobody answered 'Type MOVE to let the arm move:'"):
+        operator("", yes=True).ask(MOVE)  # --yes is not enough for what must be typed
+    with pytest.raises(Declined):
+        operator("maybe\n").ask(FREE)
+
+
+def test_plain_lines_tell_what_is_worth_a_line() -> None:
+    stderr = io.StringIO()
+    operator: Operator = PlainOperator(stdin=io.StringIO("what\nMOVE\n"), stderr=stderr)
+    events: list[Event] = [
+        StateChanged(state=State.PREFLIGHT),
+        Checked(name="robot", passed=False, words="remote control is off: switch it on"),
+        RunOpened(folder="runs/a", resume="ftdrive calibrate --resume runs/a"),
+        StateChanged(state=State.SETTLE, stop=7, stops=25, number=5),
+        POSE,
+        estimated(),
+        Noted(words="[bold] stays as it is", warning=True),
+        GuardTripped(hazard=7, words="31 N: look at the tool"),
+        StateChanged(state=State.HOLD, words="contact"),
+    ]
+    for event in events:
+        operator.tell(event)
+    assert operator.ask(MOVE) == "MOVE"
+    operator.tell(Asked(question=MOVE.text, answer="MOVE"))  # stands there already
+    operator.tell(Asked(question=FREE.text, answer="yes"))  # assumed, never shown
+    assert stderr.getvalue().splitlines() == [
+        "preflight",
+        "FAIL robot: remote control is off: switch it on",
+        "kept in runs/a; to continue after a stop: ftdrive calibrate --resume runs/a",
+        "7/25 R05: settled 0.9 s, 2000 samples in 2.0 s, sigma 0.031 N 0.0012 N·m, 2 attempts, NOT STEADY",
+        "  coverage amber, mass 1.2000 ± 0.0030 kg, 0.060 N from the fit before, 1.5 sigma; "
+        "helps most: point the tool's +x axis down: turn the last joint by +90°",
+        "! [bold] stays as it is",
+        "STOPPED by guard 7: 31 N: look at the tool",
+        "HOLD: contact",
+        "Type MOVE to let the arm move: what",
+        "'what' is none of the answers.",
+        "Type MOVE to let the arm move: MOVE",
+        "Is the tool free? yes",
+    ]
+    assert "\x1b" not in stderr.getvalue()
