@@ -106,6 +106,32 @@ class ArmState:
     """(3,)"""
 
 
+@dataclass(frozen=True, slots=True)
+class ArmStatus:
+    """What a controller says of itself, all in one moment. None where this controller does not tell."""
+
+    t_host_ns: int
+    t_device_s: float
+    robot_mode: str
+    """Such as "running", "idle", "power off"."""
+    safety_mode: str
+    """Such as "normal", "reduced", "protective stop"."""
+    program: str
+    """"stopped", "playing", "paused", or on the way to one of them; ours plays too while the arm is controlled."""
+    fault: str | None
+    """Why the arm may not move, and what the operator has to do; None when nothing forbids it."""
+    speed_slider: float
+    """0 to 1, as set at the pendant or by a program."""
+    speed_scaling: float
+    """0 to 1, how much of the programmed speed the controller allows at this moment."""
+    payload_kg: float | None
+    """What the controller was told to hang on the flange."""
+    p_flange_payload_m: tuple[float, ...] | None
+    """(3,) centre of mass of that payload."""
+    tcp_offset: tuple[float, ...] | None
+    """(6,) active TCP in the flange: m, then a rotation vector in rad."""
+
+
 class _Device(ABC):
     @abstractmethod
     def close(self) -> None:
@@ -160,7 +186,17 @@ class RobotArm(_Device):
 
     @abstractmethod
     def state(self) -> ArmState:
-        """Read a fresh, consistent state; raises `DeviceTimeout` when the controller's clock stands still."""
+        """Read a fresh, consistent state; raises `DeviceTimeout` when the controller's clock stands still.
+
+        From any thread, also while `move_to` runs in another.
+        """
+
+    @abstractmethod
+    def status(self) -> ArmStatus:
+        """Tell the controller's modes and settings. Quick; from any thread, also while `move_to` runs in another.
+
+        Never older than the last tenth of a second; raises `DeviceTimeout` or `StreamBroken` instead.
+        """
 
     @abstractmethod
     def within_safety_limits(self, q_rad: Sequence[float]) -> bool:

@@ -19,7 +19,7 @@ from math import radians
 from typing import Final
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
-from drivers.interfaces import ArmState, DeviceInfo, Guard, RobotArm
+from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, Guard, RobotArm
 from drivers.ur.control import ControlProcess
 from drivers.ur.control_child import DECELERATION_RAD_S2, UNWATCHED_S
 from drivers.ur.kinematics import MODELS, model_named
@@ -223,6 +223,19 @@ class UrArm(RobotArm):
         lost, and `DeviceFault` when the joints are not measured (no power) or the pose does not fit the model.
         """
         return self._reading().state(lambda: self._in_control().call("tcp_offset"))
+
+    def status(self) -> ArmStatus:
+        """Tell the controller's modes and settings; see `RobotArm`. 125 times a second there is something new."""
+        return self._reading().status()
+
+    def in_remote_control(self) -> bool | None:
+        """Ask the dashboard server, which takes some milliseconds; None before PolyScope 5.6, which does not tell.
+
+        Raises `StreamBroken` or `DeviceTimeout`.
+        """
+        if self._reading().version[:2] < (5, 6):
+            return None
+        return ask_dashboard(self._host, lambda dashboard: dashboard.isInRemoteControl(), timeout_s=CONNECT_S)
 
     # ------------------------------------------------------------------ moving
 
