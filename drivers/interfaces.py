@@ -7,8 +7,8 @@ device is gone. Every wait has a time-out. An old value is never returned: stale
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, field
+from typing import Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,30 @@ Guard = Callable[[], None]
 """Called between two looks at the arm; raises when the motion must not go on."""
 
 
+NOT_REPORTED: Final = "not reported"
+"""What stands for a serial number or a firmware version that a device does not tell."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """Something known about a device, and from where."""
+
+    value: float | str | tuple[float, ...]
+    source: Literal["device", "documented", "configured", "assumed"]
+    """Told by the device, fixed by its manual, given by the user, or none of these: to be checked."""
+
+
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """Who a device says it is."""
+    """Who a device says it is, and what is known of it."""
 
     model: str
     serial: str
     firmware: str
+    facts: dict[str, Fact] = field(default_factory=dict)
+    """Of a sensor: `serial`; `counts_per_N` and `counts_per_Nm`, the scale of the device's own numbers; `range`, (6,)
+    the largest force in N and torque in N·m on each axis of the sensor, either way; `sign`, 1 or -1. What is not known
+    is not there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

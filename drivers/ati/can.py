@@ -17,7 +17,7 @@ import numpy as np
 from can.interfaces.slcan import slcanBus
 
 from drivers._can import BUS_ERRORS, close_bus, open_bus
-from drivers._stream import LINK_ERRORS, NOTHING, StreamingSensor
+from drivers._stream import LINK_ERRORS, NOTHING, StreamingSensor, scale_facts
 from drivers.ati import codec
 from drivers.ati.calibration import NEWTON, NEWTON_METRE, Calibration, saturated_gauges
 from drivers.ati.codec import Op
@@ -115,6 +115,11 @@ class AtiCanSensor(StreamingSensor):
             model="ATI F/T (NETCANOEM, CAN)",
             serial=serial,
             firmware=f"{firmware.major}.{firmware.minor} build {firmware.build}",
+            facts=scale_facts(
+                self._calibration.counts_per_N,
+                self._calibration.counts_per_Nm,
+                "device" if firmware >= codec.COUNTS_PER_UNIT_SINCE else "assumed",
+            ),
         )
 
     def _read_block(self) -> FtSamples:

@@ -144,6 +144,8 @@ class CalibrationBlock:
     matrix: Array
     """(6, 6) counts per gauge count, rows Fx..Tz, columns G0..G5."""
     unit_codes: tuple[int, int]
+    max_rating: tuple[float, ...]
+    """(6,) Fx..Tz, in these units."""
     counts_per_unit: tuple[int, int]
     gains: tuple[int, ...]
     offsets: tuple[int, ...]
@@ -163,6 +165,7 @@ def decode_calibration_block(data: bytes) -> CalibrationBlock:
         calibrated_at=decode_text(data[44:64]),
         matrix=matrix.astype(np.float64),
         unit_codes=(data[208], data[209]),
+        max_rating=struct.unpack_from(">6f", data, 2 * 105),
         counts_per_unit=(force, torque),
         gains=struct.unpack_from(">6H", data, 2 * 121),
         offsets=struct.unpack_from(">6H", data, 2 * 127),

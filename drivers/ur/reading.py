@@ -21,7 +21,7 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from drivers.interfaces import ArmState, ArmStatus, DeviceInfo
+from drivers.interfaces import NOT_REPORTED, ArmState, ArmStatus, DeviceInfo
 from drivers.ur.kinematics import MODELS, Pose, forward, model_named
 from drivers.ur.library import Dashboard, Receive, ask_dashboard, connect_receive, require, retire
 from drivers.ur.rtde import LiveReader
@@ -153,7 +153,7 @@ class Reader:
                 serial = dashboard.getSerialNumber()
             except RuntimeError as error:  # the question is younger than some controllers
                 log.info("%s does not tell its serial number: %s", self._host, error)
-                serial = "unknown"
+                serial = NOT_REPORTED
             return told, serial, dashboard.polyscopeVersion().strip()
 
         try:

@@ -351,7 +351,7 @@ def test_robotiq_saturation_is_a_fault(start: Start) -> None:
 
 def test_robotiq_unknown_serial_number(start: Start) -> None:
     with start("robotiq-ft300", serial=("FTS", 0)).sensor() as sensor:
-        assert sensor.identify().serial == "unknown"
+        assert sensor.identify().serial == "not reported"
         assert sensor.identify().firmware == "FTS-2.0.1"
 
 
