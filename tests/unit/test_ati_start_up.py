@@ -183,7 +183,7 @@ def test_can_reply_lost_in_the_start_up_is_asked_again() -> None:
     ],
 )
 def test_can_status_that_ends_the_stream(first_half: str, error: type[DriverError], message: str) -> None:
-    script = [GAUGES, GAUGES, [first_half, GAUGES[1]]]
+    script = [*[GAUGES] * 50, [first_half, GAUGES[1]]]  # so many that `open` has returned
     with CanPeer({"200": script}) as peer, peer.sensor() as sensor, pytest.raises(error, match=message):
         sensor.collect(1.0)
 
