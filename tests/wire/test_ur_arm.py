@@ -120,8 +120,10 @@ def test_old_controllers_need_control_to_tell_the_tcp(
     outputs = {name: kind for name, kind in LiveReader._outputs.items() if name != "tcp_offset"}
     monkeypatch.setattr(LiveReader, "_outputs", outputs)
     arm = new_arm()
+    arm.open()
+    assert arm.status().tcp_offset is None
     with pytest.raises(ConnectError, match="too old to tell its active TCP"):
-        arm.open()
+        arm.state()
     arm.open(control=True)
     station.do("set-tcp", tcp=TCP)
     assert_flange_is_right(arm)
@@ -225,18 +227,18 @@ def test_status_is_what_the_controller_says_now(station: Station, new_arm: Calla
 
 @pytest.mark.parametrize("stopped", [False, True])
 def test_others_may_look_and_stop_while_the_arm_moves(station: Station, arm: UrArm, stopped: bool) -> None:
-    q, done = away(arm), threading.Event()
-    seen: list[tuple[float, str, float]] = []  # joint 6, program, how long both looks took
+    q0, q, done = arm.state().q_rad[5], away(arm), threading.Event()
+    seen: list[tuple[float, str]] = []  # joint 6, program
     failures: list[Exception] = []
 
     def look_along() -> None:
         try:
             while not done.is_set():
-                t0 = time.monotonic()
-                seen.append((arm.state().q_rad[5], arm.status().program, time.monotonic() - t0))
-                if stopped and len(seen) == 20:
+                seen.append((arm.state().q_rad[5], arm.status().program))
+                if stopped and abs(seen[-1][0] - q0) > 0.2:
                     arm.stop()
                     assert not station.do("state")["moving"]  # it returns when the arm stands
+                    return
         except Exception as error:
             failures.append(error)
 
@@ -254,10 +256,10 @@ def test_others_may_look_and_stop_while_the_arm_moves(station: Station, arm: UrA
         for looker in lookers:
             looker.join(5)
     assert not failures
-    assert {program for _, program, _ in seen} == {"playing"}
-    assert len({angle for angle, _, _ in seen}) > 10
-    assert np.median([took_s for _, _, took_s in seen]) < 0.05
+    assert {program for _, program in seen} == {"playing"}
+    assert stopped or len({angle for angle, _ in seen}) > 10  # they saw the arm move
     here = arm.state().q_rad
+    assert (abs(here[5] - q[5]) > 0.1) == stopped
     arm.move_to(here.tolist(), timeout_s=5, guard=no_guard)
 
 
