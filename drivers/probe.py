@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from drivers._frames import Deframer
 from drivers._serial import SerialPort
 from drivers.ati import modbus
+from drivers.ati.codec import decode_text
 from drivers.bota import codec as bota
 from drivers.errors import ConnectError, ProtocolError, StreamBroken
 from drivers.robotiq import codec as robotiq
@@ -94,14 +95,15 @@ def _ati_streams(data: bytes) -> bool:
     return False
 
 
-_ATI_REQUEST = modbus.read_registers(modbus.STATUS, 1)
+_ATI_REQUEST = modbus.read_registers(modbus.calibration_reads(1)[0][0], 20)
+"""Serial and part number of the first stored calibration."""
 _ROBOTIQ_REQUEST = robotiq.read_registers(robotiq.SERIAL, 4)
 _ROBOTOUS_REQUEST = robotous.encode_frame(robotous.encode(robotous.Command.MODEL))
 
 
 def _ati_reply(data: bytes) -> str:
-    status = modbus.check_reply(_ATI_REQUEST, data[: modbus.reply_size(_ATI_REQUEST)])
-    return f"ATI Digital F/T, status 0x{status.hex()}"
+    told = modbus.check_reply(_ATI_REQUEST, data[: modbus.reply_size(_ATI_REQUEST)])
+    return f"ATI Digital F/T {decode_text(told[8:])}, serial {decode_text(told[:8])}"
 
 
 def _robotiq_reply(data: bytes) -> str:
