@@ -215,6 +215,10 @@ class RobotArm(_Device):
         Never older than the last tenth of a second; raises `DeviceTimeout` or `StreamBroken` instead.
         """
 
+    def in_remote_control(self) -> bool | None:
+        """Whether the controller takes programs from the network; None where there is no such switch."""
+        return None
+
     @abstractmethod
     def within_safety_limits(self, q_rad: Sequence[float]) -> bool:
         """Ask the controller whether it would accept these joint angles (6,). Needs control."""

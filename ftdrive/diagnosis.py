@@ -195,7 +195,7 @@ def check_remote(remote: bool | None) -> Check:
     """Judge whether the controller takes programs from the network; None where it does not tell."""
     name = "robot.remote"
     if remote is None:
-        return Check(name, "skipped", "not applicable: before PolyScope 5.6 there is no remote control to switch")
+        return Check(name, "skipped", "not applicable: this controller has no remote control to switch")
     if remote:
         return Check(name, "ok", "remote control on")
     return Check(name, "failed", "local control", "press Local, Remote Control at the top right of the pendant")

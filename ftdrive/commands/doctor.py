@@ -15,8 +15,7 @@ from rich.markup import escape
 
 from calib import CalibrationResult
 from drivers.errors import DriverError
-from drivers.interfaces import ArmStatus, ForceTorqueSensor
-from drivers.ur.arm import UrArm
+from drivers.interfaces import ArmStatus, ForceTorqueSensor, RobotArm
 from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
 from ftdrive.commands.common import JSON, RUNS, read_cell, write_json
@@ -101,7 +100,7 @@ def doctor(
         raise NotAccepted(f"{len(failed)} of {len(found)} checks failed: {', '.join(failed)}")
 
 
-def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> UrArm | None:
+def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> RobotArm | None:
     host, arm = cell.robot.host, build_arm(cell)
     stack.callback(arm.close)
     try:
@@ -123,7 +122,7 @@ def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> Ur
     return arm
 
 
-def _flange(arm: UrArm, status: ArmStatus) -> Check:
+def _flange(arm: RobotArm, status: ArmStatus) -> Check:
     name = "robot.flange"
     if status.tcp_offset is None:
         return Check(name, "skipped", "the controller is too old to tell its TCP: only a calibration can read poses")
@@ -135,7 +134,7 @@ def _flange(arm: UrArm, status: ArmStatus) -> Check:
     return Check(name, "ok", f"TCP told; the flange is at ({where}) mm in base, where the model has it")
 
 
-def _clock(arm: UrArm) -> Check:
+def _clock(arm: RobotArm) -> Check:
     host_ns: list[int] = []
     device_s: list[float] = []
     try:
@@ -175,7 +174,7 @@ def _examine_sensor(
 
 def _examine_push(
     device: ForceTorqueSensor | None,
-    arm: UrArm | None,
+    arm: RobotArm | None,
     R_flange_sensor: Array | None,
     sign: int,
     station: Station | None,
