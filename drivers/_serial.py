@@ -1,13 +1,13 @@
-"""A serial port that fails in our words: opened once, 8N1, every wait bounded."""
+"""A serial port that fails in our words: opened once, every wait bounded."""
 
 import contextlib
+import os
 
 import serial
 
 from drivers._stream import LINK_ERRORS
 from drivers.errors import ConnectError, StreamBroken
 
-_READ_S = 0.05
 _WRITE_S = 0.2
 
 
@@ -21,19 +21,34 @@ class SerialPort:
     path : str
         Such as ``/dev/serial/by-id/…``.
     baud : int
-        Bit/s; always 8 data bits, no parity, one stop bit.
+        Bit/s; always 8 data bits and one stop bit.
+    even_parity : bool
+        Without it no parity.
+    read_s : float
+        What one read waits at most.
     """
 
-    def __init__(self, owner: str, path: str, baud: int) -> None:
+    def __init__(self, owner: str, path: str, baud: int, *, even_parity: bool = False, read_s: float = 0.05) -> None:
         self._owner = owner
         self._path = path
         self._baud = baud
+        self._parity = serial.PARITY_EVEN if even_parity else serial.PARITY_NONE
+        self._read_s = read_s
         self._port: serial.Serial | None = None
 
     def open(self) -> None:
         """Take the port for this process alone. Raises `ConnectError`."""
+        # A pseudo-terminal refuses even parity at the second look; everything is set in the constructor, never later.
+        emulated = os.path.realpath(self._path).startswith("/dev/pts/")
         try:
-            self._port = serial.Serial(self._path, self._baud, timeout=_READ_S, write_timeout=_WRITE_S, exclusive=True)
+            self._port = serial.Serial(
+                self._path,
+                self._baud,
+                parity=serial.PARITY_NONE if emulated else self._parity,
+                timeout=self._read_s,
+                write_timeout=_WRITE_S,
+                exclusive=True,
+            )
         except (ValueError, *LINK_ERRORS) as exc:
             raise ConnectError(
                 f"{self._owner}: the port does not open ({exc}); is it plugged in, free, and are you in its group?"
@@ -54,7 +69,7 @@ class SerialPort:
         return self._port is not None
 
     def read(self, size: int) -> bytes:
-        """Read `size` bytes, or fewer after 0.05 s. Raises `StreamBroken`."""
+        """Read `size` bytes, or fewer after `read_s`. Raises `StreamBroken`."""
         port = self._open_or_broken()
         try:
             return port.read(size)
@@ -62,7 +77,7 @@ class SerialPort:
             raise self._broken(exc) from exc
 
     def read_all(self, at_least: int) -> bytes:
-        """Read `at_least` bytes, or fewer after 0.05 s, and whatever else has arrived. Raises `StreamBroken`."""
+        """Read `at_least` bytes, or fewer after `read_s`, and whatever else has arrived. Raises `StreamBroken`."""
         port = self._open_or_broken()
         try:
             data = port.read(at_least)
@@ -70,10 +85,12 @@ class SerialPort:
         except (TypeError, *LINK_ERRORS) as exc:
             raise self._broken(exc) from exc
 
-    def write(self, data: bytes) -> None:
-        """Send bytes. Raises `StreamBroken`."""
+    def write(self, data: bytes, *, discard: bool = False) -> None:
+        """Send bytes, on request after throwing away what has arrived so far. Raises `StreamBroken`."""
         port = self._open_or_broken()
         try:
+            if discard:
+                port.reset_input_buffer()
             port.write(data)
         except (TypeError, *LINK_ERRORS) as exc:
             raise self._broken(exc) from exc

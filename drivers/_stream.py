@@ -8,11 +8,13 @@ import threading
 import time
 from abc import abstractmethod
 from collections import deque
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
-from drivers.interfaces import DeviceInfo, ForceTorqueSensor, FtSamples, Health
+from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
 
 if sys.platform == "win32":
     LINK_ERRORS: tuple[type[Exception], ...] = (OSError,)
@@ -33,6 +35,14 @@ NOTHING = FtSamples(
     status=np.zeros(0, np.uint32),
 )
 """What `_read_block` returns when nothing came in time."""
+
+
+def scale_facts(
+    counts_per_N: float, counts_per_Nm: float, source: Literal["device", "documented", "configured", "assumed"]
+) -> dict[str, Fact]:
+    """Say what the device's own numbers mean, for `DeviceInfo.facts`."""
+    return {"counts_per_N": Fact(counts_per_N, source), "counts_per_Nm": Fact(counts_per_Nm, source)}
+
 
 _JOIN_S = 0.6
 _FIRST_SAMPLE_S = 1.0
@@ -83,6 +93,9 @@ class StreamingSensor(ForceTorqueSensor):
         self._stale_after_s = stale_after_s
         self._max_collect_samples = max_collect_samples
         self.recover = recover
+        self.configured: dict[str, Fact] = {}
+        """`serial` and `range`, for a device that does not tell them; until `open`. A device that tells another serial
+        number is refused; a range given here comes before the device's own."""
         self._nominal_Hz = math.nan
         """A subclass that knows its rate sets it in `_connect`."""
         self._thread: threading.Thread | None = None
@@ -119,7 +132,7 @@ class StreamingSensor(ForceTorqueSensor):
             return
         self._reset()
         try:
-            self._info = self._connect()
+            self._info = self._connect_and_identify()
         except BaseException as exc:
             self._let_go()
             if isinstance(exc, DriverError) and not isinstance(exc, ConnectError | DeviceFault):
@@ -227,6 +240,19 @@ class StreamingSensor(ForceTorqueSensor):
                 events=tuple(self._events),
             )
 
+    def _connect_and_identify(self) -> DeviceInfo:
+        """Connect, and complete what the device tells by what was configured."""
+        info = self._connect()
+        told = {} if info.serial == NOT_REPORTED else {"serial": Fact(info.serial, "device")}
+        facts = info.facts | told | self.configured | {"sign": Fact(self._sign, "configured")}
+        if told and facts["serial"].value != info.serial:
+            raise ConnectError(
+                f"{self.name}: serial number {info.serial} answers, {facts['serial'].value} is configured; check the "
+                "address, or its option serial"
+            )
+        serial = str(facts["serial"].value) if "serial" in facts else info.serial
+        return replace(info, serial=serial, facts=facts)
+
     def _reset(self) -> None:
         self._failure = None
         self._newest = NOTHING
@@ -289,7 +315,7 @@ class StreamingSensor(ForceTorqueSensor):
         while True:
             self._let_go()
             try:
-                info = self._connect()
+                info = self._connect_and_identify()
                 break
             except DeviceFault:
                 raise

@@ -7,8 +7,8 @@ device is gone. Every wait has a time-out. An old value is never returned: stale
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, field
+from typing import Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,30 @@ Guard = Callable[[], None]
 """Called between two looks at the arm; raises when the motion must not go on."""
 
 
+NOT_REPORTED: Final = "not reported"
+"""What stands for a serial number or a firmware version that a device does not tell."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """Something known about a device, and from where."""
+
+    value: float | str | tuple[float, ...]
+    source: Literal["device", "documented", "configured", "assumed"]
+    """Told by the device, fixed by its manual, given by the user, or none of these: to be checked."""
+
+
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """Who a device says it is."""
+    """Who a device says it is, and what is known of it."""
 
     model: str
     serial: str
     firmware: str
+    facts: dict[str, Fact] = field(default_factory=dict)
+    """Of a sensor: `serial`; `counts_per_N` and `counts_per_Nm`, the scale of the device's own numbers; `range`, (6,)
+    the largest force in N and torque in N·m on each axis of the sensor, either way; `sign`, 1 or -1. What is not known
+    is not there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,6 +123,32 @@ class ArmState:
     """(3,)"""
 
 
+@dataclass(frozen=True, slots=True)
+class ArmStatus:
+    """What a controller says of itself, all in one moment. None where this controller does not tell."""
+
+    t_host_ns: int
+    t_device_s: float
+    robot_mode: str
+    """Such as "running", "idle", "power off"."""
+    safety_mode: str
+    """Such as "normal", "reduced", "protective stop"."""
+    program: str
+    """"stopped", "playing", "paused", or on the way to one of them; ours plays too while the arm is controlled."""
+    fault: str | None
+    """Why the arm may not move, and what the operator has to do; None when nothing forbids it."""
+    speed_slider: float
+    """0 to 1, as set at the pendant or by a program."""
+    speed_scaling: float
+    """0 to 1, how much of the programmed speed the controller allows at this moment."""
+    payload_kg: float | None
+    """What the controller was told to hang on the flange."""
+    p_flange_payload_m: tuple[float, ...] | None
+    """(3,) centre of mass of that payload."""
+    tcp_offset: tuple[float, ...] | None
+    """(6,) active TCP in the flange: m, then a rotation vector in rad."""
+
+
 class _Device(ABC):
     @abstractmethod
     def close(self) -> None:
@@ -160,7 +203,21 @@ class RobotArm(_Device):
 
     @abstractmethod
     def state(self) -> ArmState:
-        """Read a fresh, consistent state; raises `DeviceTimeout` when the controller's clock stands still."""
+        """Read a fresh, consistent state; raises `DeviceTimeout` when the controller's clock stands still.
+
+        From any thread, also while `move_to` runs in another.
+        """
+
+    @abstractmethod
+    def status(self) -> ArmStatus:
+        """Tell the controller's modes and settings. Quick; from any thread, also while `move_to` runs in another.
+
+        Never older than the last tenth of a second; raises `DeviceTimeout` or `StreamBroken` instead.
+        """
+
+    def in_remote_control(self) -> bool | None:
+        """Whether the controller takes programs from the network; None where there is no such switch."""
+        return None
 
     @abstractmethod
     def within_safety_limits(self, q_rad: Sequence[float]) -> bool:

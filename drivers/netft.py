@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 import pynetft
 
-from drivers._stream import NOTHING, StreamingSensor
+from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM
 from drivers.errors import ConnectError, DeviceFault, StreamBroken
-from drivers.interfaces import DeviceInfo, FtSamples, Health
+from drivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples, Health
 
 if TYPE_CHECKING:
     from drivers.registry import Options
@@ -135,7 +135,7 @@ def describe_status(status: int, bits: Mapping[int, str]) -> str:
 def serial_in(page: bytes) -> str:
     """Find the serial number of the active calibration in ``netftapi2.xml``."""
     match = re.search(rb"<cfgcalsn>\s*([\x20-\x3b\x3d-\x7e]{1,32}?)\s*</cfgcalsn>", page)
-    return match[1].decode("ascii") if match else "not reported"
+    return match[1].decode("ascii") if match else NOT_REPORTED
 
 
 class NetFtSensor(StreamingSensor):
@@ -180,7 +180,7 @@ class NetFtSensor(StreamingSensor):
         )
 
     def _connect(self) -> DeviceInfo:
-        serial = "not reported" if self._onrobot else self._read_serial()
+        serial = NOT_REPORTED if self._onrobot else self._read_serial()
         override = None
         if self._onrobot:
             override = pynetft.Calibration(*_ONROBOT_COUNTS, pynetft.ForceUnit.NEWTON, pynetft.TorqueUnit.NEWTON_METER)
@@ -209,12 +209,16 @@ class NetFtSensor(StreamingSensor):
                 f"{self.name}: it measures in {scale.force_unit.value} and {scale.torque_unit.value}; "
                 "choose N and Nm on its configuration page"
             )
-        self._unit_per_count = np.array(
-            [_FORCE_N[scale.force_unit.value] / scale.counts_per_force_unit] * 3
-            + [_TORQUE_NM[scale.torque_unit.value] / scale.counts_per_torque_unit] * 3
-        )
+        counts_per_N = scale.counts_per_force_unit / _FORCE_N[scale.force_unit.value]
+        counts_per_Nm = scale.counts_per_torque_unit / _TORQUE_NM[scale.torque_unit.value]
+        self._counts_per_unit = np.repeat([counts_per_N, counts_per_Nm], 3)
         model = "OnRobot HEX (Ethernet)" if self._onrobot else told.product_name or "ATI Net F/T"
-        return DeviceInfo(model=model, serial=serial, firmware="not reported")
+        return DeviceInfo(
+            model=model,
+            serial=serial,
+            firmware=NOT_REPORTED,
+            facts=scale_facts(counts_per_N, counts_per_Nm, "documented" if self._onrobot else "device"),
+        )
 
     def _read_block(self) -> FtSamples:
         samples = self._fetch()
@@ -234,7 +238,7 @@ class NetFtSensor(StreamingSensor):
             t_device_s=np.full(n, np.nan),
             seq=np.array(numbers, np.int64),
             counts=counts,
-            wrench=counts * self._unit_per_count,
+            wrench=counts / self._counts_per_unit,
             status=status,
         )
 

@@ -4,18 +4,16 @@ Nothing is set, started or stopped: what is sent are requests to read, in the pr
 They are still bytes, and what an unknown device makes of them is unknown. CAN is not probed.
 """
 
-import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import serial
-
 from drivers._frames import Deframer
-from drivers._stream import LINK_ERRORS
+from drivers._serial import SerialPort
 from drivers.ati import modbus
+from drivers.ati.codec import decode_text
 from drivers.bota import codec as bota
-from drivers.errors import ConnectError, ProtocolError
+from drivers.errors import ConnectError, ProtocolError, StreamBroken
 from drivers.robotiq import codec as robotiq
 from drivers.robotous import codec as robotous
 
@@ -37,7 +35,7 @@ class Answer:
 class _Known:
     url: str
     baud: int
-    parity: str
+    even_parity: bool
     streams: Callable[[bytes], bool]
     request: bytes | None
     reply: Callable[[bytes], str]
@@ -65,19 +63,20 @@ def probe(port: str) -> Answer | None:
     return None
 
 
-def _hear(port: str, known: _Known, request: bytes | None, duration_s: float) -> bytes:
-    emulated = os.path.realpath(port).startswith("/dev/pts/")  # a pseudo-terminal knows no parity
-    parity = serial.PARITY_NONE if emulated else known.parity
+def _hear(path: str, known: _Known, request: bytes | None, duration_s: float) -> bytes:
+    port = SerialPort(path, path, known.baud, even_parity=known.even_parity, read_s=0.02)
+    data, end = b"", time.monotonic() + duration_s
     try:
-        with serial.Serial(port, known.baud, parity=parity, timeout=0.02, write_timeout=0.2, exclusive=True) as line:
-            if request is not None:
-                line.write(request)
-            data, end = b"", time.monotonic() + duration_s
-            while time.monotonic() < end:
-                data += line.read(4096)
-            return data
-    except (ValueError, *LINK_ERRORS) as exc:
-        raise ConnectError(f"{port} does not open ({exc}); is it plugged in, free, and are you in its group?") from exc
+        port.open()
+        if request is not None:
+            port.write(request)
+        while time.monotonic() < end:
+            data += port.read(4096)
+    except StreamBroken as exc:
+        raise ConnectError(str(exc)) from exc
+    finally:
+        port.close()
+    return data
 
 
 def _frames(header: bytes, size: int, is_frame: Callable[[bytes], bool]) -> Callable[[bytes], bool]:
@@ -96,14 +95,15 @@ def _ati_streams(data: bytes) -> bool:
     return False
 
 
-_ATI_REQUEST = modbus.read_registers(modbus.STATUS, 1)
+_ATI_REQUEST = modbus.read_registers(modbus.calibration_reads(1)[0][0], 20)
+"""Serial and part number of the first stored calibration."""
 _ROBOTIQ_REQUEST = robotiq.read_registers(robotiq.SERIAL, 4)
 _ROBOTOUS_REQUEST = robotous.encode_frame(robotous.encode(robotous.Command.MODEL))
 
 
 def _ati_reply(data: bytes) -> str:
-    status = modbus.check_reply(_ATI_REQUEST, data[: modbus.reply_size(_ATI_REQUEST)])
-    return f"ATI Digital F/T, status 0x{status.hex()}"
+    told = modbus.check_reply(_ATI_REQUEST, data[: modbus.reply_size(_ATI_REQUEST)])
+    return f"ATI Digital F/T {decode_text(told[8:])}, serial {decode_text(told[:8])}"
 
 
 def _robotiq_reply(data: bytes) -> str:
@@ -133,7 +133,7 @@ _KNOWN = (
     _Known(
         "bota://{port}",
         460_800,
-        serial.PARITY_NONE,
+        False,
         _frames(bota.HEADER, bota.FRAME_SIZE, bota.is_frame),
         None,
         _nothing,
@@ -141,21 +141,19 @@ _KNOWN = (
     _Known(
         "robotiq-ft300://{port}",
         19_200,
-        serial.PARITY_NONE,
+        False,
         _frames(robotiq.HEADER, robotiq.FRAME_SIZE, robotiq.is_frame),
         _ROBOTIQ_REQUEST,
         _robotiq_reply,
     ),
-    _Known(
-        "robotous-serial://{port}", 115_200, serial.PARITY_NONE, _robotous_streams, _ROBOTOUS_REQUEST, _robotous_reply
-    ),
+    _Known("robotous-serial://{port}", 115_200, False, _robotous_streams, _ROBOTOUS_REQUEST, _robotous_reply),
     _Known(
         "robotous-serial://{port}?baud=921600",
         921_600,
-        serial.PARITY_NONE,
+        False,
         _robotous_streams,
         _ROBOTOUS_REQUEST,
         _robotous_reply,
     ),
-    _Known("ati-serial://{port}", 1_250_000, serial.PARITY_EVEN, _ati_streams, _ATI_REQUEST, _ati_reply),
+    _Known("ati-serial://{port}", 1_250_000, True, _ati_streams, _ATI_REQUEST, _ati_reply),
 )

@@ -16,7 +16,7 @@ from typing import Any, Protocol, cast
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 from drivers._stream import StreamingSensor
-from drivers.interfaces import ForceTorqueSensor, RobotArm
+from drivers.interfaces import Fact, ForceTorqueSensor, RobotArm
 
 SENSORS: Mapping[str, str] = MappingProxyType(
     {
@@ -92,6 +92,28 @@ class Options:
             raise BadUrl(f"{self._url}: option '{key}' is '{text}'; it must be a positive number")
         return value
 
+    def configured(self) -> dict[str, Fact]:
+        """Take what may be said of any sensor that does not say it itself: `serial` and `range`."""
+        facts = {}
+        if "serial" in self._given:
+            facts["serial"] = Fact(self.text("serial", ""), "configured")
+        if "range" in self._given:
+            text = self.text("range", "")
+            try:
+                numbers = [float(number) for number in text.split(",")]
+            except ValueError:
+                numbers = []
+            if len(numbers) == 2:
+                numbers = [numbers[0]] * 3 + [numbers[1]] * 3
+            if len(numbers) != 6 or not all(isfinite(number) and number > 0 for number in numbers):
+                raise BadUrl(
+                    f"{self._url}: option 'range' is '{text}'; it is the largest force in N and torque in N·m, such as "
+                    f"300,30 or 300,300,500,30,30,20"
+                )
+            facts["range"] = Fact(tuple(numbers), "configured")
+        self._asked |= {"serial", "range"}
+        return facts
+
     def reject_others(self) -> None:
         """Refuse options that nobody asked for."""
         if unknown := sorted(self._given.keys() - self._asked):
@@ -132,7 +154,7 @@ def sensor_from_url(url: str, *, sign: int = 1) -> ForceTorqueSensor:
         raise BadUrl(f"{url}: which device? Write it like {', '.join(_EXAMPLES)}")
     driver = cast("_FromUrl", _load(entry))
     options = Options(url, parts.query)
-    recover = bool(options.integer("recover", 0, 0, 1))
+    recover, configured = bool(options.integer("recover", 0, 0, 1)), options.configured()
     try:
         sensor = driver.from_url(address, options, sign=sign)
     except BadUrl:
@@ -140,10 +162,10 @@ def sensor_from_url(url: str, *, sign: int = 1) -> ForceTorqueSensor:
     except ValueError as exc:
         raise BadUrl(f"{url}: {exc}") from exc
     options.reject_others()
-    if recover:
-        if not isinstance(sensor, StreamingSensor):
-            raise BadUrl(f"{url}: this driver cannot recover a stream; leave the option 'recover' out")
-        sensor.recover = True
+    if isinstance(sensor, StreamingSensor):
+        sensor.recover, sensor.configured = recover, configured
+    elif recover or configured:
+        raise BadUrl(f"{url}: this driver knows none of the options recover, serial and range; leave them out")
     return sensor
 
 

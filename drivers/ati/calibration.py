@@ -41,12 +41,22 @@ NEWTON, NEWTON_METRE = 2, 3
 _LOWEST, _HIGHEST = -32768, 32767
 
 
+def units(unit_codes: tuple[int, int]) -> tuple[float, float]:
+    """Look up what one unit of force is in N, and one of torque in N·m. Raises `ProtocolError` for unknown codes."""
+    force, torque = unit_codes
+    if force not in FORCE_UNITS_N or torque not in TORQUE_UNITS_NM:
+        raise ProtocolError(f"unit codes are {force} (force) and {torque} (torque); codes 1 to 6 are known")
+    return FORCE_UNITS_N[force], TORQUE_UNITS_NM[torque]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
     """One calibration of one transducer."""
 
     wrench_per_count: Array
     """(6, 6) N and N·m (rows Fx..Tz) per gauge count (columns G0..G5)."""
+    counts_per_N: float
+    counts_per_Nm: float
 
     @classmethod
     def from_vendor(cls, matrix: Array, counts_per_unit: tuple[int, int], unit_codes: tuple[int, int]) -> "Calibration":
@@ -64,13 +74,11 @@ class Calibration:
         ProtocolError
             An unknown unit code, or a matrix no transducer can have (not finite or singular).
         """
-        force, torque = unit_codes
-        if force not in FORCE_UNITS_N or torque not in TORQUE_UNITS_NM:
-            raise ProtocolError(f"unit codes are {force} (force) and {torque} (torque); codes 1 to 6 are known")
+        unit_N, unit_Nm = units(unit_codes)
         if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix) < 6:
             raise ProtocolError("the calibration matrix is not invertible; the slot is empty, select another one")
-        scale = [FORCE_UNITS_N[force] / counts_per_unit[0]] * 3 + [TORQUE_UNITS_NM[torque] / counts_per_unit[1]] * 3
-        return cls(np.diag(scale) @ matrix)
+        counts_per_N, counts_per_Nm = counts_per_unit[0] / unit_N, counts_per_unit[1] / unit_Nm
+        return cls(matrix / np.repeat([counts_per_N, counts_per_Nm], 3)[:, np.newaxis], counts_per_N, counts_per_Nm)
 
     def wrench(self, gauges: NDArray[Any]) -> Array:
         """Convert gauges (n, 6) to wrenches (n, 6) in N and N·m."""

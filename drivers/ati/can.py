@@ -17,7 +17,7 @@ import numpy as np
 from can.interfaces.slcan import slcanBus
 
 from drivers._can import BUS_ERRORS, close_bus, open_bus
-from drivers._stream import LINK_ERRORS, NOTHING, StreamingSensor
+from drivers._stream import LINK_ERRORS, NOTHING, StreamingSensor, scale_facts
 from drivers.ati import codec
 from drivers.ati.calibration import NEWTON, NEWTON_METRE, Calibration, saturated_gauges
 from drivers.ati.codec import Op
@@ -80,7 +80,7 @@ class AtiCanSensor(StreamingSensor):
         self._base = base
         self._slot = slot
         self._bus: can.BusABC | None = None
-        self._echoes = False
+        self._echoes = self._asked = False
         self._polls = self._missed = self._seen_status = 0
         self._next_poll_s = 0.0
 
@@ -104,7 +104,7 @@ class AtiCanSensor(StreamingSensor):
             self._bitrate,
             [{"can_id": self._base << 4, "can_mask": 0x7F0, "extended": False}],
         )
-        self._echoes = False
+        self._echoes = self._asked = False
         self._polls = self._missed = self._seen_status = 0
         serial = codec.decode_serial(*self._ask(Op.SERIAL))
         firmware = codec.decode_firmware(*self._ask(Op.FIRMWARE))
@@ -115,14 +115,20 @@ class AtiCanSensor(StreamingSensor):
             model="ATI F/T (NETCANOEM, CAN)",
             serial=serial,
             firmware=f"{firmware.major}.{firmware.minor} build {firmware.build}",
+            facts=scale_facts(
+                self._calibration.counts_per_N,
+                self._calibration.counts_per_Nm,
+                "device" if firmware >= codec.COUNTS_PER_UNIT_SINCE else "assumed",
+            ),
         )
 
     def _read_block(self) -> FtSamples:
-        time.sleep(max(0.0, self._next_poll_s - time.monotonic()))
-        self._next_poll_s = max(self._next_poll_s + _PERIOD_S, time.monotonic())
-        self._polls += 1
+        if not self._asked:
+            time.sleep(max(0.0, self._next_poll_s - time.monotonic()))
+            self._poll()
+        self._asked = False
         try:
-            first, second = self._exchange(Op.GAUGES, b"", _POLL_S)
+            first, second = self._answer(Op.GAUGES, b"", _POLL_S)
         except (DeviceTimeout, ProtocolError):
             self._lost += 1
             self._missed += 1
@@ -130,19 +136,27 @@ class AtiCanSensor(StreamingSensor):
             if self._missed > 1:
                 self._select_slot()  # it may have restarted, and would be back at slot 0
             return NOTHING
-        t_host_ns = time.monotonic_ns()
+        t_host_ns, seq = time.monotonic_ns(), self._polls
         self._missed = 0
+        if time.monotonic() >= self._next_poll_s:
+            self._poll()  # the sensor works on the next reading while we work on this one
         reading = codec.decode_gauges(first, second)
         self._judge(reading)
         gauges = reading.gauges[np.newaxis]
         return FtSamples(
             t_host_ns=np.array([t_host_ns], np.int64),
             t_device_s=np.array([np.nan]),
-            seq=np.array([self._polls], np.int64),
+            seq=np.array([seq], np.int64),
             counts=gauges,
             wrench=self._calibration.wrench(gauges),
             status=np.array([reading.status], np.uint32),
         )
+
+    def _poll(self) -> None:
+        self._next_poll_s = max(self._next_poll_s + _PERIOD_S, time.monotonic())
+        self._polls += 1
+        self._request(Op.GAUGES, b"", _POLL_S)
+        self._asked = True
 
     def _disconnect(self) -> None:
         bus, self._bus = self._bus, None
@@ -198,24 +212,36 @@ class AtiCanSensor(StreamingSensor):
         )
 
     def _exchange(self, op: Op, data: bytes, timeout_s: float) -> list[bytes]:
-        """Send one request and return the payloads of its reply, or raise `DeviceTimeout`: never half a reply.
+        """Send one request and return the payloads of its reply. One thread at a time: the opening one, or the reader.
+
+        Raises as `_answer`.
+        """
+        self._request(op, data, timeout_s)
+        return self._answer(op, data, timeout_s)
+
+    def _request(self, op: Op, data: bytes, timeout_s: float) -> None:
+        """Send a request, after throwing away what belongs to earlier ones; `_answer` must follow."""
+        if self._bus is None:
+            raise StreamBroken(f"{self.name}: closed")
+        self._drain()
+        message = can.Message(arbitration_id=self._base << 4 | op, data=data, is_extended_id=False)
+        try:
+            self._bus.send(message, timeout=timeout_s)
+        except BUS_ERRORS as exc:
+            raise self._broken(exc) from exc
+
+    def _answer(self, op: Op, data: bytes, timeout_s: float) -> list[bytes]:
+        """Return the payloads of the reply to the request just sent, or raise `DeviceTimeout`: never half a reply.
 
         Frames are matched by identifier and length, not by order of arrival. They carry no number: when two differing
         ones answer, or come in the wrong order with another behind, one belongs to an earlier request, nobody knows
-        which, and that is a `ProtocolError`. One thread at a time exchanges: the opening one, then the reader.
+        which, and that is a `ProtocolError`.
         """
-        if self._bus is None:
-            raise StreamBroken(f"{self.name}: closed")
         expected = codec.REPLIES[op]
         request_id = self._base << 4 | op
         parts: dict[int, bytes] = {}
         # only the reply to SELECT_SLOT looks like its request: on a bus that echoes, the first one is ours
         skip_echo = self._echoes and op is Op.SELECT_SLOT
-        self._drain()
-        try:
-            self._bus.send(can.Message(arbitration_id=request_id, data=data, is_extended_id=False), timeout=timeout_s)
-        except BUS_ERRORS as exc:
-            raise self._broken(exc) from exc
         deadline = time.monotonic() + timeout_s
         while len(parts) < len(expected) or list(parts) != sorted(parts):
             whole = len(parts) == len(expected)

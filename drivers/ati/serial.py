@@ -9,19 +9,18 @@ outlives the program that started it. Gauge gains and offsets are volatile and a
 
 import contextlib
 import logging
-import os
 import time
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
-import serial
 
-from drivers._stream import LINK_ERRORS, StreamingSensor
+from drivers._serial import SerialPort
+from drivers._stream import StreamingSensor, scale_facts
 from drivers.ati import modbus
-from drivers.ati.calibration import Calibration, saturated_gauges
+from drivers.ati.calibration import Calibration, saturated_gauges, units
 from drivers.ati.codec import describe_status
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
-from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
+from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 
 if TYPE_CHECKING:
     from drivers.registry import Options
@@ -59,9 +58,8 @@ class AtiSerialSensor(StreamingSensor):
 
     def __init__(self, port: str, *, calibration: int = 1, sign: int = 1) -> None:
         super().__init__(f"ATI serial sensor on {port}", sign=sign)
-        self._port_name = port
         self._calibration_index = calibration
-        self._port: serial.Serial | None = None
+        self._port = SerialPort(self.name, port, _BAUD, even_parity=True, read_s=_READ_S)
         self._buffer = bytearray()
         self._seq = self._status = self._restarts = 0
         self._slipped = False
@@ -77,7 +75,7 @@ class AtiSerialSensor(StreamingSensor):
         self._seq = self._restarts = 0
         self._slipped, self._last_good_ns = False, None
         self._nominal_Hz = modbus.NOMINAL_RATE_Hz
-        self._port = self._open_port()
+        self._port.open()
         self._status = self._stop_stream()
         if self._status & modbus.CRITICAL:
             raise self._fault()
@@ -98,14 +96,21 @@ class AtiSerialSensor(StreamingSensor):
         finally:
             self._ask(modbus.LOCK)
         self._start_stream()
+        facts = scale_facts(self._calibration.counts_per_N, self._calibration.counts_per_Nm, "device")
+        rating = np.array(block.max_rating) * np.repeat(units(block.unit_codes), 3)
+        if np.isfinite(rating).all() and (rating > 0).all():
+            facts["range"] = Fact(tuple(rating.tolist()), "device")
         return DeviceInfo(
-            model=f"ATI Digital F/T {block.part_number}".strip(), serial=block.serial, firmware="not reported"
+            model=f"ATI Digital F/T {block.part_number}".strip(),
+            serial=block.serial,
+            firmware=NOT_REPORTED,
+            facts=facts,
         )
 
     def _read_block(self) -> FtSamples:
         if self._slipped:
             self._restart()
-        self._buffer += self._read(_BATCH_BYTES)
+        self._buffer += self._port.read(_BATCH_BYTES)
         t_host_ns = time.monotonic_ns()
         whole = len(self._buffer) // modbus.RECORD_SIZE * modbus.RECORD_SIZE
         records = modbus.decode_records(bytes(self._buffer[:whole]))
@@ -156,37 +161,12 @@ class AtiSerialSensor(StreamingSensor):
         self._last_good_ns = self._last_good_ns or t_host_ns
 
     def _disconnect(self) -> None:
-        port = self._port
-        if port is None:
+        if not self._port.is_open:
             return
         try:
             self._jam()
         finally:
-            self._port = None
-            with contextlib.suppress(*LINK_ERRORS):
-                port.close()
-
-    def _open_port(self) -> serial.Serial:
-        # A pseudo-terminal refuses even parity at the second look; everything is set in the constructor, never later.
-        emulated = os.path.realpath(self._port_name).startswith("/dev/pts/")
-        try:
-            port = serial.Serial(
-                self._port_name,
-                baudrate=_BAUD,
-                bytesize=serial.EIGHTBITS,
-                parity=serial.PARITY_NONE if emulated else serial.PARITY_EVEN,
-                stopbits=serial.STOPBITS_ONE,
-                timeout=_READ_S,
-                write_timeout=_REPLY_S,
-                exclusive=True,
-            )
-        except (ValueError, *LINK_ERRORS) as exc:
-            raise ConnectError(
-                f"{self.name}: the port does not open ({exc}); is it plugged in, free, and are you in its group?"
-            ) from exc
-        with contextlib.suppress(ValueError, NotImplementedError, *LINK_ERRORS):
-            port.set_low_latency_mode(True)  # a courtesy of some adapters: 1 ms instead of 16 ms
-        return port
+            self._port.close()
 
     def _stop_stream(self) -> int:
         """Jam, wait for silence and prove it by reading the status word, which is returned."""
@@ -227,9 +207,9 @@ class AtiSerialSensor(StreamingSensor):
 
     def _jam(self) -> None:
         """Stop whatever is streaming and wait until the line is silent."""
-        self._write(modbus.JAM)
+        self._port.write(modbus.JAM, discard=True)
         deadline = time.monotonic() + _SILENCE_S
-        while self._read(_BATCH_BYTES) and time.monotonic() < deadline:
+        while self._port.read(_BATCH_BYTES) and time.monotonic() < deadline:
             pass
 
     def _ask(self, request: bytes) -> bytes:
@@ -240,12 +220,12 @@ class AtiSerialSensor(StreamingSensor):
             except modbus.Refused:
                 raise
             except (DeviceTimeout, ProtocolError):
-                self._read(_BATCH_BYTES)  # a late reply passes
+                self._port.read(_BATCH_BYTES)  # a late reply passes
         return self._exchange(request)
 
     def _exchange(self, request: bytes) -> bytes:
         """Send a request and return the payload of its reply."""
-        self._write(request)
+        self._port.write(request, discard=True)
         deadline = time.monotonic() + _REPLY_S
         reply = self._read_exactly(5, deadline)
         if not reply[1] & 0x80:
@@ -258,33 +238,10 @@ class AtiSerialSensor(StreamingSensor):
     def _read_exactly(self, size: int, deadline: float) -> bytes:
         data = b""
         while len(data) < size:
-            data += self._read(size - len(data))
+            data += self._port.read(size - len(data))
             if len(data) < size and time.monotonic() > deadline:
                 raise DeviceTimeout(f"{self.name}: no reply within {_REPLY_S} s ({len(data)} of {size} bytes)")
         return data
-
-    def _read(self, size: int) -> bytes:
-        """Read what comes within the port's time-out, at most `size` bytes."""
-        try:
-            return self._open_or_broken().read(size)
-        except (TypeError, *LINK_ERRORS) as exc:  # TypeError: closed under a blocked read
-            raise self._broken(exc) from exc
-
-    def _write(self, data: bytes) -> None:
-        port = self._open_or_broken()
-        try:
-            port.reset_input_buffer()
-            port.write(data)
-        except (TypeError, *LINK_ERRORS) as exc:
-            raise self._broken(exc) from exc
-
-    def _open_or_broken(self) -> serial.Serial:
-        if self._port is None:
-            raise StreamBroken(f"{self.name}: closed")
-        return self._port
-
-    def _broken(self, exc: Exception) -> DriverError:
-        return StreamBroken(f"{self.name}: the port is gone ({exc}); plug it in and open it again")
 
     def _fault(self) -> DeviceFault:
         text = describe_status(self._status, modbus.STATUS_BITS)

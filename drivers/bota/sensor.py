@@ -17,10 +17,10 @@ import numpy as np
 
 from drivers._frames import Deframer
 from drivers._serial import SerialPort
-from drivers._stream import NOTHING, StreamingSensor
+from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.bota import codec
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
 
 if TYPE_CHECKING:
     from drivers.registry import Options
@@ -78,7 +78,12 @@ class BotaSensor(StreamingSensor):
         self._nominal_Hz = 1e6 / self._period_us
         self._t_us = times[-1]
         self._seq = 0
-        return DeviceInfo(model="Bota force/torque sensor", serial="not reported", firmware="not reported")
+        return DeviceInfo(
+            model="Bota force/torque sensor",
+            serial=NOT_REPORTED,
+            firmware=NOT_REPORTED,
+            facts=scale_facts(1.0, 1.0, "documented"),
+        )
 
     def _read_block(self) -> FtSamples:
         received = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 from drivers._crc import crc16_modbus
 from drivers.errors import ProtocolError
+from drivers.interfaces import NOT_REPORTED
 
 ADDRESS = 9
 READ_HOLDING, WRITE_MULTIPLE = 0x03, 0x10
@@ -28,6 +29,8 @@ FRAME_SIZE = 16
 NOMINAL_RATE_Hz = 100.0
 COUNTS_PER_UNIT = (100, 100, 100, 1000, 1000, 1000)
 """Per N and per N·m."""
+RANGE = (300.0, 300.0, 300.0, 30.0, 30.0, 30.0)
+"""N and N·m, either way."""
 
 
 class Refused(ProtocolError):
@@ -80,7 +83,7 @@ def decode_serial(registers: Sequence[int]) -> str:
     first, second, low, high = _words(registers, 4)
     number = high << 16 | low
     letters = _letters(first >> 8, first & 0xFF, second >> 8)
-    return f"{letters}-{number:04d}" if number and letters else f"{number:04d}" if number else "unknown"
+    return f"{letters}-{number:04d}" if number and letters else f"{number:04d}" if number else NOT_REPORTED
 
 
 def decode_firmware(registers: Sequence[int]) -> str:

@@ -15,9 +15,9 @@ import numpy as np
 
 from drivers._frames import Deframer
 from drivers._serial import SerialPort
-from drivers._stream import NOTHING, StreamingSensor
+from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
-from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 from drivers.robotiq import codec
 
 if TYPE_CHECKING:
@@ -64,12 +64,17 @@ class RobotiqFt300(StreamingSensor):
         try:
             firmware = codec.decode_firmware(self._ask(codec.read_registers(codec.FIRMWARE, 3)))
         except codec.Refused:
-            firmware = "not reported"
+            firmware = NOT_REPORTED
         self._ask(codec.write_register(codec.STREAM, codec.START_STREAM))
         self._frames = Deframer(codec.HEADER, codec.FRAME_SIZE, codec.is_frame)
         self._nominal_Hz = codec.NOMINAL_RATE_Hz
         self._hint_since_ns, self._hint_frames, self._hinted = 0, 0, False
-        return DeviceInfo(model="Robotiq FT 300", serial=serial, firmware=firmware)
+        return DeviceInfo(
+            model="Robotiq FT 300",
+            serial=serial,
+            firmware=firmware,
+            facts=scale_facts(100, 1000, "documented") | {"range": Fact(codec.RANGE, "documented")},
+        )
 
     def _read_block(self) -> FtSamples:
         frames = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from drivers._stream import NOTHING, StreamingSensor
+from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.interfaces import DeviceInfo, FtSamples
 from drivers.robotous import codec
@@ -87,7 +87,12 @@ class RobotousSensor(StreamingSensor):
         self._link.send(codec.encode(Command.START))
         self._damaged_before = self._link.damaged
         self._nominal_Hz = self._rate_Hz or math.nan
-        return DeviceInfo(model=f"Robotous {model}", serial=serial, firmware=firmware)
+        return DeviceInfo(
+            model=f"Robotous {model}",
+            serial=serial,
+            firmware=firmware,
+            facts=scale_facts(force, torque, "documented"),
+        )
 
     def _read_block(self) -> FtSamples:
         received = self._link.receive()

@@ -19,7 +19,7 @@ from math import radians
 from typing import Final
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
-from drivers.interfaces import ArmState, DeviceInfo, Guard, RobotArm
+from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, Guard, RobotArm
 from drivers.ur.control import ControlProcess
 from drivers.ur.control_child import DECELERATION_RAD_S2, UNWATCHED_S
 from drivers.ur.kinematics import MODELS, model_named
@@ -123,12 +123,7 @@ class UrArm(RobotArm):
             self._reader = Reader(self._host, self._model)
         if control and self._control is None:
             self._open_control(self._reader)
-        if not self._reader.tells_tcp and self._control is None:
-            raise ConnectError(
-                f"the controller {self._host} is too old to tell its active TCP, without which its poses say nothing "
-                f"about the flange: update it, or open the arm with control."
-            )
-        if self._reader.look().robot_mode == ROBOT_RUNNING:
+        if self._reader.look().robot_mode == ROBOT_RUNNING and (self._reader.tells_tcp or self._control is not None):
             self.state()  # is it the right model?
 
     def _open_control(self, reader: Reader) -> None:
@@ -220,9 +215,29 @@ class UrArm(RobotArm):
         """Read a fresh, consistent state; the flange pose is that of the mechanical flange, whatever TCP is active.
 
         Raises `DeviceTimeout` when the controller's clock stands still for 0.2 s, `StreamBroken` when the connection is
-        lost, and `DeviceFault` when the joints are not measured (no power) or the pose does not fit the model.
+        lost, `DeviceFault` when the joints are not measured (no power) or the pose does not fit the model, and
+        `ConnectError` when the controller is too old to tell its TCP and the arm was opened without control.
         """
-        return self._reading().state(lambda: self._in_control().call("tcp_offset"))
+        reader = self._reading()
+        if not reader.tells_tcp and self._control is None:
+            raise ConnectError(
+                f"the controller {self._host} is too old to tell its active TCP, without which its poses say nothing "
+                f"about the flange: update it, or open the arm with control."
+            )
+        return reader.state(lambda: self._in_control().call("tcp_offset"))
+
+    def status(self) -> ArmStatus:
+        """Tell the controller's modes and settings; see `RobotArm`. 125 times a second there is something new."""
+        return self._reading().status()
+
+    def in_remote_control(self) -> bool | None:
+        """Ask the dashboard server, which takes some milliseconds; None before PolyScope 5.6, which does not tell.
+
+        Raises `StreamBroken` or `DeviceTimeout`.
+        """
+        if self._reading().version[:2] < (5, 6):
+            return None
+        return ask_dashboard(self._host, lambda dashboard: dashboard.isInRemoteControl(), timeout_s=CONNECT_S)
 
     # ------------------------------------------------------------------ moving
 

@@ -21,7 +21,7 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from drivers.interfaces import ArmState, DeviceInfo
+from drivers.interfaces import NOT_REPORTED, ArmState, ArmStatus, DeviceInfo
 from drivers.ur.kinematics import MODELS, Pose, forward, model_named
 from drivers.ur.library import Dashboard, Receive, ask_dashboard, connect_receive, require, retire
 from drivers.ur.rtde import LiveReader
@@ -30,6 +30,9 @@ log = logging.getLogger(__name__)
 
 CONNECT_S: Final = 2.0
 STALE_S: Final = 0.2
+_STATUS_S: Final = 0.05
+_YOUNGER: Final = {"tcp_offset", "payload", "payload_cog"}
+"""What some controllers that ur_rtde can read from do not tell yet."""
 _MODEL_POSITION_M: Final = 0.005
 _MODEL_ANGLE_RAD: Final = radians(0.5)
 
@@ -51,6 +54,19 @@ _ROBOT_MODES: Final = {
     8: "updating firmware",
 }
 _PROGRAM_STATES: Final = {0: "stopping", 1: "stopped", 2: "playing", 3: "pausing", 4: "paused", 5: "resuming"}
+_SAFETY_MODES: Final = {
+    1: "normal",
+    2: "reduced",
+    3: "protective stop",
+    4: "recovery",
+    5: "safeguard stop",
+    6: "system emergency stop",
+    7: "robot emergency stop",
+    8: "violation",
+    9: "fault",
+    10: "joint identification",
+    11: "undefined",
+}
 _SAFETY: Final = (  # the first that applies says most
     (0b0_1110_0000, "emergency stop: make the cell safe, release the button, power the arm on at the pendant"),
     (0b0_0000_0100, "protective stop: find and remove its cause, then clear it at the pendant"),
@@ -78,14 +94,7 @@ class Look:
 
     def safety_fault(self) -> str | None:
         """Say why the arm may not move, as far as the arm itself is concerned."""
-        for bits, meaning in _SAFETY:
-            if self.safety_bits & bits:
-                return f"{meaning} (safety status bits 0x{self.safety_bits:x})"
-        if self.robot_mode != ROBOT_RUNNING:
-            mode = _ROBOT_MODES.get(self.robot_mode, "unknown")
-            cure = "release its brakes" if self.robot_mode == ROBOT_IDLE else "power the arm on and release its brakes"
-            return f"robot mode {self.robot_mode} ({mode}): {cure} at the pendant"
-        return None
+        return _safety_fault(self.safety_bits, self.robot_mode)
 
     def program_fault(self) -> str | None:
         """Say why our program on the controller does not move the arm."""
@@ -93,6 +102,17 @@ class Look:
             return None
         state = _PROGRAM_STATES.get(self.program_state, "unknown")
         return f"the control program was ended or paused by somebody else (state {self.program_state}, {state})"
+
+
+def _safety_fault(safety_bits: int, robot_mode: int) -> str | None:
+    for bits, meaning in _SAFETY:
+        if safety_bits & bits:
+            return f"{meaning} (safety status bits 0x{safety_bits:x})"
+    if robot_mode != ROBOT_RUNNING:
+        mode = _ROBOT_MODES.get(robot_mode, "unknown")
+        cure = "release its brakes" if robot_mode == ROBOT_IDLE else "power the arm on and release its brakes"
+        return f"robot mode {robot_mode} ({mode}): {cure} at the pendant"
+    return None
 
 
 class Reader:
@@ -124,13 +144,16 @@ class Reader:
                 f"with: PolyScope 5 or the CB3 generation is needed."
             )
 
+        if lacking := sorted(self._live.missing - _YOUNGER):
+            raise ConnectError(f"{self._host} does not tell {', '.join(lacking)} over RTDE: update its PolyScope.")
+
         def ask(dashboard: Dashboard) -> tuple[str, str, str]:
             told = dashboard.getRobotModel().strip()
             try:
                 serial = dashboard.getSerialNumber()
             except RuntimeError as error:  # the question is younger than some controllers
                 log.info("%s does not tell its serial number: %s", self._host, error)
-                serial = "unknown"
+                serial = NOT_REPORTED
             return told, serial, dashboard.polyscopeVersion().strip()
 
         try:
@@ -151,6 +174,27 @@ class Reader:
     def tells_tcp(self) -> bool:
         """Whether the controller tells its TCP offset without being controlled; old ones do not."""
         return self._live.tells_tcp
+
+    def status(self) -> ArmStatus:
+        """Tell the controller's modes and settings, as one sample has them. Raises as `look`."""
+        sample = self._live.live(max_age_s=_STATUS_S, limit_s=STALE_S)
+        told = sample.outputs
+        robot_mode, safety_mode, bits, program = (
+            int(told[name][0]) for name in ("robot_mode", "safety_mode", "safety_status_bits", "runtime_state")
+        )
+        return ArmStatus(
+            t_host_ns=sample.t_host_ns,
+            t_device_s=sample.t_device_s,
+            robot_mode=_ROBOT_MODES.get(robot_mode, f"unknown ({robot_mode})"),
+            safety_mode=_SAFETY_MODES.get(safety_mode, f"unknown ({safety_mode})"),
+            program=_PROGRAM_STATES.get(program, f"unknown ({program})"),
+            fault=_safety_fault(bits, robot_mode),
+            speed_slider=told["target_speed_fraction"][0],
+            speed_scaling=told["speed_scaling"][0],
+            payload_kg=told.get("payload", (None,))[0],
+            p_flange_payload_m=told.get("payload_cog"),
+            tcp_offset=told.get("tcp_offset"),
+        )
 
     def close(self) -> None:
         """Let the connections go. Idempotent."""
@@ -228,8 +272,9 @@ class Reader:
         )
 
     def _tcp_offset(self, since_s: float, ask_tcp: Callable[[], Sequence[float]]) -> tuple[float, Sequence[float]]:
-        if self._live.tells_tcp:
-            return self._live.offset(since_s=since_s, limit_s=STALE_S)
+        if self.tells_tcp:
+            sample = self._live.newest(since_s=since_s, limit_s=STALE_S)
+            return sample.t_device_s, sample.outputs["tcp_offset"]
         return since_s, ask_tcp()
 
     def _check_model(self, look: Look, flange: Pose) -> None:

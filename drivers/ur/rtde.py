@@ -18,6 +18,8 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import accumulate, pairwise
 from types import MappingProxyType
 from typing import Final
 
@@ -107,19 +109,23 @@ class Recipe:
 
     def unpack(self, payload: bytes) -> list[tuple[float, ...]]:
         """Unpack a data package into one tuple per output."""
-        formats = [struct.Struct(">" + _FORMATS[kind]) for kind in self.types if kind in _FORMATS]
-        if len(formats) != len(self.types):
-            raise ProtocolError(f"RTDE output of unknown type: {', '.join(self.types)}")
-        expected = 1 + sum(one.size for one in formats)
-        if len(payload) != expected or payload[0] != self.id:
+        whole, fields = _layout(self.types)
+        if len(payload) != whole.size or payload[0] != self.id:
             raise ProtocolError(
-                f"RTDE data of {len(payload)} bytes, {expected} expected for recipe {self.id}: {payload.hex(' ')}"
+                f"RTDE data of {len(payload)} bytes, {whole.size} expected for recipe {self.id}: {payload.hex(' ')}"
             )
-        values, offset = [], 1
-        for one in formats:
-            values.append(one.unpack_from(payload, offset))
-            offset += one.size
-        return values
+        values = whole.unpack(payload)
+        return [values[field] for field in fields]
+
+
+@lru_cache(maxsize=16)
+def _layout(types: tuple[str, ...]) -> tuple[struct.Struct, list[slice]]:
+    """Lay out a data package: all of it, the recipe's number first, and where in it each output is."""
+    if unknown := [kind for kind in types if kind not in _FORMATS]:
+        raise ProtocolError(f"RTDE output of unknown type: {', '.join(unknown)}")
+    formats = [_FORMATS[kind] for kind in types]
+    ends = list(accumulate((int(one[:-1] or 1) for one in formats), initial=1))
+    return struct.Struct(">B" + "".join(formats)), [slice(*pair) for pair in pairwise(ends)]
 
 
 class _Connection:
@@ -270,14 +276,38 @@ def _awake_s() -> float:
     return time.monotonic()
 
 
-class LiveReader:
-    """The controller's version, and its clock and active TCP offset kept current by a thread.
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What the controller told once."""
 
-    Every offset carries the controller's time, the same clock the poses of ur_rtde carry, so that a pose can be matched
+    t_host_ns: int
+    t_awake_s: float
+    """When it came, by `_awake_s`."""
+    t_device_s: float
+    outputs: Mapping[str, tuple[float, ...]]
+
+
+class LiveReader:
+    """The controller's version, and its clock, active TCP offset and modes, kept current by a thread.
+
+    Every sample carries the controller's time, the same clock the poses of ur_rtde carry, so that a pose can be matched
     with the offset that was active when it was taken.
     """
 
-    _outputs: Mapping[str, str] = MappingProxyType({"timestamp": "DOUBLE", "tcp_offset": "VECTOR6D"})
+    _outputs: Mapping[str, str] = MappingProxyType(
+        {
+            "timestamp": "DOUBLE",
+            "robot_mode": "INT32",
+            "safety_mode": "INT32",
+            "safety_status_bits": "UINT32",
+            "runtime_state": "UINT32",
+            "speed_scaling": "DOUBLE",
+            "target_speed_fraction": "DOUBLE",
+            "tcp_offset": "VECTOR6D",
+            "payload": "DOUBLE",
+            "payload_cog": "VECTOR3D",
+        }
+    )
     _frequency_Hz = 125.0  # the full rate of the CB3 generation; e-Series arms send every fourth cycle
     _live_s = (0.002, 0.1)
     """How long one waits for a sample that has just been taken: 8 ms. What has piled up comes without waiting."""
@@ -287,11 +317,14 @@ class LiveReader:
         self._stream: Subscription | None = None
         self._thread: threading.Thread | None = None
         self._changed = threading.Condition()
-        self._newest: tuple[float, tuple[float, ...]] | None = None
+        self._newest: Sample | None = None
+        self._live: Sample | None = None
         self._live_count = 0
         self._failure: DriverError | None = None
         self.version = (0, 0, 0, 0)
         """Of the controller, after `open`: major, minor, bugfix, build."""
+        self.missing: frozenset[str] = frozenset()
+        """What this controller does not know of what it was asked for, after `open`."""
         self.tells_tcp = False
         """Whether this controller tells its TCP offset; older ones do not."""
 
@@ -299,7 +332,9 @@ class LiveReader:
         """Say hello and start to follow. Raises `ConnectError`."""
         self._stream = Subscription(self._host, self._outputs, self._frequency_Hz, timeout_s=timeout_s)
         self.version = self._stream.version
-        self.tells_tcp = not self._stream.missing
+        self.missing = frozenset(self._stream.missing)
+        self._names = [name for name in self._outputs if name not in self.missing]
+        self.tells_tcp = "tcp_offset" in self._names
         self._thread = threading.Thread(target=self._run, args=(self._stream,), name="ur-live", daemon=True)
         self._thread.start()
 
@@ -320,21 +355,30 @@ class LiveReader:
         silent for `limit_s`.
         """
         before = self._live_count
-        return self._wait(lambda: self._live_count != before, limit_s)[0]
+        return self._wait(lambda: self._live if self._live_count != before else None, limit_s).t_device_s
 
-    def offset(self, *, since_s: float, limit_s: float) -> tuple[float, tuple[float, ...]]:
-        """Controller time and TCP offset (6,) of the newest sample, taken at `since_s` or later. Raises as `now_s`."""
-        return self._wait(lambda: self._newest is not None and self._newest[0] >= since_s, limit_s)
+    def newest(self, *, since_s: float, limit_s: float) -> Sample:
+        """Return the newest sample, taken at controller time `since_s` or later. Raises as `now_s`."""
+        return self._wait(
+            lambda: self._newest if self._newest is not None and self._newest.t_device_s >= since_s else None, limit_s
+        )
 
-    def _wait(self, done: Callable[[], bool], limit_s: float) -> tuple[float, tuple[float, ...]]:
+    def live(self, *, max_age_s: float, limit_s: float) -> Sample:
+        """Return the last sample that was new when it came, if that is `max_age_s` ago or less. Raises as `now_s`."""
+        oldest_s = _awake_s() - max_age_s
+        return self._wait(
+            lambda: self._live if self._live is not None and self._live.t_awake_s >= oldest_s else None, limit_s
+        )
+
+    def _wait(self, find: Callable[[], Sample | None], limit_s: float) -> Sample:
         silent_s = 0.0
         with self._changed:
             while True:
                 self.check()
-                if self._newest is not None and done():
-                    return self._newest
+                if (found := find()) is not None:
+                    return found
                 if silent_s > limit_s:
-                    stands = "" if self._newest is None else f" at {self._newest[0]:.3f} s"
+                    stands = "" if self._newest is None else f" at {self._newest.t_device_s:.3f} s"
                     raise DeviceTimeout(
                         f"the clock of {self._host} has stood still{stands} for {silent_s:.2f} s: check the robot and "
                         f"the network, and press the emergency stop if the arm moves."
@@ -354,11 +398,13 @@ class LiveReader:
         try:
             while True:
                 t0 = _awake_s()
-                (t_s,), *rest = stream.read(None)
-                waited_s = _awake_s() - t0
+                outputs = dict(zip(self._names, stream.read(None), strict=True))
+                now_s = _awake_s()
                 with self._changed:
-                    self._newest = (t_s, rest[0] if rest else ())
-                    self._live_count += self._live_s[0] <= waited_s <= self._live_s[1]
+                    self._newest = Sample(time.monotonic_ns(), now_s, outputs["timestamp"][0], outputs)
+                    if self._live_s[0] <= now_s - t0 <= self._live_s[1]:
+                        self._live = self._newest
+                        self._live_count += 1
                     self._changed.notify_all()
         except (OSError, StreamBroken) as error:
             failure: DriverError = StreamBroken(

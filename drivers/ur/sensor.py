@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from drivers._stream import NOTHING, StreamingSensor
+from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.errors import ConnectError, ProtocolError, StreamBroken
-from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
 from drivers.ur.rtde import Subscription
 
 if TYPE_CHECKING:
@@ -50,7 +50,8 @@ class UrWristSensor(StreamingSensor):
     def __init__(self, host: str, *, counts_per_N: float, counts_per_Nm: float, sign: int = 1) -> None:
         super().__init__(f"wrist sensor of the arm at {host}", sign=sign)
         self._host = host
-        self._counts_per_unit = np.array([counts_per_N] * 3 + [counts_per_Nm] * 3)
+        self._facts = scale_facts(counts_per_N, counts_per_Nm, "configured")
+        self._counts_per_unit = np.repeat([counts_per_N, counts_per_Nm], 3)
         self._stream: Subscription | None = None
 
     @classmethod
@@ -74,7 +75,13 @@ class UrWristSensor(StreamingSensor):
                 "e-Series arm with PolyScope 5.9 or later"
             )
         self._seq: int | None = None
-        return DeviceInfo(model="UR e-Series wrist sensor (ft_raw_wrench)", serial="not reported", firmware=version)
+        self._nominal_Hz = _RATE_Hz
+        return DeviceInfo(
+            model="UR e-Series wrist sensor (ft_raw_wrench)",
+            serial=NOT_REPORTED,
+            firmware=version,
+            facts=self._facts,
+        )
 
     def _read_block(self) -> FtSamples:
         stream = self._stream

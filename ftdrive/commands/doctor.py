@@ -1,9 +1,8 @@
 """`ftdrive doctor`: is the cell connected, quiet and permitted? Nothing moves."""
 
-import socket
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,22 +15,18 @@ from rich.markup import escape
 
 from calib import CalibrationResult
 from drivers.errors import DriverError
-from drivers.interfaces import ForceTorqueSensor
-from drivers.ur.kinematics import model_named
-from drivers.ur.library import ask_dashboard
-from drivers.ur.reading import CONNECT_S, PROGRAM_STOPPED, Reader
-from ftdrive import checks
+from drivers.interfaces import ArmStatus, ForceTorqueSensor, RobotArm
+from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
 from ftdrive.commands.common import JSON, RUNS, read_cell, write_json
 from ftdrive.config import CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.report import talk
 from ftdrive.simulation import Station
-from ftdrive.wiring import build_sensor
+from ftdrive.wiring import build_arm, build_sensor
 
 Array = NDArray[np.float64]
 
-_DASHBOARD_PORT = 29999
 _CLOCK_S = 1.0
 _LOOK_S = 2.0
 _PUSH_S = 3.0
@@ -78,19 +73,19 @@ def doctor(
         address = SensorAddress.of(cell.sensor.url)
         device = build_sensor(cell)
 
-        reader = _examine_robot(cell, found, stack)
+        arm = _examine_robot(cell, found, stack)
         alive = _examine_sensor(device, address, cell, mass_kg, found, stack)
         found += [*checks.check_disk(runs), *checks.check_permissions(address)]
         if calibration is not None:
             serials = {"sensor": device.identify().serial} if alive else {}
-            if reader is not None:
-                serials["arm"] = reader.info.serial
-            found.append(checks.check_calibration(calibration, serials))
+            if arm is not None:
+                serials["arm"] = arm.identify().serial
+            found.append(diagnosis.check_calibration(calibration, serials))
         if push:
             R_flange_sensor = None if calibration is None else calibration.R_flange_sensor
             if station is not None and calibration is None:
                 R_flange_sensor = np.array(station.truth["R_flange_sensor"])
-            pushed = _examine_push(device if alive else None, reader, R_flange_sensor, cell.sensor.sign, station, found)
+            pushed = _examine_push(device if alive else None, arm, R_flange_sensor, cell.sensor.sign, station, found)
     failed = [check.name for check in found if check.state == "failed"]
     if as_json:
         answer = {
@@ -105,79 +100,52 @@ def doctor(
         raise NotAccepted(f"{len(failed)} of {len(found)} checks failed: {', '.join(failed)}")
 
 
-def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> Reader | None:
-    host = cell.robot.host
-    start = time.perf_counter()
+def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> RobotArm | None:
+    host, arm = cell.robot.host, build_arm(cell)
+    stack.callback(arm.close)
     try:
-        socket.create_connection((host, _DASHBOARD_PORT), CONNECT_S).close()
-    except OSError as error:
-        fix = f"ping {host}; is the controller on, the cable in, the dashboard server enabled under Security, Services?"
-        found.append(Check("robot.reachable", "failed", f"{host} cannot be reached ({error})", fix))
-        return None
-    took_ms = 1e3 * (time.perf_counter() - start)
-    try:
-        model = cell.robot.model
-        reader = stack.enter_context(closing(Reader(host, None if model is None else model_named(model, 0) or model)))
-        info, look = reader.info, reader.look(limit_s=1.0)
+        arm.open()
+        info, status = arm.identify(), arm.status()
     except DriverError as error:
-        found.append(Check("robot.reachable", "failed", str(error)))
+        found.append(Check("robot.reachable", "failed", str(error), f"ping {host}"))
         return None
-    found.append(Check("robot.reachable", "ok", f"{host} answers in {took_ms:.1f} ms"))
+    found.append(Check("robot.reachable", "ok", f"{host} answers"))
     found.append(Check("robot.identity", "ok", f"{info.model}, serial {info.serial}, PolyScope {info.firmware}"))
-    found.append(_remote_control(host, reader.version))
-    fault = look.safety_fault()
-    if fault is None:
-        found.append(Check("robot.safety", "ok", "powered, brakes released, no stop"))
-    else:
-        state, _, cure = fault.partition(": ")
-        found.append(Check("robot.safety", "failed", state, cure))
-    if look.program_state == PROGRAM_STOPPED:
-        found.append(Check("robot.program", "ok", "no program runs; other clients that only read cannot be seen"))
-    else:
-        what = f"a program is on the controller (state {look.program_state})"
-        found.append(Check("robot.program", "warning", what, "stop it at the pendant: calibrate would end it"))
-    found.append(_flange(reader))
-    found.append(_clock(reader))
-    return reader
-
-
-def _remote_control(host: str, version: tuple[int, int, int, int]) -> Check:
-    name = "robot.remote"
-    if version[:2] < (5, 6):
-        return Check(name, "skipped", f"not applicable: PolyScope {version[0]}.{version[1]} does not tell")
     try:
-        remote = ask_dashboard(host, lambda dashboard: dashboard.isInRemoteControl(), timeout_s=CONNECT_S)
+        found.append(diagnosis.check_remote(arm.in_remote_control()))
     except DriverError as error:
-        return Check(name, "failed", str(error), "enable the dashboard server under Settings, Security, Services")
-    if remote:
-        return Check(name, "ok", "remote control on")
-    return Check(name, "failed", "local control", "press Local, Remote Control at the top right of the pendant")
+        fix = "enable the dashboard server under Settings, Security, Services"
+        found.append(Check("robot.remote", "failed", str(error), fix))
+    found += diagnosis.check_status(status)
+    found.append(_flange(arm, status))
+    found.append(_clock(arm))
+    return arm
 
 
-def _flange(reader: Reader) -> Check:
+def _flange(arm: RobotArm, status: ArmStatus) -> Check:
     name = "robot.flange"
-    if not reader.tells_tcp:
+    if status.tcp_offset is None:
         return Check(name, "skipped", "the controller is too old to tell its TCP: only a calibration can read poses")
     try:
-        p_mm = 1e3 * reader.state(lambda: ()).p_base_flange_m
+        p_mm = 1e3 * arm.state().p_base_flange_m
     except DriverError as error:
         return Check(name, "failed", str(error))
     where = ", ".join(f"{value:.0f}" for value in p_mm)
     return Check(name, "ok", f"TCP told; the flange is at ({where}) mm in base, where the model has it")
 
 
-def _clock(reader: Reader) -> Check:
+def _clock(arm: RobotArm) -> Check:
     host_ns: list[int] = []
     device_s: list[float] = []
     try:
         while not host_ns or host_ns[-1] - host_ns[0] < _CLOCK_S * 1e9:
             time.sleep(0.02)
-            look = reader.look()
-            host_ns.append(look.t_host_ns)
-            device_s.append(look.t_device_s)
+            status = arm.status()
+            host_ns.append(status.t_host_ns)
+            device_s.append(status.t_device_s)
     except DriverError as error:
         return Check("clock.pace", "failed", str(error))
-    return checks.check_clock(host_ns, device_s)
+    return diagnosis.check_clock(host_ns, device_s)
 
 
 def _examine_sensor(
@@ -188,24 +156,25 @@ def _examine_sensor(
     found: list[Check],
     stack: ExitStack,
 ) -> bool:
+    name = "sensor.identity"
     try:
         stack.enter_context(device)
-        info = device.identify()
-        found.append(Check("sensor.identity", "ok", f"{info.model}, serial {info.serial}, firmware {info.firmware}"))
+        found += diagnosis.check_identity(device.identify())
+        name = "sensor.stream"
         samples = device.collect(_LOOK_S)
         health = device.health()
     except DriverError as error:
-        name = "sensor.stream" if found[-1].name == "sensor.identity" else "sensor.identity"
-        found.append(Check(name, "failed", str(error), "see the permissions below; ftdrive devices lists the ports"))
+        fix = "see the permissions below; ftdrive devices lists the ports"
+        found.append(Check(name, "failed", str(error), fix))
         return False
-    found += checks.check_stream(samples, health, address, _LOOK_S)
-    found += checks.check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg)
+    found += diagnosis.check_stream(samples, health, address, _LOOK_S)
+    found += diagnosis.check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg)
     return True
 
 
 def _examine_push(
     device: ForceTorqueSensor | None,
-    reader: Reader | None,
+    arm: RobotArm | None,
     R_flange_sensor: Array | None,
     sign: int,
     station: Station | None,
@@ -215,7 +184,7 @@ def _examine_push(
         found.append(Check("push.sign", "skipped", "the sensor does not measure"))
         return None
     try:
-        R_base_flange = None if reader is None else reader.state(lambda: ()).R_base_flange
+        R_base_flange = None if arm is None else arm.state().R_base_flange
     except DriverError:
         R_base_flange = None  # said under robot.flange
     try:
@@ -233,7 +202,7 @@ def _examine_push(
         found.append(Check("push.sign", "failed", str(error)))
         return None
     largest = max(changes, key=lambda change: float(np.linalg.norm(change)))
-    check, moved = checks.check_push(largest, R_base_flange, R_flange_sensor, sign)
+    check, moved = diagnosis.check_push(largest, R_base_flange, R_flange_sensor, sign)
     found.append(check)
     return moved
 

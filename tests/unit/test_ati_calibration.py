@@ -52,7 +52,9 @@ def test_force_and_torque_have_counts_of_their_own() -> None:
 )
 def test_units(codes: tuple[int, int], force: float, torque: float) -> None:
     si = Calibration.from_vendor(MATRIX, COUNTS, (NEWTON, NEWTON_METRE)).wrench_per_count
-    other = Calibration.from_vendor(MATRIX, COUNTS, codes).wrench_per_count
+    calibration = Calibration.from_vendor(MATRIX, COUNTS, codes)
+    assert (calibration.counts_per_N, calibration.counts_per_Nm) == pytest.approx((1e6 / force, 1e6 / torque))
+    other = calibration.wrench_per_count
     np.testing.assert_allclose(other[:3], force * si[:3], rtol=1e-15)
     np.testing.assert_allclose(other[3:], torque * si[3:], rtol=1e-15)
 

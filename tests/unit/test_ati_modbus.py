@@ -101,6 +101,7 @@ def block(**change: bytes) -> bytes:
         44: b"2019-09-2404:00:00Z\0",
         64: struct.pack(">36f", *range(36)),
         208: b"\x02\x03",
+        210: struct.pack(">6f", 130, 130, 400, 10, 10, 10.5),
         234: struct.pack(">ii", 1_000_000, 2_000_000),
         242: struct.pack(">6H", 543, 555, 569, 579, 565, 567),
         254: struct.pack(">6H", 29000, 30000, 31000, 32000, 33000, 34000),
@@ -116,6 +117,7 @@ def test_calibration_block() -> None:
     assert decoded.calibrated_at == "2019-09-2404:00:00Z"
     assert decoded.matrix.tolist() == np.arange(36.0).reshape(6, 6).tolist()
     assert decoded.unit_codes == (2, 3)
+    assert decoded.max_rating == (130, 130, 400, 10, 10, 10.5)
     assert decoded.counts_per_unit == (1_000_000, 2_000_000)
     assert decoded.gains == (543, 555, 569, 579, 565, 567)
     assert decoded.offsets == (29000, 30000, 31000, 32000, 33000, 34000)

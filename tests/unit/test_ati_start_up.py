@@ -18,6 +18,7 @@ import pytest
 from drivers.ati.can import AtiCanSensor
 from drivers.ati.serial import AtiSerialSensor
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from drivers.interfaces import Fact
 
 GAUGES = ["200 0000 0064 012C 01F4", "201 FF38 FE70 FDA8"]
 WRENCH = [-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608]
@@ -96,6 +97,8 @@ def test_can_start_up_is_golden_and_then_only_gauges_are_asked() -> None:
         samples = sensor.collect(0.1)
         info = sensor.identify()
         assert (info.serial, info.firmware) == ("FT12345", "3.8 build 2")
+        assert info.facts["counts_per_N"] == info.facts["counts_per_Nm"] == Fact(1e6, "device")
+        assert "range" not in info.facts
         assert samples.wrench.mean(axis=0).tolist() == pytest.approx(WRENCH)
         assert samples.counts[0].tolist() == [100, -200, 300, -400, 500, -600]
     assert peer.requests[:12] == list(START_UP)
@@ -120,6 +123,7 @@ def test_can_old_firmware_has_a_million_counts_per_newton(caplog: pytest.LogCapt
     with CanPeer({"20F": ["20F 03060001"], "207": [], "208": []}) as peer, peer.sensor() as sensor:
         assert sensor.latest(timeout_s=1).wrench[0].tolist() == pytest.approx(WRENCH)
         assert not {"207", "208"} & set(peer.requests)
+        assert sensor.identify().facts["counts_per_N"] == Fact(1e6, "assumed")
     assert "does not tell its units" in caplog.text
 
 
@@ -179,7 +183,7 @@ def test_can_reply_lost_in_the_start_up_is_asked_again() -> None:
     ],
 )
 def test_can_status_that_ends_the_stream(first_half: str, error: type[DriverError], message: str) -> None:
-    script = [GAUGES, GAUGES, [first_half, GAUGES[1]]]
+    script = [*[GAUGES] * 50, [first_half, GAUGES[1]]]  # so many that `open` has returned
     with CanPeer({"200": script}) as peer, peer.sensor() as sensor, pytest.raises(error, match=message):
         sensor.collect(1.0)
 
@@ -219,7 +223,7 @@ def crc(data: bytes) -> bytes:
     return struct.pack("<H", value)
 
 
-def calibration_block() -> bytes:
+def calibration_block(unit_codes: bytes = b"\x02\x03", max_rating: float = 0.0) -> bytes:
     data = bytearray(338)
     matrix = [
         *(0, 0, 0, -4250, 0, 4250),
@@ -232,7 +236,8 @@ def calibration_block() -> bytes:
     data[0:8] = b"FT54321\0"
     data[8:17] = b"SI-130-10"
     data[64:208] = struct.pack(">36f", *matrix)
-    data[208:210] = b"\x02\x03"
+    data[208:210] = unit_codes
+    data[210:234] = struct.pack(">6f", *[max_rating] * 6)
     data[234:242] = struct.pack(">ii", 1_000_000, 1_000_000)
     data[242:254] = struct.pack(">6H", 543, 555, 569, 579, 565, 567)
     data[254:266] = struct.pack(">6H", *[0x8000] * 6)
@@ -350,6 +355,30 @@ def test_serial_start_up_and_goodbye_are_golden() -> None:
             assert samples.counts[0].tolist() == [100, -200, 300, -400, 500, -600]
             assert len(samples) > 300
         assert peer.requests == [*SERIAL_START_UP, JAM]
+
+
+@pytest.mark.parametrize(
+    ("unit_codes", "max_rating", "counts_per_N", "range_"),
+    [
+        (b"\x02\x03", 25.0, 1e6, (25.0,) * 6),
+        (b"\x04\x04", 2.0, 1e3, (2000.0,) * 3 + (0.002,) * 3),  # kN and N·mm
+        (b"\x02\x03", 0.0, 1e6, None),
+        (b"\x02\x03", math.nan, 1e6, None),
+    ],
+)
+def test_serial_scale_and_range_are_the_devices(
+    unit_codes: bytes, max_rating: float, counts_per_N: float, range_: tuple[float, ...] | None
+) -> None:
+    block = calibration_block(unit_codes, max_rating)
+    change = {SERIAL_START_UP[3]: [read_reply(block[128:256])]}
+    with SerialPeer(change) as peer, peer.sensor() as sensor:
+        facts = sensor.identify().facts
+    assert facts["counts_per_N"] == Fact(counts_per_N, "device")
+    if range_ is None:
+        assert "range" not in facts
+    else:
+        assert facts["range"].source == "device"
+        assert facts["range"].value == pytest.approx(range_)
 
 
 def test_serial_sensor_left_streaming_is_jammed_first() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConnectError, DeviceFault, StreamBroken
+from drivers.interfaces import Fact
 from drivers.netft import AXIA_BITS, NET_FT_BITS, ONROBOT_BITS, NetFtSensor, describe_status, serial_in
 from drivers.registry import BadUrl, sensor_from_url
 
@@ -107,12 +108,14 @@ def test_start_stop_and_record_are_golden() -> None:
     assert first.counts[0].tolist() == [1_500_000, -2_250_000, 10_000_000, 100_000, -50_000, 25_000]
     assert (np.diff(samples.seq) == 1).all()
     assert (info.model, info.serial) == ("Ethernet Axia", "FT12345")
+    assert info.facts["counts_per_N"] == Fact(1e6, "device")
 
 
 def test_onrobot_scale_is_the_manuals() -> None:
     with Box() as box, box.sensor(onrobot=True) as sensor:
         np.testing.assert_allclose(sensor.latest(timeout_s=0.5).wrench[0], [150, -225, 1000, 1, -0.5, 0.25])
         assert sensor.identify().model == "OnRobot HEX (Ethernet)"
+        assert sensor.identify().facts["counts_per_Nm"] == Fact(100_000, "documented")
 
 
 def test_lost_requests_are_repeated() -> None:

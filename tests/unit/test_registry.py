@@ -10,6 +10,7 @@ from drivers._stream import StreamingSensor
 from drivers.ati.can import AtiCanSensor
 from drivers.ati.serial import AtiSerialSensor
 from drivers.bota.sensor import BotaSensor
+from drivers.interfaces import Fact
 from drivers.netft import NetFtSensor
 from drivers.registry import BadUrl, arm_class, sensor_from_url
 from drivers.robotiq.sensor import RobotiqFt300
@@ -63,7 +64,10 @@ def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: st
         ("ati-can:can0", "which device"),
         ("ati-can://can0#1", "which device"),
         ("ati-can://[can0", "write it like"),
-        ("ati-can://can0?bitrat=1", "unknown option bitrat; known: base, bitrate, interface, recover, slot"),
+        (
+            "ati-can://can0?bitrat=1",
+            "bitrat; known: base, bitrate, interface, range, recover, serial, slot",
+        ),
         ("ati-can://can0?bitrate=fast", "whole number"),
         ("ati-can://can0?base=0x80", "allowed are 0 to 127"),
         ("ati-can://can0?base=", "empty"),
@@ -73,10 +77,14 @@ def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: st
         ("robotous-can://can0?rate=123", "rate is 123 Hz; the sensor knows 10, 20"),
         ("robotous-serial:///dev/x?rate=1000", "at this baud rate 500 Hz is the most"),
         ("robotous-serial:///dev/x?baud=60000", "baud is 60000; the sensor knows"),
-        ("robotiq-ft300:///dev/x?rate=1", "unknown option rate; known: recover"),
+        ("robotiq-ft300:///dev/x?rate=1", "unknown option rate; known: range, recover, serial"),
         ("bota:///dev/x?sinc=513", "allowed are 0 to 512"),
+        ("bota:///dev/x?range=300", "such as 300,30 or"),
+        ("bota:///dev/x?range=300,-30", "such as 300,30 or"),
+        ("bota:///dev/x?range=a,b", "such as 300,30 or"),
+        ("bota:///dev/x?serial=", "empty"),
         ("ati-netft://192.168.1.1?onrobot=2", "allowed are 0 to 1"),
-        ("ati-serial:///dev/x?parity=E", "unknown option parity; known: calibration, recover"),
+        ("ati-serial:///dev/x?parity=E", "unknown option parity; known: calibration, range, recover, serial"),
     ],
 )
 def test_mistakes_are_named(url: str, message: str) -> None:
@@ -138,17 +146,38 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
 def test_another_package_brings_a_sensor_and_an_arm(install: Install) -> None:
     points = "[ftdrive.sensors]\nacme-usb = acme_ft:Sensor\n[ftdrive.arms]\nacme = acme_ft:Arm\n"
     install("acme_ft", points, ACME)
-    sensor = sensor_from_url("acme-usb:///dev/acme0?gain=3", sign=-1)
+    sensor = sensor_from_url("acme-usb:///dev/acme0?gain=3&range=300,30", sign=-1)
     with contextlib.closing(sensor):
         sensor.open()
         assert sensor.identify().model == "Acme"
+        assert sensor.identify().facts == {
+            "serial": Fact("1", "device"),
+            "range": Fact((300, 300, 300, 30, 30, 30), "configured"),
+            "sign": Fact(-1, "configured"),
+        }
         assert (sensor.collect(0.05).wrench == -3).all()
-    with pytest.raises(BadUrl, match="unknown option gian; known: gain, recover"):
+    with pytest.raises(BadUrl, match="unknown option gian; known: gain, range, recover, serial"):
         sensor_from_url("acme-usb:///dev/acme0?gian=3")
     with pytest.raises(BadUrl, match=r"known: ati-can, .*, acme-usb"):
         sensor_from_url("acme:///dev/acme0")
     assert issubclass(arm_class("acme"), UrArm)
     assert arm_class("acme") is not UrArm
+
+
+PLAIN = """
+class Sensor:
+    @classmethod
+    def from_url(cls, address, options, *, sign=1):
+        return cls()
+"""
+
+
+def test_a_driver_that_is_no_stream_of_ours_takes_no_options_of_ours(install: Install) -> None:
+    install("plain_ft", "[ftdrive.sensors]\nplain = plain_ft:Sensor\n", PLAIN)
+    assert type(sensor_from_url("plain://x")).__module__ == "plain_ft"
+    for option in ("recover=1", "range=1,1", "serial=A"):
+        with pytest.raises(BadUrl, match="knows none of the options recover, serial and range"):
+            sensor_from_url(f"plain://x?{option}")
 
 
 def test_arms() -> None:

@@ -88,7 +88,7 @@ def test_identity() -> None:
     assert codec.decode_serial([*letters, 1234, 0]) == "FTS-1234"
     assert codec.decode_serial([*letters, 1, 1]) == "FTS-65537"
     assert codec.decode_serial([0, 0, 7, 0]) == "0007"
-    assert codec.decode_serial([0, 0, 0, 0]) == "unknown"
+    assert codec.decode_serial([0, 0, 0, 0]) == "not reported"
     assert codec.decode_firmware([0x4654, 0x5302, 0x0001]) == "FTS-2.0.1"
     assert codec.decode_firmware([0, 2, 0x0001]) == "2.0.1"
 

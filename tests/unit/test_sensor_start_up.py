@@ -18,6 +18,7 @@ import pytest
 from drivers._crc import crc16_modbus, crc16_x25
 from drivers.bota.sensor import BotaSensor
 from drivers.errors import ConnectError, DeviceFault
+from drivers.interfaces import Fact
 from drivers.robotiq.sensor import RobotiqFt300
 from drivers.robotous.can import CanLink
 from drivers.robotous.sensor import RobotousSensor
@@ -123,6 +124,7 @@ def test_robotous_uart_start_up_is_golden() -> None:
         fields = [bytes(peer.heard[at + 1 : at + 9]).hex().upper() for at in range(0, len(peer.heard), 11)]
     assert fields == WITH_RATE  # no bias, 0x11, anywhere
     assert (info.model, info.serial, info.firmware) == ("Robotous RFT60-HA01", "A60HA00123", "VER 1.7")
+    assert info.facts["counts_per_N"] == Fact(50, "documented")
     np.testing.assert_allclose(samples.wrench[0], [10, -5, 20, 1, -0.5, 0.05])
     assert samples.counts[0].tolist() == [500, -250, 1000, 2000, -1000, 100]
 
@@ -235,6 +237,8 @@ def test_robotiq_start_up_is_golden() -> None:
         wait_for(lambda: not peer.streaming)
     assert bytes(peer.heard) == FT300_STOP + ASK_SERIAL + ASK_FIRMWARE + FT300_START + FT300_STOP
     assert (info.serial, info.firmware) == ("FTS-1234", "FTS-2.0.1")
+    assert info.facts["counts_per_Nm"] == Fact(1000, "documented")
+    assert info.facts["range"] == Fact((300, 300, 300, 30, 30, 30), "documented")
     np.testing.assert_allclose(samples.wrench[0], [12.34, -5.67, 100, 0.15, -0.025, 1])
 
 

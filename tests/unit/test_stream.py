@@ -1,10 +1,11 @@
 """The reader thread shared by all streaming sensors: nothing lost, nothing old, nothing silent."""
 
+import json
 import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from drivers._stream import NOTHING, StreamingSensor
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
-from drivers.interfaces import Array, DeviceInfo, FtSamples
+from drivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, FtSamples
 
 
 class FakeSensor(StreamingSensor):
@@ -170,6 +171,36 @@ def test_more_samples_than_a_collect_may_hold_is_an_error() -> None:
         with pytest.raises(StreamBroken, match="more than 10 samples"):
             fake.collect(1.0)
         feeder.join()
+
+
+def test_what_the_device_does_not_tell_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = Fact((100.0,) * 6, "device")
+    fake = FakeSensor(sign=-1)
+    monkeypatch.setattr(fake, "_connect", lambda: DeviceInfo("fake", NOT_REPORTED, "1.0", {"range": told}))
+    fake.feed.put(1)
+    fake.configured = {"serial": Fact("F7", "configured")}
+    with fake:
+        info = fake.identify()
+    assert info.serial == "F7"
+    assert info.facts == {
+        "serial": Fact("F7", "configured"),
+        "range": told,
+        "sign": Fact(-1, "configured"),
+    }
+    assert json.loads(json.dumps(asdict(info)))["facts"]["range"] == {"value": [100.0] * 6, "source": "device"}
+
+
+def test_a_sensor_that_tells_another_serial_number_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = FakeSensor()
+    fake.configured = {"serial": Fact("F2", "configured")}
+    with pytest.raises(ConnectError, match="serial number F1 answers, F2 is configured"):
+        fake.open()
+    assert fake.disconnects == 1
+    fake.configured = {"serial": Fact("F1", "configured"), "range": Fact((1.0,) * 6, "configured")}
+    monkeypatch.setattr(fake, "_connect", lambda: DeviceInfo("fake", "F1", "1.0", {"range": Fact(2.0, "device")}))
+    fake.feed.put(1)
+    with fake:
+        assert fake.identify().facts["range"] == Fact((1.0,) * 6, "configured")  # the user knows why
 
 
 def test_sign_turns_the_wrench_once_and_leaves_counts_raw() -> None:

@@ -79,7 +79,7 @@ def test_decoding_is_total(data: bytes) -> None:
 
 
 class Server:
-    """A controller that knows only the TCP offset, and answers what `answer` says."""
+    """A controller that answers what `answer` says."""
 
     host = f"127.83.{os.getpid() % 251}.1"  # its own loopback address: the port is fixed
 
@@ -101,10 +101,11 @@ class Server:
         except OSError:
             pass
 
-    def tell(self, *values: float) -> None:
+    def tell(self, t_s: float, *tcp: float, safety_mode: int = 1) -> None:
         assert self.started.wait(5)
         assert self.client is not None
-        self.client.sendall(rtde.encode(rtde.DATA, b"\x01" + struct.pack(f">{len(values)}d", *values)))
+        values = struct.pack(">di6d", t_s, safety_mode, *(tcp or [0.0] * 6))
+        self.client.sendall(rtde.encode(rtde.DATA, b"\x01" + values))
 
     def close(self) -> None:
         for sock in (self._listener, self.client):
@@ -116,12 +117,21 @@ class Server:
 
 
 ANSWERS = {"V": ANSWER_PROTOCOL, "v": ANSWER_VERSION, "S": ANSWER_START}
+OUTPUTS = {"timestamp": "DOUBLE", "safety_mode": "INT32", "tcp_offset": "VECTOR6D"}
 
 
 @contextmanager
-def served(types: bytes = b"DOUBLE,VECTOR6D", **replace: bytes) -> Iterator[Server]:
-    answers = ANSWERS | {"O": rtde.encode(rtde.SETUP_OUTPUTS, b"\x01" + types)} | replace
-    server = Server(lambda request: answers[chr(request[2])])
+def served(outputs: dict[str, str] = OUTPUTS, replace: dict[str, bytes] = ANSWERS) -> Iterator[Server]:
+    """Start a controller that knows these outputs."""
+
+    def answer(request: bytes) -> bytes:
+        kind = chr(request[2])
+        if kind in (answers := ANSWERS | replace):
+            return answers[kind]
+        types = ",".join(outputs.get(name, "NOT_FOUND") for name in request[11:].decode().split(","))
+        return rtde.encode(rtde.SETUP_OUTPUTS, b"\x01" + types.encode())
+
+    server = Server(answer)
     try:
         yield server
     finally:
@@ -142,77 +152,92 @@ def opened(server: Server) -> Iterator[rtde.LiveReader]:
 def test_the_newest_offset_is_told_with_its_time() -> None:
     with served() as server, opened(server) as reader:
         assert reader.tells_tcp
+        assert not reader.missing & OUTPUTS.keys()
         assert reader.version == (5, 15, 0, 1)
-        server.tell(1.0, *[0.0] * 6)
+        server.tell(1.0)
         server.tell(2.0, 0.1, 0, 0.2, 0, 0, 1)
-        assert reader.offset(since_s=1.5, limit_s=2.0) == (2.0, (0.1, 0, 0.2, 0, 0, 1))
+        sample = reader.newest(since_s=1.5, limit_s=2.0)
+        assert sample.t_device_s == 2.0
+        assert sample.outputs == {"timestamp": (2.0,), "tcp_offset": (0.1, 0, 0.2, 0, 0, 1), "safety_mode": (1,)}
 
 
 def test_a_lost_connection_is_raised_at_the_consumer() -> None:
     with served() as server, opened(server) as reader:
-        server.tell(1.0, *[0.0] * 6)
-        reader.offset(since_s=1.0, limit_s=2.0)
+        server.tell(1.0)
+        reader.newest(since_s=1.0, limit_s=2.0)
         server.close()
         for _ in range(2):
             with pytest.raises(StreamBroken, match="open the arm again"):
-                reader.offset(since_s=5.0, limit_s=2.0)
+                reader.newest(since_s=5.0, limit_s=2.0)
             with pytest.raises(StreamBroken):
                 reader.now_s(limit_s=2.0)
 
 
 def test_an_old_controller_tells_at_least_its_time() -> None:
-    def answer(request: bytes) -> bytes:
-        known = b"DOUBLE,NOT_FOUND" if request.endswith(b",tcp_offset") else b"DOUBLE"
-        return {**ANSWERS, "O": rtde.encode(rtde.SETUP_OUTPUTS, b"\x01" + known)}[chr(request[2])]
-
-    server = Server(answer)
-    reader = rtde.LiveReader(server.host)
-    try:
-        reader.open(timeout_s=2.0)
+    with served({"timestamp": "DOUBLE", "safety_mode": "INT32"}) as server, opened(server) as reader:
         assert not reader.tells_tcp
         assert reader.version[:2] == (5, 15)
-        server.tell(7.0)
-        assert reader.offset(since_s=7.0, limit_s=2.0) == (7.0, ())
-    finally:
-        reader.close()
-        server.close()
+        assert server.started.wait(5)
+        assert server.client is not None
+        server.client.sendall(rtde.encode(rtde.DATA, b"\x01" + struct.pack(">di", 7.0, 3)))
+        outputs = reader.newest(since_s=7.0, limit_s=2.0).outputs
+        assert outputs == {"timestamp": (7.0,), "safety_mode": (3,)}
 
 
 def test_what_has_piled_up_is_not_now() -> None:
     with served() as server, opened(server) as reader:
-        server.tell(1.0, *[0.0] * 6)
-        reader.offset(since_s=1.0, limit_s=2.0)
+        server.tell(1.0)
+        reader.newest(since_s=1.0, limit_s=2.0)
         told: list[float] = []
         asking = threading.Thread(target=lambda: told.append(reader.now_s(limit_s=5.0)))
         asking.start()
         time.sleep(0.15)  # a pause far longer than between two samples, then what a socket held back
         for k in range(100):
-            server.tell(2.0 + 0.008 * k, *[0.0] * 6)
+            server.tell(2.0 + 0.008 * k)
         t_s = 3.0
         while asking.is_alive():
             time.sleep(0.008)
-            server.tell(t_s := t_s + 0.008, *[0.0] * 6)
+            server.tell(t_s := t_s + 0.008)
         assert told[0] > 3.0
+
+
+def test_what_has_piled_up_is_no_status() -> None:
+    with served() as server, opened(server) as reader:
+        server.tell(1.0)
+        reader.newest(since_s=1.0, limit_s=2.0)
+        time.sleep(0.15)
+        for k in range(100):
+            server.tell(2.0 + 0.008 * k)
+        with pytest.raises(DeviceTimeout):
+            reader.live(max_age_s=0.05, limit_s=0.1)
+        told: list[rtde.Sample] = []
+        asking = threading.Thread(target=lambda: told.append(reader.live(max_age_s=0.05, limit_s=5.0)))
+        asking.start()
+        t_s = 3.0
+        while asking.is_alive():
+            time.sleep(0.008)
+            server.tell(t_s := t_s + 0.008, safety_mode=3)
+        assert told[0].outputs["safety_mode"] == (3,)
 
 
 def test_a_clock_that_stands_still_is_found_after_a_fifth_of_a_second() -> None:
     with served() as server, opened(server) as reader:
-        server.tell(1.0, *[0.0] * 6)
+        server.tell(1.0)
         t0 = time.monotonic()
         with pytest.raises(DeviceTimeout, match=r"stood still at 1\.000 s"):
-            reader.offset(since_s=1.001, limit_s=0.2)
+            reader.newest(since_s=1.001, limit_s=0.2)
         assert 0.2 < time.monotonic() - t0 < 1.0
 
 
 def test_our_own_pause_is_not_the_controllers(monkeypatch: pytest.MonkeyPatch) -> None:
     with served() as server, opened(server) as reader:
-        server.tell(1.0, *[0.0] * 6)
-        reader.offset(since_s=1.0, limit_s=2.0)
+        server.tell(1.0)
+        reader.newest(since_s=1.0, limit_s=2.0)
         pauses = iter(range(0, 10**9, 30))  # 30 s between any two looks at the clock: the computer sleeps all the time
         monkeypatch.setattr(time, "monotonic", lambda: float(next(pauses)))
-        later = threading.Timer(0.04, server.tell, (2.0, *[0.0] * 6))
+        later = threading.Timer(0.04, server.tell, (2.0,))
         later.start()
-        assert reader.offset(since_s=2.0, limit_s=0.2)[0] == 2.0
+        assert reader.newest(since_s=2.0, limit_s=0.2).t_device_s == 2.0
         later.join()
 
 
@@ -220,9 +245,9 @@ def test_our_own_pause_is_not_the_controllers(monkeypatch: pytest.MonkeyPatch) -
     ("types", "taken"), [(b"INT32,DOUBLE", []), (b"IN_USE,DOUBLE", ["a"]), (b"NOT_FOUND,IN_USE", ["b"])]
 )
 def test_inputs_of_others_are_told(types: bytes, taken: list[str]) -> None:
-    with served(I=rtde.encode(rtde.SETUP_INPUTS, b"\x01" + types)) as server:
+    with served(replace={"I": rtde.encode(rtde.SETUP_INPUTS, b"\x01" + types)}) as server:
         assert rtde.registers_in_use(server.host, ("a", "b"), timeout_s=2.0) == taken
-    with served(I=b"") as server, pytest.raises(DeviceTimeout, match="did not answer"):
+    with served(replace={"I": b""}) as server, pytest.raises(DeviceTimeout, match="did not answer"):
         rtde.registers_in_use(server.host, ("a", "b"), timeout_s=0.1)
     with pytest.raises(StreamBroken, match="was lost"):
         rtde.registers_in_use("127.83.7.2", ("a", "b"), timeout_s=0.1)
@@ -236,11 +261,11 @@ def test_inputs_of_others_are_told(types: bytes, taken: list[str]) -> None:
         ({"V": b"HTTP/1.1 400 Bad Request\r\n"}, "did not answer"),
         ({"V": b"\x00\x01\x00"}, "does not speak RTDE"),
         ({"S": bytes.fromhex("00045300")}, "does not start"),
-        ({"O": rtde.encode(rtde.SETUP_OUTPUTS, b"\x01DOUBLE,DOUBLE")}, "DOUBLE, DOUBLE"),
+        ({"O": rtde.encode(rtde.SETUP_OUTPUTS, b"\x01" + b",".join([b"DOUBLE"] * 10))}, "DOUBLE, DOUBLE"),
     ],
 )
 def test_whoever_does_not_speak_rtde_is_refused_in_time(replace: dict[str, bytes], says: str) -> None:
-    with served(**replace) as server:
+    with served(replace=replace) as server:
         reader = rtde.LiveReader(server.host)
         t0 = time.monotonic()
         with pytest.raises(ConnectError, match=says):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConnectError, StreamBroken
+from drivers.interfaces import Fact
 from drivers.registry import BadUrl, sensor_from_url
 from drivers.ur import rtde
 from drivers.ur.sensor import UrWristSensor
@@ -83,6 +84,8 @@ def test_raw_wrench_is_scaled_as_told_and_only_read() -> None:
     assert (np.diff(samples.seq) == 1).all()
     np.testing.assert_allclose(np.diff(samples.t_device_s), 0.002, atol=1e-9)
     assert "ft_raw_wrench" in info.model
+    assert info.facts["counts_per_N"] == Fact(200.0, "configured")
+    assert "serial" not in info.facts
     assert info.firmware == "5.15.0.1"
     assert controller.heard[2] == rtde.encode_setup_outputs(500.0, ("timestamp", "ft_raw_wrench"))
     assert [chr(request[2]) for request in controller.heard] == ["V", "v", "O", "S"]
@@ -92,6 +95,7 @@ def test_skipped_cycles_are_gaps() -> None:
     with Controller(99.998, 100.0, 100.002, 100.01, 100.012), sensor() as wrist:
         wrist.collect(0.05)
         assert wrist.health().lost >= 3
+        assert wrist.health().nominal_rate_Hz == 500
 
 
 def test_a_clock_that_goes_back_ends_the_stream() -> None:

@@ -1,18 +1,23 @@
-"""The emulated UR controller, as the tests of its driver use it."""
+"""The emulated UR controller and the emulated sensors, as the tests of their drivers use them."""
 
 import json
 import select
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from math import radians
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from drivers._stream import StreamingSensor
+from drivers.registry import sensor_from_url
 from drivers.ur.arm import UrArm
 
 ROOT = Path(__file__).parents[2]
@@ -118,3 +123,150 @@ def arm(new_arm: Callable[..., UrArm]) -> UrArm:
     arm = new_arm()
     arm.open(control=True)
     return arm
+
+
+# ---------------------------------------------------------------------- sensors
+
+WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])
+NOISE = np.array([0.03] * 3 + [0.001] * 3)
+
+PROGRAM = """
+import json, sys
+import numpy as np
+from mocks.ati_can import AtiCanNode
+from mocks.ati_serial import AtiSerialBox
+from mocks.bota import BotaBox
+from mocks.faults import Faults
+from mocks.netft import Calibration, NetFtBox
+from mocks.robotiq import RobotiqBox
+from mocks.robotous import Model, RobotousCanNode, RobotousSerialBox
+
+wrench, noise = np.array(json.loads(sys.argv[1])), np.array(json.loads(sys.argv[2]))
+rng = np.random.default_rng(1)
+measure = lambda n: wrench + rng.normal(size=(n, 6)) * noise
+kinds = {"ati-can": AtiCanNode, "ati-serial": AtiSerialBox, "robotous-can": RobotousCanNode, "bota": BotaBox,
+         "robotous-serial": RobotousSerialBox, "robotiq-ft300": RobotiqBox, "ati-netft": NetFtBox}
+parts = {"faults": Faults, "model": Model, "calibration": Calibration}
+devices = []
+for line in sys.stdin:
+    word, argument, options = json.loads(line)
+    if word == "start":
+        options = {key: parts[key](**value) if key in parts else tuple(value) if isinstance(value, list) else value
+                   for key, value in options.items()}
+        devices.append(kinds[argument](measure, seed=2, **options))
+        print(json.dumps([len(devices) - 1, devices[-1].start()]), flush=True)
+    elif word == "faults":
+        for key, value in options.items():
+            setattr(devices[argument].faults, key, value)
+        print("done", flush=True)
+    else:
+        getattr(devices[argument], word)()
+        print("done", flush=True)
+"""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a test must know about one sort of sensor."""
+
+    scheme: str
+    query: str
+    quantisation: tuple[float, float]
+    rate_Hz: float
+    counts: int
+    serial: str
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+KINDS = {
+    kind.scheme: kind
+    for kind in (
+        Kind("ati-can", "interface=slcan", (0.02, 0.001), 1000, 6, "FT"),
+        Kind("ati-serial", "", (0.02, 0.001), 7000, 6, "FT"),
+        Kind("robotous-can", "interface=slcan", (0.02, 0.0005), 200, 6, "A60HA00123"),
+        Kind("robotous-serial", "", (0.02, 0.0005), 200, 6, "A60HA00123"),
+        Kind("robotiq-ft300", "", (0.01, 0.001), 100, 6, "FTS-1234"),
+        Kind("bota", "", (1e-5, 1e-6), 100, 0, "not reported"),
+        Kind("ati-netft", "", (1e-6, 1e-6), 1000, 6, "FT12345", {"rdt_port": 0, "rate_hz": 1000}),
+    )
+}
+
+
+class Laboratory:
+    """Emulated sensors in one child process."""
+
+    def __init__(self) -> None:
+        arguments = [sys.executable, "-c", PROGRAM, json.dumps(WRENCH.tolist()), json.dumps(NOISE.tolist())]
+        self.process = subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._lock = threading.Lock()
+
+    def tell(self, word: str, argument: str | int, options: dict[str, Any] | None = None) -> str:
+        assert self.process.stdin
+        assert self.process.stdout
+        with self._lock:
+            self.process.stdin.write(json.dumps([word, argument, options]) + "\n")
+            self.process.stdin.flush()
+            return self.process.stdout.readline().strip()
+
+    def close(self) -> None:
+        self.process.communicate(timeout=5)
+
+
+class Emulator:
+    """One emulated sensor."""
+
+    def __init__(self, laboratory: Laboratory, scheme: str, options: dict[str, Any]) -> None:
+        self.kind = KINDS[scheme]
+        self.laboratory = laboratory
+        self._number, self.endpoint = json.loads(laboratory.tell("start", scheme, self.kind.options | options))
+
+    def sensor(self, options: str = "", sign: int = 1) -> StreamingSensor:
+        where, ports = self.endpoint, []
+        if isinstance(where, dict):
+            ports = [f"{key}={where[key]}" for key in ("rdt_port", "http_port")]
+            where = where["host"]
+        query = "&".join(filter(None, [self.kind.query, *ports, options]))
+        sensor = sensor_from_url(f"{self.kind.scheme}://{where}?{query}".rstrip("?"), sign=sign)
+        assert isinstance(sensor, StreamingSensor)
+        return sensor
+
+    def faults(self, **options: Any) -> None:
+        assert self.laboratory.tell("faults", self._number, options) == "done"
+
+    def unplug(self) -> None:
+        assert self.laboratory.tell("unplug", self._number) == "done"
+
+    def reset(self) -> None:
+        assert self.laboratory.tell("reset", self._number) == "done"
+
+    def stop(self) -> None:
+        assert self.laboratory.tell("stop", self._number) == "done"
+
+
+@pytest.fixture(scope="module")
+def laboratory() -> Iterator[Laboratory]:
+    laboratory = Laboratory()
+    yield laboratory
+    laboratory.close()
+
+
+@pytest.fixture
+def start(laboratory: Laboratory) -> Iterator[Callable[..., Emulator]]:
+    """Start an emulated sensor of its own for a test: a scheme, and options of the emulator."""
+    running: list[Emulator] = []
+
+    def run(scheme: str, **options: Any) -> Emulator:
+        running.append(Emulator(laboratory, scheme, options))
+        return running[-1]
+
+    yield run
+    for emulator in running:
+        emulator.stop()
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def shared(request: pytest.FixtureRequest, laboratory: Laboratory) -> Iterator[Emulator]:
+    """A healthy emulator of every kind, for tests that leave it as they found it."""
+    emulator = Emulator(laboratory, request.param, {})
+    yield emulator
+    emulator.stop()

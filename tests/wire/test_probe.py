@@ -22,7 +22,7 @@ def measure(n: int) -> Any:
 @pytest.mark.parametrize(
     ("kind", "options", "scheme", "what"),
     [
-        (AtiSerialBox, {}, "ati-serial", "status 0x0000"),
+        (AtiSerialBox, {}, "ati-serial", "serial FT"),
         (AtiSerialBox, {"streaming_at_start": True}, "ati-serial", "streams"),
         (RobotiqBox, {}, "robotiq-ft300", "serial FTS-1234"),
         (RobotiqBox, {"streaming_at_start": True}, "robotiq-ft300", "streams"),

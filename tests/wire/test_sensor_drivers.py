@@ -1,15 +1,11 @@
-"""Robotous, Robotiq, Bota and Net F/T drivers against their emulators, which run in a process of their own."""
+"""All sensor drivers against their emulators, which run in a process of their own: one suite, seven wires."""
 
-import json
 import math
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pytest
@@ -18,150 +14,30 @@ from drivers._stream import StreamingSensor
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from drivers.registry import BadUrl, sensor_from_url
 
-WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])
+WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])  # what the emulators of conftest.py measure, with
 NOISE = np.array([0.03] * 3 + [0.001] * 3)
 
-PROGRAM = """
-import json, sys
-import numpy as np
-from mocks.bota import BotaBox
-from mocks.faults import Faults
-from mocks.netft import Calibration, NetFtBox
-from mocks.robotiq import RobotiqBox
-from mocks.robotous import Model, RobotousCanNode, RobotousSerialBox
-
-wrench, noise = np.array(json.loads(sys.argv[1])), np.array(json.loads(sys.argv[2]))
-rng = np.random.default_rng(1)
-measure = lambda n: wrench + rng.normal(size=(n, 6)) * noise
-kinds = {"robotous-can": RobotousCanNode, "robotous-serial": RobotousSerialBox, "robotiq-ft300": RobotiqBox,
-         "bota": BotaBox, "ati-netft": NetFtBox}
-parts = {"faults": Faults, "model": Model, "calibration": Calibration}
-devices = []
-for line in sys.stdin:
-    word, argument, options = json.loads(line)
-    if word == "start":
-        options = {key: parts[key](**value) if key in parts else tuple(value) if isinstance(value, list) else value
-                   for key, value in options.items()}
-        devices.append(kinds[argument](measure, seed=2, **options))
-        print(json.dumps([len(devices) - 1, devices[-1].start()]), flush=True)
-    elif word == "faults":
-        for key, value in options.items():
-            setattr(devices[argument].faults, key, value)
-        print("done", flush=True)
-    else:
-        getattr(devices[argument], word)()
-        print("done", flush=True)
-"""
+SCHEMES = ("ati-can", "ati-serial", "robotous-can", "robotous-serial", "robotiq-ft300", "bota", "ati-netft")
 
 
-@dataclass(frozen=True)
-class Kind:
-    """What a test must know about one sort of device."""
+class Emulator(Protocol):
+    """What the tests use of an emulated sensor."""
 
-    scheme: str
-    query: str
-    quantisation: tuple[float, float]
-    rate_Hz: float
-    counts: int
-    serial: str
-    options: dict[str, Any]
+    kind: Any
 
+    def sensor(self, options: str = "", sign: int = 1) -> StreamingSensor: ...
 
-KINDS = {
-    kind.scheme: kind
-    for kind in (
-        Kind("robotous-can", "interface=slcan", (0.02, 0.0005), 200, 6, "A60HA00123", {}),
-        Kind("robotous-serial", "", (0.02, 0.0005), 200, 6, "A60HA00123", {}),
-        Kind("robotiq-ft300", "", (0.01, 0.001), 100, 6, "FTS-1234", {}),
-        Kind("bota", "", (1e-5, 1e-6), 100, 0, "not reported", {}),
-        Kind("ati-netft", "", (1e-6, 1e-6), 1000, 6, "FT12345", {"rdt_port": 0, "rate_hz": 1000}),
-    )
-}
+    def faults(self, **options: Any) -> None: ...
 
+    def unplug(self) -> None: ...
 
-class Laboratory:
-    """Emulated sensors in one child process."""
-
-    def __init__(self) -> None:
-        arguments = [sys.executable, "-c", PROGRAM, json.dumps(WRENCH.tolist()), json.dumps(NOISE.tolist())]
-        self.process = subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        self._lock = threading.Lock()
-
-    def tell(self, word: str, argument: str | int, options: dict[str, Any] | None = None) -> str:
-        assert self.process.stdin
-        assert self.process.stdout
-        with self._lock:
-            self.process.stdin.write(json.dumps([word, argument, options]) + "\n")
-            self.process.stdin.flush()
-            return self.process.stdout.readline().strip()
-
-    def close(self) -> None:
-        self.process.communicate(timeout=5)
-
-
-class Emulator:
-    """One emulated sensor."""
-
-    def __init__(self, laboratory: Laboratory, scheme: str, options: dict[str, Any]) -> None:
-        self.kind = KINDS[scheme]
-        self._laboratory = laboratory
-        self._number, self.endpoint = json.loads(laboratory.tell("start", scheme, self.kind.options | options))
-
-    def sensor(self, options: str = "", sign: int = 1) -> StreamingSensor:
-        where, ports = self.endpoint, []
-        if isinstance(where, dict):
-            ports = [f"{key}={where[key]}" for key in ("rdt_port", "http_port")]
-            where = where["host"]
-        query = "&".join(filter(None, [self.kind.query, *ports, options]))
-        sensor = sensor_from_url(f"{self.kind.scheme}://{where}?{query}".rstrip("?"), sign=sign)
-        assert isinstance(sensor, StreamingSensor)
-        return sensor
-
-    def faults(self, **options: Any) -> None:
-        assert self._laboratory.tell("faults", self._number, options) == "done"
-
-    def unplug(self) -> None:
-        assert self._laboratory.tell("unplug", self._number) == "done"
-
-    def reset(self) -> None:
-        assert self._laboratory.tell("reset", self._number) == "done"
-
-    def stop(self) -> None:
-        assert self._laboratory.tell("stop", self._number) == "done"
+    def reset(self) -> None: ...
 
 
 Start = Callable[..., Emulator]
 
 
-@pytest.fixture(scope="module")
-def laboratory() -> Iterator[Laboratory]:
-    laboratory = Laboratory()
-    yield laboratory
-    laboratory.close()
-
-
-@pytest.fixture
-def start(laboratory: Laboratory) -> Iterator[Start]:
-    running: list[Emulator] = []
-
-    def run(scheme: str, **options: Any) -> Emulator:
-        running.append(Emulator(laboratory, scheme, options))
-        return running[-1]
-
-    yield run
-    for emulator in running:
-        emulator.stop()
-
-
-@pytest.fixture(scope="module", params=KINDS)
-def shared(request: pytest.FixtureRequest, laboratory: Laboratory) -> Iterator[Emulator]:
-    """A healthy emulator for tests that leave it as they found it."""
-    emulator = Emulator(laboratory, request.param, {})
-    yield emulator
-    emulator.stop()
-
-
-@pytest.fixture(params=KINDS)
+@pytest.fixture(params=SCHEMES)
 def scheme(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
@@ -174,24 +50,23 @@ def test_wrench_counts_and_samples(shared: Emulator) -> None:
     n = len(samples)
     bound = np.repeat(kind.quantisation, 3) / 2 + 5 * np.hypot(NOISE, np.repeat(kind.quantisation, 3)) / math.sqrt(n)
     assert (np.abs(samples.wrench.mean(axis=0) - WRENCH) < bound).all()
-    assert (np.diff(samples.seq) == 1).all()
+    assert (np.diff(samples.seq) >= 1).all()
+    assert samples.seq[-1] - samples.seq[0] + 1 - n <= health.lost <= 0.01 * n  # a poll may be late on a busy computer
     assert (np.diff(samples.t_host_ns) >= 0).all()
     assert 0.1 * kind.rate_Hz < n < 0.65 * kind.rate_Hz  # few on a busy computer, never more
     assert samples.counts.shape == (n, kind.counts)
     assert (samples.status == 0).all()
-    assert info.serial == kind.serial
-    assert (health.lost, health.malformed) == (0, 0)
+    assert info.serial.startswith(kind.serial)
+    assert health.malformed == 0
 
 
 def test_counts_and_wrench_tell_the_same(shared: Emulator) -> None:
+    if shared.kind.scheme in {"ati-can", "ati-serial", "bota"}:
+        return  # gauges, and no counts at all
     with shared.sensor() as sensor:
-        samples = sensor.collect(0.2)
-    if not shared.kind.counts:
-        return
-    scale = {"ati-netft": [1e6] * 6, "robotiq-ft300": [100] * 3 + [1000] * 3}.get(
-        shared.kind.scheme, [50] * 3 + [2000] * 3
-    )
-    np.testing.assert_allclose(samples.counts / np.array(scale), samples.wrench, rtol=1e-12)
+        samples, facts = sensor.collect(0.2), sensor.identify().facts
+    scale = np.repeat([facts[f"counts_per_{unit}"].value for unit in ("N", "Nm")], 3)
+    np.testing.assert_allclose(samples.counts / scale, samples.wrench, rtol=1e-12)
 
 
 def test_sign_turns_the_reading(shared: Emulator) -> None:
@@ -228,6 +103,7 @@ def test_open_close_reopen_and_nothing_stays(shared: Emulator) -> None:
     assert (descriptors(), threading.active_count()) == (before, threads)
 
 
+@pytest.mark.parametrize("scheme", [scheme for scheme in SCHEMES if scheme != "ati-can"])  # it is polled
 def test_already_streaming_when_opened(start: Start, scheme: str) -> None:
     """A client died, or the sensor streams from power-up on."""
     with start(scheme, streaming_at_start=("127.0.0.1", 9) if scheme == "ati-netft" else True).sensor() as sensor:
@@ -262,7 +138,7 @@ def test_silence_is_an_error(start: Start, scheme: str) -> None:
             sensor.collect(2.0)
 
 
-@pytest.mark.parametrize("scheme", sorted(KINDS.keys() - {"bota"}))  # a Bota is given 3 s to boot: see the unit tests
+@pytest.mark.parametrize("scheme", [scheme for scheme in SCHEMES if scheme != "bota"])  # it is given 3 s to boot
 def test_a_silent_device_is_no_device(start: Start, scheme: str) -> None:
     emulator = start(scheme)
     emulator.faults(stall=True)
@@ -276,10 +152,11 @@ def test_a_silent_device_is_no_device(start: Start, scheme: str) -> None:
     ("scheme", "fault"),
     [
         (scheme, fault)
-        for scheme in KINDS
+        for scheme in SCHEMES
+        if scheme != "ati-serial"  # its records have no header and a short sum: see `test_ati_drivers.py`
         for fault in ("drop", "corrupt", "byte_slip")
         # CAN controllers and UDP drop damaged frames themselves
-        if fault == "drop" or scheme not in {"robotous-can", "ati-netft"}
+        if fault == "drop" or scheme not in {"ati-can", "robotous-can", "ati-netft"}
     ],
 )
 def test_damage_is_dropped_and_counted(start: Start, scheme: str, fault: str) -> None:
@@ -351,7 +228,7 @@ def test_robotiq_saturation_is_a_fault(start: Start) -> None:
 
 def test_robotiq_unknown_serial_number(start: Start) -> None:
     with start("robotiq-ft300", serial=("FTS", 0)).sensor() as sensor:
-        assert sensor.identify().serial == "unknown"
+        assert sensor.identify().serial == "not reported"
         assert sensor.identify().firmware == "FTS-2.0.1"
 
 

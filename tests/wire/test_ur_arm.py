@@ -117,10 +117,13 @@ def test_a_tcp_set_on_the_way_does_not_change_the_flange(station: Station, new_a
 def test_old_controllers_need_control_to_tell_the_tcp(
     station: Station, new_arm: Callable[..., UrArm], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(LiveReader, "_outputs", {"timestamp": "DOUBLE", "not_yet_invented": "VECTOR6D"})
+    outputs = {name: kind for name, kind in LiveReader._outputs.items() if name != "tcp_offset"}
+    monkeypatch.setattr(LiveReader, "_outputs", outputs)
     arm = new_arm()
+    arm.open()
+    assert arm.status().tcp_offset is None
     with pytest.raises(ConnectError, match="too old to tell its active TCP"):
-        arm.open()
+        arm.state()
     arm.open(control=True)
     station.do("set-tcp", tcp=TCP)
     assert_flange_is_right(arm)
@@ -191,6 +194,73 @@ def test_identity_and_clock(station: Station, new_arm: Callable[..., UrArm]) -> 
     assert second.t_device_s > first.t_device_s
     assert 0 <= time.monotonic_ns() - second.t_host_ns < 100e6
     assert first.q_rad == pytest.approx(station.do("state")["q_rad"], abs=1e-6)
+
+
+def test_status_is_what_the_controller_says_now(station: Station, new_arm: Callable[..., UrArm]) -> None:
+    arm = new_arm()
+    arm.open()
+    status = arm.status()
+    assert (status.robot_mode, status.safety_mode, status.program) == ("running", "normal", "stopped")
+    assert status.fault is None
+    assert 0 < status.speed_slider <= 1
+    assert 0 < status.speed_scaling <= 1
+    assert status.payload_kg is not None
+    assert status.payload_kg >= 0
+    assert status.p_flange_payload_m is not None
+    assert len(status.p_flange_payload_m) == 3
+    assert 0 <= time.monotonic_ns() - status.t_host_ns < 100e6
+    assert arm.in_remote_control()
+    station.do("set-tcp", tcp=TCP)
+    station.do("remote-control", on=False)
+    station.do("protective-stop")
+    time.sleep(0.1)  # what a status may be old
+    status = arm.status()
+    assert status.tcp_offset == pytest.approx(TCP)
+    assert status.safety_mode == "protective stop"
+    assert "find and remove its cause" in (status.fault or "")
+    assert arm.in_remote_control() is False
+    station.do("freeze")
+    time.sleep(0.1)
+    with pytest.raises(DeviceTimeout, match="stood still"):
+        arm.status()
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_others_may_look_and_stop_while_the_arm_moves(station: Station, arm: UrArm, stopped: bool) -> None:
+    q0, q, done = arm.state().q_rad[5], away(arm), threading.Event()
+    seen: list[tuple[float, str]] = []  # joint 6, program
+    failures: list[Exception] = []
+
+    def look_along() -> None:
+        try:
+            while not done.is_set():
+                seen.append((arm.state().q_rad[5], arm.status().program))
+                if stopped and abs(seen[-1][0] - q0) > 0.2:
+                    arm.stop()
+                    assert not station.do("state")["moving"]  # it returns when the arm stands
+                    return
+        except Exception as error:
+            failures.append(error)
+
+    lookers = [threading.Thread(target=look_along) for _ in range(1 if stopped else 3)]
+    for looker in lookers:
+        looker.start()
+    try:
+        if stopped:
+            with pytest.raises(DeviceFault, match="told to stop"):
+                arm.move_to(q, timeout_s=10, guard=no_guard)
+        else:
+            arm.move_to(q, timeout_s=10, guard=no_guard)
+    finally:
+        done.set()
+        for looker in lookers:
+            looker.join(5)
+    assert not failures
+    assert {program for _, program in seen} == {"playing"}
+    assert stopped or len({angle for angle, _ in seen}) > 10  # they saw the arm move
+    here = arm.state().q_rad
+    assert (abs(here[5] - q[5]) > 0.1) == stopped
+    arm.move_to(here.tolist(), timeout_s=5, guard=no_guard)
 
 
 def test_wrong_model_is_refused(new_arm: Callable[..., UrArm]) -> None:

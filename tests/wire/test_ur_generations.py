@@ -55,6 +55,17 @@ def test_open_state_move_stop_limits_close(start_station: Callable[..., Station]
     assert arm.identify().model == model
     assert arm.identify().firmware.startswith(polyscope)
 
+    status = arm.status()
+    assert (status.robot_mode, status.safety_mode, status.program, status.fault) == (
+        "running",
+        "normal",
+        "playing",
+        None,
+    )
+    assert status.tcp_offset == pytest.approx([float(value) for value in tcp.split(",")])
+    assert (status.payload_kg is None) == (status.p_flange_payload_m is None) == old
+    assert arm.in_remote_control() is (None if old or polyscope.startswith("3") else True)
+
     q = arm.state().q_rad
     q[5] += -0.5 if q[5] > 0.5 else 0.5
     assert arm.within_safety_limits(q.tolist())

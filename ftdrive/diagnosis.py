@@ -1,0 +1,275 @@
+"""What `doctor` says of the devices, as functions of what was seen; nothing here opens one."""
+
+import math
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import CalibrationResult
+from calib.design import Guess, predicted_sigma, special
+from calib.noise import is_stationary, mean_and_covariance
+from drivers.interfaces import ArmStatus, DeviceInfo, Fact, FtSamples, Health
+from ftdrive.checks import Check, SensorAddress, State, latency_command
+
+Array = NDArray[np.float64]
+
+_PUSH_N = 2.0
+# ---------------------------------------------------------------------------------------------------------- the sensor
+
+
+_SAYS: Mapping[str, str] = MappingProxyType(
+    {
+        "device": "told by the device",
+        "documented": "fixed by its manual",
+        "configured": "configured",
+        "assumed": "assumed",
+    }
+)
+
+
+def check_identity(info: DeviceInfo) -> list[Check]:
+    """Say who a sensor is and what its numbers mean, and from where each of it is known."""
+    who = f"{info.model}, serial {info.serial}, firmware {info.firmware}"
+    identity = Check("sensor.identity", "ok", who)
+    if "serial" not in info.facts:
+        fix = "add serial=… (its label) to the sensor's address, so that a calibration knows its sensor"
+        identity = Check("sensor.identity", "warning", who, fix)
+    facts = info.facts
+    return [
+        identity,
+        _check_scale(facts.get("counts_per_N"), facts.get("counts_per_Nm")),
+        _check_range(facts.get("range")),
+        _check_sign(facts.get("sign")),
+    ]
+
+
+def _check_scale(force: Fact | None, torque: Fact | None) -> Check:
+    name = "sensor.counts"
+    if force is None or torque is None:
+        return Check(name, "ok", "the driver does not tell its scale")
+    found = f"{force.value:.7g} counts per N and {torque.value:.7g} per N·m, {_SAYS[force.source]}"
+    if force.source == "assumed":
+        return Check(name, "warning", found, "compare with the calibration certificate, or hang a known weight on it")
+    return Check(name, "ok", found)
+
+
+def _check_range(fact: Fact | None) -> Check:
+    name = "sensor.range"
+    if fact is None or not isinstance(fact.value, tuple):
+        fix = "add range=N,Nm of its data sheet to the sensor's address, such as range=300,30"
+        return Check(name, "warning", "its range is not known, so nobody watches for an overload", fix)
+    *force, tx, ty, tz = (f"{value:g}" for value in fact.value)
+    return Check(name, "ok", f"±({', '.join(force)}) N, ±({tx}, {ty}, {tz}) N·m, {_SAYS[fact.source]}")
+
+
+def _check_sign(fact: Fact | None) -> Check:
+    if fact is None:
+        return Check("sensor.sign", "ok", "the driver does not tell its sign")
+    return Check("sensor.sign", "ok", f"sign {fact.value}, {_SAYS[fact.source]}; --push shows whether it is right")
+
+
+def check_stream(samples: FtSamples, health: Health, address: SensorAddress, duration_s: float) -> list[Check]:
+    """Judge two seconds of a sensor: rate, losses, age, status."""
+    return [
+        _check_rate(len(samples) / duration_s, health.nominal_rate_Hz, address),
+        _check_lost(health),
+        Check("sensor.age", "ok", f"the newest sample is {1e3 * health.age_s:.1f} ms old"),
+        _check_status(samples.status),
+    ]
+
+
+def _check_rate(rate_Hz: float, nominal_Hz: float, address: SensorAddress) -> Check:
+    if math.isnan(nominal_Hz):
+        return Check("sensor.rate", "ok", f"{rate_Hz:.0f} Hz (as fast as it answers, or as it is set)")
+    found = f"{rate_Hz:.1f} Hz (nominal {nominal_Hz:g})"
+    if rate_Hz > 0.95 * nominal_Hz:
+        return Check("sensor.rate", "ok", found)
+    port = address.serial_port
+    fix = "close other programs, and try another USB port or cable"
+    if port is not None and (tty := port.resolve().name).startswith("ttyUSB"):
+        fix = latency_command(tty)
+    return Check("sensor.rate", "failed" if rate_Hz < 0.5 * nominal_Hz else "warning", found, fix)
+
+
+def _check_lost(health: Health) -> Check:
+    found = f"{health.lost} lost, {health.malformed} damaged of {health.received}"
+    bad = max(health.lost, health.malformed)
+    if not bad:
+        return Check("sensor.lost", "ok", found)
+    state: State = "failed" if bad > 0.01 * health.received else "warning"
+    return Check("sensor.lost", state, found, "check the cable, its shield and the termination of the bus")
+
+
+def _check_status(status: NDArray[np.uint32]) -> Check:
+    words = [f"0x{int(word):x}" for word in np.unique(status)]
+    found = f"status {', '.join(words)}"
+    if words == ["0x0"]:
+        return Check("sensor.status", "ok", found)
+    return Check(
+        "sensor.status", "warning", found, "look the bits up in the sensor's manual; the driver goes on with them"
+    )
+
+
+def check_noise(wrench: Array, duration_s: float, average_s: float, mass_kg: float) -> list[Check]:
+    """Judge the noise of a sensor at rest, and say what a calibration with it will be worth.
+
+    Parameters
+    ----------
+    wrench : array, shape (n, 6)
+        `duration_s` seconds of N and N·m.
+    average_s : float
+        How long each pose is averaged.
+    mass_kg : float
+        Expected, of all that hangs on the sensor.
+    """
+    if len(wrench) < 40:
+        return [Check("noise.level", "failed", f"only {len(wrench)} samples", "see the rate of the sensor above")]
+    sigma = wrench.std(axis=0, ddof=1)
+    force, torque = ", ".join(f"{s:.4f}" for s in sigma[:3]), ", ".join(f"{s:.5f}" for s in sigma[3:])
+    found = f"σ ({force}) N, ({torque}) N·m"
+    if not np.ptp(wrench, axis=0).any():
+        return [Check("noise.level", "failed", "every sample is the same", "switch the sensor off and on")]
+    level = Check("noise.level", "ok", found)
+    if not is_stationary(wrench):
+        level = Check("noise.level", "warning", f"{found}, but not steady", "keep hands and cables off, let it warm up")
+    variance = np.diag(mean_and_covariance(wrench).covariance) * duration_s / average_s
+    guess = Guess(mass_kg, float(np.sqrt(variance[:3].mean())), float(np.sqrt(variance[3:].mean())))
+    expected = predicted_sigma(special(range(1, 25)), guess)
+    com_mm, turn_deg = (
+        factor * float(np.max(np.abs(expected.sigma[key])))
+        for key, factor in (("p_sensor_com_m", 1e3), ("R_flange_sensor", 180 / np.pi))
+    )
+    mass_g = 1e3 * float(np.max(expected.sigma["mass_kg"]))
+    accuracy = (
+        f"from noise alone, for {mass_kg:g} kg and 24 poses of {average_s:g} s: mass ±{mass_g:.2g} g, "
+        f"centre of mass ±{com_mm:.2g} mm, rotation ±{turn_deg:.2g}°"
+    )
+    return [level, Check("noise.accuracy", "ok", accuracy)]
+
+
+# ------------------------------------------------------------------------------------------------------------- the arm
+
+
+def check_status(status: ArmStatus) -> list[Check]:
+    """Judge what the controller says of itself: may the arm move, does a program run, how fast, with what payload."""
+    return [_check_safety(status), _check_program(status), _check_speed(status), _check_payload(status)]
+
+
+def _check_safety(status: ArmStatus) -> Check:
+    if status.fault is not None:
+        state, _, cure = status.fault.partition(": ")
+        return Check("robot.safety", "failed", state, cure)
+    if status.safety_mode != "normal":
+        fix = "see the pendant for what puts it there; a calibration needs the normal mode"
+        return Check("robot.safety", "warning", f"safety mode {status.safety_mode}", fix)
+    return Check("robot.safety", "ok", "powered, brakes released, no stop")
+
+
+def _check_program(status: ArmStatus) -> Check:
+    if status.program == "stopped":
+        return Check("robot.program", "ok", "no program runs; other clients that only read cannot be seen")
+    what = f"a program is on the controller ({status.program})"
+    return Check("robot.program", "warning", what, "stop it at the pendant: calibrate would end it")
+
+
+def _check_speed(status: ArmStatus) -> Check:
+    found = f"speed slider at {status.speed_slider:.0%}, the controller allows {status.speed_scaling:.0%}"
+    return Check("robot.speed", "ok", found)
+
+
+def _check_payload(status: ArmStatus) -> Check:
+    name = "robot.payload"
+    if status.payload_kg is None or status.p_flange_payload_m is None:
+        return Check(name, "skipped", "not applicable: this PolyScope does not tell its payload")
+    if not status.payload_kg:
+        fix = "set mass and centre of mass of all that hangs on the flange at the pendant; else the arm may stop itself"
+        return Check(name, "warning", "the controller was told of no payload", fix)
+    where = ", ".join(f"{1e3 * value:.0f}" for value in status.p_flange_payload_m)
+    return Check(name, "ok", f"payload {status.payload_kg:.2f} kg at ({where}) mm from the flange")
+
+
+def check_remote(remote: bool | None) -> Check:
+    """Judge whether the controller takes programs from the network; None where it does not tell."""
+    name = "robot.remote"
+    if remote is None:
+        return Check(name, "skipped", "not applicable: this controller has no remote control to switch")
+    if remote:
+        return Check(name, "ok", "remote control on")
+    return Check(name, "failed", "local control", "press Local, Remote Control at the top right of the pendant")
+
+
+def check_clock(t_host_ns: Sequence[int], t_device_s: Sequence[float]) -> Check:
+    """Compare the pace of the controller's clock with ours; their readings are never subtracted from each other."""
+    host_s = (np.asarray(t_host_ns) - t_host_ns[0]) / 1e9
+    pace = float(np.polyfit(host_s, np.asarray(t_device_s) - t_device_s[0], 1)[0])
+    found = f"the controller's clock runs at {pace:.4f} of ours, over {host_s[-1]:.1f} s"
+    if abs(pace - 1) < 0.02:
+        return Check("clock.pace", "ok", found)
+    return Check("clock.pace", "warning", found, "close other programs on this computer; look at the network's load")
+
+
+def check_calibration(result: CalibrationResult, serials: Mapping[str, str]) -> Check:
+    """See whether a calibration belongs to the devices that are connected."""
+    made_with = result.provenance.get("devices") or {}
+    for role, found in serials.items():
+        told = made_with.get(role, {}).get("serial") if isinstance(made_with, Mapping) else None
+        if told is not None and told != found:
+            return Check(
+                "calibration.devices",
+                "failed",
+                f"it belongs to {role} {told}, connected is {role} {found}",
+                "ftdrive calibrate",
+            )
+    made = result.provenance.get("created_utc", "an unknown time")
+    return Check("calibration.devices", "ok", f"verdict {result.verdict}, made at {made}, with these devices")
+
+
+def check_push(
+    change: Array, R_base_flange: Array | None, R_flange_sensor: Array | None, sign: int
+) -> tuple[Check, dict[str, Any]]:
+    """Judge a push along +X of the base.
+
+    Parameters
+    ----------
+    change : array, shape (3,)
+        Force during the push minus force before, N, sensor axes.
+    R_base_flange, R_flange_sensor : array, shape (3, 3), or None
+        Where unknown.
+    sign : int
+        As configured now.
+
+    Returns
+    -------
+    Check
+        A reading is exerted on the sensor, so it must move along +X of the base.
+    dict
+        For sensor, flange and base: force_N and the axis that moved most, such as "-Y"; None where unknown.
+    """
+    flange = None if R_flange_sensor is None else R_flange_sensor @ change
+    base = None if flange is None or R_base_flange is None else R_base_flange @ flange
+    moved = {
+        frame: None if force is None else {"force_N": force.tolist(), "axis": _axis(force)}
+        for frame, force in (("sensor", change), ("flange", flange), ("base", base))
+    }
+    words = ", ".join(f"{frame} {'unknown' if told is None else told['axis']}" for frame, told in moved.items())
+    size_N = float(np.linalg.norm(change))
+    found = f"{size_N:.1f} N: {words}"
+    if size_N < _PUSH_N:
+        return Check("push.sign", "failed", found, f"push again, harder than {_PUSH_N:g} N, and hold"), moved
+    if base is None:
+        return Check("push.sign", "skipped", found, "give --calibration FILE: the mounting must be known"), moved
+    if abs(base[0]) < 0.8 * size_N:
+        fix = "push along +X of the base; if you did, the mounting is another one: ftdrive calibrate"
+        return Check("push.sign", "failed", found, fix), moved
+    if base[0] < 0:
+        fix = f"set sign = {-sign} under [sensor] in the configuration, then calibrate again"
+        return Check("push.sign", "failed", f"{found}: it reports the reaction", fix), moved
+    return Check("push.sign", "ok", found), moved
+
+
+def _axis(force: Array) -> str:
+    i = int(np.argmax(np.abs(force)))
+    return ("-" if force[i] < 0 else "+") + "XYZ"[i]

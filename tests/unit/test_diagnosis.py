@@ -1,0 +1,174 @@
+"""What doctor finds in states of a sensor and an arm that can be made up, and what it says mends them."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationResult
+from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
+from ftdrive import diagnosis
+from ftdrive.checks import Check, SensorAddress
+
+FACTS = {
+    "serial": Fact("FT1", "device"),
+    "counts_per_N": Fact(1e6, "device"),
+    "counts_per_Nm": Fact(1e6, "device"),
+    "range": Fact((130.0, 130.0, 400.0, 10.0, 10.0, 10.5), "configured"),
+    "sign": Fact(-1, "configured"),
+}
+
+
+def test_what_is_known_of_a_sensor_is_said_with_its_source() -> None:
+    found = {check.name: check for check in diagnosis.check_identity(DeviceInfo("Gamma", "FT1", "3.8", FACTS))}
+    assert {check.state for check in found.values()} == {"ok"}
+    assert found["sensor.counts"].found == "1000000 counts per N and 1000000 per N·m, told by the device"
+    assert found["sensor.range"].found == "±(130, 130, 400) N, ±(10, 10, 10.5) N·m, configured"
+    assert found["sensor.sign"].found.startswith("sign -1, configured")
+
+
+def test_what_is_assumed_or_unknown_of_a_sensor_is_a_warning() -> None:
+    facts = {name: Fact(1e6, "assumed") for name in ("counts_per_N", "counts_per_Nm")}
+    info = DeviceInfo("Mini45", NOT_REPORTED, "3.6", facts)
+    found = {check.name: check for check in diagnosis.check_identity(info)}
+    warned = {name for name, check in found.items() if check.state == "warning"}
+    assert warned == {"sensor.identity", "sensor.counts", "sensor.range"}
+    assert "serial=" in str(found["sensor.identity"].fix)
+    assert "range=300,30" in str(found["sensor.range"].fix)
+    assert {check.state for check in diagnosis.check_identity(DeviceInfo("plain", "1", "2"))} == {"ok", "warning"}
+
+
+STATUS = ArmStatus(
+    t_host_ns=0,
+    t_device_s=1.0,
+    robot_mode="running",
+    safety_mode="normal",
+    program="stopped",
+    fault=None,
+    speed_slider=0.5,
+    speed_scaling=1.0,
+    payload_kg=1.2,
+    p_flange_payload_m=(0.0, 0.01, 0.05),
+    tcp_offset=(0.0,) * 6,
+)
+
+
+def test_a_ready_arm() -> None:
+    found = {check.name: check for check in diagnosis.check_status(STATUS)}
+    assert {check.state for check in found.values()} == {"ok"}
+    assert "50%" in found["robot.speed"].found
+    assert found["robot.payload"].found == "payload 1.20 kg at (0, 10, 50) mm from the flange"
+
+
+@pytest.mark.parametrize(
+    ("different", "name", "state", "words"),
+    [
+        ({"fault": "protective stop: clear it"}, "robot.safety", "failed", "clear it"),
+        ({"safety_mode": "reduced"}, "robot.safety", "warning", "normal mode"),
+        ({"program": "playing"}, "robot.program", "warning", "would end it"),
+        ({"payload_kg": 0.0}, "robot.payload", "warning", "at the pendant"),
+        ({"payload_kg": None}, "robot.payload", "skipped", ""),
+    ],
+)
+def test_an_arm_that_is_not(different: dict[str, Any], name: str, state: str, words: str) -> None:
+    found = {check.name: check for check in diagnosis.check_status(replace(STATUS, **different))}
+    assert {other for other, check in found.items() if check.state != "ok"} == {name}
+    assert found[name].state == state
+    assert words in (found[name].fix or "")
+
+
+@pytest.mark.parametrize(("remote", "state"), [(True, "ok"), (False, "failed"), (None, "skipped")])
+def test_remote_control(remote: bool | None, state: str) -> None:
+    assert diagnosis.check_remote(remote).state == state
+
+
+def stream(rate_Hz: float, *, nominal_Hz: float = 100.0, lost: int = 0, status: int = 0) -> dict[str, Check]:
+    n = round(2 * rate_Hz)
+    samples = FtSamples(
+        t_host_ns=np.arange(n, dtype=np.int64),
+        t_device_s=np.full(n, np.nan),
+        seq=np.arange(n, dtype=np.int64),
+        counts=np.zeros((n, 6), np.int32),
+        wrench=np.zeros((n, 6)),
+        status=np.full(n, status, np.uint32),
+    )
+    health = Health(received=n, lost=lost, malformed=0, rate_Hz=rate_Hz, age_s=0.001, nominal_rate_Hz=nominal_Hz)
+    address = SensorAddress.of("robotiq-ft300:///dev/ttyUSB7")
+    return {check.name: check for check in diagnosis.check_stream(samples, health, address, 2.0)}
+
+
+def test_a_healthy_stream_and_three_that_are_not() -> None:
+    assert {check.state for check in stream(100).values()} == {"ok"}
+    slow = stream(62.5)["sensor.rate"]
+    assert slow.state == "warning"
+    assert "ttyUSB7/latency_timer" in str(slow.fix)
+    assert stream(40)["sensor.rate"].state == "failed"
+    assert stream(100, lost=1)["sensor.lost"].state == "warning"
+    assert stream(100, lost=20)["sensor.lost"].state == "failed"
+    assert stream(100, status=0x4000)["sensor.status"].found == "status 0x4000"
+    assert stream(7, nominal_Hz=np.nan)["sensor.rate"].state == "ok"
+
+
+def test_noise_at_rest_under_a_hand_and_none_at_all() -> None:
+    noise = np.random.default_rng(0).normal(size=(2000, 6)) * ([0.03] * 3 + [0.001] * 3)
+    level, accuracy = diagnosis.check_noise(noise, 2.0, 2.0, 1.2)
+    assert (level.state, accuracy.state) == ("ok", "ok")
+    assert "σ (0.03" in level.found
+    assert "1.2 kg" in accuracy.found
+    hand = noise.copy()
+    hand[1000:, 2] += 0.5
+    assert diagnosis.check_noise(hand, 2.0, 2.0, 1.2)[0].state == "warning"
+    (dead,) = diagnosis.check_noise(np.ones((2000, 6)), 2.0, 2.0, 1.2)
+    assert dead.state == "failed"
+    (few,) = diagnosis.check_noise(noise[:10], 2.0, 2.0, 1.2)
+    assert few.state == "failed"
+
+
+@pytest.mark.parametrize(("pace", "state"), [(1.0, "ok"), (1.001, "ok"), (1.1, "warning"), (0.5, "warning")])
+def test_pace_of_the_controllers_clock(pace: float, state: str) -> None:
+    t_host_s = np.arange(0, 1, 0.02) + np.random.default_rng(0).uniform(0, 0.002, 50)
+    t_host_ns = (t_host_s * 1e9).astype(np.int64) + 12345
+    assert diagnosis.check_clock(t_host_ns.tolist(), (7e5 + pace * t_host_s).tolist()).state == state
+
+
+rotations = st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(rng=seed).as_matrix())
+
+
+@given(rotations, rotations, st.floats(3, 100))
+def test_push_names_axis_and_sign(R_base_flange: Any, R_flange_sensor: Any, size_N: float) -> None:
+    R_sensor_base = (R_base_flange @ R_flange_sensor).T
+    check, moved = diagnosis.check_push(R_sensor_base @ [size_N, 0, 0], R_base_flange, R_flange_sensor, 1)
+    assert check.state == "ok"
+    assert moved["base"]["axis"] == "+X"
+    np.testing.assert_allclose(moved["flange"]["force_N"], R_base_flange.T @ [size_N, 0, 0], atol=1e-9)
+
+    check, moved = diagnosis.check_push(R_sensor_base @ [-size_N, 0, 0], R_base_flange, R_flange_sensor, -1)
+    assert (check.state, moved["base"]["axis"]) == ("failed", "-X")
+    assert "sign = 1 " in str(check.fix)
+
+    check, moved = diagnosis.check_push(R_sensor_base @ [0, -size_N, 0], R_base_flange, R_flange_sensor, 1)
+    assert (check.state, moved["base"]["axis"]) == ("failed", "-Y")
+    assert "sign" not in str(check.fix)
+
+
+def test_push_without_mounting_or_without_a_push() -> None:
+    check, moved = diagnosis.check_push(np.array([0.5, -9.0, 1.0]), np.eye(3), None, 1)
+    assert check.state == "skipped"
+    assert moved["sensor"]["axis"] == "-Y"
+    assert moved["flange"] is moved["base"] is None
+    check, _ = diagnosis.check_push(np.array([0.5, 0.0, 0.0]), np.eye(3), np.eye(3), 1)
+    assert check.state == "failed"
+
+
+def test_calibration_of_another_sensor() -> None:
+    provenance = {"devices": {"arm": {"serial": "A"}, "sensor": {"serial": "S"}}, "created_utc": "2026-01-01"}
+    result = cast(CalibrationResult, SimpleNamespace(provenance=provenance, verdict="good"))
+    assert diagnosis.check_calibration(result, {"arm": "A", "sensor": "S"}).state == "ok"
+    other = diagnosis.check_calibration(result, {"arm": "A", "sensor": "T"})
+    assert other.state == "failed"
+    assert "sensor S" in other.found
