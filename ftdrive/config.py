@@ -5,6 +5,7 @@ FTDRIVE_ROBOT_HOST is the key `host` of `[robot]`; the project's file, `ftdrive.
 `--config`; the user's file, `$XDG_CONFIG_HOME/ftdrive/ftdrive.toml`; the default. What must be measured has none.
 """
 
+import json
 import os
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
@@ -174,6 +175,13 @@ def cell_of(values: Mapping[str, Setting], *, devices: bool = True) -> CellConfi
 def variable(key: str) -> str:
     """Name of the environment variable of a key."""
     return PREFIX + key.replace(".", "_").upper()
+
+
+def as_toml(value: Any) -> str:
+    """Write a value as it stands in a file."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return json.dumps(value)
 
 
 def user_file() -> Path:
