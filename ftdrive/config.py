@@ -342,7 +342,7 @@ def _wrong_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
     for row in rows:
         if len(row) not in {3, 5} or not (0 <= row[0] < row[1] <= 2000 and 0 < row[2] <= 1000):
             return (
-                f"{list(row)} is no cylinder: give [from, to, diameter] or [from, to, diameter, x, y] in mm from the "
+                f"{list(row)} is no cylinder of the tool: give [from, to, diameter] or [from, to, diameter, x, y] in mm from the "
                 "flange face, from 0 up, to at most 2000, diameter at most 1000"
             )
     return None
@@ -350,8 +350,10 @@ def _wrong_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
 
 def _wrong_planes(rows: Sequence[Sequence[float]]) -> str | None:
     for row in rows:
-        if len(row) != 4 or not any(row[:3]):
+        if len(row) != 4:
             return f"{list(row)} is no plane: give [nx, ny, nz, mm], such as [-1, 0, 0, -800]"
+        if not any(row[:3]):
+            return f"the normal of {list(row)} has no direction: give for example [-1, 0, 0, -800]"
     return None
 
 

@@ -1,7 +1,7 @@
 """What several commands share: options, the progress bar, JSON on stdout."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,34 @@ RUNS = click.option(
     show_default=True,
     help="Folder in which the run's own folder is made.",
 )
+
+
+CONFIG = click.option(
+    "--config",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="The cell, in TOML, in place of ftdrive.toml here.",
+)
+
+
+def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> list[float]:
+    """Read the numbers in the value of an option; raises `ConfigError` unless there are as many as asked for."""
+    from math import isfinite
+
+    from ftdrive.errors import ConfigError
+
+    try:
+        values = [float(part) for part in text.split(separator)]
+    except ValueError:
+        values = []
+    if len(values) not in counts or not all(map(isfinite, values)):
+        wanted = " or ".join(map(str, counts))
+        raise ConfigError(f"{option} is '{text}': give {wanted} numbers separated by '{separator}'")
+    return values
+
+
+def rows(option: str, texts: Sequence[str], counts: Sequence[int]) -> list[list[float]] | None:
+    """Read an option that may be repeated, numbers separated by colons; None where it was not given."""
+    return [numbers(option, text, ":", counts) for text in texts] or None
 
 
 def write_json(value: Mapping[str, Any]) -> None:
