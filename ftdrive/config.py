@@ -342,8 +342,8 @@ def _wrong_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
     for row in rows:
         if len(row) not in {3, 5} or not (0 <= row[0] < row[1] <= 2000 and 0 < row[2] <= 1000):
             return (
-                f"{list(row)} is no cylinder of the tool: give [from, to, diameter] or [from, to, diameter, x, y] in mm from the "
-                "flange face, from 0 up, to at most 2000, diameter at most 1000"
+                f"{list(row)} is no cylinder of the tool: give [from, to, diameter] or [from, to, diameter, x, y], mm "
+                "from the flange face, from 0 up, to at most 2000, diameter at most 1000"
             )
     return None
 

@@ -174,21 +174,16 @@ def _look(made: "Plan", certifier: "Certifier") -> None:
     import os
     import threading
     import webbrowser
+    from contextlib import suppress
 
-    from ftdrive.planning.view import HOST, serve
+    from ftdrive.planning.view import shown
     from ftdrive.report import talk
 
-    server = serve(made, certifier)
-    try:
-        url = f"http://{HOST}:{server.get_port()}"
-        talk.print(f"The plan is shown at {url} ; Ctrl-C ends.")
+    with shown(made, certifier) as url, suppress(KeyboardInterrupt):
+        talk.print(f"The plan is shown at {url} until Ctrl-C.")
         if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
             webbrowser.open(url)
         threading.Event().wait()
-    except KeyboardInterrupt:
-        talk.print()
-    finally:
-        server.stop()
 
 
 def _tip_speed(text: str | None) -> float | None:

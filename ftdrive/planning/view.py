@@ -1,5 +1,8 @@
 """A plan in three dimensions, in the browser, with a slider along the tour."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -19,25 +22,31 @@ _AROUND, _ARC = 24, 6
 """Facets around a body, and over a quarter of its rounding."""
 
 
-def serve(plan: Plan, certifier: Certifier) -> Any:
-    """Start a viser server that shows the plan; it runs in threads until its `stop` is called.
+@contextmanager
+def shown(plan: Plan, certifier: Certifier) -> Iterator[str]:
+    """Serve the scene to browsers on this computer while the block runs; gives its address. Needs the extra `viz`.
 
     Parameters
     ----------
     plan : Plan
     certifier : Certifier
         For the same arm, tool and scene.
-
-    Returns
-    -------
-    viser.ViserServer
-        Of the extra `viz`. Its `get_port` tells where: another one when 8080 is taken.
     """
     try:
         from viser import ViserServer
     except ImportError:
         raise ConfigError("a view needs viser: install ftdrive with its extra viz, `ftdrive[viz]`") from None
-    server = ViserServer(host=HOST, label=f"ftdrive plan, {certifier.arm.name}", verbose=False)
+    with redirect_stdout(StringIO()):  # it prints a banner; our stdout is data
+        server = ViserServer(host=HOST, label=f"ftdrive plan, {certifier.arm.name}", verbose=False)
+    try:
+        _fill(server, plan, certifier)
+        yield f"http://{HOST}:{server.get_port()}"  # another port than usual when that is taken
+    finally:
+        with redirect_stdout(StringIO()):
+            server.stop()
+
+
+def _fill(server: Any, plan: Plan, certifier: Certifier) -> None:
     arm, (q, move) = certifier.arm, path(plan)
     _draw_surroundings(server.scene, plan, certifier, q)
     bodies = arm.bodies(q)
@@ -63,7 +72,6 @@ def serve(plan: Plan, certifier: Certifier) -> Any:
 
     slider.on_update(show)
     show()
-    return server
 
 
 def path(plan: Plan) -> tuple[Array, Any]:
