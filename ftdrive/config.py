@@ -150,7 +150,7 @@ def settings(config: Path | None = None, flags: Mapping[str, Flag] | None = None
     found |= _from_environment()
     for key, (option, value) in (flags or {}).items():
         if value is not None:
-            found[key] = Setting(_checked(option, key, value), option)
+            found[key] = Setting(checked(option, key, value), option)
     return {key: found.get(key) or _default(key) for key in _KEYS}
 
 
@@ -220,7 +220,7 @@ def _from_file(path: Path) -> dict[str, Setting]:
         for key, value in content.items():
             if f"{section}.{key}" not in _KEYS:
                 raise ConfigError(f"{path}: [{section}] has no key '{key}': {_known(section)}")
-            values[f"{section}.{key}"] = Setting(_checked(str(path), f"{section}.{key}", value), str(path))
+            values[f"{section}.{key}"] = Setting(checked(str(path), f"{section}.{key}", value), str(path))
     return values
 
 
@@ -229,7 +229,7 @@ def _from_environment() -> dict[str, Setting]:
     names = {variable(key): key for key in _KEYS}
     for name, text in os.environ.items():
         if name in names:
-            values[names[name]] = Setting(_checked(name, names[name], _parsed(name, names[name], text)), name)
+            values[names[name]] = Setting(checked(name, names[name], _parsed(name, names[name], text)), name)
             continue
         for section in _SECTIONS:
             if name.startswith(variable(section) + "_"):
@@ -298,8 +298,8 @@ _RANGES: Mapping[str, tuple[float, float]] = {
 }
 
 
-def _checked(place: str, key: str, value: Any) -> Any:
-    """Return the value as its section takes it, or raise `ConfigError`."""
+def checked(place: str, key: str, value: Any) -> Any:
+    """Return the value of a key such as "robot.host" as its section takes it, or raise `ConfigError`."""
     said = f"{place}: [{key.replace('.', '] ')} = {value!r}"
     kind = _KEYS[key].type
     words, fits = _TYPES[kind]

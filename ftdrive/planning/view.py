@@ -49,6 +49,9 @@ def shown(plan: Plan, certifier: Certifier) -> Iterator[str]:
 def _fill(server: Any, plan: Plan, certifier: Certifier) -> None:
     arm, (q, move) = certifier.arm, path(plan)
     _draw_surroundings(server.scene, plan, certifier, q)
+    look_at = 0.7 * arm.frames(q[:1]).wrist_m[0]
+    server.initial_camera.look_at = look_at
+    server.initial_camera.position = look_at + 0.75 * _size_m(certifier) * np.array([1.0, 1.0, 0.6])
     bodies = arm.bodies(q)
     n_arm = len(arm.names) - len(arm.tool)
     meshes = [
@@ -126,7 +129,7 @@ def turned_up(axis: Array) -> Array:
 
 def _draw_surroundings(scene: Any, plan: Plan, certifier: Certifier, q_rad: Array) -> None:
     arm = certifier.arm
-    size_m = 2 * (arm.ball_m - arm.geometry.a2_m - arm.geometry.a3_m)
+    size_m = _size_m(certifier)
     scene.add_frame("/base", axes_length=0.2, axes_radius=0.004)
     for i, plane in enumerate(certifier.scene.planes, start=1):
         scene.add_box(
@@ -145,6 +148,11 @@ def _draw_surroundings(scene: Any, plan: Plan, certifier: Certifier, q_rad: Arra
     farthest = int(np.argmax([part.to_m for part in arm.tool]))
     tip = tips(arm, q_rad)[:, farthest]
     scene.add_line_segments("/path of the tool tip", np.stack([tip[:-1], tip[1:]], axis=1), _TIP, thickness=0.004)
+
+
+def _size_m(certifier: Certifier) -> float:
+    arm = certifier.arm
+    return 2 * (arm.ball_m - arm.geometry.a2_m - arm.geometry.a3_m)
 
 
 def _foot(plane: Plane) -> Array:
