@@ -44,7 +44,7 @@ def cell_file(cell: CellConfig, found: Sequence[str]) -> str:
         "",
         "[workcell]",
         _line("mounting", workcell.mounting, "floor, wall, ceiling, or degrees the base leans about its y"),
-        "# PLACEHOLDERS until you have measured: mm from the centre of the base, in its axes; what it stands on is known.",
+        "# PLACEHOLDERS until measured: mm from the centre of the base, in its axes; what it stands on is known.",
         "# Planes, [nx, ny, nz, mm]: the arm stays where normal times point is mm or more; [-1, 0, 0, -800] is a wall",
         "# 800 mm away towards +x. Boxes, [x, y, z, x, y, z]: two opposite corners of a block.",
         *_rows("planes_mm", workcell.planes_mm),

@@ -47,12 +47,12 @@ def sensor_at(port: str) -> str:
 
 
 def places() -> list[str]:
-    """List where a sensor may be: CAN interfaces with the sensors known there, and serial ports by id."""
+    """List where a sensor may be: CAN interfaces with the sensors known there, and serial ports on USB by id."""
     found = []
     for name in can_interfaces():
         bitrate = can_details(name).get("bitrate")
         found += [f"ati-can://{name}" + (f"?bitrate={bitrate}" if bitrate else ""), f"robotous-can://{name}"]
     by_id = DEV / "serial" / "by-id"
     links = {os.path.realpath(link): str(link) for link in by_id.iterdir()} if by_id.is_dir() else {}
-    ports = sorted(port.device for port in list_ports.comports())
+    ports = sorted(port.device for port in list_ports.comports() if port.vid is not None)
     return found + [links.get(os.path.realpath(port), port) for port in ports]

@@ -236,7 +236,11 @@ def _sensor(ask: Questions, given: str | None, usual: str | None) -> tuple[str, 
     found = [] if given or not ask.somebody_answers else places()
     for number, place in enumerate(found, start=1):
         _say(f"  {number}) {place}")
-    words = "Sensor, a number or its address" if found else "Sensor address, such as ati-can://can0?bitrate=250000"
+    words = (
+        "Sensor, a number (a port is asked what is there) or its address"
+        if found
+        else "Sensor address, such as ati-can://can0?bitrate=250000"
+    )
     text = ask.text(words, "sensor.url", "--sensor", given, usual or ("1" if found else None))
     failed: str | None = None
     while True:

@@ -1,5 +1,6 @@
 """A plan as a table of joint targets."""
 
+from ftdrive.exports.common import plain, require_usable
 from ftdrive.planning.plan import Plan
 
 FORMAT = "ftdrive.targets/1"
@@ -11,7 +12,8 @@ def table(plan: Plan) -> str:
 
     The first line is a comment with the format, the plan's hash and the model.
     """
-    lines = [f"# {FORMAT} plan {plan.to_dict()['sha256']} {plan.description['model']}", COLUMNS]
+    require_usable(plan)
+    lines = [f"# {FORMAT} plan {plan.to_dict()['sha256']} {plain(plan.description['model'])}", COLUMNS]
     for i, step in enumerate(plan.steps, start=1):
         numbers = (*step.q_rad, step.speed_rad_s, plan.acceleration_rad_s2, step.clearance_m)
         lines.append(",".join([str(i), str(step.number), *(f"{number:.9g}" for number in numbers)]))

@@ -5,17 +5,15 @@ Checked on hardware: no.
 """
 
 from collections.abc import Iterator
-from math import degrees, isfinite, pi, radians
+from math import degrees, radians
 from typing import Any
 
-from ftdrive.errors import PlanRefused
+from ftdrive.exports.common import plain, require_usable
 from ftdrive.planning.plan import Plan
 
 NEAR_RAD = radians(30)
 """The way to the first pose is not part of a plan: no joint may be farther from it than this at the start."""
 APPROACH_RAD_S, APPROACH_RAD_S2 = radians(10), radians(20)
-_FASTEST_RAD_S, _FASTEST_RAD_S2 = pi, radians(300)
-_SPELLED = {"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u"}
 
 
 def program(plan: Plan, *, dwell_s: float) -> str:
@@ -31,7 +29,7 @@ def program(plan: Plan, *, dwell_s: float) -> str:
     PlanRefused
         A move is not proven clear, or a number in the plan is not one that an arm can follow.
     """
-    _require(plan)
+    require_usable(plan)
     return "".join(
         f"{line}\n"
         for line in ("def ftdrive_tour():", *(f"  {line}" if line else "" for line in _body(plan, dwell_s)), "end")
@@ -103,19 +101,6 @@ def _warnings(plan: Plan, model: str) -> Iterator[str]:
     yield "Nothing guards the motion but the arm's own safety system: while it runs, ftdrive can only listen."
 
 
-def _require(plan: Plan) -> None:
-    if not plan.certified:
-        raise PlanRefused("a move of the plan is not proven clear: it is not exported")
-    numbers = [*(q / (2 * pi) for step in plan.steps for q in step.q_rad)]
-    speeds = [
-        *(step.speed_rad_s / _FASTEST_RAD_S for step in plan.steps),
-        plan.acceleration_rad_s2 / _FASTEST_RAD_S2,
-    ]
-    usable = all(isfinite(x) and abs(x) <= 1 + 1e-9 for x in (*numbers, *speeds)) and all(x > 0 for x in speeds)
-    if not usable or any(len(step.q_rad) != 6 for step in plan.steps):
-        raise PlanRefused("the plan holds a joint angle, speed or acceleration that no arm can follow: make a new plan")
-
-
 def _joints(q_rad: tuple[float, ...]) -> str:
     return f"[{', '.join(f'{round(q, 6) + 0.0:.6f}' for q in q_rad)}]"
 
@@ -124,10 +109,3 @@ def _cylinder(part: dict[str, Any]) -> str:
     mm = {name: f"{1e3 * float(value):.1f}" for name, value in part.items()}
     aside = f", axis at x {mm['x_m']}, y {mm['y_m']}" if float(part["x_m"]) or float(part["y_m"]) else ""
     return f"from {mm['from_m']} to {mm['to_m']}, diameter {mm['diameter_m']}{aside}"
-
-
-def plain(text: str) -> str:
-    """Reduce a text to what cannot end a string, a comment or a line of URScript, which knows no escapes."""
-    for sign, words in _SPELLED.items():
-        text = text.replace(sign, words)
-    return "".join(c if " " <= c <= "~" and c not in "\"'\\" else "?" for c in text)
