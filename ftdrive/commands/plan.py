@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 import click
 
 from ftdrive.commands.common import CONFIG, JSON, numbers, rows, write_json
-from ftdrive.errors import ConfigError, PlanRefused
 
 if TYPE_CHECKING:
     from ftdrive.planning.certify import Certifier
@@ -75,6 +74,7 @@ def plan(
     import numpy as np
 
     from ftdrive.config import cell_of, settings
+    from ftdrive.errors import ConfigError, PlanRefused
     from ftdrive.planning.cell import certifier_for
     from ftdrive.planning.motion import Speeds
     from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
@@ -112,9 +112,10 @@ def plan(
     made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess_of(certifier, mass_kg))
     if not made.certified:
         raise PlanRefused("a move of the plan could not be proven clear")
-    if not tool and not cell.workcell.measured:
-        where = found["tool.cylinders_mm"].origin
-        talk.print(f"The tool and the surroundings in {where} are not measured yet: this plan is for the eye only.")
+    described = {found[key].origin for key in ("tool.cylinders_mm", "workcell.planes_mm", "workcell.boxes_mm")}
+    described -= {"default", "--tool", "--plane", "--box"}
+    if described and not cell.workcell.measured:
+        talk.print(f"Placeholders are in {', '.join(sorted(described))} (measured = false): a plan for the eye only.")
     if output is not None:
         made.save(output)
     if png is not None:
@@ -187,6 +188,8 @@ def _look(made: "Plan", certifier: "Certifier") -> None:
 
 
 def _tip_speed(text: str | None) -> float | None:
+    from ftdrive.errors import ConfigError
+
     if text is None or text == "none":
         return None
     (speed_mm_s,) = numbers("--tip-speed-limit", text, " ", (1,))
