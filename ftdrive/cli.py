@@ -11,6 +11,8 @@ from ftdrive import __version__, _siblings
 # A command, its module, its line in the help. The module is imported only when the command is called: help is fast.
 _COMMANDS = {
     "demo": ("ftdrive.commands.demo", "Calibrate an emulated cell: nothing to connect, half a minute."),
+    "init": ("ftdrive.commands.init", "Describe a cell: asks, looks, writes ftdrive.toml. Moves nothing."),
+    "config": ("ftdrive.commands.config", "Show the configuration, and where it comes from."),
     "plan": ("ftdrive.commands.plan", "Plan a tour that is proven clear; needs no robot."),
     "calibrate": ("ftdrive.commands.calibrate", "Take an arm through the tour, average its sensor, solve."),
     "doctor": ("ftdrive.commands.doctor", "Is everything connected, quiet and permitted? Moves nothing."),
@@ -18,6 +20,7 @@ _COMMANDS = {
     "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
     "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
     "replay": ("ftdrive.commands.replay", "Repeat a recorded run through the same routine and solver."),
+    "export": ("ftdrive.commands.export", "Write a plan as a program for the pendant, or as a table."),
     "transcript": ("ftdrive.commands.transcript", "Record or play the bytes on a sensor's wire."),
 }
 

@@ -1,7 +1,16 @@
-"""One cell, described in a TOML file: which arm, which sensor, how long to look."""
+"""One cell: which arm, sensor, tool and surroundings; where each value comes from, and whether it can be used.
 
+A value is taken from the first of these that tells it: an option of the command; the environment, where
+FTDRIVE_ROBOT_HOST is the key `host` of `[robot]`; the project's file, `ftdrive.toml` where the command is run, or
+`--config`; the user's file, `$XDG_CONFIG_HOME/ftdrive/ftdrive.toml`; the default. What must be measured has none.
+"""
+
+import json
+import os
 import tomllib
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +18,10 @@ from calib.routine import Sampling
 from ftdrive.errors import ConfigError
 
 FORMAT = "ftdrive.config/1"
+FILE = "ftdrive.toml"
+PREFIX = "FTDRIVE_"
+
+Rows = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,12 +29,14 @@ class RobotConfig:
     """The arm."""
 
     host: str
-    """Name or IPv4 address of the controller."""
+    """Name or IPv4 address of the controller; empty where no arm is needed."""
     model: str | None = None
     """Such as "ur5e"; checked against the controller where it can tell."""
-    speed_deg_s: float = 30.0
+    speed_deg_s: float = 60.0
     """Of the fastest joint in a move."""
-    acceleration_deg_s2: float = 40.0
+    acceleration_deg_s2: float = 80.0
+    tip_speed_mm_s: float = 250.0
+    """Of the tool's farthest points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +44,38 @@ class SensorConfig:
     """The force/torque sensor."""
 
     url: str
-    """Such as "ati-can://can0?bitrate=250000" or "ati-serial:///dev/serial/by-id/..."."""
+    """Such as "ati-can://can0?bitrate=250000"; empty where no sensor is needed."""
     sign: int = 1
     """-1 for a sensor that reports the reaction."""
+    height_mm: float | None = None
+    """Of the sensor's origin above the flange face; gravity cannot tell it."""
+    mass_kg: float | None = None
+    """Of sensor and adapter, which the sensor cannot weigh."""
+
+
+@dataclass(frozen=True, slots=True)
+class ToolConfig:
+    """Everything mounted on the flange, the sensor included."""
+
+    name: str = "tool"
+    cylinders_mm: Rows = ()
+    """(from, to, diameter[, x, y]) along the flange z axis from the flange face; x, y put the axis aside."""
+    mass_kg: float | None = None
+    """Of what hangs on the sensor, about; for predictions only."""
+
+
+@dataclass(frozen=True, slots=True)
+class WorkcellConfig:
+    """What stands around the arm, base axes."""
+
+    mounting: str = "floor"
+    """floor, wall, ceiling, or degrees the base leans about its y axis."""
+    planes_mm: Rows = ()
+    """(nx, ny, nz, place): the arm stays where normal times point is place or more."""
+    boxes_mm: Rows = ()
+    """(x, y, z, x, y, z): two opposite corners."""
+    measured: bool = False
+    """Whether a person has measured the tool, planes and boxes; nothing moves before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,44 +92,286 @@ class CellConfig:
 
     robot: RobotConfig
     sensor: SensorConfig
+    tool: ToolConfig = field(default_factory=ToolConfig)
+    workcell: WorkcellConfig = field(default_factory=WorkcellConfig)
     sampling: Sampling = field(default_factory=Sampling)
     site: SiteConfig = field(default_factory=SiteConfig)
 
 
-def load(path: Path) -> CellConfig:
-    """Read a configuration file; raises `ConfigError` with the key and what is wrong with it."""
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One value of the configuration."""
+
+    value: Any
+    """None where nothing was said and there is no default."""
+    origin: str
+    """The option, variable or file that says it; "default" or "not set"."""
+
+
+Flag = tuple[str, Any]
+"""An option of a command as it is called there, and its value; None where it was not given."""
+
+_SECTIONS: Mapping[str, Any] = {
+    "robot": RobotConfig,
+    "sensor": SensorConfig,
+    "tool": ToolConfig,
+    "workcell": WorkcellConfig,
+    "sampling": Sampling,
+    "site": SiteConfig,
+}
+_KEYS = {f"{name}.{item.name}": item for name, kind in _SECTIONS.items() for item in fields(kind)}
+
+
+def load(config: Path | None = None, flags: Mapping[str, Flag] | None = None, *, devices: bool = True) -> CellConfig:
+    """Put a cell together from all that is said about it.
+
+    Parameters
+    ----------
+    config : Path, optional
+        Read in place of the project's file.
+    flags : mapping
+        Options of the command by key, such as ``{"robot.host": ("--robot", "10.0.0.2")}``.
+    devices : bool
+        Whether arm and sensor must be named; where not, their addresses may be empty.
+
+    Raises
+    ------
+    ConfigError
+        With the place, the section, the key, the value and what to do.
+    """
+    return cell_of(settings(config, flags), devices=devices)
+
+
+def settings(config: Path | None = None, flags: Mapping[str, Flag] | None = None) -> dict[str, Setting]:
+    """Every key, such as "robot.host", with its value and where it comes from; parameters and errors as `load`."""
+    found: dict[str, Setting] = {}
+    for path in _files(config):
+        found |= _from_file(path)
+    found |= _from_environment()
+    for key, (option, value) in (flags or {}).items():
+        if value is not None:
+            found[key] = Setting(checked(option, key, value), option)
+    return {key: found.get(key) or _default(key) for key in _KEYS}
+
+
+def cell_of(values: Mapping[str, Setting], *, devices: bool = True) -> CellConfig:
+    """Turn settings into a cell; raises `ConfigError` when a device is needed and not named."""
+    missing = [key for key in ("robot.host", "sensor.url") if values[key].value is None]
+    if missing and devices:
+        section, key = missing[0].split(".")
+        raise ConfigError(
+            f"[{section}] {key} is not set: write it into {FILE} (`ftdrive init` asks for it), set "
+            f"{variable(missing[0])} or give --{section}; --simulate takes an emulated cell"
+        )
+    said = {key: setting.value for key, setting in values.items()} | dict.fromkeys(missing, "")
+    return CellConfig(
+        **{
+            name: kind(**{item.name: said[f"{name}.{item.name}"] for item in fields(kind)})
+            for name, kind in _SECTIONS.items()
+        }
+    )
+
+
+def variable(key: str) -> str:
+    """Name of the environment variable of a key."""
+    return PREFIX + key.replace(".", "_").upper()
+
+
+def as_toml(value: Any) -> str:
+    """Write a value as it stands in a file."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return json.dumps(value)
+
+
+def user_file() -> Path:
+    """Where a user keeps what holds for all projects; it need not exist."""
+    home = os.environ.get("XDG_CONFIG_HOME", "")
+    folder = Path(home) if Path(home).is_absolute() else Path("~/.config").expanduser()
+    return folder / "ftdrive" / FILE
+
+
+def project_file() -> Path:
+    """Where a project keeps its cell; it need not exist."""
+    return Path(FILE)
+
+
+def _files(config: Path | None) -> list[Path]:
+    """The later one wins."""
+    found = [path for path in (user_file(), project_file()) if path.is_file()]
+    if config is None:
+        return found
+    return [*(path for path in found if path == user_file()), config]
+
+
+def _from_file(path: Path) -> dict[str, Setting]:
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not a TOML file: {error}") from error
     if (found := document.pop("format", None)) != FORMAT:
         raise ConfigError(f'{path}: the first line must be format = "{FORMAT}", found {found!r}')
-    sections: dict[str, Any] = {
-        "robot": RobotConfig,
-        "sensor": SensorConfig,
-        "sampling": Sampling,
-        "site": SiteConfig,
-    }
-    if unknown := sorted(document.keys() - sections.keys()):
-        raise ConfigError(f"{path}: unknown section [{unknown[0]}]: the sections are {', '.join(sections)}")
-    return CellConfig(**{name: _section(path, name, kind, document.get(name, {})) for name, kind in sections.items()})
+    if unknown := sorted(document.keys() - _SECTIONS.keys()):
+        raise ConfigError(f"{path}: unknown section [{unknown[0]}]: the sections are {', '.join(_SECTIONS)}")
+    values: dict[str, Setting] = {}
+    for section, content in document.items():
+        if not isinstance(content, dict):
+            raise ConfigError(f"{path}: [{section}] must be a section, found {content!r}")
+        for key, value in content.items():
+            if f"{section}.{key}" not in _KEYS:
+                raise ConfigError(f"{path}: [{section}] has no key '{key}': {_known(section)}")
+            values[f"{section}.{key}"] = Setting(checked(str(path), f"{section}.{key}", value), str(path))
+    return values
 
 
-def _section(path: Path, name: str, kind: Any, values: Any) -> Any:
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path}: [{name}] must be a section, found {values!r}")
-    known = {item.name: item for item in fields(kind)}
-    for key, value in values.items():
-        if key not in known:
-            raise ConfigError(f"{path}: [{name}] has no key '{key}': the keys are {', '.join(known)}")
-        wanted = known[key].type
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        fits = {float: number, int: number and isinstance(value, int), str: isinstance(value, str)}.get(
-            wanted if isinstance(wanted, type) else str, isinstance(value, str)
-        )
-        if not fits:
-            raise ConfigError(f"{path}: [{name}] {key} = {value!r} is not a {getattr(wanted, '__name__', 'str')}")
+def _from_environment() -> dict[str, Setting]:
+    values: dict[str, Setting] = {}
+    names = {variable(key): key for key in _KEYS}
+    for name, text in os.environ.items():
+        if name in names:
+            values[names[name]] = Setting(checked(name, names[name], _parsed(name, names[name], text)), name)
+            continue
+        for section in _SECTIONS:
+            if name.startswith(variable(section) + "_"):
+                raise ConfigError(f"{name} is set, but [{section}] has no such key: {_known(section)}; unset it")
+    return values
+
+
+def _parsed(name: str, key: str, text: str) -> Any:
+    """Texts stand as they are; everything else is written as in the file."""
+    if not text:
+        raise ConfigError(f"{name} is empty: give [{key.replace('.', '] ')} a value, or unset it")
+    if _KEYS[key].type in {str, str | None}:
+        return text
     try:
-        return kind(**values)
-    except TypeError as error:
-        raise ConfigError(f"{path}: [{name}] is incomplete: {error}") from error
+        document = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        document = {}
+    return document["value"] if document.keys() == {"value"} else text
+
+
+def _default(key: str) -> Setting:
+    item = _KEYS[key]
+    if item.default is MISSING or item.default is None:
+        return Setting(None, "not set")
+    return Setting(item.default, "default")
+
+
+def _known(section: str) -> str:
+    return f"the keys are {', '.join(item.name for item in fields(_SECTIONS[section]))}"
+
+
+# What a value may be. ----------------------------------------------------------------------------------------------
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+
+
+def _rows(value: Any) -> bool:
+    return isinstance(value, list | tuple) and all(
+        isinstance(row, list | tuple) and all(map(_number, row)) for row in value
+    )
+
+
+_TYPES: Mapping[Any, tuple[str, Callable[[Any], bool]]] = {
+    str: ("a text", lambda value: isinstance(value, str)),
+    float: ("a number", _number),
+    int: ("a whole number", lambda value: isinstance(value, int) and not isinstance(value, bool)),
+    bool: ("true or false", lambda value: isinstance(value, bool)),
+    Rows: ("a list of lists of numbers", _rows),
+}
+_TYPES = {**_TYPES, str | None: _TYPES[str], float | None: _TYPES[float]}
+
+_RANGES: Mapping[str, tuple[float, float]] = {
+    "robot.speed_deg_s": (0.5, 180),
+    "robot.acceleration_deg_s2": (1, 300),
+    "robot.tip_speed_mm_s": (1, 1000),
+    "sensor.height_mm": (0, 500),
+    "sensor.mass_kg": (0, 20),
+    "tool.mass_kg": (0.001, 100),
+    "sampling.average_s": (0.05, 600),
+    "sampling.move_timeout_s": (1, 600),
+    "sampling.still_timeout_s": (1, 600),
+    "sampling.attempts": (1, 100),
+    "site.g_m_s2": (9.7, 9.9),
+}
+
+
+def checked(place: str, key: str, value: Any) -> Any:
+    """Return the value of a key such as "robot.host" as its section takes it, or raise `ConfigError`."""
+    said = f"{place}: [{key.replace('.', '] ')} = {value!r}"
+    kind = _KEYS[key].type
+    words, fits = _TYPES[kind]
+    if not fits(value):
+        raise ConfigError(f"{said} is not {words}")
+    if key in _RANGES:
+        low, high = _RANGES[key]
+        if not low <= value <= high:
+            raise ConfigError(f"{said} is out of range: give {low:g} to {high:g}")
+    if cure := _WRONG.get(key, lambda _: None)(value):
+        raise ConfigError(f"{said} cannot be used: {cure}")
+    if kind is float or kind == float | None:
+        return float(value)
+    return tuple(tuple(map(float, row)) for row in value) if kind == Rows else value
+
+
+def _wrong_text(value: str) -> str | None:
+    return None if value.strip() else "it is empty"
+
+
+def _wrong_model(value: str) -> str | None:
+    from drivers.ur.kinematics import MODELS, model_named
+
+    return None if model_named(value, controller_major=0) else f"the models are {', '.join(MODELS)}"
+
+
+def _wrong_sign(value: int) -> str | None:
+    return None if value in {-1, 1} else "give 1, or -1 for a sensor that reports the reaction"
+
+
+def _wrong_mounting(value: str) -> str | None:
+    try:
+        usable = value in {"floor", "wall", "ceiling"} or isfinite(float(value))
+    except ValueError:
+        usable = False
+    return None if usable else "give floor, wall, ceiling, or degrees about base y"
+
+
+def _wrong_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
+    for row in rows:
+        if len(row) not in {3, 5} or not (0 <= row[0] < row[1] <= 2000 and 0 < row[2] <= 1000):
+            return (
+                f"{list(row)} is no cylinder of the tool: give [from, to, diameter] or [from, to, diameter, x, y], mm "
+                "from the flange face, from 0 up, to at most 2000, diameter at most 1000"
+            )
+    return None
+
+
+def _wrong_planes(rows: Sequence[Sequence[float]]) -> str | None:
+    for row in rows:
+        if len(row) != 4:
+            return f"{list(row)} is no plane: give [nx, ny, nz, mm], such as [-1, 0, 0, -800]"
+        if not any(row[:3]):
+            return f"the normal of {list(row)} has no direction: give for example [-1, 0, 0, -800]"
+    return None
+
+
+def _wrong_boxes(rows: Sequence[Sequence[float]]) -> str | None:
+    for row in rows:
+        if len(row) != 6 or any(row[i] == row[i + 3] for i in range(3)):
+            return f"{list(row)} is no box: give two opposite corners [x, y, z, x, y, z] in mm"
+    return None
+
+
+_WRONG: Mapping[str, Callable[[Any], str | None]] = {
+    "robot.host": _wrong_text,
+    "robot.model": _wrong_model,
+    "sensor.url": _wrong_text,
+    "sensor.sign": _wrong_sign,
+    "tool.name": _wrong_text,
+    "tool.cylinders_mm": _wrong_cylinders,
+    "workcell.mounting": _wrong_mounting,
+    "workcell.planes_mm": _wrong_planes,
+    "workcell.boxes_mm": _wrong_boxes,
+}

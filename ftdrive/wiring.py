@@ -1,18 +1,20 @@
 """The only place where configuration becomes drivers."""
 
+from collections.abc import Callable
 from math import radians
+from typing import cast
 
 from calib.ports import Arm, Sensor
-from drivers.interfaces import ForceTorqueSensor
-from drivers.registry import sensor_from_url
-from drivers.ur.arm import UrArm
+from drivers.interfaces import ForceTorqueSensor, RobotArm
+from drivers.registry import arm_class, sensor_from_url
 from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError
 
 
-def build_arm(cell: CellConfig) -> UrArm:
-    """Build the arm's driver, not yet open."""
-    arm = UrArm(
+def build_arm(cell: CellConfig) -> RobotArm:
+    """Build the arm's driver, not yet open; it moves at the speed of the cell unless a move names its own."""
+    build = cast("Callable[..., RobotArm]", arm_class())
+    arm = build(
         cell.robot.host,
         model=cell.robot.model,
         speed_rad_s=radians(cell.robot.speed_deg_s),

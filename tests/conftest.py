@@ -13,6 +13,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # Before numpy is loaded: matrices are small, and the threads of two workers would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# The configuration of whoever runs the tests is none of their business.
+os.environ["XDG_CONFIG_HOME"] = str(Path(__file__).parent / "no-such-folder")
+for _name in [name for name in os.environ if name.startswith("FTDRIVE_") and name != "FTDRIVE_REAL_DATA"]:
+    del os.environ[_name]
+
 settings.register_profile("ftdrive", deadline=None, derandomize=True, max_examples=60)
 settings.load_profile("ftdrive")
 

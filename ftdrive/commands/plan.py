@@ -1,29 +1,27 @@
 """`ftdrive plan`: where an arm would go and how clear it stays, without an arm."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import JSON, write_json
-from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.commands.common import CONFIG, JSON, numbers, rows, write_json
 
 if TYPE_CHECKING:
-    from ftdrive.planning.arm_model import Cylinder
+    from ftdrive.planning.certify import Certifier
     from ftdrive.planning.plan import Plan
-    from ftdrive.planning.scene import Box, Plane
 
 USUAL_POSTURE = "45,-100,60"
+USUAL_MASS_KG = 1.0
 
 
 @click.command()
-@click.option("--model", required=True, help="Of the arm: ur3e, ur5e, ur7e, ur10e, ur12e, ur16e, ur20 or ur30.")
+@CONFIG
+@click.option("--model", help="Of the arm: ur3e, ur5e, ur7e, ur10e, ur12e, ur16e, ur20 or ur30.")
 @click.option(
     "--tool",
     "tool",
     multiple=True,
-    required=True,
     metavar="FROM:TO:DIAMETER[:X:Y]",
     help="A cylinder of what is mounted, in mm from the flange face; X:Y puts its axis aside. Repeatable.",
 )
@@ -36,12 +34,7 @@ USUAL_POSTURE = "45,-100,60"
     metavar="Q1,Q2,Q3",
     help="Of the first three joints, degrees.",
 )
-@click.option(
-    "--mounting",
-    default="floor",
-    show_default=True,
-    help="floor, wall, ceiling, or degrees the base leans about its y.",
-)
+@click.option("--mounting", help="floor, wall, ceiling, or degrees the base leans about its y.")
 @click.option(
     "--plane",
     "planes",
@@ -50,55 +43,79 @@ USUAL_POSTURE = "45,-100,60"
     help="A wall: the arm stays where normal times place, base axes, is MM or more. The mounting surface is known.",
 )
 @click.option("--box", "boxes", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block, two corners in mm, base axes.")
-@click.option(
-    "--tip-speed-limit", default="250", show_default=True, metavar="MM/S|none", help="Of the tool's farthest points."
-)
-@click.option(
-    "--mass", "mass_kg", type=float, default=1.0, show_default=True, help="Of the tool in kg, for the prediction."
-)
+@click.option("--tip-speed-limit", metavar="MM/S|none", help="Of the tool's farthest points.  [default: 250]")
+@click.option("--mass", "mass_kg", type=float, help="Of the tool in kg, for the prediction.  [default: 1]")
 @click.option("--output", type=click.Path(dir_okay=False, path_type=Path), help="Save the plan as a new JSON file.")
-@click.option("--png", type=click.Path(dir_okay=False, path_type=Path), help="Save stick figures (needs matplotlib).")
+@click.option("--png", type=click.Path(dir_okay=False, path_type=Path), help="Save stick figures (needs ftdrive[viz]).")
+@click.option("--view", is_flag=True, help="Show it in the browser, in three dimensions (needs ftdrive[viz]).")
 @JSON
 def plan(
-    model: str,
+    config: Path | None,
+    model: str | None,
     tool: tuple[str, ...],
     quick: bool,
     minimal: bool,
     posture: str,
-    mounting: str,
+    mounting: str | None,
     planes: tuple[str, ...],
     boxes: tuple[str, ...],
-    tip_speed_limit: str,
-    mass_kg: float,
+    tip_speed_limit: str | None,
+    mass_kg: float | None,
     output: Path | None,
     png: Path | None,
+    view: bool,
     as_json: bool,
 ) -> None:
     """Plan a tour that is proven clear of the arm itself, of the tool and of planes and boxes. Needs no robot.
 
-    Real cables, fixtures and people are not in the model: look at the ball before anything moves.
+    Arm, tool and surroundings come from the configuration where there is one; what is given here takes its place. Real
+    cables, fixtures and people are not in the model: look at the ball before anything moves.
     """
     import numpy as np
 
-    from ftdrive.planning.arm_model import ArmModel
-    from ftdrive.planning.certify import Certifier
+    from ftdrive.config import cell_of, settings
+    from ftdrive.errors import ConfigError, PlanRefused
+    from ftdrive.planning.cell import certifier_for
     from ftdrive.planning.motion import Speeds
     from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
-    from ftdrive.planning.scene import BASE_PLANE, Scene, lean_of
+    from ftdrive.report import talk
 
     if quick and minimal:
         raise ConfigError("give --quick (12 poses) or --minimal (6), not both")
-    if not (np.isfinite(mass_kg) and mass_kg > 0):
-        raise ConfigError(f"--mass is {mass_kg}: give the mass of the tool in kg, above zero")
+    found = settings(
+        config,
+        {
+            "robot.model": ("--model", model),
+            "robot.tip_speed_mm_s": ("--tip-speed-limit", _tip_speed(tip_speed_limit)),
+            "tool.cylinders_mm": ("--tool", rows("--tool", tool, (3, 5))),
+            "tool.mass_kg": ("--mass", mass_kg),
+            "workcell.mounting": ("--mounting", mounting),
+            "workcell.planes_mm": ("--plane", rows("--plane", planes, (4,))),
+            "workcell.boxes_mm": ("--box", rows("--box", boxes, (6,))),
+        },
+    )
+    cell = cell_of(found, devices=False)
+    if cell.robot.model is None:
+        raise ConfigError("which arm? Give --model, or [robot] model in ftdrive.toml")
+    if not cell.tool.cylinders_mm:
+        raise ConfigError("what is mounted? Give --tool FROM:TO:DIAMETER, or [tool] cylinders_mm in ftdrive.toml")
     q_rad = USUAL_POSTURE_RAD.copy()
-    q_rad[:3] = np.radians(_numbers("--posture", posture, ",", (3,)))
-    scene = Scene((BASE_PLANE, *map(_plane, planes)), tuple(map(_box, boxes)), lean_of(mounting))
-    certifier = Certifier(ArmModel(model, [_cylinder(text) for text in tool]), scene)
-    speeds = Speeds(tip_m_s=_tip_speed(tip_speed_limit))
+    q_rad[:3] = np.radians(numbers("--posture", posture, ",", (3,)))
+    certifier = certifier_for(cell, cell.robot.model)
+    speeds = Speeds(
+        float(np.radians(cell.robot.speed_deg_s)),
+        float(np.radians(cell.robot.acceleration_deg_s2)),
+        None if tip_speed_limit == "none" else cell.robot.tip_speed_mm_s / 1e3,
+    )
     poses = 6 if minimal else 12 if quick else 24
+    mass_kg = USUAL_MASS_KG if cell.tool.mass_kg is None else cell.tool.mass_kg
     made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess_of(certifier, mass_kg))
     if not made.certified:
         raise PlanRefused("a move of the plan could not be proven clear")
+    described = {found[key].origin for key in ("tool.cylinders_mm", "workcell.planes_mm", "workcell.boxes_mm")}
+    described -= {"default", "--tool", "--plane", "--box"}
+    if described and not cell.workcell.measured:
+        talk.print(f"Placeholders are in {', '.join(sorted(described))} (measured = false): a plan for the eye only.")
     if output is not None:
         made.save(output)
     if png is not None:
@@ -109,6 +126,8 @@ def plan(
         write_json({"schema_version": 1} | made.to_dict())
     else:
         _show(made)
+    if view:
+        _look(made, certifier)
 
 
 def _show(plan: "Plan") -> None:
@@ -151,48 +170,29 @@ def _show(plan: "Plan") -> None:
     )
 
 
-def _numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> list[float]:
-    from math import isfinite
+def _look(made: "Plan", certifier: "Certifier") -> None:
+    """Show the scene until Ctrl-C."""
+    import os
+    import threading
+    import webbrowser
+    from contextlib import suppress
 
-    try:
-        values = [float(part) for part in text.split(separator)]
-    except ValueError:
-        values = []
-    if len(values) not in counts or not all(map(isfinite, values)):
-        wanted = " or ".join(map(str, counts))
-        raise ConfigError(f"{option} is '{text}': give {wanted} numbers separated by '{separator}'")
-    return values
+    from ftdrive.planning.view import shown
+    from ftdrive.report import talk
 
-
-def _cylinder(text: str) -> "Cylinder":
-    from ftdrive.planning.arm_model import Cylinder
-
-    return Cylinder(*(value / 1e3 for value in _numbers("--tool", text, ":", (3, 5))))
+    with shown(made, certifier) as url, suppress(KeyboardInterrupt):
+        talk.print(f"The plan is shown at {url} until Ctrl-C.")
+        if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+            webbrowser.open(url)
+        threading.Event().wait()
 
 
-def _plane(text: str) -> "Plane":
-    from math import hypot
+def _tip_speed(text: str | None) -> float | None:
+    from ftdrive.errors import ConfigError
 
-    from ftdrive.planning.scene import Plane
-
-    x, y, z, offset_mm = _numbers("--plane", text, ":", (4,))
-    length = hypot(x, y, z)
-    if not length:
-        raise ConfigError(f"--plane is '{text}': its normal has no direction, give for example -1:0:0:-800")
-    return Plane((x / length, y / length, z / length), offset_mm / 1e3)
-
-
-def _box(text: str) -> "Box":
-    from ftdrive.planning.scene import Box
-
-    x1, y1, z1, x2, y2, z2 = (value / 1e3 for value in _numbers("--box", text, ":", (6,)))
-    return Box((min(x1, x2), min(y1, y2), min(z1, z2)), (max(x1, x2), max(y1, y2), max(z1, z2)))
-
-
-def _tip_speed(text: str) -> float | None:
-    if text == "none":
+    if text is None or text == "none":
         return None
-    (speed_mm_s,) = _numbers("--tip-speed-limit", text, " ", (1,))
+    (speed_mm_s,) = numbers("--tip-speed-limit", text, " ", (1,))
     if speed_mm_s <= 0:
         raise ConfigError(f"--tip-speed-limit is {text}: give mm/s above zero, or none")
-    return speed_mm_s / 1e3
+    return speed_mm_s

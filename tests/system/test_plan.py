@@ -60,7 +60,7 @@ def test_table_is_talk_and_the_file_is_the_plan(tmp_path: Path) -> None:
         (["--plane", "0:0:0:1"], "no direction"),
         (["--tip-speed-limit", "-1"], "above zero"),
         (["--posture", "45,-100"], "3 numbers"),
-        (["--mass", "0"], "above zero"),
+        (["--mass", "0"], "0.001 to 100"),
     ],
 )
 def test_what_cannot_be_used_is_said_in_a_sentence(arguments: list[str], said: str) -> None:

@@ -1,0 +1,111 @@
+"""A plan as a program in URScript, for those who run the tour from the pendant.
+
+Ref: Universal Robots, "The URScript Programming Language", SW 5: movej, get_actual_joint_positions, popup, textmsg.
+Checked on hardware: no.
+"""
+
+from collections.abc import Iterator
+from math import degrees, radians
+from typing import Any
+
+from ftdrive.exports.common import plain, require_usable
+from ftdrive.planning.plan import Plan
+
+NEAR_RAD = radians(30)
+"""The way to the first pose is not part of a plan: no joint may be farther from it than this at the start."""
+APPROACH_RAD_S, APPROACH_RAD_S2 = radians(10), radians(20)
+
+
+def program(plan: Plan, *, dwell_s: float) -> str:
+    """Write a function that visits the poses of a plan in their order and returns to the first.
+
+    Parameters
+    ----------
+    dwell_s : float
+        Rest at each pose.
+
+    Raises
+    ------
+    PlanRefused
+        A move is not proven clear, or a number in the plan is not one that an arm can follow.
+    """
+    require_usable(plan)
+    return "".join(
+        f"{line}\n"
+        for line in ("def ftdrive_tour():", *(f"  {line}" if line else "" for line in _body(plan, dwell_s)), "end")
+    )
+
+
+def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
+    sha256 = plan.to_dict()["sha256"]
+    steps, model = plan.steps, plain(plan.description["model"])
+    name = f"ftdrive plan {sha256[:12]}"
+    first = _joints(steps[0].q_rad)
+    yield f"# ftdrive plan {sha256}"
+    yield f"# for a {model} with this tool, mm from the flange face:"
+    for part in plan.description["tool"]:
+        yield f"#   {_cylinder(part)}"
+    yield from (f"# {plain(sentence)}" for sentence in plan.why)
+    yield "#"
+    yield "# In PolyScope: a Script node of type File with this file, then one of type Line with ftdrive_tour()"
+    yield "#"
+    yield "# WARNINGS"
+    for warning in _warnings(plan, model):
+        yield f"# - {warning}"
+    yield ""
+    yield f'textmsg("{name}: {len(steps)} poses")'
+    yield (
+        f'popup("Only for a {model} with the tool of {name}. Keep a ball of {plan.ball_m:.2f} m around the wrist free, '
+        f'cables slack, hand on the emergency stop. First time: speed slider at 30 percent. Continue moves the arm.", '
+        f'title="ftdrive", warning=True, blocking=True)'
+    )
+    yield f"local first = {first}"
+    yield "local here = get_actual_joint_positions()"
+    yield "local joint = 0"
+    yield "while joint < 6:"
+    yield f"  if norm(here[joint] - first[joint]) > {NEAR_RAD:.6f}:"
+    yield f'    textmsg("{name}: too far from its first pose, nothing was moved")'
+    yield (
+        f'    popup("The arm is more than {degrees(NEAR_RAD):.0f} degrees from the first pose: jog all joints to '
+        f'{", ".join(f"{degrees(q):.0f}" for q in steps[0].q_rad)} degrees, then start again.", '
+        'title="ftdrive", error=True, blocking=True)'
+    )
+    yield "    halt"
+    yield "  end"
+    yield "  joint = joint + 1"
+    yield "end"
+    yield ""
+    yield "# To the first pose: slow, and not proven clear."
+    yield f"movej({first}, a={APPROACH_RAD_S2:.6f}, v={APPROACH_RAD_S:.6f})"
+    for i, step in enumerate((*steps, steps[0]), start=1):
+        if i > 1:
+            speed = steps[i - 2].speed_rad_s
+            yield f"movej({_joints(step.q_rad)}, a={plan.acceleration_rad_s2:.6f}, v={speed:.6f})"
+        where = f"pose {i} of {len(steps)}" if i <= len(steps) else "pose 1 again"
+        yield f'textmsg("{name}: {where}, orientation R{step.number:02d}")'
+        yield f"sleep({dwell_s:.3f})"
+    yield f'textmsg("{name}: done")'
+    yield 'popup("The tour is complete.", title="ftdrive", blocking=False)'
+
+
+def _warnings(plan: Plan, model: str) -> Iterator[str]:
+    yield "This is no safety function. Real cables, fixtures and people are not in the plan."
+    yield f"Run it on a {model} with exactly this tool and mounting; in another cell the moves are not proven clear."
+    yield f"All that moves stays in a ball of {plan.ball_m:.2f} m around the crossing of the axes of wrist 1 and 2."
+    yield "The tool turns every way, upside down too: nothing loose, no fluid, nothing in the gripper."
+    yield (
+        f"The way to the first pose is not in the plan: the program stops unless each joint is within "
+        f"{degrees(NEAR_RAD):.0f} degrees of it."
+    )
+    yield "The first time: speed slider at 30 percent, hand on the emergency stop."
+    yield "Nothing guards the motion but the arm's own safety system: while it runs, ftdrive can only listen."
+
+
+def _joints(q_rad: tuple[float, ...]) -> str:
+    return f"[{', '.join(f'{round(q, 6) + 0.0:.6f}' for q in q_rad)}]"
+
+
+def _cylinder(part: dict[str, Any]) -> str:
+    mm = {name: f"{1e3 * float(value):.1f}" for name, value in part.items()}
+    aside = f", axis at x {mm['x_m']}, y {mm['y_m']}" if float(part["x_m"]) or float(part["y_m"]) else ""
+    return f"from {mm['from_m']} to {mm['to_m']}, diameter {mm['diameter_m']}{aside}"

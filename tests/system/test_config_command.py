@@ -1,0 +1,132 @@
+"""`ftdrive config show`, and a configuration as the other commands see it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from ftdrive.cli import cli, exit_code
+from ftdrive.config import load, settings
+
+CELL = """format = "ftdrive.config/1"
+[robot]
+model = "ur5e"
+speed_deg_s = 30
+[tool]
+cylinders_mm = [[0, 200, 100]]
+[workcell]
+boxes_mm = [[600, 600, 0, 800, 800, 200]]
+"""
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, arguments)
+
+
+def test_what_is_shown_can_be_used_in_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("ftdrive.toml").write_text(CELL)
+    monkeypatch.setenv("FTDRIVE_ROBOT_HOST", "10.0.0.2")
+    monkeypatch.setenv("FTDRIVE_SENSOR_URL", 'ati-can://can0?x="\\')
+    monkeypatch.setenv("FTDRIVE_TOOL_NAME", "gripper ü #2")
+    for options in ((), ("--origin",)):
+        shown = run("config", "show", *options)
+        assert shown.exit_code == 0, shown.output
+        Path("copy.toml").write_text(shown.stdout, encoding="utf-8")
+        with monkeypatch.context() as alone:
+            cell = load()
+            for name in ("ROBOT_HOST", "SENSOR_URL", "TOOL_NAME"):
+                alone.delenv(f"FTDRIVE_{name}")
+            assert load(Path("copy.toml")) == cell
+
+
+def test_origins_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("ftdrive.toml").write_text(CELL)
+    monkeypatch.setenv("FTDRIVE_ROBOT_HOST", "10.0.0.2")
+    lines = run("config", "show", "--origin").stdout.splitlines()
+    told = {line.split("=")[0].strip(): line.rsplit("#", 1)[1].strip() for line in lines[1:] if "=" in line}
+    assert told["host"] == "FTDRIVE_ROBOT_HOST"
+    assert told["speed_deg_s"] == "ftdrive.toml"
+    assert told["average_s"] == "default"
+    assert told["# height_mm"] == "not set"
+    assert "FTDRIVE_ROBOT_HOST" not in run("config", "show").stdout
+
+    answer = json.loads(run("config", "show", "--origin", "--json").stdout)
+    assert answer["schema_version"] == 1
+    assert answer["config"]["robot"]["host"] == "10.0.0.2"
+    assert answer["config"]["sensor"]["height_mm"] is None
+    assert (
+        answer["origin"]["robot"] | {"host": "FTDRIVE_ROBOT_HOST", "speed_deg_s": "ftdrive.toml"}
+        == answer["origin"]["robot"]
+    )
+    assert answer["origin"].keys() == answer["config"].keys()
+    assert "origin" not in json.loads(run("config", "show", "--json").stdout)
+
+
+def test_a_wrong_file_is_exit_code_2() -> None:
+    Path("ftdrive.toml").write_text(CELL.replace("speed_deg_s", "sped"))
+    error = run("config", "show").exception
+    assert error is not None
+    assert exit_code(error) == 2
+    assert "ftdrive.toml: [robot] has no key 'sped'" in str(error)
+
+
+def plan(*arguments: str) -> dict[str, object]:
+    outcome = run("plan", "--json", *arguments)
+    assert outcome.exit_code == 0, (outcome.output, outcome.exception)
+    document: dict[str, object] = json.loads(outcome.stdout)
+    return document
+
+
+def test_a_plan_takes_the_cell_from_the_configuration_and_options_override_it() -> None:
+    Path("ftdrive.toml").write_text(CELL)
+    cell = plan()["description"]
+    assert isinstance(cell, dict)
+    assert cell["model"] == "UR5e"
+    assert cell["speeds"]["joint_rad_s"] == pytest.approx(0.5236, abs=1e-4)
+    assert len(cell["scene"]["boxes"]) == 1
+    other = plan("--model", "ur10e", "--tool", "0:100:80", "--box", "900:900:0:950:950:10", "--tip-speed-limit", "none")
+    cell = other["description"]
+    assert isinstance(cell, dict)
+    assert cell["model"] == "UR10e"
+    assert [part["to_m"] for part in cell["tool"]] == [0.1]
+    assert cell["scene"]["boxes"][0]["high_m"] == [0.95, 0.95, 0.01]
+    assert cell["speeds"]["tip_m_s"] is None
+
+
+def test_placeholders_are_named_as_such() -> None:
+    Path("ftdrive.toml").write_text(CELL)
+    assert "Placeholders are in ftdrive.toml" in run("plan").stderr
+    assert "Placeholders" in run("plan", "--tool", "0:200:100").stderr
+    assert "Placeholders" not in run("plan", "--tool", "0:200:100", "--box", "900:900:0:950:950:10").stderr
+    Path("ftdrive.toml").write_text(CELL + "measured = true\n")
+    assert "Placeholders" not in run("plan").stderr
+
+
+@pytest.mark.parametrize(("arguments", "said"), [(["--tool", "0:200:100"], "--model"), (["--model", "ur5e"], "--tool")])
+def test_without_a_configuration_a_plan_needs_arm_and_tool(arguments: list[str], said: str) -> None:
+    error = run("plan", *arguments).exception
+    assert error is not None
+    assert exit_code(error) == 2
+    assert f"Give {said}" in str(error)
+
+
+@pytest.mark.parametrize("name", ["config", "export", "init", "plan"])
+def test_help_of_a_command_is_fast(name: str) -> None:
+    code = (
+        f"import ftdrive.commands.{name}, sys; sys.exit(str({{'numpy', 'rich', 'serial'}} & sys.modules.keys() or 0))"
+    )
+    outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert outcome.stdout.strip() == "[]"
+
+
+def test_settings_are_all_shown() -> None:
+    shown = run("config", "show").stdout
+    assert all(f"{key.split('.')[1]} =" in shown for key in settings())

@@ -1,0 +1,201 @@
+"""`ftdrive init` against an emulated cell: as a script calls it, as answers typed, and in a real terminal."""
+
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from drivers.errors import ConnectError
+from ftdrive.cli import cli, exit_code
+from ftdrive.config import load
+from ftdrive.simulation import Station
+
+TOOL = ["--height", "33", "--tool", "0:33:80", "--tool", "33:200:100:0:5"]
+
+
+@pytest.fixture(scope="module")
+def station() -> Iterator[Station]:
+    with Station("both", ["--time-scale", "1"]) as station:
+        yield station
+
+
+@pytest.fixture
+def addresses(station: Station) -> list[str]:
+    return ["--robot", station.cell.robot.host, "--sensor", f"ati-serial://{station.endpoints['serial']['port']}"]
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def run(*arguments: str, typed: str = "") -> Result:
+    return CliRunner().invoke(cli, ["init", *arguments], input=typed)
+
+
+def test_a_script_needs_no_questions(station: Station) -> None:
+    addresses = ["--robot", station.cell.robot.host, "--sensor", station.endpoints["serial"]["port"]]
+    more = [
+        "--sensor-mass",
+        "0.255",
+        "--tool-mass",
+        "1.2",
+        "--plane",
+        "-1:0:0:-900",
+        "--box",
+        "5:5:0:9:9:9",
+        "--speed",
+        "45",
+    ]
+    outcome = run(*addresses, *TOOL, *more, "--mounting", "12.5", "--tool-name", "gripper", "--yes")
+    assert outcome.exit_code == 0, (outcome.output, outcome.exception)
+    assert outcome.stdout == ""
+    cell = load()
+    assert (cell.robot.host, cell.robot.model, cell.robot.speed_deg_s) == (station.cell.robot.host, "UR5e", 45)
+    assert cell.sensor.url == f"ati-serial://{station.endpoints['serial']['port']}"  # the port was asked what is there
+    assert (cell.sensor.height_mm, cell.sensor.mass_kg) == (33, 0.255)
+    assert cell.tool.cylinders_mm == ((0, 33, 80), (33, 200, 100, 0, 5))
+    assert (cell.tool.name, cell.tool.mass_kg, cell.workcell.mounting) == ("gripper", 1.2, "12.5")
+    assert cell.workcell.planes_mm == ((-1, 0, 0, -900),)
+    assert cell.workcell.boxes_mm == ((5, 5, 0, 9, 9, 9),)
+
+
+def test_nothing_counts_as_measured_until_a_person_says_so(addresses: list[str]) -> None:
+    assert run(*addresses, *TOOL, "--yes").exit_code == 0
+    text = Path("ftdrive.toml").read_text()
+    assert load().workcell.measured is False
+    said = re.sub(r"^# ?", "", text, flags=re.MULTILINE).replace("\n", " ")
+    assert "PLACEHOLDERS until measured" in said
+    assert "nothing moves before" in said
+    Path("ftdrive.toml").write_text(text.replace("measured = false", "measured = true"))
+    assert load().workcell.measured is True
+
+
+def test_what_was_not_asked_is_left_to_the_users_file(addresses: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Path("user/ftdrive").absolute()
+    folder.mkdir(parents=True)
+    (folder / "ftdrive.toml").write_text(
+        'format = "ftdrive.config/1"\n[site]\ng_m_s2 = 9.81\n[robot]\nspeed_deg_s = 20\n'
+    )
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(folder.parent))
+    assert run(*addresses, *TOOL, "--yes").exit_code == 0
+    assert (load().site.g_m_s2, load().robot.speed_deg_s) == (9.81, 20)
+    assert "site" in tomllib.loads(Path("ftdrive.toml").read_text())
+
+
+def test_an_existing_file_is_never_overwritten() -> None:
+    Path("ftdrive.toml").write_text("mine")
+    outcome = run("--yes")
+    assert isinstance(outcome.exception, FileExistsError)
+    assert "never overwritten" in str(outcome.exception)
+    assert Path("ftdrive.toml").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("without", "said"), [("--height", "--height is missing and has no default"), ("--tool", "--tool is missing")]
+)
+def test_a_measured_number_has_no_default(without: str, said: str, addresses: list[str]) -> None:
+    kept = [
+        word for flag, value in zip(TOOL[::2], TOOL[1::2], strict=True) if flag != without for word in (flag, value)
+    ]
+    error = run(*addresses, *kept, "--yes").exception
+    assert error is not None
+    assert exit_code(error) == 2
+    assert said in str(error)
+    assert not Path("ftdrive.toml").exists()
+
+
+def test_a_robot_that_does_not_answer_is_exit_code_3(station: Station) -> None:
+    error = run("--robot", "127.99.99.9", "--sensor", station.cell.sensor.url, *TOOL, "--yes").exception
+    assert isinstance(error, ConnectError)
+    assert exit_code(error) == 3
+    assert not Path("ftdrive.toml").exists()
+
+
+def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
+    answers = ["127.99.99.9", station.cell.robot.host, "ati-nonsense://x", station.endpoints["serial"]["port"]]
+    answers += ["high", "3300", "33", "", "", "0:33", "0:33:80", "33:20:100", "33:200:100", "", "", "", "", "", "", ""]
+    outcome = run(typed="\n".join(answers) + "\n")
+    assert outcome.exit_code == 0, (outcome.output, outcome.exception)
+    for words in (
+        "cannot be reached",
+        "unknown sensor",
+        "is not a number",
+        "out of range",
+        "3 or 5 numbers",
+        "no cylinder",
+    ):
+        assert words in outcome.stderr
+    cell = load()
+    assert cell.robot.host == station.cell.robot.host
+    assert cell.tool.cylinders_mm == ((0, 33, 80), (33, 200, 100))
+    assert (cell.sensor.height_mm, cell.sensor.mass_kg) == (33, None)
+
+
+def test_a_person_may_keep_addresses_that_do_not_answer() -> None:
+    silent = "ati-serial:///dev/no-such-port"
+    typed = ["127.99.99.9", "", "ur10e", "", silent, "", "33", "", "", "0:50:80", "", "", "", "", "", "", ""]
+    outcome = run(typed="\n".join(typed) + "\n")
+    assert outcome.exit_code == 0, (outcome.output, outcome.exception)
+    cell = load()
+    assert (cell.robot.host, cell.robot.model, cell.sensor.url) == ("127.99.99.9", "ur10e", silent)
+    assert Path("ftdrive.toml").read_text().count("did not answer") == 2
+
+
+def test_simulated(tmp_path: Path) -> None:
+    outcome = run("--simulate", "--yes", *TOOL, "-o", str(tmp_path / "cell.toml"))
+    assert outcome.exit_code == 0, (outcome.output, outcome.exception)
+    cell = load(tmp_path / "cell.toml")
+    assert cell.robot.model == "UR5e"
+    assert cell.sensor.url.startswith("ati-can://")
+
+
+def test_in_a_terminal(station: Station) -> None:
+    """Every question is read on the screen before it is answered."""
+    leader, follower = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ftdrive", "init"], stdin=follower, stdout=follower, stderr=follower, close_fds=True
+    )
+    os.close(follower)
+    screen = ""
+    talk = [
+        (r"Robot address: ", station.cell.robot.host),
+        (r"Sensor(, a number| address).*: ", station.endpoints["serial"]["port"]),
+        (r"measure it\): ", "33"),
+        (r"Sensor and adapter, kg .*: ", "0.255"),
+        (r"Name of the tool \[tool\]: ", ""),
+        (r"mm from the flange: ", "0:33:80"),
+        (r"next \(Enter: no more\): ", ""),
+        (r"Tool, kg, about .*: ", "1.2"),
+        (r"Mounting: floor, wall, ceiling or degrees \[floor\]: ", ""),
+        (r"Walls and tables .*: ", ""),
+        (r"Blocks .*: ", ""),
+        (r"deg/s \[60\]: ", ""),
+    ]
+    try:
+        for question, answer in [*talk, ("Wrote ftdrive.toml", None)]:
+            before, deadline = len(screen), time.monotonic() + 20
+            while not re.search(question, screen[before:]):
+                assert time.monotonic() < deadline, screen
+                if select.select([leader], [], [], 0.1)[0]:
+                    screen += os.read(leader, 4096).decode()
+            if answer is not None:
+                os.write(leader, f"{answer}\n".encode())
+        assert process.wait(10) == 0
+    finally:
+        process.kill()
+        process.wait()
+        os.close(leader)
+    assert "✔ UR5e, serial" in screen
+    assert "remote control ON" in screen
+    assert re.search(r"✔ ati-serial://\S+: ATI", screen)
+    assert load().sensor.height_mm == 33

@@ -1,0 +1,238 @@
+"""A plan as a program for the pendant: run here by an interpreter that knows only the statements it may use."""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from math import radians
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from ftdrive.cli import cli, exit_code
+from ftdrive.errors import PlanRefused
+from ftdrive.exports import targets_csv, urscript
+from ftdrive.planning.plan import Plan
+
+STEP = re.compile(r"(?P<name>[a-z_]+)\((?P<rest>.*)\)")
+
+
+class Halted(Exception):
+    """The program stopped itself."""
+
+
+@dataclass
+class Pendant:
+    """Runs the few statements of URScript that an export uses; anything else is an error."""
+
+    q_rad: list[float]
+    moves: list[tuple[list[float], float, float]] = field(default_factory=list)
+    said: list[str] = field(default_factory=list)
+    rests: list[float] = field(default_factory=list)
+
+    def run(self, text: str) -> None:
+        lines = [line.strip() for line in text.splitlines() if line.strip() and not line.strip().startswith("#")]
+        assert lines[0] == "def ftdrive_tour():"
+        assert lines[-1] == "end"
+        names: dict[str, Any] = {}
+        self._block(lines[1:-1], names)
+
+    def _block(self, lines: Sequence[str], names: dict[str, Any]) -> None:
+        i = 0
+        while i < len(lines):
+            line = lines[i]
+            if match := re.fullmatch(r"(while|if) (.+):", line):
+                end = self._end(lines, i)
+                body, condition = lines[i + 1 : end], match[2]
+                while self._value(condition, names):
+                    self._block(body, names)
+                    if match[1] == "if":
+                        break
+                i = end
+            elif line == "halt":
+                raise Halted
+            elif match := re.fullmatch(r"(?:local )?([a-z_]+) = (.+)", line):
+                names[match[1]] = self._value(match[2], names)
+            else:
+                match = STEP.fullmatch(line)
+                assert match, f"not a statement: {line}"
+                self._value(line, names)
+            i += 1
+
+    @staticmethod
+    def _end(lines: Sequence[str], start: int) -> int:
+        depth = 0
+        for i in range(start, len(lines)):
+            depth += bool(re.fullmatch(r"(while|if) .+:", lines[i])) - (lines[i] == "end")
+            if not depth:
+                return i
+        raise AssertionError("a block has no end")
+
+    def _value(self, expression: str, names: dict[str, Any]) -> Any:
+        assert not re.search(r"__|lambda|import", expression)
+        called: dict[str, Callable[..., Any]] = {
+            "movej": self._movej,
+            "textmsg": self.said.append,
+            "popup": lambda words, **_: self.said.append(words),
+            "sleep": self.rests.append,
+            "norm": abs,
+            "get_actual_joint_positions": lambda: list(self.q_rad),
+        }
+        scope = {"__builtins__": {}, "True": True, "False": False} | called | names
+        return eval(expression, scope)
+
+    def _movej(self, q: list[float], *, a: float, v: float) -> None:
+        self.moves.append((q, a, v))
+        self.q_rad = list(q)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("plan") / "plan.json"
+    outcome = CliRunner().invoke(
+        cli, ["plan", "--model", "ur5e", "--tool", "0:33:80", "--tool", "33:200:100:0:5", "--output", str(path)]
+    )
+    assert outcome.exit_code == 0, outcome.output
+    return path
+
+
+@pytest.fixture(scope="module")
+def plan(path: Path) -> Plan:
+    return Plan.load(path)
+
+
+def export(path: Path, *arguments: str) -> Result:
+    return CliRunner().invoke(cli, ["export", "plan", str(path), *arguments])
+
+
+def test_the_program_visits_what_was_planned_as_it_was_planned(plan: Plan) -> None:
+    first = list(plan.steps[0].q_rad)
+    pendant = Pendant([angle + radians(29) for angle in first])
+    pendant.run(urscript.program(plan, dwell_s=3.5))
+    assert len(pendant.moves) == len(plan.steps) + 1
+    goals = np.array([goal for goal, _, _ in pendant.moves])
+    np.testing.assert_allclose(goals, [*(step.q_rad for step in plan.steps), first], atol=1e-6)
+    np.testing.assert_allclose(
+        [v for _, _, v in pendant.moves[1:]], [step.speed_rad_s for step in plan.steps], atol=1e-6
+    )
+    np.testing.assert_allclose([a for _, a, _ in pendant.moves[1:]], plan.acceleration_rad_s2, atol=1e-6)
+    assert pendant.moves[0][2] <= radians(10) + 1e-6  # the way there is not proven
+    assert pendant.rests == [3.5] * (len(plan.steps) + 1)
+    poses = [words for words in pendant.said if ": pose " in words]
+    assert [int(words[-2:]) for words in poses] == [*(step.number for step in plan.steps), plan.steps[0].number]
+    assert "pose 1 of 24" in poses[0]
+
+
+@pytest.mark.parametrize("joint", range(6))
+@pytest.mark.parametrize("away_deg", [31, -31, 360])
+def test_far_from_the_first_pose_nothing_moves(plan: Plan, joint: int, away_deg: float) -> None:
+    q = list(plan.steps[0].q_rad)
+    q[joint] += radians(away_deg)
+    pendant = Pendant(q)
+    with pytest.raises(Halted):
+        pendant.run(urscript.program(plan, dwell_s=1.0))
+    assert pendant.moves == []
+    assert "jog all joints to 45, -100, 60" in pendant.said[-1]
+
+
+def test_a_person_is_asked_before_the_first_move(plan: Plan) -> None:
+    lines = urscript.program(plan, dwell_s=1.0).splitlines()
+    asked = next(i for i, line in enumerate(lines) if line.strip().startswith("popup("))
+    assert "blocking=True" in lines[asked]
+    assert asked < next(i for i, line in enumerate(lines) if "get_actual_joint_positions" in line)
+    assert not any("movej" in line for line in lines[:asked])
+
+
+def test_header_says_what_it_is_for(plan: Plan) -> None:
+    comments = "\n".join(re.findall(r"^ *#.*$", urscript.program(plan, dwell_s=1.0), re.MULTILINE))
+    for word in (
+        plan.to_dict()["sha256"],
+        "UR5e",
+        "from 33.0 to 200.0, diameter 100.0, axis at x 0.0, y 5.0",
+        "WARNINGS",
+    ):
+        assert word in comments
+    assert "no safety function" in comments
+    assert "within 30 degrees" in comments
+
+
+GOLDEN = """\
+  movej([0.785398, -1.745329, 1.047198, -0.872665, 1.570796, 0.785398], a=0.349066, v=0.174533)
+  textmsg("ftdrive plan HASH: pose 1 of 24, orientation R01")
+  sleep(4.000)
+  movej([0.785398, -1.745329, 1.047198, -2.443461, 0.785398, 1.570796], a=1.396263, v=SPEED)
+  textmsg("ftdrive plan HASH: pose 2 of 24, orientation R19")
+  sleep(4.000)
+"""
+
+
+def test_golden_lines_and_the_same_each_time(path: Path, plan: Plan) -> None:
+    text = export(path, "--format", "urscript").stdout
+    assert text == export(path, "--format", "urscript").stdout
+    speed = f"{plan.steps[0].speed_rad_s:.6f}"
+    assert GOLDEN.replace("HASH", plan.to_dict()["sha256"][:12]).replace("SPEED", speed) in text
+    assert text.isascii()
+    assert text.startswith("def ftdrive_tour():\n")
+    assert [line for line in text.splitlines() if line.rstrip() != line] == []
+    assert re.findall(r"^\S.*$", text, re.MULTILINE) == [
+        "def ftdrive_tour():",
+        "end",
+    ]  # the controller ends at this end
+
+
+@pytest.mark.parametrize("model", ['"\nend\nmovej([9,0,0,0,0,0])\n#', "a\r\nhalt", 'x")\u2028movej([0])', "\\", "\0"])
+def test_no_text_leaves_its_comment_or_string(plan: Plan, model: str) -> None:
+    hostile = replace(plan, why=(model,), description={**plan.description, "model": model})
+    usual, text = (urscript.program(each, dwell_s=1.0) for each in (plan, hostile))
+    assert text.isascii()
+    assert len(text.splitlines()) == len(usual.splitlines()) - len(plan.why) + 1
+    pendant = Pendant(list(plan.steps[0].q_rad))
+    pendant.run(text)
+    assert len(pendant.moves) == len(plan.steps) + 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"certified": False},
+        {"speed_rad_s": 0.0},
+        {"speed_rad_s": float("nan")},
+        {"speed_rad_s": 4.0},
+        {"q_rad": (7.0, 0.0, 0.0, 0.0, 0.0, 0.0)},
+        {"q_rad": (float("inf"), 0.0, 0.0, 0.0, 0.0, 0.0)},
+        {"q_rad": (0.0,) * 5},
+    ],
+)
+def test_what_no_arm_should_follow_is_refused(plan: Plan, change: dict[str, Any]) -> None:
+    steps = (*plan.steps[:5], replace(plan.steps[5], **change), *plan.steps[6:])
+    for target in (lambda plan: urscript.program(plan, dwell_s=1.0), targets_csv.table):
+        with pytest.raises(PlanRefused):
+            target(replace(plan, steps=steps))
+
+
+def test_table_of_targets(path: Path, plan: Plan) -> None:
+    text = export(path, "--format", "csv").stdout
+    first, names, *lines = text.splitlines()
+    assert first == f"# ftdrive.targets/1 plan {plan.to_dict()['sha256']} UR5e"
+    values = np.array([[float(cell) for cell in line.split(",")] for line in lines])
+    assert len(names.split(",")) == values.shape[1]
+    np.testing.assert_allclose(values[:, 2:8], [step.q_rad for step in plan.steps], atol=1e-8)
+    np.testing.assert_allclose(values[:, 8], [step.speed_rad_s for step in plan.steps], atol=1e-8)
+    assert values[:, 1].tolist() == [step.number for step in plan.steps]
+
+
+def test_files_are_new_and_plans_unchanged(path: Path, tmp_path: Path) -> None:
+    out = tmp_path / "tour.script"
+    assert export(path, "--format", "urscript", "-o", str(out)).exit_code == 0
+    written = out.read_text()
+    again = export(path, "--format", "csv", "-o", str(out))
+    assert isinstance(again.exception, FileExistsError)
+    assert out.read_text() == written
+    edited = tmp_path / "edited.json"
+    edited.write_text(path.read_text().replace('"speed_rad_s": 1.0471975511965976', '"speed_rad_s": 3.0'))
+    refused = export(edited, "--format", "urscript").exception
+    assert refused is not None
+    assert exit_code(refused) == 7
+    assert "changed" in str(refused)
