@@ -19,6 +19,11 @@ class Speeds:
     tip_m_s: float | None = 0.25
     """None for no limit."""
 
+    @classmethod
+    def first_run(cls) -> "Speeds":
+        """Give the slow limits for a plan that has not run in its workcell yet."""
+        return cls(float(np.radians(30)), float(np.radians(40)))
+
 
 def move_duration_s(turn_rad: Array, speed_rad_s: Array | float, acceleration_rad_s2: float) -> Array:
     """Duration of moves by the angle of their leading joint, with speed ramped up and down."""

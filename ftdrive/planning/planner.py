@@ -12,10 +12,14 @@ from calib.design import SUBSET_6, T12, Guess, special
 from calib.tour import wrist_tour
 from drivers.ur.kinematics import Array
 from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.certify import Certifier
+from ftdrive.planning.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan, make_plan
 from ftdrive.planning.tours import allowed_moves, shortest_tour, wrist_nodes
+
+__all__ = ["NUMBERS", "USUAL_POSTURE_RAD", "Approach", "guess_of", "plan_approach", "plan_tour"]
 
 USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 """Where all models have room for the constant tour with usual tools; the wrist is at its first pose."""
@@ -53,7 +57,7 @@ def plan_tour(
     PlanRefused
         Neither here nor in another posture is there a tour whose moves are all proven clear.
     """
-    stands = _checked(q_rad)
+    stands = checked_joints(q_rad)
     if poses not in NUMBERS:
         raise ConfigError(f"a plan of {poses} poses is not known: take {', '.join(map(str, NUMBERS))}")
     if poses == 24:
@@ -83,13 +87,6 @@ def plan_tour(
         f"{reason}, and none of the other postures of joints 1 to 3 that were tried has a tour that is proven clear: "
         "describe the tool more closely, or free the scene"
     )
-
-
-def _checked(q_rad: ArrayLike) -> Array:
-    q = np.asarray(q_rad, dtype=np.float64)
-    if q.shape != (6,) or not np.all(np.abs(q) <= 2 * np.pi):
-        raise ConfigError(f"joints are {np.degrees(q).round(1).tolist()} degrees: give six within one turn of zero")
-    return q
 
 
 def _constant(certifier: Certifier, q_rad: Array) -> tuple[Sequence[int], Array] | None:
