@@ -47,6 +47,23 @@ def speed_of_leading_joint(arm: ArmModel, start_rad: Array, end_rad: Array, spee
     return speed
 
 
+def durations_s(arm: ArmModel, q_rad: Array, speeds: Speeds) -> Array:
+    """Duration (n, n) of straight moves between joint vectors (n, 6), to compare tours by.
+
+    Tips are seen at both ends and in the middle of a move only: they may be a little faster than their limit here.
+    """
+    turn = np.abs(q_rad[:, None] - q_rad).max(axis=2)
+    speed = np.full(turn.shape, speeds.joint_rad_s)
+    if speeds.tip_m_s is not None:
+        at = tips(arm, q_rad)
+        i, j = np.triu_indices(len(q_rad), 1)
+        middle = tips(arm, (q_rad[i] + q_rad[j]) / 2)
+        halves = [np.linalg.norm(middle - at[end], axis=2).max(axis=1) for end in (i, j)]
+        path_m = np.maximum(2 * np.maximum(*halves), 1e-9)
+        speed[i, j] = speed[j, i] = np.minimum(speeds.joint_rad_s, speeds.tip_m_s * turn[i, j] / path_m)
+    return move_duration_s(turn, np.maximum(speed, 1e-9), speeds.joint_rad_s2)
+
+
 def tips(arm: ArmModel, q_rad: Array) -> Array:
     """Centres (n, k, 3) in base of the far ends of the tool's cylinders."""
     at = arm.frames(q_rad)

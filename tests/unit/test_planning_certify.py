@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.tour import wrist_tour
 from drivers.ur.kinematics import Array
 from ftdrive.errors import ConfigError
 from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier, Margins
+from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.scene import Box, Plane, Scene
 from ftdrive.planning.shapes import Bodies, height_above, separation, separation_from_box
 
@@ -99,7 +99,7 @@ def test_no_point_of_arm_or_tool_moves_faster_than_its_bound(model: str) -> None
 @pytest.mark.parametrize("tool", TOOLS)
 @pytest.mark.parametrize("model", MODELS)
 def test_constant_tour_is_clear(model: str, tool: tuple[Cylinder, ...]) -> None:
-    poses = np.array([pose.q_rad for pose in wrist_tour(STANDS)])
+    poses = constant_tour(STANDS)
     moves = poses, np.roll(poses, -1, axis=0)
     certifier = Certifier(ArmModel(model, tool), Scene())
     certificate = certifier.certify(*moves)
