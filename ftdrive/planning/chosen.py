@@ -27,7 +27,7 @@ MOST_PARTS = 2
 """Parts of free space, which do not hang together, that are tried."""
 NEARLY = 1.05
 """A prediction this much above that of the best poses of the cone is not worth another posture."""
-OTHER_POSTURES = 3
+OTHER_POSTURES = 2
 POSTURE_STEP_DEG = 20
 LOOKS = 24
 """Directions of the tool by which postures are compared."""

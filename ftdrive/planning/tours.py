@@ -46,7 +46,7 @@ def connected(certifier: Certifier, q_rad: Array, layer: Nodes) -> Nodes:
     shapes, of = distinct(certifier, q_rad)
     layer_of_shape = layer[np.unique(of, return_index=True)[1]]
     layers = np.unique(layer_of_shape, return_inverse=True)[1].ravel()
-    moves = _to_every_group(shapes, layers, NEIGHBOURS // (layers.max() + 1) + 2)
+    moves = _to_every_group(shapes, layers, NEIGHBOURS // (layers.max() + 1) + 1)
     return _Proof(certifier, shapes).parts(np.arange(len(shapes)), *moves)[of]
 
 

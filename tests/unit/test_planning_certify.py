@@ -165,6 +165,23 @@ def test_margins_are_kept_exactly() -> None:
         assert Certifier(arm, Scene(), margins).free([STANDS])[0] is np.bool_(expected)
 
 
+@pytest.mark.parametrize("model", ["UR3e", "UR20"])
+def test_stated_clearance_is_not_above_the_distance_of_points_on_the_surfaces(model: str) -> None:
+    arm = ArmModel(model, TOOLS[3])
+    poses = constant_tour(STANDS)
+    following = np.roll(poses, -1, axis=0)
+    stated = Certifier(arm, Scene()).certify(poses, following).self_clearance_m.min()
+    share = np.random.default_rng(0).random((24, 1))
+    bodies = arm.bodies(poses + share * (following - poses))
+    least = np.inf
+    for place in range(24):
+        points = [surface(bodies[np.array([place]), np.array([k])]) for k in range(len(arm.names))]
+        for a, b in arm.pairs:
+            gap = np.sqrt(((points[a][::3, None] - points[b][::3]) ** 2).sum(axis=2)).min()
+            least = min(least, gap - bodies.rounding_m[a] - bodies.rounding_m[b])
+    assert 0.02 < stated <= least < stated + 0.04
+
+
 @pytest.mark.parametrize("model", ["UR15", "UR5", "Panda"])
 def test_an_arm_of_unknown_shape_is_refused(model: str) -> None:
     with pytest.raises(ConfigError, match=model):

@@ -11,7 +11,7 @@ import pytest
 from calib.design import special
 from drivers.ur.kinematics import Array
 from ftdrive.errors import ConfigError, PlanRefused
-from ftdrive.planning.arm_model import ArmModel, Cylinder
+from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier, Margins
 from ftdrive.planning.motion import Speeds, move_duration_s, tips
 from ftdrive.planning.plan import Plan
@@ -196,7 +196,7 @@ def test_shortest_tour_is_the_best_of_all() -> None:
 def test_random_plans_sampled_at_half_a_degree_are_clear() -> None:
     rng = np.random.default_rng(7)
     made = 0
-    for model in MODELS * 5:
+    for model in [*SHAPES] * 3:
         certifier = certifier_of(model, TOOLS[rng.integers(4)])
         q = USUAL_POSTURE_RAD + np.concatenate([rng.uniform(-0.4, 0.4, 3), np.zeros(3)])
         tour = np.array([p.q_rad for p in planned(certifier, q, 6 if made % 3 else 24).tour])
@@ -204,7 +204,7 @@ def test_random_plans_sampled_at_half_a_degree_are_clear() -> None:
         path = (1 - share) * tour + share * np.roll(tour, -1, axis=0)
         assert certifier.free(path.reshape(-1, 6)).all()  # farther away than the margins of 20 and 30 mm
         made += 1
-    assert made == 30
+    assert made == 24
 
 
 def test_posture_that_cannot_be_is_refused() -> None:
