@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drivers.ur.kinematics import Array, Geometry
+from ftdrive.errors import ConfigError
 
 ALIGNED = 1e-9
 """Below this sine of q5, joints 4 and 6 turn about one line."""
@@ -33,6 +34,14 @@ class Frames:
     R_base_flange: Array
     """(n, 3, 3); its last column is the direction of axis 6."""
     flange_m: Array
+
+
+def checked_joints(q_rad: ArrayLike) -> Array:
+    """Joint vector (6,); raises `ConfigError` unless all are within one turn of zero, which every model can reach."""
+    q = np.asarray(q_rad, dtype=np.float64)
+    if q.shape != (6,) or not np.all(np.abs(q) <= 2 * np.pi + ALIGNED):
+        raise ConfigError(f"joints are {np.degrees(q).round(1).tolist()} degrees: give six within one turn of zero")
+    return q
 
 
 def frames(geometry: Geometry, q_rad: ArrayLike) -> Frames:

@@ -19,6 +19,11 @@ class Speeds:
     tip_m_s: float | None = 0.25
     """None for no limit."""
 
+    @classmethod
+    def first_run(cls) -> "Speeds":
+        """Give the slow limits for a plan that has not run in its workcell yet."""
+        return cls(float(np.radians(30)), float(np.radians(40)))
+
 
 def move_duration_s(turn_rad: Array, speed_rad_s: Array | float, acceleration_rad_s2: float) -> Array:
     """Duration of moves by the angle of their leading joint, with speed ramped up and down."""
@@ -40,6 +45,23 @@ def speed_of_leading_joint(arm: ArmModel, start_rad: Array, end_rad: Array, spee
         path_m = np.linalg.norm(np.diff(points, axis=0), axis=2).max() * (len(share) - 1)
         speed[i] = min(speeds.joint_rad_s, speeds.tip_m_s * leading[i] / path_m) if path_m > 0 else speeds.joint_rad_s
     return speed
+
+
+def durations_s(arm: ArmModel, q_rad: Array, speeds: Speeds) -> Array:
+    """Duration (n, n) of straight moves between joint vectors (n, 6), to compare tours by.
+
+    Tips are seen at both ends and in the middle of a move only: they may be a little faster than their limit here.
+    """
+    turn = np.abs(q_rad[:, None] - q_rad).max(axis=2)
+    speed = np.full(turn.shape, speeds.joint_rad_s)
+    if speeds.tip_m_s is not None:
+        at = tips(arm, q_rad)
+        i, j = np.triu_indices(len(q_rad), 1)
+        middle = tips(arm, (q_rad[i] + q_rad[j]) / 2)
+        halves = [np.linalg.norm(middle - at[end], axis=2).max(axis=1) for end in (i, j)]
+        path_m = np.maximum(2 * np.maximum(*halves), 1e-9)
+        speed[i, j] = speed[j, i] = np.minimum(speeds.joint_rad_s, speeds.tip_m_s * turn[i, j] / path_m)
+    return move_duration_s(turn, np.maximum(speed, 1e-9), speeds.joint_rad_s2)
 
 
 def tips(arm: ArmModel, q_rad: Array) -> Array:

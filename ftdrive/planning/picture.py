@@ -31,7 +31,7 @@ def draw(plan: Plan, arm: ArmModel, path: Path) -> None:
             axes.plot(arm_line[:, across], arm_line[:, up], "-o", color="tab:gray", markersize=3, linewidth=1)
             axes.plot(tool_line[:, across], tool_line[:, up], color="tab:orange", linewidth=2)
         turn = np.linspace(0, 2 * np.pi, 100)
-        centre, ball = at.wrist_m[0], plan.ball_m
+        centre, ball = plan.ball_centre_m, plan.ball_m
         axes.plot(centre[across] + ball * np.cos(turn), centre[up] + ball * np.sin(turn), ":", color="tab:blue")
         axes.set_aspect("equal")
         axes.set_title(title)

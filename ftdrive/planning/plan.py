@@ -18,6 +18,7 @@ from ftdrive.planning.certify import Certificate, Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
 
 PLAN_FORMAT = "ftdrive.plan/1"
+BALL_SAMPLES = 181
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +26,7 @@ class Step:
     """One pose, and the move from it to the next one; the last move leads back to the first pose."""
 
     number: int
-    """Of the orientation in the paper."""
+    """Of the orientation in the paper, 1 to 24; from 101 on for chosen poses."""
     q_rad: tuple[float, ...]
     R_base_flange: tuple[tuple[float, ...], ...]
     turn_rad: float
@@ -44,7 +45,7 @@ class Plan:
     """See `to_dict` for the file."""
 
     kind: str
-    """constant, wrist or posture."""
+    """constant, wrist, posture, box, cone or reachable."""
     why: tuple[str, ...]
     """What was tried, and what the choice costs."""
     made_for: Mapping[str, str]
@@ -52,6 +53,9 @@ class Plan:
     steps: tuple[Step, ...]
     acceleration_rad_s2: float
     ball_m: float
+    """Radius of a ball that all of the wrist and the tool stays in."""
+    ball_centre_m: tuple[float, ...]
+    """(3,) in base; where the axes of joints 4 and 5 cross, if base, shoulder and elbow rest."""
     predicted: Mapping[str, Any]
     description: Mapping[str, Any]
     """Model, tool, scene and speeds in words and numbers."""
@@ -66,6 +70,11 @@ class Plan:
         """Whether every move, the last one back included, is proven clear."""
         return all(step.certified for step in self.steps)
 
+    @property
+    def arm_rests(self) -> bool:
+        """Whether base, shoulder and elbow stand still all along the tour."""
+        return len({step.q_rad[:3] for step in self.steps}) == 1
+
     def to_dict(self) -> dict[str, Any]:
         """Give the contents of the file; its hash over all the rest shows a change by hand."""
         document: dict[str, Any] = {
@@ -79,6 +88,7 @@ class Plan:
             "motion_time_s": float(sum(step.duration_s for step in self.steps)),
             "min_clearance_mm": 1e3 * min(step.clearance_m for step in self.steps),
             "ball_m": self.ball_m,
+            "ball_centre_m": list(self.ball_centre_m),
             "predicted_sigma": dict(self.predicted),
             "acceleration_rad_s2": self.acceleration_rad_s2,
             "made_for": dict(self.made_for),
@@ -114,6 +124,7 @@ class Plan:
             steps,
             document["acceleration_rad_s2"],
             document["ball_m"],
+            tuple(document["ball_centre_m"]),
             document["predicted_sigma"],
             document["description"],
         )
@@ -138,7 +149,22 @@ def make_plan(
     speeds: Speeds,
     guess: Guess,
 ) -> Plan:
-    """Certify and price a closed tour through joint vectors (n, 6)."""
+    """Certify and price a closed tour through joint vectors (n, 6).
+
+    Parameters
+    ----------
+    kind : str
+    why : sequence of str
+        Sentences; what the choice costs is added.
+    certifier : Certifier
+    numbers : sequence of int
+        Of the orientations.
+    q_rad : array, shape (n, 6)
+        In the order of travel.
+    speeds : Speeds
+    guess : Guess
+        Of the tool and the noise, for the prediction.
+    """
     arm, following = certifier.arm, np.roll(q_rad, -1, axis=0)
     certificate: Certificate = certifier.certify(q_rad, following)
     R = arm.frames(q_rad).R_base_flange
@@ -146,7 +172,8 @@ def make_plan(
     speed = speed_of_leading_joint(arm, q_rad, following, speeds)
     duration = move_duration_s(turn, speed, speeds.joint_rad_s2)
     prediction = predicted_sigma(R, guess)
-    cost = prediction.force_rms_N / predicted_sigma(special(range(1, 25)), guess).force_rms_N
+    all_24 = predicted_sigma(special(range(1, 25)), guess).force_rms_N
+    ball_centre_m, ball_m = _ball(certifier, q_rad, following)
     steps = tuple(
         Step(
             int(numbers[i]),
@@ -163,11 +190,16 @@ def make_plan(
     )
     return Plan(
         kind,
-        (*why, f"Predicted error of force compensation: {cost:.2f} times that of all 24 poses."),
+        (
+            *why,
+            f"Predicted error of force compensation: {prediction.force_rms_N:.3f} N, "
+            f"{prediction.force_rms_N / all_24:.2f} times that of all 24 poses.",
+        ),
         fingerprints(certifier),
         steps,
         speeds.joint_rad_s2,
-        arm.ball_m,
+        ball_m,
+        tuple(ball_centre_m.tolist()),
         _as_json(prediction),
         {
             "model": arm.name,
@@ -182,6 +214,17 @@ def make_plan(
             },
         },
     )
+
+
+def _ball(certifier: Certifier, start_rad: Array, end_rad: Array) -> tuple[Array, float]:
+    """Centre (3,) and radius of a ball that holds the wrist and the tool all along the moves."""
+    share = np.linspace(0, 1, BALL_SAMPLES)[:, None, None]
+    wrist_m = certifier.arm.frames(((1 - share) * start_rad + share * end_rad).reshape(-1, 6)).wrist_m
+    centre_m = (wrist_m.min(axis=0) + wrist_m.max(axis=0)) / 2
+    # Between two samples the wrist centre can be farther out by no more than half a step of its path.
+    step_m = np.linalg.norm(np.diff(wrist_m.reshape(BALL_SAMPLES, -1, 3), axis=0), axis=2).max()
+    away_m = np.linalg.norm(wrist_m - centre_m, axis=1).max() + step_m / 2
+    return centre_m, certifier.arm.ball_m + float(away_m)
 
 
 def fingerprints(certifier: Certifier) -> dict[str, str]:

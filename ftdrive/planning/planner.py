@@ -1,34 +1,49 @@
-"""The choice of a plan: the constant tour where it fits, else what comes next, and why."""
+"""The choice of a plan: the constant tour where it fits, else what comes next, and why.
+
+All 24 orientations come before anything else, for they tell most; of the ways to reach them, those that keep base,
+shoulder and elbow at rest; where they are out of reach, the most telling poses that are not.
+"""
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from calib.design import SUBSET_6, T12, Guess, special
-from calib.tour import wrist_tour
 from drivers.ur.kinematics import Array
 from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.planning import constant_tour
+from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.certify import Certifier
+from ftdrive.planning.chosen import Chosen, chosen_tour
+from ftdrive.planning.free_box import box_tour
+from ftdrive.planning.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds
+from ftdrive.planning.nodes import wrist_nodes
 from ftdrive.planning.plan import Plan, make_plan
-from ftdrive.planning.tours import allowed_moves, shortest_tour, wrist_nodes
+from ftdrive.planning.postures import with_room
+from ftdrive.planning.tours import clear_tour
+
+__all__ = [
+    "NUMBERS",
+    "USUAL_POSTURE_RAD",
+    "Approach",
+    "guess_of",
+    "plan_approach",
+    "plan_box",
+    "plan_cone",
+    "plan_tour",
+]
 
 USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 """Where all models have room for the constant tour with usual tools; the wrist is at its first pose."""
 NUMBERS = {24: tuple(range(1, 25)), 12: T12, 6: SUBSET_6}
-_GRID_DEG = 10
-_SHOULDER_DEG, _ELBOW_DEG = range(-180, 1, _GRID_DEG), range(-160, 161, _GRID_DEG)
-_PANS_DEG = (0, 45, -45, 90, -90, 135, -135, 180)
-_DIFFERENT_SHAPES = (0, 1, 2, 5, 11, 19)
-"""Stops of the constant tour that differ in psi and q5."""
-_BATCH = 40
-LEVEL = 1e-9
-MOST_POSTURES = 200
-"""Postures whose tour is tried, so that a hopeless cell is told within seconds."""
+BOX_HALF_SIZE_M = 0.1
+FEWEST_CHOSEN = 6
+
+Found = tuple[Sequence[int], Array]
+"""Numbers of the orientations and joint vectors (n, 6), in the order of travel."""
 
 
 def guess_of(certifier: Certifier, mass_kg: float = 1.0) -> Guess:
@@ -40,98 +55,229 @@ def guess_of(certifier: Certifier, mass_kg: float = 1.0) -> Guess:
 def plan_tour(
     certifier: Certifier, q_rad: ArrayLike = USUAL_POSTURE_RAD, poses: int = 24, *, speeds: Speeds, guess: Guess
 ) -> Plan:
-    """Plan a tour of the special orientations, with joints 1 to 3 as they stand if that is possible.
+    """Plan a tour of the special orientations if there is one, else of the most telling poses in reach.
 
     Parameters
     ----------
+    certifier : Certifier
     q_rad : array_like, shape (6,)
         Where the arm stands.
     poses : {24, 12, 6}
+    speeds : Speeds
+    guess : Guess
+        Of the tool and the noise.
+
+    Returns
+    -------
+    Plan
+        Of kind "constant", "wrist", "posture", "box" or "reachable", in this order of preference.
 
     Raises
     ------
     PlanRefused
-        Neither here nor in another posture is there a tour whose moves are all proven clear.
+        There is no tour whose moves are all proven clear.
     """
-    stands = _checked(q_rad)
-    if poses not in NUMBERS:
-        raise ConfigError(f"a plan of {poses} poses is not known: take {', '.join(map(str, NUMBERS))}")
+    stands = checked_joints(q_rad)
+    numbers = _numbers(poses)
+
+    def made(kind: str, why: Sequence[str], found: Found) -> Plan:
+        return make_plan(kind, why, certifier, *found, speeds, guess)
+
     if poses == 24:
-        constant = _constant(certifier, stands)
-        if constant is not None:
+        if (found := _constant(certifier, stands)) is not None:
             why = ["The constant tour is proven clear where the arm stands; base, shoulder and elbow stay at rest."]
-            return make_plan("constant", why, certifier, *constant, speeds, guess)
+            return made("constant", why, found)
         reason = "The constant tour cannot be proven clear where the arm stands"
     else:
         reason = f"{poses} of the 24 orientations were asked for"
-    short = _wrist(certifier, stands, poses, speeds)
-    if short is not None:
+    if (found := _wrist(certifier, stands, numbers, speeds)) is not None:
         why = [f"{reason}: the wrist visits them in the order that is fastest here, base, shoulder and elbow at rest."]
-        return make_plan("wrist", why, certifier, *short, speeds, guess)
-    for posture in _postures(certifier, stands):
-        elsewhere = _constant(certifier, posture)
-        if elsewhere is not None and poses < 24:
-            elsewhere = _wrist(certifier, posture, poses, speeds)
+        return made("wrist", why, found)
+    for posture, constant in _postures(certifier, stands):
+        elsewhere = constant if poses == 24 else _wrist(certifier, posture, numbers, speeds)
         if elsewhere is not None:
-            first = np.degrees(posture[:3]).round().astype(int).tolist()
-            why = [
-                f"{reason}, and the wrist alone finds no way there.",
-                f"With joints 1 to 3 at {first} degrees it does: jog there, that move is not part of the plan.",
-            ]
-            return make_plan("posture", why, certifier, *elsewhere, speeds, guess)
+            return made(
+                "posture", [f"{reason}, and the wrist alone finds no way there.", _jog_there(posture)], elsewhere
+            )
+    nowhere = f"{reason}, and no posture of joints 1 to 3 that was tried lets the wrist alone visit the orientations."
+    for centre_m in _box_centres(certifier, stands):
+        if (found := _box(certifier, stands, numbers, centre_m, BOX_HALF_SIZE_M, speeds)) is not None:
+            return made("box", [nowhere, _box_words(centre_m, BOX_HALF_SIZE_M)], found)
+    chosen = chosen_tour(certifier, stands, poses, np.pi, certifier.scene.down_base, speeds, guess)
+    if chosen is not None:
+        why = ["Not all of the orientations are in reach: the poses that tell most among those that are.", nowhere]
+        return made("reachable", [*why, *_chosen_words(chosen)], (chosen.numbers, chosen.q_rad))
     raise PlanRefused(
-        f"{reason}, and none of the other postures of joints 1 to 3 that were tried has a tour that is proven clear: "
-        "describe the tool more closely, or free the scene"
+        f"{reason}, and neither another posture, nor room for the flange, nor other poses give a tour that is proven "
+        "clear: describe the tool more closely, or free the scene"
     )
 
 
-def _checked(q_rad: ArrayLike) -> Array:
-    q = np.asarray(q_rad, dtype=np.float64)
-    if q.shape != (6,) or not np.all(np.abs(q) <= 2 * np.pi):
-        raise ConfigError(f"joints are {np.degrees(q).round(1).tolist()} degrees: give six within one turn of zero")
-    return q
+def plan_cone(
+    certifier: Certifier,
+    q_rad: ArrayLike = USUAL_POSTURE_RAD,
+    poses: int = 24,
+    *,
+    half_angle_rad: float,
+    axis_base: ArrayLike | None = None,
+    speeds: Speeds,
+    guess: Guess,
+) -> Plan:
+    """Plan a tour of chosen poses that keeps the tool axis in a cone.
+
+    Parameters
+    ----------
+    certifier : Certifier
+    q_rad : array_like, shape (6,)
+        Where the arm stands.
+    poses : int
+        6 or more.
+    half_angle_rad : float
+        Between the tool axis (flange z) and the axis of the cone.
+    axis_base : array_like, shape (3,), optional
+        Of the cone, in base; straight down if not given.
+    speeds : Speeds
+    guess : Guess
+
+    Returns
+    -------
+    Plan
+        Of kind "cone".
+
+    Raises
+    ------
+    PlanRefused
+        There is no tour whose moves are all proven clear.
+    """
+    stands = checked_joints(q_rad)
+    axis = certifier.scene.down_base if axis_base is None else np.asarray(axis_base, dtype=np.float64)
+    if not (0 < half_angle_rad <= np.pi and poses >= FEWEST_CHOSEN):
+        raise ConfigError(
+            f"a cone of {np.degrees(half_angle_rad):g} degrees with {poses} poses cannot be planned: give above 0 to "
+            f"180 degrees, and {FEWEST_CHOSEN} poses or more"
+        )
+    if axis.shape != (3,) or not np.linalg.norm(axis) > 0:
+        raise ConfigError(f"the axis of the cone is {axis.tolist()}: give a direction in base axes, such as 0, 0, -1")
+    chosen = chosen_tour(certifier, stands, poses, half_angle_rad, axis, speeds, guess)
+    if chosen is None:
+        raise PlanRefused(
+            f"{poses} poses with the tool within {np.degrees(half_angle_rad):.0f} degrees of the axis of the cone are "
+            "not in reach of the wrist, or no tour of them is proven clear: widen the cone, or stand elsewhere"
+        )
+    why = [f"The tool axis stays within {np.degrees(half_angle_rad):.0f} degrees of the axis of the cone."]
+    return make_plan("cone", [*why, *_chosen_words(chosen)], certifier, chosen.numbers, chosen.q_rad, speeds, guess)
 
 
-def _constant(certifier: Certifier, q_rad: Array) -> tuple[Sequence[int], Array] | None:
-    try:
-        tour = wrist_tour(q_rad)
-    except ValueError:  # joint 4 would leave its range
+def plan_box(
+    certifier: Certifier,
+    q_rad: ArrayLike = USUAL_POSTURE_RAD,
+    poses: int = 24,
+    *,
+    half_size_m: float = BOX_HALF_SIZE_M,
+    centre_m: ArrayLike | None = None,
+    speeds: Speeds,
+    guess: Guess,
+) -> Plan:
+    """Plan a tour of the special orientations with the flange free in a box. Base, shoulder and elbow move too.
+
+    Parameters
+    ----------
+    certifier : Certifier
+    q_rad : array_like, shape (6,)
+        Where the arm stands.
+    poses : {24, 12, 6}
+    half_size_m : float
+        Half the length of the edges of the box, which are along the base axes.
+    centre_m : array_like, shape (3,), optional
+        Of the box, in base; where the flange is if not given.
+    speeds : Speeds
+    guess : Guess
+
+    Returns
+    -------
+    Plan
+        Of kind "box".
+
+    Raises
+    ------
+    PlanRefused
+        There is no tour whose moves are all proven clear.
+    """
+    stands = checked_joints(q_rad)
+    if not 0 <= half_size_m <= 1:
+        raise ConfigError(f"the box is {half_size_m:g} m to each side: give 0 to 1")
+    centre = certifier.arm.frames(stands).flange_m[0] if centre_m is None else np.asarray(centre_m, dtype=np.float64)
+    found = _box(certifier, stands, _numbers(poses), centre, half_size_m, speeds)
+    if found is None:
+        raise PlanRefused(
+            f"with the flange within {1e3 * half_size_m:.0f} mm of {_point(centre)} not all {poses} orientations are "
+            "in reach, or no tour of them is proven clear: give a larger box, or another centre"
+        )
+    return make_plan("box", [_box_words(centre, half_size_m)], certifier, *found, speeds, guess)
+
+
+def _numbers(poses: int) -> tuple[int, ...]:
+    if poses not in NUMBERS:
+        raise ConfigError(f"a plan of {poses} poses is not known: take {', '.join(map(str, NUMBERS))}")
+    return NUMBERS[poses]
+
+
+def _constant(certifier: Certifier, q_rad: Array) -> Found | None:
+    q = constant_tour.constant_tour(q_rad)
+    if not certifier.certify(q, np.roll(q, -1, axis=0), tight=False).clear.all():
         return None
-    q = np.array([pose.q_rad for pose in tour])
-    clear = certifier.certify(q, np.roll(q, -1, axis=0), tight=False).clear.all()
-    return ([pose.number for pose in tour], q) if clear else None
+    return constant_tour.NUMBERS, q
 
 
-def _wrist(certifier: Certifier, q_rad: Array, poses: int, speeds: Speeds) -> tuple[Sequence[int], Array] | None:
-    numbers = NUMBERS[poses]
-    pan = Rotation.from_euler("z", q_rad[0] - np.pi / 4).as_matrix()
-    q, group = wrist_nodes(certifier, q_rad, pan @ special(numbers))
-    if len(np.unique(group)) < poses:
+def _wrist(certifier: Certifier, q_rad: Array, numbers: Sequence[int], speeds: Speeds) -> Found | None:
+    q, group = wrist_nodes(certifier, q_rad, _at_pan(q_rad, numbers))
+    if len(np.unique(group)) < len(numbers):
         return None
-    order = shortest_tour(q, group, allowed_moves(certifier, q, group), speeds)
+    order = clear_tour(certifier, q, group, speeds)
     return None if order is None else ([numbers[g] for g in group[order]], q[order])
 
 
-def _postures(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
-    """Other postures of joints 1 to 3 in which the poses of the constant tour are free, the nearest first."""
-    level = not certifier.scene.boxes and all(np.hypot(*plane.normal[:2]) < LEVEL for plane in certifier.scene.planes)
-    pans = q_rad[0] + np.radians(_PANS_DEG[:1] if level else _PANS_DEG)  # nothing distinguishes one pan from another
-    grid = np.array(list(product(pans, np.radians(_SHOULDER_DEG), np.radians(_ELBOW_DEG))))
-    grid = grid[np.abs(grid[:, 0]) <= 2 * np.pi]
-    away = np.abs(grid - q_rad[:3])
-    grid = grid[np.argsort(away.max(axis=1) + 0.01 * away.sum(axis=1), kind="stable")]
-    tried = 0
-    for batch in np.array_split(grid, max(1, len(grid) // _BATCH)):
-        tours = []
-        for first in batch:
-            with suppress(ValueError):  # joint 4 would leave its range
-                tours.append([pose.q_rad for pose in wrist_tour([*first, *q_rad[3:]])])
-        if not tours:
-            continue
-        # Turning joint 6 alone brings a new pose, but hardly a new shape: the rest is for the proof.
-        q = np.array(tours)[:, _DIFFERENT_SHAPES]
-        for i in np.flatnonzero(certifier.free(q.reshape(-1, 6)).reshape(q.shape[:2]).all(axis=1)):
-            tried += 1
-            yield np.array(tours[i][0])
-            if tried == MOST_POSTURES:
-                return
+def _postures(certifier: Certifier, q_rad: Array) -> Iterator[tuple[Array, Found]]:
+    for tour in with_room(certifier, q_rad):
+        if certifier.certify(tour, np.roll(tour, -1, axis=0), tight=False).clear.all():
+            yield tour[0], (constant_tour.NUMBERS, tour)
+
+
+def _box(
+    certifier: Certifier, q_rad: Array, numbers: Sequence[int], centre_m: Array, half_size_m: float, speeds: Speeds
+) -> Found | None:
+    found = box_tour(certifier, q_rad, _at_pan(q_rad, numbers), centre_m, half_size_m, speeds)
+    return None if found is None else ([numbers[g] for g in found[0]], found[1])
+
+
+def _box_centres(certifier: Certifier, q_rad: Array) -> Array:
+    """Where the flange is, and where it would be in the usual posture with this pan."""
+    usual = np.array([q_rad[0], *USUAL_POSTURE_RAD[1:]])
+    return certifier.arm.frames([q_rad, usual]).flange_m
+
+
+def _at_pan(q_rad: Array, numbers: Sequence[int]) -> Array:
+    """Orientations (n, 3, 3) as the constant tour would visit them: turned about base z with joint 1."""
+    return np.asarray(Rotation.from_euler("z", q_rad[0] - np.pi / 4).as_matrix() @ special(numbers))
+
+
+def _chosen_words(chosen: Chosen) -> list[str]:
+    lost = chosen.force_rms_N / chosen.ideal_force_rms_N
+    words = [f"Of that, {lost:.2f} times the error of the poses that would be best if the arm reached them."]
+    return [*words, _jog_there(chosen.q_rad[0])] if chosen.elsewhere else words
+
+
+def _jog_there(q_rad: Array) -> str:
+    first = np.degrees(q_rad[:3]).round().astype(int).tolist()
+    return f"With joints 1 to 3 at {first} degrees there is a tour: jog there, that move is not part of the plan."
+
+
+def _box_words(centre_m: Array, half_size_m: float) -> str:
+    return (
+        f"The flange goes where it has room within {1e3 * half_size_m:.0f} mm of {_point(centre_m)}: base, shoulder "
+        "and elbow move too, and the whole arm needs its room."
+    )
+
+
+def _point(centre_m: Array) -> str:
+    return "(" + ", ".join(f"{value:.2f}" for value in centre_m) + ") m in base"

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.tour import wrist_tour
 from drivers.ur.kinematics import Array
 from ftdrive.errors import ConfigError
 from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier, Margins
+from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.scene import Box, Plane, Scene
 from ftdrive.planning.shapes import Bodies, height_above, separation, separation_from_box
 
@@ -99,7 +99,7 @@ def test_no_point_of_arm_or_tool_moves_faster_than_its_bound(model: str) -> None
 @pytest.mark.parametrize("tool", TOOLS)
 @pytest.mark.parametrize("model", MODELS)
 def test_constant_tour_is_clear(model: str, tool: tuple[Cylinder, ...]) -> None:
-    poses = np.array([pose.q_rad for pose in wrist_tour(STANDS)])
+    poses = constant_tour(STANDS)
     moves = poses, np.roll(poses, -1, axis=0)
     certifier = Certifier(ArmModel(model, tool), Scene())
     certificate = certifier.certify(*moves)
@@ -163,6 +163,23 @@ def test_margins_are_kept_exactly() -> None:
         assert Certifier(arm, Scene(), margins).free([STANDS])[0] is np.bool_(expected)
         margins = replace(margins, self_m=0.0, scene_m=float(outside[0]) + change)
         assert Certifier(arm, Scene(), margins).free([STANDS])[0] is np.bool_(expected)
+
+
+@pytest.mark.parametrize("model", ["UR3e", "UR20"])
+def test_stated_clearance_is_not_above_the_distance_of_points_on_the_surfaces(model: str) -> None:
+    arm = ArmModel(model, TOOLS[3])
+    poses = constant_tour(STANDS)
+    following = np.roll(poses, -1, axis=0)
+    stated = Certifier(arm, Scene()).certify(poses, following).self_clearance_m.min()
+    share = np.random.default_rng(0).random((24, 1))
+    bodies = arm.bodies(poses + share * (following - poses))
+    least = np.inf
+    for place in range(24):
+        points = [surface(bodies[np.array([place]), np.array([k])]) for k in range(len(arm.names))]
+        for a, b in arm.pairs:
+            gap = np.sqrt(((points[a][::3, None] - points[b][::3]) ** 2).sum(axis=2)).min()
+            least = min(least, gap - bodies.rounding_m[a] - bodies.rounding_m[b])
+    assert 0.02 < stated <= least < stated + 0.04
 
 
 @pytest.mark.parametrize("model", ["UR15", "UR5", "Panda"])

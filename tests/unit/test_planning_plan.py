@@ -11,7 +11,7 @@ import pytest
 from calib.design import special
 from drivers.ur.kinematics import Array
 from ftdrive.errors import ConfigError, PlanRefused
-from ftdrive.planning.arm_model import ArmModel, Cylinder
+from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier, Margins
 from ftdrive.planning.motion import Speeds, move_duration_s, tips
 from ftdrive.planning.plan import Plan
@@ -51,7 +51,9 @@ def test_figures_of_the_constant_tour(model: str) -> None:
     assert document["max_move_deg"] <= 90.1
     assert document["motion_time_s"] == pytest.approx(54.0)  # 24 moves of 90 degrees at 60 degrees/s and 80 degrees/s2
     assert document["min_clearance_mm"] > 20
-    assert planned(certifier_of(model)).to_dict()["motion_time_s"] <= 62
+    slower = [planned(certifier_of(model, tool)).to_dict() for tool in TOOLS]
+    assert {one["kind"] for one in slower} == {"constant"}
+    assert max(one["motion_time_s"] for one in slower) <= 62
 
 
 def test_ball_holds_every_point_of_the_tool() -> None:
@@ -183,18 +185,18 @@ def test_shortest_tour_is_the_best_of_all() -> None:
         for picks in itertools.product(range(3), repeat=5)
         for closed in [list(zip((0, *order), picks, strict=True))]
     )
-    tour = shortest_tour(q, group, allowed, NO_TIP_LIMIT)
+    tour = shortest_tour(cost, group, allowed)
     assert tour is not None
     assert sorted(group[tour]) == [0, 1, 2, 3, 4]
     assert cost[tour, np.roll(tour, -1)].sum() == pytest.approx(best)
     allowed[group == 2] = allowed[:, group == 2] = False
-    assert shortest_tour(q, group, allowed, NO_TIP_LIMIT) is None
+    assert shortest_tour(cost, group, allowed) is None
 
 
 def test_random_plans_sampled_at_half_a_degree_are_clear() -> None:
     rng = np.random.default_rng(7)
     made = 0
-    for model in MODELS * 5:
+    for model in [*SHAPES] * 3:
         certifier = certifier_of(model, TOOLS[rng.integers(4)])
         q = USUAL_POSTURE_RAD + np.concatenate([rng.uniform(-0.4, 0.4, 3), np.zeros(3)])
         tour = np.array([p.q_rad for p in planned(certifier, q, 6 if made % 3 else 24).tour])
@@ -202,7 +204,7 @@ def test_random_plans_sampled_at_half_a_degree_are_clear() -> None:
         path = (1 - share) * tour + share * np.roll(tour, -1, axis=0)
         assert certifier.free(path.reshape(-1, 6)).all()  # farther away than the margins of 20 and 30 mm
         made += 1
-    assert made == 30
+    assert made == 24
 
 
 def test_posture_that_cannot_be_is_refused() -> None:

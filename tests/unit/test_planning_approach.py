@@ -1,0 +1,134 @@
+"""The way to the first pose, and the cell it is judged in."""
+
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drivers.ur.kinematics import Array
+from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.planning.arm_model import ArmModel, Cylinder
+from ftdrive.planning.cell import certifier_for
+from ftdrive.planning.certify import Certifier
+from ftdrive.planning.motion import Speeds
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, Approach, plan_approach
+from ftdrive.planning.scene import BASE_PLANE, Box, Plane, Scene
+
+TOOL = (Cylinder(0, 0.2, 0.1),)
+CROWDED = Scene(
+    (BASE_PLANE, Plane((0.0, -1.0, 0.0), -0.45), Plane((-1.0, 0.0, 0.0), -0.6)),
+    (Box((-0.9, -0.6, 0.0), (-0.3, -0.2, 0.3)), Box((0.3, -0.6, 0.0), (0.5, 0.2, 0.9))),
+)
+SLOW = Speeds.first_run()
+
+
+def sampled_clear(certifier: Certifier, q_now: Array, approach: Approach) -> bool:
+    ends = np.vstack([q_now, approach.q_rad])
+    share = np.linspace(0, 1, 721)[:, None, None]
+    path = (1 - share) * ends[:-1] + share * ends[1:]
+    return bool(certifier.free(path.reshape(-1, 6)).all())
+
+
+def random_free(certifier: Certifier, rng: np.random.Generator) -> Array:
+    while True:
+        q = rng.uniform(-np.pi, np.pi, 6) * [1, 0.5, 0.9, 1, 1, 1] - [0, np.pi / 2, 0, 0, 0, 0]
+        if certifier.free(q)[0]:
+            return np.asarray(q)
+
+
+def test_a_clear_way_is_one_straight_move_at_the_slow_speed() -> None:
+    certifier = Certifier(ArmModel("UR5e", TOOL), Scene())
+    now = USUAL_POSTURE_RAD + np.radians([30, 10, -20, 10, 0, -90])
+    approach = plan_approach(certifier, now, USUAL_POSTURE_RAD, SLOW)
+    assert approach.straight
+    assert np.array_equal(approach.q_rad, [USUAL_POSTURE_RAD])
+    assert approach.certified
+    assert approach.clearance_m > 0.02
+    assert approach.speed_rad_s[0] <= np.radians(30)
+    assert approach.duration_s > 90 / 30
+
+
+def test_ways_through_a_crowded_cell_are_clear_where_sampled_and_quick_to_find() -> None:
+    rng = np.random.default_rng(2)
+    detours = 0
+    for model in ("UR3e", "UR5e") * 6:
+        certifier = Certifier(ArmModel(model, TOOL), CROWDED)
+        now = random_free(certifier, rng)
+        begin = time.process_time()
+        approach = plan_approach(certifier, now, USUAL_POSTURE_RAD, SLOW)
+        assert time.process_time() - begin < 5  # 0.6 s at most when the machine is its own
+        assert approach.certified
+        assert np.array_equal(approach.q_rad[-1], USUAL_POSTURE_RAD)
+        assert np.abs(approach.q_rad).max() <= 2 * np.pi
+        assert sampled_clear(certifier, now, approach)
+        detours += not approach.straight
+        again = plan_approach(certifier, now, USUAL_POSTURE_RAD, SLOW)
+        assert np.array_equal(again.q_rad, approach.q_rad)
+    assert detours > 1
+
+
+def test_a_wound_joint_is_unwound_and_never_wound_further() -> None:
+    certifier = Certifier(ArmModel("UR5e", TOOL), Scene())
+    now = USUAL_POSTURE_RAD.copy()
+    now[5] = np.radians(350)
+    approach = plan_approach(certifier, now, USUAL_POSTURE_RAD, SLOW)
+    assert np.array_equal(approach.q_rad, [USUAL_POSTURE_RAD])
+    with pytest.raises(ConfigError, match="one turn"):
+        plan_approach(certifier, now + np.radians([0, 0, 0, 0, 0, 20]), USUAL_POSTURE_RAD, SLOW)
+
+
+def test_no_way_is_refused_with_the_joints_to_jog_to() -> None:
+    # Walls close around the column of the base hold the arm where it is.
+    walls = [Box((x, y, 0.0), (x + 0.05, y + 0.9, 2.0)) for x, y in ((-0.75, -0.9), (0.75, -0.9))]
+    front = [Box((-0.9, y, 0.0), (0.9, y + 0.02, 2.0)) for y in (0.25, -0.95)]
+    certifier = Certifier(ArmModel("UR5e", TOOL), Scene(boxes=(*walls, *front)))
+    now = USUAL_POSTURE_RAD.copy()
+    now[0] -= np.pi
+    open_ = Certifier(ArmModel("UR5e", TOOL), Scene())
+    assert open_.free(now)[0]
+    with pytest.raises(PlanRefused, match=r"jog the arm to within 30 degrees of joints 45, -100, 60, -50, 90, 45"):
+        plan_approach(certifier, now, USUAL_POSTURE_RAD, SLOW)
+
+
+def test_an_arm_that_stands_too_near_to_something_is_told_what() -> None:
+    arm = ArmModel("UR5e", TOOL)
+    low = float(arm.frames(USUAL_POSTURE_RAD).wrist_m[0, 2])
+    certifier = Certifier(arm, Scene((Plane((0.0, 0.0, 1.0), low - 0.06),)))
+    away = USUAL_POSTURE_RAD - np.radians([0, 20, 0, 0, 0, 0])
+    with pytest.raises(PlanRefused, match=r"mm from contact \(.*plane 1\), less than the margin of 30 mm: jog"):
+        plan_approach(certifier, USUAL_POSTURE_RAD, away, SLOW)
+
+
+def cell(**changes: object) -> SimpleNamespace:
+    tool = {"cylinders_mm": ((0, 200, 100), (20, 60, 30, 70, -10))}
+    workcell = {"mounting": "wall", "planes_mm": ((0, -2, 0, -800),), "boxes_mm": ((400, 0, 300, 300, -600, 0),)}
+    return SimpleNamespace(
+        tool=SimpleNamespace(**{k: changes.get(k, v) for k, v in tool.items()}),
+        workcell=SimpleNamespace(**{k: changes.get(k, v) for k, v in workcell.items()}),
+    )
+
+
+def test_a_cell_in_millimetres_becomes_what_judges_moves() -> None:
+    certifier = certifier_for(cell(), "ur10e")
+    assert certifier.arm.name == "UR10e"
+    assert certifier.arm.tool == (Cylinder(0, 0.2, 0.1), Cylinder(0.02, 0.06, 0.03, 0.07, -0.01))
+    assert tuple(certifier.scene.planes) == (BASE_PLANE, Plane((0.0, -1.0, 0.0), -0.8))
+    assert certifier.scene.boxes == (Box((0.3, -0.6, 0.0), (0.4, 0.0, 0.3)),)
+    assert np.allclose(certifier.scene.down_base, [-1, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"cylinders_mm": ()}, "tool is empty"),
+        ({"cylinders_mm": ((0, 200),)}, "3 or 5 numbers"),
+        ({"planes_mm": ((0, 0, 0, 5),)}, "no direction"),
+        ({"boxes_mm": ((0, 0, 0, float("nan"), 1, 1),)}, "6 numbers"),
+        ({"boxes_mm": ((0, 0, 0, 0, 1, 1),)}, "is empty"),
+        ({"mounting": "desk"}, "mounting is 'desk'"),
+    ],
+)
+def test_a_cell_that_cannot_be_is_refused(changes: dict[str, object], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        certifier_for(cell(**changes), "ur5e")
