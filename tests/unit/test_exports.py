@@ -162,8 +162,8 @@ GOLDEN = """\
   movej([0.785398, -1.745329, 1.047198, -0.872665, 1.570796, 0.785398], a=0.349066, v=0.174533)
   textmsg("ftdrive plan HASH: pose 1 of 24, orientation R01")
   sleep(4.000)
-  movej([0.785398, -1.745329, 1.047198, -2.443461, 0.785398, 1.570796], a=1.396263, v=SPEED)
-  textmsg("ftdrive plan HASH: pose 2 of 24, orientation R19")
+  movej([0.785398, -1.745329, 1.047198, -0.872665, 1.570796, -0.785398], a=1.396263, v=SPEED)
+  textmsg("ftdrive plan HASH: pose 2 of 24, orientation R10")
   sleep(4.000)
 """
 
