@@ -19,6 +19,7 @@ HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
 GOAL = vector6([*HOME[:5], HOME[5] + 1.0])
 CONTROL = Upload("rtde_control", "", secondary=False)
 OTHER = Upload("other", "", secondary=False)
+SLEEPING = Upload("other", "def other():\n  sleep(2)\nend\n", secondary=False)
 
 
 def new_robot(polyscope: tuple[int, int, int] = (5, 15, 0)) -> Robot:
@@ -161,7 +162,7 @@ def test_power_comes_back_step_by_step(late: float) -> None:
 
 def test_a_command_to_a_foreign_program_is_noted_as_lost() -> None:
     robot = moving_robot()
-    robot.upload(OTHER, by="another script client", seconds=2.0)
+    robot.upload(SLEEPING, by="another script client")
     run(robot, 0.2)
     assert (robot.runtime, robot.program_name) == (Runtime.PLAYING, "other")
     robot.write_inputs({"input_int_register_0": 34})

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mocks.disturbances import Push
 from mocks.kinematics import MODELS, Vector6, forward, inverse, matrix_of, vector6
 from mocks.world import Truth, World
 
@@ -85,15 +86,10 @@ def test_readings_are_noisy_around_the_truth() -> None:
 def test_a_push_adds_to_the_reading_until_it_ends() -> None:
     world = World(plain(), DH, POSTURE)
     before = world.true_wrench()
-    world.push([1, -2, 3, 0.1, 0.2, -0.3])
+    world.touch("push", Push(np.array([1, -2, 3, 0.1, 0.2, -0.3]), in_sensor=True))
     np.testing.assert_allclose(world.true_wrench() - before, [1, -2, 3, 0.1, 0.2, -0.3])
-    world.push([0] * 6)
+    world.touch("push", None)
     np.testing.assert_allclose(world.true_wrench(), before)
-
-
-def test_a_push_of_five_numbers_is_refused() -> None:
-    with pytest.raises(ValueError, match="reshape"):
-        World(plain(), DH, POSTURE).push([1, 2, 3, 4, 5])
 
 
 def test_bias_drifts_with_time() -> None:
