@@ -52,11 +52,12 @@ def number(value: object, what: str) -> float:
     return value
 
 
-def six(value: Any, what: str, kind: type = list) -> Vector6:
+def six(value: object, what: str, kind: type = list) -> Vector6:
     """Take six numbers: joint angles, or a pose with `kind` Pose."""
-    if type(value) is not kind or len(value) != 6:
-        raise ScriptError(f"{what} must be {'a pose' if kind is Pose else 'six joint values'}, not {value!r}")
-    return vector6([number(v, what) for v in value])
+    values = value if isinstance(value, list) and type(value) is kind else []
+    if len(values) != 6:
+        raise ScriptError(f"{what} must be {'a pose' if kind is Pose else 'six joint values'}, not {shown(value)}")
+    return vector6([number(v, what) for v in values])
 
 
 def function(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
