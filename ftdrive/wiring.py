@@ -8,6 +8,7 @@ from drivers.registry import sensor_from_url
 from drivers.ur.arm import UrArm
 from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError
+from ftdrive.simulation import sensor_url
 
 
 def build_arm(cell: CellConfig) -> UrArm:
@@ -25,7 +26,7 @@ def build_arm(cell: CellConfig) -> UrArm:
 def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
     """Build the sensor's driver, not yet open."""
     try:
-        sensor = sensor_from_url(cell.sensor.url, sign=cell.sensor.sign)
+        sensor = sensor_from_url(sensor_url(cell.sensor.url), sign=cell.sensor.sign)
     except ValueError as error:
         raise ConfigError(str(error)) from error
     _fits: Sensor = sensor

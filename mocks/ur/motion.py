@@ -232,6 +232,11 @@ class Arm:
         """Whether a path is not yet finished."""
         return bool(self._paths)
 
+    @property
+    def _under_way(self) -> bool:
+        """Whether there is motion to be ended: a path that has just been finished ended at rest."""
+        return self.busy and not self.at_rest
+
     def start(self, path: Path, owner: str) -> None:
         """Follow `path` for the program thread `owner`, from rest.
 
@@ -241,7 +246,7 @@ class Arm:
             When another thread of the program controls the arm.
         """
         self._seize(owner)
-        self._follow([path] if self.at_rest else [self._rundown(), path])
+        self._follow([self._rundown(), path] if self._under_way else [path])
 
     def stop_joints(self, deceleration: float, owner: str) -> None:
         """stopj: the fastest joint slows down by `deceleration` (rad/s²)."""
@@ -264,7 +269,7 @@ class Arm:
         """Forget the path of `owner` (of anybody without a name); a moving arm comes to rest by itself."""
         if owner is None or owner == self._owner:
             self._owner = None
-            self._follow([] if self.at_rest else [self._rundown()])
+            self._follow([self._rundown()] if self._under_way else [])
 
     def step(self, dt: float) -> None:
         """Let `dt` seconds pass.
@@ -311,7 +316,7 @@ class Arm:
         if not deceleration > 0.0:
             raise MotionError(f"deceleration {deceleration} must be positive")
         self._seize(owner)
-        self._follow([] if self.at_rest else [Stop(speed / deceleration)])
+        self._follow([Stop(speed / deceleration)] if self._under_way else [])
 
     def _along(self, dt: float) -> Vector6:
         path = self._paths[0]

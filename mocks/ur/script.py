@@ -73,7 +73,7 @@ def take_uploads(buffer: bytearray) -> list[Upload]:
             end, name, secondary = text.find("\n") + 1, "statement", False
             if end == 0 or re.match(r"\s*(def|sec)\b[^\n]*$", text):
                 return uploads
-        if text[:end].strip():
+        if text[:end].strip() and not text[:end].lstrip().startswith("#"):
             uploads.append(Upload(name, text[:end], secondary))
         del buffer[:end]
 
