@@ -52,7 +52,8 @@ class Workcell:
 
     def _push(self, request: Request) -> dict[str, Any]:
         wrench = _numbers(request["wrench"], 6)
-        self._world.touch("push", self._contact(wrench, request, FOREVER_S) if wrench.any() else None)
+        push = self._contact(wrench, request, FOREVER_S)
+        self._world.touch("push", push if wrench.any() else None)
         return {"done": "push"}
 
     def _bump(self, request: Request) -> dict[str, Any]:
