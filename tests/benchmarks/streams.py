@@ -191,13 +191,13 @@ def crew(scheme: str, fault: str) -> int:
 
 
 def endure(emulator: Emulator, fault: str, samples: int) -> Counter[str]:
-    """Let a fault befall one sensor until so many samples have come; counts them, the wrong ones and the errors."""
+    """Let a fault befall one sensor until so many samples have come; counts them, the wrong ones and errors by name."""
     count = Counter(received=0)
     while count["received"] < samples:
         with emulator.sensor() as sensor:
             watched = Watched(sensor)
             emulator.faults(**chances(emulator.kind.scheme, fault))
-            count["told"] += len(suffer(sensor, PIECE_S * 5))
+            count.update(type(error).__name__ for error in suffer(sensor, PIECE_S * 5))
             emulator.faults(**HEALTHY)
             time.sleep(0.05)  # what was delayed belongs to this stream
         count["received"] += len(watched.samples())
@@ -215,11 +215,12 @@ def faults(laboratory: Laboratory, folder: Path, scheme: str, samples: int) -> b
             count = sum(pool.map(partial(endure, fault=fault, samples=-(-samples // size)), emulators), Counter())
         for emulator in emulators:
             emulator.unplug()
-        received, wrong = count["received"], count["wrong"]
+        received, wrong = count.pop("received"), count.pop("wrong", 0)
+        told = "".join(f", {number} {error}" for error, number in count.items())
         allowed = most_wrong(scheme, fault, received)
         passed &= report(
             f"{scheme}, {fault}" + (f" ({size} at a time)" if size > 1 else ""),
-            f"{wrong} wrong of {received}, {count['told']} errors",
+            f"{wrong} wrong of {received}{told}",
             f"<= {allowed:.0f} wrong",
             wrong <= allowed,
         )
