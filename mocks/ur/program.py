@@ -151,6 +151,8 @@ class Program:
                 thread.done = True
             except _Halt:
                 return False
+            except RecursionError:
+                raise ScriptError("functions call each other without an end") from None
         self._threads = [thread for thread in self._threads if not thread.done]
         return not self._main.done
 

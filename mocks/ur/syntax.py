@@ -139,7 +139,10 @@ def parse(text: str, name: str) -> Function:
     UrscriptSyntaxError
         With the line.
     """
-    return _Parser(text).program(name)
+    try:
+        return _Parser(text).program(name)
+    except RecursionError:
+        raise UrscriptSyntaxError("it is nested too deeply") from None
 
 
 def _tokens(text: str) -> list[_Token]:

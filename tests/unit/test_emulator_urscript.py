@@ -5,6 +5,8 @@ from textwrap import indent
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mocks.kinematics import MODELS, vector6
 from mocks.ur.dashboard import answer
@@ -332,6 +334,7 @@ def test_sleep_lasts_in_the_time_of_the_controller() -> None:
         ("  write_output_integer_register(48, 1)", "no register 48"),
         ("  thread t():\n  end\n  t()", "t is a thread: say run"),
         ("  x = sqrt(-1)", "sqrt"),
+        ("  def g():\n    g()\n  end\n  g()", "call each other without an end"),
     ],
 )
 def test_run_time_errors_say_what_is_wrong(body: str, why: str) -> None:
@@ -363,6 +366,22 @@ def test_what_is_no_program_is_refused_with_the_line(text: str, why: str) -> Non
     assert not robot.upload(Upload("f", text, secondary=False))
     assert "syntax error" in robot.events[-1].why
     assert answer(robot, "programState") == "PLAYING g"
+
+
+WORDS = ["def f():\n", "thread t():\n", "if True:\n", "else:\n", "while x < 3:\n", "end\n", "break\n", "halt\n", "\n"]
+WORDS += ["x = ", "x[1]", "f(", "a=", "run ", "kill x\n", "local ", "sync()\n", "not ", "1", "2.5", '"text"', "p[", "#"]
+WORDS += [*"[]),+-", "==", "(" * 3000]
+
+
+@given(st.lists(st.sampled_from(WORDS), max_size=25).map("".join) | st.text(max_size=50))
+def test_whatever_is_sent_is_a_program_or_a_syntax_error_and_harms_nobody(text: str) -> None:
+    """Also what happens to be a program: it runs for a while, ends, or is ended by an error."""
+    robot = new_robot()
+    if robot.upload(Upload("f", f"def f():\n{text}\nend\n", secondary=False)):
+        run(robot, 0.12)
+    else:
+        assert "syntax error" in robot.events[-1].why
+    assert robot.arm.at_rest
 
 
 def test_one_line_alone_is_a_program_too() -> None:
