@@ -189,7 +189,7 @@ def decode_speed() -> bool:
 def crew(scheme: str, fault: str) -> int:
     """How many sensors of a kind suffer at a time, so that together they send about 1000 samples in a second."""
     slow = {("ati-can", "delay"): 16, ("ati-can", "drop"): 6}
-    return slow.get((scheme, fault), {"ati-serial": 1, "robotiq-ft300": 12}.get(scheme, 2))
+    return slow.get((scheme, fault), {"ati-serial": 1, "robotiq-ft300": 12, "robotous-can": 5}.get(scheme, 2))
 
 
 def endure(emulator: Emulator, fault: str, samples: int) -> Counter[str]:
