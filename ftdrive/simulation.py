@@ -1,17 +1,24 @@
 """An emulated cell as a child process: the real drivers talk to it over real wires."""
 
+import atexit
 import json
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, Self
 
 from calib.routine import Sampling
 from drivers.errors import ConnectError
 from ftdrive.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.errors import ConfigError
 
 TIME_SCALE = 20
 """The emulated arm lives this many times faster; nothing else differs from a real cell."""
+
+SENSORS = ("can", "serial", "robotous-can", "robotous-serial", "robotiq", "bota", "netft", "ur-ft")
+"""Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm."""
+EMULATED = "emulated://"
 
 
 class Station:
@@ -19,7 +26,7 @@ class Station:
 
     Parameters
     ----------
-    sensor : {"can", "serial"}
+    sensor : one of `SENSORS`, "both" (can and serial) or "none"
     options : sequence of str
         More options of `python -m mocks station`.
     """
@@ -78,13 +85,36 @@ class Station:
     @property
     def cell(self) -> CellConfig:
         """Configuration that reaches this station as it would reach a real cell."""
-        arm, can, serial = (self.endpoints[wire] for wire in ("arm", "can", "serial"))
-        if self.sensor == "can":
-            url = f"ati-can://{can['channel']}?interface={can['interface']}&bitrate={can['bitrate']}&base={can['base']}"
-        else:
-            url = f"ati-serial://{serial['port']}"
+        arm = self.endpoints["arm"]
+        url = next(iter(self.endpoints["sensors"].values()))["url"]
         return CellConfig(
             robot=RobotConfig(arm["host"], arm["model"], speed_deg_s=60.0, acceleration_deg_s2=80.0),
             sensor=SensorConfig(url),
             sampling=Sampling(average_s=0.4),
         )
+
+
+def sensor_url(url: str) -> str:
+    """Return the address a driver understands: for emulated://NAME that of a sensor which is started for it.
+
+    Its orientation is constant; emulated:// alone is an ATI sensor on CAN. Any other address is returned as it is.
+
+    Raises
+    ------
+    ConfigError
+        Unknown name.
+    """
+    if not url.startswith(EMULATED):
+        return url
+    name = url.removeprefix(EMULATED) or SENSORS[0]
+    if name not in SENSORS:
+        raise ConfigError(f"{url}: there is no such emulated sensor; known: {', '.join(EMULATED + n for n in SENSORS)}")
+    return _emulated_alone(name)
+
+
+@cache
+def _emulated_alone(name: str) -> str:
+    """Start one, which lives as long as this process."""
+    station = Station(name, ["--time-scale", "1"])
+    atexit.register(station.__exit__)
+    return station.__enter__().cell.sensor.url

@@ -9,6 +9,7 @@ from drivers.interfaces import ForceTorqueSensor, RobotArm
 from drivers.registry import arm_class, sensor_from_url
 from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError
+from ftdrive.simulation import sensor_url
 
 
 def build_arm(cell: CellConfig) -> RobotArm:
@@ -27,7 +28,7 @@ def build_arm(cell: CellConfig) -> RobotArm:
 def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
     """Build the sensor's driver, not yet open."""
     try:
-        sensor = sensor_from_url(cell.sensor.url, sign=cell.sensor.sign)
+        sensor = sensor_from_url(sensor_url(cell.sensor.url), sign=cell.sensor.sign)
     except ValueError as error:
         raise ConfigError(str(error)) from error
     _fits: Sensor = sensor

@@ -5,7 +5,8 @@ import sys
 from collections.abc import Callable
 
 from mocks.kinematics import MODELS, Array
-from mocks.station import SENSORS, Station, parse_vector
+from mocks.sensors import CHOICES
+from mocks.station import Station, parse_vector
 from mocks.world import MOUNTS_RAD
 
 
@@ -52,7 +53,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, help="draws the truth below, the noise and the start posture (default 0)")
     add("--host", help="loopback address to listen on (default: a free 127.x.y.z)")
     add("--time-scale", type=_positive, default=1.0, metavar="K", help="the arm moves K times faster than real")
-    add("--sensor", choices=SENSORS, default="can", help="sensor emulators to start (default can)")
+    add("--sensor", choices=CHOICES, default="can", metavar="NAME", help=f"{', '.join(CHOICES)} (default can)")
+    add("--do", action="append", default=[], metavar="JSON", help="a request of the control channel to begin with")
 
     arm = station.add_argument_group("arm")
     add = arm.add_argument
@@ -90,9 +92,12 @@ def _parser() -> argparse.ArgumentParser:
 
 def main() -> int:
     """Run what the command line asks for and return the exit code."""
-    options = _parser().parse_args()
+    parser = _parser()
+    options = parser.parse_args()
     try:
         station = Station(options)
+    except ValueError as error:
+        parser.error(str(error))
     except OSError as error:
         sys.stderr.write(f"cannot listen: {error}\n")
         return 3

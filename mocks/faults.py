@@ -34,7 +34,8 @@ class Faults:
     foreign
         Another node's frame precedes it (CAN).
     delay_s, jitter_s
-        Time on the way, and the largest random time added before each frame; neither changes the order.
+        Time on the way, and the largest random time added to it, for each frame anew; neither changes the order, and
+        a stream does not fall behind.
     stall
         Nothing is sent, as with a broken wire; the device itself goes on.
     """
@@ -89,15 +90,12 @@ class FaultyWire(Generic[Frame]):
         """
         if self._faults.stall:
             return
-        chance = self._random.random
         due_s = time.monotonic() + self._faults.delay_s
-        if self._outbox:
-            due_s = max(due_s, self._outbox[-1][0])
         if self._held or self._faults.harm_frames:
             frames = self._with_faults(frames, stream)
         for frame in frames:
-            due_s += self._faults.jitter_s * chance()
-            self._outbox.append((due_s, frame))
+            last_s = self._outbox[-1][0] if self._outbox else due_s  # nobody overtakes
+            self._outbox.append((max(last_s, due_s + self._faults.jitter_s * self._random.random()), frame))
 
     def due(self, now_s: float) -> list[Frame]:
         """Take the frames that arrive now."""

@@ -14,41 +14,26 @@ import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from importlib import import_module
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from mocks.kinematics import MODELS, Array, Vector6, rotation, vector6
+from mocks.sensors import WRIST, Sensor
 from mocks.ur.operator import Operator
 from mocks.ur.robot import Robot, RobotSettings
 from mocks.ur.server import UrServer
+from mocks.workcell import Workcell
 from mocks.world import MOUNTS_RAD, Truth, World
 
 FORMAT = "mocks.station/1"
-SENSORS = ("can", "serial", "both", "none")
 HOST_TRIALS = 20
-CAN_BASE = 0x20
-CAN_BITRATE = 250_000
 
 START_Q_DEG = (45.0, -100.0, 60.0, -50.0, 90.0, 45.0)
 """Near the first pose of the tour: q4 = -90° - q2 - q3."""
 
 START_SCATTER_DEG = 5.0
 """The wrist starts this far off at most, so that a first move is a real one."""
-
-
-class SensorEmulator(Protocol):
-    """What a sensor emulator offers: it opens its end of a pty in `start` and serves it from its own thread."""
-
-    def start(self) -> str:
-        """Open the pty and return the path a driver opens."""
-
-    def unplug(self) -> None:
-        """Close the pty, as if the cable were pulled."""
-
-    def stop(self) -> None:
-        """End the thread."""
 
 
 def truth_from(options: Namespace) -> Truth:
@@ -75,6 +60,10 @@ def truth_from(options: Namespace) -> Truth:
         changes["force_drift_N_min"] = np.array(options.force_drift)
     if options.torque_drift is not None:
         changes["torque_drift_Nm_min"] = np.array(options.torque_drift)
+    if options.sensor == WRIST:
+        if options.sensor_rotvec_deg is not None:
+            raise ValueError(f"the axes of {WRIST} are those of the flange: leave --sensor-rotvec-deg out")
+        changes["R_flange_sensor"] = np.eye(3)
     return replace(truth, **changes)
 
 
@@ -126,13 +115,12 @@ class Station:
         )
         self._selector = selectors.SelectSelector()  # the only one that waits for less than a millisecond
         self.server = self._listen()
-        self._sensors: dict[str, tuple[SensorEmulator, str]] = {}
+        self._sensors: dict[str, Sensor] = {}
         self._ended = False
         self._line = bytearray()
         self._verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
-            "unplug": self._unplug,
-            "push": self._push,
             "state": self._state,
+            **Workcell(self.world, self._sensors).verbs,
             **Operator(self.robot, self.server).verbs,
         }
 
@@ -143,11 +131,15 @@ class Station:
             signal.signal(number, self._on_signal)
         try:
             self._start_sensors()
+            for request in self._options.do:
+                if "error" in (answer := self._obey(request.encode())):
+                    sys.stderr.write(f"--do {request}: {answer['error']}\n")
+                    return 2
             self._selector.register(sys.stdin.fileno(), selectors.EVENT_READ, self._on_stdin)
             self._say(self._hello())
             self.server.run(lambda: self._ended)
         finally:
-            for sensor, _path in self._sensors.values():
+            for sensor in self._sensors.values():
                 sensor.stop()
             self.server.close()
         return 0
@@ -164,19 +156,14 @@ class Station:
         raise OSError(f"no free loopback address in {HOST_TRIALS} trials: is something listening on 0.0.0.0:30004?")
 
     def _start_sensors(self) -> None:
-        wanted = self._options.sensor
-        if wanted in ("can", "both"):
-            emulator = import_module("mocks.ati_can").AtiCanNode
-            node = emulator(self.world.measure, base=CAN_BASE, bitrate=CAN_BITRATE, seed=self._options.seed)
-            self._sensors["can"] = (node, node.start())
-        if wanted in ("serial", "both"):
-            emulator = import_module("mocks.ati_serial").AtiSerialBox
-            box = emulator(self.world.measure, seed=self._options.seed)
-            self._sensors["serial"] = (box, box.start())
+        wanted = {"both": ("can", "serial"), "none": ()}.get(self._options.sensor, (self._options.sensor,))
+        if WRIST in wanted:
+            self.robot.wrist_sensor = self.world.measure
+        for name in wanted:
+            self._sensors[name] = Sensor(name, self.world.measure, seed=self._options.seed, host=self.server.host)
 
     def _hello(self) -> dict[str, Any]:
-        can = self._sensors.get("can")
-        serial = self._sensors.get("serial")
+        sensors = {name: sensor.endpoint for name, sensor in self._sensors.items()}
         return {
             "format": FORMAT,
             "arm": {
@@ -184,8 +171,9 @@ class Station:
                 "model": self._options.model,
                 "serial_number": self._options.serial_number,
             },
-            "can": can and {"interface": "slcan", "channel": can[1], "bitrate": CAN_BITRATE, "base": CAN_BASE},
-            "serial": serial and {"port": serial[1]},
+            "sensors": sensors,
+            "can": sensors.get("can"),
+            "serial": sensors.get("serial"),
             "truth": self.world.truth.to_json(),
         }
 
@@ -212,25 +200,14 @@ class Station:
     def _obey(self, line: bytes) -> dict[str, Any]:
         try:
             request = json.loads(line)
-            verb = self._verbs[request["do"]]
-        except (ValueError, TypeError, KeyError):
+            verb = self._verbs[request["do"].replace("_", "-")]
+        except (ValueError, TypeError, KeyError, AttributeError):
             known = ", ".join(self._verbs)
             return {"error": f'not understood: {line.decode("utf-8", "replace")}; say {{"do": …}} with {known}'}
         try:
             return verb(request)
         except (ValueError, TypeError, KeyError, OSError) as error:
             return {"error": f"{request['do']}: {error!r}"}
-
-    def _unplug(self, request: dict[str, Any]) -> dict[str, Any]:
-        device = request.get("device", "sensor")
-        names = list(self._sensors) if device == "sensor" else [device]
-        for name in names:
-            self._sensors[name][0].unplug()
-        return {"done": "unplug", "devices": names}
-
-    def _push(self, request: dict[str, Any]) -> dict[str, Any]:
-        self.world.push(request["wrench"])
-        return {"done": "push"}
 
     def _state(self, request: dict[str, Any]) -> dict[str, Any]:
         robot, arm = self.robot, self.robot.arm
@@ -241,6 +218,7 @@ class Station:
             "steady": robot.steady,
             "runtime_state": robot.runtime.name,
             "program": robot.program_name,
+            "popup": robot.popup,
             "robot_mode": robot.robot_mode.name,
             "safety_mode": robot.safety_mode.name,
             "remote_control": robot.remote_control,

@@ -8,18 +8,20 @@ points down reads ``+m g`` on z.
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from mocks.disturbances import Contact, Drift
 from mocks.kinematics import Array, Dh, Vector6, cross, forward, rotation
 
 MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
 """Tilt beta of the base for each mounting."""
 
-_MINUTE_NS = 60_000_000_000
+_MINUTE_S = 60.0
+_NOTHING: Array = np.zeros(6)
 
 
 def _zero3() -> Array:
@@ -106,6 +108,8 @@ def _on_circle(rng: np.random.Generator) -> Array:
 class World:
     """The cell at this instant. The arm emulator writes `q`; sensor emulators call `measure` from their own threads.
 
+    What can change while others read is replaced as a whole, so that they see one instant.
+
     Parameters
     ----------
     truth
@@ -117,7 +121,7 @@ class World:
     seed
         Seed of the noise.
     clock_ns
-        Time for the bias drift; drift is in real minutes whatever the speed of the arm.
+        Time for drift and pushes: real time, whatever the speed of the arm.
     """
 
     def __init__(
@@ -126,42 +130,78 @@ class World:
         self.truth = truth
         self.dh = dh
         self.q = q
-        """Actual joint angles (rad); replaced as a whole, so a reader in another thread sees one instant."""
-        self.contact_wrench: Array = np.zeros(6)
-        """What pushes on the sensor besides gravity, (6,): sensor axes, about its origin; replaced as a whole."""
+        """Actual joint angles (rad)."""
+        self.contacts: dict[str, Contact] = {}
+        """What touches the tool, by any name."""
+        self.drifts: tuple[Drift, ...] = ()
+        """How the zero moves besides the drift of the truth."""
         self._clock_ns = clock_ns
-        self._t0_ns = clock_ns()
+        self._t0_s = self.now_s
         self._lock = threading.Lock()
         self._noise = np.random.default_rng([seed, 2])
         self._noise_sd = np.repeat([truth.noise_force_N, truth.noise_torque_Nm], 3)
-        self._load: tuple[Vector6, Array] | None = None
+        self._load: tuple[Vector6, Truth, Array] | None = None
+        self._override: Array | None = None
+
+    @property
+    def now_s(self) -> float:
+        """The clock of pushes and drift."""
+        return self._clock_ns() * 1e-9
 
     def true_wrench(self) -> Array:
         """Wrench on the sensor without noise, (6,): N and N·m, sensor axes, bias and drift included."""
-        truth = self.truth
-        minutes = (self._clock_ns() - self._t0_ns) / _MINUTE_NS
+        return self.load_wrench() + self.contact_wrench() + self._bias()
+
+    def _bias(self) -> Array:
+        truth, now_s = self.truth, self.now_s
+        minutes = (now_s - self._t0_s) / _MINUTE_S
         force_bias_N = truth.force_bias_N + minutes * truth.force_drift_N_min
         torque_bias_Nm = truth.torque_bias_Nm + minutes * truth.torque_drift_Nm_min
-        return self.load_wrench() + self.contact_wrench + np.concatenate((force_bias_N, torque_bias_Nm))
+        return np.concatenate((force_bias_N, torque_bias_Nm)) + sum((d.at(now_s) for d in self.drifts), _NOTHING)
 
     def load_wrench(self) -> Array:
         """What gravity alone does to the sensor, (6,), sensor axes, about the sensor origin."""
-        q, known = self.q, self._load
-        if known is not None and known[0] is q:
-            return known[1]
-        R_base_sensor = forward(self.dh, q)[:3, :3] @ self.truth.R_flange_sensor
-        force_N = R_base_sensor.T @ self.truth.gravity_force_base_N
-        load = np.concatenate((force_N, cross(self.truth.p_sensor_com_m, force_N)))
-        self._load = (q, load)
+        q, truth, known = self.q, self.truth, self._load
+        if known is not None and known[0] is q and known[1] is truth:
+            return known[2]
+        R_base_sensor = forward(self.dh, q)[:3, :3] @ truth.R_flange_sensor
+        force_N = R_base_sensor.T @ truth.gravity_force_base_N
+        load = np.concatenate((force_N, cross(truth.p_sensor_com_m, force_N)))
+        self._load = (q, truth, load)
         return load
+
+    def contact_wrench(self) -> Array:
+        """What touches the tool besides gravity, (6,): sensor axes, about the sensor origin."""
+        contacts = self.contacts
+        if not contacts:
+            return _NOTHING
+        now_s, q = self.now_s, self.q
+        R_base_sensor = forward(self.dh, q)[:3, :3] @ self.truth.R_flange_sensor
+        felt = {name: contact.wrench(now_s, q, R_base_sensor) for name, contact in contacts.items()}
+        return sum((wrench for wrench in felt.values() if wrench is not None), _NOTHING)
 
     def measure(self, n: int) -> Array:
         """`n` successive noisy readings at this instant, (n, 6): N and N·m, sensor axes. Thread-safe."""
+        override = self._override
+        if override is not None:
+            return np.tile(override, (n, 1))
         with self._lock:
             noise = self._noise.standard_normal((n, 6))
         readings: Array = self.true_wrench() + noise * self._noise_sd
         return readings
 
-    def push(self, wrench: Sequence[float]) -> None:
-        """Let something push on the sensor: (6,) N and N·m in sensor axes about the sensor origin; zeros let go."""
-        self.contact_wrench = np.array(wrench, dtype=float).reshape(6)
+    def touch(self, name: str, contact: Contact | None) -> None:
+        """Let something touch the tool in place of what had that name; None lets go."""
+        others = {key: value for key, value in self.contacts.items() if key != name}
+        self.contacts = others if contact is None else {**others, name: contact}
+
+    def shift_payload(self, mass_kg: float | None, p_sensor_com_m: Array | None) -> None:
+        """Something was lost, screwed on or slipped: from now on this is the truth."""
+        if mass_kg is not None:
+            self.truth = replace(self.truth, mass_kg=mass_kg)
+        if p_sensor_com_m is not None:
+            self.truth = replace(self.truth, p_sensor_com_m=p_sensor_com_m)
+
+    def read_always(self, reading: Array | None) -> None:
+        """Let every reading be this one, (6,); None measures again."""
+        self._override = reading

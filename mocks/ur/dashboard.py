@@ -36,7 +36,6 @@ _QUERIES: dict[str, Callable[[Robot], str]] = {
 
 _TALK = {
     "popup": "showing popup",
-    "close popup": "closing popup",
     "close safety popup": "closing safety popup",
     "addtolog": "Added log message",
     "quit": "Disconnected",
@@ -69,6 +68,11 @@ def _unlock(robot: Robot) -> str | None:
     return "Protective stop releasing" if robot.unlock() else None
 
 
+def _close_popup(robot: Robot) -> str | None:
+    robot.popup = None
+    return "closing popup"
+
+
 def _power_on(robot: Robot) -> str | None:
     return "Powering on" if robot.power_on() else None
 
@@ -92,6 +96,7 @@ _COMMANDS: dict[str, Callable[[Robot], str | None]] = {
     "stop": _stop,
     "pause": _pause,
     "unlock protective stop": _unlock,
+    "close popup": _close_popup,
     "power on": _power_on,
     "power off": _power_off,
     "brake release": _brake_release,

@@ -6,6 +6,7 @@ is paused. A motion that meets a moving arm first brings it to rest: position an
 
 import math
 from collections import deque
+from collections.abc import Generator
 from typing import Protocol
 
 from mocks.kinematics import (
@@ -74,6 +75,8 @@ class Path(Protocol):
     """One motion, planned when its turn comes."""
 
     duration_s: float
+    real_time: bool
+    """Whether it runs at its own speed, whatever slider and limiter say."""
 
     def begin(self, q: Vector6, qd: Vector6, /) -> None:
         """Plan from the present set-point: angles (rad) and speeds (rad/s). Sets `duration_s`."""
@@ -92,6 +95,8 @@ class JointMove:
     speed, acceleration
         Of the leading joint, rad/s and rad/s²; no joint exceeds its own speed limit.
     """
+
+    real_time = False
 
     def __init__(self, dh: Dh, goal: Vector6, speed: float, acceleration: float) -> None:
         Trapezoid(0.0, speed, acceleration)  # refuses impossible values now, not in mid-motion
@@ -128,6 +133,8 @@ class LineMove:
         m/s and m/s²; a turn of one radian counts as one metre where it is the longer of the two.
     """
 
+    real_time = False
+
     def __init__(self, dh: Dh, X_flange_tcp: Array, goal: Array, speed: float, acceleration: float) -> None:
         Trapezoid(0.0, speed, acceleration)
         self._dh, self._goal, self._speed, self._acceleration = dh, goal, speed, acceleration
@@ -158,8 +165,16 @@ class LineMove:
         return q
 
 
+class HandMove(JointMove):
+    """Somebody pushes the arm along: as movej, but neither slider nor limiter has a say in it."""
+
+    real_time = True
+
+
 class Stop:
     """stopj and stopl: slow down linearly along the present direction, within `duration_s` of real time."""
+
+    real_time = True
 
     def __init__(self, duration_s: float) -> None:
         self.duration_s = duration_s
@@ -217,6 +232,11 @@ class Arm:
         """Whether a path is not yet finished."""
         return bool(self._paths)
 
+    @property
+    def _under_way(self) -> bool:
+        """Whether there is motion to be ended: a path that has just been finished ended at rest."""
+        return self.busy and not self.at_rest
+
     def start(self, path: Path, owner: str) -> None:
         """Follow `path` for the program thread `owner`, from rest.
 
@@ -226,7 +246,7 @@ class Arm:
             When another thread of the program controls the arm.
         """
         self._seize(owner)
-        self._follow([path] if self.at_rest else [self._rundown(), path])
+        self._follow([self._rundown(), path] if self._under_way else [path])
 
     def stop_joints(self, deceleration: float, owner: str) -> None:
         """stopj: the fastest joint slows down by `deceleration` (rad/s²)."""
@@ -237,11 +257,19 @@ class Arm:
         twist = jacobian(self.dh, self.q) @ self.qd
         self._brake(max(math.hypot(*twist[:3]), math.hypot(*twist[3:])), deceleration, owner)
 
+    def until_finished(self, owner: str) -> Generator[None, None, None]:
+        """Wait a cycle at a time until the path has ended; closing this generator takes the arm from its path."""
+        try:
+            while self.busy:
+                yield
+        finally:
+            self.release(owner)
+
     def release(self, owner: str | None = None) -> None:
         """Forget the path of `owner` (of anybody without a name); a moving arm comes to rest by itself."""
         if owner is None or owner == self._owner:
             self._owner = None
-            self._follow([] if self.at_rest else [self._rundown()])
+            self._follow([self._rundown()] if self._under_way else [])
 
     def step(self, dt: float) -> None:
         """Let `dt` seconds pass.
@@ -256,9 +284,8 @@ class Arm:
         self._slider = _towards(self.speed_fraction, self._slider, change)
         q, qd = self.q, ZERO6
         if self._paths:
-            stopping = isinstance(self._paths[0], Stop)  # starts from the real speed, so it runs in real time
             try:
-                q = self._along(dt if stopping else dt * self.pace * self._slider)
+                q = self._along(dt if self._paths[0].real_time else dt * self.pace * self._slider)
             except CannotFollow:
                 self._paths.clear()
                 self.qd = ZERO6
@@ -289,7 +316,7 @@ class Arm:
         if not deceleration > 0.0:
             raise MotionError(f"deceleration {deceleration} must be positive")
         self._seize(owner)
-        self._follow([] if self.at_rest else [Stop(speed / deceleration)])
+        self._follow([Stop(speed / deceleration)] if self._under_way else [])
 
     def _along(self, dt: float) -> Vector6:
         path = self._paths[0]

@@ -1,5 +1,6 @@
 """What people, other machines and the network do to a controller: the arm's verbs of the control channel."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,8 @@ Request = dict[str, Any]
 Verb = Callable[[Request], dict[str, Any]]
 
 FOREIGN_PROGRAM_S = 5.0
+FOREIGN_SPEED_RAD_S = 0.3
+HAND_SPEED_RAD_S = 0.3
 
 
 class Operator:
@@ -39,12 +42,16 @@ class Operator:
             "dashboard-stop": self._dashboard_stop,
             "crash-script": self._crash_script,
             "foreign-program": self._foreign_program,
+            "close-popup": lambda _request: self._pendant("close-popup", "close popup"),
+            "hand-move": self._hand_move,
             "slider": self._slider,
             "speed-scaling": self._speed_scaling,
             "remote-control": self._remote_control,
             "set-tcp": self._set_tcp,
+            "tcp": self._set_tcp,
             "freeze": self._freeze,
             "silent": self._silent,
+            "silence-arm": self._silence_arm,
             "drop": self._drop,
             "listen": self._listen,
             "claim-registers": self._claim_registers,
@@ -108,6 +115,14 @@ class Operator:
         self._robot.note("operator", "set-tcp", tcp=list(self._robot.tcp_offset))
         return {"done": "set-tcp"}
 
+    def _hand_move(self, request: Request) -> dict[str, Any]:
+        q, speed_rad_s = vector6(request["q_rad"]), float(request.get("speed_rad_s", HAND_SPEED_RAD_S))
+        if not (speed_rad_s > 0.0 and all(map(math.isfinite, q))):
+            raise ValueError(f"expected six joint angles and a positive speed, got {list(q)} and {speed_rad_s}")
+        self._robot.hand_move(q, speed_rad_s)
+        self._robot.note("operator", "hand-move", q_rad=list(q))
+        return {"done": "hand-move"}
+
     # -- other clients, and the controller's own trouble --------------------------------------------------------------
 
     def _dashboard_stop(self, _request: Request) -> dict[str, Any]:
@@ -117,9 +132,12 @@ class Operator:
         return {"done": "crash-script", "accepted": self._robot.stop_program("run-time error: asked for")}
 
     def _foreign_program(self, request: Request) -> dict[str, Any]:
-        seconds = float(request.get("seconds", FOREIGN_PROGRAM_S))
-        upload = Upload("other", "", secondary=False)
-        accepted = self._robot.upload(upload, by="another script client", seconds=seconds)
+        does = f"sleep({float(request.get('seconds', FOREIGN_PROGRAM_S))})"
+        if "q_rad" in request:
+            speed = float(request.get("speed_rad_s", FOREIGN_SPEED_RAD_S))
+            does = f"movej({list(vector6(request['q_rad']))}, a=1.4, v={speed})"
+        upload = Upload("other", f"def other():\n  {does}\nend\n", secondary=False)
+        accepted = self._robot.upload(upload, by="another script client")
         return {"done": "foreign-program", "accepted": accepted}
 
     def _speed_scaling(self, request: Request) -> dict[str, Any]:
@@ -142,6 +160,12 @@ class Operator:
             self._server.streaming = not (on and answers)
         self._robot.note("network", f"silent {what}", on=on, answers=answers)
         return {"done": "silent"}
+
+    def _silence_arm(self, request: Request) -> dict[str, Any]:
+        for what in ("rtde", "dashboard", "script"):
+            self._server.set_silent(what, _on(request))
+        self._robot.note("network", "silence-arm", on=_on(request))
+        return {"done": "silence-arm"}
 
     def _drop(self, request: Request) -> dict[str, Any]:
         reset = bool(request.get("reset", False))

@@ -12,10 +12,13 @@ import numpy as np
 
 from mocks.kinematics import ZERO6, Array, Dh, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
 from mocks.ur.events import Event, happened
+from mocks.ur.library import ScriptError
 from mocks.ur.modes import PAUSING, PERMITTED, POWERED, POWERLESS, RobotMode, Runtime, SafetyMode
-from mocks.ur.motion import Arm, CannotFollow, MotionError
+from mocks.ur.motion import Arm, CannotFollow, HandMove, MotionError
+from mocks.ur.program import Program
 from mocks.ur.rtde import Value
-from mocks.ur.script import STOP_SCRIPT, ControlScript, ForeignProgram, ScriptError, Upload
+from mocks.ur.script import STOP_SCRIPT, ControlScript, Upload
+from mocks.ur.syntax import UrscriptSyntaxError
 from mocks.world import World
 
 UNLOCK_AFTER_S = 5.0
@@ -23,6 +26,7 @@ STEADY_AFTER_S = 0.5
 PROGRAM_START_S = 0.1
 POWER_STEP_S = 0.5
 COMMAND_REGISTERS = {"input_int_register_0", "input_int_register_24"}
+HAND_ACCELERATION_RAD_S2 = 1.5
 WATCHDOG_STEP_S = 0.01  # a stall of this process may age the watchdog by no more than this
 
 Vector3 = tuple[float, float, float]
@@ -124,13 +128,18 @@ class Robot:
         """What happened, newest last: commands taken and refused, program, safety, the arm starting and stopping."""
         self._remote_control = True
         self._reduced = False
-        self._program: ControlScript | ForeignProgram | None = None
+        self._program: ControlScript | Program | None = None
+        self.popup: str | None = None
+        """What a popup of a program shows, until somebody closes it."""
+        self.wrist_sensor: Callable[[int], Array] | None = None
+        """Readings (n, 6) of a wrist sensor with bias and noise; without one `ft_raw_wrench` is exact."""
         self._physical_s = 0.0
         self._stopped_at_s = 0.0
         self._later: list[tuple[float, Callable[[], object]]] = []
         self._watchdog: tuple[str, float] | None = None
         self._watchdog_age_s = 0.0
         self._ft_zero = np.zeros(6)
+        self._reading: tuple[int, Vector6] | None = None
         self._wrench: tuple[tuple[object, ...], Vector6] | None = None
         self._poses: dict[str, tuple[Vector6, Vector6, Vector6]] = {}
 
@@ -218,31 +227,30 @@ class Robot:
             return f"safety mode {self.safety_mode.name}"
         return None
 
-    def upload(self, upload: Upload, *, by: str = "script port", seconds: float = 0.0) -> bool:
-        """Take a program from the script port: it replaces the running one. False when it is refused.
-
-        Parameters
-        ----------
-        seconds
-            How long a program that is not interpreted keeps running, in the controller's time.
-        """
+    def upload(self, upload: Upload, *, by: str = "script port") -> bool:
+        """Take a program from the script port: it replaces the running one. False when it is refused."""
         if upload.secondary:
             self.note(by, f"secondary program {upload.name}", accepted=False, why="not interpreted")
             return False
         obstacle = self.obstacle if self.remote_control else "local control"
+        program: ControlScript | Program | None = None
+        try:
+            program = self._program_of(upload)
+        except UrscriptSyntaxError as error:
+            obstacle = obstacle or f"syntax error: {error}"
         self.note(by, f"program {upload.name}", accepted=obstacle is None, why=obstacle or "")
-        if obstacle:
+        if obstacle or program is None:
             return False
         self.stop_program("replaced")
-        program: ControlScript | ForeignProgram
-        if upload.is_control_script:
-            program = ControlScript(self, upload.register_offset("int"), upload.register_offset("float"))
-        else:
-            program = ForeignProgram(upload.name, int(seconds / (self.period_s * self.settings.time_scale)))
         self._after(PROGRAM_START_S, lambda: self._start(program))
         return True
 
-    def _start(self, program: ControlScript | ForeignProgram) -> None:
+    def _program_of(self, upload: Upload) -> ControlScript | Program:
+        if upload.is_control_script:
+            return ControlScript(self, upload.register_offset("int"), upload.register_offset("float"))
+        return Program(self, upload.name, upload.text)
+
+    def _start(self, program: ControlScript | Program) -> None:
         if self.obstacle is not None:
             self.note("program", f"started {program.name}", accepted=False, why=self.obstacle)
             return
@@ -259,6 +267,7 @@ class Robot:
         if program is not None:
             program.close()
             self.note("program", f"stopped {program.name}", why=reason)
+        self.popup = None
         self.arm.release()
         self.arm.paused = self.safety_mode not in PERMITTED
         self.runtime = Runtime.STOPPED
@@ -285,8 +294,21 @@ class Robot:
             return True
         if self.loaded_program is None or self.runtime == Runtime.PLAYING:
             return False
-        self._start(ForeignProgram(self.loaded_program))
+        self._start(Program(self, self.loaded_program, ""))
         return True
+
+    def hand_move(self, q: Vector6, speed_rad_s: float) -> None:
+        """Somebody moves the arm by hand, as in freedrive: no program plays, and the set-point goes with the joints.
+
+        Raises
+        ------
+        ValueError
+            When a program plays or the arm has no power.
+        """
+        obstacle = "a program plays" if self.runtime == Runtime.PLAYING else self.obstacle
+        if obstacle:
+            raise ValueError(f"nobody can move the arm by hand: {obstacle}")
+        self.arm.start(HandMove(self.arm.dh, q, speed_rad_s, HAND_ACCELERATION_RAD_S2), "hand")
 
     # -- safety and power ---------------------------------------------------------------------------------------------
 
@@ -458,13 +480,22 @@ class Robot:
     def flange_wrench(self) -> Array:
         """What the arm's own sensor feels, (6,): N and N·m, exerted on the flange, its axes and origin."""
         R = self.world.truth.R_flange_sensor
-        felt = self.world.load_wrench() + self.world.contact_wrench
+        felt = self.world.load_wrench() + self.world.contact_wrench()
         return np.concatenate((R @ felt[:3], R @ felt[3:]))
+
+    def raw_wrench(self) -> Vector6:
+        """ft_raw_wrench: a new reading in every cycle, flange axes."""
+        if self.wrist_sensor is None:
+            return vector6(self.flange_wrench())
+        if self._reading is None or self._reading[0] != self.cycle:
+            self._reading = (self.cycle, vector6(self.wrist_sensor(1)[0]))
+        return self._reading[1]
 
     def tcp_wrench(self) -> Vector6:
         """actual_TCP_force: payload-compensated and zeroed, base axes, at the TCP, exerted on the tool."""
         world = self.world
-        key = (world.q, world.contact_wrench, self.payload_kg, self.payload_cog_m, self._tcp_offset, self._ft_zero)
+        felt_now = (world.q, world.truth, world.contact_wrench())
+        key = (*felt_now, self.payload_kg, self.payload_cog_m, self._tcp_offset, self._ft_zero)
         if self._wrench is None or any(a is not b for a, b in zip(self._wrench[0], key, strict=True)):
             felt = self._compensated() - self._ft_zero
             R_base_flange = forward(self.arm.dh, world.q)[:3, :3]

@@ -1,8 +1,8 @@
-"""The program on the controller: a behavioural twin of the ur_rtde control script.
+"""What arrives at the script port, and a behavioural twin of the ur_rtde control script.
 
 The script port takes URScript text. The control script of ur_rtde is recognised by its name and not interpreted: this
 twin runs instead, one step per control cycle, with the same loop, registers and blocking behaviour. Any other program
-replaces the running one, as on a controller, and ends after one cycle without having done anything.
+is run as it stands, by `mocks.ur.program`.
 
 Source: the control script inside ur_rtde 1.6.5 (`ScriptClient.getScript()`), read for behaviour.
 """
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from mocks.kinematics import Array, Vector6, forward, inverse, inverse_matrix, matrix_of, pose_of
+from mocks.ur.library import ScriptError
 from mocks.ur.motion import JointMove, LineMove, Path
 
 if TYPE_CHECKING:
@@ -32,10 +33,6 @@ DIARY = MOVING | SETTING
 
 Steps = Generator[None, None, None]
 """A thread of a program: one `next()` is one control cycle."""
-
-
-class ScriptError(Exception):
-    """A run-time error of the program; it ends."""
 
 
 @dataclass(frozen=True)
@@ -76,33 +73,9 @@ def take_uploads(buffer: bytearray) -> list[Upload]:
             end, name, secondary = text.find("\n") + 1, "statement", False
             if end == 0 or re.match(r"\s*(def|sec)\b[^\n]*$", text):
                 return uploads
-        if text[:end].strip():
+        if text[:end].strip() and not text[:end].lstrip().startswith("#"):
             uploads.append(Upload(name, text[:end], secondary))
         del buffer[:end]
-
-
-class ForeignProgram:
-    """A program nobody interprets: it runs for some cycles and touches nothing.
-
-    Parameters
-    ----------
-    name
-        As the dashboard shows it.
-    cycles
-        How long it keeps the controller busy after its first cycle.
-    """
-
-    def __init__(self, name: str, cycles: int = 0) -> None:
-        self.name = name
-        self._left = cycles
-
-    def step(self) -> bool:
-        """One control cycle; False when the program has ended."""
-        self._left -= 1
-        return self._left >= 0
-
-    def close(self) -> None:
-        """End the program."""
 
 
 class ControlScript:
@@ -289,15 +262,7 @@ class ControlScript:
     def _follow(self, path: Path, owner: str) -> Steps:
         arm = self._robot.arm
         arm.start(path, owner)
-        yield from self._until_finished(owner)
-
-    def _until_finished(self, owner: str) -> Steps:
-        arm = self._robot.arm
-        try:
-            while arm.busy:
-                yield
-        finally:
-            arm.release(owner)
+        yield from arm.until_finished(owner)
 
     def _kill_async_move(self) -> None:
         if self._kill("move"):
@@ -334,7 +299,7 @@ class ControlScript:
             arm.stop_tool(deceleration, owner)
         else:
             arm.stop_joints(deceleration, owner)
-        yield from self._until_finished(owner)
+        yield from arm.until_finished(owner)
 
     def _protective_stop(self) -> Steps:
         self._robot.protective_stop("the program asked for it")

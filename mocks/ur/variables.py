@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mocks.kinematics import ZERO6, forward, vector6
+from mocks.kinematics import ZERO6, forward
 from mocks.ur.modes import JOINT_MODES, JOINT_POWER_OFF, POWERED, SAFETY_BITS, Runtime
 from mocks.ur.robot import Robot
 from mocks.ur.rtde import Value
@@ -76,7 +76,7 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
     "standard_analog_output1": ("DOUBLE", _fixed(0.0)),
     "robot_status_bits": ("UINT32", _status_bits),
     "safety_status_bits": ("UINT32", lambda r: SAFETY_BITS[r.safety_mode]),
-    "ft_raw_wrench": ("VECTOR6D", lambda r: vector6(r.flange_wrench())),
+    "ft_raw_wrench": ("VECTOR6D", lambda r: r.raw_wrench()),
     "payload": ("DOUBLE", lambda r: r.payload_kg),
     "payload_cog": ("VECTOR3D", lambda r: r.payload_cog_m),
     "payload_inertia": ("VECTOR6D", lambda r: r.payload_inertia),

@@ -1,12 +1,13 @@
 """What the streams carry, against emulated sensors in processes of their own.
 
-    python tests/benchmarks/streams.py [--seconds 60] [--samples 0]
+    python tests/benchmarks/streams.py [--seconds 60] [--samples 0] [--only bota]
 
 Prints one line per figure: the figure, the target, pass or FAIL. The ATI serial stream of 7 kHz runs beside a robot
 arm that is read at 500 Hz; our process is measured, not the emulators. The CAN sensor is compared with a bare client
 that writes and reads the adapter's lines itself, at the same 1 kHz the driver allows itself, turn by turn.
 With `--samples 100000` every fault of tests/wire/test_sensor_faults.py befalls every sensor until so many samples have
-come: hours, because some sensors send 100 in a second.
+come: half an hour. Slow sensors are several at a time, because some send 100 samples in a second; `--only` takes the
+faults of one sensor and nothing else.
 """
 
 import argparse
@@ -17,7 +18,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import deque
+from collections import Counter, deque
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +45,8 @@ from tests.wire.test_sensor_faults import (
 
 PIECE_S = 2.0
 POLL_S = 1e-3
+KNOWN = {("robotous-can", "drop"): 1 / 400}
+"""Share of wrong samples that no client can tell, see drivers/README.md: two neighbouring frames were lost."""
 CPU_TARGET, CAN_TARGET, DECODE_TARGET = 0.40, 0.95, 20.0
 
 
@@ -181,32 +186,47 @@ def decode_speed() -> bool:
     return passed
 
 
-def faults(laboratory: Laboratory, folder: Path, samples: int) -> bool:
-    """Let every fault befall every sensor and compare each sample with the truth."""
+def crew(scheme: str, fault: str) -> int:
+    """How many sensors of a kind suffer at a time, so that together they send about 1000 samples in a second."""
+    slow = {("ati-can", "delay"): 16, ("ati-can", "drop"): 6}
+    return slow.get((scheme, fault), {"ati-serial": 1, "robotiq-ft300": 12, "robotous-can": 5}.get(scheme, 2))
+
+
+def endure(emulator: Emulator, fault: str, samples: int) -> Counter[str]:
+    """Let a fault befall one sensor until so many samples have come; counts them, the wrong ones and errors by name."""
+    count = Counter(received=0)
+    while count["received"] < samples:
+        with emulator.sensor() as sensor:
+            watched = Watched(sensor)
+            emulator.faults(**chances(emulator.kind.scheme, fault))
+            count.update(type(error).__name__ for error in suffer(sensor, PIECE_S * 5))
+            emulator.faults(**HEALTHY)
+            time.sleep(0.05)  # what was delayed belongs to this stream
+        count["received"] += len(watched.samples())
+        count["wrong"] += watched.wrong()
+    return count
+
+
+def faults(laboratory: Laboratory, folder: Path, scheme: str, samples: int) -> bool:
+    """Let every fault befall one kind of sensor and compare each sample with the truth."""
     passed = True
-    for scheme in KINDS:
-        emulator = Emulator(laboratory, scheme, folder / scheme)
-        for fault in SCRIPT:
-            if not applies(scheme, fault):
-                continue
-            received = wrong = told = 0
-            while received < samples:
-                with emulator.sensor() as sensor:
-                    watched = Watched(sensor)
-                    emulator.faults(**chances(scheme, fault))
-                    told += len(suffer(sensor, 10.0))
-                    emulator.faults(**HEALTHY)
-                    time.sleep(0.05)  # what was delayed belongs to this stream
-                received += len(watched.samples())
-                wrong += watched.wrong()
-            allowed = most_wrong(scheme, fault, received)
-            passed &= report(
-                f"{scheme}, {fault}",
-                f"{wrong} wrong of {received}, {told} errors",
-                f"<= {allowed:.0f} wrong",
-                wrong <= allowed,
-            )
-        emulator.unplug()
+    for fault in [fault for fault in SCRIPT if applies(scheme, fault)]:
+        size = crew(scheme, fault)
+        emulators = [Emulator(laboratory, scheme, folder / f"{scheme}-{fault}-{number}") for number in range(size)]
+        with ThreadPoolExecutor(size) as pool:
+            count = sum(pool.map(partial(endure, fault=fault, samples=-(-samples // size)), emulators), Counter())
+        for emulator in emulators:
+            emulator.unplug()
+        received, wrong = count.pop("received"), count.pop("wrong", 0)
+        told = "".join(f", {number} {error}" for error, number in count.items())
+        known = KNOWN.get((scheme, fault), 0.0) * received
+        allowed = known or most_wrong(scheme, fault, received)
+        passed &= report(
+            f"{scheme}, {fault}" + (f" ({size} at a time)" if size > 1 else ""),
+            f"{wrong} wrong of {received}{told}",
+            f"<= {allowed:.0f} wrong" + (" (known)" if known else ""),
+            wrong <= allowed,
+        )
     return passed
 
 
@@ -215,17 +235,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="What the streams carry.")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the 7 kHz stream")
     parser.add_argument("--samples", type=int, default=0, help="for each sensor and fault; none without")
+    parser.add_argument("--only", choices=KINDS, help="just the faults of this sensor")
     options = parser.parse_args()
     laboratory = Laboratory()
     try:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
-            passed = decode_speed()
-            passed &= serial_beside_an_arm(laboratory, folder, options.seconds)
-            for latency_s in (0.0, 0.001):
-                passed &= can_against_ceiling(laboratory, folder, latency_s)
-            if options.samples:
-                passed &= faults(laboratory, folder, options.samples)
+            passed = True
+            if not options.only:
+                passed = decode_speed()
+                passed &= serial_beside_an_arm(laboratory, folder, options.seconds)
+                for latency_s in (0.0, 0.001):
+                    passed &= can_against_ceiling(laboratory, folder, latency_s)
+            for scheme in [options.only] if options.only else KINDS:
+                if options.samples:
+                    passed &= faults(laboratory, folder, scheme, options.samples)
     finally:
         laboratory.close()
     return 0 if passed else 1

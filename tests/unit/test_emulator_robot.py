@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
 GOAL = vector6([*HOME[:5], HOME[5] + 1.0])
 CONTROL = Upload("rtde_control", "", secondary=False)
 OTHER = Upload("other", "", secondary=False)
+SLEEPING = Upload("other", "def other():\n  sleep(2)\nend\n", secondary=False)
 
 
 def new_robot(polyscope: tuple[int, int, int] = (5, 15, 0)) -> Robot:
@@ -161,7 +163,7 @@ def test_power_comes_back_step_by_step(late: float) -> None:
 
 def test_a_command_to_a_foreign_program_is_noted_as_lost() -> None:
     robot = moving_robot()
-    robot.upload(OTHER, by="another script client", seconds=2.0)
+    robot.upload(SLEEPING, by="another script client")
     run(robot, 0.2)
     assert (robot.runtime, robot.program_name) == (Runtime.PLAYING, "other")
     robot.write_inputs({"input_int_register_0": 34})
@@ -228,3 +230,30 @@ def test_event_times_are_those_of_the_host_and_of_the_controller() -> None:
     times = [(event.t_host_ns, event.t_robot_s) for event in robot.events]
     assert times == sorted(times)
     assert math.isclose(found(robot, "started rtde_control").t_robot_s, 100.1, abs_tol=0.01)
+
+
+def test_a_hand_moves_the_arm_without_a_program_at_its_own_speed() -> None:
+    robot = new_robot()
+    robot.arm.speed_fraction = 0.1  # the slider has no say
+    robot.hand_move(GOAL, 0.4)
+    run(robot, 1.0)
+    assert robot.runtime == Runtime.STOPPED
+    assert robot.arm.actual_qd[5] == pytest.approx(0.4, rel=1e-6)
+    assert robot.arm.q[5] == pytest.approx(robot.arm.actual_q[5], abs=0.4 * 0.006)
+    robot.hand_move(HOME, 0.4)  # the person changes her mind: the arm turns round without a jump
+    q_rad = [robot.arm.q[5]]
+    for _ in range(2000):
+        robot.tick()
+        q_rad.append(robot.arm.q[5])
+    assert max(abs(b - a) for a, b in pairwise(q_rad)) < 0.41 * robot.period_s
+    assert robot.arm.q == HOME
+    assert robot.arm.at_rest
+
+
+def test_nobody_moves_an_arm_by_hand_that_a_program_or_its_brakes_hold() -> None:
+    with pytest.raises(ValueError, match="a program plays"):
+        moving_robot().hand_move(GOAL, 0.4)
+    robot = new_robot()
+    robot.emergency_stop(True)
+    with pytest.raises(ValueError, match="POWER_OFF"):
+        robot.hand_move(GOAL, 0.4)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mocks.disturbances import Cable, Drift, Push
 from mocks.kinematics import MODELS, Vector6, forward, inverse, matrix_of, vector6
 from mocks.world import Truth, World
 
@@ -85,15 +86,10 @@ def test_readings_are_noisy_around_the_truth() -> None:
 def test_a_push_adds_to_the_reading_until_it_ends() -> None:
     world = World(plain(), DH, POSTURE)
     before = world.true_wrench()
-    world.push([1, -2, 3, 0.1, 0.2, -0.3])
+    world.touch("push", Push(np.array([1, -2, 3, 0.1, 0.2, -0.3]), in_sensor=True))
     np.testing.assert_allclose(world.true_wrench() - before, [1, -2, 3, 0.1, 0.2, -0.3])
-    world.push([0] * 6)
+    world.touch("push", None)
     np.testing.assert_allclose(world.true_wrench(), before)
-
-
-def test_a_push_of_five_numbers_is_refused() -> None:
-    with pytest.raises(ValueError, match="reshape"):
-        World(plain(), DH, POSTURE).push([1, 2, 3, 4, 5])
 
 
 def test_bias_drifts_with_time() -> None:
@@ -103,6 +99,85 @@ def test_bias_drifts_with_time() -> None:
     before = world.true_wrench()
     now_ns = 30_000_000_000
     np.testing.assert_allclose(world.true_wrench() - before, [0.3, 0, 0, 0, 0, 0.005], atol=1e-9)
+
+
+TURNED = vector6([*POSTURE[:5], POSTURE[5] + 0.7])
+
+
+def test_a_push_in_base_axes_stays_there_while_the_arm_turns_and_ends_in_time() -> None:
+    now_ns = 0
+    world = World(plain(), DH, POSTURE, clock_ns=lambda: now_ns)
+    world.touch("push", Push(np.array([0, 0, -9.81, 0, 0, 0.5]), until_s=2.0))
+    for q in (POSTURE, TURNED):
+        world.q = q
+        R_base_sensor = forward(DH, q)[:3, :3] @ world.truth.R_flange_sensor
+        felt = world.contact_wrench()
+        np.testing.assert_allclose(R_base_sensor @ felt[:3], [0, 0, -9.81], atol=1e-12)
+        np.testing.assert_allclose(R_base_sensor @ felt[3:], [0, 0, 0.5], atol=1e-12)
+    now_ns = 2_000_000_000
+    assert not world.contact_wrench().any()
+
+
+def test_several_things_touch_the_tool_at_a_time() -> None:
+    world = World(plain(), DH, POSTURE)
+    world.touch("push", Push(np.array([1.0, 0, 0, 0, 0, 0]), in_sensor=True))
+    world.touch("bump", Push(np.array([0, 2.0, 0, 0, 0, 0]), in_sensor=True))
+    np.testing.assert_allclose(world.contact_wrench(), [1, 2, 0, 0, 0, 0])
+    world.touch("push", None)
+    np.testing.assert_allclose(world.contact_wrench(), [0, 2, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("beyond_deg", "angle_deg", "degrees"), [(30, 40, 10), (30, 20, 0), (-30, -50, 20), (-30, 0, 0)]
+)
+def test_a_cable_pulls_in_proportion_beyond_an_angle(beyond_deg: float, angle_deg: float, degrees: float) -> None:
+    world = World(plain(), DH, vector6([*POSTURE[:5], math.radians(angle_deg)]))
+    lever = np.array([0.1, 0, 0])
+    world.touch("cable", Cable(np.array([0, 0.2, 0]), lever, joint=5, beyond_rad=math.radians(beyond_deg)))
+    felt = world.contact_wrench()
+    assert np.linalg.norm(felt[:3]) == pytest.approx(0.2 * degrees)
+    np.testing.assert_allclose(felt[3:], np.cross(lever, felt[:3]), atol=1e-12)
+
+
+def test_a_cable_pulls_in_some_orientations() -> None:
+    world = World(plain(), DH, POSTURE)
+    z_base = (forward(DH, POSTURE)[:3, :3] @ world.truth.R_flange_sensor)[:, 2]
+    for towards, pull_N in ((z_base, 5.0), (-z_base, 0.0)):
+        cable = Cable(np.array([3.0, 0, 4.0]), np.zeros(3), towards=towards, within_rad=0.5)
+        world.touch("cable", cable)
+        assert np.linalg.norm(world.contact_wrench()) == pytest.approx(pull_N)
+    world.touch("cable", Cable(np.array([3.0, 0, 4.0]), np.zeros(3)))
+    assert np.linalg.norm(world.contact_wrench()) == pytest.approx(5.0), "always taut"
+
+
+def test_a_drift_is_linear_and_ends_at_its_total() -> None:
+    now_ns = 0
+    world = World(plain(), DH, POSTURE, clock_ns=lambda: now_ns)
+    before = world.true_wrench()
+    world.drifts += (Drift(np.array([0.5, 0, 0, 0, 0, 0.02]), world.now_s, 10.0),)
+    for now_s, share in ((0, 0.0), (5, 0.5), (10, 1.0), (60, 1.0)):
+        now_ns = now_s * 1_000_000_000
+        change = world.true_wrench() - before
+        np.testing.assert_allclose(change, [0.5 * share, 0, 0, 0, 0, 0.02 * share], atol=1e-9)
+
+
+def test_a_shifted_payload_is_the_new_truth() -> None:
+    world = World(plain(), DH, POSTURE)
+    before = world.load_wrench()
+    world.shift_payload(2 * world.truth.mass_kg, None)
+    np.testing.assert_allclose(world.load_wrench(), 2 * before)
+    world.shift_payload(None, np.zeros(3))
+    np.testing.assert_allclose(world.load_wrench(), [*(2 * before[:3]), 0, 0, 0], atol=1e-12)
+
+
+def test_a_frozen_sensor_repeats_itself_until_it_measures_again() -> None:
+    world = World(Truth.drawn(1), DH, POSTURE)
+    world.read_always(world.measure(1)[0])
+    frozen = world.measure(50)
+    world.q = TURNED
+    assert (world.measure(50) == frozen[0]).all()
+    world.read_always(None)
+    assert len(np.unique(world.measure(50), axis=0)) == 50
 
 
 @pytest.mark.parametrize("seed", range(20))

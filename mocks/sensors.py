@@ -1,0 +1,150 @@
+"""The sensors a station can start, by name: which emulator, and the address under which a client finds it.
+
+The addresses are those of the project's drivers (its drivers/README.md); any other client takes the path or port.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any, Protocol
+
+from mocks.faults import Faults
+from mocks.sensor import Measure
+
+
+class SensorEmulator(Protocol):
+    """What a sensor emulator offers: it opens its end of a wire in `start` and serves it from its own threads."""
+
+    faults: Faults
+
+    def start(self) -> Any:
+        """Open the wire and return what a client opens: a path, or addresses by name."""
+
+    def unplug(self) -> None:
+        """Close the wire, as if the cable were pulled."""
+
+    def stop(self) -> None:
+        """End the threads."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One sort of sensor.
+
+    Parameters
+    ----------
+    emulator
+        Module and class.
+    scheme, query
+        Of its address, around the path of its pseudo-terminal.
+    endpoint
+        What a client that knows no such address needs besides.
+    options
+        Of the emulator.
+    floats
+        Whether its wire can say that a reading is no number.
+    """
+
+    emulator: str
+    scheme: str
+    query: str = ""
+    endpoint: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+    floats: bool = False
+
+
+def _slcan(bitrate: int, **more: Any) -> dict[str, Any]:
+    return {"interface": "slcan", "bitrate": bitrate, **more}
+
+
+KINDS = {
+    "can": Kind(
+        "mocks.ati_can:AtiCanNode",
+        "ati-can",
+        "interface=slcan&bitrate=250000&base=32",
+        _slcan(250_000, base=0x20),
+        {"base": 0x20, "bitrate": 250_000},
+    ),
+    "serial": Kind("mocks.ati_serial:AtiSerialBox", "ati-serial"),
+    "robotous-can": Kind(
+        "mocks.robotous:RobotousCanNode", "robotous-can", "interface=slcan&rate=1000", _slcan(1_000_000)
+    ),
+    "robotous-serial": Kind(
+        "mocks.robotous:RobotousSerialBox", "robotous-serial", "baud=115200&rate=200", {"baud": 115_200}
+    ),
+    "robotiq": Kind("mocks.robotiq:RobotiqBox", "robotiq-ft300"),
+    "bota": Kind("mocks.bota:BotaBox", "bota", floats=True),
+    "netft": Kind("mocks.netft:NetFtBox", "ati-netft", options={"rdt_port": 0, "rate_hz": 1000}),
+}
+"""Sensors on a wire of their own."""
+
+WRIST = "ur-ft"
+"""The sensor in the arm's wrist, which the controller reports."""
+
+CHOICES = (*KINDS, WRIST, "both", "none")
+"""What a station can be asked for; "both" is can and serial."""
+
+
+class Sensor:
+    """One sensor of a running station.
+
+    Parameters
+    ----------
+    name
+        One of `KINDS`, or `WRIST`.
+    measure
+        Readings (n, 6) in N and N·m.
+    host
+        Loopback address of the station.
+    """
+
+    def __init__(self, name: str, measure: Measure, *, seed: int, host: str) -> None:
+        self.name = name
+        self._kind = KINDS.get(name)
+        self._emulator: SensorEmulator | None = None
+        if self._kind is None:
+            self.endpoint = {"url": f"{WRIST}://{host}?counts_per_N=1&counts_per_Nm=1", "host": host}
+            return
+        module, _, class_name = self._kind.emulator.partition(":")
+        options = self._kind.options | ({"host": host} if name == "netft" else {})
+        make: Callable[..., SensorEmulator] = getattr(import_module(module), class_name)
+        self._emulator = make(measure, seed=seed, **options)
+        self.endpoint = self._endpoint(self._kind, self._emulator.start())
+
+    def _endpoint(self, kind: Kind, where: Any) -> dict[str, Any]:
+        """What the station tells about it, its address under "url"."""
+        if isinstance(where, dict):
+            ports = "&".join(f"{key}={where[key]}" for key in ("rdt_port", "http_port"))
+            return {"url": f"{kind.scheme}://{where['host']}?{ports}", **where}
+        url = f"{kind.scheme}://{where}" + (f"?{kind.query}" if kind.query else "")
+        return {"url": url, "channel" if "interface" in kind.endpoint else "port": where, **kind.endpoint}
+
+    @property
+    def says_nan(self) -> bool:
+        """Whether its wire can say that a reading is no number."""
+        return self._kind is None or self._kind.floats
+
+    @property
+    def emulator(self) -> SensorEmulator:
+        """What stands behind the wire.
+
+        Raises
+        ------
+        ValueError
+            For the sensor in the wrist, which has none.
+        """
+        if self._emulator is None:
+            raise ValueError(f"{self.name} is part of the arm and has no wire of its own")
+        return self._emulator
+
+    def saturate(self, axis: int | None) -> None:
+        """Let an axis, or a gauge of a sensor that sends gauges, read the end of its range; None ends it."""
+        if axis is not None and not 0 <= axis < 6:
+            raise ValueError(f"axis {axis} is not 0 to 5")
+        attribute = "saturated_gauge" if hasattr(self.emulator, "saturated_gauge") else "saturated_axis"
+        setattr(self.emulator, attribute, axis)
+
+    def stop(self) -> None:
+        """End it."""
+        if self._emulator is not None:
+            self._emulator.stop()
