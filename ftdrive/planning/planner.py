@@ -97,7 +97,7 @@ def plan_tour(
         elsewhere = constant if poses == 24 else _wrist(certifier, posture, numbers, speeds)
         if elsewhere is not None:
             return made(
-                "posture", [f"{reason}, and the wrist alone finds no way there.", _jog_there(posture)], elsewhere
+                "posture", [f"{reason}, and the wrist alone finds no way there.", _elsewhere_words(posture)], elsewhere
             )
     nowhere = f"{reason}, and no posture of joints 1 to 3 that was tried lets the wrist alone visit the orientations."
     for centre_m in _box_centres(certifier, stands):
@@ -264,12 +264,12 @@ def _at_pan(q_rad: Array, numbers: Sequence[int]) -> Array:
 def _chosen_words(chosen: Chosen) -> list[str]:
     lost = chosen.force_rms_N / chosen.ideal_force_rms_N
     words = [f"Of that, {lost:.2f} times the error of the poses that would be best if the arm reached them."]
-    return [*words, _jog_there(chosen.q_rad[0])] if chosen.elsewhere else words
+    return [*words, _elsewhere_words(chosen.q_rad[0])] if chosen.elsewhere else words
 
 
-def _jog_there(q_rad: Array) -> str:
+def _elsewhere_words(q_rad: Array) -> str:
     first = np.degrees(q_rad[:3]).round().astype(int).tolist()
-    return f"With joints 1 to 3 at {first} degrees there is a tour: jog there, that move is not part of the plan."
+    return f"With joints 1 to 3 at {first} degrees there is a tour: the way there is not part of the plan."
 
 
 def _box_words(centre_m: Array, half_size_m: float) -> str:
