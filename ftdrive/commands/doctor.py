@@ -22,7 +22,7 @@ from ftdrive.commands.common import JSON, RUNS, read_cell, write_json
 from ftdrive.config import CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.report import talk
-from ftdrive.simulation import Station
+from ftdrive.simulation import Station, sensor_url
 from ftdrive.wiring import build_arm, build_sensor
 
 Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ def doctor(
     with ExitStack() as stack:
         station = stack.enter_context(Station(options=["--time-scale", "1"])) if simulate else None
         cell = read_cell(config, robot, sensor) if station is None else station.cell
-        address = SensorAddress.of(cell.sensor.url)
+        address = SensorAddress.of(sensor_url(cell.sensor.url))
         device = build_sensor(cell)
 
         arm = _examine_robot(cell, found, stack)

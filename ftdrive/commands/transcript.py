@@ -18,7 +18,7 @@ from ftdrive.commands.common import JSON, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.report import talk
 from ftdrive.runs import versions
-from ftdrive.simulation import Station
+from ftdrive.simulation import Station, sensor_url
 
 _TAIL_S = 0.3
 """Recorded beyond the duration, so that a replay which begins a little later still has enough."""
@@ -53,6 +53,7 @@ def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as
             sensor = station.cell.sensor.url
         if sensor is None:
             raise ConfigError("which sensor? Give --sensor URL or --simulate")
+        sensor = sensor_url(sensor)
         if SensorAddress.of(sensor).serial_port is None:
             raise ConfigError(f"{sensor} is not on a serial port: only what passes one can be recorded")
         device = _sensor(sensor)
