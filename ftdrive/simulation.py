@@ -8,10 +8,14 @@ from typing import Any, Self
 
 from calib.routine import Sampling
 from drivers.errors import ConnectError
-from ftdrive.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 
 TIME_SCALE = 20
 """The emulated arm lives this many times faster; nothing else differs from a real cell."""
+
+PAYLOAD_KG = 1.5
+"""What its controller is told about the tool, as somebody should have."""
+TOOL_MM = (0.0, 200.0, 100.0)
 
 
 class Station:
@@ -32,7 +36,7 @@ class Station:
 
     def __enter__(self) -> Self:
         command = [sys.executable, "-P", "-m", "mocks", "station", "--sensor", self.sensor]
-        command += ["--time-scale", str(TIME_SCALE), *self.options]
+        command += ["--time-scale", str(TIME_SCALE), "--payload", str(PAYLOAD_KG), *self.options]
         # A session of its own: Ctrl-C in the terminal is for us, not for the emulated cell.
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
@@ -76,6 +80,11 @@ class Station:
         return answer
 
     @property
+    def mounting(self) -> str:
+        """As its options say."""
+        return self.options[self.options.index("--mount") + 1] if "--mount" in self.options else "floor"
+
+    @property
     def cell(self) -> CellConfig:
         """Configuration that reaches this station as it would reach a real cell."""
         arm, can, serial = (self.endpoints[wire] for wire in ("arm", "can", "serial"))
@@ -86,5 +95,7 @@ class Station:
         return CellConfig(
             robot=RobotConfig(arm["host"], arm["model"], speed_deg_s=60.0, acceleration_deg_s2=80.0),
             sensor=SensorConfig(url),
+            tool=ToolConfig("emulated", (TOOL_MM,)),
+            workcell=WorkcellConfig(self.mounting, measured=True),
             sampling=Sampling(average_s=0.4),
         )
