@@ -89,9 +89,9 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
     """
     desk = Desk(operator)
     by_hand = options.mode in {"manual", "listen"}
-    desk.tell(StateChanged(state=State.PREFLIGHT))
     with build_sensor(cell) as sensor, closing(build_arm(cell)) as arm, preflight.awake() as kept_awake:
         arm.open(control=not by_hand)
+        desk.tell(StateChanged(state=State.PREFLIGHT))
         devices = {"arm": asdict(arm.identify()), "sensor": asdict(sensor.identify())}
         if by_hand:
             run = _by_hand(cell, arm, sensor, desk, options, devices)

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -268,7 +268,9 @@ def awake() -> Iterator[str]:
         start_new_session=True,
     )
     try:
-        yield "this computer is kept awake" if process.poll() is None else "this computer could not be kept awake"
+        with suppress(subprocess.TimeoutExpired):  # it only ends by itself when nobody grants the wish
+            process.wait(timeout=0.3)
+        yield "this computer is kept awake" if process.returncode is None else "this computer cannot be kept awake"
     finally:
         if process.stdin is not None:
             process.stdin.close()
