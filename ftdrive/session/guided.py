@@ -1,7 +1,7 @@
 """A whole session: open the cell, plan, check, show, ask, move and average, solve, save."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from calib.allan import averaging_time
 from calib.routine import PoseRecord, Sampling
+from calib.tour import wrist_tour
 from drivers.interfaces import DeviceInfo, ForceTorqueSensor, RobotArm
 from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError, NotAccepted, PlanRefused
@@ -47,7 +48,7 @@ from ftdrive.wiring import build_arm, build_sensor
 Array = NDArray[np.float64]
 
 _GRID_RAD: Final = float(np.radians(0.1))
-"""Plans are made where the arm stands, to this grid: it finds the same plan, and its hash, again."""
+"""Plans are made where joints 1 to 3 stand, to this grid: the same place gives the same plan, and hash, again."""
 _TARGET_N, _TARGET_NM = 0.057, 0.0035
 """Of one average: 0.02 N of bias from 24 poses."""
 _HEAVIEST_KG: Final = {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5, "UR16e": 16.0, "UR20": 20.0}
@@ -154,6 +155,8 @@ class _Begun:
         if options.plan is not None:
             return Plan.load(options.plan)
         q = np.round(self._arm.state().q_rad / _GRID_RAD) * _GRID_RAD
+        with suppress(ValueError):  # the planner says what to do about it
+            q = wrist_tour(q)[0].q_rad  # wherever the wrist was left
         speeds = Speeds(
             float(np.radians(cell.robot.speed_deg_s)),
             float(np.radians(cell.robot.acceleration_deg_s2)),

@@ -20,7 +20,7 @@ from calib.routine import PoseRecord, Sampling, Stage, take_pose
 from calib.tour import TourPose
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ForceTorqueSensor, RobotArm
-from ftdrive.errors import Declined, PlanRefused
+from ftdrive.errors import Declined, NotAccepted
 from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
@@ -183,7 +183,7 @@ class Tour:
         while self._todo:
             try:
                 self._next()
-            except (Tripped, DriverError, OSError, Stopped, TooFewSamples, PlanRefused) as error:
+            except (Tripped, DriverError, OSError, Stopped, TooFewSamples, NotAccepted) as error:
                 self._hold(error)
         self._tell_sensor_events()
         self._tell(State.CLOSE)
@@ -398,7 +398,7 @@ class Tour:
                 raise cause if not isinstance(error, Stopped) else Declined(words)
             try:
                 self._recover()
-            except (DriverError, PlanRefused) as again:
+            except (DriverError, NotAccepted) as again:
                 self._desk.tell(Noted(words=f"not yet: {again}", warning=True))
                 continue
             return
@@ -433,7 +433,7 @@ class Tour:
         self._reopened.add(stop)
         try:
             self._recover()
-        except DriverError as error:
+        except (DriverError, NotAccepted) as error:
             log.info("the sensor does not come back: %s", error)
             return False
         self._desk.tell(Noted(words=f"{trip}; it is back, pose {stop} begins anew", warning=True))
