@@ -142,6 +142,7 @@ class _Begun:
             known=self._known,
             quiet=preflight.listen(sensor, preflight.LISTEN_S),
             limits=limits,
+            sensor_range=_range_of(sensor),
         )
         self._check(preflight.CHECKS)
         self._sampling = self._chosen_sampling()
@@ -315,6 +316,12 @@ class _Begun:
         run = Run.create(self._options.runs, self._options.name, _description(self._cell, devices, self._options))
         self._plan.save(run.plan_path)
         return run
+
+
+def _range_of(sensor: ForceTorqueSensor) -> Array | None:
+    """Largest wrench (6,) of the sensor, as far as its driver knows."""
+    fact = getattr(sensor.identify(), "facts", {}).get("range")
+    return None if fact is None else np.asarray(fact.value, dtype=np.float64)
 
 
 @contextmanager

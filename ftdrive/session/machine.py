@@ -26,7 +26,17 @@ from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.runs import Run
-from ftdrive.session.events import Asked, Estimated, Event, GuardTripped, Noted, PoseTaken, State, StateChanged
+from ftdrive.session.events import (
+    Asked,
+    Estimated,
+    Event,
+    GuardTripped,
+    Noted,
+    PoseTaken,
+    RunOpened,
+    State,
+    StateChanged,
+)
 from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, hazard_of_safety
 from ftdrive.session.operator import Key, Operator, Question
 from ftdrive.session.watch import Guards
@@ -77,6 +87,7 @@ class Desk:
             for event in self._early:
                 run.append_event(event.to_dict())
             self._early.clear()
+        self.tell(RunOpened(folder=str(run.folder), resume=f"ftdrive calibrate --resume {run.folder}"), sync=True)
 
     def tell(self, event: Event, *, sync: bool = False) -> None:
         """Show and keep an event."""

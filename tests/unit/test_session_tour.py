@@ -573,12 +573,7 @@ def test_an_arm_that_was_moved_between_two_poses_is_noticed(lab: Lab) -> None:
 
 
 def test_saturated_samples_discard_the_pose(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = preflight.Before
-
-    def limited(**parts: Any) -> preflight.Before:
-        return before(**parts, sensor_range=np.array([40.0, 40, 40, 4, 4, 4]))
-
-    monkeypatch.setattr(preflight, "Before", limited)
+    monkeypatch.setattr(guided, "_range_of", lambda _: np.array([40.0, 40, 40, 4, 4, 4]))
     lab.arm.at_move[4] = lambda: setattr(lab.sensor, "push", np.array([0, 0, 0, 0, 0, 3.8]))
     with pytest.raises(DeviceFault, match="of its range"):
         lab.calibrate()
