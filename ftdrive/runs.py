@@ -152,8 +152,11 @@ class Run:
 
     def records(self) -> list[PoseRecord]:
         """Read every pose back, in the order of the tour; of one that was taken again, the last time."""
-        stops = sorted({path.stem.partition("-")[0] for path in (self.folder / "poses").glob("*.npz")}, key=int)
-        return [_read_record(_newest(self.folder / "poses" / f"{stop}.npz")) for stop in stops]
+        return [_read_record(_newest(self.folder / "poses" / f"{stop:02d}.npz")) for stop in self.stops()]
+
+    def stops(self) -> list[int]:
+        """Tell which places of the tour are taken, without reading them."""
+        return sorted({int(path.stem.partition("-")[0]) for path in (self.folder / "poses").glob("*.npz")})
 
 
 def _numbered(path: Path) -> Iterator[Path]:

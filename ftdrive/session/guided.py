@@ -219,6 +219,14 @@ class _Begun:
         plan, pace = self._plan, self._pace
         for words in plan.why:
             self._desk.tell(Noted(words=words))
+        predicted, mass_kg = plan.predicted, plan.description["guess"]["mass_kg"]
+        self._desk.tell(
+            Noted(
+                words=f"predicted for {mass_kg:g} kg, one sigma: mass {1e3 * predicted['mass_kg']:.1f} g, force bias "
+                f"{max(predicted['force_bias_N']):.3f} N, compensation {predicted['force_rms_N']:.3f} N, "
+                f"{predicted['torque_rms_Nm']:.4f} N·m"
+            )
+        )
         q = np.degrees([step.q_rad for step in plan.steps])
         ranges = ", ".join(f"{low:.0f} to {high:.0f}" for low, high in zip(q.min(axis=0), q.max(axis=0), strict=True))
         self._desk.tell(Noted(words=f"joints 1 to 6 stay within {ranges} degrees: are cables long and slack enough?"))
@@ -309,6 +317,8 @@ class _Begun:
             "Is the emergency stop in reach, and tested?",
         ):
             self._desk.require(text, assumed=self._known)
+        if self._arm.status().safety_mode == "reduced":
+            self._desk.require("The controller is in reduced mode. Is that as it should be?", assumed=self._known)
 
     def _run(self, devices: Mapping[str, Any]) -> Run:
         if self._old is not None:
@@ -330,9 +340,7 @@ def _kept(desk: Desk, run: Run) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        words = (
-            f"{len(run.records())} poses are kept in {run.folder}; go on with ftdrive calibrate --resume {run.folder}"
-        )
+        words = f"{len(run.stops())} poses are kept in {run.folder}; go on with ftdrive calibrate --resume {run.folder}"
         desk.tell(Noted(words=words), sync=True)
         raise
 

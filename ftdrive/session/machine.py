@@ -20,7 +20,7 @@ from calib.routine import PoseRecord, Sampling, Stage, take_pose
 from calib.tour import TourPose
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ForceTorqueSensor, RobotArm
-from ftdrive.errors import Declined, NotAccepted
+from ftdrive.errors import Declined, NotAccepted, PlanRefused
 from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
@@ -39,6 +39,7 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, hazard_of_safety
 from ftdrive.session.operator import Key, Operator, Question
+from ftdrive.session.preflight import forbidden
 from ftdrive.session.watch import Guards
 
 log = logging.getLogger(__name__)
@@ -52,6 +53,7 @@ _AT_RAD: Final = float(np.radians(0.5))
 _PATIENCE: Final = 20.0
 """A slow slider stretches a move; one that stands still is seen by its guard."""
 _FIRST_WORD: Final = "MOVE"
+_LOOK_AGAIN_S: Final = 0.4
 
 
 class RunningFit(Protocol):
@@ -319,9 +321,11 @@ class Tour:
 
     def _approach(self, q: Array, index: int, stop: int) -> None:
         self._at = None
-        approach = self.plan_approach(q, index)
+        approach = approach_to(self._certifier, q, self._nodes[index], Speeds(SLOW_RAD_S, SLOW_RAD_S2))
         if not len(approach.q_rad):
             return
+        if words := forbidden(self._arm, np.vstack([q, approach.q_rad])):
+            raise PlanRefused(words)
         turn_deg = np.degrees(np.abs(np.diff(np.vstack([q, approach.q_rad]), axis=0)).max())
         words = (
             f"the way to pose {stop}: {len(approach.q_rad)} moves, largest turn {turn_deg:.0f}°, proven clear by "
@@ -334,12 +338,6 @@ class Tour:
             q = goal
         if stop == 1:
             self._confirm(f"The arm stands at the first pose. The tour has {self._stops} stops. Begin?")
-
-    def plan_approach(self, q: Array, index: int) -> Approach:
-        """Plan the way from joints (6,) to a pose; one that is already there has no moves."""
-        goal = self._nodes[index]
-        speeds = Speeds(SLOW_RAD_S, SLOW_RAD_S2)
-        return approach_to(self._certifier, q, goal, speeds)
 
     def _confirm(self, text: str) -> None:
         """Ask before a motion; the first one of a workcell wants a word."""
@@ -392,7 +390,7 @@ class Tour:
             self._desk.tell(GuardTripped(hazard=trip.hazard, words=words))
         self._tell(State.STOP, words=words)
         self._tell_sensor_events()
-        kept = len(self._run.records())
+        kept = len(self._run.stops())
         self._tell(State.HOLD, words=f"{words}. {kept} poses are kept in {self._run.folder}")
         cause = error if trip is None else trip.error
         question = Question(
@@ -409,7 +407,7 @@ class Tour:
                 raise cause if not isinstance(error, Stopped) else Declined(words)
             try:
                 self._recover()
-            except (DriverError, NotAccepted) as again:
+            except (Tripped, DriverError, NotAccepted) as again:
                 self._desk.tell(Noted(words=f"not yet: {again}", warning=True))
                 continue
             return
@@ -444,7 +442,7 @@ class Tour:
         self._reopened.add(stop)
         try:
             self._recover()
-        except (DriverError, NotAccepted) as error:
+        except (Tripped, DriverError, NotAccepted) as error:
             log.info("the sensor does not come back: %s", error)
             return False
         self._desk.tell(Noted(words=f"{trip}; it is back, pose {stop} begins anew", warning=True))
@@ -461,6 +459,9 @@ class Tour:
             self._seen_events = 0
         self._recheck()
         self._guards.begin()
+        q = self._arm.state().q_rad
+        with self._guards.watching(q, q, moving=False):  # is what tripped them gone?
+            time.sleep(_LOOK_AGAIN_S)
 
     # -------------------------------------------------------------------------------------------- telling
 

@@ -101,16 +101,23 @@ def check_approach(before: Before) -> Checked:
 def check_safety_limits(before: Before) -> Checked:
     """Row 3: the controller accepts every pose, and before the first run points of the way between."""
     nodes = np.array([step.q_rad for step in before.plan.steps])
-    path = nodes if before.known else edges(np.vstack([nodes, nodes[:1]]), _EDGE_RAD)
-    path = np.vstack([path, before.approach.q_rad]) if len(before.approach.q_rad) else path
-    for q in path:
-        if not before.arm.within_safety_limits(q.tolist()):
-            return _failed(
-                "limits",
+    path = np.vstack([nodes, nodes[:1]])
+    step_rad = np.inf if before.known else _EDGE_RAD
+    for way in (path, before.approach.q_rad):
+        if len(way) and (words := forbidden(before.arm, way, step_rad)):
+            return _failed("limits", words)
+    return _passed("limits", "the controller accepts every pose" + ("" if before.known else " and the ways between"))
+
+
+def forbidden(arm: RobotArm, q_rad: Array, step_rad: float = _EDGE_RAD) -> str:
+    """Say where the controller's safety limits forbid straight moves through joint vectors (n, 6); empty if nowhere."""
+    for q in edges(q_rad, step_rad):
+        if not arm.within_safety_limits(q.tolist()):
+            return (
                 f"the controller's safety limits forbid joints {np.degrees(q).round().astype(int).tolist()} degrees: "
-                "bring joints 1 to 3 to another posture, or see the safety settings",
+                "bring joints 1 to 3 to another posture, or see the safety settings"
             )
-    return _passed("limits", f"the controller accepts all {len(path)} joint vectors it was asked for")
+    return ""
 
 
 def check_safety(before: Before) -> Checked:
@@ -195,15 +202,15 @@ def check_load(before: Before) -> Checked:
 
 def check_link(before: Before) -> Checked:
     """Row 16: states of the arm come without gaps."""
-    worst_s, end_s = 0.0, time.monotonic() + _LINK_S
+    took_s, end_s = list[float](), time.monotonic() + _LINK_S
     try:
         while (started_s := time.monotonic()) < end_s:
             before.arm.state()
-            worst_s = max(worst_s, time.monotonic() - started_s)
+            took_s.append(time.monotonic() - started_s)
     except DriverError as error:
         return _failed("link", str(error))
-    words = f"the arm answers within {1e3 * worst_s:.0f} ms"
-    if worst_s > _LATENCY_S:
+    words = f"the arm answers within {1e3 * np.median(took_s):.0f} ms, once {1e3 * max(took_s):.0f} ms"
+    if np.quantile(took_s, 0.9) > _LATENCY_S:
         return _failed("link", f"{words}: use a cable, and give this computer and network less to do")
     return _passed("link", words)
 

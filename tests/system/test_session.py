@@ -60,7 +60,7 @@ def listen_for(process: subprocess.Popen[str], words: str) -> str:
 
 
 def wait_for_poses(ftdrive: CommandLine, process: subprocess.Popen[str], count: int) -> None:
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 90
     while len(ftdrive.poses()) < count:
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
@@ -107,7 +107,7 @@ def test_a_push_stops_the_arm_until_a_person_says_go_on(station: Station, config
     assert not station.control(do="state")["moving"]
     kept = len(ftdrive.poses())
     say(process, "resume\n")
-    listen_for(process, "[resume/quit]")
+    assert "not yet: unexpected contact" in listen_for(process, "[resume/quit]")
     station.control(do="push", wrench=[0, 0, 0, 0, 0, 0])
     out, err = process.communicate("resume\nyes\nyes\n", timeout=60)
     assert process.returncode == 0, err
@@ -116,6 +116,31 @@ def test_a_push_stops_the_arm_until_a_person_says_go_on(station: Station, config
     assert {trip["hazard"] for trip in trips} == {14}
     truth, result = station.truth, json.loads(out)
     assert result["mass_kg"] == pytest.approx(truth["mass_kg"], abs=4 * result["sigma"]["mass_kg"])
+
+
+def test_after_a_protective_stop_the_operator_clears_it_and_the_tour_goes_on(
+    station: Station, config: Path, ftdrive: CommandLine
+) -> None:
+    process = ftdrive.start("calibrate", "--config", config, "--minimal", "--json")
+    say(process, QUESTIONS + FIRST_MOTION)
+    wait_for_poses(ftdrive, process, 2)
+    station.control(do="protective-stop")
+    listen_for(process, "[resume/quit]")
+    say(process, "resume\n")
+    assert "not yet" in listen_for(process, "[resume/quit]")
+    deadline = time.monotonic() + 10
+    while station.control(do="state")["safety_mode"] != "NORMAL":
+        station.control(do="unlock")
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    _, err = process.communicate("resume\nyes\nyes\n", timeout=60)
+    assert process.returncode == 0, err
+    assert len(ftdrive.poses()) == 7
+    diary = station.control(do="state", since=0)["events"]
+    ours = [event["what"] for event in diary if event["by"] == "dashboard"]
+    assert not [what for what in ours if what.startswith(("unlock", "play"))]
+    trips = [event["hazard"] for event in events_of(ftdrive) if event["event"] == "guard-tripped"]
+    assert trips[0] == 10
 
 
 def test_a_sensor_that_repeats_itself_stops_the_arm(station: Station, config: Path, ftdrive: CommandLine) -> None:
