@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from calib.allan import averaging_time
 from calib.routine import PoseRecord, Sampling
 from calib.tour import wrist_tour
-from drivers.interfaces import DeviceInfo, ForceTorqueSensor, RobotArm
+from drivers.errors import DriverError
+from drivers.interfaces import DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
 from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError, NotAccepted, PlanRefused
 from ftdrive.planning.cell import certifier_for
@@ -140,7 +141,7 @@ class _Begun:
             approach=approach_to(self._certifier, q, goal, Speeds(SLOW_RAD_S, SLOW_RAD_S2)),
             runs=options.runs,
             known=self._known,
-            quiet=preflight.listen(sensor, preflight.LISTEN_S),
+            quiet=self._listen(),
             limits=limits,
             sensor_range=_range_of(sensor),
         )
@@ -188,6 +189,16 @@ class _Begun:
                 raise PlanRefused(
                     f"the run was made with the {name} {devices[name]['serial']}, this is {info.serial}: make a new run"
                 )
+
+    def _listen(self) -> FtSamples:
+        """Take samples of the resting sensor; one that fails, as after a killed session, is opened once more."""
+        try:
+            return self._sensor.collect(preflight.LISTEN_S)
+        except DriverError as error:
+            self._desk.tell(Noted(words=f"{error}; trying once more", warning=True))
+        self._sensor.close()
+        self._sensor.open()
+        return self._sensor.collect(preflight.LISTEN_S)
 
     def _check(self, checks: Sequence[preflight.Check]) -> None:
         failed = []
@@ -304,7 +315,7 @@ class _Begun:
         return run
 
     def _recheck(self) -> None:
-        self._before = replace(self._before, quiet=preflight.listen(self._sensor, preflight.LISTEN_S))
+        self._before = replace(self._before, quiet=self._listen())
         self._check(preflight.AGAIN)
 
     def _ask(self) -> None:

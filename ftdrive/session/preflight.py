@@ -61,11 +61,6 @@ class Before:
 Check = Callable[[Before], Checked]
 
 
-def listen(sensor: ForceTorqueSensor, duration_s: float) -> FtSamples:
-    """Take the samples for `quiet`."""
-    return sensor.collect(duration_s)
-
-
 def check_workcell(before: Before) -> Checked:
     """Row 3: planes and boxes are as a person measured them."""
     work = before.cell.workcell

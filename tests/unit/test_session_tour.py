@@ -386,6 +386,19 @@ def test_a_stuck_sensor_is_refused(lab: Lab) -> None:
     refuse(lab, "did not change")
 
 
+def test_a_sensor_that_stumbles_once_is_opened_again(lab: Lab) -> None:
+    def stumble() -> None:
+        lab.sensor.collecting = lambda: None
+        raise StreamBroken("a write took too long")
+
+    lab.sensor.collecting = stumble
+    assert lab.calibrate(dry_run=True) is None
+    assert "trying once more" in " ".join(event.words for event in lab.operator.of(Noted))
+    lab.sensor.failure = StreamBroken("gone for good")
+    with pytest.raises(StreamBroken):
+        lab.calibrate(dry_run=True)
+
+
 def test_a_folder_that_cannot_be_written_is_refused(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(**_: object) -> None:
         raise OSError(28, "No space left on device")
