@@ -54,6 +54,8 @@ _TARGET_N, _TARGET_NM = 0.057, 0.0035
 """Of one average: 0.02 N of bias from 24 poses."""
 _HEAVIEST_KG: Final = {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5, "UR16e": 16.0, "UR20": 20.0}
 _HEAVIEST_OF_ALL_KG: Final = 30.0
+_EMULATED: Final = Limits(sensor_age_moving_s=0.3)
+"""An emulated sensor shares this computer with all else."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +101,7 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
             run = _by_hand(cell, arm, sensor, desk, options, devices)
         else:
             desk.tell(Noted(words=kept_awake))
-            begun = _Begun(cell, arm, sensor, desk, options, limits or Limits())
+            begun = _Begun(cell, arm, sensor, desk, options, limits or (Limits() if options.real else _EMULATED))
             if options.dry_run:
                 return None
             run = begun.tour(devices)
