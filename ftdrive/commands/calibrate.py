@@ -1,6 +1,5 @@
 """`ftdrive calibrate`: the job on a real cell."""
 
-import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +11,6 @@ from ftdrive.commands.common import JSON, RUNS, read_cell, stop_unless_accepted,
 
 if TYPE_CHECKING:
     from ftdrive.config import CellConfig
-    from ftdrive.session.events import Event
-    from ftdrive.session.operator import Key, Question
 
 
 @click.command()
@@ -69,6 +66,7 @@ def calibrate(
     """
     from ftdrive.errors import ConfigError, Declined
     from ftdrive.report import print_result, talk
+    from ftdrive.screen import open_operator
     from ftdrive.session.guided import Options
     from ftdrive.session.guided import calibrate as guide
     from ftdrive.simulation import Station
@@ -98,7 +96,8 @@ def calibrate(
             description=description,
         )
         try:
-            outcome = guide(cell, PlainOperator(yes=yes), options)
+            with open_operator(as_json=as_json, yes=yes) as operator:
+                outcome = guide(cell, operator, options)
         except Declined as error:
             talk.print(str(error))
             raise click.Abort from error
@@ -108,9 +107,9 @@ def calibrate(
     if as_json:
         write_json({"run": str(outcome.run.folder), **outcome.result.to_dict()})
     else:
-        print_result(outcome.result, drift=outcome.drift)
+        saved = None if outcome.result.verdict == "rejected" else outcome.run.calibration_path
+        print_result(outcome.result, drift=outcome.drift, records=outcome.run.records(), saved=saved)
     stop_unless_accepted(outcome.result)
-    talk.print(f" Saved {outcome.run.calibration_path}")
 
 
 def _cell(
@@ -135,62 +134,3 @@ def _cell(
         if config is None and cell.workcell == WorkcellConfig():
             cell = replace(cell, workcell=WorkcellConfig(measured=True))  # said here and now, and nothing else is there
     return cell
-
-
-class PlainOperator:
-    """A person at a plain terminal: one line for each event on stderr, answers on stdin."""
-
-    def __init__(self, *, yes: bool) -> None:
-        self._yes = yes
-
-    def tell(self, event: "Event") -> None:
-        """Print a line."""
-        from ftdrive.report import talk
-
-        if line := line_of(event):
-            talk.print(line)
-
-    def ask(self, question: "Question") -> str:
-        """Read a line; without one there is nobody."""
-        from ftdrive.errors import Declined
-
-        if self._yes and question.assumed is not None:
-            return question.assumed
-        answers = "/".join(answer or "Enter" for answer in question.answers)
-        while True:
-            click.echo(f"{question.text} [{answers}] ", err=True, nl=False)
-            line = sys.stdin.readline()
-            if not line:
-                raise Declined("nobody is here to answer: " + question.text)
-            answer = line.strip()
-            if answer in question.answers:
-                return answer
-            if len(question.answers) == 1 or answer == "no":
-                raise Declined(f"'{answer}' is not {question.answers[0]}: nothing moves")
-
-    def pressed(self) -> "Key | None":
-        """Know of no keys."""
-        return None
-
-
-def line_of(event: "Event") -> str:
-    """Say an event in a line; empty for what is only for screens."""
-    from ftdrive.session.events import Checked, GuardTripped, Noted, PoseTaken, State, StateChanged
-
-    match event:
-        case Checked():
-            return f" {'✔' if event.passed else '✘'} {event.name}: {event.words}"
-        case Noted():
-            return f" {'!' if event.warning else ' '} {event.words}"
-        case GuardTripped():
-            return f" ✘ stopped (row {event.hazard}): {event.words}"
-        case PoseTaken():
-            unsteady = "" if event.steady else "  not steady"
-            sigma_N = float((sum(event.sigma[:3] ** 2) / 3) ** 0.5)
-            return (
-                f" {event.stop:2d}/{event.stops}  R{event.number:02d}  {event.samples} samples, "
-                f"mean ± {sigma_N:.4f} N{unsteady}"
-            )
-        case StateChanged(state=State.HOLD | State.APPROACH | State.PREFLIGHT | State.CLOSE):
-            return f"{event.state.value}  {event.words}".rstrip()
-    return ""

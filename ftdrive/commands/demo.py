@@ -6,9 +6,9 @@ from typing import Any, Literal
 import click
 import numpy as np
 
-from ftdrive.commands.calibrate import PlainOperator
 from ftdrive.commands.common import JSON, RUNS, stop_unless_accepted, write_json
 from ftdrive.report import errors_in_sigma, print_result, talk
+from ftdrive.screen import open_operator
 from ftdrive.session.guided import Options
 from ftdrive.session.guided import calibrate as guide
 from ftdrive.simulation import Station
@@ -38,7 +38,8 @@ def demo(sensor: Literal["can", "serial"], seed: int, runs: Path, as_json: bool)
             questions=False,
             description={"station": {"sensor": sensor, "options": station.options, "truth": truth}},
         )
-        outcome = guide(station.cell, PlainOperator(yes=True), options)
+        with open_operator(yes=True) as operator:
+            outcome = guide(station.cell, operator, options)
     if outcome is None:
         raise RuntimeError("a demo is never a dry run")
     if as_json:

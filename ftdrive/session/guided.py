@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -40,6 +39,7 @@ from ftdrive.session.guards import (
     Tripped,
 )
 from ftdrive.session.machine import SLOW_RAD_S, SLOW_RAD_S2, Desk, Pace, RunningFit, Tour, approach_to
+from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Operator
 from ftdrive.session.outcome import Outcome, solve_and_save
 from ftdrive.session.running import Running
@@ -343,7 +343,7 @@ class _Begun:
 
 def _range_of(sensor: ForceTorqueSensor) -> Array | None:
     """Largest wrench (6,) of the sensor, as far as its driver knows."""
-    fact = getattr(sensor.identify(), "facts", {}).get("range")
+    fact = sensor.identify().facts.get("range")
     return None if fact is None else np.asarray(fact.value, dtype=np.float64)
 
 
@@ -367,12 +367,16 @@ def _by_hand(
     devices: Mapping[str, Any],
 ) -> Run:
     """No motion command at all: a person moves the arm, or a program on the pendant does."""
-    collect_manually = import_module("ftdrive.session.manual").collect_manually
-
-    run = Run.create(options.runs, options.name, _description(cell, devices, options))
+    if options.resume is None:
+        run, earlier = Run.create(options.runs, options.name, _description(cell, devices, options)), []
+    else:
+        run = Run(options.resume)
+        earlier = run.records()
     desk.keep_in(run)
     running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_of(cell))
-    collect_manually(arm, sensor, cell.sampling, desk, running, run.commit, listen=options.mode == "listen")
+    listen = options.mode == "listen"
+    with _kept(desk, run):
+        collect_manually(arm, sensor, cell.sampling, desk, running, run.commit, listen=listen, earlier=earlier)
     return run
 
 

@@ -38,7 +38,9 @@ class CommandLine:
     def json(self, *arguments: str | Path, typed: str = "") -> dict[str, Any]:
         outcome = self.run(*arguments, "--json", typed=typed)
         assert outcome.returncode == 0, outcome.stderr
-        answer: dict[str, Any] = json.loads(outcome.stdout)
+        answer: dict[str, Any] = json.loads(
+            outcome.stdout.splitlines()[-1]
+        )  # after the events, where a command tells them
         return answer
 
     def poses(self) -> list[Path]:

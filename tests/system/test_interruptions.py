@@ -34,7 +34,7 @@ def station(request: pytest.FixtureRequest) -> Iterator[Station]:
 @pytest.fixture
 def tour(station: Station, ftdrive: CommandLine, write_config: Callable[[CellConfig], Path]) -> subprocess.Popen[str]:
     """A calibration on its way, two poses taken."""
-    process = ftdrive.start("calibrate", "--config", write_config(station.cell), "--json")
+    process = ftdrive.start("calibrate", "--config", write_config(station.cell))
     assert process.stdin is not None
     process.stdin.write(ANSWERS)
     process.stdin.flush()
