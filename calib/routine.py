@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calib.dataset import CalibrationDataset
 from calib.errors import CalibError, TooFewSamples
-from calib.noise import LEAST_SAMPLES, PoseMean, is_stationary, mean_and_covariance
+from calib.noise import LEAST_SAMPLES, PoseMean, is_quiet, is_stationary, mean_and_covariance
 from calib.ports import Arm, ArmReading, Sensor, WrenchSamples
 from calib.tour import TourPose
 
@@ -21,8 +21,6 @@ Array = NDArray[np.float64]
 
 Stage = Literal["settle", "sample"]
 
-_LOUD = 2.0
-"""Samples that scatter this many times as much as at rest are not steady."""
 _MOVED_RAD = np.radians(0.05)
 """The flange may turn this much while a pose is averaged: a tenth of the noise of a good sensor at 1 kg."""
 
@@ -119,9 +117,10 @@ def take_pose(
         after = arm.state()
         guard()
         enough = len(samples.wrench) >= LEAST_SAMPLES
-        steady = enough and turned_rad(before, after) < _MOVED_RAD and is_stationary(samples.wrench)
-        if steady and quiet_std is not None:
-            steady = bool((samples.wrench.std(axis=0) <= _LOUD * quiet_std).all())
+        steady = enough and turned_rad(before, after) < _MOVED_RAD
+        if steady:
+            wrench = samples.wrench
+            steady = is_stationary(wrench) if quiet_std is None else is_quiet(wrench, quiet_std)
         if steady:
             break
     if not enough:

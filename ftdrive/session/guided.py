@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.allan import averaging_time
+from calib.noise import LEAST_SAMPLES, noise_level
 from calib.routine import PoseRecord, Sampling
 from calib.tour import wrist_tour
 from drivers.errors import DriverError
@@ -274,7 +275,9 @@ class _Begun:
             self._ask()
         run = self._run(devices)
         desk.keep_in(run)
-        quiet_std = self._before.quiet.wrench.std(axis=0)
+        quiet = self._before.quiet.wrench
+        window = int(len(quiet) * min(1.0, self._sampling.average_s / preflight.LISTEN_S))
+        quiet_std = noise_level(quiet, max(LEAST_SAMPLES, window))
         name = self._certifier.arm.name
         heaviest_kg = cell.tool.mass_kg or _HEAVIEST_KG.get(name, _HEAVIEST_OF_ALL_KG)
         reach_m = max(float(np.hypot(part.to_m, part.reach_m)) for part in self._certifier.arm.tool)
