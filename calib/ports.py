@@ -69,7 +69,15 @@ class Arm(Protocol):
     def state(self) -> ArmReading:
         """Read a fresh state, or raise."""
 
-    def move_to(self, q_rad: Sequence[float], *, timeout_s: float, guard: Callable[[], None]) -> None:
+    def move_to(
+        self,
+        q_rad: Sequence[float],
+        *,
+        timeout_s: float,
+        guard: Callable[[], None],
+        speed_rad_s: float | None = None,
+        acceleration_rad_s2: float | None = None,
+    ) -> None:
         """Move the joints to `q_rad` (6,); return on arrival, or stop the arm and raise."""
 
     def wait_until_still(self, *, timeout_s: float, guard: Callable[[], None]) -> None:

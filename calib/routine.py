@@ -1,10 +1,10 @@
-"""The calibration routine: for each pose move, wait until still, average, commit to disk, next.
+"""The calibration routine at one pose: wait until still, average, again if need be; and what many poses become.
 
 It knows the outside world only through `calib.ports`, prints nothing, and can be driven by a cell or by a recording of
 one: what it decides depends only on what the arm and the sensor tell it.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from calib.dataset import CalibrationDataset
 from calib.errors import CalibError, TooFewSamples
-from calib.noise import LEAST_SAMPLES, PoseMean, is_stationary, mean_and_covariance
+from calib.noise import LEAST_SAMPLES, PoseMean, is_quiet, is_stationary, mean_and_covariance
 from calib.ports import Arm, ArmReading, Sensor, WrenchSamples
 from calib.tour import TourPose
 
 Array = NDArray[np.float64]
+
+Stage = Literal["settle", "sample"]
 
 _MOVED_RAD = np.radians(0.05)
 """The flange may turn this much while a pose is averaged: a tenth of the noise of a good sensor at 1 kg."""
@@ -28,10 +30,11 @@ class Sampling:
     """How long to look at each pose."""
 
     average_s: float = 2.0
-    move_timeout_s: float = 30.0
     still_timeout_s: float = 10.0
-    attempts: int = 3
-    """A pose that moves or drifts while it is averaged is averaged again, this often in all."""
+    attempts: int = 2
+    """A pose that moves or drifts while it is averaged is averaged again, this often in all, and then kept as noisy."""
+    noise_record_s: float = 0.0
+    """Before the tour, listen to the sensor so long and choose from it how long to average; 0 takes `average_s`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +49,8 @@ class PoseRecord:
     samples: WrenchSamples
     steady: bool
     """Neither the flange nor the mean wrench moved while the samples were taken."""
+    clock_offset_ns: int = 0
+    """From the host's clock to one that all parts of a run share: a resumed run may have seen a restart between."""
     mean: PoseMean = field(init=False)
     """Mean wrench and the covariance of the mean."""
 
@@ -54,20 +59,8 @@ class PoseRecord:
 
     @property
     def t_mid_ns(self) -> int:
-        """Host time in the middle of the samples."""
-        return int((int(self.samples.t_host_ns[0]) + int(self.samples.t_host_ns[-1])) // 2)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Progress:
-    """What the routine does now."""
-
-    stage: Literal["moving", "settling", "averaging", "taken"]
-    stop: int
-    stops: int
-    pose: TourPose
-    record: PoseRecord | None = None
-    """Only with stage "taken": already committed."""
+        """Time in the middle of the samples, on the clock of the run."""
+        return (int(self.samples.t_host_ns[0]) + int(self.samples.t_host_ns[-1])) // 2 + self.clock_offset_ns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,51 +74,61 @@ class DriftCheck:
     elapsed_s: float
 
 
-def run_tour(
-    arm: Arm, sensor: Sensor, tour: Sequence[TourPose], sampling: Sampling, commit: Callable[[PoseRecord], None]
-) -> Iterator[Progress]:
-    """Visit every pose of the tour, then the first once more.
+def take_pose(
+    arm: Arm,
+    sensor: Sensor,
+    stop: int,
+    pose: TourPose,
+    sampling: Sampling,
+    *,
+    guard: Callable[[], None] | None = None,
+    on_stage: Callable[[Stage], None] = lambda _: None,
+    quiet_std: Array | None = None,
+) -> PoseRecord:
+    """Wait until arm and sensor are still where the arm was moved to, and average; again if something moved meanwhile.
 
     Parameters
     ----------
-    commit : callable
-        Takes each record and returns when it is safe on disk; only then does the arm move on.
-
-    Yields
-    ------
-    Progress
-        Before each step and after each pose taken.
+    stop : int
+        Place in the tour.
+    pose : TourPose
+        Where the arm was moved to.
+    guard : callable
+        Called between two looks at the arm; raises to break off. Default: the sensor's own check.
+    on_stage : callable
+        Is told of each stage as it begins.
+    quiet_std : array, shape (6,), optional
+        Standard deviation of the samples of an arm at rest: twice that is not steady.
 
     Raises
     ------
     TooFewSamples
         The sensor is too slow for the time given to a pose.
     Exception
-        Whatever the arm or the sensor raises; the records committed so far stand.
+        Whatever the arm, the sensor or the guard raises.
     """
-    stops = [*tour, tour[0]]
-    for stop, pose in enumerate(stops, start=1):
-        yield Progress("moving", stop, len(stops), pose)
-        arm.move_to([float(angle) for angle in pose.q_rad], timeout_s=sampling.move_timeout_s, guard=sensor.check)
-        for _ in range(sampling.attempts):
-            yield Progress("settling", stop, len(stops), pose)
-            arm.wait_until_still(timeout_s=sampling.still_timeout_s, guard=sensor.check)
-            yield Progress("averaging", stop, len(stops), pose)
-            before = arm.state()
-            samples = sensor.collect(sampling.average_s)
-            after = arm.state()
-            enough = len(samples.wrench) >= LEAST_SAMPLES
-            steady = enough and turned_rad(before, after) < _MOVED_RAD and is_stationary(samples.wrench)
-            if steady:
-                break
-        if not enough:
-            raise TooFewSamples(
-                f"the sensor gave {len(samples.wrench)} samples in {sampling.average_s} s, at least {LEAST_SAMPLES} "
-                "are needed: check its rate, or average longer"
-            )
-        record = PoseRecord(stop, pose, before, after, samples, steady)
-        commit(record)
-        yield Progress("taken", stop, len(stops), pose, record)
+    guard = guard or sensor.check
+    for _ in range(sampling.attempts):
+        on_stage("settle")
+        arm.wait_until_still(timeout_s=sampling.still_timeout_s, guard=guard)
+        on_stage("sample")
+        before = arm.state()
+        samples = sensor.collect(sampling.average_s)
+        after = arm.state()
+        guard()
+        enough = len(samples.wrench) >= LEAST_SAMPLES
+        steady = enough and turned_rad(before, after) < _MOVED_RAD
+        if steady:
+            wrench = samples.wrench
+            steady = is_stationary(wrench) if quiet_std is None else is_quiet(wrench, quiet_std)
+        if steady:
+            break
+    if not enough:
+        raise TooFewSamples(
+            f"the sensor gave {len(samples.wrench)} samples in {sampling.average_s} s, at least {LEAST_SAMPLES} "
+            "are needed: check its rate, or average longer"
+        )
+    return PoseRecord(stop, pose, before, after, samples, steady)
 
 
 def turned_rad(before: ArmReading, after: ArmReading) -> float:

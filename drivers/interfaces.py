@@ -224,9 +224,18 @@ class RobotArm(_Device):
         """Ask the controller whether it would accept these joint angles (6,). Needs control."""
 
     @abstractmethod
-    def move_to(self, q_rad: Sequence[float], *, timeout_s: float, guard: Guard) -> None:
-        """Move all joints to `q_rad` (6,), at the speed given at construction, and return when they have arrived.
+    def move_to(
+        self,
+        q_rad: Sequence[float],
+        *,
+        timeout_s: float,
+        guard: Guard,
+        speed_rad_s: float | None = None,
+        acceleration_rad_s2: float | None = None,
+    ) -> None:
+        """Move all joints to `q_rad` (6,) and return when they have arrived.
 
+        Speed and acceleration are those of the leading joint; None takes what was given at construction.
         `guard` is called at least 20 times a second while the arm moves. Whatever ends the wait early (an exception
         of the guard, a fault, the time-out, Ctrl-C) stops the arm first and is raised after.
         """

@@ -5,12 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from calib.ports import ArmReading, WrenchSamples
-from calib.routine import PoseRecord, is_return
-from calib.tour import TourPose
-
-
-class EndOfRecording(Exception):
-    """The run was broken off here."""
+from calib.routine import PoseRecord
 
 
 class RecordedRun:
@@ -21,16 +16,17 @@ class RecordedRun:
         self._stop = -1
         self._collected = False
 
-    @property
-    def tour(self) -> list[TourPose]:
-        """The poses visited, without the return to the first."""
-        return [record.pose for record in self._records if not is_return(record, self._records)]
-
-    def move_to(self, q_rad: Sequence[float], *, timeout_s: float, guard: Callable[[], None]) -> None:
+    def move_to(
+        self,
+        q_rad: Sequence[float],
+        *,
+        timeout_s: float,
+        guard: Callable[[], None],
+        speed_rad_s: float | None = None,
+        acceleration_rad_s2: float | None = None,
+    ) -> None:
         """Go on to the next recorded stop."""
         self._stop += 1
-        if self._stop == len(self._records):
-            raise EndOfRecording
         if not np.array_equal(q_rad, self._records[self._stop].pose.q_rad):
             raise ValueError(f"stop {self._stop + 1} of the recording went elsewhere than the routine now asks")
 

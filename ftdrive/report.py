@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult
 from calib.compare import Compared
-from calib.routine import DriftCheck, PoseRecord, Progress
+from calib.routine import DriftCheck, PoseRecord
 from ftdrive.hints import hints, names_of
-from ftdrive.session import Plan
 
 Array = NDArray[np.float64]
 
@@ -22,35 +21,6 @@ talk = Console(stderr=True, highlight=False, soft_wrap=True)
 """Everything said to a person goes to stderr; data goes to stdout."""
 
 _MARK = {"good": "[bold green]GOOD[/]", "usable": "[bold yellow]USABLE[/]", "rejected": "[bold red]REJECTED[/]"}
-
-
-def print_plan(plan: Plan) -> None:
-    """Show what the arm is going to do."""
-    talk.print(f"arm     {plan.arm.model}, serial {plan.arm.serial}, PolyScope {plan.arm.firmware}")
-    talk.print(f"sensor  {plan.sensor.model}, serial {plan.sensor.serial}, firmware {plan.sensor.firmware}")
-    table = Table(title="Where each joint will go, degrees", title_justify="left", box=None)
-    for joint in ("", "base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3"):
-        table.add_column(joint, justify="right")
-    table.add_row("from", *(f"{low:.0f}" for low, _ in plan.ranges_deg))
-    table.add_row("to", *(f"{high:.0f}" for _, high in plan.ranges_deg))
-    talk.print(table)
-    talk.print(
-        f"First a move of {plan.approach_deg:.0f}° to the first pose, then {len(plan.tour)} moves of 90° through "
-        f"{len(plan.tour)} orientations and back, at {plan.speed_deg_s:.0f}°/s: about {plan.duration_s / 60:.0f} min.\n"
-        "Base, shoulder and elbow stay where they are; the tool turns every way around the wrist, upside down too.\n"
-        "Collisions are not checked: keep a ball of 0.5 m around the wrist free, cables slack, e-stop in reach."
-    )
-
-
-def describe(progress: Progress) -> str:
-    """Say in a line where the routine stands."""
-    where = f"{progress.stop:2d}/{progress.stops}  R{progress.pose.number:02d}"
-    if progress.record is None:
-        return f"{where}  {progress.stage}"
-    record = progress.record
-    sigma_N = float(np.sqrt(np.trace(record.mean.covariance[:3, :3]) / 3))
-    unsteady = "" if record.steady else "  [yellow]not steady[/]"
-    return f"{where}  {len(record.samples.t_host_ns)} samples, mean ± {sigma_N:.4f} N{unsteady}"
 
 
 def print_result(

@@ -1,21 +1,26 @@
 """A run folder: what was planned, every pose with its raw samples, and what came of it.
 
-run.json          ftdrive.run/1: when, with what, command line, versions, configuration, devices, tour
-poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm moves on
-dataset.json      ftdrive.dataset/1: means and covariances
-calibration.json  ftdrive.calibration/1: the result
+run.json          ftdrive.run/1: when, with what, command line, versions, configuration, devices
+plan.json         ftdrive.plan/1: the plan the arm followed; not where a person moved it
+events.ndjson     what happened, one object a line, as `ftdrive.session.events` has it
+poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm moves on; 01-2.npz took its place
+dataset.json      ftdrive.dataset/1: means and covariances; dataset-2.json after poses were added or taken again
+calibration.json  ftdrive.calibration/1: the result; calibration-2.json likewise
 """
 
 import io
 import json
+import os
 import platform
 import sys
+import threading
 import time
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +67,8 @@ class Run:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._clock_offset_ns = time.time_ns() - time.monotonic_ns()
+        self._events_lock = threading.Lock()
 
     @classmethod
     def create(cls, parent: Path, name: str, description: Mapping[str, Any]) -> "Run":
@@ -90,8 +97,25 @@ class Run:
 
     @property
     def calibration_path(self) -> Path:
-        """Where the result is kept."""
-        return self.folder / "calibration.json"
+        """Where the newest result is kept."""
+        return _newest(self.folder / "calibration.json")
+
+    @property
+    def plan_path(self) -> Path:
+        """Where the plan is kept."""
+        return self.folder / "plan.json"
+
+    def new_path(self, name: str) -> Path:
+        """Give the next free path for a file that may be written again: name.json, name-2.json and so on."""
+        return _next(self.folder / f"{name}.json")
+
+    def append_event(self, event: Mapping[str, Any], *, sync: bool = False) -> None:
+        """Add a line to events.ndjson; with `sync` return when it is on disk. Any thread."""
+        with self._events_lock, (self.folder / "events.ndjson").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(event) + "\n")
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
 
     def header(self) -> Mapping[str, Any]:
         """Read run.json; raises `BadDataset` when it is not one."""
@@ -120,14 +144,35 @@ class Run:
             number=np.array(record.pose.number),
             q_target_rad=record.pose.q_rad,
             steady=np.array(record.steady),
+            clock_offset_ns=np.array(record.clock_offset_ns or self._clock_offset_ns),
             **readings,
             **{name: getattr(record.samples, name) for name in _SAMPLE_COLUMNS},
         )
-        write_new(self.folder / "poses" / f"{record.stop:02d}.npz", buffer.getvalue())
+        write_new(_next(self.folder / "poses" / f"{record.stop:02d}.npz"), buffer.getvalue())
 
     def records(self) -> list[PoseRecord]:
-        """Read every pose back, in the order of the tour."""
-        return [_read_record(path) for path in sorted((self.folder / "poses").glob("*.npz"))]
+        """Read every pose back, in the order of the tour; of one that was taken again, the last time."""
+        return [_read_record(_newest(self.folder / "poses" / f"{stop:02d}.npz")) for stop in self.stops()]
+
+    def stops(self) -> list[int]:
+        """Tell which places of the tour are taken, without reading them."""
+        return sorted({int(path.stem.partition("-")[0]) for path in (self.folder / "poses").glob("*.npz")})
+
+
+def _numbered(path: Path) -> Iterator[Path]:
+    yield path
+    yield from (path.with_stem(f"{path.stem}-{number}") for number in count(2))
+
+
+def _next(path: Path) -> Path:
+    return next(one for one in _numbered(path) if not one.exists())
+
+
+def _newest(path: Path) -> Path:
+    found = path
+    for one in takewhile(Path.exists, _numbered(path)):
+        found = one
+    return found
 
 
 def _read_record(path: Path) -> PoseRecord:
@@ -150,6 +195,7 @@ def _read_record(path: Path) -> PoseRecord:
         after=after,
         samples=Samples(*(data[name] for name in _SAMPLE_COLUMNS)),
         steady=bool(data["steady"]),
+        clock_offset_ns=int(data.get("clock_offset_ns", 0)),
     )
 
 

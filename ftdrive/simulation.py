@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from calib.routine import Sampling
 from drivers.errors import ConnectError
-from ftdrive.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import ConfigError
 
 TIME_SCALE = 20
@@ -19,6 +19,10 @@ TIME_SCALE = 20
 SENSORS = ("can", "serial", "robotous-can", "robotous-serial", "robotiq", "bota", "netft", "ur-ft")
 """Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm."""
 EMULATED = "emulated://"
+
+PAYLOAD_KG = 1.5
+"""What its controller is told about the tool, as somebody should have."""
+TOOL_MM = (0.0, 200.0, 100.0)
 
 
 class Station:
@@ -39,7 +43,7 @@ class Station:
 
     def __enter__(self) -> Self:
         command = [sys.executable, "-P", "-m", "mocks", "station", "--sensor", self.sensor]
-        command += ["--time-scale", str(TIME_SCALE), *self.options]
+        command += ["--time-scale", str(TIME_SCALE), "--payload", str(PAYLOAD_KG), *self.options]
         # A session of its own: Ctrl-C in the terminal is for us, not for the emulated cell.
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
@@ -83,6 +87,11 @@ class Station:
         return answer
 
     @property
+    def mounting(self) -> str:
+        """As its options say."""
+        return self.options[self.options.index("--mount") + 1] if "--mount" in self.options else "floor"
+
+    @property
     def cell(self) -> CellConfig:
         """Configuration that reaches this station as it would reach a real cell."""
         arm = self.endpoints["arm"]
@@ -90,6 +99,8 @@ class Station:
         return CellConfig(
             robot=RobotConfig(arm["host"], arm["model"], speed_deg_s=60.0, acceleration_deg_s2=80.0),
             sensor=SensorConfig(url),
+            tool=ToolConfig("emulated", (TOOL_MM,)),
+            workcell=WorkcellConfig(self.mounting, measured=True),
             sampling=Sampling(average_s=0.4),
         )
 

@@ -3,6 +3,7 @@
 import os
 import signal
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from hypothesis import settings
@@ -13,8 +14,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # Before numpy is loaded: matrices are small, and the threads of two workers would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# The configuration of whoever runs the tests is none of their business.
+# The configuration of whoever runs the tests, and the plans they have run, are none of their business.
 os.environ["XDG_CONFIG_HOME"] = str(Path(__file__).parent / "no-such-folder")
+_state = TemporaryDirectory(prefix="ftdrive-state-")
+os.environ["XDG_STATE_HOME"] = _state.name
 for _name in [name for name in os.environ if name.startswith("FTDRIVE_") and name != "FTDRIVE_REAL_DATA"]:
     del os.environ[_name]
 

@@ -56,7 +56,8 @@ class UrArm(RobotArm):
     model
         Such as "UR5e", for the comparison of poses with nominal kinematics; None takes what the controller says.
     speed_rad_s, acceleration_rad_s2
-        Of the leading joint in `move_to`. The speed slider of the pendant scales them down further.
+        Of the leading joint in `move_to`, where it is not told others. The speed slider of the pendant scales them
+        down further.
     """
 
     def __init__(
@@ -67,19 +68,14 @@ class UrArm(RobotArm):
         speed_rad_s: float = radians(30),
         acceleration_rad_s2: float = radians(40),
     ) -> None:
-        if not radians(0.5) <= speed_rad_s <= radians(180):
-            raise ValueError(f"speed_rad_s is {speed_rad_s}: choose 0.0087 to 3.14 (0.5 to 180 degrees per second).")
-        if not radians(1) <= acceleration_rad_s2 <= radians(300):
-            raise ValueError(
-                f"acceleration_rad_s2 is {acceleration_rad_s2}: choose 0.0175 to 5.24 (1 to 300 degrees per second "
-                f"squared)."
-            )
+        _check_speed(speed_rad_s, acceleration_rad_s2)
         if model is not None and model_named(model, 0) is None:
             raise ValueError(f"model {model!r} is not known: choose one of {', '.join(MODELS)}.")
         self._host = host
         self._model = None if model is None else model_named(model, 0)
         self._speed_rad_s = float(speed_rad_s)
         self._acceleration_rad_s2 = float(acceleration_rad_s2)
+        self._moves_at_rad_s = self._speed_rad_s
         self._reader: Reader | None = None
         self._control: ControlProcess | None = None
         self._left_behind = False  # a program of ours may be on the controller without us
@@ -256,8 +252,16 @@ class UrArm(RobotArm):
                 raise fault from error
             raise
 
-    def move_to(self, q_rad: Sequence[float], *, timeout_s: float, guard: Guard) -> None:
-        """Move all joints to `q_rad` (6,) and return when they have arrived.
+    def move_to(
+        self,
+        q_rad: Sequence[float],
+        *,
+        timeout_s: float,
+        guard: Guard,
+        speed_rad_s: float | None = None,
+        acceleration_rad_s2: float | None = None,
+    ) -> None:
+        """Move all joints to `q_rad` (6,) and return when they have arrived; see `RobotArm` for the speed.
 
         `guard` is called about 60 times a second. Whatever ends the wait early stops the arm first and is raised after:
         `DeviceFault` (protective, emergency or safeguard stop, program ended, not arrived), `StreamBroken`,
@@ -266,14 +270,19 @@ class UrArm(RobotArm):
         nobody can resume it.
         """
         q = _joints(q_rad)
+        speed = self._speed_rad_s if speed_rad_s is None else float(speed_rad_s)
+        acceleration = self._acceleration_rad_s2 if acceleration_rad_s2 is None else float(acceleration_rad_s2)
+        _check_speed(speed, acceleration)
         control = self._in_control()
         self._stop_requested.clear()
         self._goal = None
         with self._stopping_on_error():
             self._look_out()
         self._check_ours(control)  # a program of somebody else is not stopped
+        guard()
+        self._moves_at_rad_s = speed
         with self._stopping_on_error():
-            if not control.call("move", q, self._speed_rad_s, self._acceleration_rad_s2):
+            if not control.call("move", q, speed, acceleration):
                 raise self._fault() or DeviceFault(f"the controller did not accept the move to {_degrees(q)}.")
             checked = time.monotonic()
             for look in self._watch(timeout_s, guard, f"the move to {_degrees(q)} has not ended"):
@@ -387,7 +396,7 @@ class UrArm(RobotArm):
             look = self._reading().look(limit_s=0.1)
             if not control.alive or look.safety_fault() or look.program_fault():
                 return False
-            control.call("stop", timeout_s=0.5 + self._speed_rad_s / DECELERATION_RAD_S2)
+            control.call("stop", timeout_s=0.5 + self._moves_at_rad_s / DECELERATION_RAD_S2)
             for _ in range(10):  # ur_rtde does not say whether it was done
                 if max(map(abs, self._reading().look(limit_s=0.1).target_qd_rad_s)) <= _STANDING_RAD_S:
                     return True
@@ -430,6 +439,16 @@ class UrArm(RobotArm):
         if self._reader is None:
             raise ConnectError(f"the arm at {self._host} is not open: open it first.")
         return self._reader
+
+
+def _check_speed(speed_rad_s: float, acceleration_rad_s2: float) -> None:
+    if not radians(0.5) <= speed_rad_s <= radians(180):
+        raise ValueError(f"speed_rad_s is {speed_rad_s}: choose 0.0087 to 3.14 (0.5 to 180 degrees per second).")
+    if not radians(1) <= acceleration_rad_s2 <= radians(300):
+        raise ValueError(
+            f"acceleration_rad_s2 is {acceleration_rad_s2}: choose 0.0175 to 5.24 (1 to 300 degrees per second "
+            f"squared)."
+        )
 
 
 def _joints(q_rad: Sequence[float]) -> list[float]:

@@ -1,8 +1,7 @@
-"""What several commands share: options, the progress bar, JSON on stdout."""
+"""What several commands share: options, JSON on stdout."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +9,7 @@ import click
 
 if TYPE_CHECKING:
     from calib import CalibrationResult
-    from calib.routine import Progress as RoutineProgress
     from ftdrive.config import CellConfig
-    from ftdrive.runs import Run
 
 JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 RUNS = click.option(
@@ -62,40 +59,6 @@ def read_cell(config: Path | None, robot: str | None, sensor: str | None) -> "Ce
     from ftdrive.config import load
 
     return load(config, {"robot.host": ("--robot", robot), "sensor.url": ("--sensor", sensor)})
-
-
-@contextmanager
-def progress_bar() -> Iterator[tuple[Callable[["RoutineProgress"], None], Callable[["Run"], None]]]:
-    """Show the routine's progress on stderr; when it fails, say where the poses taken so far are kept.
-
-    Yields what to call with every step, and with the run as soon as it exists: the bar appears then, after questions.
-    """
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    from ftdrive.report import describe, talk
-
-    runs: list[Run] = []
-    bar = Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=talk)
-    task = bar.add_task("", total=None)
-
-    def on_run(run: "Run") -> None:
-        runs.append(run)
-        bar.start()
-
-    def on_progress(progress: "RoutineProgress") -> None:
-        done = progress.stop - (progress.stage != "taken")
-        bar.update(task, description=describe(progress), completed=done, total=progress.stops)
-
-    try:
-        yield on_progress, on_run
-    except BaseException:
-        for run in runs:
-            bar.stop()
-            poses = len(list((run.folder / "poses").glob("*.npz")))
-            talk.print(f"{poses} poses are kept in {run.folder}")
-        raise
-    if runs:
-        bar.stop()
 
 
 def stop_unless_accepted(result: "CalibrationResult") -> None:

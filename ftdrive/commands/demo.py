@@ -6,9 +6,11 @@ from typing import Any, Literal
 import click
 import numpy as np
 
-from ftdrive.commands.common import JSON, RUNS, progress_bar, stop_unless_accepted, write_json
+from ftdrive.commands.common import JSON, RUNS, stop_unless_accepted, write_json
 from ftdrive.report import errors_in_sigma, print_result, talk
-from ftdrive.session import calibrate_cell
+from ftdrive.screen import open_operator
+from ftdrive.session.guided import Options
+from ftdrive.session.guided import calibrate as guide
 from ftdrive.simulation import Station
 
 
@@ -28,17 +30,18 @@ def demo(sensor: Literal["can", "serial"], seed: int, runs: Path, as_json: bool)
             f"An emulated UR5e with an ATI sensor on {'CAN' if sensor == 'can' else 'RS-485'}, tool of "
             f"{station.truth['mass_kg']:.3f} kg. Nothing real is connected."
         )
-        with progress_bar() as (on_progress, on_run):
-            outcome = calibrate_cell(
-                station.cell,
-                runs,
-                "demo",
-                confirm=lambda _: None,  # nothing real moves
-                on_progress=on_progress,
-                on_run=on_run,
-                description={"station": {"sensor": sensor, "options": station.options, "truth": station.truth}},
-            )
         truth = station.truth
+        options = Options(
+            runs,
+            "demo",
+            real=False,
+            questions=False,
+            description={"station": {"sensor": sensor, "options": station.options, "truth": truth}},
+        )
+        with open_operator(yes=True) as operator:
+            outcome = guide(station.cell, operator, options)
+    if outcome is None:
+        raise RuntimeError("a demo is never a dry run")
     if as_json:
         write_json(
             {

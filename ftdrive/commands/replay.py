@@ -1,17 +1,18 @@
 """`ftdrive replay`: a recorded run once more, through the same routine and solver, without any driver."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
 from calib import CalibrationResult
-from calib.routine import PoseRecord, Sampling, run_tour
+from calib.routine import PoseRecord, take_pose
 from ftdrive.commands.common import JSON, stop_unless_accepted, write_json
 from ftdrive.errors import NotAccepted
-from ftdrive.recorded import EndOfRecording, RecordedRun
-from ftdrive.report import describe, print_result, talk
+from ftdrive.recorded import RecordedRun
+from ftdrive.report import print_result, talk
 from ftdrive.runs import Run
-from ftdrive.session import solve_records
+from ftdrive.session import sampling_of, solve_records
 
 
 @click.command()
@@ -22,13 +23,12 @@ def replay(folder: Path, as_json: bool) -> None:
     run = Run(folder)
     recorded = RecordedRun(run.records())
     records: list[PoseRecord] = []
-    sampling = Sampling(**run.header()["config"]["sampling"])
-    try:
-        for progress in run_tour(recorded, recorded, recorded.tour, sampling, records.append):
-            if progress.stage == "taken":
-                talk.print(describe(progress))
-    except EndOfRecording:
-        talk.print(f"the run was broken off after {len(records)} poses")
+    sampling = sampling_of(run.header())
+    for kept in run.records():
+        recorded.move_to(kept.pose.q_rad.tolist(), timeout_s=0.0, guard=recorded.check)
+        again = take_pose(recorded, recorded, kept.stop, kept.pose, sampling)
+        records.append(replace(again, clock_offset_ns=kept.clock_offset_ns))
+        talk.print(f"{kept.stop:2d}  R{kept.pose.number:02d}  {len(kept.samples.t_host_ns)} samples")
     outcome = solve_records(run, records)
     if as_json:
         write_json(outcome.result.to_dict())

@@ -27,7 +27,7 @@ class CommandLine:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env=os.environ | {"COLUMNS": "200"},
+            env=os.environ | {"COLUMNS": "200", "XDG_STATE_HOME": str(self.folder / "state")},
         )
 
     def run(self, *arguments: str | Path, typed: str = "") -> subprocess.CompletedProcess[str]:
@@ -38,7 +38,9 @@ class CommandLine:
     def json(self, *arguments: str | Path, typed: str = "") -> dict[str, Any]:
         outcome = self.run(*arguments, "--json", typed=typed)
         assert outcome.returncode == 0, outcome.stderr
-        answer: dict[str, Any] = json.loads(outcome.stdout)
+        answer: dict[str, Any] = json.loads(
+            outcome.stdout.splitlines()[-1]
+        )  # after the events, where a command tells them
         return answer
 
     def poses(self) -> list[Path]:
@@ -62,6 +64,8 @@ def write_config(tmp_path: Path) -> Callable[[CellConfig], Path]:
             f'[robot]\nhost = "{cell.robot.host}"\nmodel = "{cell.robot.model}"\n'
             f"speed_deg_s = {cell.robot.speed_deg_s}\nacceleration_deg_s2 = {cell.robot.acceleration_deg_s2}\n"
             f'[sensor]\nurl = "{cell.sensor.url}"\n'
+            f"[tool]\ncylinders_mm = {[list(row) for row in cell.tool.cylinders_mm]}\n"
+            f'[workcell]\nmounting = "{cell.workcell.mounting}"\nmeasured = true\n'
             f"[sampling]\naverage_s = {cell.sampling.average_s}\n"
         )
         return path

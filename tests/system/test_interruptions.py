@@ -13,6 +13,9 @@ import pytest
 from ftdrive.config import CellConfig
 from ftdrive.simulation import Station
 
+ANSWERS = "yes\nyes\nyes\nMOVE\nyes\n"
+"""Tool free, ball free, emergency stop in reach; the first motion; the tour."""
+
 
 class CommandLine(Protocol):
     folder: Path
@@ -31,9 +34,9 @@ def station(request: pytest.FixtureRequest) -> Iterator[Station]:
 @pytest.fixture
 def tour(station: Station, ftdrive: CommandLine, write_config: Callable[[CellConfig], Path]) -> subprocess.Popen[str]:
     """A calibration on its way, two poses taken."""
-    process = ftdrive.start("calibrate", "--config", write_config(station.cell), "--json")
+    process = ftdrive.start("calibrate", "--config", write_config(station.cell))
     assert process.stdin is not None
-    process.stdin.write("MOVE\n")
+    process.stdin.write(ANSWERS)
     process.stdin.flush()
     deadline = time.monotonic() + 30
     while len(ftdrive.poses()) < 2:
@@ -96,10 +99,12 @@ def test_without_the_typed_word_nothing_moves(
     station: Station, ftdrive: CommandLine, write_config: Callable[[CellConfig], Path]
 ) -> None:
     before = station.control(do="state")["q_rad"]
-    outcome = ftdrive.run("calibrate", "--config", write_config(station.cell), typed="yes\n")
-    assert outcome.returncode == 130
-    assert station.control(do="state")["q_rad"] == before
-    assert not (ftdrive.folder / "runs").exists()
+    config = write_config(station.cell)
+    for typed, options in (("yes\nyes\nyes\nmove\n", ()), ("", ("--yes",))):
+        outcome = ftdrive.run("calibrate", "--config", config, *options, typed=typed)
+        assert outcome.returncode == 130, outcome.stderr
+        assert station.control(do="state")["q_rad"] == before
+        assert not ftdrive.poses()
 
 
 def test_nobody_there(ftdrive: CommandLine) -> None:

@@ -31,7 +31,7 @@ def test_odd_cells_are_recovered_within_their_sigmas(
 
     sensor, options = WORLDS[world]
     with Station(sensor, ["--seed", "7", *options]) as station:
-        answer = ftdrive.json("calibrate", "--config", write_config(station.cell), typed="MOVE\n")
+        answer = ftdrive.json("calibrate", "--config", write_config(station.cell), typed="yes\nyes\nyes\nMOVE\nyes\n")
         truth = station.truth
     result = CalibrationResult.load(tmp_path / answer["run"] / "calibration.json")
     for key, errors in errors_in_sigma(result, truth).items():

@@ -1,7 +1,7 @@
-"""The routine on small fakes: order, retries, what is kept when something breaks."""
+"""The routine on small fakes: retries, what is steady, what becomes of many poses."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib.errors import TooFewSamples
-from calib.routine import PoseRecord, Progress, Sampling, dataset_from, drift_check, run_tour
+from calib.routine import PoseRecord, Sampling, dataset_from, drift_check, take_pose
 from calib.tour import TourPose
 
 Array = NDArray[np.float64]
@@ -55,11 +55,8 @@ class Cell:
         R = Rotation.from_euler("xz", [self.q[4], self.q[5] + turn]).as_matrix()
         return Reading(len(self.log), self.q, R)
 
-    def move_to(self, q_rad: Sequence[float], *, timeout_s: float, guard: Callable[[], None]) -> None:
-        assert timeout_s > 0
-        guard()
-        self.q = np.array(q_rad)
-        self._did(f"move {q_rad[5]:.0f}")
+    def move_to(self, *_: object, **__: object) -> None:
+        raise AssertionError("whoever moves the arm, it is not the routine")
 
     def wait_until_still(self, *, timeout_s: float, guard: Callable[[], None]) -> None:
         assert timeout_s > 0
@@ -77,64 +74,84 @@ class Cell:
 
 
 TOUR = [TourPose(number, np.array([0, 0, 0, 0, 0, number], dtype=float)) for number in (1, 2, 3)]
+STOPS = [*TOUR, TOUR[0]]
 
 
-def run(cell: Cell, kept: list[PoseRecord]) -> list[Progress]:
-    def commit(record: PoseRecord) -> None:
-        cell.log.append(f"commit {record.stop}")
-        kept.append(record)
-
-    return list(run_tour(cell, cell, TOUR, Sampling(average_s=0.5), commit))
-
-
-def test_each_pose_is_safe_on_disk_before_the_arm_moves_on() -> None:
-    cell, kept = Cell(), list[PoseRecord]()
-    progress = run(cell, kept)
-    once = ["still", "collect 0.5"]
-    expected = [f"move 1|{'|'.join(once)}|commit 1", f"move 2|{'|'.join(once)}|commit 2"]
-    expected += [f"move 3|{'|'.join(once)}|commit 3", f"move 1|{'|'.join(once)}|commit 4"]
-    assert "|".join(cell.log) == "|".join(expected)
-    assert [step.stage for step in progress] == ["moving", "settling", "averaging", "taken"] * 4
+def take(cell: Cell, stop: int = 1, stages: list[str] | None = None, quiet_std: Array | None = None) -> PoseRecord:
+    return take_pose(
+        cell,
+        cell,
+        stop,
+        STOPS[stop - 1],
+        Sampling(average_s=0.5),
+        on_stage=(stages if stages is not None else []).append,
+        quiet_std=quiet_std,
+    )
 
 
-def test_a_pose_that_turns_or_drifts_while_averaged_is_averaged_again() -> None:
-    for fault in ("restless", "drifting"):
-        cell, kept = Cell(), list[PoseRecord]()
-        setattr(cell, fault, 1)
-        run(cell, kept)
-        assert cell.log[:6] == ["move 1", "still", "collect 0.5", "still", "collect 0.5", "commit 1"]
-        assert all(record.steady for record in kept)
+def test_a_quiet_pose_is_averaged_once() -> None:
+    cell, stages = Cell(), list[str]()
+    assert take(cell, stages=stages).steady
+    assert cell.log == ["still", "collect 0.5"]
+    assert stages == ["settle", "sample"]
+
+
+@pytest.mark.parametrize("fault", ["restless", "drifting"])
+def test_a_pose_that_turns_or_drifts_while_averaged_is_averaged_again(fault: str) -> None:
+    cell = Cell()
+    setattr(cell, fault, 1)
+    assert take(cell).steady
+    assert cell.log == ["still", "collect 0.5"] * 2
 
 
 def test_a_pose_that_never_comes_to_rest_is_kept_and_marked() -> None:
-    cell, kept = Cell(), list[PoseRecord]()
+    cell, stages = Cell(), list[str]()
     cell.drifting = 3
-    run(cell, kept)
-    assert cell.log.count("collect 0.5") == 6
-    assert [record.steady for record in kept] == [False, True, True, True]
+    assert not take(cell, stages=stages).steady
+    assert stages == ["settle", "sample"] * 2
 
 
-@pytest.mark.parametrize("fails_at", ["move 3", "still", "collect 0.5"])
-def test_what_was_committed_before_a_failure_stands(fails_at: str) -> None:
-    cell, kept = Cell(), list[PoseRecord]()
+def test_samples_that_scatter_more_than_at_rest_are_not_steady() -> None:
+    assert take(Cell(), quiet_std=np.full(6, 0.008)).steady
+    assert not take(Cell(), quiet_std=np.full(6, 0.004)).steady
+
+
+@pytest.mark.parametrize("fails_at", ["still", "collect 0.5"])
+def test_a_failure_is_passed_on(fails_at: str) -> None:
+    cell = Cell()
     cell.fails_at = fails_at
     with pytest.raises(ConnectionError):
-        run(cell, kept)
-    assert len(kept) == (2 if fails_at == "move 3" else 0)
-    assert not cell.log[-1].startswith("commit")
+        take(cell)
 
 
 def test_a_sensor_that_is_too_slow_ends_the_tour_with_a_sentence() -> None:
-    cell, kept = Cell(), list[PoseRecord]()
+    cell = Cell()
     cell.samples = 7
     with pytest.raises(TooFewSamples, match=r"7 samples in 0\.5 s"):
-        run(cell, kept)
-    assert kept == []
+        take(cell)
+
+
+def test_a_guard_that_trips_at_the_very_end_of_a_pose_discards_it() -> None:
+    cell = Cell()
+
+    def guard() -> None:
+        if cell.log[-1:] == ["collect 0.5"]:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        take_pose(cell, cell, 1, TOUR[0], Sampling(average_s=0.5), guard=guard)
+
+
+def test_parts_of_a_run_share_one_clock() -> None:
+    """A computer that was switched off between counts its time from nought again."""
+    before, after = take(Cell(), 1), take(Cell(), 2)
+    resumed = replace(after, clock_offset_ns=5_000_000_000)
+    assert dataset_from([before, resumed], {}).t_s == pytest.approx([0, 5])
 
 
 def test_the_return_serves_the_drift_check_and_stays_out_of_the_dataset() -> None:
-    cell, kept = Cell(), list[PoseRecord]()
-    run(cell, kept)
+    cell = Cell()
+    kept = [take(cell, stop) for stop in (1, 2, 3, 4)]
     assert len(dataset_from(kept, {}).wrench) == 3
     drift = drift_check(kept)
     assert drift is not None

@@ -1,0 +1,41 @@
+"""Which plans have run to their end on which arm: only those may run at full speed, or without a typed word."""
+
+import json
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+
+FORMAT = "ftdrive.completed/1"
+
+
+def state_file() -> Path:
+    """Where a user's completed plans are remembered; it need not exist."""
+    home = os.environ.get("XDG_STATE_HOME", "")
+    folder = Path(home) if Path(home).is_absolute() else Path("~/.local/state").expanduser()
+    return folder / "ftdrive" / "completed.ndjson"
+
+
+def has_completed(arm_serial: str, plan_sha256: str) -> bool:
+    """Tell whether this plan has run to its end on this arm before. A line that cannot be read counts for nothing."""
+    path = state_file()
+    if not path.is_file():
+        return False
+    wanted = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256}
+    return any(wanted.items() <= _read(line).items() for line in path.read_text(encoding="utf-8").splitlines())
+
+
+def remember_completed(arm_serial: str, plan_sha256: str) -> None:
+    """Note that it has."""
+    path = state_file()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    line = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256, "utc": datetime.now(UTC).isoformat()}
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def _read(line: str) -> dict[str, object]:
+    try:
+        found = json.loads(line)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,392 @@
+"""A whole session: open the cell, plan, check, show, ask, move and average, solve, save."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.allan import averaging_time
+from calib.noise import LEAST_SAMPLES, noise_level
+from calib.routine import PoseRecord, Sampling
+from calib.tour import wrist_tour
+from drivers.errors import DriverError
+from drivers.interfaces import DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
+from ftdrive.config import CellConfig
+from ftdrive.errors import ConfigError, NotAccepted, PlanRefused
+from ftdrive.planning.cell import certifier_for
+from ftdrive.planning.motion import Speeds
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import guess_of, plan_tour
+from ftdrive.planning.scene import Scene, lean_of
+from ftdrive.runs import Run
+from ftdrive.session import preflight
+from ftdrive.session.completed import has_completed, remember_completed
+from ftdrive.session.events import GuardTripped, Noted, State, StateChanged
+from ftdrive.session.guards import (
+    ContactGuard,
+    Guard,
+    Limits,
+    ModelGuard,
+    PathGuard,
+    RangeGuard,
+    SafetyGuard,
+    SensorGuard,
+    SettingsGuard,
+    StallGuard,
+    Tripped,
+)
+from ftdrive.session.machine import SLOW_RAD_S, SLOW_RAD_S2, Desk, Pace, RunningFit, Tour, approach_to
+from ftdrive.session.manual import collect_manually
+from ftdrive.session.operator import Operator
+from ftdrive.session.outcome import Outcome, solve_and_save
+from ftdrive.session.running import Running
+from ftdrive.session.watch import Guards
+from ftdrive.wiring import build_arm, build_sensor
+
+Array = NDArray[np.float64]
+
+_GRID_RAD: Final = float(np.radians(0.1))
+"""Plans are made where joints 1 to 3 stand, to this grid: the same place gives the same plan, and hash, again."""
+_TARGET_N, _TARGET_NM = 0.057, 0.0035
+"""Of one average: 0.02 N of bias from 24 poses."""
+_HEAVIEST_KG: Final = {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5, "UR16e": 16.0, "UR20": 20.0}
+_HEAVIEST_OF_ALL_KG: Final = 30.0
+_EMULATED: Final = Limits(sensor_age_moving_s=0.3)
+"""An emulated sensor shares this computer with all else."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What a person asked for."""
+
+    runs: Path
+    name: str = "calibrate"
+    poses: int = 24
+    mode: Literal["auto", "step", "manual", "listen"] = "auto"
+    dry_run: bool = False
+    fast: bool = False
+    """At the plan's speeds, once it has run to its end slowly."""
+    plan: Path | None = None
+    resume: Path | None = None
+    redo: tuple[int, ...] = ()
+    real: bool = True
+    """Something real moves. An emulated cell needs no typed word and no slow first run."""
+    questions: bool = True
+    description: Mapping[str, Any] = field(default_factory=dict)
+    """Goes into run.json."""
+
+
+def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Limits | None = None) -> Outcome | None:
+    """Lead a person through a calibration; None after a dry run.
+
+    Raises
+    ------
+    Declined
+        A person ended it.
+    NotAccepted, PlanRefused, ConfigError
+        It may not begin.
+    DriverError, OSError
+        It was broken off; what was taken stands in the run, which can be resumed.
+    """
+    desk = Desk(operator)
+    by_hand = options.mode in {"manual", "listen"}
+    with build_sensor(cell) as sensor, closing(build_arm(cell)) as arm, preflight.awake() as kept_awake:
+        arm.open(control=not by_hand)
+        desk.tell(StateChanged(state=State.PREFLIGHT))
+        devices = {"arm": asdict(arm.identify()), "sensor": asdict(sensor.identify())}
+        if by_hand:
+            run = _by_hand(cell, arm, sensor, desk, options, devices)
+        else:
+            desk.tell(Noted(words=kept_awake))
+            begun = _Begun(cell, arm, sensor, desk, options, limits or (Limits() if options.real else _EMULATED))
+            if options.dry_run:
+                return None
+            run = begun.tour(devices)
+    desk.tell(StateChanged(state=State.REPORT))
+    return solve_and_save(run)
+
+
+class _Begun:
+    """A session in front of its tour: planned, checked and shown."""
+
+    def __init__(
+        self,
+        cell: CellConfig,
+        arm: RobotArm,
+        sensor: ForceTorqueSensor,
+        desk: Desk,
+        options: Options,
+        limits: Limits,
+    ) -> None:
+        self._cell, self._arm, self._sensor, self._desk, self._options = cell, arm, sensor, desk, options
+        self._limits = limits
+        info: DeviceInfo = arm.identify()
+        self._certifier = certifier_for(cell, info.model)
+        self._old = None if options.resume is None else Run(options.resume)
+        self._plan = self._planned()
+        document = self._plan.to_dict()
+        self._key = (info.serial, str(document["sha256"]))
+        self._known = not options.real or has_completed(*self._key)
+        q = arm.state().q_rad
+        self._todo, self._taken = self._what_is_left()
+        first = self._todo[0] - 1 if self._todo else 0
+        goal = np.array(self._plan.steps[first % len(self._plan.steps)].q_rad)
+        self._before = preflight.Before(
+            cell=cell,
+            arm=arm,
+            sensor=sensor,
+            certifier=self._certifier,
+            plan=self._plan,
+            approach=approach_to(self._certifier, q, goal, Speeds(SLOW_RAD_S, SLOW_RAD_S2)),
+            runs=options.runs,
+            known=self._known,
+            quiet=self._listen(),
+            limits=limits,
+            sensor_range=_range_of(sensor),
+        )
+        self._check(preflight.CHECKS)
+        self._sampling = self._chosen_sampling()
+        self._show()
+
+    def _planned(self) -> Plan:
+        """The plan of the run that is resumed, or of a file, or one made where the arm stands."""
+        options, cell = self._options, self._cell
+        if self._old is not None:
+            return Plan.load(self._old.plan_path)
+        if options.plan is not None:
+            return Plan.load(options.plan)
+        q = np.round(self._arm.state().q_rad / _GRID_RAD) * _GRID_RAD
+        with suppress(ValueError):  # the planner says what to do about it
+            q = wrist_tour(q)[0].q_rad  # wherever the wrist was left
+        speeds = Speeds(
+            float(np.radians(cell.robot.speed_deg_s)),
+            float(np.radians(cell.robot.acceleration_deg_s2)),
+            cell.robot.tip_speed_mm_s / 1e3,
+        )
+        guess = guess_of(self._certifier, cell.tool.mass_kg or 1.0)
+        return plan_tour(self._certifier, q, options.poses, speeds=speeds, guess=guess)
+
+    def _what_is_left(self) -> tuple[list[int], list[PoseRecord]]:
+        """Stops to take, and records that stand."""
+        stops = range(1, len(self._plan.steps) + 2)
+        if self._old is None:
+            if self._options.redo:
+                raise ConfigError("--redo takes poses of a run again: name the run with --resume RUN")
+            return list(stops), []
+        self._require_same_devices(self._old)
+        redo = set(self._options.redo)
+        if wrong := sorted(redo - set(stops)):
+            raise ConfigError(f"pose {wrong[0]} cannot be taken again: the run has poses 1 to {len(stops)}")
+        kept = [record for record in self._old.records() if record.stop not in redo]
+        have = {record.stop for record in kept}
+        return [stop for stop in stops if stop not in have], kept
+
+    def _require_same_devices(self, run: Run) -> None:
+        devices = run.header()["devices"]
+        for name, info in (("arm", self._arm.identify()), ("sensor", self._sensor.identify())):
+            if devices[name]["serial"] != info.serial:
+                raise PlanRefused(
+                    f"the run was made with the {name} {devices[name]['serial']}, this is {info.serial}: make a new run"
+                )
+
+    def _listen(self) -> FtSamples:
+        """Take samples of the resting sensor; one that fails, as after a killed session, is opened once more."""
+        try:
+            return self._sensor.collect(preflight.LISTEN_S)
+        except DriverError as error:
+            self._desk.tell(Noted(words=f"{error}; trying once more", warning=True))
+        self._sensor.close()
+        self._sensor.open()
+        return self._sensor.collect(preflight.LISTEN_S)
+
+    def _check(self, checks: Sequence[preflight.Check]) -> None:
+        failed = []
+        for check in checks:
+            found = check(self._before)
+            self._desk.tell(found)
+            if not found.passed:
+                failed.append(f"{found.name}: {found.words}")
+        if failed:
+            raise NotAccepted("nothing moves: " + "; ".join(failed))
+
+    def _chosen_sampling(self) -> Sampling:
+        """How long to average: as configured, or as the noise of a record asks for."""
+        sampling = self._cell.sampling
+        if not sampling.noise_record_s:
+            return sampling
+        self._desk.tell(Noted(words=f"listening to the sensor for {sampling.noise_record_s:g} s; do not touch the arm"))
+        record = self._sensor.collect(sampling.noise_record_s)
+        chosen = averaging_time(
+            record.wrench,
+            len(record) / sampling.noise_record_s,
+            target_force_N=_TARGET_N,
+            target_torque_Nm=_TARGET_NM,
+        )
+        self._desk.tell(Noted(words=chosen.words))
+        return replace(sampling, average_s=chosen.seconds)
+
+    def _show(self) -> None:
+        plan, pace = self._plan, self._pace
+        for words in plan.why:
+            self._desk.tell(Noted(words=words))
+        predicted, mass_kg = plan.predicted, plan.description["guess"]["mass_kg"]
+        self._desk.tell(
+            Noted(
+                words=f"predicted for {mass_kg:g} kg, one sigma: mass {1e3 * predicted['mass_kg']:.1f} g, force bias "
+                f"{max(predicted['force_bias_N']):.3f} N, compensation {predicted['force_rms_N']:.3f} N, "
+                f"{predicted['torque_rms_Nm']:.4f} N·m"
+            )
+        )
+        q = np.degrees([step.q_rad for step in plan.steps])
+        ranges = ", ".join(f"{low:.0f} to {high:.0f}" for low, high in zip(q.min(axis=0), q.max(axis=0), strict=True))
+        self._desk.tell(Noted(words=f"joints 1 to 6 stay within {ranges} degrees: are cables long and slack enough?"))
+        if self._options.fast and pace.slow:
+            self._desk.tell(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
+        speed = np.degrees(max(step.speed_rad_s for step in plan.steps))
+        speed = min(speed, float(np.degrees(SLOW_RAD_S))) if pace.slow else speed
+        factor = max(1.0, float(np.degrees(max(step.speed_rad_s for step in plan.steps))) / speed)
+        moves_s = factor * sum(step.duration_s for step in plan.steps)
+        rest_s = (len(plan.steps) + 1) * (self._sampling.average_s + 0.6)
+        self._desk.tell(
+            Noted(
+                words=f"{len(self._todo)} stops, at most {speed:.0f}°/s: about {(moves_s + rest_s) / 60:.1f} min; "
+                f"{len(self._taken)} poses are there already"
+            )
+        )
+
+    @property
+    def _pace(self) -> Pace:
+        options = self._options
+        return Pace(
+            slow=options.real and not (options.fast and self._known),
+            step=options.mode == "step",
+            trusted=self._known,
+            asks=self._options.questions,
+        )
+
+    def tour(self, devices: Mapping[str, Any]) -> Run:
+        """Ask, move, keep."""
+        desk, plan, cell = self._desk, self._plan, self._cell
+        if self._options.questions and self._todo:
+            self._ask()
+        run = self._run(devices)
+        desk.keep_in(run)
+        quiet = self._before.quiet.wrench
+        window = int(len(quiet) * min(1.0, self._sampling.average_s / preflight.LISTEN_S))
+        quiet_std = noise_level(quiet, max(LEAST_SAMPLES, window))
+        name = self._certifier.arm.name
+        heaviest_kg = cell.tool.mass_kg or _HEAVIEST_KG.get(name, _HEAVIEST_OF_ALL_KG)
+        reach_m = max(float(np.hypot(part.to_m, part.reach_m)) for part in self._certifier.arm.tool)
+        load = RangeGuard(self._limits, self._before.sensor_range)
+        contact = ContactGuard(self._limits, heaviest_kg, reach_m, plan.acceleration_rad_s2, quiet_std)
+        rows: Sequence[Guard] = (
+            SafetyGuard(),
+            PathGuard(self._limits),
+            SensorGuard(self._limits),
+            load,
+            contact,
+            ModelGuard(self._limits, self._certifier),
+            SettingsGuard(),
+            StallGuard(self._limits),
+        )
+        running: RunningFit = Running(g_m_s2=cell.site.g_m_s2, down_base=self._certifier.scene.down_base)
+
+        def on_trip(trip: Tripped) -> None:
+            desk.tell(GuardTripped(hazard=trip.hazard, words=str(trip)))
+
+        with _kept(desk, run), Guards(self._arm, self._sensor, rows, on_trip) as guards:
+            Tour(
+                self._arm,
+                self._sensor,
+                self._certifier,
+                plan,
+                run,
+                desk,
+                running,
+                guards,
+                contact=contact,
+                load=load,
+                sampling=self._sampling,
+                pace=self._pace,
+                recheck=self._recheck,
+                quiet_std=quiet_std,
+            ).run(self._todo, self._taken)
+        if self._options.real:
+            remember_completed(*self._key)
+        return run
+
+    def _recheck(self) -> None:
+        self._before = replace(self._before, quiet=self._listen())
+        self._check(preflight.AGAIN)
+
+    def _ask(self) -> None:
+        wrist_m = self._certifier.arm.frames(self._plan.steps[0].q_rad).wrist_m[0]
+        x, y, z = (f"{value:.2f}" for value in wrist_m)
+        for text in (
+            "Is the tool free: nothing touches it, nothing is held, no fluid, cables slack, the base bolted?",
+            f"Is the ball of {self._plan.ball_m:.2f} m around x {x}, y {y}, z {z} m (base axes; the wrist) free, of "
+            "people too?",
+            "Is the emergency stop in reach, and tested?",
+        ):
+            self._desk.require(text, assumed=self._known)
+        if self._arm.status().safety_mode == "reduced":
+            self._desk.require("The controller is in reduced mode. Is that as it should be?", assumed=self._known)
+
+    def _run(self, devices: Mapping[str, Any]) -> Run:
+        if self._old is not None:
+            return self._old
+        run = Run.create(self._options.runs, self._options.name, _description(self._cell, devices, self._options))
+        self._plan.save(run.plan_path)
+        return run
+
+
+def _range_of(sensor: ForceTorqueSensor) -> Array | None:
+    """Largest wrench (6,) of the sensor, as far as its driver knows."""
+    fact = sensor.identify().facts.get("range")
+    return None if fact is None else np.asarray(fact.value, dtype=np.float64)
+
+
+@contextmanager
+def _kept(desk: Desk, run: Run) -> Iterator[None]:
+    """Say where the poses are when a session ends before its time."""
+    try:
+        yield
+    except BaseException:
+        words = f"{len(run.stops())} poses are kept in {run.folder}; go on with ftdrive calibrate --resume {run.folder}"
+        desk.tell(Noted(words=words), sync=True)
+        raise
+
+
+def _by_hand(
+    cell: CellConfig,
+    arm: RobotArm,
+    sensor: ForceTorqueSensor,
+    desk: Desk,
+    options: Options,
+    devices: Mapping[str, Any],
+) -> Run:
+    """No motion command at all: a person moves the arm, or a program on the pendant does."""
+    if options.resume is None:
+        run, earlier = Run.create(options.runs, options.name, _description(cell, devices, options)), []
+    else:
+        run = Run(options.resume)
+        earlier = run.records()
+    desk.keep_in(run)
+    running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_of(cell))
+    listen = options.mode == "listen"
+    with _kept(desk, run):
+        collect_manually(arm, sensor, cell.sampling, desk, running, run.commit, listen=listen, earlier=earlier)
+    return run
+
+
+def down_of(cell: CellConfig) -> Array:
+    """Direction of gravity in base (3,), as mounted."""
+    return Scene(lean_rad=lean_of(cell.workcell.mounting)).down_base
+
+
+def _description(cell: CellConfig, devices: Mapping[str, Any], options: Options) -> dict[str, Any]:
+    return {"config": asdict(cell), "devices": dict(devices), "mode": options.mode, **options.description}

@@ -1,0 +1,82 @@
+"""From a run on disk to a result."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from calib import CalibrationDataset, CalibrationResult, solve
+from calib.routine import DriftCheck, PoseRecord, Sampling, dataset_from, drift_check
+from ftdrive.config import CellConfig, RobotConfig, SensorConfig, SiteConfig, ToolConfig, WorkcellConfig
+from ftdrive.runs import Run, versions
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What a session leaves."""
+
+    run: Run
+    dataset: CalibrationDataset
+    result: CalibrationResult
+    drift: DriftCheck | None
+
+
+def solve_and_save(run: Run) -> Outcome:
+    """Solve a run from its files, not from memory: what is on disk is then enough to repeat it."""
+    outcome = solve_records(run, run.records())
+    outcome.dataset.save(run.new_path("dataset"))
+    if outcome.result.verdict != "rejected":
+        outcome.result.save(run.new_path("calibration"))
+    return outcome
+
+
+def dataset_of(run: Run) -> tuple[CalibrationDataset, float, dict[str, Any]]:
+    """Read a run as a dataset, with the local gravity it was made at and where a result of it comes from."""
+    return _prepared(run, run.records())
+
+
+def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
+    """Solve records of a run, as they are on disk or as a replay gives them."""
+    dataset, g_m_s2, provenance = _prepared(run, records)
+    result = solve(dataset, g_m_s2=g_m_s2, provenance=provenance)
+    return Outcome(run, dataset, result, drift_check(records))
+
+
+def cell_of(header: Mapping[str, Any]) -> CellConfig:
+    """Read the cell back from a run's header."""
+    kinds: dict[str, Any] = {
+        "robot": RobotConfig,
+        "sensor": SensorConfig,
+        "tool": ToolConfig,
+        "workcell": WorkcellConfig,
+        "site": SiteConfig,
+    }
+    sections = {name: kind(**_tuples(header["config"].get(name, {}))) for name, kind in kinds.items()}
+    return CellConfig(**sections, sampling=sampling_of(header))
+
+
+def sampling_of(header: Mapping[str, Any]) -> Sampling:
+    """Read how long a run looked at each pose; older runs also said how long a move may take."""
+    values = dict(header["config"]["sampling"])
+    values.pop("move_timeout_s", None)
+    return Sampling(**values)
+
+
+def _tuples(section: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: tuple(map(tuple, value)) if isinstance(value, list) else value for key, value in section.items()}
+
+
+def _prepared(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, float, dict[str, Any]]:
+    header = run.header()
+    devices = header.get("devices", {})
+    dataset = dataset_from(records, {"run": run.folder.name, "devices": devices})
+    provenance = {
+        "created_utc": datetime.now(UTC).isoformat(),
+        "argv": sys.argv,
+        "versions": versions(),
+        "devices": devices,
+        "run": run.folder.name,
+        "station": header.get("station"),
+    }
+    return dataset, float(header["config"]["site"]["g_m_s2"]), provenance

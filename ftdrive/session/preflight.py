@@ -1,0 +1,291 @@
+"""What is looked at before anything moves. A check answers with what it found; one that failed forbids to go on."""
+
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.noise import LEAST_SAMPLES
+from drivers.errors import DriverError
+from drivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
+from ftdrive.config import CellConfig
+from ftdrive.errors import PlanRefused
+from ftdrive.planning.approach import Approach
+from ftdrive.planning.certify import Certifier
+from ftdrive.planning.plan import Plan
+from ftdrive.session.events import Checked
+from ftdrive.session.guards import AXES, G_M_S2, Limits, ModelGuard, Tripped
+
+Array = NDArray[np.float64]
+
+LISTEN_S: Final = 2.0
+_RATE: Final = 0.1
+_LINK_S: Final = 0.5
+_LATENCY_S: Final = 0.1
+_FREE_BYTES: Final = 200_000_000
+_EDGE_RAD: Final = float(np.radians(15))
+"""Each question takes the controller some 10 ms. Between two points no part is more than 3 mm off their chord."""
+_LOAD: Final = 0.8
+_PAYLOAD_KG, _PAYLOAD_SHARE = 0.5, 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Before:
+    """Everything the checks look at."""
+
+    cell: CellConfig
+    arm: RobotArm
+    sensor: ForceTorqueSensor
+    certifier: Certifier
+    plan: Plan
+    approach: Approach
+    runs: Path
+    known: bool
+    """Whether this plan has run to its end on this arm before: its edges were asked of the controller then."""
+    quiet: FtSamples
+    """Two seconds of the sensor at rest."""
+    limits: Limits
+    sensor_range: Array | None = None
+
+
+Check = Callable[[Before], Checked]
+
+
+def check_workcell(before: Before) -> Checked:
+    """Row 3: planes and boxes are as a person measured them."""
+    work = before.cell.workcell
+    if not work.measured:
+        return _failed(
+            "workcell",
+            "nobody has measured tool, planes and boxes: measure them, then set measured = true in [workcell]",
+        )
+    found = f"{len(work.planes_mm)} planes, {len(work.boxes_mm)} boxes and the surface the arm is mounted on"
+    return _passed("workcell", f"measured: {found}")
+
+
+def check_plan(before: Before) -> Checked:
+    """Rows 2 and 25: every move of the plan is proven clear, for this arm, tool and scene."""
+    try:
+        before.plan.require(before.certifier)
+    except PlanRefused as error:
+        return _failed("plan", str(error))
+    clear = 1e3 * min(step.clearance_m for step in before.plan.steps)
+    return _passed("plan", f"{len(before.plan.steps)} moves proven clear, nearest {clear:.0f} mm; joint moves only")
+
+
+def check_approach(before: Before) -> Checked:
+    """Row 5: so is the way from where the arm stands to the first pose."""
+    approach = before.approach
+    if not approach.certified:
+        return _failed("approach", "the way to the first pose is not proven clear: jog the arm near it")
+    if not len(approach.q_rad):
+        return _passed("approach", "the arm stands at the first pose")
+    return _passed("approach", f"{len(approach.q_rad)} moves proven clear, nearest {1e3 * approach.clearance_m:.0f} mm")
+
+
+def check_safety_limits(before: Before) -> Checked:
+    """Row 3: the controller accepts every pose, and before the first run points of the way between."""
+    nodes = np.array([step.q_rad for step in before.plan.steps])
+    path = np.vstack([nodes, nodes[:1]])
+    step_rad = np.inf if before.known else _EDGE_RAD
+    for way in (path, before.approach.q_rad):
+        if len(way) and (words := forbidden(before.arm, way, step_rad)):
+            return _failed("limits", words)
+    return _passed("limits", "the controller accepts every pose" + ("" if before.known else " and the ways between"))
+
+
+def forbidden(arm: RobotArm, q_rad: Array, step_rad: float = _EDGE_RAD) -> str:
+    """Say where the controller's safety limits forbid straight moves through joint vectors (n, 6); empty if nowhere."""
+    for q in edges(q_rad, step_rad):
+        if not arm.within_safety_limits(q.tolist()):
+            return (
+                f"the controller's safety limits forbid joints {np.degrees(q).round().astype(int).tolist()} degrees: "
+                "bring joints 1 to 3 to another posture, or see the safety settings"
+            )
+    return ""
+
+
+def check_safety(before: Before) -> Checked:
+    """Rows 10, 11 and 12: the safety system lets the arm move."""
+    status = before.arm.status()
+    if status.fault is not None:
+        return _failed("safety", status.fault)
+    return _passed("safety", f"safety mode {status.safety_mode}, program {status.program}")
+
+
+def check_model(before: Before) -> Checked:
+    """Rows 8 and 9: the flange is where this model has it."""
+    state = before.arm.state()
+    try:
+        ModelGuard(before.limits, before.certifier).judge(state)
+    except Tripped as trip:
+        return _failed("model", str(trip))
+    info = before.arm.identify()
+    return _passed("model", f"{info.model}, serial {info.serial}: the flange is where its joints have it")
+
+
+def check_payload(before: Before) -> Checked:
+    """Row 7: the controller knows about what it carries."""
+    told = before.arm.status().payload_kg
+    if told is None:
+        return _passed("payload", "this controller does not tell its payload: compare it at the pendant")
+    if told <= 0:
+        return _failed(
+            "payload",
+            "the controller believes that nothing hangs on the flange: set payload and its centre at the pendant",
+        )
+    parts = (before.cell.tool.mass_kg, before.cell.sensor.mass_kg)
+    if parts[0] is None:
+        return _passed("payload", f"the controller carries {told:.2f} kg; is that sensor, adapter and tool together?")
+    expected = sum(part for part in parts if part is not None)
+    if abs(told - expected) > max(_PAYLOAD_KG, _PAYLOAD_SHARE * expected):
+        return _failed(
+            "payload",
+            f"the controller carries {told:.2f} kg, sensor and tool are {expected:.2f} kg: correct one of the two",
+        )
+    return _passed("payload", f"the controller carries {told:.2f} kg, sensor and tool are {expected:.2f} kg")
+
+
+def check_slider(before: Before) -> Checked:
+    """Row 22: a slow arm only takes longer; the slider is never touched."""
+    slider = before.arm.status().speed_slider
+    return _passed("slider", f"the speed slider stands at {100 * slider:.0f} %")
+
+
+def check_sensor(before: Before) -> Checked:
+    """Rows 14 and 15: all six axes live, at their rate."""
+    wrench, nominal = before.quiet.wrench, before.sensor.health().nominal_rate_Hz
+    if len(wrench) < LEAST_SAMPLES:
+        return _failed("sensor", f"{len(wrench)} samples in {LISTEN_S:g} s: check its rate")
+    if not np.isfinite(wrench).all():
+        return _failed("sensor", "the sensor says something that is no number: check its cable and supply")
+    span_s = float(before.quiet.t_host_ns[-1] - before.quiet.t_host_ns[0]) / 1e9
+    rate_Hz = (len(wrench) - 1) / max(span_s, 1e-3)
+    if np.isfinite(nominal) and abs(rate_Hz / nominal - 1) > _RATE:
+        return _failed("sensor", f"{rate_Hz:.0f} Hz instead of {nominal:.0f}: see `ftdrive doctor`")
+    dead = [AXES[i] for i in np.flatnonzero(np.ptp(wrench, axis=0) == 0)]
+    if dead:
+        return _failed("sensor", f"{', '.join(dead)} did not change for {span_s:.1f} s: the sensor is stuck")
+    std = wrench.std(axis=0)
+    return _passed("sensor", f"{rate_Hz:.0f} Hz, noise {std[:3].max():.3f} N, {std[3:].max():.4f} N·m")
+
+
+def check_load(before: Before) -> Checked:
+    """Row 13: twice the tool's weight fits into the sensor's range."""
+    mass_kg = before.cell.tool.mass_kg
+    if before.sensor_range is None or mass_kg is None:
+        return _passed("load", "the sensor itself tells when it is overloaded")
+    weight_N = mass_kg * G_M_S2
+    lever_m = max(part.to_m for part in before.certifier.arm.tool)
+    share = max(
+        2 * weight_N / float(before.sensor_range[:3].min()),
+        2 * weight_N * lever_m / float(before.sensor_range[3:].min()),
+    )
+    words = f"twice the tool's weight is {100 * share:.0f} % of the sensor's range"
+    return _passed("load", words) if share <= _LOAD else _failed("load", f"{words}: take a larger sensor")
+
+
+def check_link(before: Before) -> Checked:
+    """Row 16: states of the arm come without gaps."""
+    took_s, end_s = list[float](), time.monotonic() + _LINK_S
+    try:
+        while (started_s := time.monotonic()) < end_s:
+            before.arm.state()
+            took_s.append(time.monotonic() - started_s)
+    except DriverError as error:
+        return _failed("link", str(error))
+    words = f"the arm answers within {1e3 * np.median(took_s):.0f} ms, once {1e3 * max(took_s):.0f} ms"
+    if np.quantile(took_s, 0.9) > _LATENCY_S:
+        return _failed("link", f"{words}: use a cable, and give this computer and network less to do")
+    return _passed("link", words)
+
+
+def check_disk(before: Before) -> Checked:
+    """Row 26: poses can be written, and there is room for them."""
+    folder = next(path for path in (before.runs.absolute(), *before.runs.absolute().parents) if path.is_dir())
+    try:
+        with TemporaryFile(dir=folder) as file:
+            file.write(b"ftdrive")
+            file.flush()
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        return _failed("disk", f"nothing can be written in {folder} ({error}): choose another folder with --runs")
+    words = f"{free / 1e9:.1f} GB free in {folder}"
+    return _passed("disk", words) if free > _FREE_BYTES else _failed("disk", f"{words}: make room first")
+
+
+CHECKS: Final[Sequence[Check]] = (
+    check_safety,
+    check_model,
+    check_payload,
+    check_slider,
+    check_link,
+    check_sensor,
+    check_load,
+    check_workcell,
+    check_plan,
+    check_approach,
+    check_safety_limits,
+    check_disk,
+)
+"""In the order in which they are told."""
+
+AGAIN: Final[Sequence[Check]] = (check_safety, check_model, check_payload, check_link, check_sensor, check_disk)
+"""What is looked at once more before a stopped session goes on."""
+
+
+def edges(q_rad: Array, step_rad: float) -> Array:
+    """Points (m, 6) along straight moves through joint vectors (n, 6), no further apart than `step_rad`."""
+    parts = []
+    for start, end in pairwise(q_rad):
+        count = max(1, int(np.ceil(np.abs(end - start).max() / step_rad)))
+        parts.append(start + np.arange(count)[:, None] / count * (end - start))
+    return np.vstack([*parts, q_rad[-1:]])
+
+
+@contextmanager
+def awake() -> Iterator[str]:
+    """Row 18: keep the computer from going to sleep where systemd can; yields what was done, in words."""
+    tool = shutil.which("systemd-inhibit") if sys.platform == "linux" else None
+    if tool is None:
+        yield "this computer is not kept awake: see that it does not go to sleep"
+        return
+    command = [tool, "--what=sleep:idle", "--who=ftdrive", "--why=an arm is under way", "--mode=block", "cat"]
+    # `cat` ends with our end of its stdin, so the inhibition cannot outlive us.
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        with suppress(subprocess.TimeoutExpired):  # it only ends by itself when nobody grants the wish
+            process.wait(timeout=0.3)
+        yield "this computer is kept awake" if process.returncode is None else "this computer cannot be kept awake"
+    finally:
+        if process.stdin is not None:
+            process.stdin.close()
+        try:
+            process.wait(timeout=1.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _passed(name: str, words: str) -> Checked:
+    return Checked(name=name, passed=True, words=words)
+
+
+def _failed(name: str, words: str) -> Checked:
+    return Checked(name=name, passed=False, words=words)

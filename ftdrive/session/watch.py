@@ -1,0 +1,160 @@
+"""The thread that watches: a hundred looks a second, by its own clock. It stops the arm first and tells then."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.routine import turned_rad
+from drivers.errors import DeviceFault, DriverError
+from drivers.interfaces import ArmState, ForceTorqueSensor, RobotArm
+from ftdrive.session.guards import Guard, Seen, Tripped, Watch, hazard_of_safety
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+PERIOD_S: Final = 0.01
+_LATE_S: Final = 0.02
+"""So much of the time between two looks counts as silence: when this process gets no time, nothing else is late."""
+_HUNG_S: Final = 1.0
+
+
+class Guards:
+    """The thread. Watches from `begin` on, whenever a `watching` block is open.
+
+    Parameters
+    ----------
+    arm, sensor
+        Asked from the thread.
+    guards : sequence of Guard
+    on_trip : callable
+        Is told from the thread, after the arm was stopped.
+    """
+
+    def __init__(
+        self,
+        arm: RobotArm,
+        sensor: ForceTorqueSensor,
+        guards: Sequence[Guard],
+        on_trip: Callable[[Tripped], None],
+    ) -> None:
+        self._arm, self._sensor, self._guards, self._on_trip = arm, sensor, tuple(guards), on_trip
+        self._watch: Watch | None = None
+        self._wake = threading.Event()
+        self._end = threading.Event()
+        self._told = threading.Event()
+        self._tripped: Tripped | None = None
+        self._begun = False
+        self._last: tuple[float, ArmState] | None = None
+        self._looked_s = 0.0
+        self._thread = threading.Thread(target=self._run, name="guards", daemon=True)
+
+    def __enter__(self) -> "Guards":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._wake.set()
+        self._thread.join(timeout=5.0)
+
+    def begin(self) -> None:
+        """Forget a trip, and take the next look as what is normal."""
+        self._tripped = None
+        self._told.clear()
+        self._begun = False
+
+    @contextmanager
+    def watching(self, start_rad: Array, goal_rad: Array, *, moving: bool) -> Iterator[None]:
+        """Watch while the block runs. What trips is raised at its end, and by `check`."""
+        self._last = None
+        self._looked_s = time.monotonic()
+        self._watch = Watch(np.asarray(start_rad), np.asarray(goal_rad), moving)
+        self._wake.set()
+        try:
+            yield
+        finally:
+            self._watch = None
+            self._wake.clear()
+        self.check()
+
+    def check(self) -> None:
+        """Raise what has tripped. Called in the loops that wait for the arm."""
+        if self._tripped is not None:
+            raise self._tripped
+        if self._watch is not None and time.monotonic() - self._looked_s > _HUNG_S:
+            raise Tripped(18, DeviceFault("the guards have not looked for a second: give this computer less to do"))
+
+    def tripped(self, *, wait_s: float) -> Tripped | None:
+        """Tell what has tripped, once the arm was stopped and that was told; None after `wait_s` without."""
+        deadline = time.monotonic() + wait_s
+        while self._tripped is None and time.monotonic() < deadline:
+            time.sleep(0.005)
+        if self._tripped is not None:
+            self._told.wait(5.0)
+        return self._tripped
+
+    def _run(self) -> None:
+        while not self._end.is_set():
+            watch = self._watch
+            if watch is None or self._tripped is not None:
+                self._wake.wait(0.2)
+                if self._tripped is not None:
+                    self._end.wait(0.02)
+                continue
+            started_s = time.monotonic()
+            try:
+                self._look(watch)
+            except Tripped as trip:
+                self._stop(trip)
+            except DriverError as error:
+                self._stop(Tripped(16, error))
+            except Exception as error:
+                log.exception("a guard failed")
+                self._stop(Tripped(18, DeviceFault(f"a guard failed ({error!r}): report this, and do not go on")))
+            self._end.wait(max(0.0, started_s + PERIOD_S - time.monotonic()))
+
+    def _look(self, watch: Watch) -> None:
+        status = self._arm.status()
+        try:
+            state = self._arm.state()
+        except DeviceFault as error:
+            raise Tripped(9 if status.fault is None else hazard_of_safety(status.safety_mode), error) from error
+        try:
+            self._sensor.check()
+            sample = self._sensor.latest(timeout_s=0.0)
+        except DriverError as error:
+            raise Tripped(15, error) from error
+        if watch is not self._watch:  # the block has ended meanwhile: what was seen may belong to the next one
+            return
+        now_s = time.monotonic()
+        dt_s = min(now_s - self._looked_s, _LATE_S)
+        turn_rad_s = 0.0
+        if self._last is not None:
+            then_s, before = self._last
+            turn_rad_s = turned_rad(before, state) / max(now_s - then_s, 1e-3)
+        self._last, self._looked_s = (now_s, state), now_s
+        seen = Seen(now_s, dt_s, watch, state, status, sample.wrench[-1], int(sample.seq[-1]), turn_rad_s)
+        if not self._begun:
+            for guard in self._guards:
+                guard.begin(seen)
+            self._begun = True
+        for guard in self._guards:
+            guard.look(seen)
+
+    def _stop(self, trip: Tripped) -> None:
+        self._tripped = trip
+        try:
+            self._arm.stop()
+        except Exception:
+            log.exception("the arm could not be told to stop: press the emergency stop")
+        try:
+            self._on_trip(trip)
+        finally:
+            self._told.set()

@@ -1,0 +1,190 @@
+"""A guided session as a user runs it, on an emulated cell: modes, a person who pushes, a sensor that stops, kill -9."""
+
+import json
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationResult
+from ftdrive.config import CellConfig
+from ftdrive.simulation import Station
+
+
+class CommandLine(Protocol):
+    folder: Path
+
+    def start(self, *arguments: str | Path) -> subprocess.Popen[str]: ...
+    def run(self, *arguments: str | Path, typed: str = "") -> subprocess.CompletedProcess[str]: ...
+    def json(self, *arguments: str | Path, typed: str = "") -> dict[str, Any]: ...
+    def poses(self) -> list[Path]: ...
+
+
+QUESTIONS = "yes\nyes\nyes\n"
+"""Tool free, ball free, emergency stop in reach."""
+FIRST_MOTION = "MOVE\nyes\n"
+"""The way to the first pose; the tour."""
+
+
+@pytest.fixture
+def station() -> Iterator[Station]:
+    with Station("can", ["--seed", "5"]) as station:
+        yield station
+
+
+@pytest.fixture
+def config(station: Station, write_config: Callable[[CellConfig], Path]) -> Path:
+    return write_config(station.cell)
+
+
+def say(process: subprocess.Popen[str], words: str) -> None:
+    assert process.stdin is not None
+    process.stdin.write(words)
+    process.stdin.flush()
+
+
+def listen_for(process: subprocess.Popen[str], words: str) -> str:
+    """Read what the process says until it has said this."""
+    assert process.stderr is not None
+    said = ""
+    while words not in said:
+        said += (letter := process.stderr.read(1))
+        assert letter, said
+    return said
+
+
+def wait_for_poses(ftdrive: CommandLine, process: subprocess.Popen[str], count: int) -> None:
+    deadline = time.monotonic() + 90
+    while len(ftdrive.poses()) < count:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def events_of(ftdrive: CommandLine) -> list[dict[str, Any]]:
+    (path,) = ftdrive.folder.glob("runs/*/events.ndjson")
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def moves_of(station: Station) -> int:
+    return sum(event["what"] == "moves" for event in station.control(do="state", since=0)["events"])
+
+
+def test_a_dry_run_shows_everything_and_moves_nothing(station: Station, config: Path, ftdrive: CommandLine) -> None:
+    outcome = ftdrive.run("calibrate", "--config", config, "--dry-run")
+    assert outcome.returncode == 0, outcome.stderr
+    for words in ("24 moves proven clear", "the controller accepts", "joints 1 to 6", "nothing has moved"):
+        assert words in outcome.stderr
+    assert moves_of(station) == 0
+    assert not (ftdrive.folder / "runs").exists()
+
+
+def test_step_mode_moves_at_each_enter_and_a_completed_plan_may_run_by_itself(
+    station: Station, config: Path, ftdrive: CommandLine
+) -> None:
+    typed = QUESTIONS + "\n" + FIRST_MOTION + "\n" * 6
+    answer = ftdrive.json("calibrate", "--config", config, "--minimal", "--step", typed=typed)
+    assert moves_of(station) == 7
+    # The same posture gives the same plan, which has run to its end now.
+    again = ftdrive.json("calibrate", "--config", config, "--minimal", "--fast", "--yes")
+    assert again["mass_kg"] == pytest.approx(answer["mass_kg"], abs=0.01)
+    assert station.control(do="state")["bad_inputs"] == []
+
+
+def test_a_push_stops_the_arm_until_a_person_says_go_on(station: Station, config: Path, ftdrive: CommandLine) -> None:
+    process = ftdrive.start("calibrate", "--config", config, "--quick")
+    say(process, QUESTIONS + FIRST_MOTION)
+    wait_for_poses(ftdrive, process, 8)
+    station.control(do="push", wrench=[0, 40, 0, 0, 0, 0])
+    said = listen_for(process, "[resume/quit]")
+    assert "unexpected contact" in said
+    assert not station.control(do="state")["moving"]
+    kept = len(ftdrive.poses())
+    say(process, "resume\n")
+    assert "not yet: unexpected contact" in listen_for(process, "[resume/quit]")
+    station.control(do="push", wrench=[0, 0, 0, 0, 0, 0])
+    _, err = process.communicate("resume\nyes\nyes\n", timeout=60)
+    assert process.returncode == 0, err
+    assert len(ftdrive.poses()) == 13 > kept
+    trips = [event for event in events_of(ftdrive) if event["event"] == "guard-tripped"]
+    assert {trip["hazard"] for trip in trips} == {14}
+    result = CalibrationResult.load(ftdrive.poses()[0].parent.parent / "calibration.json")
+    assert result.mass_kg == pytest.approx(station.truth["mass_kg"], abs=4 * float(result.sigma["mass_kg"]))
+
+
+def test_after_a_protective_stop_the_operator_clears_it_and_the_tour_goes_on(
+    station: Station, config: Path, ftdrive: CommandLine
+) -> None:
+    process = ftdrive.start("calibrate", "--config", config, "--minimal")
+    say(process, QUESTIONS + FIRST_MOTION)
+    wait_for_poses(ftdrive, process, 2)
+    station.control(do="protective-stop")
+    listen_for(process, "[resume/quit]")
+    say(process, "resume\n")
+    assert "not yet" in listen_for(process, "[resume/quit]")
+    deadline = time.monotonic() + 10
+    while station.control(do="state")["safety_mode"] != "NORMAL":
+        station.control(do="unlock")
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    _, err = process.communicate("resume\nyes\nyes\n", timeout=60)
+    assert process.returncode == 0, err
+    assert len(ftdrive.poses()) == 7
+    diary = station.control(do="state", since=0)["events"]
+    ours = [event["what"] for event in diary if event["by"] == "dashboard"]
+    assert not [what for what in ours if what.startswith(("unlock", "play"))]
+    trips = [event["hazard"] for event in events_of(ftdrive) if event["event"] == "guard-tripped"]
+    assert trips[0] == 10
+
+
+def test_a_sensor_that_repeats_itself_stops_the_arm(station: Station, config: Path, ftdrive: CommandLine) -> None:
+    if "error" in station.control(do="freeze-sensor", on=False):
+        pytest.skip("this station cannot freeze its sensor")
+    process = ftdrive.start("calibrate", "--config", config, "--quick")
+    say(process, QUESTIONS + FIRST_MOTION)
+    wait_for_poses(ftdrive, process, 3)
+    station.control(do="freeze-sensor", on=True)
+    listen_for(process, "[resume/quit]")
+    assert not station.control(do="state")["moving"]
+    station.control(do="freeze-sensor", on=False)
+    _, err = process.communicate("resume\nyes\nyes\n", timeout=60)
+    assert process.returncode == 0, err
+    assert len(ftdrive.poses()) == 13
+    assert next(event for event in events_of(ftdrive) if event["event"] == "guard-tripped")["hazard"] == 15
+
+
+def test_a_run_that_was_killed_goes_on_and_gives_the_same(config: Path, ftdrive: CommandLine) -> None:
+    process = ftdrive.start("calibrate", "--config", config, "--quick")
+    say(process, QUESTIONS + FIRST_MOTION)
+    wait_for_poses(ftdrive, process, 5)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    kept = {path.name: path.read_bytes() for path in ftdrive.poses()}
+    run = ftdrive.poses()[0].parent.parent
+    resumed = ftdrive.json("calibrate", "--resume", run, typed=QUESTIONS + "MOVE\n")
+    assert Path(resumed["run"]).resolve() == run.resolve()
+    assert {name: (run / "poses" / name).read_bytes() for name in kept} == kept
+    assert len(ftdrive.poses()) == 13
+    assert ftdrive.json("replay", run)["mass_kg"] == resumed["mass_kg"]
+
+    undisturbed = ftdrive.json("calibrate", "--config", config, "--plan", run / "plan.json", "--yes")
+    one, other = (
+        CalibrationResult.load(ftdrive.folder / answer["run"] / "calibration.json") for answer in (resumed, undisturbed)
+    )
+    assert away_in_sigma(one, other) < 1.7
+
+
+def away_in_sigma(one: CalibrationResult, other: CalibrationResult) -> float:
+    """Root mean square of the differences of two results, each over its standard deviation; 1 is expected."""
+    turn = Rotation.from_matrix(one.R_flange_sensor @ other.R_flange_sensor.T).as_rotvec()
+    differences = [turn / np.asarray(one.sigma["R_flange_sensor"]) / np.sqrt(2)]
+    for name in ("gravity_force_base_N", "force_bias_N", "torque_bias_Nm", "p_sensor_com_m"):
+        sigma = np.hypot(one.sigma[name], other.sigma[name])
+        differences.append((getattr(one, name) - getattr(other, name)) / sigma)
+    return float(np.sqrt(np.mean(np.concatenate(differences) ** 2)))

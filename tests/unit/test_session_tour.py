@@ -1,0 +1,661 @@
+"""The state machine on a fake cell: states, questions, holds, keys, resume; each fault injected on the way."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.routine import PoseRecord, Sampling
+from drivers.errors import DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
+from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.errors import Declined, NotAccepted, PlanRefused
+from ftdrive.planning.arm_model import ArmModel, Cylinder
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import USUAL_POSTURE_RAD
+from ftdrive.runs import Run
+from ftdrive.session import guided, preflight
+from ftdrive.session.completed import has_completed
+from ftdrive.session.events import Asked, Checked, Event, GuardTripped, Noted, PoseTaken, State, StateChanged
+from ftdrive.session.guided import Options
+from ftdrive.session.operator import Key, Question
+from ftdrive.session.outcome import Outcome
+
+Array = NDArray[np.float64]
+
+SPEED = 4000.0
+"""The fake arm is this many times faster than it should be."""
+STATUS = ArmStatus(0, 0.0, "running", "normal", "playing", None, 1.0, 1.0, 1.5, (0.0, 0.0, 0.05), (0.0,) * 6)
+MODEL = ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)])
+NOISE = np.repeat([0.02, 0.001], 3)
+
+
+class FakeArm(RobotArm):
+    """Joints that go where they are sent, in steps; faults by `at_move`."""
+
+    def __init__(self) -> None:
+        self.q = USUAL_POSTURE_RAD + np.radians([0, 0, 0, 3.0, -2, 4])
+        self._status = STATUS
+        self.push_rad = np.zeros(6)
+        self.moves: list[tuple[Array, float, float]] = []
+        self.stops = 0
+        self.opened = 0
+        self.at_move: dict[int, Callable[[], None]] = {}
+        self.forbidden: Array | None = None
+        self.halted = threading.Event()
+        self.gone: DriverError | None = None
+
+    def open(self, *, control: bool = False) -> None:
+        self.opened += 1
+        assert control
+
+    def close(self) -> None:
+        pass
+
+    def identify(self) -> DeviceInfo:
+        return DeviceInfo("UR5e", "A1", "5.15")
+
+    def state(self) -> ArmState:
+        if self.gone:
+            raise self.gone
+        q = self.q + self.push_rad
+        at = MODEL.frames(q)
+        return ArmState(time.monotonic_ns(), 0.0, q, np.zeros(6), at.R_base_flange[0], at.flange_m[0])
+
+    def status(self) -> ArmStatus:
+        return self._status
+
+    def set_status(self, **different: Any) -> None:
+        self._status = replace(STATUS, **different)
+
+    def within_safety_limits(self, q_rad: Sequence[float]) -> bool:
+        return self.forbidden is None or not np.allclose(q_rad, self.forbidden)
+
+    def move_to(
+        self,
+        q_rad: Sequence[float],
+        *,
+        timeout_s: float,
+        guard: Guard,
+        speed_rad_s: float | None = None,
+        acceleration_rad_s2: float | None = None,
+    ) -> None:
+        assert timeout_s > 0
+        assert speed_rad_s is not None
+        assert acceleration_rad_s2 is not None
+        goal = np.array(q_rad)
+        self.moves.append((goal, speed_rad_s, acceleration_rad_s2))
+        self.halted.clear()
+        start, steps = self.q, 4
+        fault = self.at_move.pop(len(self.moves), None)
+        for step in range(1, steps + 1):
+            guard()
+            if self.halted.is_set():
+                raise DeviceFault("the arm was told to stop before it had arrived.")
+            self.q = start + step / steps * (goal - start)
+            if fault is not None and step == 2:
+                fault()
+                deadline = time.monotonic() + 20  # held here until something stops it
+                while not self.halted.is_set():
+                    guard()
+                    assert time.monotonic() < deadline
+                    time.sleep(0.002)
+            time.sleep(0.001)
+
+    def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
+        assert timeout_s > 0
+        guard()
+
+    def stop(self) -> None:
+        self.stops += 1
+        self.halted.set()
+
+
+class FakeSensor(ForceTorqueSensor):
+    """Feels 1.2 kg hanging on the arm's flange, and what pushes."""
+
+    def __init__(self, arm: FakeArm) -> None:
+        self.arm = arm
+        self.rng = np.random.default_rng(1)
+        self.push = np.zeros(6)
+        self.failure: DriverError | None = None
+        self.stuck = False
+        self.heals = False
+        self.collecting: Callable[[], None] = lambda: None
+        self._newest = np.zeros(6)
+        self._seq = 0
+        self.events: tuple[tuple[int, str], ...] = ()
+
+    def open(self) -> None:
+        if self.heals:
+            self.failure, self.stuck = None, False
+
+    def close(self) -> None:
+        pass
+
+    def identify(self) -> DeviceInfo:
+        return DeviceInfo("fake", "S1", "1")
+
+    def _wrench(self) -> Array:
+        if not self.stuck:
+            at = MODEL.frames(self.arm.q).R_base_flange[0]
+            force = at.T @ [0, 0, -1.2 * 9.81]
+            free = np.add(np.r_[force, np.cross([0.01, 0, 0.06], force)], [1, 2, 3, 0.1, 0.2, 0.3])
+            self._newest = free + self.push + self.rng.normal(0, NOISE)
+        return self._newest
+
+    def collect(self, duration_s: float) -> FtSamples:
+        self.check()
+        n = max(40, int(duration_s * 100))
+        self.collecting()
+        rows = np.array([self._wrench() for _ in range(n)])
+        now = time.monotonic_ns()
+        self._seq += n
+        return FtSamples(
+            now - (np.arange(n)[::-1] * 1_000_000).astype(np.int64),
+            np.full(n, np.nan),
+            np.arange(n, dtype=np.int64),
+            np.zeros((n, 0), np.int32),
+            rows,
+            np.zeros(n, np.uint32),
+        )
+
+    def latest(self, *, timeout_s: float) -> FtSamples:
+        assert timeout_s == 0
+        self.check()
+        self._seq += 1
+        return FtSamples(
+            np.array([time.monotonic_ns()]),
+            np.array([np.nan]),
+            np.array([self._seq]),
+            np.zeros((1, 0), np.int32),
+            self._wrench()[None],
+            np.zeros(1, np.uint32),
+        )
+
+    def check(self) -> None:
+        if self.failure is not None:
+            raise self.failure
+
+    def health(self) -> Health:
+        return Health(self._seq, 0, 0, 1000.0, 0.001, events=self.events)
+
+
+@dataclass
+class Scripted:
+    """An operator that agrees to everything, but for what a test says."""
+
+    answers: dict[str, list[str]] = field(default_factory=dict)
+    on_event: Callable[[Event], None] = lambda _: None
+    keys: list[Key] = field(default_factory=list)
+    told: list[Event] = field(default_factory=list)
+    asked: list[Question] = field(default_factory=list)
+
+    def tell(self, event: Event) -> None:
+        self.told.append(event)
+        self.on_event(event)
+
+    def ask(self, question: Question) -> str:
+        self.asked.append(question)
+        for word, answers in self.answers.items():
+            if word in question.text and answers:
+                return answers.pop(0)
+        if "resume" in question.answers:
+            raise Declined("nobody")
+        return question.answers[0]
+
+    def pressed(self) -> Key | None:
+        return self.keys.pop(0) if self.keys else None
+
+    def states(self) -> list[State]:
+        return [event.state for event in self.told if isinstance(event, StateChanged)]
+
+    def of(self, kind: type[Any]) -> list[Any]:
+        return [event for event in self.told if isinstance(event, kind)]
+
+
+class Lab:
+    """A fake cell and what a test wants of it."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder = folder
+        self.arm = FakeArm()
+        self.sensor = FakeSensor(self.arm)
+        self.operator = Scripted()
+        self.cell = CellConfig(
+            RobotConfig("fake"),
+            SensorConfig("fake://"),
+            ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),)),
+            WorkcellConfig(measured=True),
+            Sampling(average_s=0.3),
+        )
+        monkeypatch.setattr(guided, "build_arm", lambda _: self.arm)
+        monkeypatch.setattr(guided, "build_sensor", lambda _: self.sensor)
+        monkeypatch.setattr(preflight, "_LINK_S", 0.02)
+        monkeypatch.setattr("shutil.which", lambda _: None)
+
+    def calibrate(self, **options: Any) -> Outcome | None:
+        return guided.calibrate(self.cell, self.operator, Options(self.folder / "runs", poses=6, **options))
+
+    def run(self) -> Run:
+        (folder,) = (self.folder / "runs").iterdir()
+        return Run(folder)
+
+    def stops(self) -> list[int]:
+        return [record.stop for record in self.run().records()]
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lab]:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    yield Lab(tmp_path, monkeypatch)
+    assert not [thread for thread in threading.enumerate() if thread.name == "guards"]
+
+
+def test_the_states_follow_one_another_and_all_is_written_down(lab: Lab) -> None:
+    outcome = lab.calibrate()
+    assert outcome is not None
+    assert outcome.result.mass_kg == pytest.approx(1.2, abs=0.01)
+    states = lab.operator.states()
+    one = [State.MOVE, State.SETTLE, State.SAMPLE]
+    assert states == [State.PREFLIGHT, State.APPROACH, *one[1:], *one * 6, State.CLOSE, State.REPORT]
+    assert [event.stop for event in lab.operator.of(PoseTaken)] == [1, 2, 3, 4, 5, 6, 7]
+    run = lab.run()
+    lines = (run.folder / "events.ndjson").read_text().splitlines()
+    assert len(lines) == len(lab.operator.told)
+    assert outcome.drift is not None
+    assert {path.name for path in run.folder.iterdir()} >= {"plan.json", "run.json", "dataset.json", "calibration.json"}
+
+
+def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> None:
+    lab.calibrate()
+    texts = [question.text for question in lab.operator.asked]
+    order = ["tool free", "ball of 0.3", "emergency stop in reach", "Type MOVE", "Begin"]
+    assert [next(word for word in order if word in text) for text in texts] == order
+    assert all(question.assumed is None for question in lab.operator.asked)
+    assert len(lab.operator.of(Asked)) == 5
+
+
+@pytest.mark.parametrize("word", ["tool free", "ball", "emergency stop in reach", "MOVE"])
+def test_without_an_answer_nothing_moves(word: str, lab: Lab) -> None:
+    lab.operator.answers[word] = ["no"]
+    with pytest.raises(Declined):
+        lab.calibrate()
+    assert lab.arm.moves == []
+
+
+def test_the_first_run_is_slow_whatever_was_asked_and_the_second_may_be_fast(lab: Lab) -> None:
+    lab.calibrate(fast=True)
+    assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
+    assert max(acceleration for *_, acceleration in lab.arm.moves) <= np.radians(40) + 1e-9
+    lab.arm.moves.clear()
+    lab.operator.asked.clear()
+    lab.calibrate(fast=True)
+    assert max(speed for _, speed, _ in lab.arm.moves) > np.radians(31)
+    assert all(question.assumed is not None for question in lab.operator.asked)
+    lab.arm.moves.clear()
+    lab.calibrate()
+    assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
+
+
+def test_a_run_that_was_ended_does_not_count_as_complete(lab: Lab) -> None:
+    lab.operator.answers["Begin"] = ["no"]
+    with pytest.raises(Declined):
+        lab.calibrate()
+    plan = Plan.load(lab.run().plan_path)
+    assert not has_completed("A1", str(plan.to_dict()["sha256"]))
+    assert len(lab.arm.moves) == 1
+
+
+def test_a_dry_run_shows_all_and_moves_nothing(lab: Lab) -> None:
+    assert lab.calibrate(dry_run=True) is None
+    assert lab.arm.moves == []
+    assert lab.operator.asked == []
+    assert not (lab.folder / "runs").exists()
+    assert len(lab.operator.of(Checked)) == len(preflight.CHECKS)
+
+
+def test_step_mode_waits_for_enter_before_each_move(lab: Lab) -> None:
+    lab.operator.answers["Pose 3 of 7"] = ["s"]
+    lab.operator.answers["Pose 5 of 7"] = ["r", ""]
+    lab.calibrate(mode="step")
+    asked = [question.text.split(",")[0] for question in lab.operator.asked if question.text.startswith("Pose")]
+    assert asked == [f"Pose {stop} of 7" for stop in (1, 2, 3, 4, 5, 4, 5, 6, 7)]
+    assert lab.stops() == [1, 2, 4, 5, 6, 7]
+    assert (lab.run().folder / "poses" / "04-2.npz").exists()
+
+
+# ------------------------------------------------------------------------------------------ what is checked before
+
+
+def refuse(lab: Lab, words: str) -> None:
+    with pytest.raises(NotAccepted, match=words):
+        lab.calibrate()
+    assert lab.arm.moves == []
+    assert lab.operator.asked == []
+
+
+def test_a_workcell_nobody_measured_is_refused(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, workcell=WorkcellConfig())
+    refuse(lab, "measured = true")
+
+
+@pytest.mark.parametrize(
+    ("different", "words"),
+    [
+        ({"fault": "protective stop: clear it", "safety_mode": "protective stop"}, "protective stop"),
+        ({"payload_kg": 0.0}, "nothing hangs"),
+    ],
+)
+def test_a_controller_that_is_not_ready_is_refused(different: dict[str, Any], words: str, lab: Lab) -> None:
+    lab.arm.set_status(**different)
+    refuse(lab, words)
+
+
+def test_a_payload_that_is_not_that_of_the_tool_is_refused(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=3.0))
+    refuse(lab, "1.50 kg, sensor and tool are 3.00 kg")
+
+
+def test_a_pose_the_controller_forbids_is_refused(lab: Lab) -> None:
+    assert lab.calibrate(dry_run=True) is None
+    lab.arm.forbidden = lab.arm.q.round(12)
+    lab.arm.within_safety_limits = lambda q_rad: q_rad[4] < 2.0  # type: ignore[method-assign]
+    refuse(lab, "safety limits forbid")
+
+
+def test_another_model_or_tcp_is_refused(lab: Lab) -> None:
+    right = lab.arm.state
+
+    def elsewhere() -> ArmState:
+        state = right()
+        return replace(state, p_base_flange_m=np.add(state.p_base_flange_m, [0, 0, 0.02]))
+
+    lab.arm.state = elsewhere  # type: ignore[method-assign]
+    refuse(lab, "check the model and the active TCP")
+
+
+def test_a_stuck_sensor_is_refused(lab: Lab) -> None:
+    lab.sensor.stuck = True
+    refuse(lab, "did not change")
+
+
+def test_a_sensor_that_stumbles_once_is_opened_again(lab: Lab) -> None:
+    def stumble() -> None:
+        lab.sensor.collecting = lambda: None
+        raise StreamBroken("a write took too long")
+
+    lab.sensor.collecting = stumble
+    assert lab.calibrate(dry_run=True) is None
+    assert "trying once more" in " ".join(event.words for event in lab.operator.of(Noted))
+    lab.sensor.failure = StreamBroken("gone for good")
+    with pytest.raises(StreamBroken):
+        lab.calibrate(dry_run=True)
+
+
+def test_a_folder_that_cannot_be_written_is_refused(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(**_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(preflight, "TemporaryFile", full)
+    refuse(lab, "No space left")
+
+
+def test_a_plan_for_another_tool_is_refused(lab: Lab) -> None:
+    lab.calibrate()
+    plan = lab.run().plan_path
+    lab.arm.moves.clear()
+    lab.operator.asked.clear()
+    lab.cell = replace(lab.cell, tool=ToolConfig(cylinders_mm=((0.0, 210.0, 100.0),)))
+    with pytest.raises(NotAccepted, match="another tool"):
+        lab.calibrate(plan=plan)
+    assert lab.arm.moves == []
+
+
+# ----------------------------------------------------------------------------------------------------- what stops it
+
+FAULTS: dict[str, tuple[int, Callable[[Lab], None], Callable[[Lab], None], type[Exception]]] = {
+    "a joint pushed off": (
+        2,
+        lambda lab: setattr(lab.arm, "push_rad", np.radians([0, 1.0, 0, 0, 0, 0])),
+        lambda lab: setattr(lab.arm, "push_rad", np.zeros(6)),
+        DeviceFault,
+    ),
+    "the TCP changed": (
+        8,
+        lambda lab: lab.arm.set_status(tcp_offset=(0.0, 0.0, 0.0, 0.3, 0.0, 0.0)),
+        lambda lab: lab.arm.set_status(),
+        DeviceFault,
+    ),
+    "a protective stop": (
+        10,
+        lambda lab: lab.arm.set_status(fault="protective stop: …", safety_mode="protective stop"),
+        lambda lab: lab.arm.set_status(),
+        DeviceFault,
+    ),
+    "an emergency stop": (
+        11,
+        lambda lab: lab.arm.set_status(fault="emergency stop: …", safety_mode="robot emergency stop"),
+        lambda lab: lab.arm.set_status(),
+        DeviceFault,
+    ),
+    "reduced mode": (
+        12,
+        lambda lab: lab.arm.set_status(safety_mode="reduced"),
+        lambda lab: lab.arm.set_status(),
+        DeviceFault,
+    ),
+    "a push before the tool is known": (
+        14,
+        lambda lab: setattr(lab.sensor, "push", np.array([150.0, 0, 0, 0, 0, 0])),
+        lambda lab: setattr(lab.sensor, "push", np.zeros(6)),
+        DeviceFault,
+    ),
+    "a silent sensor": (
+        15,
+        lambda lab: setattr(lab.sensor, "failure", StreamBroken("gone")),
+        lambda lab: setattr(lab.sensor, "failure", None),
+        StreamBroken,
+    ),
+    "a stuck sensor": (
+        15,
+        lambda lab: setattr(lab.sensor, "stuck", True),
+        lambda lab: setattr(lab.sensor, "stuck", False),
+        DeviceFault,
+    ),
+    "a silent controller": (
+        16,
+        lambda lab: setattr(lab.arm, "gone", DeviceTimeout("silent")),
+        lambda lab: setattr(lab.arm, "gone", None),
+        DeviceTimeout,
+    ),
+    "somebody else's program": (
+        21,
+        lambda lab: lab.arm.set_status(program="stopped"),
+        lambda lab: lab.arm.set_status(),
+        DeviceFault,
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_on_the_way_stops_the_arm_and_resume_goes_on(fault: str, lab: Lab) -> None:
+    hazard, inject, mend, _ = FAULTS[fault]
+    lab.arm.at_move[4] = lambda: inject(lab)
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, StateChanged) and event.state is State.HOLD:
+            assert lab.arm.halted.is_set()
+            assert lab.stops() == [1, 2, 3]
+            mend(lab)
+
+    lab.operator.on_event = on_event
+    lab.operator.answers["Type resume"] = ["resume"]
+    outcome = lab.calibrate()
+    assert outcome is not None
+    (trip,) = lab.operator.of(GuardTripped)
+    assert trip.hazard == hazard
+    assert lab.arm.opened == 2
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+    states = lab.operator.states()
+    stop = states.index(State.STOP)
+    assert states[stop : stop + 3] == [State.STOP, State.HOLD, State.APPROACH]
+    assert outcome.result.mass_kg == pytest.approx(1.2, abs=0.01)
+    # The way on was asked for, planned from where the arm stood, and slow.
+    assert any("the way to pose 4" in question.text for question in lab.operator.asked)
+    assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_with_nobody_there_the_reason_is_raised_and_the_poses_are_kept(fault: str, lab: Lab) -> None:
+    hazard, inject, _, error = FAULTS[fault]
+    lab.arm.at_move[4] = lambda: inject(lab)
+    with pytest.raises(error):
+        lab.calibrate()
+    assert lab.stops() == [1, 2, 3]
+    assert lab.operator.of(GuardTripped)[0].hazard == hazard
+    assert f"--resume {lab.run().folder}" in lab.operator.of(Noted)[-1].words
+
+
+def test_a_push_once_the_tool_is_known(lab: Lab) -> None:
+    def push() -> None:
+        lab.sensor.push = np.array([0, 0, 0, 0, 2.0, 0])
+
+    lab.arm.at_move[7] = push
+    lab.operator.answers["Type resume"] = ["quit"]
+    with pytest.raises(DeviceFault, match="unexpected contact"):
+        lab.calibrate()
+    assert lab.operator.of(GuardTripped)[0].hazard == 14
+
+
+def test_resume_before_the_cause_is_mended_is_not_believed(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.arm.set_status(fault="protective stop: …", safety_mode="protective stop")
+    lab.operator.answers["Type resume"] = ["resume", "resume", "quit"]
+    with pytest.raises(DeviceFault, match="protective stop"):
+        lab.calibrate()
+    assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet")]) == 2
+    assert len(lab.arm.moves) == 3
+
+
+def test_a_sensor_that_comes_back_while_the_arm_stands_needs_nobody(lab: Lab) -> None:
+    def fail() -> None:
+        if len(lab.arm.moves) == 3 and not lab.sensor.heals:
+            lab.sensor.heals = True
+            lab.sensor.failure = StreamBroken("a cable came off")
+            raise lab.sensor.failure
+
+    lab.sensor.collecting = fail
+    assert lab.calibrate() is not None
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+    assert State.HOLD not in lab.operator.states()
+    assert any("begins anew" in event.words for event in lab.operator.of(Noted))
+
+
+def test_a_full_disk_holds_before_the_arm_moves_on(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    commit, failed = Run.commit, list[int]()
+
+    def full(run: Run, record: PoseRecord) -> None:
+        if record.stop == 3 and not failed:
+            failed.append(len(lab.arm.moves))
+            raise OSError(28, "No space left on device")
+        commit(run, record)
+
+    monkeypatch.setattr(Run, "commit", full)
+    lab.operator.answers["Type resume"] = ["resume"]
+    lab.calibrate()
+    assert lab.operator.of(GuardTripped)[0].hazard == 26
+    assert failed == [3]
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_an_arm_that_was_moved_between_two_poses_is_noticed(lab: Lab) -> None:
+    def on_event(event: Event) -> None:
+        if isinstance(event, PoseTaken) and event.stop == 2:
+            lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 0, 2.0])
+
+    lab.operator.on_event = on_event
+    with pytest.raises(DeviceFault, match=r"somebody has moved it|something else moves it"):
+        lab.calibrate()
+    assert lab.operator.of(GuardTripped)[0].hazard == 21
+
+
+def test_saturated_samples_discard_the_pose(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guided, "_range_of", lambda _: np.array([40.0, 40, 40, 4, 4, 4]))
+    lab.arm.at_move[4] = lambda: setattr(lab.sensor, "push", np.array([0, 0, 0, 0, 0, 3.8]))
+    with pytest.raises(DeviceFault, match="of its range"):
+        lab.calibrate()
+    assert lab.operator.of(GuardTripped)[0].hazard == 13
+    assert lab.stops() == [1, 2, 3]
+
+
+# ------------------------------------------------------------------------------------------------- keys, resume, redo
+
+
+@pytest.mark.parametrize("key", [Key.STOP, Key.PAUSE])
+def test_a_key_stops_the_arm_on_its_way_and_ends_or_goes_on(key: Key, lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(key)
+    lab.operator.answers["Type resume"] = ["resume"]
+    lab.calibrate()
+    assert lab.operator.states().count(State.HOLD) == 1
+    assert lab.operator.of(GuardTripped) == []
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+    lab.arm.moves.clear()
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(key)
+    lab.operator.answers["Type resume"] = ["quit"]
+    with pytest.raises(Declined):
+        lab.calibrate()
+
+
+def test_redo_and_skip_keys(lab: Lab) -> None:
+    def on_event(event: Event) -> None:
+        if isinstance(event, PoseTaken) and event.stop == 2 and Key.REDO not in pressed:
+            pressed.append(Key.REDO)
+            lab.operator.keys.append(Key.REDO)
+        if isinstance(event, PoseTaken) and event.stop == 4:
+            lab.operator.keys.append(Key.SKIP)
+
+    pressed: list[Key] = []
+    lab.operator.on_event = on_event
+    lab.calibrate()
+    assert [event.stop for event in lab.operator.of(PoseTaken)] == [1, 2, 2, 3, 4, 6, 7]
+    assert len(lab.arm.moves) == 7  # nowhere twice, and past the skipped pose
+
+
+def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
+    lab.operator.answers["Type resume"] = ["quit"]
+    with pytest.raises(Declined):
+        lab.calibrate()
+    run = lab.run()
+    lab.operator.told.clear()
+    outcome = lab.calibrate(resume=run.folder)
+    assert outcome is not None
+    assert outcome.run.folder == run.folder
+    assert [event.stop for event in lab.operator.of(PoseTaken)] == [4, 5, 6, 7]
+    assert len((run.folder / "events.ndjson").read_text().splitlines()) > len(lab.operator.told)
+    first = run.calibration_path.read_bytes()
+    lab.operator.told.clear()
+    assert lab.calibrate(resume=run.folder, redo=(3,)) is not None
+    assert [event.stop for event in lab.operator.of(PoseTaken)] == [3]
+    assert run.calibration_path.name == "calibration-2.json"
+    assert (run.folder / "calibration.json").read_bytes() == first
+
+
+def test_a_run_of_another_sensor_is_not_gone_on_with(lab: Lab) -> None:
+    lab.calibrate()
+    lab.sensor.identify = lambda: DeviceInfo("fake", "S2", "1")  # type: ignore[method-assign]
+    with pytest.raises(PlanRefused, match="S1, this is S2"):
+        lab.calibrate(resume=lab.run().folder)
+
+
+def test_what_the_sensor_went_through_is_written_down(lab: Lab) -> None:
+    lab.sensor.events = ((17, "connected again"),)
+    lab.calibrate()
+    told = [event for event in lab.operator.of(Noted) if "connected again" in event.words]
+    assert len(told) == 1
