@@ -106,7 +106,7 @@ def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str 
     row = int(quality["worst_pose"])
     worst = names[row - 1] if names else f"pose {row}"
     return (
-        f"worst pose {worst}, {quality['residual_sigma'][row - 1]:.1f} sigma; each pose predicted by the others: "
+        f"worst: {worst}, {quality['residual_sigma'][row - 1]:.1f} sigma; each pose predicted by the others: "
         f"{quality['loo_force_rms_N']:.4f} N, {quality['loo_torque_rms_Nm']:.5f} N·m rms"
     )
 

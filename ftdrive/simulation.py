@@ -16,7 +16,16 @@ from ftdrive.errors import ConfigError
 TIME_SCALE = 20
 """The emulated arm lives this many times faster; nothing else differs from a real cell."""
 
-SENSORS = ("can", "serial", "robotous-can", "robotous-serial", "robotiq", "bota", "netft", "ur-ft")
+SENSORS = {
+    "can": "ATI sensor on CAN",
+    "serial": "ATI sensor on RS-485",
+    "robotous-can": "Robotous sensor on CAN",
+    "robotous-serial": "Robotous sensor on a serial port",
+    "robotiq": "Robotiq sensor",
+    "bota": "Bota sensor",
+    "netft": "ATI Net F/T",
+    "ur-ft": "sensor of its own",
+}
 """Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm."""
 EMULATED = "emulated://"
 
@@ -115,12 +124,15 @@ def sensor_url(url: str) -> str:
     ConfigError
         Unknown name.
     """
-    if not url.startswith(EMULATED):
-        return url
-    name = url.removeprefix(EMULATED) or SENSORS[0]
+    return _emulated_alone(sensor_name(url)) if url.startswith(EMULATED) else url
+
+
+def sensor_name(url: str | None) -> str:
+    """Return the name in emulated://NAME; the first one where none is named. Raises `ConfigError`."""
+    name = (url or EMULATED).removeprefix(EMULATED) or next(iter(SENSORS))
     if name not in SENSORS:
         raise ConfigError(f"{url}: there is no such emulated sensor; known: {', '.join(EMULATED + n for n in SENSORS)}")
-    return _emulated_alone(name)
+    return name
 
 
 @cache

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     metavar="FROM:TO:DIAMETER[:X:Y]",
     help="A cylinder of what is mounted, sensor included, in mm from the flange face; instead of [tool]. Repeatable.",
 )
-@click.option("--simulate", is_flag=True, help="An emulated cell.")
+@click.option("--simulate", is_flag=True, help="An emulated cell; --sensor emulated://NAME chooses its sensor.")
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses.")
 @click.option("--step", is_flag=True, help="Wait for Enter before each move.")
@@ -69,7 +69,7 @@ def calibrate(
     from ftdrive.screen import open_operator
     from ftdrive.session.guided import Options
     from ftdrive.session.guided import calibrate as guide
-    from ftdrive.simulation import Station
+    from ftdrive.simulation import Station, sensor_name
 
     if sum((step, manual, listen)) > 1 or (quick and minimal) or (plan and (quick or minimal or resume)):
         raise ConfigError(
@@ -78,9 +78,9 @@ def calibrate(
     with ExitStack() as stack:
         description: dict[str, Any] = {}
         if simulate:
-            station = stack.enter_context(Station())
+            station = stack.enter_context(Station(sensor_name(sensor)))
             cell = station.cell
-            description = {"station": {"sensor": "can", "options": station.options, "truth": station.truth}}
+            description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
         else:
             cell = _cell(config, robot, sensor, tool, resume)
         options = Options(

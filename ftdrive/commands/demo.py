@@ -1,7 +1,7 @@
 """`ftdrive demo`: the whole job on an emulated cell, truth beside estimate."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 import numpy as np
@@ -11,26 +11,25 @@ from ftdrive.report import errors_in_sigma, print_result, talk
 from ftdrive.screen import open_operator
 from ftdrive.session.guided import Options
 from ftdrive.session.guided import calibrate as guide
-from ftdrive.simulation import Station
+from ftdrive.simulation import SENSORS, Station
 
 
 @click.command()
-@click.option("--sensor", type=click.Choice(["can", "serial"]), default="can", show_default=True, help="Which wire.")
+@click.option("--sensor", type=click.Choice(list(SENSORS)), default="can", show_default=True, help="Which one.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Draws the truth and the noise.")
 @RUNS
 @JSON
-def demo(sensor: Literal["can", "serial"], seed: int, runs: Path, as_json: bool) -> None:
+def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
     """Calibrate an emulated cell: nothing is connected, nothing real moves.
 
-    A UR5e and an ATI sensor are emulated in a process of their own, down to the bytes on their wires; the arm lives 20
-    times faster. Everything on this side is what a real cell gets.
+    A UR5e and a sensor are emulated in a process of their own, down to the bytes on their wires; the arm lives 20 times
+    faster. Everything on this side is what a real cell gets.
     """
     with Station(sensor, ["--seed", str(seed)]) as station:
-        talk.print(
-            f"An emulated UR5e with an ATI sensor on {'CAN' if sensor == 'can' else 'RS-485'}, tool of "
-            f"{station.truth['mass_kg']:.3f} kg. Nothing real is connected."
-        )
         truth = station.truth
+        talk.print(
+            f"An emulated UR5e, {SENSORS[sensor]}, tool of {truth['mass_kg']:.3f} kg. Nothing real is connected."
+        )
         options = Options(
             runs,
             "demo",

@@ -22,7 +22,7 @@ from ftdrive.commands.common import JSON, RUNS, read_cell, write_json
 from ftdrive.config import CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.report import talk
-from ftdrive.simulation import Station, sensor_url
+from ftdrive.simulation import Station, sensor_name, sensor_url
 from ftdrive.wiring import build_arm, build_sensor
 
 Array = NDArray[np.float64]
@@ -39,7 +39,7 @@ _MARK = {"ok": "[green]✔[/]", "warning": "[yellow]![/]", "failed": "[red]✘[/
 @click.option("--config", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="The cell, in TOML.")
 @click.option("--robot", metavar="HOST", help="Address of the controller.")
 @click.option("--sensor", metavar="URL", help="Such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0.")
-@click.option("--simulate", is_flag=True, help="An emulated cell.")
+@click.option("--simulate", is_flag=True, help="An emulated cell; --sensor emulated://NAME chooses its sensor.")
 @click.option(
     "--calibration", "path", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Does it fit? FILE."
 )
@@ -68,7 +68,7 @@ def doctor(
     found: list[Check] = []
     pushed: dict[str, Any] | None = None
     with ExitStack() as stack:
-        station = stack.enter_context(Station(options=["--time-scale", "1"])) if simulate else None
+        station = stack.enter_context(Station(sensor_name(sensor), ["--time-scale", "1"])) if simulate else None
         cell = read_cell(config, robot, sensor) if station is None else station.cell
         address = SensorAddress.of(sensor_url(cell.sensor.url))
         device = build_sensor(cell)

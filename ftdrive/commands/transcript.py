@@ -1,7 +1,6 @@
 """`ftdrive transcript`: the bytes of a serial sensor into a file, and back to the driver."""
 
 import time
-from contextlib import ExitStack
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,7 +17,7 @@ from ftdrive.commands.common import JSON, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.report import talk
 from ftdrive.runs import versions
-from ftdrive.simulation import Station, sensor_url
+from ftdrive.simulation import EMULATED, sensor_url
 
 _TAIL_S = 0.3
 """Recorded beyond the duration, so that a replay which begins a little later still has enough."""
@@ -47,34 +46,32 @@ def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as
 
     Nothing is sent but what the driver sends anyway. If the sensor fails, the transcript of the failure is kept.
     """
-    with ExitStack() as stack:
-        if simulate:
-            station = stack.enter_context(Station("serial"))
-            sensor = station.cell.sensor.url
-        if sensor is None:
-            raise ConfigError("which sensor? Give --sensor URL or --simulate")
-        sensor = sensor_url(sensor)
-        if SensorAddress.of(sensor).serial_port is None:
-            raise ConfigError(f"{sensor} is not on a serial port: only what passes one can be recorded")
-        device = _sensor(sensor)
-        header = {
-            "url": sensor,
-            "duration_s": duration_s,
-            "utc": datetime.now(UTC).isoformat(),
-            "t_ns": time.monotonic_ns(),
-            "versions": versions(),
-        }
-        writer = Writer(path, header)
-        seen: dict[str, Any] = {"error": "interrupted"}
-        try:
-            with recording(writer):
-                seen = _watch(device, duration_s, tail_s=_TAIL_S)
-        except Exception as error:
-            seen = {"error": f"{type(error).__name__}: {error}"}
-            raise
-        finally:
-            writer.end(**seen)
-            talk.print(f" Saved {path}")
+    if simulate:
+        sensor = f"{EMULATED}serial"
+    if sensor is None:
+        raise ConfigError("which sensor? Give --sensor URL or --simulate")
+    sensor = sensor_url(sensor)
+    if SensorAddress.of(sensor).serial_port is None:
+        raise ConfigError(f"{sensor} is not on a serial port: only what passes one can be recorded")
+    device = _sensor(sensor)
+    header = {
+        "url": sensor,
+        "duration_s": duration_s,
+        "utc": datetime.now(UTC).isoformat(),
+        "t_ns": time.monotonic_ns(),
+        "versions": versions(),
+    }
+    writer = Writer(path, header)
+    seen: dict[str, Any] = {"error": "interrupted"}
+    try:
+        with recording(writer):
+            seen = _watch(device, duration_s, tail_s=_TAIL_S)
+    except Exception as error:
+        seen = {"error": f"{type(error).__name__}: {error}"}
+        raise
+    finally:
+        writer.end(**seen)
+        talk.print(f" Saved {path}")
     if as_json:
         write_json({"schema_version": 1, "file": str(path), "url": sensor, "recorded": seen})
     else:

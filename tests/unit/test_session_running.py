@@ -358,7 +358,7 @@ def test_the_report_names_poses_says_the_drift_and_ends_with_the_file(capsys: py
     assert lines[-1] == f" Saved {path}"
     text = "\n".join(lines)
     assert "USABLE" in text
-    assert "worst pose R" in text
+    assert "worst: R" in text
     assert "each pose predicted by the others: 0." in text
     assert f"? {name(8)} is off by" in text
     assert "0.6 N/min, let the sensor warm up" in text
