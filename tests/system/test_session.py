@@ -144,8 +144,6 @@ def test_after_a_protective_stop_the_operator_clears_it_and_the_tour_goes_on(
 
 
 def test_a_sensor_that_repeats_itself_stops_the_arm(station: Station, config: Path, ftdrive: CommandLine) -> None:
-    if "error" in station.control(do="freeze-sensor", on=False):
-        pytest.skip("this station cannot freeze its sensor")
     process = ftdrive.start("calibrate", "--config", config, "--quick")
     say(process, QUESTIONS + FIRST_MOTION)
     wait_for_poses(ftdrive, process, 3)
