@@ -15,7 +15,6 @@ from calib.dataset import CalibrationDataset
 from calib.errors import CalibError, TooFewSamples
 from calib.noise import LEAST_SAMPLES, PoseMean, is_quiet, is_stationary, mean_and_covariance
 from calib.ports import Arm, ArmReading, Sensor, WrenchSamples
-from calib.tour import TourPose
 
 Array = NDArray[np.float64]
 
@@ -23,6 +22,16 @@ Stage = Literal["settle", "sample"]
 
 _MOVED_RAD = np.radians(0.05)
 """The flange may turn this much while a pose is averaged: a tenth of the noise of a good sensor at 1 kg."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TourPose:
+    """One stop of a tour."""
+
+    number: int
+    """Of the orientation: 1 to 24 as in Yu et al., Fig. 3; above 100 for one that was chosen otherwise."""
+    q_rad: Array
+    """(6,) joint angles."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 
 from calib.errors import BadDataset
 from calib.files import check_format, read_object, write_new
-from calib.routine import PoseRecord
-from calib.tour import TourPose
+from calib.routine import PoseRecord, TourPose
 from ftdrive import __version__
 
 RUN_FORMAT = "ftdrive.run/1"

@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.design import Guess, Prediction, predicted_sigma, special
 from calib.files import check_format, read_object, write_new
-from calib.tour import TourPose
+from calib.routine import TourPose
 from drivers.ur.kinematics import Array
 from ftdrive.errors import PlanRefused
 from ftdrive.planning.certify import Certificate, Certifier

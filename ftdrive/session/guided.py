@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from calib.allan import averaging_time
 from calib.noise import LEAST_SAMPLES, noise_level
 from calib.routine import PoseRecord, Sampling
-from calib.tour import wrist_tour
 from drivers.errors import DriverError
 from drivers.interfaces import DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
 from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError, NotAccepted, PlanRefused
 from ftdrive.planning.cell import certifier_for
+from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
@@ -160,8 +160,8 @@ class _Begun:
         if options.plan is not None:
             return Plan.load(options.plan)
         q = np.round(self._arm.state().q_rad / _GRID_RAD) * _GRID_RAD
-        with suppress(ValueError):  # the planner says what to do about it
-            q = wrist_tour(q)[0].q_rad  # wherever the wrist was left
+        with suppress(ConfigError):  # the planner says what to do about it
+            q = constant_tour(q)[0]  # wherever the wrist was left
         speeds = Speeds(
             float(np.radians(cell.robot.speed_deg_s)),
             float(np.radians(cell.robot.acceleration_deg_s2)),

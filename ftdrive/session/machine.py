@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import TooFewSamples
-from calib.routine import PoseRecord, Sampling, Stage, take_pose
-from calib.tour import TourPose
+from calib.routine import PoseRecord, Sampling, Stage, TourPose, take_pose
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrive.errors import Declined, NotAccepted, PlanRefused

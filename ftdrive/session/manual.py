@@ -14,8 +14,7 @@ import numpy as np
 from calib.errors import TooFewSamples
 from calib.noise import CHANNELS, LEAST_SAMPLES, is_stationary, restless_channels
 from calib.ports import Sensor, WrenchSamples
-from calib.routine import PoseRecord, Sampling, turned_rad
-from calib.tour import TourPose
+from calib.routine import PoseRecord, Sampling, TourPose, turned_rad
 from drivers.interfaces import ArmState
 from ftdrive.session.events import Array, Estimated, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.operator import Key, Operator

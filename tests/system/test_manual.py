@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from calib import solve
-from calib.routine import PoseRecord, dataset_from, drift_check
-from calib.tour import TourPose, wrist_tour
+from calib.routine import PoseRecord, TourPose, dataset_from, drift_check
 from drivers.errors import StreamBroken
 from drivers.interfaces import ArmState, RobotArm
+from ftdrive.planning.constant_tour import NUMBERS, constant_tour
 from ftdrive.report import errors_in_sigma
 from ftdrive.runs import Run
 from ftdrive.session.events import Estimated, Event, PoseTaken
@@ -136,7 +136,11 @@ def watch(station: Station, run: Run, *, listen: bool, commit: Callable[[PoseRec
     with closing(build_arm(cell)) as theirs, closing(build_arm(cell)) as ours, build_sensor(cell) as sensor:
         theirs.open(control=True)
         ours.open()
-        tour = [pose for pose in wrist_tour(ours.state().q_rad) if pose.number in QUICK][: 12 if listen else 8]
+        tour = [
+            TourPose(number, q)
+            for number, q in zip(NUMBERS, constant_tour(ours.state().q_rad), strict=True)
+            if number in QUICK
+        ][: 12 if listen else 8]
         mover = Mover(theirs, [*tour, tour[0]])
         person = Person(mover.measured, None if listen else len(tour))
         with mover:

@@ -27,7 +27,7 @@ from calib.design import (
 from calib.errors import NotObservable
 from calib.model import Array, jacobian, predict
 from calib.selection import Criterion, choose, cone_candidates, enough, next_pose, order
-from calib.tour import wrist_tour
+from ftdrive.planning.constant_tour import NUMBERS
 
 ALL = special(range(1, 25))
 GUESS = Guess(mass_kg=20 / 9.80665, sigma_force_N=0.2, sigma_torque_Nm=0.005)  # weight / sigma 100, lever 25 mm
@@ -155,7 +155,7 @@ def test_what_poses_do_not_tell_is_infinite() -> None:
 
 
 def test_linear_drift_costs_little_in_a_good_order_and_nothing_without_time() -> None:
-    tour = special([pose.number for pose in wrist_tour([np.pi / 4, -1.7, 1.0, 0, 0, 0])])
+    tour = special(NUMBERS)
     guess = replace(FORCES_ONLY, p_sensor_com_m=(0, 0, 0.05))
     still, drifting = predicted_sigma(tour, guess), predicted_sigma(tour, guess, t_s=np.arange(24) * 5.0)
     ratio = [norm(drifting.sigma[k]) / norm(still.sigma[k]) for k in ("R_flange_sensor", "weight_N", "force_bias_N")]

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib.errors import TooFewSamples
-from calib.routine import PoseRecord, Sampling, dataset_from, drift_check, take_pose
-from calib.tour import TourPose
+from calib.routine import PoseRecord, Sampling, TourPose, dataset_from, drift_check, take_pose
 
 Array = NDArray[np.float64]
 
