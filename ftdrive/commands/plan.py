@@ -28,6 +28,12 @@ USUAL_MASS_KG = 1.0
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses.")
 @click.option(
+    "--cone", "cone_deg", type=float, metavar="DEG", help="Chosen poses with the tool so near to straight down."
+)
+@click.option(
+    "--free-box", "box_mm", type=float, metavar="MM", help="The flange may go so far to each side: the whole arm moves."
+)
+@click.option(
     "--posture",
     default=USUAL_POSTURE,
     show_default=True,
@@ -55,6 +61,8 @@ def plan(
     tool: tuple[str, ...],
     quick: bool,
     minimal: bool,
+    cone_deg: float | None,
+    box_mm: float | None,
     posture: str,
     mounting: str | None,
     planes: tuple[str, ...],
@@ -77,11 +85,13 @@ def plan(
     from ftdrive.errors import ConfigError, PlanRefused
     from ftdrive.planning.cell import certifier_for
     from ftdrive.planning.motion import Speeds
-    from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
+    from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
     from ftdrive.report import talk
 
     if quick and minimal:
         raise ConfigError("give --quick (12 poses) or --minimal (6), not both")
+    if cone_deg is not None and box_mm is not None:
+        raise ConfigError("give --cone or --free-box, not both")
     found = settings(
         config,
         {
@@ -109,7 +119,14 @@ def plan(
     )
     poses = 6 if minimal else 12 if quick else 24
     mass_kg = USUAL_MASS_KG if cell.tool.mass_kg is None else cell.tool.mass_kg
-    made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess_of(certifier, mass_kg))
+    guess = guess_of(certifier, mass_kg)
+    if cone_deg is not None:
+        cone_rad = float(np.radians(cone_deg))
+        made = plan_cone(certifier, q_rad, poses, half_angle_rad=cone_rad, speeds=speeds, guess=guess)
+    elif box_mm is not None:
+        made = plan_box(certifier, q_rad, poses, half_size_m=box_mm / 1e3, speeds=speeds, guess=guess)
+    else:
+        made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess)
     if not made.certified:
         raise PlanRefused("a move of the plan could not be proven clear")
     described = {found[key].origin for key in ("tool.cylinders_mm", "workcell.planes_mm", "workcell.boxes_mm")}
@@ -140,17 +157,20 @@ def _show(plan: "Plan") -> None:
     for sentence in plan.why:
         talk.print(sentence)
     q_deg = np.degrees([step.q_rad for step in plan.steps])
-    still = ", ".join(f"{angle:.0f}" for angle in q_deg[0, :3])
-    talk.print(f"Base, shoulder and elbow stay at {still} degrees.")
+    shown = slice(3, 6) if plan.arm_rests else slice(0, 6)
+    if plan.arm_rests:
+        still = ", ".join(f"{angle:.0f}" for angle in q_deg[0, :3])
+        talk.print(f"Base, shoulder and elbow stay at {still} degrees.")
     table = Table(title="Poses in degrees, and the move on to the next", title_justify="left", box=None)
-    for title in ("", "R", "wrist 1", "wrist 2", "wrist 3", "turn", "°/s", "s", "clear mm"):
+    joints = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
+    for title in ("", "R", *joints[shown], "turn", "°/s", "s", "clear mm"):
         table.add_column(title, justify="right")
     for i, (step, q) in enumerate(zip(plan.steps, q_deg, strict=True), start=1):
         turn, speed = np.degrees([step.turn_rad, step.speed_rad_s])
-        cells = [f"{angle:.0f}" for angle in q[3:]] + [f"{turn:.0f}", f"{speed:.0f}", f"{step.duration_s:.1f}"]
+        cells = [f"{angle:.0f}" for angle in q[shown]] + [f"{turn:.0f}", f"{speed:.0f}", f"{step.duration_s:.1f}"]
         table.add_row(str(i), f"{step.number:02d}", *cells, f"{1e3 * step.clearance_m:.0f}")
-    table.add_row("from", "", *(f"{angle:.0f}" for angle in q_deg[:, 3:].min(axis=0)))
-    table.add_row("to", "", *(f"{angle:.0f}" for angle in q_deg[:, 3:].max(axis=0)))
+    table.add_row("from", "", *(f"{angle:.0f}" for angle in q_deg[:, shown].min(axis=0)))
+    table.add_row("to", "", *(f"{angle:.0f}" for angle in q_deg[:, shown].max(axis=0)))
     talk.print(table)
     nearest = min(plan.steps, key=lambda step: step.clearance_m)
     sigma = document["predicted_sigma"]
@@ -160,14 +180,21 @@ def _show(plan: "Plan") -> None:
         f"\n{document['poses']} poses, {document['poses']} moves all proven clear, none above "
         f"{document['max_move_deg']:.0f}°: {document['motion_time_s']:.0f} s of motion.\n"
         f"Nearest: {document['min_clearance_mm']:.0f} mm, {nearest.limited_by}.\n"
-        f"All that moves stays in a ball of {plan.ball_m:.2f} m about the crossing of the axes of wrist 1 and 2: "
-        "keep it free, cables slack.\n"
+        f"{_room(plan)}\n"
         f"Predicted for {guess['mass_kg']:g} kg and averages good to {guess['sigma_force_N']} N, "
         f"{guess['sigma_torque_Nm']} N·m (one sigma): mass {1e3 * sigma['mass_kg']:.1f} g, "
         f"centre of mass {1e3 * np.max(sigma['p_sensor_com_m']):.2f} mm, "
         f"force bias {np.max(sigma['force_bias_N']):.3f} N, "
         f"tilt {tilt.max():.2f}°; compensation {sigma['force_rms_N']:.3f} N, {sigma['torque_rms_Nm']:.4f} N·m."
     )
+
+
+def _room(plan: "Plan") -> str:
+    x, y, z = (f"{value:.2f}" for value in plan.ball_centre_m)
+    ball = f"ball of {plan.ball_m:.2f} m around x {x}, y {y}, z {z} m in base"
+    if plan.arm_rests:
+        return f"All that moves stays in a {ball}, where the axes of wrist 1 and 2 cross: keep it free, cables slack."
+    return f"Wrist and tool stay in a {ball}, and the whole arm moves: keep the room of both free, cables slack."
 
 
 def _look(made: "Plan", certifier: "Certifier") -> None:

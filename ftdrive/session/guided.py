@@ -324,12 +324,12 @@ class _Begun:
         self._check(preflight.AGAIN)
 
     def _ask(self) -> None:
-        wrist_m = self._certifier.arm.frames(self._plan.steps[0].q_rad).wrist_m[0]
-        x, y, z = (f"{value:.2f}" for value in wrist_m)
+        x, y, z = (f"{value:.2f}" for value in self._plan.ball_centre_m)
+        room = "" if self._plan.arm_rests else ", and the room of the whole arm, which moves too,"
         for text in (
             "Is the tool free: nothing touches it, nothing is held, no fluid, cables slack, the base bolted?",
-            f"Is the ball of {self._plan.ball_m:.2f} m around x {x}, y {y}, z {z} m (base axes; the wrist) free, of "
-            "people too?",
+            f"Is the ball of {self._plan.ball_m:.2f} m around x {x}, y {y}, z {z} m (base axes; the wrist){room} free, "
+            "of people too?",
             "Is the emergency stop in reach, and tested?",
         ):
             self._desk.require(text, assumed=self._known)
