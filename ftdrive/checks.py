@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import parse_qs, urlsplit
 
+from ftdrive.config import CellConfig
+
 State = Literal["ok", "warning", "failed", "skipped"]
 
 SYS = Path("/sys")
@@ -92,6 +94,21 @@ def check_disk(folder: Path) -> list[Check]:
     if free < _FREE_BYTES:
         return [Check("disk.runs", "warning", found, "make room, or give --runs DIR on another disk")]
     return [Check("disk.runs", "ok", found)]
+
+
+def check_workcell(cell: CellConfig) -> Check:
+    """See whether tool and surroundings are described as a person has measured them."""
+    name = "workcell.measured"
+    if not cell.tool.cylinders_mm:
+        cure = "describe what is mounted: [tool] cylinders_mm in ftdrive.toml, or --tool of calibrate"
+        return Check(name, "warning", "no tool is described", cure)
+    if not cell.workcell.measured:
+        cure = "measure tool, planes and boxes, then set measured = true in [workcell] of ftdrive.toml"
+        return Check(name, "failed", "tool and surroundings are placeholders", cure)
+    planes, boxes = len(cell.workcell.planes_mm), len(cell.workcell.boxes_mm)
+    return Check(
+        name, "ok", f"tool of {len(cell.tool.cylinders_mm)} cylinders, {planes} planes, {boxes} boxes, measured"
+    )
 
 
 def check_permissions(address: SensorAddress, *, sys: Path = SYS, dev: Path = DEV) -> list[Check]:

@@ -1,5 +1,6 @@
 """Results and plans as text for a person."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,8 @@ from ftdrive.hints import hints, names_of
 
 Array = NDArray[np.float64]
 
-talk = Console(stderr=True, highlight=False, soft_wrap=True)
-"""Everything said to a person goes to stderr; data goes to stdout."""
+talk = Console(stderr=True, highlight=False, soft_wrap=not sys.stderr.isatty())
+"""Everything said to a person goes to stderr; data goes to stdout. A terminal gets whole words, a file whole lines."""
 
 _MARK = {"good": "[bold green]GOOD[/]", "usable": "[bold yellow]USABLE[/]", "rejected": "[bold red]REJECTED[/]"}
 

@@ -75,7 +75,7 @@ def doctor(
 
         arm = _examine_robot(cell, found, stack)
         alive = _examine_sensor(device, address, cell, mass_kg, found, stack)
-        found += [*checks.check_disk(runs), *checks.check_permissions(address)]
+        found += [checks.check_workcell(cell), *checks.check_disk(runs), *checks.check_permissions(address)]
         if calibration is not None:
             serials = {"sensor": device.identify().serial} if alive else {}
             if arm is not None:

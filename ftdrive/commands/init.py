@@ -88,7 +88,7 @@ def init(
     )
     name = ask.text("Name of the tool", "tool.name", "--tool-name", tool_name, said["tool.name"].value)
     cylinders = ask.rows(
-        "All that is mounted, the sensor too, as cylinders FROM:TO:DIAMETER, mm from the flange",
+        "What is mounted, first cylinder, sensor included: FROM:TO:DIAMETER in mm from the flange, such as 0:60:90",
         "tool.cylinders_mm",
         "--tool",
         tool,
@@ -105,13 +105,13 @@ def init(
             said["workcell.mounting"].value,
         ),
         ask.rows(
-            "Walls and tables as NX:NY:NZ:MM; -1:0:0:-800 is 800 mm away towards +x",
+            "First wall or table, NX:NY:NZ:MM; -1:0:0:-800 is 800 mm away towards +x",
             "workcell.planes_mm",
             "--plane",
             planes,
             (4,),
         ),
-        ask.rows("Blocks as two corners X:Y:Z:X:Y:Z, mm", "workcell.boxes_mm", "--box", boxes, (6,)),
+        ask.rows("First block, two corners X:Y:Z:X:Y:Z in mm", "workcell.boxes_mm", "--box", boxes, (6,)),
     )
     usual = said["robot.speed_deg_s"].value
     speed_deg_s = ask.number("Speed of the fastest joint, deg/s", "robot.speed_deg_s", "--speed", speed, f"{usual:g}")
@@ -263,4 +263,6 @@ def _sensor(ask: Questions, given: str | None, usual: str | None) -> tuple[str, 
 
 
 def _say(text: str) -> None:
-    click.echo(text, err=True)
+    from ftdrive.report import talk
+
+    talk.print(text, markup=False)

@@ -173,12 +173,12 @@ def test_in_a_terminal(station: Station) -> None:
         (r"measure it\): ", "33"),
         (r"Sensor and adapter, kg .*: ", "0.255"),
         (r"Name of the tool \[tool\]: ", ""),
-        (r"mm from the flange: ", "0:33:80"),
+        (r"such as 0:60:90: ", "0:33:80"),
         (r"next \(Enter: no more\): ", ""),
         (r"Tool, kg, about .*: ", "1.2"),
         (r"Mounting: floor, wall, ceiling or degrees \[floor\]: ", ""),
-        (r"Walls and tables .*: ", ""),
-        (r"Blocks .*: ", ""),
+        (r"First wall or table.*: ", ""),
+        (r"First block.*: ", ""),
         (r"deg/s \[60\]: ", ""),
     ]
     try:
