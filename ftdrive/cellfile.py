@@ -31,7 +31,7 @@ def cell_file(cell: CellConfig, found: Sequence[str]) -> str:
         "",
         "[sensor]",
         _line("url", sensor.url),
-        _line("sign", sensor.sign, "-1 for a sensor that reports the reaction: ftdrive doctor --push tells"),
+        _line("# sign", sensor.sign, "-1 for a sensor that reports the reaction: ftdrive doctor --push tells"),
         _line("height_mm", sensor.height_mm, "of its origin above the flange face"),
         _line("mass_kg", sensor.mass_kg, "of sensor and adapter: scale or datasheet; the sensor cannot weigh itself"),
         "",

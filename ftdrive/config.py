@@ -291,9 +291,9 @@ _RANGES: Mapping[str, tuple[float, float]] = {
     "sensor.mass_kg": (0, 20),
     "tool.mass_kg": (0.001, 100),
     "sampling.average_s": (0.05, 600),
-    "sampling.move_timeout_s": (1, 600),
     "sampling.still_timeout_s": (1, 600),
     "sampling.attempts": (1, 100),
+    "sampling.noise_record_s": (0, 600),
     "site.g_m_s2": (9.7, 9.9),
 }
 

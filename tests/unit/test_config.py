@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ftdrive.config import CellConfig, load, settings, user_file, variable
+from ftdrive.config import _KEYS, _RANGES, _WRONG, CellConfig, load, settings, user_file, variable
 from ftdrive.errors import ConfigError
 
 HEAD = 'format = "ftdrive.config/1"\n'
@@ -180,6 +180,13 @@ def test_errors_name_file_and_key(text: str, word: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=word) as error:
         load(path)
     assert str(path) in str(error.value) or "is not set" in str(error.value)
+
+
+def test_every_number_has_a_range_and_every_range_a_key() -> None:
+    values = settings()
+    numbers = {key for key in values if _KEYS[key].type in {int, float, float | None}}
+    assert numbers - {"sensor.sign"} == set(_RANGES)
+    assert set(_WRONG) <= set(values)
 
 
 def test_a_plan_needs_no_addresses() -> None:
