@@ -25,7 +25,7 @@ NAMED = {
     *("robot.reachable", "robot.identity", "robot.remote", "robot.safety", "robot.program", "robot.flange"),
     *("clock.pace", "sensor.identity", "sensor.rate", "sensor.lost", "sensor.age", "sensor.status", "sensor.counts"),
     *("sensor.range", "sensor.sign", "robot.speed", "robot.payload"),
-    *("noise.level", "noise.accuracy", "disk.runs"),
+    *("noise.level", "noise.accuracy", "disk.runs", "workcell.measured"),
     *("permissions.port", "permissions.by-id", "permissions.latency_timer"),
 }
 
