@@ -55,7 +55,16 @@ def cli(verbose: int, quiet: bool) -> None:
     New here? `ftdrive demo` needs no hardware.
     """
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[_Talk()])
+
+
+class _Talk(logging.Handler):
+    """To where people are told things, above a live screen if there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        from ftdrive.talk import talk
+
+        talk.print(self.format(record), markup=False)
 
 
 def exit_code(error: BaseException) -> int | None:

@@ -1,13 +1,11 @@
 """Results and plans as text for a person."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
@@ -15,11 +13,9 @@ from calib import CalibrationResult
 from calib.compare import Compared
 from calib.routine import DriftCheck, PoseRecord
 from ftdrive.hints import hints, names_of
+from ftdrive.talk import talk
 
 Array = NDArray[np.float64]
-
-talk = Console(stderr=True, highlight=False, soft_wrap=not sys.stderr.isatty())
-"""Everything said to a person goes to stderr; data goes to stdout. A terminal gets whole words, a file whole lines."""
 
 _MARK = {"good": "[bold green]GOOD[/]", "usable": "[bold yellow]USABLE[/]", "rejected": "[bold red]REJECTED[/]"}
 

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
+from itertools import pairwise
+from statistics import median
 from threading import RLock
 from types import TracebackType
 from typing import Literal, Self, TextIO
@@ -37,6 +39,7 @@ from ftdrive.session.events import (
 from ftdrive.session.operator import Key, Operator, Question
 from ftdrive.session.operators import JsonOperator, PlainOperator, in_words, match, prompt, read_line, rms_sigma
 from ftdrive.session.running import GREEN
+from ftdrive.talk import talk
 
 Array = NDArray[np.float64]
 
@@ -141,7 +144,8 @@ def _title(view: View, now_s: float, width: int) -> Text:
     right = f"{kept} kept"
     left = view.last.stops - kept if view.last else 0
     if len(times_s) > 2 and left > 0:
-        rest_s = max((times_s[-1] - times_s[0]) / (len(times_s) - 1) * left - (now_s - times_s[-1]), 0.0)
+        usual_s = median(b - a for a, b in pairwise(times_s))  # a stop with questions is not usual
+        rest_s = max(usual_s * left - (now_s - times_s[-1]), 0.0)
         right += f", about {_minutes(rest_s)} left"
     name = "ftdrive calibrate"
     return Text.assemble((name, "bold"), " " * max(width - len(name) - len(right), 2), right)
@@ -383,10 +387,13 @@ class Screen:
         """Ask until there is an answer, then take questions and frame away: the next one is drawn in their place."""
         used = len(self._frame().renderables)
         while True:
-            asked = self._plain(Text(prompt(question), "bold"))
-            self._console.print(asked, end="", soft_wrap=True)
+            width = self._console.width
+            *lines, last = self._plain(Text(prompt(question), "bold")).wrap(self._console, width)
+            for line in lines:
+                self._console.print(line)
+            self._console.print(last, end=" ", soft_wrap=True)
             typed = read_line(self._stdin, question)
-            used += (asked.cell_len + cell_len(typed.rstrip("\n"))) // self._console.width + 1
+            used += len(lines) + (last.cell_len + 1 + cell_len(typed.rstrip("\n"))) // width + 1
             if (answer := match(question, typed)) is not None:
                 break
             self._console.print(
@@ -426,10 +433,9 @@ def open_operator(*, as_json: bool = False, yes: bool = False) -> Iterator[Opera
     if as_json:
         yield JsonOperator(yes=yes)
         return
-    console = Console(stderr=True, highlight=False)
-    if not console.is_terminal or console.is_dumb_terminal or not os.isatty(0):
+    if not talk.is_terminal or talk.is_dumb_terminal or not os.isatty(0):
         yield PlainOperator(yes=yes)
         return
     keyboard = Keyboard(0) if Keyboard.usable(0) else None
-    with Screen(console, keyboard, yes=yes) as screen:
+    with Screen(talk, keyboard, yes=yes) as screen:
         yield screen

@@ -65,11 +65,12 @@ def calibrate(
     has room only the three wrist joints move. Ctrl-C stops the arm; what was taken is kept and --resume goes on.
     """
     from ftdrive.errors import ConfigError, Declined
-    from ftdrive.report import print_result, talk
+    from ftdrive.report import print_result
     from ftdrive.screen import open_operator
     from ftdrive.session.guided import Options
     from ftdrive.session.guided import calibrate as guide
     from ftdrive.simulation import Station, sensor_name
+    from ftdrive.talk import talk
 
     if sum((step, manual, listen)) > 1 or (quick and minimal) or (plan and (quick or minimal or resume)):
         raise ConfigError(

@@ -7,11 +7,12 @@ import click
 import numpy as np
 
 from ftdrive.commands.common import JSON, RUNS, stop_unless_accepted, write_json
-from ftdrive.report import errors_in_sigma, print_result, talk
+from ftdrive.report import errors_in_sigma, print_result
 from ftdrive.screen import open_operator
 from ftdrive.session.guided import Options
 from ftdrive.session.guided import calibrate as guide
 from ftdrive.simulation import SENSORS, Station
+from ftdrive.talk import talk
 
 
 @click.command()

@@ -21,8 +21,8 @@ from ftdrive.checks import Check, SensorAddress
 from ftdrive.commands.common import JSON, RUNS, read_cell, write_json
 from ftdrive.config import CellConfig
 from ftdrive.errors import NotAccepted
-from ftdrive.report import talk
 from ftdrive.simulation import Station, sensor_name, sensor_url
+from ftdrive.talk import talk
 from ftdrive.wiring import build_arm, build_sensor
 
 Array = NDArray[np.float64]

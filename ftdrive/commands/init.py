@@ -263,6 +263,6 @@ def _sensor(ask: Questions, given: str | None, usual: str | None) -> tuple[str, 
 
 
 def _say(text: str) -> None:
-    from ftdrive.report import talk
+    from ftdrive.talk import talk
 
     talk.print(text, markup=False)

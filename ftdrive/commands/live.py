@@ -20,9 +20,9 @@ from drivers.interfaces import DeviceInfo
 from ftdrive.commands.common import JSON, read_cell, write_json
 from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError
-from ftdrive.report import talk
 from ftdrive.runs import Run
 from ftdrive.simulation import Station
+from ftdrive.talk import talk
 from ftdrive.wiring import build_arm, build_sensor
 
 Array = NDArray[np.float64]

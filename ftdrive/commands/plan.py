@@ -86,7 +86,7 @@ def plan(
     from ftdrive.planning.cell import certifier_for
     from ftdrive.planning.motion import Speeds
     from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
-    from ftdrive.report import talk
+    from ftdrive.talk import talk
 
     if quick and minimal:
         raise ConfigError("give --quick (12 poses) or --minimal (6), not both")
@@ -151,7 +151,7 @@ def _show(plan: "Plan") -> None:
     import numpy as np
     from rich.table import Table
 
-    from ftdrive.report import talk
+    from ftdrive.talk import talk
 
     document = plan.to_dict()
     for sentence in plan.why:
@@ -205,7 +205,7 @@ def _look(made: "Plan", certifier: "Certifier") -> None:
     from contextlib import suppress
 
     from ftdrive.planning.view import shown
-    from ftdrive.report import talk
+    from ftdrive.talk import talk
 
     with shown(made, certifier) as url, suppress(KeyboardInterrupt):
         talk.print(f"The plan is shown at {url} until Ctrl-C.")

@@ -10,9 +10,10 @@ from calib.routine import PoseRecord, take_pose
 from ftdrive.commands.common import JSON, stop_unless_accepted, write_json
 from ftdrive.errors import NotAccepted
 from ftdrive.recorded import RecordedRun
-from ftdrive.report import print_result, talk
+from ftdrive.report import print_result
 from ftdrive.runs import Run
 from ftdrive.session import sampling_of, solve_records
+from ftdrive.talk import talk
 
 
 @click.command()

@@ -17,9 +17,10 @@ from calib.result import Method
 from ftdrive.cli import exit_code
 from ftdrive.commands.common import JSON, stop_unless_accepted, write_json
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.report import print_comparison, print_result, talk
+from ftdrive.report import print_comparison, print_result
 from ftdrive.runs import Run, versions
 from ftdrive.session import dataset_of
+from ftdrive.talk import talk
 
 Orientation = Literal["R_base_flange", "R_flange_base"]
 

@@ -15,9 +15,9 @@ from drivers.transcript import Player, Transcript, Writer, recording
 from ftdrive.checks import SensorAddress
 from ftdrive.commands.common import JSON, write_json
 from ftdrive.errors import ConfigError
-from ftdrive.report import talk
 from ftdrive.runs import versions
 from ftdrive.simulation import EMULATED, sensor_url
+from ftdrive.talk import talk
 
 _TAIL_S = 0.3
 """Recorded beyond the duration, so that a replay which begins a little later still has enough."""

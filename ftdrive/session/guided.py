@@ -18,7 +18,7 @@ from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError, NotAccepted, PlanRefused
 from ftdrive.planning.cell import certifier_for
 from ftdrive.planning.constant_tour import constant_tour
-from ftdrive.planning.motion import Speeds
+from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
 from ftdrive.planning.scene import Scene, lean_of
@@ -246,14 +246,16 @@ class _Begun:
         self._desk.tell(Noted(words=f"joints 1 to 6 stay within {ranges} degrees: are cables long and slack enough?"))
         if self._options.fast and pace.slow:
             self._desk.tell(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
-        speed = np.degrees(max(step.speed_rad_s for step in plan.steps))
-        speed = min(speed, float(np.degrees(SLOW_RAD_S))) if pace.slow else speed
-        factor = max(1.0, float(np.degrees(max(step.speed_rad_s for step in plan.steps))) / speed)
-        moves_s = factor * sum(step.duration_s for step in plan.steps)
+        turn = np.array([step.turn_rad for step in plan.steps])
+        speed = np.array([step.speed_rad_s for step in plan.steps])
+        acceleration = plan.acceleration_rad_s2
+        if pace.slow:
+            speed, acceleration = np.minimum(speed, SLOW_RAD_S), min(acceleration, SLOW_RAD_S2)
+        moves_s = float(move_duration_s(turn, speed, acceleration).sum())
         rest_s = (len(plan.steps) + 1) * (self._sampling.average_s + 0.6)
         self._desk.tell(
             Noted(
-                words=f"{len(self._todo)} stops, at most {speed:.0f}°/s: about {(moves_s + rest_s) / 60:.1f} min; "
+                words=f"{len(self._todo)} stops, at most {np.degrees(speed.max()):.0f}°/s: about {(moves_s + rest_s) / 60:.1f} min; "
                 f"{len(self._taken)} poses are there already"
             )
         )

@@ -327,7 +327,7 @@ class Tour:
             raise PlanRefused(words)
         turn_deg = np.degrees(np.abs(np.diff(np.vstack([q, approach.q_rad]), axis=0)).max())
         words = (
-            f"the way to pose {stop}: {len(approach.q_rad)} moves, largest turn {turn_deg:.0f}°, proven clear by "
+            f"the way to pose {stop}: {_moves(len(approach.q_rad))}, largest turn {turn_deg:.0f}°, proven clear by "
             f"{1e3 * approach.clearance_m:.0f} mm, at {np.degrees(APPROACH_RAD_S):.0f}°/s at most"
         )
         self._tell(State.APPROACH, stop, words)
@@ -473,6 +473,10 @@ class Tour:
         for t_host_ns, words in events[self._seen_events :]:
             self._desk.tell(Noted(words=f"sensor, at {t_host_ns} ns of the host's clock: {words}", warning=True))
         self._seen_events = len(events)
+
+
+def _moves(count: int) -> str:
+    return "1 move" if count == 1 else f"{count} moves"
 
 
 def approach_to(certifier: Certifier, q_rad: Array, goal_rad: Array, speeds: Speeds) -> Approach:

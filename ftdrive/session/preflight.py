@@ -90,7 +90,9 @@ def check_approach(before: Before) -> Checked:
         return _failed("approach", "the way to the first pose is not proven clear: jog the arm near it")
     if not len(approach.q_rad):
         return _passed("approach", "the arm stands at the first pose")
-    return _passed("approach", f"{len(approach.q_rad)} moves proven clear, nearest {1e3 * approach.clearance_m:.0f} mm")
+    return _passed(
+        "approach", f"moves: {len(approach.q_rad)}, proven clear, nearest {1e3 * approach.clearance_m:.0f} mm"
+    )
 
 
 def check_safety_limits(before: Before) -> Checked:
