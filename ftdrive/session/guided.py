@@ -255,8 +255,8 @@ class _Begun:
         rest_s = (len(plan.steps) + 1) * (self._sampling.average_s + 0.6)
         self._desk.tell(
             Noted(
-                words=f"{len(self._todo)} stops, at most {np.degrees(speed.max()):.0f}°/s: about {(moves_s + rest_s) / 60:.1f} min; "
-                f"{len(self._taken)} poses are there already"
+                words=f"{len(self._todo)} stops, at most {np.degrees(speed.max()):.0f}°/s: about "
+                f"{(moves_s + rest_s) / 60:.1f} min; {len(self._taken)} poses are there already"
             )
         )
 
