@@ -51,7 +51,7 @@ def _fill(server: Any, plan: Plan, certifier: Certifier) -> None:
     _draw_surroundings(server.scene, plan, certifier, q)
     look_at = 0.7 * arm.frames(q[:1]).wrist_m[0]
     server.initial_camera.look_at = look_at
-    server.initial_camera.position = look_at + 0.75 * _size_m(certifier) * np.array([1.0, 1.0, 0.6])
+    server.initial_camera.position = look_at + 0.5 * _size_m(certifier) * np.array([1.0, 1.0, 0.6])
     bodies = arm.bodies(q)
     n_arm = len(arm.names) - len(arm.tool)
     meshes = [
