@@ -388,7 +388,7 @@ class Screen:
         used = len(self._frame().renderables)
         while True:
             width = self._console.width
-            *lines, last = self._plain(Text(prompt(question), "bold")).wrap(self._console, width)
+            *lines, last = self._plain(Text(prompt(question).rstrip(), "bold")).wrap(self._console, width)
             for line in lines:
                 self._console.print(line)
             self._console.print(last, end=" ", soft_wrap=True)

@@ -251,11 +251,12 @@ class _Begun:
         acceleration = plan.acceleration_rad_s2
         if pace.slow:
             speed, acceleration = np.minimum(speed, SLOW_RAD_S), min(acceleration, SLOW_RAD_S2)
-        moves_s = float(move_duration_s(turn, speed, acceleration).sum())
-        rest_s = (len(plan.steps) + 1) * (self._sampling.average_s + 0.6)
+        into = np.array(self._todo, dtype=np.intp) - 2  # the move to a stop is told with the stop before
+        moves_s = float(move_duration_s(turn, speed, acceleration)[into].sum())
+        rest_s = len(into) * (self._sampling.average_s + 0.6)
         self._desk.tell(
             Noted(
-                words=f"{len(self._todo)} stops, at most {np.degrees(speed.max()):.0f}°/s: about "
+                words=f"stops to come: {len(self._todo)}, at most {np.degrees(speed.max()):.0f}°/s: about "
                 f"{(moves_s + rest_s) / 60:.1f} min; {len(self._taken)} poses are there already"
             )
         )
