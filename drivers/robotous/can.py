@@ -57,11 +57,12 @@ class CanLink:
         while True:
             left_s = max(0.0, deadline - time.monotonic())
             frame = self._bus.receive(left_s if self._halves.quiet else self._halves.silence_s)
+            fields: list[Field] = []
             if frame is None:
                 fields = self._halves.silence()
             else:
                 identifier, data = frame
-                fields = self._halves.take(time.monotonic_ns(), data, second=identifier == _SECOND_HALF)
+                self._halves.take(time.monotonic_ns(), data, second=identifier == _SECOND_HALF)
             if fields or not left_s:
                 return fields
 

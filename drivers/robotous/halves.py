@@ -40,7 +40,6 @@ class Halves:
         self.quiet = True
         """Whether nothing came since a silence."""
         self._period_ns = period_s * 1e9
-        self._newest_ns = 0
         self._number = 0
         self._clock_ns: float | None = None
         """When the field `_number` came."""
@@ -53,11 +52,8 @@ class Halves:
         self._in_step = False
         """Whether the clock counts these fields: nothing was out of turn since it was set."""
 
-    def take(self, t_host_ns: int, data: bytes, *, second: bool) -> list[Field]:
-        """Take a half, and return the fields before it if a silence has shown that they can be believed."""
-        silent = t_host_ns - self._newest_ns >= self.silence_s * 1e9
-        fields = self.silence() if silent else []
-        self._newest_ns = t_host_ns
+    def take(self, t_host_ns: int, data: bytes, *, second: bool) -> None:
+        """Take a half."""
         self.quiet = False
         if second != bool(self._first) or len(data) != codec.REPLY_SIZE // 2 or len(self._waiting) == _MOST_WAITING:
             self._in_turn = False
@@ -66,7 +62,6 @@ class Halves:
             self._first = b""
         else:
             self._first = data
-        return fields
 
     def silence(self) -> list[Field]:
         """Return the fields that can be believed now that nothing has come for `silence_s`."""
