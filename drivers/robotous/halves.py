@@ -84,7 +84,7 @@ class Halves:
             self._set_clock(self._doubtful)
             if self._complete():
                 return self._believe()
-            self._set_clock(len(self._waiting))
+            self._set_clock(len(self._waiting), by_period=False)  # twice: the sensor's own time has shifted
         return []
 
     def _complete(self) -> bool:
@@ -102,15 +102,16 @@ class Halves:
             self._clock_ns = min(latest_ns, fields[-1].t_host_ns)
         return fields
 
-    def _set_clock(self, fields: int) -> None:
+    def _set_clock(self, fields: int, *, by_period: bool = True) -> None:
         """Set the clock by the last of the oldest fields, and throw them away.
 
-        The host may be late: if the clock was set before, it only moves on by whole periods.
+        The host may be late: a clock that was set before only moves on by whole periods.
         """
         clock_ns: float = self._waiting[fields - 1].t_host_ns
         if self._clock_ns is not None:
             missed = max(1, math.floor((clock_ns - self._clock_ns) / self._period_ns + _EARLY))
-            clock_ns = min(clock_ns, self._clock_ns + missed * self._period_ns)
+            if by_period:
+                clock_ns = min(clock_ns, self._clock_ns + missed * self._period_ns)
             self._number += missed
             self.lost += missed
         self._clock_ns = clock_ns

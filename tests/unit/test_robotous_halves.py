@@ -14,6 +14,9 @@ Half = tuple[float, int, bool]
 """When it can be received, of which sample it is, and whether it is the second."""
 
 
+MANY = [f"F{number} S{number}" for number in range(200)]
+
+
 def data(number: int) -> bytes:
     return bytes([0x0B]) + number.to_bytes(2, "big") + bytes(5)
 
@@ -85,7 +88,7 @@ def test_what_is_missing_is_numbered_and_counted_by_the_clock() -> None:
 
 
 def test_a_late_host_loses_nothing() -> None:
-    sent = halves(" ".join(f"F{k} S{k}" for k in range(12)))
+    sent = halves(" ".join(MANY[:12]))
     link = Halves(PERIOD_S)
     assert heard(link, sent, [0.0] * 6 + [0.022]) == whole(range(1, 12))
     assert link.lost == 0
@@ -101,8 +104,25 @@ def test_a_late_host_does_not_pair_what_was_lost() -> None:
 
 @pytest.mark.parametrize("slower", [0.9, 1.0, 1.001, 1.1])
 def test_the_sensor_may_be_slower_or_faster_than_it_says(slower: float) -> None:
-    sent = halves(" ".join(f"F{k} S{k}" for k in range(200)), PERIOD_S * slower)
+    sent = halves(" ".join(MANY), PERIOD_S * slower)
     assert heard(Halves(PERIOD_S), sent) == whole(range(1, 200))
+
+
+@pytest.mark.parametrize("shift", [0.1, 0.3, 0.5, 0.6, 0.7, 0.9, 5.6])
+def test_a_sensor_that_pauses_is_believed_again(shift: float) -> None:
+    link = Halves(PERIOD_S)
+    heard(link, halves("F0 S0 F1 S1 F2 S2 F3 S3"))
+    later = [(t_s + shift * PERIOD_S, number, second) for t_s, number, second in halves(" ".join(MANY[4:]))]
+    assert len(heard(link, later)) > 190
+
+
+@pytest.mark.parametrize("slower", [0.9, 1.0, 1.001, 1.1])
+def test_losses_on_a_sensor_slower_or_faster_than_it_says(slower: float) -> None:
+    chance = random.Random(1)
+    kept = [word for words in MANY for word in words.split() if chance.random() >= 0.05]
+    got = heard(Halves(PERIOD_S), halves(" ".join(kept), PERIOD_S * slower))
+    assert len(got) > 100
+    assert all(first == second for _, first, second in got)
 
 
 def test_replies_need_no_clock() -> None:
