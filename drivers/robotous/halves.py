@@ -10,8 +10,10 @@ from drivers.robotous.codec import Field
 
 _SILENCE_S = 0.002
 """The halves of a field follow each other on the bus; so long a silence, or half a period, lies between two fields."""
-_DRIFT = 0.15
+_DRIFT = 0.12
 """How much slower than it says the sensor may be: manual and vendor's header differ by a tenth on one rate."""
+_LATE = 0.5
+"""By how much of a period the host may be late when it has all fields."""
 _EARLY = 0.25
 """By how much of a period the clock may be late when it counts what is missing."""
 _MOST_WAITING = 1000
@@ -24,7 +26,7 @@ class Halves:
     turns, but it is a field short of the clock. So a run of fields is believed in the first silence after it, and only
     if all that were due since the last one have come. A late host has all of them, since it finds together what it
     missed: the next run tells late from lost, and meanwhile the fields wait. After a half that is out of turn all
-    up to the next silence is thrown away, and the run that follows only sets the clock.
+    up to the next silence is thrown away, and the run that follows only sets the clock, as do the first two.
 
     Parameters
     ----------
@@ -92,7 +94,7 @@ class Halves:
         if self._clock_ns is None:
             return True
         # there cannot be too many: it is the clock that was set late
-        return self._waiting[-1].t_host_ns - self._clock_ns < (len(self._waiting) + 0.5) * self._period_ns
+        return self._waiting[-1].t_host_ns - self._clock_ns < (len(self._waiting) + _LATE) * self._period_ns
 
     def _believe(self) -> list[Field]:
         fields, self._waiting, self._doubtful = self._waiting, [], 0
@@ -108,15 +110,16 @@ class Halves:
         The host may be late: a clock that was set before only moves on by whole periods.
         """
         clock_ns: float = self._waiting[fields - 1].t_host_ns
+        self._in_step = by_period and self._clock_ns is not None  # else it may be late, and the next run sets it again
         if self._clock_ns is not None:
             missed = max(1, math.floor((clock_ns - self._clock_ns) / self._period_ns + _EARLY))
             if by_period:
                 clock_ns = min(clock_ns, self._clock_ns + missed * self._period_ns)
-            self._number += missed
-            self.lost += missed
+            if self._number:  # the stream begins with the first that is believed
+                self._number += missed
+                self.lost += missed
         self._clock_ns = clock_ns
         self._waiting = [
             field._replace(number=self._number + place) for place, field in enumerate(self._waiting[fields:], 1)
         ]
         self._doubtful = 0
-        self._in_step = True

@@ -21,11 +21,11 @@ def data(number: int) -> bytes:
     return bytes([0x0B]) + number.to_bytes(2, "big") + bytes(5)
 
 
-def halves(pattern: str, period_s: float = PERIOD_S) -> list[Half]:
+def halves(pattern: str, period_s: float = PERIOD_S, *, begin: int = 0) -> list[Half]:
     """Halves such as ``F0 S0 F1 S1``, each when its sample is due or with the half before it, if that is later."""
     out: list[Half] = []
     for word in pattern.split():
-        number = int(word[1:])
+        number = begin + int(word[1:])
         t_s = 1 + number * period_s + (1.3e-4 if word[0] == "S" else 0)
         out.append((max([t_s, *[half[0] + 1e-5 for half in out[-1:]]]), number, word[0] == "S"))
     return out
@@ -50,62 +50,68 @@ def heard(link: Halves, sent: Iterable[Half], late_s: Iterable[float] = ()) -> l
     ]
 
 
-def whole(numbers: Iterable[int]) -> list[tuple[int, int, int]]:
-    return [(number, number, number) for number in numbers]
-
-
-def test_a_healthy_stream_is_believed_but_for_the_first() -> None:
+def in_step() -> Halves:
+    """Pairing that has heard of samples 0 and 1, which it needs to set its clock."""
     link = Halves(PERIOD_S)
-    assert heard(link, halves("F0 S0 F1 S1 F2 S2 F3 S3")) == whole([1, 2, 3])
+    assert heard(link, halves(" ".join(MANY[:2]))) == []
+    return link
+
+
+def whole(samples: Iterable[int]) -> list[tuple[int, int, int]]:
+    """Halves that belong together; the third sample of a stream is its number 1."""
+    return [(sample - 1, sample, sample) for sample in samples]
+
+
+def test_a_healthy_stream_is_believed_but_for_the_first_two() -> None:
+    link = Halves(PERIOD_S)
+    assert heard(link, halves(" ".join(MANY[:5]))) == whole([2, 3, 4])
     assert link.lost == 0
 
 
 @pytest.mark.parametrize(
     ("pattern", "believed"),
     [
-        ("F0 S0 F1 S1 F2 S3 F4 S4 F5 S5", [1, 4, 5]),  # two losses, and what is left takes turns
-        ("F0 S0 F1 S1 F2 S4 F5 S5 F6 S6", [1, 5, 6]),
-        ("F0 S0 F1 S1 F2 S3 S4 F5 S5 F6 S6", [1, 6]),
-        ("F0 S0 F1 S1 F3 S3 F4 S4", [1, 4]),  # one as a whole: it might have been two halves
-        ("F0 S0 F1 S1 F2 F3 S3 F4 S4 F5 S5", [1, 5]),
-        ("F0 S0 F1 S1 S2 F3 S3 F4 S4", [1, 4]),
-        ("F0 S0 F1 F2 S1 S2 F3 S3 F4 S4", [4]),  # changed places
-        ("F0 S0 S1 F1 S2 F2 S3 F3 F4 S4 F5 S5", [5]),
-        ("F0 S0 F1 S1 S1 F2 S2 F3 S3", [3]),  # twice: a foreign half would look the same
-        ("F0 S0 F1 S1 F2 F2 S2 F3 S3 F4 S4", [1, 4]),
+        ("F0 S0 F1 S1 F2 S3 F4 S4 F5 S5", [0, 1, 4, 5]),  # two losses, and what is left takes turns
+        ("F0 S0 F1 S1 F2 S4 F5 S5 F6 S6", [0, 1, 5, 6]),
+        ("F0 S0 F1 S1 F2 S3 S4 F5 S5 F6 S6", [0, 1, 6]),
+        ("F0 S0 F1 S1 F3 S3 F4 S4", [0, 1, 4]),  # one as a whole: it might have been two halves
+        ("F0 S0 F1 S1 F2 F3 S3 F4 S4 F5 S5", [0, 1, 5]),
+        ("F0 S0 F1 S1 S2 F3 S3 F4 S4", [0, 1, 4]),
+        ("F0 S0 F1 F2 S1 S2 F3 S3 F4 S4", [0, 4]),  # changed places
+        ("F0 S0 S1 F1 S2 F2 S3 F3 F4 S4 F5 S5", [0, 5]),
+        ("F0 S0 F1 S1 S1 F2 S2 F3 S3", [0, 3]),  # twice: a foreign half would look the same
+        ("F0 S0 F1 S1 F2 F2 S2 F3 S3 F4 S4", [0, 1, 4]),
         ("S0 F1 S1 F2 S2", [2]),
     ],
 )
 def test_what_is_out_of_turn_or_short_of_the_clock_is_thrown_away(pattern: str, believed: list[int]) -> None:
-    got = heard(Halves(PERIOD_S), halves(pattern))
-    assert [(first, second) for _, first, second in got] == [(number, number) for number in believed]
+    got = heard(in_step(), halves(pattern, begin=2))
+    assert [(first - 2, second - 2) for _, first, second in got] == [(number, number) for number in believed]
 
 
 def test_what_is_missing_is_numbered_and_counted_by_the_clock() -> None:
-    link = Halves(PERIOD_S)
-    assert heard(link, halves("F0 S0 F1 S1 F2 S2 F6 S6 F7 S7 F8 S8")) == whole([1, 2, 7, 8])
+    link = in_step()
+    assert heard(link, halves("F2 S2 F6 S6 F7 S7 F8 S8")) == whole([2, 7, 8])
     assert link.lost == 4  # three that never came, and the one that sets the clock
 
 
 def test_a_late_host_loses_nothing() -> None:
     sent = halves(" ".join(MANY[:12]))
     link = Halves(PERIOD_S)
-    assert heard(link, sent, [0.0] * 6 + [0.022]) == whole(range(1, 12))
+    assert heard(link, sent, [0.0] * 6 + [0.022]) == whole(range(2, 12))
     assert link.lost == 0
 
 
 def test_a_late_host_does_not_pair_what_was_lost() -> None:
     """It finds `F4 S5` among halves that are not crosswise, as if it had come so."""
-    sent = halves("F0 S0 F1 S1 F2 S2 F3 S3 F4 S5 F6 S6 F7 S7 F8 S8")
-    got = heard(Halves(PERIOD_S), sent, [0.0] * 6 + [0.022])
-    assert [first for _, first, _ in got] == [1, 2, 8]
-    assert all(first == second for _, first, second in got)
+    sent = halves("F2 S2 F3 S3 F4 S5 F6 S6 F7 S7 F8 S8 F9 S9")
+    assert heard(in_step(), sent, [0.0] * 2 + [0.022]) == whole([2, 8, 9])
 
 
 @pytest.mark.parametrize("slower", [0.9, 1.0, 1.001, 1.1])
 def test_the_sensor_may_be_slower_or_faster_than_it_says(slower: float) -> None:
     sent = halves(" ".join(MANY), PERIOD_S * slower)
-    assert heard(Halves(PERIOD_S), sent) == whole(range(1, 200))
+    assert heard(Halves(PERIOD_S), sent) == whole(range(2, 200))
 
 
 @pytest.mark.parametrize("shift", [0.1, 0.3, 0.5, 0.6, 0.7, 0.9, 5.6])
