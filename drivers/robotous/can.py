@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 _COMMAND, _FIRST_HALF, _SECOND_HALF = 0x64, 0x01, 0x02
 _BITRATE = 1_000_000
 _WAIT_S = 0.05
-_DEAF_S = 0.002
-"""A wait that ends so much too late was none: the host was busy, and frames may be there."""
+_OVERSLEPT_S = 0.002
+"""Where a wait ends so much too late the host was busy, and frames may be there: it has to look once more."""
 
 
 class CanLink:
@@ -56,16 +56,20 @@ class CanLink:
     def receive(self) -> list[Field]:
         """Take the next fields, or none after 0.05 s."""
         deadline = time.monotonic() + _WAIT_S
+        overslept = False
         while True:
             begin_s = time.monotonic()
             left_s = max(0.0, deadline - begin_s)
-            wait_s = left_s if self._halves.quiet else self._halves.silence_s
+            wait_s = left_s if self._halves.quiet else 0.0 if overslept else self._halves.silence_s
             fields: list[Field] = []
             if frame := self._bus.receive(wait_s):
                 identifier, data = frame
                 self._halves.take(time.monotonic_ns(), data, second=identifier == _SECOND_HALF)
-            elif time.monotonic() - begin_s < wait_s + _DEAF_S:
+                overslept = False
+            elif overslept or time.monotonic() - begin_s < wait_s + _OVERSLEPT_S:
                 fields = self._halves.silence()
+            else:
+                overslept = True
             if fields or not left_s:
                 return fields
 

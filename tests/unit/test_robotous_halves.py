@@ -1,12 +1,14 @@
 """Which halves of a Robotous sensor on CAN are believed to be one sample: none that may be of two."""
 
 import random
+import time
 from collections.abc import Iterable
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.robotous.can import CanLink
 from drivers.robotous.halves import Halves
 
 PERIOD_S = 0.005
@@ -170,3 +172,19 @@ def test_no_crosswise_pair_while_the_host_keeps_up(loss: float, swaps: float, se
     numbers = [number for number, _, _ in got]
     assert numbers == sorted(set(numbers))
     assert len(got) > 290 or loss + swaps > 0
+
+
+@pytest.mark.parametrize(("slept_s", "fields"), [(0.0, 1), (0.02, 0)])
+def test_a_silence_the_host_slept_through_is_none(slept_s: float, fields: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second half that comes twice shows that the first may be foreign: unless it came after a silence."""
+    link = CanLink("can0")
+    frames: list[tuple[int, bytes] | None] = [(1, data(1)), (2, data(1)), None, (2, data(1))]
+
+    def receive(timeout_s: float) -> tuple[int, bytes] | None:
+        frame = frames.pop(0) if frames else None
+        if frame is None:
+            time.sleep(timeout_s + slept_s)
+        return frame
+
+    monkeypatch.setattr(link._bus, "receive", receive)
+    assert len(link.receive()) == fields
