@@ -3,10 +3,13 @@
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7: 1 Mbit/s, 11-bit identifiers.
 """
 
+import time
 from typing import TYPE_CHECKING, Self
 
 from drivers._can import CanBus
 from drivers.robotous import codec
+from drivers.robotous.codec import Command, Field
+from drivers.robotous.halves import Halves
 from drivers.robotous.sensor import RobotousSensor
 
 if TYPE_CHECKING:
@@ -15,57 +18,64 @@ if TYPE_CHECKING:
 _COMMAND, _FIRST_HALF, _SECOND_HALF = 0x64, 0x01, 0x02
 _BITRATE = 1_000_000
 _WAIT_S = 0.05
-_TOGETHER_S = 0.003
-"""Both halves leave the sensor together; one that comes later belongs to another field."""
+_OVERSLEPT_S = 0.002
+"""Where a wait ends so much too late the host was busy, and frames may be there: it has to look once more."""
 
 
 class CanLink:
     """The wire of a Robotous sensor with the identifiers of the factory, 0x64 to it, 0x01 and 0x02 from it.
 
-    The second half of a field says nothing about the first: a half without its other is thrown away and counted.
+    The second half of a field says nothing about the first; `Halves` says which belong together.
     """
 
     def __init__(self, channel: str, *, interface: str = "socketcan") -> None:
         self.name = f"Robotous sensor on {interface} {channel}"
         self.fastest_Hz = 1000
         self._bus = CanBus(self.name, channel, interface, _BITRATE, (_FIRST_HALF, _SECOND_HALF))
-        self._number = self._halves_lost = 0
+        self._halves = Halves()
 
     @property
     def damaged(self) -> int:
-        """Fields of which only a part arrived."""
-        return self._halves_lost + self._bus.malformed
+        """Samples that are missing, by the clock, or were not certain to be whole."""
+        return self._halves.lost
 
     def open(self) -> None:
         """Join the bus."""
+        self._halves = Halves()
         self._bus.open()
 
     def send(self, field: bytes) -> None:
         """Send a command field."""
         self._bus.send(_COMMAND, field)
 
-    def receive(self) -> list[tuple[int, bytes]]:
-        """Take the next field, or none after 0.05 s."""
-        first = b""
-        while (frame := self._bus.receive(_TOGETHER_S if first else _WAIT_S)) is not None:
-            identifier, data = frame
-            if identifier == _SECOND_HALF and first and len(first + data) == codec.REPLY_SIZE:
-                self._number += 1
-                return [(self._number, first + data)]
-            if identifier == _SECOND_HALF or first:
-                self._count_lost()
-            first = data if identifier == _FIRST_HALF else b""
-        if first:
-            self._count_lost()
-        return []
+    def stream(self, rate_Hz: int, /) -> None:
+        """Start the stream."""
+        self._halves = Halves(1 / rate_Hz)
+        self.send(codec.encode(Command.START))
+
+    def receive(self) -> list[Field]:
+        """Take the next fields, or none after 0.05 s."""
+        deadline = time.monotonic() + _WAIT_S
+        overslept = False
+        while True:
+            begin_s = time.monotonic()
+            left_s = max(0.0, deadline - begin_s)
+            wait_s = left_s if self._halves.quiet else 0.0 if overslept else self._halves.silence_s
+            fields: list[Field] = []
+            if frame := self._bus.receive(wait_s):
+                identifier, data = frame
+                self._halves.take(time.monotonic_ns(), data, second=identifier == _SECOND_HALF)
+                overslept = False
+            elif overslept or time.monotonic() - begin_s < wait_s + _OVERSLEPT_S:
+                fields = self._halves.silence()
+            else:
+                overslept = True
+            if fields or not left_s:
+                return fields
 
     def close(self) -> None:
         """Leave the bus."""
         self._bus.close()
-
-    def _count_lost(self) -> None:
-        self._halves_lost += 1
-        self._number += 1
 
 
 class RobotousCan(RobotousSensor):

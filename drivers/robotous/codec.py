@@ -48,6 +48,14 @@ class Command(IntEnum):
     GET_RATE = 0x10
 
 
+class Field(NamedTuple):
+    """A field of 16 bytes as it came; `number` counts damaged ones too."""
+
+    number: int
+    t_host_ns: int
+    data: bytes
+
+
 class Sample(NamedTuple):
     """One sample: six counts Fx..Tz, and the overload bits, 5 for Fx down to 0 for Tz."""
 

@@ -7,7 +7,6 @@ While it streams the sensor hears only stop and bias, so an answer to any other 
 has a bias command; this driver never sends it.
 """
 
-import math
 import time
 from typing import Protocol
 
@@ -17,7 +16,7 @@ from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.interfaces import DeviceInfo, FtSamples
 from drivers.robotous import codec
-from drivers.robotous.codec import Command
+from drivers.robotous.codec import Command, Field
 
 _REPLY_S = 0.15
 _ATTEMPTS = 3
@@ -41,8 +40,11 @@ class Link(Protocol):
     def send(self, field: bytes) -> None:
         """Send a command field (8 bytes)."""
 
-    def receive(self) -> list[tuple[int, bytes]]:
-        """Take the fields (16 bytes) that come within about 0.05 s, with a number that counts damaged ones too."""
+    def stream(self, rate_Hz: int, /) -> None:
+        """Send the command to start; from now on samples come at this rate."""
+
+    def receive(self) -> list[Field]:
+        """Take the fields that come within about 0.05 s."""
 
     def close(self) -> None:
         """Free the wire. Idempotent."""
@@ -52,8 +54,8 @@ class RobotousSensor(StreamingSensor):
     """A Robotous RFT on a `Link`.
 
     `counts` are the six raw values, `t_device_s` is NaN, `status` holds the overload bits (5 for Fx down to 0 for Tz);
-    any of them set is a `DeviceFault`. Samples carry no number: `seq` counts what arrived, damaged fields included, so
-    a sample the wire swallowed whole shows only in the rate.
+    any of them set is a `DeviceFault`. Samples carry no number: on a UART `seq` counts what arrived, damaged frames
+    included, so a sample the wire swallowed whole shows only in the rate; on CAN the clock tells what is missing.
 
     Parameters
     ----------
@@ -82,11 +84,13 @@ class RobotousSensor(StreamingSensor):
         self._unit_per_count = 1 / np.array([force] * 3 + [torque] * 3)
         serial = codec.decode_text(self._ask(Command.SERIAL))
         firmware = codec.decode_text(self._ask(Command.FIRMWARE))
-        if self._rate_Hz is not None and codec.decode_rate(self._ask(Command.GET_RATE)) != self._rate_Hz:
+        rate_Hz = codec.decode_rate(self._ask(Command.GET_RATE))
+        if self._rate_Hz is not None and rate_Hz != self._rate_Hz:
             codec.check_set(self._ask(Command.SET_RATE, codec.RATE_CODES[self._rate_Hz]))
-        self._link.send(codec.encode(Command.START))
+            rate_Hz = self._rate_Hz
+        self._link.stream(rate_Hz)
         self._damaged_before = self._link.damaged
-        self._nominal_Hz = self._rate_Hz or math.nan
+        self._nominal_Hz = rate_Hz
         return DeviceInfo(
             model=f"Robotous {model}",
             serial=serial,
@@ -96,24 +100,21 @@ class RobotousSensor(StreamingSensor):
 
     def _read_block(self) -> FtSamples:
         received = self._link.receive()
-        t_host_ns = time.monotonic_ns()
         self._lost = self._malformed = self._link.damaged - self._damaged_before
-        samples = [
-            (number, codec.decode_sample(field)) for number, field in received if field[0] == Command.START
-        ]  # a late reply is no sample
-        if not samples:
+        fields = [field for field in received if field.data[0] == Command.START]  # a late reply is no sample
+        if not fields:
             return NOTHING
-        overload = np.array([sample.overload for _, sample in samples], np.uint32)
+        samples = [codec.decode_sample(field.data) for field in fields]
+        overload = np.array([sample.overload for sample in samples], np.uint32)
         if axes := codec.overloaded_axes(int(np.bitwise_or.reduce(overload))):
             raise DeviceFault(
                 f"{self.name}: overload of {', '.join(axes)}; take the load off, then check the zero of the sensor"
             )
-        counts = np.array([sample.counts for _, sample in samples], np.int32)
-        n = len(samples)
+        counts = np.array([sample.counts for sample in samples], np.int32)
         return FtSamples(
-            t_host_ns=np.full(n, t_host_ns, np.int64),
-            t_device_s=np.full(n, np.nan),
-            seq=np.array([number for number, _ in samples], np.int64),
+            t_host_ns=np.array([field.t_host_ns for field in fields], np.int64),
+            t_device_s=np.full(len(fields), np.nan),
+            seq=np.array([field.number for field in fields], np.int64),
             counts=counts,
             wrench=counts * self._unit_per_count,
             status=overload,
@@ -132,9 +133,9 @@ class RobotousSensor(StreamingSensor):
             self._link.send(codec.encode(command, *parameters))
             deadline = time.monotonic() + _REPLY_S
             while time.monotonic() < deadline:
-                for _, field in self._link.receive():
-                    if field[0] == command:
-                        return field
+                for field in self._link.receive():
+                    if field.data[0] == command:
+                        return field.data
         raise DeviceTimeout(
             f"{self.name}: no answer to {command.name} after {_ATTEMPTS} attempts of {_REPLY_S} s; check supply, "
             "wiring, bit rate and, on CAN, that the identifiers are the factory's"

@@ -3,11 +3,13 @@
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7: 8N1, 115200 baud from the factory.
 """
 
+import time
 from typing import TYPE_CHECKING, Self
 
 from drivers._frames import Deframer
 from drivers._serial import SerialPort
 from drivers.robotous import codec
+from drivers.robotous.codec import Command, Field
 from drivers.robotous.sensor import RobotousSensor
 
 if TYPE_CHECKING:
@@ -42,10 +44,15 @@ class SerialLink:
         """Send a command field."""
         self._port.write(codec.encode_frame(field))
 
-    def receive(self) -> list[tuple[int, bytes]]:
+    def stream(self, _rate_Hz: int, /) -> None:
+        """Start the stream; a UART needs no rate to tell frames apart."""
+        self.send(codec.encode(Command.START))
+
+    def receive(self) -> list[Field]:
         """Take the fields that have come, waiting up to 0.05 s for the first."""
         frames = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))
-        return [(number, frame[1:-2]) for number, frame in frames]
+        t_host_ns = time.monotonic_ns()
+        return [Field(number, t_host_ns, frame[1:-2]) for number, frame in frames]
 
     def close(self) -> None:
         """Close the port."""

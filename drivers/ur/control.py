@@ -132,7 +132,10 @@ class ControlProcess:
             if reply["id"] != to:
                 continue  # the answer to a call that was interrupted
             if "error" in reply:
-                raise StreamBroken(f"ur_rtde says: {reply['error']}")
+                cure = (
+                    ": check the robot and the cable, then open the arm again." if to else ""
+                )  # at the start: `UrArm`
+                raise StreamBroken(f"ur_rtde says: {reply['error']}{cure}")
             return reply["value"]
 
     def _loss(self) -> StreamBroken:

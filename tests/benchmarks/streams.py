@@ -45,8 +45,6 @@ from tests.wire.test_sensor_faults import (
 
 PIECE_S = 2.0
 POLL_S = 1e-3
-KNOWN = {("robotous-can", "drop"): 1 / 400}
-"""Share of wrong samples that no client can tell, see drivers/README.md: two neighbouring frames were lost."""
 CPU_TARGET, CAN_TARGET, DECODE_TARGET = 0.40, 0.95, 20.0
 
 
@@ -219,12 +217,11 @@ def faults(laboratory: Laboratory, folder: Path, scheme: str, samples: int) -> b
             emulator.unplug()
         received, wrong = count.pop("received"), count.pop("wrong", 0)
         told = "".join(f", {number} {error}" for error, number in count.items())
-        known = KNOWN.get((scheme, fault), 0.0) * received
-        allowed = known or most_wrong(scheme, fault, received)
+        allowed = most_wrong(scheme, fault, received)
         passed &= report(
             f"{scheme}, {fault}" + (f" ({size} at a time)" if size > 1 else ""),
             f"{wrong} wrong of {received}{told}",
-            f"<= {allowed:.0f} wrong" + (" (known)" if known else ""),
+            f"<= {allowed:.0f} wrong",
             wrong <= allowed,
         )
     return passed

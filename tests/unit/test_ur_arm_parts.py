@@ -4,14 +4,16 @@ import re
 import subprocess
 import sys
 from math import inf, nan, radians
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from drivers.errors import ConnectError
+from drivers.errors import ConnectError, StreamBroken
 from drivers.ur import arm as arm_module
-from drivers.ur import library
+from drivers.ur import control_child, library
 from drivers.ur.arm import UrArm
+from drivers.ur.control import ControlProcess
 from drivers.ur.reading import Look
 
 
@@ -104,3 +106,21 @@ def test_without_ur_rtde_the_error_says_where_it_exists(monkeypatch: pytest.Monk
 def test_importing_the_driver_does_not_load_ur_rtde() -> None:
     code = "import sys, drivers.ur.arm; sys.exit(any('rtde_' in n or n == 'dashboard_client' for n in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_what_the_library_says_comes_with_a_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    child = tmp_path / "child.py"
+    child.write_text(
+        "import json, sys\n"
+        'print(json.dumps({"id": 0, "value": None}), flush=True)\n'
+        "for line in sys.stdin:\n"
+        '    print(json.dumps({"id": json.loads(line)["id"], "error": "the connection was lost"}), flush=True)\n'
+    )
+    monkeypatch.setattr(control_child, "__file__", str(child))
+    control = ControlProcess("10.0.0.1", 125.0)
+    try:
+        control.wait_until_ready(lambda: None)
+        with pytest.raises(StreamBroken, match="was lost: check the robot and the cable, then open the arm again"):
+            control.call("progress")
+    finally:
+        control.kill()
