@@ -15,7 +15,7 @@ from rich.live import Live
 from rich.table import Table
 
 from calib import CalibrationResult
-from calib.noise import PoseMean, mean_and_covariance
+from calib.noise import LEAST_SAMPLES, PoseMean, mean_and_covariance
 from drivers.interfaces import DeviceInfo
 from ftdrive.commands.common import JSON, read_cell, write_json
 from ftdrive.config import CellConfig
@@ -106,11 +106,15 @@ def _live_looks(cell: CellConfig, calibration: CalibrationResult) -> Iterator[It
         _refuse_other_devices(calibration, {"arm": arm.identify(), "sensor": sensor.identify()})
 
         def looks() -> Iterator[Look]:
+            recent = np.empty((0, 6))
             while True:
-                samples = sensor.collect(_PERIOD_S)
+                wrench = sensor.collect(_PERIOD_S).wrench
+                # A slow sensor says too little in one period to tell its noise.
+                recent = np.concatenate([recent, wrench])[-max(len(wrench), LEAST_SAMPLES) :]
                 R_base_flange = arm.state().R_base_flange
                 health = sensor.health()
-                yield Look(mean_and_covariance(samples.wrench), R_base_flange, health.rate_Hz, health.lost)
+                if len(recent) >= LEAST_SAMPLES:
+                    yield Look(mean_and_covariance(recent), R_base_flange, health.rate_Hz, health.lost)
 
         yield looks()
 
@@ -118,14 +122,14 @@ def _live_looks(cell: CellConfig, calibration: CalibrationResult) -> Iterator[It
 def _recorded_looks(run: Run) -> Iterator[Look]:
     for record in run.records():
         samples = record.samples
-        t_s = (samples.t_host_ns - samples.t_host_ns[0]) * 1e-9
-        for start_s in np.arange(0.0, t_s[-1], _PERIOD_S):
-            inside = (t_s >= start_s) & (t_s < start_s + _PERIOD_S)
-            if np.count_nonzero(inside) > 1:
-                lost = int(np.ptp(samples.seq)) + 1 - len(samples.seq)
-                rate_Hz = float(np.count_nonzero(inside) / _PERIOD_S)
-                yield Look(mean_and_covariance(samples.wrench[inside]), record.before.R_base_flange, rate_Hz, lost)
-                time.sleep(_PERIOD_S)
+        n = len(samples.wrench)
+        rate_Hz = (n - 1) / (float(samples.t_host_ns[-1] - samples.t_host_ns[0]) * 1e-9)
+        lost = int(np.ptp(samples.seq)) + 1 - n
+        size = max(LEAST_SAMPLES, round(rate_Hz * _PERIOD_S))
+        for start in range(0, n - size + 1, size):
+            mean = mean_and_covariance(samples.wrench[start : start + size])
+            yield Look(mean, record.before.R_base_flange, rate_Hz, lost)
+            time.sleep(size / rate_Hz)
 
 
 def _refuse_other_devices(calibration: CalibrationResult, found: dict[str, DeviceInfo]) -> None:
