@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from calib import CalibrationResult
 from calib.changes import Change, lasting_change
 from calib.quality import out_of_line
-from calib.routine import PoseRecord, is_return, turned_rad
+from calib.routine import PoseRecord, drift_check, is_return, turned_rad
 
 Array = NDArray[np.float64]
 
@@ -31,6 +31,7 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[str
     records : sequence of PoseRecord
         In the order of the tour.
     """
+    again = drift_check(records)
     records = _in_dataset(records)
     if len(records) != result.n_poses:
         raise ValueError(f"{len(records)} records do not belong to a result of {result.n_poses} poses")
@@ -55,6 +56,14 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[str
     if len(pulled) > 1:
         together = ", ".join(names[row] for row in pulled)
         words.append(f"something pulls in {together}: a cable that is too short there? Give it slack, repeat these")
+    if again is not None and np.abs(again.change / again.sigma).max() > _SIGNIFICANT:
+        if result.drift is not None:
+            words.append("the sensor drifts: let it warm up for 15 to 30 min, then calibrate again")
+        elif np.abs(again.change / _sigma(result)).max() > np.sqrt(2) * _SIGNIFICANT:
+            words.append(
+                f"{names[0]} reads otherwise at the end, and the poses between do not drift: was it touched then? "
+                "Repeat the last stop"
+            )
     return tuple(words)
 
 
