@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from calib.changes import lasting_change
 from calib.evidence import Evidence, standardized
 from calib.identifiability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
 from calib.model import PARAMETER_NAMES, Array, Parameters, jacobian
@@ -68,6 +69,7 @@ def judge(
     fit: Evidence,
     *,
     t_s: Array | None = None,
+    measured_sigma: Array | None = None,
     farthest_com_m: float = FARTHEST_COM_M,
     up_in_base: ArrayLike = _UP_IN_BASE,
 ) -> Quality:
@@ -82,6 +84,8 @@ def judge(
     fit : Evidence
     t_s : array, shape (n,), optional
         When each pose was measured; the order of rows counts where it is missing or not finite.
+    measured_sigma : array, shape (6,), optional
+        Noise of a pose, as measured. With it, a load that shifted in mid-run is found.
     farthest_com_m : float
         How far from the sensor the centre of mass of the tool can be.
     up_in_base : array_like, shape (3,)
@@ -115,6 +119,8 @@ def judge(
         if chi2_p < SURE:
             good = noise_factor <= NOISE_FACTOR and largest <= NOISY_SHARE
             (notes if good else usable).append(_noise_reason(fit, noise_factor))
+    if measured_sigma is not None and chi2_p is not None and (chi2_p < SURE or not used.all()):
+        rejected += _change_reasons(fit, residual_sigma, measured_sigma, t_s)
     if not used.all():
         few = n >= (1 - FEW_LEFT_OUT) * len(used)
         listed = ", ".join(str(k + 1) for k in np.flatnonzero(~used))
@@ -305,6 +311,34 @@ def _second_solution_reasons(fit: Evidence) -> list[str]:
         "a quite different mounting of the sensor explains the data almost as well "
         f"(it is the right one with {odds:.2g} %): add poses with another angle between the tool and the vertical"
     ]
+
+
+def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
+    """Rows that were left out, or that the others predict badly."""
+    typical = max(float(np.median(residual_sigma[used] ** 2)), 1.0)
+    limit = stats.chi2.isf(SURE / len(residual_sigma), 6) / 6 * typical
+    return np.flatnonzero(~used | (residual_sigma**2 > limit)).tolist()
+
+
+def _change_reasons(fit: Evidence, residual_sigma: Array, measured_sigma: Array, t_s: Array | None) -> list[str]:
+    """Refuse poses of two different loads. White noise cannot stand for that: half the poses are off the same way.
+
+    Where all poses before the change were left out, the rest tells of the load as it is now.
+    """
+    n, used = len(fit.wrench), fit.weights > 0.5
+    times = np.arange(n, dtype=np.float64) if t_s is None or not np.isfinite(t_s).all() else t_s
+    order = np.argsort(times, kind="stable")
+    change = lasting_change(
+        fit.parameters,
+        fit.R_base_flange[order],
+        fit.residuals[order],
+        measured_sigma,
+        times[order],
+        np.flatnonzero(np.isin(order, out_of_line(residual_sigma, used))).tolist(),
+    )
+    if change is None or not change.of_the_tool or not used[order[: change.position]].any():
+        return []
+    return [f"the poses do not belong to one tool: {change.in_words(f'pose {order[change.position] + 1}')}"]
 
 
 def _com_reasons(parameters: Parameters, farthest_com_m: float, rejected: list[str], usable: list[str]) -> None:

@@ -100,7 +100,8 @@ def solve(
             np.ones(len(dataset)),
             best.second_basin_chi2,
         )
-    quality = judge(evidence, t_s=dataset.t_s)
+    measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
+    quality = judge(evidence, t_s=dataset.t_s, measured_sigma=measured_sigma)
     chi2 = evidence.chi2 if wrench_cov is None else evidence.measured_chi2
     drifted = best.drift if estimator is None else None
     return CalibrationResult(
@@ -116,7 +117,7 @@ def solve(
         reasons=quality.reasons,
         provenance={**(provenance or {}), "dataset_sha256": dataset.sha256()},
         p_value=quality.chi2_p,
-        measured_sigma=None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0)),
+        measured_sigma=measured_sigma,
         weights=evidence.weights,
         components=evidence.components,
         drift=None if drifted is None else DriftResult(drifted.change, drifted.sigma),

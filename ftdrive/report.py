@@ -180,5 +180,7 @@ def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
     words = f"first pose again after {drift.elapsed_s:.0f} s, {force_N:.3f} N, {torque_Nm:.4f} N·m away: "
     if worst < 4:
         return words + "none seen", False
-    per_minute_N = 60 * force_N / max(drift.elapsed_s, 1.0)
-    return words + f"{per_minute_N:.2g} N/min, let the sensor warm up for 15 to 30 min, then calibrate again", True
+    minutes = max(drift.elapsed_s, 1.0) / 60
+    in_force = np.max(np.abs(drift.change[:3]) / drift.sigma[:3]) >= 4
+    rate = f"{force_N / minutes:.2g} N/min" if in_force else f"{torque_Nm / minutes:.2g} N·m/min"
+    return words + rate, True

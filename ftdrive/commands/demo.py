@@ -56,7 +56,7 @@ def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
             }
         )
     else:
-        print_result(outcome.result, truth=truth, drift=outcome.drift)
+        print_result(outcome.result, truth=truth, drift=outcome.drift, records=outcome.run.records())
         talk.print(
             "\n Try next:"
             f"\n   ftdrive live --calibration {outcome.run.calibration_path} --simulate"

@@ -34,7 +34,7 @@ def replay(folder: Path, as_json: bool) -> None:
     if as_json:
         write_json(outcome.result.to_dict())
     else:
-        print_result(outcome.result, drift=outcome.drift)
+        print_result(outcome.result, drift=outcome.drift, records=records)
     stop_unless_accepted(outcome.result)
     if run.calibration_path.exists():
         _compare(outcome.result, CalibrationResult.load(run.calibration_path))
