@@ -300,8 +300,8 @@ def test_nothing_is_said_of_quiet_runs_and_inexact_arms_and_no_pose_is_named_whe
         bias = np.zeros(6)
         for wrench_of in (lambda _, R, __: predict(TRUTH, R), rough):
             assert said(disturbed(wrench_of, seed)) == ()
-        for wrench_of in (drifting, wandering):
-            (words,) = said(disturbed(wrench_of, seed))
+        for drifts in (drifting, wandering):
+            (words,) = said(disturbed(drifts, seed))
             assert words.startswith("the sensor drifts")
 
 
