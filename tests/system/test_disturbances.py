@@ -1,0 +1,204 @@
+"""Sessions on an emulated cell that something disturbs: it is named in words, and the result holds or is refused."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.routine import Sampling
+from ftdrive.errors import Declined
+from ftdrive.report import errors_in_sigma, print_result
+from ftdrive.session.events import Event, GuardTripped, PoseTaken, State, StateChanged
+from ftdrive.session.guided import Options, calibrate
+from ftdrive.session.operator import Question
+from ftdrive.session.outcome import Outcome
+from ftdrive.simulation import Station
+
+Array = NDArray[np.float64]
+Happening = Callable[[Event], None]
+
+POSES = 12
+PUSH = [1.5, 1.0, 0.0, 0.0, 0.0, 0.0]
+"""N in base axes: far below what stops the arm."""
+CONTACT = 14
+NOTHING = [0.0] * 6
+
+
+@dataclass
+class Nobody:
+    """Lets the session run, and makes things happen at its events."""
+
+    happening: Happening
+    told: list[Event] = field(default_factory=list)
+
+    def tell(self, event: Event) -> None:
+        self.told.append(event)
+        self.happening(event)
+
+    def ask(self, question: Question) -> str:
+        raise Declined(question.text)
+
+    def pressed(self) -> None:
+        return None
+
+    def taken(self) -> dict[int, PoseTaken]:
+        return {event.stop: event for event in self.told if isinstance(event, PoseTaken)}
+
+
+@pytest.fixture
+def station() -> Iterator[Station]:
+    with Station("can", ["--seed", "5"]) as station:
+        yield station
+
+
+@pytest.fixture
+def tour(station: Station, tmp_path: Path) -> Callable[[Happening], tuple[Outcome, Nobody]]:
+    def run(happening: Happening) -> tuple[Outcome, Nobody]:
+        nobody = Nobody(happening)
+        cell = replace(station.cell, sampling=Sampling(average_s=0.3))
+        outcome = calibrate(cell, nobody, Options(tmp_path, poses=POSES, real=False, questions=False))
+        assert outcome is not None
+        assert len(outcome.run.stops()) == POSES + 1
+        assert CONTACT not in [event.hazard for event in nobody.told if isinstance(event, GuardTripped)]
+        return outcome, nobody
+
+    return run
+
+
+@pytest.fixture
+def words_of(capsys: pytest.CaptureFixture[str]) -> Callable[[Outcome], str]:
+    """What a person reads at the end."""
+
+    def read(outcome: Outcome) -> str:
+        print_result(outcome.result, drift=outcome.drift, records=outcome.run.records())
+        return capsys.readouterr().err
+
+    return read
+
+
+def names(outcome: Outcome, *stops: int) -> list[str]:
+    return [f"R{record.pose.number:02d}" for record in outcome.run.records() if record.stop in stops]
+
+
+def begins(event: Event, state: State, stop: int) -> bool:
+    return isinstance(event, StateChanged) and event.state is state and event.stop == stop
+
+
+def assert_near(outcome: Outcome, truth: dict[str, Any]) -> None:
+    """Within 4 standard deviations: one of fifteen numbers is beyond 3 in every 25th undisturbed run."""
+    for key, errors in errors_in_sigma(outcome.result, truth).items():
+        assert np.abs(errors).max() < 4, (key, errors)
+
+
+def test_pushes_and_a_tap_while_poses_are_averaged(
+    station: Station,
+    tour: Callable[[Happening], tuple[Outcome, Nobody]],
+    words_of: Callable[[Outcome], str],
+) -> None:
+    pushed, tapped, last = 4, 7, POSES + 1
+    taps = 0
+
+    def happening(event: Event) -> None:
+        nonlocal taps
+        if begins(event, State.SETTLE, pushed) or begins(event, State.SETTLE, last):
+            station.control(do="push", wrench=PUSH, axes="base")
+        elif isinstance(event, PoseTaken) and event.stop == pushed:
+            station.control(do="push", wrench=NOTHING)
+        elif begins(event, State.SAMPLE, tapped) and not taps:
+            taps += 1
+            station.control(do="bump", wrench=PUSH, seconds=0.15)
+
+    outcome, nobody = tour(happening)
+    assert nobody.taken()[tapped].attempts == 2
+    assert nobody.taken()[tapped].steady
+    text = words_of(outcome)
+    first, bumped = names(outcome, 1, pushed)
+    assert f"? {bumped} is off by 1.8 N and" in text
+    assert "touched, bumped or pulled by a cable? Repeat it" in text
+    assert outcome.result.rejected_poses == (pushed,)
+    assert f"? {first} reads otherwise at the end, and the poses between do not drift: was it touched then?" in text
+    assert "warm up" not in text
+    assert text.count(" ? ") == 2
+    assert_near(outcome, dict(station.truth))
+
+
+def test_a_cable_that_pulls_in_three_poses(
+    station: Station,
+    tour: Callable[[Happening], tuple[Outcome, Nobody]],
+    words_of: Callable[[Outcome], str],
+) -> None:
+    taut_deg = -60
+    station.control(do="cable", joint=6, beyond_deg=taut_deg, force_N_deg=[0.0, 0.02, 0.01])
+    outcome, _ = tour(lambda _: None)
+    wound = [r.stop for r in outcome.run.records() if np.degrees(r.pose.q_rad[5]) < taut_deg and r.stop <= POSES]
+    assert len(wound) == 3
+    assert f"something pulls in {', '.join(names(outcome, *wound))}: a cable" in words_of(outcome)
+    assert outcome.result.rejected_poses == tuple(wound)
+    assert outcome.result.verdict == "usable"
+    assert_near(outcome, dict(station.truth))
+
+
+def test_a_sensor_that_drifts_by_half_a_newton(
+    station: Station,
+    tour: Callable[[Happening], tuple[Outcome, Nobody]],
+    words_of: Callable[[Outcome], str],
+) -> None:
+    slope_N_s, began_ns = 0.06, 0
+
+    def happening(event: Event) -> None:
+        nonlocal began_ns
+        if begins(event, State.SETTLE, 1):
+            station.control(do="drift", force_N=[0, 0, slope_N_s * 100], seconds=100)
+            began_ns = time.monotonic_ns()
+
+    outcome, _ = tour(happening)
+    records = outcome.run.records()[:POSES]
+    offset_ns = records[0].clock_offset_ns
+    drifted_N = slope_N_s * np.array([(r.t_mid_ns - offset_ns - began_ns) * 1e-9 for r in records])
+    assert drifted_N[-1] > 0.3
+    text = words_of(outcome)
+    assert "N/min" in text
+    assert "the sensor drifts: let it warm up" in text
+    assert text.count(" ? ") == 1
+    found = outcome.result.drift
+    assert found is not None
+    assert found.change[2] == pytest.approx(drifted_N[-1] - drifted_N[0], abs=4 * found.sigma[2])
+    truth = dict(station.truth)  # the bias is the mean over the poses
+    truth["force_bias_N"] = np.add(truth["force_bias_N"], [0, 0, drifted_N.mean()])
+    assert_near(outcome, truth)
+
+
+@pytest.mark.parametrize(
+    ("shift", "kind"),
+    [
+        ({"p_sensor_com_m": [0.002, 0.001, 0.004]}, "the centre of mass is"),
+        ({"mass_kg": -0.02}, "the load weighs 0.2 N less"),
+    ],
+    ids=["centre of mass", "mass"],
+)
+def test_a_payload_that_shifts_in_mid_run(
+    shift: dict[str, Any],
+    kind: str,
+    station: Station,
+    tour: Callable[[Happening], tuple[Outcome, Nobody]],
+    words_of: Callable[[Outcome], str],
+) -> None:
+    since = 7
+    new = {name: np.add(station.truth[name], change).tolist() for name, change in shift.items()}
+
+    def happening(event: Event) -> None:
+        if begins(event, State.MOVE, since):
+            station.control(do="payload-shift", **new)
+
+    outcome, _ = tour(happening)
+    text = words_of(outcome)
+    (first,) = names(outcome, since)
+    assert f"? from {first} on {kind}" in text
+    assert "REJECTED" in text
+    assert f"the poses do not belong to one tool: from pose {since} on {kind}" in text
+    assert not list(outcome.run.folder.glob("calibration*.json"))
