@@ -191,8 +191,13 @@ def wrong_basin_probability(delta_chi2: float) -> float:
 
 def different_orientations(R_base_flange: Array) -> int:
     """Count orientations that differ by more than half a degree; stops counting at 24."""
-    kept = np.empty((0, 3, 3))
-    for R in R_base_flange:
+    kept, rest = R_base_flange[:24], R_base_flange[24:]
+    pairs = np.triu_indices(len(kept), 1)
+    if np.any(angle_between(kept[pairs[0]], kept[pairs[1]]) <= SAME_ORIENTATION_RAD):
+        kept, rest = np.empty((0, 3, 3)), R_base_flange
+    elif len(kept) == 24:
+        return 24
+    for R in rest:
         if np.all(angle_between(kept, R) > SAME_ORIENTATION_RAD):
             kept = np.concatenate([kept, R[None]])
             if len(kept) == 24:

@@ -34,7 +34,9 @@ def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
     size = np.ones(len(S))
     for _ in range(8):
         shape = np.average(S / size[:, None, None], axis=0, weights=freedom)
-        size = np.einsum("ij,nji->n", np.linalg.inv(shape), S) / 6
+        before, size = size, np.einsum("ij,nji->n", np.linalg.inv(shape), S) / 6
+        if np.abs(size - before).max() <= 1e-12 * size.max():
+            break
     # Sizes scatter by 2 / (6 freedom) in the logarithm when nothing differs: remove that share.
     log_size = np.log(size)
     scatter = 2 / (6 * freedom)

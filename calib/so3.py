@@ -350,7 +350,7 @@ def _descend(quartic: Array, q: Array) -> tuple[Array, Array, Array]:
     longest, kick, floor, arrived = 0.35, 0.05, 1e-7, 1e-8  # lengths on the sphere: half the angles of rotation
     reach = np.full(len(q), longest)
     here: tuple[Array, ...] = (q, *_local(quartic, q))
-    ends: list[Array] = []
+    ends: list[tuple[Array, ...]] = []
     for _ in range(100):
         q, cost, gradient, hessian, basis = here
         curvature, axes = np.linalg.eigh(hessian)
@@ -366,12 +366,12 @@ def _descend(quartic: Array, q: Array) -> tuple[Array, Array, Array]:
         reach = np.where(down, np.minimum(2 * reach, longest), reach / 4)
         done = (length < arrived) | (reach < arrived)
         here = tuple(np.where(down.reshape(-1, *[1] * (y.ndim - 1)), y, x) for x, y in zip(here, there, strict=True))
-        ends.append(here[0][done])
-        here, reach = tuple(x[~done] for x in here), reach[~done]
-        if done.all():
+        if done.any():
+            ends.append(tuple(x[done] for x in here[:4]))
+            here, reach = tuple(x[~done] for x in here), reach[~done]
+        if not len(reach):
             break
-    q = np.concatenate((*ends, here[0]))
-    cost, gradient, hessian, _ = _local(quartic, q)
+    q, cost, gradient, hessian = (np.concatenate(parts) for parts in zip(*ends, here[:4], strict=True))
     curvature = np.linalg.eigvalsh(hessian)[:, 0]
     found = (curvature > -_FLAT) & (np.linalg.norm(gradient, axis=1) < 1e-9)
     found[np.argmin(cost)] = True
