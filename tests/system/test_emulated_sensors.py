@@ -31,6 +31,7 @@ def test_a_driver_reads_the_truth_of_the_cell_and_refuses_what_is_none(name: str
             assert (np.abs(samples.wrench.mean(axis=0) - expected) < 5 * sigma + resolution).all()
 
             station.control(do="push", wrench=[0, 0, -30, 0, 0, 0], axes="base")
+            sensor.collect(0.1)  # what was under way
             push_N = sensor.collect(0.3).wrench.mean(axis=0)[:3] - expected[:3]
             weight_N = expected[:3] - truth["force_bias_N"]  # gravity pulls the same way, nearly: the base leans 2°
             cosine = push_N @ weight_N / np.linalg.norm(push_N) / truth["weight_N"]

@@ -164,7 +164,7 @@ def test_linear_drift_costs_little_in_a_good_order_and_nothing_without_time() ->
     unmoved = predicted_sigma(tour, guess, t_s=np.full(24, 7.0))
     assert_allclose(unmoved.sigma["weight_N"], still.sigma["weight_N"], rtol=1e-12)
     # One half of the orientations first and the other later: drift cannot be told from what differs between them.
-    sorted_ = tour[np.argsort(tour[:, 2, 0])]
+    sorted_ = ALL[np.lexsort((ALL[:, 2, 1], ALL[:, 2, 0]))]
     bad = predicted_sigma(sorted_, guess, t_s=np.arange(24))
     assert norm(bad.sigma["R_flange_sensor"]) > 1.2 * norm(still.sigma["R_flange_sensor"])
 
