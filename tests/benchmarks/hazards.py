@@ -43,7 +43,7 @@ BRAKING_S: Final = 0.35
 """From 60 deg/s with 4 rad/s2: 0.26 s; two looks of the guards, and the way of the command."""
 PATIENCE_S: Final = 120.0
 UNSEEN: Final[Mapping[str, str]] = {
-    "1 cable, gently": "below the contact limit nothing stops the arm; the report names the poses (test_disturbances.py)",
+    "1 cable, gently": "nothing stops the arm below the contact limit; the report names poses (test_disturbances.py)",
     "2 joints off their line": "the emulated arm cannot leave its path while a program plays: unit tests only",
     "4 what is not described": "only the question and the contact guard (14)",
     "6 singularities": "by construction: joint moves only",
@@ -60,8 +60,8 @@ UNSEEN: Final[Mapping[str, str]] = {
 class Fault:
     """Something that happens in mid-tour.
 
-    `inject` and `mend` get the scene; `at` is the state in which it happens, on the way to `stop`; `hazards` are the rows
-    that may name it; `resumed` says that the process is gone, and --resume goes on.
+    `at` is the state in which it happens, on the way to `stop`; `hazards` are the rows that may name it; `resumed` says
+    that the process is gone, and --resume goes on.
     """
 
     row: str
@@ -154,7 +154,10 @@ def standing(scene: Scene, since_ns: int, before_ns: int) -> int | None:
 
 def inject(scene: Scene, fault: Fault, seen: Observed) -> None:
     if fault.at in {"move", "approach"}:
+        deadline = time.monotonic() + PATIENCE_S / 4
         while not scene.station.control(do="state")["moving"]:
+            if time.monotonic() > deadline:
+                return
             time.sleep(0.005)
         time.sleep(DEEP_S)
         seen.was_moving = bool(scene.station.control(do="state")["moving"])
@@ -186,8 +189,13 @@ def conduct(scene: Scene, fault: Fault | None = None, seen: Observed | None = No
         if name == "guard-tripped":
             hazards.append(event["hazard"])
             seen.told_ns, seen.words = seen.told_ns or at_ns, seen.words or event["words"]
-        here = name == "state-changed" and event["state"] == fault.at
-        if here and not injected and (fault.at == "approach" or event["stop"] == fault.stop):
+        if fault.at == "approach":
+            here = name == "asked" and event["question"].startswith(
+                "The arm goes"
+            )  # the session says it after the answer
+        else:
+            here = name == "state-changed" and event["state"] == fault.at and event["stop"] == fault.stop
+        if here and not injected:
             injected = True
             inject(scene, fault, seen)
             if fault.resumed:
@@ -243,6 +251,10 @@ def cell(folder: Path, *options: str) -> Iterator[tuple[Station, Path]]:
         yield station, write_config(folder, station.cell)
 
 
+def posture(q_deg: Array) -> str:
+    return "--start-q-deg=" + ",".join(str(float(angle)) for angle in q_deg)
+
+
 def undisturbed(folder: Path, *arguments: str) -> Json:
     with cell(folder) as (station, config):
         scene = Scene(station, folder, Child(folder, "--config", config, *arguments))
@@ -254,8 +266,11 @@ def undisturbed(folder: Path, *arguments: str) -> Json:
 
 
 def disturb(folder: Path, plan: Path, fault: Fault) -> Observed:
-    seen = Observed()
-    with cell(folder) as (station, config):
+    seen, options = Observed(), list[str]()
+    if fault.at == "approach":
+        q_deg = np.degrees(json.loads(plan.read_text())["steps"][0]["q_rad"])
+        options = [posture(q_deg + np.array([0, 0, 0, 0, 0, 40]))]
+    with cell(folder, *options) as (station, config):
         scene = Scene(station, folder, Child(folder, "--config", config, "--plan", plan, "--fast"))
         try:
             seen.resumed = conduct(scene, fault, seen)
@@ -267,9 +282,9 @@ def disturb(folder: Path, plan: Path, fault: Fault) -> Observed:
                 fault.mend(scene)
             scene.child.end()
             if fault.restart and seen.injected_ns and scene.run is not None:
-                q_deg = ",".join(str(float(x)) for x in np.degrees(station.control(do="state")["q_rad"]))
+                q_deg = np.degrees(station.control(do="state")["q_rad"])
                 station.__exit__()
-                with cell(folder, "--start-q-deg=" + q_deg) as (again, other):
+                with cell(folder, posture(q_deg)) as (again, other):
                     scene = Scene(again, folder, Child(folder, "--config", other, "--resume", scene.run, "--fast"))
                     seen.resumed = conduct(scene)
             elif seen.resumed is None and scene.run is not None:
