@@ -125,6 +125,7 @@ class Guards:
         try:
             state = self._arm.state()
         except DeviceFault as error:
+            status = self._arm.status()  # what stopped the arm may have come between the two
             raise Tripped(9 if status.fault is None else hazard_of_safety(status.safety_mode), error) from error
         try:
             self._sensor.check()
