@@ -50,6 +50,7 @@ class FakeArm(RobotArm):
         self.forbidden: Array | None = None
         self.halted = threading.Event()
         self.gone: DriverError | None = None
+        self.gone_status: dict[str, Any] = {}
 
     def open(self, *, control: bool = False) -> None:
         self.opened += 1
@@ -63,6 +64,8 @@ class FakeArm(RobotArm):
 
     def state(self) -> ArmState:
         if self.gone:
+            if self.gone_status:
+                self.set_status(**self.gone_status)
             raise self.gone
         q = self.q + self.push_rad
         at = MODEL.frames(q)
@@ -73,6 +76,15 @@ class FakeArm(RobotArm):
 
     def set_status(self, **different: Any) -> None:
         self._status = replace(STATUS, **different)
+
+    def lose_power(self) -> None:
+        """An emergency stop, of which the joints tell before the status does."""
+        self.gone_status = {"fault": "emergency stop: …", "safety_mode": "robot emergency stop"}
+        self.gone = DeviceFault("the joints are not measured")
+
+    def power_up(self) -> None:
+        self.gone_status, self.gone = {}, None
+        self.set_status()
 
     def within_safety_limits(self, q_rad: Sequence[float]) -> bool:
         return self.forbidden is None or not np.allclose(q_rad, self.forbidden)
@@ -443,6 +455,12 @@ FAULTS: dict[str, tuple[int, Callable[[Lab], None], Callable[[Lab], None], type[
         11,
         lambda lab: lab.arm.set_status(fault="emergency stop: …", safety_mode="robot emergency stop"),
         lambda lab: lab.arm.set_status(),
+        DeviceFault,
+    ),
+    "an emergency stop between two looks": (
+        11,
+        lambda lab: lab.arm.lose_power(),
+        lambda lab: lab.arm.power_up(),
         DeviceFault,
     ),
     "reduced mode": (
