@@ -33,8 +33,8 @@ _RATE: Final = 0.1
 _LINK_S: Final = 0.5
 _LATENCY_S: Final = 0.1
 _FREE_BYTES: Final = 200_000_000
-_EDGE_RAD: Final = float(np.radians(15))
-"""Each question takes the controller some 10 ms. Between two points no part is more than 3 mm off their chord."""
+_EDGE_RAD: Final = float(np.radians(5))
+"""Each question takes the controller some 10 ms. Between two points no part is more than 1 mm off their chord."""
 _LOAD: Final = 0.8
 _PAYLOAD_KG, _PAYLOAD_SHARE = 0.5, 0.3
 
