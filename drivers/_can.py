@@ -61,10 +61,10 @@ class CanBus:
     bitrate : int
         Bit/s; on socketcan it is set with ``ip link`` and this value is not used.
     identifiers : iterable of int
-        What the device sends; everything else is ignored.
+        What the device sends; everything else is ignored. None of them: nothing is ignored.
     """
 
-    def __init__(self, owner: str, channel: str, interface: str, bitrate: int, identifiers: Iterable[int]) -> None:
+    def __init__(self, owner: str, channel: str, interface: str, bitrate: int, identifiers: Iterable[int] = ()) -> None:
         self._owner = owner
         self._channel = channel
         self._interface = interface
@@ -115,7 +115,7 @@ class CanBus:
             if message is None:
                 return None
             strange = message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd
-            if not strange and message.arbitration_id in self._identifiers:
+            if not strange and (not self._identifiers or message.arbitration_id in self._identifiers):
                 return message.arbitration_id, bytes(message.data)
 
     def _broken(self, exc: Exception) -> StreamBroken:

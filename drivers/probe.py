@@ -1,7 +1,7 @@
 """Which known sensor is on a serial port: listen first, then ask for its name. Only for ports that the user names.
 
 Nothing is set, started or stopped: what is sent are requests to read, in the protocols of ATI, Robotiq and Robotous.
-They are still bytes, and what an unknown device makes of them is unknown. CAN is not probed.
+They are still bytes, and what an unknown device makes of them is unknown. CAN buses: `probe_can`.
 """
 
 import time
@@ -25,10 +25,12 @@ _ENOUGH_FRAMES = 5
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A sensor that has shown itself."""
+    """A sensor that has shown itself, or one that could not be asked."""
 
-    url: str
+    url: str | None
+    """To be used as it is; None for a sensor that was not asked."""
     what: str
+    """What it says of itself, or why it was not asked."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,19 +2,26 @@
 
 import os
 from contextlib import closing
+from pathlib import Path
+from urllib.parse import urlsplit
 
 from serial.tools import list_ports
 
-from drivers.probe import probe
+from drivers.errors import ConnectError
+from drivers.probe import Answer, probe
+from drivers.probe_can import probe_can
+from drivers.registry import Options
 from drivers.ur.kinematics import model_named
 from drivers.ur.library import ask_dashboard
 from drivers.ur.reading import CONNECT_S, Reader
-from ftdrive.checks import DEV, can_details, can_interfaces
+from ftdrive.checks import DEV, Check, can_details, can_interfaces, check_can_interface, check_serial_port
 from ftdrive.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.errors import ConfigError
 from ftdrive.wiring import build_sensor
 
 _LOOK_S = 0.5
+_CAN = ("socketcan", "slcan")
+_SLCAN = "slcan:///dev/ttyACM0?bitrate=250000"
 
 
 def look_at_robot(host: str, model: str | None) -> tuple[str, str]:
@@ -36,23 +43,80 @@ def look_at_sensor(url: str) -> str:
     return f"{info.model}, serial {info.serial}, firmware {info.firmware}, {rate_Hz:.0f} Hz"
 
 
-def sensor_at(port: str) -> str:
-    """Ask a serial port that the user named which known sensor is there; raises `ConfigError` if none answers."""
-    answer = probe(port)
-    if answer is None:
-        raise ConfigError(
-            f"no known sensor answers on {port}: is it powered? Or give its address, as drivers/README has it"
-        )
-    return answer.url
+def is_place(text: str) -> bool:
+    """Tell whether this names where a sensor may be, and not yet which one is there."""
+    return "://" not in text or text.startswith(tuple(f"{interface}://" for interface in _CAN))
+
+
+def sensor_at(place: str) -> str:
+    """Ask which known sensor is at a place that the user named; raises `ConfigError` unless there is just one."""
+    answers = ask(place)
+    urls = [answer.url for answer in answers if answer.url]
+    if len(urls) == 1:
+        return urls[0]
+    if urls:
+        raise ConfigError(f"{len(urls)} sensors answer on {place}: choose one, {' or '.join(urls)}")
+    why = "; ".join(answer.what for answer in answers)
+    usual = "is it powered, and at this bit rate? Or give its address, as drivers/README has it"
+    raise ConfigError(f"no known sensor answers on {place}: {why or usual}")
+
+
+def ask(place: str) -> list[Answer]:
+    """Ask which known sensors are at a place that the user named; they are only read.
+
+    Parameters
+    ----------
+    place : str
+        A serial port; a CAN interface of the kernel, ``can0`` or ``socketcan://can0?base=0x7F``; or a CAN adapter on a
+        serial port with the bit rate of its bus, ``slcan:///dev/ttyACM0?bitrate=250000``.
+
+    Raises
+    ------
+    ConfigError
+        The place is not written so.
+    ConnectError
+        It is not there, not up, or not permitted.
+    """
+    if "://" in place:
+        return _ask_can(place)
+    if "/" in place or place.upper().startswith("COM"):
+        _must_pass(check_serial_port(Path(place)))
+        answer = probe(place)
+        return [] if answer is None else [answer]
+    return _ask_can(f"socketcan://{place}")
+
+
+def _ask_can(url: str) -> list[Answer]:
+    try:
+        parts = urlsplit(url)
+        interface, channel, options = parts.scheme, parts.netloc + parts.path, Options(url, parts.query)
+        if interface not in _CAN or not channel:
+            raise ConfigError(f"{url} is no place to ask: give a serial port, can0, or {_SLCAN}")
+        bitrate = options.integer("bitrate", 0, 0, 1_000_000) or None
+        base = options.integer("base", 0x20, 0, 0x7F)
+        options.reject_others()
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    if interface == "socketcan":
+        details = can_details(channel)
+        bitrate = bitrate or details.get("bitrate")
+        _must_pass([check_can_interface(channel, bitrate or 250_000, details)])
+    elif bitrate is None:
+        raise ConfigError(f"{url}: at which bit rate? A wrong one disturbs the bus; write it like {_SLCAN}")
+    else:
+        _must_pass(check_serial_port(Path(channel.split("@")[0])))
+    return probe_can(channel, interface=interface, bitrate=bitrate, base=base)
+
+
+def _must_pass(checks: list[Check]) -> None:
+    for check in checks:
+        if check.state == "failed":
+            raise ConnectError(f"{check.found}: {check.fix}")
 
 
 def places() -> list[str]:
-    """List where a sensor may be: CAN interfaces with the sensors known there, and serial ports on USB by id."""
-    found = []
-    for name in can_interfaces():
-        bitrate = can_details(name).get("bitrate")
-        found += [f"ati-can://{name}" + (f"?bitrate={bitrate}" if bitrate else ""), f"robotous-can://{name}"]
+    """List where a sensor may be: CAN interfaces of the kernel, and serial ports on USB by id."""
     by_id = DEV / "serial" / "by-id"
     links = {os.path.realpath(link): str(link) for link in by_id.iterdir()} if by_id.is_dir() else {}
     ports = sorted(port.device for port in list_ports.comports() if port.vid is not None)
-    return found + [links.get(os.path.realpath(port), port) for port in ports]
+    return can_interfaces() + [links.get(os.path.realpath(port), port) for port in ports]

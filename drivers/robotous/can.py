@@ -15,8 +15,8 @@ from drivers.robotous.sensor import RobotousSensor
 if TYPE_CHECKING:
     from drivers.registry import Options
 
-_COMMAND, _FIRST_HALF, _SECOND_HALF = 0x64, 0x01, 0x02
-_BITRATE = 1_000_000
+COMMAND, FIRST_HALF, SECOND_HALF = 0x64, 0x01, 0x02
+BITRATE = 1_000_000
 _WAIT_S = 0.05
 _OVERSLEPT_S = 0.002
 """Where a wait ends so much too late the host was busy, and frames may be there: it has to look once more."""
@@ -31,7 +31,7 @@ class CanLink:
     def __init__(self, channel: str, *, interface: str = "socketcan") -> None:
         self.name = f"Robotous sensor on {interface} {channel}"
         self.fastest_Hz = 1000
-        self._bus = CanBus(self.name, channel, interface, _BITRATE, (_FIRST_HALF, _SECOND_HALF))
+        self._bus = CanBus(self.name, channel, interface, BITRATE, (FIRST_HALF, SECOND_HALF))
         self._halves = Halves()
 
     @property
@@ -46,7 +46,7 @@ class CanLink:
 
     def send(self, field: bytes) -> None:
         """Send a command field."""
-        self._bus.send(_COMMAND, field)
+        self._bus.send(COMMAND, field)
 
     def stream(self, rate_Hz: int, /) -> None:
         """Start the stream."""
@@ -64,7 +64,7 @@ class CanLink:
             fields: list[Field] = []
             if frame := self._bus.receive(wait_s):
                 identifier, data = frame
-                self._halves.take(time.monotonic_ns(), data, second=identifier == _SECOND_HALF)
+                self._halves.take(time.monotonic_ns(), data, second=identifier == SECOND_HALF)
                 overslept = False
             elif overslept or time.monotonic() - begin_s < wait_s + _OVERSLEPT_S:
                 fields = self._halves.silence()

@@ -1,4 +1,4 @@
-"""`ftdrive devices`: which ports this computer has, and on request which known sensor is on one."""
+"""`ftdrive devices`: which ports and buses this computer has, and on request which known sensors are there."""
 
 import os
 from pathlib import Path
@@ -9,30 +9,39 @@ from rich.console import Console
 from rich.markup import escape
 from serial.tools import list_ports
 
-from drivers.probe import probe
 from ftdrive.checks import DEV, Check, can_details, can_interfaces, check_serial_port
 from ftdrive.commands.common import JSON, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.simulation import Station
 
+_PLACES = """\b
+A PLACE is
+  /dev/ttyUSB0                            a serial port
+  can0                                    a CAN interface that is up, at its own bit rate
+  slcan:///dev/ttyACM0?bitrate=250000     a CAN adapter on a serial port"""
 
-@click.command()
+
+@click.command(epilog=_PLACES)
 @click.option(
-    "--probe", "ports", multiple=True, metavar="PORT", help="Ask which known sensor is there; may be repeated."
+    "--probe", "places", multiple=True, metavar="PLACE", help="Ask which known sensors are there; may be repeated."
 )
 @click.option("--simulate", is_flag=True, help="Show the ports of an emulated cell instead.")
 @JSON
-def devices(ports: tuple[str, ...], simulate: bool, as_json: bool) -> None:
-    """List serial ports by id and CAN interfaces.
+def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
+    """List serial ports by id and CAN interfaces, and known sensors that answer where you tell it to ask.
 
-    No port is opened and no byte is sent, except to the serial ports named with --probe: there it listens, and then
-    sends requests to read in the protocols of the sensors it knows. Do not probe a port with something else on it.
+    Nothing is opened and no byte is sent, except at each PLACE: there it listens, and then sends requests to read in
+    the protocols of the sensors it knows. Do not probe a serial port with something else on it.
+
+    On CAN, ATI sensors are looked for at base identifier 0x20 (another: socketcan://can0?base=0x7F), Robotous sensors
+    at 1 Mbit/s only. Where something else sends on the identifiers of a sensor, nothing is sent and you are told.
+    A wrong bit rate disturbs a bus in use.
     """
-    if simulate and ports:
+    if simulate and places:
         raise ConfigError("an emulated cell has just its own ports: give either --simulate or --probe")
     found = _emulated() if simulate else {"serial": _serial_ports(), "can": _can_interfaces()}
-    if ports:
-        found["answers"] = [_answer(port) for port in ports]
+    if places:
+        found["answers"] = [answer for place in places for answer in _answers(place)]
     if as_json:
         write_json({"schema_version": 1, **found})
     else:
@@ -68,9 +77,11 @@ def _can_interfaces() -> list[dict[str, Any]]:
     return [{"interface": name, **can_details(name)} for name in can_interfaces()]
 
 
-def _answer(port: str) -> dict[str, Any]:
-    answer = probe(port)
-    return {"port": port, "url": answer and answer.url, "what": answer and answer.what}
+def _answers(place: str) -> list[dict[str, Any]]:
+    from ftdrive.discovery import ask
+
+    answers = [{"port": place, "url": answer.url, "what": answer.what} for answer in ask(place)]
+    return answers or [{"port": place, "url": None, "what": "no known sensor answers"}]
 
 
 def _emulated() -> dict[str, Any]:
@@ -100,5 +111,5 @@ def _print(found: dict[str, Any]) -> None:
         if not found[kind]:
             data.print(f" no {name}")
     for answer in found.get("answers", ()):
-        told = "no known sensor" if answer["url"] is None else f"{answer['what']}   {answer['url']}"
-        data.print(escape(f" probed  {answer['port']}   {told}"))
+        words = [answer["port"], answer["what"], answer["url"]]
+        data.print(" probed  " + escape("   ".join(word for word in words if word)))

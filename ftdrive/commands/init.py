@@ -18,7 +18,7 @@ _SILENT = "did not answer when this was written"
 @click.command()
 @click.option("--robot", metavar="HOST", help="Address of the controller.")
 @click.option("--model", help="Of the arm, where the controller does not tell it (CB3).")
-@click.option("--sensor", metavar="URL|PORT", help="Its address, or a serial port to ask what is there.")
+@click.option("--sensor", metavar="URL|PLACE", help="Its address, or what `ftdrive devices --probe` takes.")
 @click.option("--height", metavar="MM", help="Of the sensor above the flange face. Measure it.")
 @click.option("--sensor-mass", metavar="KG", help="Of sensor and adapter.")
 @click.option("--tool-name", metavar="NAME", help="Of the tool.")
@@ -230,14 +230,14 @@ def _robot(ask: Questions, given: str | None, usual: str | None, model: str | No
 def _sensor(ask: Questions, given: str | None, usual: str | None) -> tuple[str, str]:
     """Address, and what the sensor says of itself; a person may keep an address that does not answer."""
     from drivers.errors import DriverError
-    from ftdrive.discovery import look_at_sensor, places, sensor_at
+    from ftdrive.discovery import is_place, look_at_sensor, places, sensor_at
     from ftdrive.errors import ConfigError
 
     found = [] if given or not ask.somebody_answers else places()
     for number, place in enumerate(found, start=1):
         _say(f"  {number}) {place}")
     words = (
-        "Sensor, a number (a port is asked what is there) or its address"
+        "Sensor, a number (a port or bus is asked what is there) or its address"
         if found
         else "Sensor address, such as ati-can://can0?bitrate=250000"
     )
@@ -248,13 +248,13 @@ def _sensor(ask: Questions, given: str | None, usual: str | None) -> tuple[str, 
         if url == failed:
             return url, _SILENT
         try:
-            url = url if "://" in url else sensor_at(url)
+            url = sensor_at(url) if is_place(url) else url
             told = look_at_sensor(url)
         except (DriverError, ConfigError) as error:
             if not ask.somebody_answers:
                 raise
             _say(f"  ✘ {error}")
-            failed = url if isinstance(error, DriverError) and "://" in url else None
+            failed = url if isinstance(error, DriverError) and not is_place(url) else None
             keep = ", or Enter to keep it" if failed else ""
             text = ask.text(f"Another address{keep}", "sensor.url", "--sensor", None, failed)
             continue

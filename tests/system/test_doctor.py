@@ -124,6 +124,24 @@ def test_devices_of_this_computer_and_of_an_emulated_cell(station: Station, ftdr
     assert [port["url"].partition(":")[0] for port in emulated["serial"]] == ["ati-serial", "ati-can"]
 
 
+def test_devices_asks_serial_port_and_can_bus_where_it_is_told_to(ftdrive: CommandLine) -> None:
+    with Station("both", ["--time-scale", "1"]) as station:
+        port, can = station.endpoints["serial"]["port"], station.endpoints["can"]
+        bus = f"slcan://{can['channel']}?bitrate={can['bitrate']}"
+        url = f"ati-can://{can['channel']}?interface=slcan&bitrate={can['bitrate']}"
+        serial_answer, can_answer = ftdrive.json("devices", "--probe", port, "--probe", bus)["answers"]
+        assert (serial_answer["port"], serial_answer["url"]) == (port, f"ati-serial://{port}")
+        assert (can_answer["port"], can_answer["url"]) == (bus, url)
+        assert "ATI NETCANOEM, serial FT12345" in can_answer["what"]
+        shown = ftdrive.run("devices", "--probe", bus, "--probe", f"{bus}&base=0x7F").stdout
+        assert f" probed  {bus}   {can_answer['what']}   {url}\n" in shown
+        assert f" probed  {bus}&base=0x7F   no known sensor answers\n" in shown
+    gone = ftdrive.run("devices", "--probe", "no-can")
+    assert gone.returncode == 3
+    assert "sudo ip link set no-can up type can bitrate 250000" in gone.stderr
+    assert "Traceback" not in gone.stderr
+
+
 def test_transcript_of_a_sensor(ftdrive: CommandLine) -> None:
     recorded = ftdrive.json("transcript", "record", "--simulate", "-o", "sensor.jsonl", "--duration", "1")["recorded"]
     played = ftdrive.json("transcript", "play", ftdrive.folder / "sensor.jsonl")

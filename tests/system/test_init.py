@@ -69,6 +69,14 @@ def test_a_script_needs_no_questions(station: Station) -> None:
     assert cell.workcell.boxes_mm == ((5, 5, 0, 9, 9, 9),)
 
 
+def test_a_bus_is_asked_what_is_there(station: Station) -> None:
+    can = station.endpoints["can"]
+    bus = f"slcan://{can['channel']}?bitrate={can['bitrate']}"
+    outcome = run("--robot", station.cell.robot.host, "--sensor", bus, *TOOL, "--yes")
+    assert outcome.exit_code == 0, (outcome.output, outcome.exception)
+    assert load().sensor.url == f"ati-can://{can['channel']}?interface=slcan&bitrate={can['bitrate']}"
+
+
 def test_nothing_counts_as_measured_until_a_person_says_so(addresses: list[str]) -> None:
     assert run(*addresses, *TOOL, "--yes").exit_code == 0
     text = Path("ftdrive.toml").read_text()
@@ -142,8 +150,8 @@ def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
 
 
 def test_a_person_may_keep_addresses_that_do_not_answer() -> None:
-    silent = "ati-serial:///dev/no-such-port"
-    typed = ["127.99.99.9", "", "ur10e", "", silent, "", "33", "", "", "0:50:80", "", "", "", "", "", "", ""]
+    silent, no_bus = "ati-serial:///dev/no-such-port", "slcan:///dev/no-such-port?bitrate=250000"
+    typed = ["127.99.99.9", "", "ur10e", "", no_bus, silent, "", "33", "", "", "0:50:80", "", "", "", "", "", "", ""]
     outcome = run(typed="\n".join(typed) + "\n")
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)
     cell = load()

@@ -43,6 +43,7 @@ def test_a_sensor_shows_itself(kind: Any, options: dict[str, Any], scheme: str |
         assert answer is None
     else:
         assert answer is not None
+        assert answer.url is not None
         assert answer.url.partition("?")[0] == f"{scheme}://{port}"
         assert what in answer.what
 

@@ -1,0 +1,198 @@
+"""Which known sensors are on a CAN bus: listen first, then ask for their names. Only for buses that the user names.
+
+Three frames may be sent, all requests to read: serial number and firmware of an ATI NETCANOEM, and the model of a
+Robotous. A sensor is asked only if nothing is heard on its identifiers: they may be commands to other devices, such as
+motor drives, for which 0x201 to 0x20F are set values.
+
+Ref: ATI 9610-05-1030-04, command list; Robotous RFT manual 1.7, communication protocol; CiA 301, predefined connection
+set.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+
+from drivers._can import CanBus
+from drivers.ati import codec as ati
+from drivers.ati.codec import Op
+from drivers.errors import ConnectError, ProtocolError, StreamBroken
+from drivers.probe import Answer
+from drivers.robotous import can as robotous_can
+from drivers.robotous import codec as robotous
+
+_LISTEN_S = 1.0
+"""Ten samples of the slowest Robotous, and about the slowest heartbeat in use."""
+_REPLY_S = 0.25
+_ENOUGH_SAMPLES = 5
+"""In a row and in order, before frames are believed to be that sensor's."""
+
+_HEARTBEATS = frozenset(range(0x701, 0x780))
+"""Nodes of CANopen; with them on a bus every lower identifier may be a command, also one that is silent now."""
+
+Frame = tuple[int, bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    name: str
+    url: str
+    must_be_silent: AbstractSet[int]
+    """Identifiers on which nothing may be heard before it is asked."""
+    shows_itself: Callable[[Sequence[Frame]], str | None]
+    ask: Callable[[CanBus], str | None]
+
+
+def probe_can(channel: str, *, interface: str, bitrate: int | None, base: int = 0x20) -> list[Answer]:
+    """Tell which known sensors are on a bus, and which could not be asked.
+
+    Parameters
+    ----------
+    channel, interface : str
+        ``can0`` and ``socketcan``, or a serial port and ``slcan``.
+    bitrate : int or None
+        Bit/s of the bus: a wrong one disturbs it. None on socketcan, where it is not known.
+    base : int
+        Where an ATI sensor is looked for, 0x00 to 0x7F.
+
+    Raises
+    ------
+    ConnectError
+        The bus does not open, or is lost.
+    """
+    known = [_ati(channel, interface, bitrate, base)]
+    if bitrate in {None, robotous_can.BITRATE}:
+        known.append(_robotous(channel, interface))
+    bus = CanBus(f"{interface} {channel}", channel, interface, bitrate or 250_000)
+    try:
+        bus.open()
+        heard = _hear(bus)
+        return [answer for sensor in known if (answer := _look(sensor, heard, bus))]
+    except StreamBroken as exc:
+        raise ConnectError(str(exc)) from exc
+    finally:
+        bus.close()
+
+
+def _hear(bus: CanBus) -> list[Frame]:
+    frames, end = [], time.monotonic() + _LISTEN_S
+    while (left_s := end - time.monotonic()) > 0:
+        if frame := bus.receive(left_s):
+            frames.append(frame)
+    return frames
+
+
+def _look(known: _Known, heard: Sequence[Frame], bus: CanBus) -> Answer | None:
+    if what := known.shows_itself(heard):
+        return Answer(known.url, what)
+    if busy := sorted(known.must_be_silent & {identifier for identifier, _ in heard}):
+        some = ", ".join(f"0x{identifier:03X}" for identifier in busy[:4]) + (" …" if busy[4:] else "")
+        return Answer(
+            None,
+            f"{known.name} was not asked, because something else sends on {some}; "
+            f"if you know that it is there, its address is {known.url}",
+        )
+    return Answer(known.url, what) if (what := known.ask(bus)) else None
+
+
+def _ati(channel: str, interface: str, bitrate: int | None, base: int) -> _Known:
+    first = base << 4
+    own = frozenset(range(first, first + 16))
+    options = [
+        f"interface={interface}" if interface != "socketcan" else "",
+        f"bitrate={bitrate}" if bitrate else "",
+        f"base=0x{base:02X}" if base != 0x20 else "",
+    ]
+
+    def replies(op: Op) -> dict[int, int]:
+        return {first | opcode: size for opcode, size in ati.REPLIES[op].items()}
+
+    def is_read(heard: Sequence[Frame]) -> str | None:
+        request = (first | Op.GAUGES, b"")
+        ours = [frame for frame in heard if frame[0] in own and frame != request]
+        return "another host reads it" if len(_messages(ours, replies(Op.GAUGES))) >= _ENOUGH_SAMPLES else None
+
+    def ask(bus: CanBus) -> str | None:
+        serial = _ask(bus, first | Op.SERIAL, b"", replies(Op.SERIAL))
+        firmware = None if serial is None else _ask(bus, first | Op.FIRMWARE, b"", replies(Op.FIRMWARE))
+        if serial is None or firmware is None:
+            return None
+        major, minor, build = ati.decode_firmware(firmware)
+        return f"ATI NETCANOEM, serial {ati.decode_serial(serial)}, firmware {major}.{minor} build {build}"
+
+    return _Known(
+        f"an ATI NETCANOEM at base 0x{base:02X}",
+        _url("ati-can", channel, options),
+        own | _HEARTBEATS if first < min(_HEARTBEATS) else own,
+        is_read,
+        ask,
+    )
+
+
+def _robotous(channel: str, interface: str) -> _Known:
+    reply = dict.fromkeys((robotous_can.FIRST_HALF, robotous_can.SECOND_HALF), 8)
+
+    def streams(heard: Sequence[Frame]) -> str | None:
+        fields = _messages([frame for frame in heard if frame[0] in reply], reply)
+        try:
+            samples = [robotous.decode_sample(field) for field in fields]
+        except ProtocolError:
+            return None
+        plausible = all(sample.overload < 0x40 for sample in samples)
+        return "it streams" if plausible and len(samples) >= _ENOUGH_SAMPLES else None
+
+    def ask(bus: CanBus) -> str | None:
+        field = _ask(bus, robotous_can.COMMAND, robotous.encode(robotous.Command.MODEL), reply)
+        try:
+            told = field and field[0] == robotous.Command.MODEL and robotous.decode_text(field)
+        except ProtocolError:
+            return None
+        return f"Robotous {told}" if told else None
+
+    return _Known(
+        "a Robotous",
+        _url("robotous-can", channel, [f"interface={interface}" if interface != "socketcan" else ""]),
+        reply.keys() | {robotous_can.COMMAND},
+        streams,
+        ask,
+    )
+
+
+def _url(scheme: str, channel: str, options: Sequence[str]) -> str:
+    return f"{scheme}://{channel}?{'&'.join(filter(None, options))}".rstrip("?")
+
+
+def _ask(bus: CanBus, identifier: int, data: bytes, parts: Mapping[int, int]) -> bytes | None:
+    """Send a request and return its reply, or None."""
+    bus.send(identifier, data)
+    frames: list[Frame] = []
+    end = time.monotonic() + _REPLY_S
+    while (left_s := end - time.monotonic()) > 0:
+        frame = bus.receive(left_s)
+        if frame and len(frame[1]) == parts.get(frame[0]):
+            frames.append(frame)
+            if replies := _messages(frames, parts):
+                return replies[0]
+    return None
+
+
+def _messages(frames: Sequence[Frame], parts: Mapping[int, int]) -> list[bytes]:
+    """Put whole messages together; none if one frame is out of order or of the wrong length.
+
+    Parameters
+    ----------
+    parts : mapping
+        From identifier to length in bytes of the frames of one message, in their order.
+    """
+    order = list(parts)
+    if not frames or frames[0][0] not in order:
+        return []
+    begun = order.index(frames[0][0])
+    for number, (identifier, data) in enumerate(frames, start=begun):
+        if identifier != order[number % len(order)] or len(data) != parts[identifier]:
+            return []
+    whole = frames[-begun % len(order) :]
+    return [
+        b"".join(data for _, data in whole[start : start + len(order)])
+        for start in range(0, len(whole) - len(order) + 1, len(order))
+    ]
