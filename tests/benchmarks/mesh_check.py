@@ -1,150 +1,342 @@
-"""Measure the constant tour against the convex hulls of collision meshes, with a foreign library.
+"""Measure tours, and our shapes of the arm, against the meshes of the arm, with a foreign library.
 
 Distances come from `coal`, the placing of the links from a URDF by code of its own: of the planner nothing is used but
-the joint angles of the tour. Needs `coal` (PyPI), and a URDF with the meshes in the folder beside its own, such as
-those of `example-robot-data` (PyPI): share/example-robot-data/robots/ur_description/urdf/ur5_robot.urdf. That package
-has the older UR3, UR5 and UR10 only. `--stretch` places their hulls by the lengths of an arm that is planned for. As
-they are, the hulls of their forearm and wrist 2 are never more than 16 to 20 mm apart, whatever the angles.
+the joint angles of its tours and, to compare, its own distances. A link is the convex hull of its meshes; hulls fill
+what is hollow, so the distance of the meshes themselves stands beside theirs.
 
-Run: python tests/benchmarks/mesh_check.py --urdf .../ur5_robot.urdf [--stretch UR5e] [--tool 0:200:100]
+Install: uv pip install coal airo-models example-robot-data
+  airo-models 0.0.12 (MIT): UR3e and UR5e, airo_models/arms/ur5e/ur5e.urdf.
+  example-robot-data 6.0.0 (BSD-3-Clause): the older UR3, UR5 and UR10, in share/example-robot-data/robots/
+  ur_description/urdf/ur10_robot.urdf. `--stretch` places them by the lengths of an arm that is planned for. As they
+  are, the hulls of their forearm and wrist 2 are never more than 16 to 20 mm apart, whatever the angles.
+
+Run: python -m tests.benchmarks.mesh_check --urdf .../ur5e.urdf [--stretch UR10e] [--tool 0:200:100]
 """
 
 import argparse
 import importlib
 import sys
 import xml.etree.ElementTree as ET
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from drivers.ur.kinematics import MODELS, forward
+from drivers.ur.kinematics import MODELS, Array, forward
+from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder
+from ftdrive.planning.certify import Certifier
 from ftdrive.planning.constant_tour import constant_tour
-from ftdrive.planning.planner import USUAL_POSTURE_RAD
+from ftdrive.planning.motion import Speeds
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_tour
+from ftdrive.planning.scene import Scene
+from tests.benchmarks.planning import FIXED_POINTS_M
 
 coal: Any = importlib.import_module("coal")
-TARGET_MM = 15.0
-STEP_DEG = 1.0
+TARGET_M = 0.015
+STEP_RAD = np.radians(1.0)
 FITS_M = 0.002
-CHAIN = ("base_link", "shoulder_link", "upper_arm_link", "forearm_link", "wrist_1_link", "wrist_2_link", "wrist_3_link")
-TOOL = "tool"
-HELD_APART = {
-    ("base_link", "upper_arm_link"),
-    ("shoulder_link", "forearm_link"),
-    ("wrist_1_link", "wrist_3_link"),
-    ("wrist_2_link", TOOL),
-}
+RANDOM = 3000
+PARTS = ("base", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3", "tool")
+TOOL = 7
+HELD_APART = {(0, 2), (1, 3), (4, 6), (5, TOOL)}
 """No turn of the joint between them brings them together."""
-Joints = list[tuple[Any, Any]]
-"""Fixed transform (4, 4) and axis (3,) of each joint along the chain; the last one leads to the flange and is fixed."""
+PAIRS = [(i, j) for i in range(8) for j in range(i + 2, 8) if (i, j) not in HELD_APART]
+STRETCHED_RAD = USUAL_POSTURE_RAD + np.radians([0, 70, -40, 0, 0, 0])
+"""Where the constant tour has no room: another posture must be searched."""
+Joints = list[tuple[Array, Array]]
+"""Fixed transform (4, 4) and axis (3,) of each joint; the last one leads to the flange and is fixed."""
+Mesh = tuple[Array, NDArray[np.intp]]
+"""Corners (n, 3) in metres, link axes, and the three corners (m, 3) of every facet."""
+
+
+@dataclass
+class Arm:
+    """An arm as its URDF has it, with a tool."""
+
+    model: str
+    joints: Joints
+    links: list[Mesh]
+    """Of the seven links."""
+    hulls: list[Any]
+    """Of the links, then the tool."""
+    meshes: list[Any]
+    """Of the links, then the tool."""
+    tool_m: float
+    """From the flange to the middle of the tool."""
+
+    def place(self, q_rad: Array) -> list[Array]:
+        """Pose (4, 4) of every link, and of the flange."""
+        pose, poses = np.eye(4), [np.eye(4)]
+        for (fixed, axis), angle in zip(self.joints, (*q_rad, 0.0), strict=True):
+            pose = pose @ fixed @ posed(Rotation.from_rotvec(angle * axis))
+            poses.append(pose)
+        return poses
+
+    def distances_m(self, bodies: list[Any], q_rad: Array, pairs: list[tuple[int, int]]) -> Array:
+        """Distances (p,) of pairs of bodies, zero or less where they overlap."""
+        poses = self.place(q_rad)
+        poses[TOOL] = poses[TOOL] @ posed(Rotation.identity(), (0, 0, self.tool_m))
+        at = [coal.Transform3s(pose[:3, :3], pose[:3, 3]) for pose in poses]
+        request = coal.DistanceRequest()
+        return np.array(
+            [coal.distance(bodies[a], at[a], bodies[b], at[b], request, coal.DistanceResult()) for a, b in pairs]
+        )
+
+    def closest(self, q_rad: Array) -> tuple[Array, str, int]:
+        """Look for the smallest distances at joint vectors (n, 6).
+
+        Returns
+        -------
+        hulls_m : array, shape (n,)
+            Smallest distance of the hulls at each place.
+        words : str
+            The smallest of the hulls and of the meshes, with the pair and the verdict.
+        place : int
+            Where the meshes come closest.
+        """
+        hulls_m = np.array([self.distances_m(self.hulls, q, PAIRS) for q in q_rad])
+        order = np.argsort(hulls_m, axis=None)
+        least_m, at = np.inf, order[0]
+        for i in order:
+            place, pair = divmod(int(i), len(PAIRS))
+            if hulls_m[place, pair] >= least_m:  # a mesh is inside its hull
+                break
+            found_m = self.distances_m(self.meshes, q_rad[place], [PAIRS[pair]])[0]
+            if found_m < least_m:
+                least_m, at = found_m, i
+        words = f"hulls {judged(hulls_m.min(), order[0])}, meshes {judged(least_m, at)}"
+        return hulls_m.min(axis=1), words, int(at) // len(PAIRS)
 
 
 def main() -> None:
-    """Print the smallest distance of every pair of links that are no neighbours."""
+    """Check the placing, then the tours, then our shapes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--urdf", type=Path, required=True)
     parser.add_argument("--stretch", choices=sorted(MODELS), help="place the links by the lengths of this model")
     parser.add_argument("--tool", default="0:200:100", help="from:to:diameter in mm from the flange")
     arguments = parser.parse_args()
-    joints, hulls = read(arguments.urdf)
+    tool = Cylinder(*(float(value) / 1e3 for value in arguments.tool.split(":")))
+    arm = read(arguments.urdf, tool)
     if arguments.stretch:
-        stretch(joints, arguments.stretch)
-    model = arguments.stretch or arguments.urdf.name.partition("_")[0].upper()
-    ours = forward(MODELS[model], USUAL_POSTURE_RAD).p_m
-    theirs = place(joints, USUAL_POSTURE_RAD)[TOOL][:3, 3]
+        stretch(arm, arguments.stretch)
+    show(f"{arm.model}, meshes of {arguments.urdf.name}")
+    placing(arm)
+    tour(arm, "constant tour", constant_tour(USUAL_POSTURE_RAD))
+    if arm.model in SHAPES:
+        certifier = Certifier(ArmModel(arm.model, [tool]), Scene())
+        planned(arm, certifier)
+        if not arguments.stretch:
+            compare(arm, certifier)
+            cover(arm, certifier.arm)
+
+
+def placing(arm: Arm) -> None:
+    """Show how far the flange is from ours, and how far neighbours are apart."""
+    apart_m = turned_rad = gap_m = 0.0
     # The axes of a URDF's base are turned by 180 degrees about z.
-    sys.stdout.write(
-        f"{model}: flange of the URDF {1e3 * np.linalg.norm(theirs - ours * [-1, -1, 1]):.2f} mm from ours\n"
-    )
-    low, high, diameter = (float(value) / 1e3 for value in arguments.tool.split(":"))
-    hulls[TOOL] = [coal.Cylinder(diameter / 2, high - low)]
-    tour = constant_tour(USUAL_POSTURE_RAD)
-    share = np.linspace(0, 1, int(np.ceil(90 / STEP_DEG)), endpoint=False)[:, None, None]
-    path = ((1 - share) * tour + share * np.roll(tour, -1, axis=0)).reshape(-1, 6)
-    order = (*CHAIN, TOOL)
-    pairs = [(a, b) for i, a in enumerate(order) for b in order[i + 2 :]]
-    found = np.empty((len(path), len(pairs)))
-    for row, q in zip(found, path, strict=True):
-        poses = place(joints, q)
-        poses[TOOL] = poses[TOOL] @ moved(2, (low + high) / 2)
-        row[:] = [min(distance_m(x, poses[a], y, poses[b]) for x in hulls[a] for y in hulls[b]) for a, b in pairs]
-    smallest = 1e3 * found.min(axis=0)
-    judged = [i for i, (a, b) in enumerate(pairs) if (a, b) not in HELD_APART]
-    for i in sorted(range(len(pairs)), key=lambda i: smallest[i])[:8]:
-        note = "" if i in judged else "   (held apart by the build, not judged)"
-        sys.stdout.write(f"{smallest[i]:7.1f} mm  {' - '.join(pairs[i])}{note}\n")
-    least = smallest[judged].min()
-    verdict = "pass" if least >= TARGET_MM else "FAIL"
-    sys.stdout.write(f"smallest at {len(path)} places: {least:.1f} mm (target {TARGET_MM:.0f} mm)  {verdict}\n")
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    for q in sampled(constant_tour(USUAL_POSTURE_RAD))[::10]:
+        ours, theirs = forward(MODELS[arm.model], q), arm.place(q)[TOOL]
+        apart_m = max(apart_m, float(np.linalg.norm(theirs[:3, 3] - half_turn @ ours.p_m)))
+        turned_rad = max(turned_rad, float(Rotation.from_matrix(theirs[:3, :3].T @ half_turn @ ours.R).magnitude()))
+        gap_m = max(gap_m, arm.distances_m(arm.meshes, q, [(i, i + 1) for i in range(TOOL)]).max())
+    show(f"  flange {1e3 * apart_m:.2f} mm and {np.degrees(turned_rad):.2f} degrees from ours")
+    show(f"  neighbours at most {1e3 * gap_m:.1f} mm apart")
 
 
-def read(urdf: Path) -> tuple[Joints, dict[str, list[Any]]]:
-    """Joints along the chain, and the hulls of the links."""
-    root: Any = ET.parse(urdf).getroot()
-    by_child = {joint.find("child").get("link"): joint for joint in root.findall("joint")}
-    joints = []
-    for child in (*CHAIN[1:], "tool0"):
-        axis = by_child[child].find("axis")
-        turns = np.zeros(3) if axis is None else np.array([float(value) for value in axis.get("xyz").split()])
-        joints.append((transform(by_child[child].find("origin")), turns))
-    hulls: dict[str, list[Any]] = {}
-    for link in root.findall("link"):
-        if link.get("name") in CHAIN:
-            hulls[str(link.get("name"))] = [hull_of(urdf, collision) for collision in link.findall("collision")]
-    return joints, hulls
+def planned(arm: Arm, certifier: Certifier) -> None:
+    """Check tours that the planner searches: of all poses and of 12 (--quick), and one in a box."""
+    guess, point = guess_of(certifier), FIXED_POINTS_M.get(arm.model)
+    for plan in (
+        plan_tour(certifier, STRETCHED_RAD, speeds=Speeds(), guess=guess),
+        plan_tour(certifier, STRETCHED_RAD, 12, speeds=Speeds(), guess=guess),
+        plan_box(certifier, poses=12, centre_m=point, speeds=Speeds(), guess=guess),
+    ):
+        clearance_m = min(step.clearance_m for step in plan.steps)
+        name = f"{plan.kind}, {len(plan.steps)} poses, {1e3 * clearance_m:.1f} mm certified"
+        tour(arm, name, np.array([step.q_rad for step in plan.steps]))
 
 
-def hull_of(urdf: Path, collision: Any) -> Any:
-    """Convex hull of a binary STL."""
-    name = collision.find("geometry/mesh").get("filename").split("/meshes/")[1]
-    data = (urdf.parent.parent / "meshes" / name).read_bytes()
-    count = int.from_bytes(data[80:84], "little")
+def tour(arm: Arm, name: str, q_rad: Array) -> None:
+    """Show the smallest distances along a closed tour."""
+    path = sampled(q_rad)
+    show(f"  {name}, {len(path)} places: {arm.closest(path)[1]}")
+
+
+def compare(arm: Arm, certifier: Certifier) -> None:
+    """Look at random angles that keep the margin by our shapes."""
+    random = np.random.default_rng(1)
+    for name, first in (("wrist", 3), ("arm", 0)):
+        q = np.tile(USUAL_POSTURE_RAD, (RANDOM, 1))
+        q[:, first:] = random.uniform(-np.pi, np.pi, (RANDOM, 6 - first))
+        ours_m, _ = certifier.clearances(q)
+        clear = ours_m >= certifier.margins.self_m
+        hulls_m, words, worst = arm.closest(q[clear])
+        close = np.sum(hulls_m < TARGET_M)
+        show(f"  random {name}: {clear.sum()} of {RANDOM} clear, {close} of them with hulls too close: {words}")
+        angles = np.degrees(q[clear][worst]).round(1).tolist()
+        show(f"    meshes closest at {angles}, our shapes {1e3 * ours_m[clear][worst]:.1f} mm apart there")
+
+
+def cover(arm: Arm, ours: ArmModel) -> None:
+    """Show how far the meshes stand out of our shapes."""
+    bodies, poses = ours.bodies(USUAL_POSTURE_RAD), arm.place(USUAL_POSTURE_RAD)
+    show("  meshes out of our shapes, mm:")
+    for link, (points_m, _) in enumerate(arm.links):
+        points = moved(points_m, poses[link]) * [-1, -1, 1]
+        away = np.full(len(points), np.inf)
+        for k in np.flatnonzero(ours.moved_by[: -len(ours.tool)] == link):
+            offset, axis = points - bodies.centre_m[0, k], bodies.axis[0, k]
+            along = offset @ axis
+            across = np.linalg.norm(offset - along[:, None] * axis, axis=1)
+            beyond = np.abs(along) - bodies.half_length_m[k], across - bodies.radius_m[k]
+            away = np.minimum(away, np.hypot(*np.maximum(beyond, 0)) - bodies.rounding_m[k])
+        worst = away.argmax()
+        at_mm = (1e3 * points_m[worst]).round().astype(int).tolist()
+        show(f"    {PARTS[link]:9s} {1e3 * away[worst]:5.1f} at {at_mm} of its axes")
+
+
+def judged(distance_m: float, index: int) -> str:
+    """Say a distance, whose it is (index into places x pairs), and whether it meets the target."""
+    a, b = PAIRS[index % len(PAIRS)]
+    verdict = "pass" if distance_m >= TARGET_M else f"below {1e3 * TARGET_M:.0f} mm"
+    return f"{1e3 * distance_m:.1f} mm ({PARTS[a]}, {PARTS[b]}) {verdict}"
+
+
+def sampled(q_rad: Array) -> Array:
+    """Give joint vectors (n, 6) along a closed tour, the leading joint at most a step apart."""
+    parts = []
+    for a, b in zip(q_rad, np.roll(q_rad, -1, axis=0), strict=True):
+        parts.append(np.linspace(a, b, int(np.ceil(np.abs(b - a).max() / STEP_RAD)), endpoint=False))
+    return np.concatenate(parts)
+
+
+def read(urdf: Path, tool: Cylinder) -> Arm:
+    """Read the chain from the root to the flange, and the meshes on it."""
+    # airo-models uses the prefix drake: without declaring it.
+    root: Any = ET.fromstring(urdf.read_text().replace("drake:", "drake_"))
+    links = {link.get("name"): link for link in root.findall("link")}
+    by_child = {joint.find("child").get("link"): joint for joint in root.iterfind("joint[child]")}
+    chain, name = [], "tool0"
+    while name in by_child:
+        chain.append((by_child[name], name))
+        name = by_child[name].find("parent").get("link")
+    joints: Joints = []
+    found, pose = [meshes_of(urdf, links[name])], np.eye(4)
+    for joint, child in reversed(chain):
+        pose = pose @ transform(joint.find("origin"))
+        if joint.get("type") != "fixed":
+            joints.append((pose, np.array([float(value) for value in joint.find("axis").get("xyz").split()])))
+            found.append([])
+            pose = np.eye(4)
+        found[-1] += [(moved(points, pose), facets) for points, facets in meshes_of(urdf, links[child])]
+    joints.append((pose, np.zeros(3)))
+    bodies = [joined(meshes) for meshes in found]
+    model = {name.lower(): name for name in MODELS}[urdf.stem.partition("_")[0]]
+    body = coal.Cylinder(tool.diameter_m / 2, tool.to_m - tool.from_m)
+    hulls, meshes = [hull_of(points) for points, _ in bodies], [mesh_of(*mesh) for mesh in bodies]
+    return Arm(model, joints, bodies, [*hulls, body], [*meshes, body], (tool.from_m + tool.to_m) / 2)
+
+
+def meshes_of(urdf: Path, link: Any) -> list[Mesh]:
+    """Read the OBJ files of a link that are seen, else its STL files for collisions."""
+    for kind in ("visual", "collision"):
+        found = []
+        for body in link.findall(kind):
+            mesh = body.find("geometry/mesh")
+            # That of airo-models with its cable is 0.4 m long.
+            name = "" if mesh is None else mesh.get("filename").replace("base_cable_labels", "base")
+            path = urdf.parent / name
+            if "/meshes/" in name:
+                path = urdf.parent.parent / "meshes" / name.split("/meshes/")[1]
+            if path.suffix in READERS:
+                points, facets = READERS[path.suffix](path.read_bytes())
+                found.append((moved(points, transform(body.find("origin"))), facets))
+        if found:
+            return found
+    return []
+
+
+def read_stl(data: bytes) -> Mesh:
+    """Read a binary STL."""
     kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("pad", "<u2")])
-    facets = np.frombuffer(data[84:], dtype=kind, count=count)
-    corners = facets["corners"].reshape(-1, 3).astype(float)
-    at = transform(collision.find("origin"))
-    corners = corners @ at[:3, :3].T + at[:3, 3]
-    corners = corners[ConvexHull(corners).vertices]
+    count = int.from_bytes(data[80:84], "little")
+    points = np.frombuffer(data[84:], dtype=kind, count=count)["corners"].reshape(-1, 3).astype(float)
+    return points, np.arange(len(points)).reshape(-1, 3)
+
+
+def read_obj(data: bytes) -> Mesh:
+    """Read the corners and faces of an OBJ; a face of more corners becomes a fan."""
+    words = [line.split() for line in data.decode().splitlines()]
+    points = np.array([line[1:4] for line in words if line[:1] == ["v"]], dtype=float)
+    faces = [[int(corner.partition("/")[0]) - 1 for corner in line[1:]] for line in words if line[:1] == ["f"]]
+    return points, np.array([(f[0], f[k], f[k + 1]) for f in faces for k in range(1, len(f) - 1)])
+
+
+READERS = {".stl": read_stl, ".obj": read_obj}
+
+
+def joined(meshes: list[Mesh]) -> Mesh:
+    """Join the meshes of a link."""
+    starts = np.cumsum([0, *(len(points) for points, _ in meshes)])
+    facets = [facets + start for (_, facets), start in zip(meshes, starts, strict=False)]
+    return np.concatenate([points for points, _ in meshes]), np.concatenate(facets)
+
+
+def hull_of(points_m: Array) -> Any:
+    """Convex hull of points."""
+    return coal.Convex.convexHull(vectors(points_m[ConvexHull(points_m).vertices]), False, None)
+
+
+def mesh_of(points_m: Array, facets: NDArray[np.intp]) -> Any:
+    """Body of facets, hollow inside."""
+    triangles = coal.StdVec_Triangle()
+    for facet in facets.tolist():
+        triangles.append(coal.Triangle(*facet))
+    body = coal.BVHModelOBBRSS()
+    body.beginModel(len(facets), len(points_m))
+    body.addSubModel(vectors(points_m), triangles)
+    body.endModel()
+    return body
+
+
+def vectors(points_m: Array) -> Any:
+    """Give points as the library takes them."""
     points = coal.StdVec_Vec3s()
-    for corner in corners:
-        points.append(corner)
-    return coal.Convex.convexHull(points, False, None)
+    for point in points_m:
+        points.append(point)
+    return points
 
 
-def transform(origin: Any) -> Any:
+def transform(origin: Any) -> Array:
     """Read a URDF origin as (4, 4)."""
+    if origin is None:
+        return np.eye(4)
+    rpy, xyz = ([float(value) for value in origin.get(name, "0 0 0").split()] for name in ("rpy", "xyz"))
+    return posed(Rotation.from_euler("xyz", rpy), xyz)
+
+
+def posed(R: Rotation, p_m: Any = (0, 0, 0)) -> Array:
+    """Transform (4, 4) of a rotation and a shift."""
     X = np.eye(4)
-    if origin is not None:
-        X[:3, :3] = Rotation.from_euler("xyz", [float(v) for v in origin.get("rpy", "0 0 0").split()]).as_matrix()
-        X[:3, 3] = [float(v) for v in origin.get("xyz", "0 0 0").split()]
+    X[:3, :3], X[:3, 3] = R.as_matrix(), p_m
     return X
 
 
-def moved(axis: int, by_m: float) -> Any:
-    """Transform that moves along an axis."""
-    X = np.eye(4)
-    X[axis, 3] = by_m
-    return X
+def moved(points_m: Array, X: Array) -> Array:
+    """Move points (n, 3)."""
+    return np.asarray(points_m @ X[:3, :3].T + X[:3, 3])
 
 
-def place(joints: Joints, q_rad: Any) -> dict[str, Any]:
-    """Pose of every link and, as the tool's, of the flange."""
-    pose, poses = np.eye(4), {CHAIN[0]: np.eye(4)}
-    for name, (fixed, axis), angle in zip((*CHAIN[1:], TOOL), joints, (*q_rad, 0.0), strict=True):
-        turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
-        pose = pose @ fixed @ turn
-        poses[name] = pose
-    return poses
-
-
-def stretch(joints: Joints, model: str) -> None:
+def stretch(arm: Arm, model: str) -> None:
     """Put the lengths of another model into the joints' transforms."""
-    g = MODELS[model]
+    g, joints = MODELS[model], arm.joints
     if max(abs(joints[2][0][2, 3] + g.a2_m), abs(joints[3][0][2, 3] + g.a3_m)) > FITS_M:
-        raise SystemExit(f"upper arm and forearm of the {model} have other lengths than the hulls: they do not fit")
+        raise SystemExit(f"upper arm and forearm of the {model} have other lengths than the meshes: they do not fit")
     # d4 is spread over three joints: the two offsets along the lift axis stay, wrist 1 takes the rest.
     offsets = joints[1][0][1, 3] + joints[2][0][1, 3]
     lengths = (
@@ -157,13 +349,13 @@ def stretch(joints: Joints, model: str) -> None:
     )
     for joint, axis, length in lengths:
         joints[joint][0][axis, 3] = length
+    arm.model = model
 
 
-def distance_m(a: Any, pose_a: Any, b: Any, pose_b: Any) -> float:
-    """Distance of two bodies, negative where they overlap."""
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
-    place_a, place_b = (coal.Transform3s(pose[:3, :3], pose[:3, 3]) for pose in (pose_a, pose_b))
-    return float(coal.distance(a, place_a, b, place_b, request, result))
+def show(line: str) -> None:
+    """Write a line."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":
