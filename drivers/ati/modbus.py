@@ -207,7 +207,7 @@ def decode_records(data: bytes, damaged: Sequence[int] = ()) -> Records:
 
 
 def keep_records(intact: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int, bool]:
-    """Judge n records by their checksums: which to use, how many are settled, and whether the stream has slipped.
+    """Judge n records, intact or not: which to use, how many are settled, and whether the stream has slipped.
 
     The stream has no sync byte, and after a slip one record in 128 still passes. So three damaged records in a row mean
     a slip, and neither an intact one between two damaged ones nor the last one before a slip is believed. So the last

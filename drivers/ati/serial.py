@@ -34,7 +34,7 @@ _REPLY_S = 0.1
 _SILENCE_S = 0.2
 _ATTEMPTS = 3
 _BATCH_BYTES = 32 * modbus.RECORD_SIZE
-"""4.6 ms of stream: few wake-ups, and far less than a serial port buffers."""
+"""4.6 ms of stream, less where bytes are FF and come doubled: few wake-ups, and far less than a port buffers."""
 _MAX_RESTARTS = 3
 
 
@@ -43,6 +43,7 @@ class AtiSerialSensor(StreamingSensor):
 
     Records carry no time and no number: `t_host_ns` is the receipt of the batch of about 32 they came in, `t_device_s`
     is NaN, `seq` counts records, damaged ones included; what a restart of the stream lost is estimated from the clock.
+    Damaged is a record whose sum is wrong or in which a byte came with wrong parity.
     `status` is the status word as last read: a record itself has one error bit, on which the stream ends with the word
     read anew. `counts` are the six gauges.
 

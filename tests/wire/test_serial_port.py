@@ -26,6 +26,9 @@ class FarSide:
     def __init__(self) -> None:
         self.master, slave = os.openpty()
         tty.setraw(slave)
+        settings = termios.tcgetattr(slave)
+        settings[0] |= termios.IGNPAR | termios.BRKINT  # as another program may leave a port
+        termios.tcsetattr(slave, termios.TCSANOW, settings)
         self.path = os.ttyname(slave)
         self._slave = slave
 
