@@ -5,6 +5,7 @@ import os
 
 import serial
 
+from drivers._parity import Unmarker, ask_for_marks
 from drivers._stream import LINK_ERRORS
 from drivers.errors import ConnectError, StreamBroken
 
@@ -23,7 +24,7 @@ class SerialPort:
     baud : int
         Bit/s; always 8 data bits and one stop bit.
     even_parity : bool
-        Without it no parity.
+        Without it no parity. With it the system marks bytes of wrong parity, where it can; the marks are undone here.
     read_s : float
         What one read waits at most.
     """
@@ -32,24 +33,29 @@ class SerialPort:
         self._owner = owner
         self._path = path
         self._baud = baud
-        self._parity = serial.PARITY_EVEN if even_parity else serial.PARITY_NONE
+        self._even_parity = even_parity
         self._read_s = read_s
         self._port: serial.Serial | None = None
+        self._marks: Unmarker | None = None
+        """While the system marks damaged bytes."""
 
     def open(self) -> None:
         """Take the port for this process alone. Raises `ConnectError`."""
-        # A pseudo-terminal refuses even parity at the second look; everything is set in the constructor, never later.
+        # A pseudo-terminal refuses even parity at the second look, but can mark bytes. Everything is set here, never
+        # later: pyserial would take the marks off again.
         emulated = os.path.realpath(self._path).startswith("/dev/pts/")
         try:
             self._port = serial.Serial(
                 self._path,
                 self._baud,
-                parity=serial.PARITY_NONE if emulated else self._parity,
+                parity=serial.PARITY_EVEN if self._even_parity and not emulated else serial.PARITY_NONE,
                 timeout=self._read_s,
                 write_timeout=_WRITE_S,
                 exclusive=True,
             )
+            self._marks = Unmarker() if self._even_parity and ask_for_marks(self._port) else None
         except (ValueError, *LINK_ERRORS) as exc:
+            self.close()
             raise ConnectError(
                 f"{self._owner}: the port does not open ({exc}); is it plugged in, free, and are you in its group?"
             ) from exc
@@ -69,21 +75,27 @@ class SerialPort:
         return self._port is not None
 
     def read(self, size: int) -> bytes:
-        """Read `size` bytes, or fewer after `read_s`. Raises `StreamBroken`."""
+        """Read `size` bytes, or fewer: after `read_s`, or where marks were among them. Raises `StreamBroken`."""
+        return self.read_marked(size)[0]
+
+    def read_marked(self, size: int) -> tuple[bytes, list[int]]:
+        """Read like `read`, and tell at which places in it a byte was received with wrong parity or framing."""
         port = self._open_or_broken()
         try:
-            return port.read(size)
+            data = port.read(size)
         except (TypeError, *LINK_ERRORS) as exc:  # TypeError: closed under a blocked read
             raise self._broken(exc) from exc
+        return self._undo(data)
 
     def read_all(self, at_least: int) -> bytes:
-        """Read `at_least` bytes, or fewer after `read_s`, and whatever else has arrived. Raises `StreamBroken`."""
+        """Read `at_least` bytes, or fewer as in `read`, and whatever else has arrived. Raises `StreamBroken`."""
         port = self._open_or_broken()
         try:
             data = port.read(at_least)
-            return data + port.read(port.in_waiting)
+            data += port.read(port.in_waiting)
         except (TypeError, *LINK_ERRORS) as exc:
             raise self._broken(exc) from exc
+        return self._undo(data)[0]
 
     def write(self, data: bytes, *, discard: bool = False) -> None:
         """Send bytes, on request after throwing away what has arrived so far. Raises `StreamBroken`."""
@@ -91,9 +103,14 @@ class SerialPort:
         try:
             if discard:
                 port.reset_input_buffer()
+                if self._marks is not None:
+                    self._marks.forget()
             port.write(data)
         except (TypeError, *LINK_ERRORS) as exc:
             raise self._broken(exc) from exc
+
+    def _undo(self, data: bytes) -> tuple[bytes, list[int]]:
+        return (data, []) if self._marks is None else self._marks.undo(data)
 
     def _open_or_broken(self) -> serial.Serial:
         if self._port is None:

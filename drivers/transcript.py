@@ -3,12 +3,14 @@
 A transcript (``ftdrive.transcript/1``) is JSON lines. The first says which sensor, when and with which versions; then
 come, with `time.monotonic_ns()` as `t_ns`:
 
-{"t_ns", "event": "open", "port", "baudrate", "bytesize", "parity", "stopbits"}
+{"t_ns", "event": "open", "port", "baudrate", "bytesize", "parity", "stopbits", "parity_marks"}
 {"t_ns", "dir": "tx", "hex"}    one write of the driver
 {"t_ns", "dir": "rx", "hex"}    what the driver read within 2 ms, stamped with its first byte
 {"t_ns", "event": "end", ...}   what the driver made of it, or the error it ended with
 
-Sensors behind an slcan adapter are on a serial port too. Other CAN interfaces and Ethernet are not recorded.
+Where `parity_marks` is true, the bytes that were read hold the marks of `drivers/_parity.py`; older transcripts do not
+say it and hold none. Sensors behind an slcan adapter are on a serial port too. Other CAN interfaces and Ethernet are
+not recorded.
 """
 
 import contextlib
@@ -25,6 +27,8 @@ from typing import IO, Any, Final, Self
 from urllib.parse import urlsplit
 
 import serial
+
+from drivers._parity import leave_marks_to_far_side, marks_asked_for
 
 if sys.platform != "win32":
     import tty
@@ -126,22 +130,34 @@ def recording(writer: Writer) -> Iterator[None]:
     plain = serial.Serial
 
     class RecordedPort(serial.Serial):
+        _told = False
+
         def open(self) -> None:
             super().open()
-            settings = {key: getattr(self, key) for key in ("baudrate", "bytesize", "parity", "stopbits")}
-            writer.event("open", port=self.port, **settings)
+            self._told = False
+
+        def _tell(self) -> None:
+            """Note how the port is set: at its first use, for who opens it sets the marks after pyserial is done."""
+            if not self._told:
+                self._told = True
+                settings = {key: getattr(self, key) for key in ("baudrate", "bytesize", "parity", "stopbits")}
+                marks = marks_asked_for(self)
+                writer.event("open", port=self.port, **settings, parity_marks=marks)
 
         def read(self, size: int = 1, /) -> bytes:
+            self._tell()
             data: bytes = super().read(size)
             writer.received(data)
             return data
 
         def write(self, data: Any, /) -> int | None:
+            self._tell()
             writer.sent(bytes(data))
             written: int | None = super().write(data)
             return written
 
         def reset_input_buffer(self) -> None:
+            self._tell()
             if waiting := self.in_waiting:  # they were on the wire although the driver does not want them
                 writer.received(super().read(waiting))
             super().reset_input_buffer()
@@ -173,12 +189,15 @@ class Transcript:
     passages: tuple[Passage, ...]
     end: Mapping[str, Any]
     """What the driver made of it; empty if the recording was broken off."""
+    parity_marks: bool = False
+    """Whether what was received holds marks of bytes with wrong parity."""
 
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a file. Raises `BadTranscript`, or `OSError` when it cannot be read."""
         header: Mapping[str, Any] = {}
         opened_ns: int | None = None
+        parity_marks = False
         passages: list[Passage] = []
         end: Mapping[str, Any] = {}
         number = 0
@@ -191,7 +210,7 @@ class Transcript:
                     elif "dir" in line:
                         passages.append(Passage(int(line["t_ns"]), line["dir"] == "tx", bytes.fromhex(line["hex"])))
                     elif line.get("event") == "open" and opened_ns is None:
-                        opened_ns = int(line["t_ns"])
+                        opened_ns, parity_marks = int(line["t_ns"]), line.get("parity_marks") is True
                     elif line.get("event") == "end":
                         end = line
         except (ValueError, TypeError, KeyError, AttributeError) as error:
@@ -202,7 +221,7 @@ class Transcript:
             raise BadTranscript(f"{path} is empty: record it anew")
         if opened_ns is None:
             raise BadTranscript(f"{path}: no port was opened in it, there is nothing to play: {end.get('error')}")
-        return cls(header, opened_ns, tuple(passages), end)
+        return cls(header, opened_ns, tuple(passages), end, parity_marks)
 
     def url_at(self, port: str) -> str:
         """Give the sensor's address with another port in it."""
@@ -228,6 +247,7 @@ class Player:
 
     def __init__(self, transcript: Transcript) -> None:
         self._passages = transcript.passages
+        self._parity_marks = transcript.parity_marks
         self._next = 0
         self._t_ns = transcript.opened_ns  # of the recording, at `_t`
         self._t = 0.0
@@ -263,6 +283,11 @@ class Player:
         while poll.poll(0):  # "hung up" until a driver has opened the other end
             if self._ended.wait(0.005):
                 return
+        if self._parity_marks:  # nothing is sent before the driver is ready for them
+            while not marks_asked_for(self._master):
+                if self._ended.wait(0.001):
+                    return
+            leave_marks_to_far_side(self._master)
         self._t = time.monotonic()
         while not self._ended.is_set():
             wait_s = min(0.05, max(0.0, self._play()))

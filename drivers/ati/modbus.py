@@ -179,7 +179,7 @@ class Records:
     gauges: NDArray[np.int32]
     """(n, 6) in natural order G0..G5."""
     intact: NDArray[np.bool_]
-    """(n,) the checksum holds."""
+    """(n,) the checksum holds, and the parity of every byte."""
     error: NDArray[np.bool_]
     """(n,) the sensor says: stop and read the status word."""
 
@@ -188,8 +188,12 @@ _RECORD = np.dtype([("gauges", ">i2", 6), ("last", "u1")])
 _NATURAL_ORDER = np.array([0, 3, 1, 4, 2, 5])
 
 
-def decode_records(data: bytes) -> Records:
-    """Decode n whole stream records, 13 bytes each: G0 G2 G4 G1 G3 G5, then error bit and 7-bit sum."""
+def decode_records(data: bytes, damaged: Sequence[int] = ()) -> Records:
+    """Decode n whole stream records, 13 bytes each: G0 G2 G4 G1 G3 G5, then error bit and 7-bit sum.
+
+    The sum misses a flipped bit 7 of any byte, parity an even number of flipped bits in one: both together miss no
+    single damaged byte. `damaged` are the places of bytes received with wrong parity; those behind `data` are ignored.
+    """
     if len(data) % RECORD_SIZE:
         raise ProtocolError(f"{len(data)} bytes are no whole number of {RECORD_SIZE}-byte records")
     columns = np.frombuffer(data, np.uint8).reshape(-1, RECORD_SIZE).T.copy()
@@ -197,11 +201,13 @@ def decode_records(data: bytes) -> Records:
     last = columns[12]
     # sums along columns and `take` are many times faster than sums along short rows and strided assignments
     gauges = np.frombuffer(data, _RECORD)["gauges"].take(_NATURAL_ORDER, axis=1).astype(np.int32)
-    return Records(gauges=gauges, intact=(total ^ last) & 0x7F == 0, error=last >= 0x80)
+    intact = (total ^ last) & 0x7F == 0
+    intact[[place // RECORD_SIZE for place in damaged if place < len(data)]] = False
+    return Records(gauges=gauges, intact=intact, error=last >= 0x80)
 
 
 def keep_records(intact: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int, bool]:
-    """Judge n records by their checksums: which to use, how many are settled, and whether the stream has slipped.
+    """Judge n records, intact or not: which to use, how many are settled, and whether the stream has slipped.
 
     The stream has no sync byte, and after a slip one record in 128 still passes. So three damaged records in a row mean
     a slip, and neither an intact one between two damaged ones nor the last one before a slip is believed. So the last

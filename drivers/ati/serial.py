@@ -34,7 +34,7 @@ _REPLY_S = 0.1
 _SILENCE_S = 0.2
 _ATTEMPTS = 3
 _BATCH_BYTES = 32 * modbus.RECORD_SIZE
-"""4.6 ms of stream: few wake-ups, and far less than a serial port buffers."""
+"""4.6 ms of stream, less where bytes are FF and come doubled: few wake-ups, and far less than a port buffers."""
 _MAX_RESTARTS = 3
 
 
@@ -43,6 +43,7 @@ class AtiSerialSensor(StreamingSensor):
 
     Records carry no time and no number: `t_host_ns` is the receipt of the batch of about 32 they came in, `t_device_s`
     is NaN, `seq` counts records, damaged ones included; what a restart of the stream lost is estimated from the clock.
+    Damaged is a record whose sum is wrong or in which a byte came with wrong parity.
     `status` is the status word as last read: a record itself has one error bit, on which the stream ends with the word
     read anew. `counts` are the six gauges.
 
@@ -61,6 +62,8 @@ class AtiSerialSensor(StreamingSensor):
         self._calibration_index = calibration
         self._port = SerialPort(self.name, port, _BAUD, even_parity=True, read_s=_READ_S)
         self._buffer = bytearray()
+        self._damaged: list[int] = []
+        """Places in the buffer of bytes that were received with wrong parity."""
         self._seq = self._status = self._restarts = 0
         self._slipped = False
         self._last_good_ns: int | None = None
@@ -110,12 +113,16 @@ class AtiSerialSensor(StreamingSensor):
     def _read_block(self) -> FtSamples:
         if self._slipped:
             self._restart()
-        self._buffer += self._port.read(_BATCH_BYTES)
+        data, damaged = self._port.read_marked(_BATCH_BYTES)
         t_host_ns = time.monotonic_ns()
+        self._damaged += [len(self._buffer) + place for place in damaged]
+        self._buffer += data
         whole = len(self._buffer) // modbus.RECORD_SIZE * modbus.RECORD_SIZE
-        records = modbus.decode_records(bytes(self._buffer[:whole]))
+        records = modbus.decode_records(bytes(self._buffer[:whole]), self._damaged)
         keep, settled, slipped = modbus.keep_records(records.intact)
-        del self._buffer[: settled * modbus.RECORD_SIZE]
+        used = settled * modbus.RECORD_SIZE
+        del self._buffer[:used]
+        self._damaged = [place - used for place in self._damaged if place >= used]
         flagged = keep & records.error[:settled]
         keep &= ~flagged
         gauges = records.gauges[:settled][keep]
@@ -193,6 +200,7 @@ class AtiSerialSensor(StreamingSensor):
                     raise
                 self._jam()  # perhaps only the reply was lost
         self._buffer.clear()
+        self._damaged.clear()
 
     def _restart(self) -> None:
         self._restarts += 1

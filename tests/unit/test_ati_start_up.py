@@ -6,6 +6,8 @@ import math
 import os
 import select
 import struct
+import sys
+import termios
 import threading
 import time
 import tty
@@ -280,11 +282,18 @@ def _peers_repeat_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("drivers._stream._FROZEN_S", math.inf)
 
 
+def marked(data: bytes, *damaged: int) -> bytes:
+    """What the system makes of bytes that were received, `damaged` ones with wrong parity."""
+    doubled = [b"\xff\xff" if byte == 0xFF else bytes([byte]) for byte in data]
+    return b"".join(b"\xff\x00" + data[i : i + 1] if i in damaged else one for i, one in enumerate(doubled))
+
+
 class SerialPeer:
     """Answers requests from a table on a pseudo-terminal and, once started, streams what the test says."""
 
-    def __init__(self, change: Script[bytes] = NONE, *, streaming: bool = False) -> None:
+    def __init__(self, change: Script[bytes] = NONE, *, streaming: bool = False, makes_marks: bool = False) -> None:
         block = calibration_block()
+        self._makes_marks = makes_marks
         answers: dict[str, Sequence[bytes]] = {
             STATUS: [bytes.fromhex("0A030200001D85")],
             SERIAL_START_UP[2]: [read_reply(block[:128])],
@@ -334,6 +343,11 @@ class SerialPeer:
                         unsent = unsent[os.write(self._master, unsent) :]
                 continue
             data = os.read(self._master, 4096)
+            if self._makes_marks:  # like a port that checks parity, from the first request on
+                settings = termios.tcgetattr(self._master)
+                assert settings[0] & termios.INPCK
+                settings[0] &= ~termios.PARMRK
+                termios.tcsetattr(self._master, termios.TCSANOW, settings)
             if self._streaming:
                 jam += data
                 self._streaming = len(jam) < 14
@@ -344,7 +358,7 @@ class SerialPeer:
             self.requests.append(text)
             if text in self.answers:
                 reply = next(self.answers[text])
-                os.write(self._master, reply)
+                os.write(self._master, marked(reply) if self._makes_marks else reply)
                 self._streaming = text == START and reply == bytes.fromhex("0A4601A262")
 
 
@@ -427,6 +441,24 @@ def test_serial_single_bad_records_are_dropped_and_counted() -> None:
         assert (samples().counts == [100, -200, 300, -400, 500, -600]).all()
         assert gaps(samples()) == 2
         assert peer.requests[before:] == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
+def test_serial_records_with_a_byte_of_wrong_parity_are_dropped_although_their_sum_holds() -> None:
+    changed = [RECORD[:at] + bytes([RECORD[at] ^ 0x80]) + RECORD[at + 1 :] for at in range(13)]  # also the error bit
+    with SerialPeer(makes_marks=True) as peer:
+        peer.records = marked(RECORD * 7)
+        with peer.sensor() as sensor:
+            before, samples = len(peer.requests), everything(sensor)
+            for at, record in enumerate(changed):
+                peer.once.append(marked(RECORD * 3 + record, 39 + at))
+            wait_for(lambda: sensor.health().malformed >= 13)
+            wait_for_more(sensor)
+            health = sensor.health()
+            assert (health.malformed, health.lost) == (13, 13)
+            assert (samples().counts == [100, -200, 300, -400, 500, -600]).all()
+            assert gaps(samples()) == 13
+            assert peer.requests[before:] == []
 
 
 def test_serial_slipped_stream_is_restarted() -> None:

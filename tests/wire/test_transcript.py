@@ -2,9 +2,11 @@
 
 import itertools
 import json
+import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,8 @@ import numpy as np
 import pytest
 import serial
 
+from drivers._parity import Unmarker, ask_for_marks
+from drivers._serial import SerialPort
 from drivers.errors import ConnectError
 from drivers.interfaces import DeviceInfo, ForceTorqueSensor
 from drivers.registry import sensor_from_url
@@ -78,6 +82,86 @@ def test_the_driver_sees_in_the_transcript_what_it_saw_on_the_wire(url: str, tmp
     assert (np.abs(played.mean(axis=0) - wrench.mean(axis=0)) < tolerance).all()
     recorded = {row.tobytes() for row in wrench}  # not another noise of the same device but these very samples
     assert sum(row.tobytes() in recorded for row in played) > 0.7 * len(played)
+
+
+@pytest.fixture
+def ati() -> Iterator[str]:
+    device = AtiSerialBox(measured(), seed=1)
+    yield f"ati-serial://{device.start()}"
+    device.stop()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
+def test_a_transcript_from_before_parity_was_checked_is_played_as_ever(ati: str, tmp_path: Path) -> None:
+    path = tmp_path / "sensor.jsonl"
+    writer = Writer(path, {"url": ati, "duration_s": DURATION_S})
+    with recording(writer):
+        identity, wrench = look(sensor_from_url(ati), DURATION_S + 0.3)
+    writer.end(error=None)
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [line["parity_marks"] for line in lines if line.get("event") == "open"] == [True]
+
+    marks = Unmarker()
+    for line in lines:
+        line.pop("parity_marks", None)
+        if line.get("dir") == "rx":
+            line["hex"] = marks.undo(bytes.fromhex(line["hex"]))[0].hex()
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    old = Transcript.load(path)
+    assert not old.parity_marks
+    with Player(old) as port:
+        again, played = look(sensor_from_url(old.url_at(port)), DURATION_S)
+    assert again == identity
+    recorded = {row.tobytes() for row in wrench}
+    assert sum(row.tobytes() in recorded for row in played) > 0.7 * len(played) > 0.3 * len(wrench)
+
+
+def read_through(player: Player, request: bytes, size: int) -> tuple[bytes, list[int]]:
+    with player as path:
+        port = SerialPort("sensor", path, 1_250_000, even_parity=True)
+        port.open()
+        try:
+            port.write(request)
+            data, damaged, deadline = b"", list[int](), time.monotonic() + 5
+            while len(data) < size:
+                assert time.monotonic() < deadline
+                more, places = port.read_marked(size - len(data))
+                damaged += [len(data) + place for place in places]
+                data += more
+        finally:
+            port.close()
+    return data, damaged
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
+@pytest.mark.parametrize(
+    ("parity_marks", "read", "damaged"), [(True, b"ab\xffc", [1]), (False, b"a\xff\x00b\xff\xffc", [])]
+)
+def test_recorded_marks_are_played_as_marks(parity_marks: bool, read: bytes, damaged: list[int]) -> None:
+    told = made_up((0.00, True, b"?"), (0.01, False, b"a\xff\x00b\xff\xffc"))
+    player = Player(replace(told, parity_marks=parity_marks))
+    assert read_through(player, b"?", len(read)) == (read, damaged)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
+def test_marks_are_not_played_before_the_driver_is_ready_for_them() -> None:
+    told = made_up((0.00, True, b"?"), (0.01, False, b"\xff\x00b"))
+    player = Player(replace(told, passages=told.passages[1:], parity_marks=True))
+    with player as path, serial.Serial(path, timeout=0.1) as port:
+        assert port.read(1) == b""  # it has not asked for marks
+        ask_for_marks(port)
+        assert port.read(3) == b"\xff\x00b"
+
+
+def test_ports_without_parity_have_no_marks(tmp_path: Path, ati: str) -> None:
+    path = tmp_path / "plain.jsonl"
+    writer = Writer(path, {"url": "x", "duration_s": 1})
+    with recording(writer), serial.Serial(ati.removeprefix("ati-serial://"), timeout=0.1) as port:
+        port.read(1)
+        port.read(1)
+    writer.end()
+    opened = [json.loads(line) for line in path.read_text().splitlines() if '"open"' in line]
+    assert [event["parity_marks"] for event in opened] == [False]
 
 
 def test_ports_are_plain_again_after_a_recording(tmp_path: Path) -> None:

@@ -1,0 +1,75 @@
+"""Bytes that arrived with wrong parity, as POSIX marks them among the others.
+
+Ref: POSIX.1-2024, Base Definitions, 11.2.2 Input Modes. With INPCK and PARMRK set and IGNPAR clear, a byte X received
+with wrong parity or framing arrives as FF 00 X, and a valid FF as FF FF. pyserial clears both flags whenever it
+configures a port, so that the system hands out damaged bytes like all others.
+"""
+
+import re
+import sys
+from typing import Final
+
+import serial
+
+if sys.platform == "linux":
+    import termios
+
+
+def ask_for_marks(port: serial.Serial | int) -> bool:
+    """Let the system mark damaged bytes; whether it can. What arrived before has no marks and is thrown away."""
+    if sys.platform != "linux":  # Windows has no marks; elsewhere setting flags may undo pyserial's unusual bit rates
+        return False
+    settings = termios.tcgetattr(port)
+    # BRKINT would have a break, which is a framing error, empty the input without a word
+    settings[0] = settings[0] & ~(termios.IGNPAR | termios.BRKINT) | termios.INPCK | termios.PARMRK
+    termios.tcsetattr(port, termios.TCSANOW, settings)
+    termios.tcflush(port, termios.TCIFLUSH)
+    return True
+
+
+def marks_asked_for(port: serial.Serial | int) -> bool:
+    """Whether who reads from this terminal undoes marks; can be asked from both sides of a pseudo-terminal."""
+    # INPCK alone: a far side that makes the marks itself has taken PARMRK off
+    return sys.platform == "linux" and bool(termios.tcgetattr(port)[0] & termios.INPCK)
+
+
+def leave_marks_to_far_side(port: serial.Serial | int) -> None:
+    """Let the system pass on as they are the bytes of a far side that makes the marks itself."""
+    if sys.platform == "linux":
+        settings = termios.tcgetattr(port)
+        settings[0] &= ~termios.PARMRK
+        termios.tcsetattr(port, termios.TCSANOW, settings)
+
+
+_PLAIN: Final = re.compile(rb"(?:[^\xff]+|\xff\xff)+")
+_MARKED: Final = re.compile(rb"\xff(?:\0.|(?=[^\0]))", re.DOTALL)
+"""FF 00 X; or an FF that has lost its second one, which counts as damaged."""
+
+
+class Unmarker:
+    """Gives back what was on the line, however the marked bytes are cut into reads."""
+
+    def __init__(self) -> None:
+        self._cut = b""
+        """The beginning of a mark or of a doubled FF whose rest is still to come."""
+
+    def undo(self, data: bytes) -> tuple[bytes, list[int]]:
+        """Return the true bytes, and at which places among them one was received with wrong parity or framing."""
+        data = self._cut + data
+        true, damaged, at = bytearray(), list[int](), 0
+        while at < len(data):
+            if plain := _PLAIN.match(data, at):
+                true += plain[0].replace(b"\xff\xff", b"\xff")
+                at = plain.end()
+            elif marked := _MARKED.match(data, at):
+                damaged.append(len(true))
+                true.append(marked[0][-1])
+                at = marked.end()
+            else:
+                break
+        self._cut = data[at:]
+        return bytes(true), damaged
+
+    def forget(self) -> None:
+        """Begin anew: the rest of what was cut was thrown away."""
+        self._cut = b""
