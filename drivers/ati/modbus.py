@@ -179,7 +179,9 @@ class Records:
     gauges: NDArray[np.int32]
     """(n, 6) in natural order G0..G5."""
     intact: NDArray[np.bool_]
-    """(n,) the checksum holds, and the parity of every byte."""
+    """(n,) the checksum holds."""
+    parity: NDArray[np.bool_]
+    """(n,) so does the parity of every byte; not for judging slips: some adapters blame a whole packet for one byte."""
     error: NDArray[np.bool_]
     """(n,) the sensor says: stop and read the status word."""
 
@@ -202,12 +204,13 @@ def decode_records(data: bytes, damaged: Sequence[int] = ()) -> Records:
     # sums along columns and `take` are many times faster than sums along short rows and strided assignments
     gauges = np.frombuffer(data, _RECORD)["gauges"].take(_NATURAL_ORDER, axis=1).astype(np.int32)
     intact = (total ^ last) & 0x7F == 0
-    intact[[place // RECORD_SIZE for place in damaged if place < len(data)]] = False
-    return Records(gauges=gauges, intact=intact, error=last >= 0x80)
+    parity = np.ones(len(last), bool)
+    parity[[place // RECORD_SIZE for place in damaged if place < len(data)]] = False
+    return Records(gauges=gauges, intact=intact, parity=parity, error=last >= 0x80)
 
 
 def keep_records(intact: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int, bool]:
-    """Judge n records, intact or not: which to use, how many are settled, and whether the stream has slipped.
+    """Judge n records by their checksums: which to use, how many are settled, and whether the stream has slipped.
 
     The stream has no sync byte, and after a slip one record in 128 still passes. So three damaged records in a row mean
     a slip, and neither an intact one between two damaged ones nor the last one before a slip is believed. So the last

@@ -120,6 +120,7 @@ class AtiSerialSensor(StreamingSensor):
         whole = len(self._buffer) // modbus.RECORD_SIZE * modbus.RECORD_SIZE
         records = modbus.decode_records(bytes(self._buffer[:whole]), self._damaged)
         keep, settled, slipped = modbus.keep_records(records.intact)
+        keep &= records.parity[:settled]
         used = settled * modbus.RECORD_SIZE
         del self._buffer[:used]
         self._damaged = [place - used for place in self._damaged if place >= used]

@@ -155,7 +155,7 @@ def struct_loop(data: bytes) -> modbus.Records:
         gauges.append((g0, g1, g2, g3, g4, g5))
         intact.append(sum(data[at : at + 12]) & 0x7F == last & 0x7F)
         error.append(last & 0x80 != 0)
-    return modbus.Records(np.array(gauges, np.int32), np.array(intact), np.array(error))
+    return modbus.Records(np.array(gauges, np.int32), np.array(intact), np.ones(len(intact), bool), np.array(error))
 
 
 def decode_speed() -> bool:

@@ -458,6 +458,10 @@ def test_serial_records_with_a_byte_of_wrong_parity_are_dropped_although_their_s
             assert (health.malformed, health.lost) == (13, 13)
             assert (samples().counts == [100, -200, 300, -400, 500, -600]).all()
             assert gaps(samples()) == 13
+            peer.once.append(marked(RECORD * 5, *range(65)))  # an adapter that blames a whole packet: no slip
+            wait_for(lambda: sensor.health().malformed >= 18)
+            wait_for_more(sensor)
+            assert gaps(samples()) == 18
             assert peer.requests[before:] == []
 
 
