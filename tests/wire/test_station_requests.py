@@ -93,6 +93,8 @@ def test_cables_drift_and_payload(station: Answering) -> None:
         ("sensor-faults", {"dropp": 1}, "unknown fault dropp"),
         ("hand-move", {"q_rad": [0] * 5}, "hand-move"),
         ("hand-move", {"q_rad": [0] * 6, "speed_rad_s": 0}, "positive speed"),
+        ("push-joint", {"joint": 0, "off_deg": 1}, "joint 0"),
+        ("set-payload", {"payload_kg": -1}, "payload -1"),
         ("slider", {"fraction": 2}, "not between"),
     ],
 )
