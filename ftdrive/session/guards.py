@@ -19,7 +19,6 @@ from ftdrive.planning.certify import Certifier
 Array = NDArray[np.float64]
 
 G_M_S2: Final = 9.81
-_PROTECTIVE: Final = 10
 AXES: Final = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 
@@ -230,12 +229,7 @@ class SafetyGuard(Guard):
         """Trip on every stop and every change."""
         status = seen.status
         if status.fault is not None:
-            hazard = hazard_of_safety(status.safety_mode)
-            words = f"the arm stopped: {status.fault}"
-            if hazard == _PROTECTIVE:
-                told = "" if status.payload_kg is None else f" (it was told {status.payload_kg:.2f} kg)"
-                words += f"; usual causes are contact, and a controller with a wrong payload or centre of mass{told}"
-            raise Tripped(hazard, DeviceFault(words))
+            raise by_safety(status, f"the arm stopped: {status.fault}")
         if self._mode is not None and status.safety_mode != self._mode:
             raise Tripped(
                 12,
@@ -401,11 +395,14 @@ def out_of_sight(error: DriverError, *, moving: bool) -> Tripped:
     return Tripped(16, type(error)(words))
 
 
-def hazard_of_safety(mode: str) -> int:
-    """Row of a stop, by the safety mode that the controller tells."""
+def by_safety(status: ArmStatus, words: str) -> Tripped:
+    """Rows 7, 10, 11 and 12: the safety system has stopped the arm, and `words` say so."""
+    mode = status.safety_mode
     if mode == "protective stop":
-        return _PROTECTIVE
-    return 11 if "emergency" in mode or "safeguard" in mode else 12
+        told = "" if status.payload_kg is None else f" (it was told {status.payload_kg:.2f} kg)"
+        words += f"; usual causes are contact, and a controller with a wrong payload or centre of mass{told}"
+        return Tripped(10, DeviceFault(words))
+    return Tripped(11 if "emergency" in mode or "safeguard" in mode else 12, DeviceFault(words))
 
 
 def _changed(before: Any, now: Any) -> bool:

@@ -36,7 +36,7 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
-from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, hazard_of_safety, out_of_sight
+from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, by_safety, out_of_sight
 from ftdrive.session.operator import Key, Operator, Question
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.watch import Guards
@@ -430,7 +430,7 @@ class Tour:
         except DriverError:
             return out_of_sight(error, moving=self._at is None)
         if status.fault is not None:
-            return Tripped(hazard_of_safety(status.safety_mode), error)
+            return by_safety(status, str(error))
         return Tripped(21, error) if isinstance(error, DeviceFault) else Tripped(16, error)
 
     def _mended(self, trip: Tripped) -> bool:

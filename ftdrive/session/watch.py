@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calib.routine import turned_rad
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ArmState, ForceTorqueSensor, RobotArm
-from ftdrive.session.guards import Guard, Seen, Tripped, Watch, hazard_of_safety, out_of_sight
+from ftdrive.session.guards import Guard, Seen, Tripped, Watch, by_safety, out_of_sight
 
 log = logging.getLogger(__name__)
 
@@ -131,7 +131,7 @@ class Guards:
             state = self._arm.state()
         except DeviceFault as error:
             status = self._arm.status()  # what stopped the arm may have come between the two
-            raise Tripped(9 if status.fault is None else hazard_of_safety(status.safety_mode), error) from error
+            raise (Tripped(9, error) if status.fault is None else by_safety(status, str(error))) from error
         try:
             self._sensor.check()
             sample = self._sensor.latest(timeout_s=0.0)

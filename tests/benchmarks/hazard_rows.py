@@ -309,7 +309,7 @@ BEFOREHAND: Final[Sequence[Beforehand]] = (
         "5",
         "the arm stands in a box",
         7,
-        "the way to the first pose",
+        "0 mm from contact",
         change=_of_workcell(boxes_mm=((-400.0, -600.0, 300.0, 100.0, 0.0, 600.0),)),
     ),
     Beforehand("7", "payload 0 in the controller", 7, "payload", ("--payload", "0")),
