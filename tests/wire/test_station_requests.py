@@ -114,6 +114,17 @@ def test_a_hand_moves_the_arm(station: Answering) -> None:
     station.until(lambda s: not s["moving"] and s["q_rad"] == pytest.approx(goal, abs=1e-6))
 
 
+def test_a_pushed_joint_and_a_changed_payload(station: Answering) -> None:
+    before = station.do("state")
+    station.do("push-joint", joint=2, off_deg=3)
+    pushed = station.until(lambda s: s["q_rad"][1] - before["q_rad"][1] == pytest.approx(math.radians(3), abs=1e-6))
+    assert pushed["target_q_rad"] == before["target_q_rad"]
+    station.do("push-joint", joint=2, off_deg=0)
+    station.until(lambda s: s["q_rad"] == pytest.approx(before["q_rad"], abs=1e-6))
+    station.do("set-payload", payload_kg=2.5)
+    assert station.do("state")["payload_kg"] == 2.5
+
+
 def test_another_client_moves_the_arm(station: Answering) -> None:
     q_rad = station.do("state")["q_rad"]
     goal = [*q_rad[:5], q_rad[5] + 0.1]
