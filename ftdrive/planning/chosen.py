@@ -77,7 +77,7 @@ def chosen_tour(
     Returns
     -------
     Chosen or None
-        None where so many poses are nowhere in reach.
+        None where so many poses, different enough to estimate everything, are nowhere in reach.
     """
     stands = np.asarray(q_rad, dtype=np.float64)
     lumps = certifier.arm.travel_m[:, 5].any()
@@ -118,9 +118,11 @@ def _at(
         place = np.full(len(candidates), -1)
         place[chosen] = np.arange(poses)
         order = clear_tour(certifier, q[nodes], place[group[nodes]], speeds)
-        if order is not None:
-            nodes = nodes[order]
-            rms = predicted_sigma(candidates[group[nodes]], guess).force_rms_N
+        if order is None:
+            continue
+        nodes = nodes[order]
+        rms = predicted_sigma(candidates[group[nodes]], guess).force_rms_N
+        if np.isfinite(rms):  # else there is something that these poses cannot tell
             return Chosen(tuple((101 + place[group[nodes]]).tolist()), q[nodes], rms, ideal, elsewhere=False)
     return None
 

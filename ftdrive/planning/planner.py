@@ -109,7 +109,7 @@ def plan_tour(
         return made("reachable", [*why, *_chosen_words(chosen)], (chosen.numbers, chosen.q_rad))
     raise PlanRefused(
         f"{reason}, and neither another posture, nor room for the flange, nor other poses give a tour that is proven "
-        "clear: describe the tool more closely, or free the scene"
+        "clear and different enough to estimate everything: describe the tool more closely, or free the scene"
     )
 
 
@@ -162,7 +162,8 @@ def plan_cone(
     if chosen is None:
         raise PlanRefused(
             f"{poses} poses with the tool within {np.degrees(half_angle_rad):.0f} degrees of the axis of the cone are "
-            "not in reach of the wrist, or no tour of them is proven clear: widen the cone, or stand elsewhere"
+            "not in reach of the wrist, not different enough to estimate everything, or no tour of them is proven "
+            "clear: widen the cone, or stand elsewhere"
         )
     why = [f"The tool axis stays within {np.degrees(half_angle_rad):.0f} degrees of the axis of the cone."]
     return make_plan("cone", [*why, *_chosen_words(chosen)], certifier, chosen.numbers, chosen.q_rad, speeds, guess)

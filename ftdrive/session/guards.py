@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import DeviceFault, DeviceTimeout
+from drivers.errors import DeviceFault, DeviceTimeout, DriverError
 from drivers.interfaces import ArmState, ArmStatus
 from ftdrive.planning.certify import Certifier
 
@@ -217,7 +217,7 @@ class SettingsGuard(Guard):
 
 @dataclass
 class SafetyGuard(Guard):
-    """Rows 10, 11, 12 and 21: the safety system and the program on the controller."""
+    """Rows 7, 10, 11, 12 and 21: the safety system and the program on the controller."""
 
     _mode: str | None = field(default=None, init=False)
 
@@ -229,7 +229,7 @@ class SafetyGuard(Guard):
         """Trip on every stop and every change."""
         status = seen.status
         if status.fault is not None:
-            raise Tripped(hazard_of_safety(status.safety_mode), DeviceFault(f"the arm stopped: {status.fault}"))
+            raise by_safety(status, f"the arm stopped: {status.fault}")
         if self._mode is not None and status.safety_mode != self._mode:
             raise Tripped(
                 12,
@@ -384,11 +384,25 @@ class ContactGuard(Guard):
             )
 
 
-def hazard_of_safety(mode: str) -> int:
-    """Row of a stop, by the safety mode that the controller tells."""
+def out_of_sight(error: DriverError, *, moving: bool) -> Tripped:
+    """Row 16: nobody sees the arm any more. On its way it may not hear the stop either."""
+    if not moving:
+        return Tripped(16, error)
+    words = (
+        f"{str(error).rstrip('.')}. It was told to stop, but may not have heard it: then it ends the one move it was "
+        "given, which is proven clear, and goes no further"
+    )
+    return Tripped(16, type(error)(words))
+
+
+def by_safety(status: ArmStatus, words: str) -> Tripped:
+    """Rows 7, 10, 11 and 12: the safety system has stopped the arm, and `words` say so."""
+    mode = status.safety_mode
     if mode == "protective stop":
-        return 10
-    return 11 if "emergency" in mode or "safeguard" in mode else 12
+        told = "" if status.payload_kg is None else f" (it was told {status.payload_kg:.2f} kg)"
+        words += f"; usual causes are contact, and a controller with a wrong payload or centre of mass{told}"
+        return Tripped(10, DeviceFault(words))
+    return Tripped(11 if "emergency" in mode or "safeguard" in mode else 12, DeviceFault(words))
 
 
 def _changed(before: Any, now: Any) -> bool:

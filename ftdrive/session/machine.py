@@ -36,7 +36,7 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
-from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, hazard_of_safety
+from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, by_safety, out_of_sight
 from ftdrive.session.operator import Key, Operator, Question
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.watch import Guards
@@ -384,7 +384,7 @@ class Tour:
         if trip is not None and self._mended(trip):
             return
         self._at = None
-        words = str(error if trip is None else trip)
+        words = str(error if trip is None else trip).rstrip(".")
         if trip is not None and trip is not self._guards.tripped(wait_s=0.0):
             self._desk.tell(GuardTripped(hazard=trip.hazard, words=words))
         self._tell(State.STOP, words=words)
@@ -428,9 +428,9 @@ class Tour:
         try:
             status = self._arm.status()
         except DriverError:
-            return Tripped(16, error)
+            return out_of_sight(error, moving=self._at is None)
         if status.fault is not None:
-            return Tripped(hazard_of_safety(status.safety_mode), error)
+            return by_safety(status, str(error))
         return Tripped(21, error) if isinstance(error, DeviceFault) else Tripped(16, error)
 
     def _mended(self, trip: Tripped) -> bool:

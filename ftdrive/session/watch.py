@@ -1,4 +1,7 @@
-"""The thread that watches: a hundred looks a second, by its own clock. It stops the arm first and tells then."""
+"""The thread that watches: a hundred looks a second, by its own clock. It stops the arm, then it tells.
+
+A stop that nobody answers takes a second or two: that is told while it goes on.
+"""
 
 import logging
 import threading
@@ -13,7 +16,7 @@ from numpy.typing import NDArray
 from calib.routine import turned_rad
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ArmState, ForceTorqueSensor, RobotArm
-from ftdrive.session.guards import Guard, Seen, Tripped, Watch, hazard_of_safety
+from ftdrive.session.guards import Guard, Seen, Tripped, Watch, by_safety, out_of_sight
 
 log = logging.getLogger(__name__)
 
@@ -23,6 +26,8 @@ PERIOD_S: Final = 0.01
 _LATE_S: Final = 0.02
 """So much of the time between two looks counts as silence: when this process gets no time, nothing else is late."""
 _HUNG_S: Final = 1.0
+_TELL_S: Final = 0.2
+"""A stop that takes longer is told meanwhile. An arm that answers brakes from 60 deg/s in 0.26 s."""
 
 
 class Guards:
@@ -34,7 +39,7 @@ class Guards:
         Asked from the thread.
     guards : sequence of Guard
     on_trip : callable
-        Is told from the thread, after the arm was stopped.
+        Is told from the thread, once the arm was stopped or is slow to.
     """
 
     def __init__(
@@ -114,7 +119,7 @@ class Guards:
             except Tripped as trip:
                 self._stop(trip)
             except DriverError as error:
-                self._stop(Tripped(16, error))
+                self._stop(out_of_sight(error, moving=watch.moving))
             except Exception as error:
                 log.exception("a guard failed")
                 self._stop(Tripped(18, DeviceFault(f"a guard failed ({error!r}): report this, and do not go on")))
@@ -126,7 +131,7 @@ class Guards:
             state = self._arm.state()
         except DeviceFault as error:
             status = self._arm.status()  # what stopped the arm may have come between the two
-            raise Tripped(9 if status.fault is None else hazard_of_safety(status.safety_mode), error) from error
+            raise (Tripped(9, error) if status.fault is None else by_safety(status, str(error))) from error
         try:
             self._sensor.check()
             sample = self._sensor.latest(timeout_s=0.0)
@@ -151,11 +156,17 @@ class Guards:
 
     def _stop(self, trip: Tripped) -> None:
         self._tripped = trip
+        stopping = threading.Thread(target=self._stop_arm, name="guards stop", daemon=True)
+        stopping.start()
+        stopping.join(_TELL_S)
+        try:
+            self._on_trip(trip)
+        finally:
+            stopping.join()
+            self._told.set()
+
+    def _stop_arm(self) -> None:
         try:
             self._arm.stop()
         except Exception:
             log.exception("the arm could not be told to stop: press the emergency stop")
-        try:
-            self._on_trip(trip)
-        finally:
-            self._told.set()

@@ -208,6 +208,8 @@ class Arm:
         self.qd = self.actual_qd = self.qdd = ZERO6
         self.speed_fraction = 1.0
         """Speed slider, 0 to 1."""
+        self.pushed_rad = ZERO6
+        """How far somebody pushes the joints off their set-points."""
         self.scaling = 1.0
         """What the trajectory limiter leaves of the speed, 0 to 1."""
         self.paused = False
@@ -330,13 +332,16 @@ class Arm:
         return q
 
     def _lag(self, dt: float) -> None:
-        if self.actual_q is self.q:
+        goal = self.q
+        if self.pushed_rad is not ZERO6:
+            goal = vector6([q + off for q, off in zip(self.q, self.pushed_rad, strict=True)])
+        if self.actual_q is goal:
             self.actual_qd = ZERO6
             return
         share = 1.0 - math.exp(-dt / FOLLOW_TIME_S)
-        after = vector6([a + (b - a) * share for a, b in zip(self.actual_q, self.q, strict=True)])
-        if self.qd is ZERO6 and max(abs(a - b) for a, b in zip(after, self.q, strict=True)) < 1e-9:
-            after = self.q
+        after = vector6([a + (b - a) * share for a, b in zip(self.actual_q, goal, strict=True)])
+        if self.qd is ZERO6 and max(abs(a - b) for a, b in zip(after, goal, strict=True)) < 1e-9:
+            after = goal
         self.actual_qd = vector6([(new - old) / dt for new, old in zip(after, self.actual_q, strict=True)])
         self.actual_q = after
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mocks.kinematics import vector6
+from mocks.kinematics import ZERO6, vector6
 from mocks.ur import dashboard
 from mocks.ur.modes import PERMITTED, RobotMode, SafetyMode
 from mocks.ur.robot import Robot
@@ -44,11 +44,13 @@ class Operator:
             "foreign-program": self._foreign_program,
             "close-popup": lambda _request: self._pendant("close-popup", "close popup"),
             "hand-move": self._hand_move,
+            "push-joint": self._push_joint,
             "slider": self._slider,
             "speed-scaling": self._speed_scaling,
             "remote-control": self._remote_control,
             "set-tcp": self._set_tcp,
             "tcp": self._set_tcp,
+            "set-payload": self._set_payload,
             "freeze": self._freeze,
             "silent": self._silent,
             "silence-arm": self._silence_arm,
@@ -114,6 +116,24 @@ class Operator:
         self._robot.tcp_offset = vector6(request["tcp"])
         self._robot.note("operator", "set-tcp", tcp=list(self._robot.tcp_offset))
         return {"done": "set-tcp"}
+
+    def _set_payload(self, request: Request) -> dict[str, Any]:
+        payload_kg = float(request["payload_kg"])
+        if not 0.0 <= payload_kg < math.inf:
+            raise ValueError(f"payload {payload_kg} kg")
+        self._robot.payload_kg = payload_kg
+        self._robot.note("operator", "set-payload", payload_kg=payload_kg)
+        return {"done": "set-payload"}
+
+    def _push_joint(self, request: Request) -> dict[str, Any]:
+        joint, off_rad = int(request["joint"]), math.radians(request["off_deg"])
+        if not (1 <= joint <= 6 and math.isfinite(off_rad)):
+            raise ValueError(f"joint {joint} is not 1 to 6, or {off_rad} rad is no angle")
+        pushed = [0.0] * 6
+        pushed[joint - 1] = off_rad
+        self._robot.arm.pushed_rad = vector6(pushed) if off_rad else ZERO6
+        self._robot.note("operator", "push-joint", joint=joint, off_deg=request["off_deg"])
+        return {"done": "push-joint"}
 
     def _hand_move(self, request: Request) -> dict[str, Any]:
         q, speed_rad_s = vector6(request["q_rad"]), float(request.get("speed_rad_s", HAND_SPEED_RAD_S))

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mocks.kinematics import MODELS, Vector6, forward, matrix_of, pose_of, rotvec, vector6
+from mocks.kinematics import MODELS, ZERO6, Vector6, forward, matrix_of, pose_of, rotvec, vector6
 from mocks.ur.motion import Arm, CannotFollow, JointMove, LineMove, MotionError, Trapezoid
 
 DH = MODELS["UR5e"]
@@ -165,6 +165,21 @@ def test_actual_joints_follow_and_settle_exactly() -> None:
         arm.step(DT)
     assert arm.actual_q == goal
     assert arm.actual_qd == (0.0,) * 6
+
+
+def test_a_pushed_joint_is_off_its_set_point_until_it_is_let_go() -> None:
+    arm = Arm(DH, HOME)
+    arm.pushed_rad = shifted(ZERO6, 1, 0.05)
+    arm.start(JointMove(DH, shifted(HOME, 5, 1.0), 1.0, 2.0), "main")
+    for _ in range(500):
+        arm.step(DT)
+    assert arm.actual_q[1] - arm.q[1] == pytest.approx(0.05, abs=1e-6)
+    assert arm.q[1] == HOME[1]
+    arm.pushed_rad = ZERO6
+    run(arm)
+    for _ in range(100):
+        arm.step(DT)
+    assert arm.actual_q == arm.q == shifted(HOME, 5, 1.0)
 
 
 commands = st.lists(

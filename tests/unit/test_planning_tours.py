@@ -106,6 +106,12 @@ def test_cone_that_cannot_be_is_refused(change: dict[str, object], words: str) -
         plan_cone(certifier, **given)  # type: ignore[arg-type]  # one dict
 
 
+def test_poses_that_cannot_tell_everything_are_no_plan() -> None:
+    certifier = certifier_of()
+    with pytest.raises(PlanRefused, match="not different enough"):
+        plan_cone(certifier, poses=6, half_angle_rad=1e-6, speeds=Speeds(), guess=guess_of(certifier))
+
+
 def test_free_box_tour_keeps_the_flange_in_its_box_and_the_moves_clear() -> None:
     certifier = certifier_of("UR3e")
     centre = np.array([0.283, 0.283, 0.3])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers.errors import DeviceTimeout
 from drivers.interfaces import ArmState, ArmStatus
 from ftdrive.planning.arm_model import ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier
@@ -25,6 +26,7 @@ from ftdrive.session.guards import (
     StallGuard,
     Tripped,
     Watch,
+    out_of_sight,
 )
 
 Array = NDArray[np.float64]
@@ -137,6 +139,24 @@ def test_every_stop_and_change_of_the_controller_is_seen_at_once(different: dict
     looks = Looks(SafetyGuard())
     assert looks.trips(5) is None
     assert looks.trip(status=replace(STATUS, **different)).hazard == hazard
+
+
+def test_a_protective_stop_is_told_with_the_payload_that_may_have_caused_it() -> None:
+    stopped = replace(STATUS, fault="protective stop: …", safety_mode="protective stop")
+    assert "payload or centre of mass (it was told 1.50 kg)" in str(Looks(SafetyGuard()).trip(status=stopped))
+    untold = str(Looks(SafetyGuard()).trip(status=replace(stopped, payload_kg=None)))
+    assert untold.endswith("payload or centre of mass")
+    braked = replace(STATUS, fault="emergency stop: …", safety_mode="robot emergency stop")
+    assert "payload" not in str(Looks(SafetyGuard()).trip(status=braked))
+
+
+def test_an_arm_out_of_sight_may_be_ending_its_move() -> None:
+    lost = DeviceTimeout("the clock stands still.")
+    under_way, standing = out_of_sight(lost, moving=True), out_of_sight(lost, moving=False)
+    assert (under_way.hazard, standing.hazard) == (16, 16)
+    assert isinstance(under_way.error, DeviceTimeout)
+    assert "stands still. It was told to stop, but may not have heard it: then it ends the one move" in str(under_way)
+    assert str(standing) == str(lost)
 
 
 @pytest.mark.parametrize(("moving", "after_s"), [(True, 0.1), (False, 0.5)])

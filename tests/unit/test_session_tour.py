@@ -530,6 +530,40 @@ def test_a_fault_on_the_way_stops_the_arm_and_resume_goes_on(fault: str, lab: La
     assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
 
 
+def test_a_protective_stop_that_the_driver_tells_names_its_usual_causes_too(lab: Lab) -> None:
+    def stop() -> None:
+        lab.arm.set_status(fault="protective stop: …", safety_mode="protective stop")
+        raise DeviceFault("the arm stopped: protective stop")
+
+    lab.arm.at_move[4] = stop
+    with pytest.raises(DeviceFault, match="wrong payload or centre of mass"):
+        lab.calibrate()
+    assert lab.operator.of(GuardTripped)[0].hazard == 10
+
+
+def test_a_stop_that_nobody_answers_is_told_while_it_goes_on(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    told, told_meanwhile, stop = threading.Event(), list[bool](), lab.arm.stop
+
+    def unanswered() -> None:
+        if lab.arm.gone:
+            told_meanwhile.append(told.wait(5.0))
+        stop()
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, GuardTripped):
+            told.set()
+
+    monkeypatch.setattr(lab.arm, "stop", unanswered)
+    lab.operator.on_event = on_event
+    lab.arm.at_move[4] = lambda: setattr(lab.arm, "gone", DeviceTimeout("silent"))
+    with pytest.raises(DeviceTimeout):
+        lab.calibrate()
+    assert told_meanwhile
+    assert all(told_meanwhile)
+    holds = [event for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
+    assert "it ends the one move it was given" in holds[0].words
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_with_nobody_there_the_reason_is_raised_and_the_poses_are_kept(fault: str, lab: Lab) -> None:
     hazard, inject, _, error = FAULTS[fault]

@@ -93,6 +93,8 @@ def test_cables_drift_and_payload(station: Answering) -> None:
         ("sensor-faults", {"dropp": 1}, "unknown fault dropp"),
         ("hand-move", {"q_rad": [0] * 5}, "hand-move"),
         ("hand-move", {"q_rad": [0] * 6, "speed_rad_s": 0}, "positive speed"),
+        ("push-joint", {"joint": 0, "off_deg": 1}, "joint 0"),
+        ("set-payload", {"payload_kg": -1}, "payload -1"),
         ("slider", {"fraction": 2}, "not between"),
     ],
 )
@@ -110,6 +112,17 @@ def test_a_hand_moves_the_arm(station: Answering) -> None:
     assert station.do("hand_move", q_rad=goal, speed_rad_s=0.5) == {"done": "hand-move"}
     assert station.until(lambda s: s["moving"])["runtime_state"] == "STOPPED"
     station.until(lambda s: not s["moving"] and s["q_rad"] == pytest.approx(goal, abs=1e-6))
+
+
+def test_a_pushed_joint_and_a_changed_payload(station: Answering) -> None:
+    before = station.do("state")
+    station.do("push-joint", joint=2, off_deg=3)
+    pushed = station.until(lambda s: s["q_rad"][1] - before["q_rad"][1] == pytest.approx(math.radians(3), abs=1e-6))
+    assert pushed["target_q_rad"] == before["target_q_rad"]
+    station.do("push-joint", joint=2, off_deg=0)
+    station.until(lambda s: s["q_rad"] == pytest.approx(before["q_rad"], abs=1e-6))
+    station.do("set-payload", payload_kg=2.5)
+    assert station.do("state")["payload_kg"] == 2.5
 
 
 def test_another_client_moves_the_arm(station: Answering) -> None:

@@ -1,0 +1,342 @@
+"""The rows of the hazard table: what happens to a cell in mid-tour, and what is wrong with one before."""
+
+import json
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from ftdrive.config import CellConfig, ToolConfig, WorkcellConfig
+from ftdrive.simulation import PAYLOAD_KG, Station
+
+Json = dict[str, Any]
+
+UNSEEN: Final[Mapping[str, str]] = {
+    "1 cable, gently": "nothing stops the arm below the contact limit; the report names poses (test_disturbances.py)",
+    "4 what is not described": "only the question and the contact guard (14)",
+    "6 singularities": "by construction: joint moves only",
+    "13 overload of a known range": "the contact guard comes first (14); guard and samples of a pose: unit tests",
+    "20 people": "only the questions, and 14",
+    "23 the tool moves": "named in the report, and refused where it changed the tool (test_disturbances.py)",
+    "24 base not bolted": "only the question; the tilt is estimated",
+}
+
+
+class Child:
+    """`ftdrive calibrate --json` in a process group of its own: events as they come."""
+
+    def __init__(self, folder: Path, *arguments: str | Path) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "ftdrive", "calibrate", *map(str, arguments), "--json"],
+            cwd=folder,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=(folder / "stderr.txt").open("w"),
+            text=True,
+            start_new_session=True,
+            env=os.environ | {"XDG_STATE_HOME": str(folder / "state"), "XDG_CONFIG_HOME": str(folder / "none")},
+        )
+        self.lines: queue.Queue[tuple[int, Json] | None] = queue.Queue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        for line in self.process.stdout or ():
+            self.lines.put((time.monotonic_ns(), json.loads(line)))
+        self.lines.put(None)
+
+    def say(self, words: str) -> None:
+        with suppress(BrokenPipeError):
+            if self.process.stdin is not None:
+                self.process.stdin.write(words + "\n")
+                self.process.stdin.flush()
+
+    def end(self) -> int:
+        with suppress(ProcessLookupError):
+            if self.process.poll() is None:
+                os.killpg(self.process.pid, signal.SIGKILL)
+        return self.process.wait()
+
+
+@dataclass
+class Scene:
+    """One cell and one session in it."""
+
+    station: Station
+    folder: Path
+    child: Child
+    run: Path | None = None
+
+    def poses(self) -> list[Path]:
+        """Those on disk, in whatever folder they are."""
+        return [] if self.run is None else sorted(self.run.glob("*/*.npz"))
+
+    def state(self) -> Mapping[str, Any]:
+        return self.station.control(do="state", since=0)
+
+    def do(self, **request: Any) -> None:
+        answer = self.station.control(**request)
+        if "error" in answer:
+            raise RuntimeError(f"{request}: {answer['error']}")
+
+
+Deed = Callable[[Scene], None]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that happens in mid-tour."""
+
+    row: str
+    name: str
+    inject: Deed
+    mend: Deed
+    hazards: frozenset[int]
+    """The rows that may name it."""
+    detect_s: float = 0.05
+    at: str = "move"
+    """The state in which it happens, on the way to `stop`; or "approach"."""
+    stop: int = 4
+    resumed: bool = False
+    """The process is gone, and --resume goes on."""
+    restart: bool = False
+    """Its mending needs the cell to be switched off and on."""
+    ends_its_move: bool = False
+    """Nobody can reach the arm: it ends the move it was given, and that is told."""
+    words: str = ""
+    """Part of what is told."""
+
+
+# -- what happens ------------------------------------------------------------------------------------------------------
+
+
+def nothing(_: Scene) -> None:
+    pass
+
+
+def ask(**request: Any) -> Callable[[Scene], None]:
+    return lambda scene: scene.do(**request)
+
+
+def unlock(scene: Scene) -> None:
+    """As the operator at the pendant: after 5 s; the dashboard refuses before."""
+    while scene.station.control(do="state")["safety_mode"] != "NORMAL":
+        scene.station.control(do="unlock")
+        time.sleep(0.5)
+
+
+def power_up(scene: Scene) -> None:
+    """Release the emergency stop, power on, release the brakes, by the dashboard as by the pendant."""
+    scene.do(do="emergency-stop", on=False)
+    host = scene.station.endpoints["arm"]["host"]
+    with socket.create_connection((host, 29999), timeout=5) as dashboard:
+        dashboard.recv(200)
+        for words in ("close safety popup", "power on", "brake release"):
+            dashboard.sendall(f"{words}\n".encode())
+            dashboard.recv(200)
+            time.sleep(2.0)
+    deadline = time.monotonic() + 60
+    while scene.station.control(do="state")["robot_mode"] != "RUNNING" and time.monotonic() < deadline:
+        time.sleep(0.2)
+
+
+def send(number: int, group: bool = False) -> Callable[[Scene], None]:
+    def deliver(scene: Scene) -> None:
+        (os.killpg if group else os.kill)(scene.child.process.pid, number)
+
+    return deliver
+
+
+def hide_poses(scene: Scene) -> None:
+    assert scene.run is not None
+    (scene.run / "poses").rename(scene.run / "hidden")
+
+
+def show_poses(scene: Scene) -> None:
+    assert scene.run is not None
+    (scene.run / "hidden").rename(scene.run / "poses")
+
+
+def by_hand(scene: Scene) -> None:
+    """Begin to turn the last joint by hand; that takes seconds."""
+    *others, last = scene.state()["q_rad"]
+    scene.do(do="hand-move", q_rad=[*others, last - 1.0], speed_rad_s=0.2)
+
+
+PUSH: Final = [0.0, 25.0, 0.0, 0.0, 0.0, 0.0]
+HARD: Final = [0.0, 140.0, 0.0, 0.0, 0.0, 0.0]
+RELEASE: Final = ask(do="push", wrench=[0.0] * 6)
+
+FAULTS: Final[Sequence[Fault]] = (
+    Fault(
+        "1", "cable pulls hard", ask(do="cable", force_N=[0, 20, 0]), ask(do="cable", on=False), frozenset({14}), stop=7
+    ),
+    Fault(
+        "2",
+        "a joint off its line",
+        ask(do="push-joint", joint=2, off_deg=1.5),
+        ask(do="push-joint", joint=2, off_deg=0),
+        frozenset({2}),
+    ),
+    Fault("5", "protective stop on the approach", ask(do="protective-stop"), unlock, frozenset({10}), at="approach"),
+    Fault(
+        "7",
+        "payload changed",
+        ask(do="set-payload", payload_kg=3.0),
+        ask(do="set-payload", payload_kg=PAYLOAD_KG),
+        frozenset({7}),
+        words="payload",
+    ),
+    Fault(
+        "8",
+        "TCP changed",
+        ask(do="set-tcp", tcp=[0, 0, 0.1, 0, 0, 0]),
+        ask(do="set-tcp", tcp=[0.0] * 6),
+        frozenset({8}),
+    ),
+    Fault("7, 10", "protective stop", ask(do="protective-stop"), unlock, frozenset({10}), words="wrong payload"),
+    Fault("11", "emergency stop", ask(do="emergency-stop", on=True), power_up, frozenset({11})),
+    Fault("11", "safeguard stop", ask(do="safeguard", on=True), ask(do="safeguard", on=False), frozenset({11, 21})),
+    Fault("12", "reduced mode", ask(do="reduced", on=True), ask(do="reduced", on=False), frozenset({12})),
+    Fault("13", "an axis saturates", ask(do="saturate", axis=2), ask(do="saturate", on=False), frozenset({13, 14, 15})),
+    Fault("14", "push, tool not yet known", ask(do="push", wrench=HARD), RELEASE, frozenset({14})),
+    Fault("14", "push, tool known", ask(do="push", wrench=PUSH), RELEASE, frozenset({14}), stop=7),
+    Fault(
+        "14", "push while a pose is averaged", ask(do="push", wrench=HARD), RELEASE, frozenset({14}), 0.1, at="sample"
+    ),
+    Fault(
+        "15",
+        "sensor silent",
+        ask(do="sensor-faults", stall=True),
+        ask(do="sensor-faults", stall=False),
+        frozenset({15}),
+        0.15,
+    ),
+    Fault("15", "sensor stuck", ask(do="freeze-sensor"), ask(do="freeze-sensor", on=False), frozenset({15}), 0.25),
+    Fault("15", "sensor unplugged", ask(do="unplug"), nothing, frozenset({15}), 0.15, restart=True),
+    Fault(
+        "16",
+        "controller silent",
+        ask(do="silence-arm"),
+        ask(do="silence-arm", on=False),
+        frozenset({16}),
+        0.5,
+        ends_its_move=True,
+        words="it ends the one move it was given",
+    ),
+    Fault(
+        "16",
+        "state stream silent",
+        ask(do="silent", what="rtde"),
+        ask(do="silent", what="rtde", on=False),
+        frozenset({16}),
+        0.3,
+    ),
+    Fault("16", "state stream hangs up", ask(do="drop", what="rtde", reset=True), nothing, frozenset({16, 21}), 0.3),
+    Fault("17", "Ctrl-C", send(signal.SIGINT), nothing, frozenset(), resumed=True),
+    Fault("18", "killed", send(signal.SIGKILL), nothing, frozenset(), 0.5, resumed=True),
+    Fault(
+        "18", "killed with all its processes", send(signal.SIGKILL, group=True), nothing, frozenset(), 0.5, resumed=True
+    ),
+    Fault("18", "suspended", send(signal.SIGSTOP), send(signal.SIGCONT), frozenset(), 0.5, resumed=True),
+    Fault("19", "moved by hand, resume meanwhile", ask(do="dashboard-stop"), by_hand, frozenset({21})),
+    Fault(
+        "19",
+        "pushed while a pose is averaged",
+        ask(do="push-joint", joint=6, off_deg=1.0),
+        ask(do="push-joint", joint=6, off_deg=0),
+        frozenset({21}),
+        0.1,
+        at="sample",
+    ),
+    Fault("21", "program of another client", ask(do="foreign-program", seconds=1), nothing, frozenset({21})),
+    Fault("21", "another client's stop", ask(do="dashboard-stop"), nothing, frozenset({21})),
+    Fault("21", "program ends by itself", ask(do="crash-script"), nothing, frozenset({21})),
+    Fault("22", "slider at 0", ask(do="slider", fraction=0.0), ask(do="slider", fraction=1.0), frozenset({22}), 11.0),
+    Fault("26", "poses cannot be written", hide_poses, show_poses, frozenset({26}), 2.0, at="sample"),
+)
+
+
+# -- before anything moves ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Beforehand:
+    """Something that is odd before the tour: refused with an exit code and words, or rightly not (code 0)."""
+
+    row: str
+    name: str
+    code: int
+    words: str = ""
+    options: tuple[str, ...] = ()
+    do: Json | None = None
+    change: Callable[[CellConfig], CellConfig] = lambda cell: cell
+    arguments: tuple[str, ...] = ("--minimal",)
+    sensor: str = "can"
+
+
+def _of_model(model: str) -> Callable[[CellConfig], CellConfig]:
+    return lambda cell: replace(cell, robot=replace(cell.robot, model=model))
+
+
+def _of_tool(*cylinder: float, mass_kg: float | None = None) -> Callable[[CellConfig], CellConfig]:
+    return lambda cell: replace(cell, tool=ToolConfig("tool", (cylinder,), mass_kg))
+
+
+def _of_workcell(**different: Any) -> Callable[[CellConfig], CellConfig]:
+    return lambda cell: replace(cell, workcell=replace(cell.workcell, **different))
+
+
+def _caged(cell: CellConfig) -> CellConfig:
+    """Four walls and a ceiling around an arm with a tool that is longer than its cage."""
+    walls = ((-1, 0, 0, -600), (1, 0, 0, -600), (0, 1, 0, -600), (0, -1, 0, -600), (0, 0, -1, -1000))
+    return replace(_of_tool(0.0, 1200.0, 100.0)(cell), workcell=WorkcellConfig(planes_mm=walls, measured=True))
+
+
+BEFOREHAND: Final[Sequence[Beforehand]] = (
+    Beforehand("2, 3", "a tool longer than its cage", 7, "proven clear", change=_caged),
+    Beforehand("3", "nobody has measured", 7, "measured", change=_of_workcell(measured=False)),
+    Beforehand("3", "a safety plane in the way", 7, "safety limits", ("--plane", "0,0,1,1.0")),
+    Beforehand(
+        "5",
+        "the arm stands in a box",
+        7,
+        "0 mm from contact",
+        change=_of_workcell(boxes_mm=((-400.0, -600.0, 300.0, 100.0, 0.0, 600.0),)),
+    ),
+    Beforehand("7", "payload 0 in the controller", 7, "payload", ("--payload", "0")),
+    Beforehand("8", "a turned TCP, not told", 0, options=("--tcp", "0,0,0.2,0.3,0,0", "--no-tcp-offset")),
+    Beforehand("9", "another model", 3, "UR10e", change=_of_model("UR10e")),
+    Beforehand("10", "protective stop", 3, "protective", do={"do": "protective-stop"}),
+    Beforehand("11", "emergency stop", 3, "emergency", do={"do": "emergency-stop"}),
+    Beforehand(
+        "13",
+        "a tool of 14 kg, 300 mm",
+        7,
+        "of the sensor's range",
+        ("--payload", "14"),
+        change=_of_tool(0.0, 300.0, 100.0, mass_kg=14.0),
+        sensor="serial",
+    ),
+    Beforehand("15", "sensor silent", 3, "no answer", do={"do": "sensor-faults", "stall": True}),
+    Beforehand("15", "sensor stuck", 5, "frozen", do={"do": "freeze-sensor"}),
+    Beforehand("16", "controller silent", 3, "did not answer", do={"do": "silence-arm"}),
+    Beforehand("21", "local control", 3, "remote", do={"do": "remote-control", "on": False}),
+    Beforehand(
+        "25",
+        "a plan for another tool",
+        7,
+        "another tool",
+        change=_of_tool(0.0, 150.0, 90.0),
+        arguments=("--plan", "PLAN"),
+    ),
+    Beforehand("26", "a folder that cannot be written", 7, "written", arguments=("--minimal", "--runs", "/proc/none")),
+)
