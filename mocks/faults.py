@@ -27,7 +27,7 @@ class Faults:
     drop, duplicate
         A frame is lost, or sent twice.
     corrupt
-        One byte of a frame is changed (serial and UDP); on a line with parity it shows where an odd number of bits is.
+        One byte of a frame is changed (serial and UDP); its parity is wrong when an odd number of bits is.
     byte_slip
         One byte of a frame is lost (serial and UDP).
     swap

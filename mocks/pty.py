@@ -132,6 +132,7 @@ class PtyDevice(ABC):
 
     def _write(self, data: bytes) -> int:
         """Write without blocking; return how many bytes are gone, with one whose mark left in part."""
+        # The flags are read before every write: while PARMRK is on, the kernel would double what is marked here.
         form: Callable[[bytes], bytes] = marked if self.has_parity and self._client_wants_marks() else bytes
         wire = self._begun + form(data)
         try:
@@ -150,6 +151,7 @@ class PtyDevice(ABC):
         return sent
 
     def _client_wants_marks(self) -> bool:
+        """Whether wrong parity must be marked; the kernel marks nothing any more when this returns True."""
         attributes = termios.tcgetattr(self._master)  # the client's: both ends have the same
         flags = attributes[0]
         if flags & (termios.INPCK | termios.IGNPAR) != termios.INPCK:
