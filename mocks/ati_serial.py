@@ -2,9 +2,9 @@
 
 Ref: ATI 9620-05-Digital FT, sections 8.1, 8.3, 8.4; ATI 9610-05-1030-04, section 9 (the same port on a NETCANOEM).
 
-Does not model: parity and baud mismatch (a pty has neither), collisions of a half-duplex line, writing calibrations to
-storage, the power-up time. Unspecified by the sources and chosen here: an empty calibration slot reads zeros, the 23
-registers between two slots do not exist, a read of more than 64 registers is exception 3.
+Does not model: baud mismatch (a pty has no speed), parity of what the client sends, collisions of a half-duplex line,
+writing calibrations to storage, the power-up time. Unspecified by the sources and chosen here: an empty calibration
+slot reads zeros, the 23 registers between two slots do not exist, a read of more than 64 registers is exception 3.
 """
 
 import struct
@@ -118,6 +118,8 @@ class AtiSerialBox(PtyDevice):
     bad_checksum
         Probability of a record to carry a wrong checksum and right data.
     """
+
+    has_parity = True
 
     def __init__(
         self,

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from mocks.slcan import CanFrame
+from mocks.uart import WrongParity
 
 Frame = TypeVar("Frame", bytes, CanFrame)
 
@@ -26,7 +27,7 @@ class Faults:
     drop, duplicate
         A frame is lost, or sent twice.
     corrupt
-        One byte of a frame is changed (serial and UDP).
+        One byte of a frame is changed (serial and UDP); its parity is wrong when an odd number of bits is.
     byte_slip
         One byte of a frame is lost (serial and UDP).
     swap
@@ -135,11 +136,17 @@ class FaultyWire(Generic[Frame]):
         return sent
 
     def _damaged(self, frame: Frame) -> Frame:
-        if isinstance(frame, bytes) and frame:
-            if self._random.random() < self._faults.corrupt:
-                i = self._random.randrange(len(frame))
-                frame = frame[:i] + bytes([frame[i] ^ self._random.randrange(1, 256)]) + frame[i + 1 :]
-            if self._random.random() < self._faults.byte_slip:
-                i = self._random.randrange(len(frame))
-                frame = frame[:i] + frame[i + 1 :]
-        return frame
+        if not isinstance(frame, bytes) or not frame:
+            return frame
+        data, wrong = frame, None
+        if self._random.random() < self._faults.corrupt:
+            i = self._random.randrange(len(data))
+            flipped = self._random.randrange(1, 256)
+            data = data[:i] + bytes([data[i] ^ flipped]) + data[i + 1 :]
+            wrong = i if flipped.bit_count() % 2 else None
+        if self._random.random() < self._faults.byte_slip:
+            i = self._random.randrange(len(data))
+            data = data[:i] + data[i + 1 :]
+            if wrong is not None:
+                wrong = None if wrong == i else wrong - (wrong > i)
+        return data if wrong is None else WrongParity(data, wrong)

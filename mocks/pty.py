@@ -2,14 +2,24 @@
 
 Ref: pty(7), termios(3). The slave end stays open here, or the master would read EIO as soon as a client leaves.
 
-Does not model: line speed and parity (a pty has neither), modem lines, breaks.
+A pty has no parity. Where the line has, a client asks for marks with INPCK and PARMRK, as it asks a real port. PARMRK
+is then taken off again, or the kernel would double what is marked here; as long as INPCK stays, all marking is done
+here. Bytes that are in the terminal while the client changes its flags come in either form.
+
+Does not model: line speed (a pty has none), INPCK without PARMRK, IGNPAR, parity of what the client sends, modem lines,
+breaks.
 """
 
 import os
 import select
+import termios
 import threading
 import tty
 from abc import ABC, abstractmethod
+from bisect import bisect_left
+from collections.abc import Callable
+
+from mocks.uart import marked
 
 _END, _RESET = b"!", b"r"
 
@@ -20,10 +30,13 @@ class PtyDevice(ABC):
     A subclass says what happens at power-up, on received bytes, and when its time comes.
     """
 
+    has_parity = False  # of the line: whether wrong parity can be marked
+
     def __init__(self) -> None:
         self._thread: threading.Thread | None = None
         self._master = self._wake_read = self._wake_write = -1
         self._unsent = b""
+        self._begun = b""  # the rest of a mark that left in part
 
     def start(self) -> str:
         """Power the device up behind a new pseudo-terminal.
@@ -44,7 +57,7 @@ class PtyDevice(ABC):
         tty.setraw(slave)  # else the terminal echoes the device's own bytes back to it
         os.set_blocking(self._master, False)
         self._wake_read, self._wake_write = os.pipe()
-        self._unsent = b""
+        self._unsent = self._begun = b""
         path = os.ttyname(slave)
         self._power_up()
         self._thread = threading.Thread(target=self._serve, args=(slave,), name=f"{type(self).__name__} {path}")
@@ -110,7 +123,7 @@ class PtyDevice(ABC):
         return len(rest) // record_bytes
 
     def _finish_record(self) -> None:
-        if self._unsent:
+        if self._unsent or self._begun:
             self._unsent = self._unsent[self._write(self._unsent) :]
 
     def _forget_unsent(self) -> None:
@@ -118,16 +131,41 @@ class PtyDevice(ABC):
         self._unsent = b""
 
     def _write(self, data: bytes) -> int:
+        """Write without blocking; return how many bytes are gone, with one whose mark left in part."""
+        # The flags are read before every write: while PARMRK is on, the kernel would double what is marked here.
+        form: Callable[[bytes], bytes] = marked if self.has_parity and self._client_wants_marks() else bytes
+        wire = self._begun + form(data)
         try:
-            return os.write(self._master, data)
+            wire_sent = os.write(self._master, wire)
         except BlockingIOError:
             return 0
+        if wire_sent == len(wire):
+            self._begun = b""
+            return len(data)
+        wire_sent -= len(self._begun)
+        if wire_sent < 0:
+            self._begun = self._begun[wire_sent:]
+            return 0
+        sent = bisect_left(range(len(data)), wire_sent, key=lambda count: len(form(data[:count])))
+        self._begun = form(data[:sent])[wire_sent:]
+        return sent
+
+    def _client_wants_marks(self) -> bool:
+        """Whether wrong parity must be marked; the kernel marks nothing any more when this returns True."""
+        attributes = termios.tcgetattr(self._master)  # the client's: both ends have the same
+        flags = attributes[0]
+        if flags & (termios.INPCK | termios.IGNPAR) != termios.INPCK:
+            return False
+        if flags & termios.PARMRK:
+            attributes[0] = flags & ~termios.PARMRK
+            termios.tcsetattr(self._master, termios.TCSANOW, attributes)
+        return True
 
     def _serve(self, slave: int) -> None:
         try:
             while True:
                 wait_s = self._tick()
-                unfinished = [self._master] if self._unsent else []
+                unfinished = [self._master] if self._unsent or self._begun else []
                 readable, writable, _ = select.select([self._master, self._wake_read], unfinished, [], wait_s)
                 if self._wake_read in readable:
                     if os.read(self._wake_read, 1) == _END:
