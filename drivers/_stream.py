@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
-from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
+from drivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
 
 if sys.platform == "win32":
     LINK_ERRORS: tuple[type[Exception], ...] = (OSError,)
@@ -46,21 +46,38 @@ def scale_facts(
 
 _JOIN_S = 0.6
 _FIRST_SAMPLE_S = 1.0
-_FROZEN_SAMPLES, _FROZEN_S = 50, 0.2
-"""A living sensor has noise of a count or more: so many identical readings over so long a time are none."""
+_FROZEN_S = 0.2
+_FROZEN_SAMPLES = (20, 50)
+"""A living sensor has noise: identical readings over so long a time are none, if they are as many as come in that time,
+but at least and at most so many. README.md says why, under Decisions."""
 _CLOCK_JUMP_S = 0.5
 """How far the device's clock may gain on ours from one block to the next; a late block makes it fall behind only."""
+_CLOCK_DRIFT = 0.02
+"""How much slower than ours the device's clock may run before its samples are taken for late ones."""
+_AWAY_S = 0.3
+"""A shorter pause between two reads is not told from a busy computer."""
+_SETTLE_S, _WAITED_S, _DISCARD_S = 0.05, 0.001, 0.5
+"""After a pause: how long an adapter may still deliver what it has held back, how long a read lasts that had to wait
+for something new, and how long to try for one."""
 _RATE_TOLERANCE, _RATE_WINDOW_S = 0.1, 2.0
 _RECOVER_S = 10.0
 _RETRY_S = 0.2
 _EVENTS = 1000
 
 
+def awake_s() -> float:
+    """Seconds of a clock that goes on while the computer sleeps, where there is one."""
+    if sys.platform == "linux":
+        return time.clock_gettime(time.CLOCK_BOOTTIME)
+    return time.monotonic()
+
+
 class StreamingSensor(ForceTorqueSensor):
     """A sensor whose samples are fetched by a thread of its own.
 
     A subclass says how to connect, how to read the next samples and how to let go; this class does the waiting. The
-    first exception in the reader thread ends the stream: every later call raises a copy of it, until `close`.
+    first exception in the reader thread ends the stream: every later call raises a copy of it, until `close`. What has
+    piled up while this program or computer was suspended is thrown away: it would be old and look new.
 
     Parameters
     ----------
@@ -117,6 +134,18 @@ class StreamingSensor(ForceTorqueSensor):
     @abstractmethod
     def _disconnect(self) -> None:
         """Stop the stream and free the port within 0.3 s; also after a failed `_connect` or on a lost device."""
+
+    def _discard_backlog(self) -> None:
+        """Throw away what has piled up in port or socket while nobody read: until a read waits for what it returns."""
+        begin_s = self._turn_s
+        while self._is_mine():
+            rows = len(self._read_block())
+            self._earlier_lost += rows
+            turn_s = self._turn()
+            if self._was_away(turn_s):
+                begin_s = self._turn_s
+            elif self._turn_s - begin_s > (_SETTLE_S if rows and turn_s > _WAITED_S else _DISCARD_S):
+                return
 
     def open(self) -> None:
         """Connect, start the stream and wait for its first sample. Idempotent.
@@ -177,7 +206,7 @@ class StreamingSensor(ForceTorqueSensor):
             self._check()
             start_ns = time.monotonic_ns()
             end_ns = start_ns + round(duration_s * 1e9)
-            before, reconnects = self._received, self._reconnects
+            before, reconnects, pauses = self._received, self._reconnects, self._pauses
             self._taps.append(blocks)
             try:
                 while self._newest_ns < end_ns:
@@ -185,6 +214,8 @@ class StreamingSensor(ForceTorqueSensor):
                     self._check()
                     if self._reconnects != reconnects:
                         raise StreamBroken(f"{self.name}: the stream was interrupted and came back; collect again")
+                    if self._pauses != pauses:
+                        raise DeviceTimeout(f"{self.name}: {self._pause}; collect again")
                     if self._received - before > self._max_collect_samples:
                         raise StreamBroken(
                             f"{self.name}: more than {self._max_collect_samples} samples in one collect of "
@@ -243,6 +274,7 @@ class StreamingSensor(ForceTorqueSensor):
     def _connect_and_identify(self) -> DeviceInfo:
         """Connect, and complete what the device tells by what was configured."""
         info = self._connect()
+        self._turn()
         told = {} if info.serial == NOT_REPORTED else {"serial": Fact(info.serial, "device")}
         facts = info.facts | told | self.configured | {"sign": Fact(self._sign, "configured")}
         if told and facts["serial"].value != info.serial:
@@ -257,6 +289,11 @@ class StreamingSensor(ForceTorqueSensor):
         self._failure = None
         self._newest = NOTHING
         self._opened_ns = self._newest_ns = time.monotonic_ns()
+        self._heard_s = self._turn_s = awake_s()
+        """When the newest sample came, and when a read last returned."""
+        self._pauses, self._pause, self._fresh_from_ns = 0, "", 0
+        self._is_back = True
+        """Whether a sample has come since the last pause."""
         self._taps = []
         self._arrivals.clear()
         self._received = self._duplicated = self._out_of_order = self._silences = self._reconnects = 0
@@ -264,15 +301,16 @@ class StreamingSensor(ForceTorqueSensor):
         self._lost = self._malformed = 0
         """Since the last `_connect`; a subclass may count or assign them."""
         self._events: deque[tuple[int, str]] = deque(maxlen=_EVENTS)
-        self._rate_warned = False
+        self._rate_is_wrong = False
         self._seq_offset = 0
         self._start_watching()
 
     def _start_watching(self) -> None:
         """Forget what the checks of a running stream compare with."""
         self._same_rows, self._same_since_ns = 0, 0
-        self._clock: tuple[float, int] | None = None
+        self._clock: tuple[float, float] | None = None
         self._lead_s = 0.0
+        self._is_late = False
         self._rate_since_ns, self._rate_samples = 0, 0
 
     def _run(self) -> None:
@@ -301,10 +339,35 @@ class StreamingSensor(ForceTorqueSensor):
         """Read and publish until `close`."""
         while self._is_mine():
             block = self._read_block()
-            if len(block):
+            turn_s = self._turn()  # after the read: a stamp tells when a sample was read, not how long it had waited
+            if self._was_away(turn_s):
+                self._start_afresh(turn_s, len(block))
+            elif len(block):
                 self._publish(block)
-            elif self.recover and self._age_s() > self._stale_after_s:
+            elif self.recover and min(self._age_s(), self._settled_s()) > self._stale_after_s:
                 raise self._stale(self._age_s())
+
+    def _turn(self) -> float:
+        """Return how long ago this was called last; the time this computer has slept counts."""
+        before_s, self._turn_s = self._turn_s, awake_s()
+        return self._turn_s - before_s
+
+    def _was_away(self, turn_s: float) -> bool:
+        return turn_s > max(_AWAY_S, self._stale_after_s)
+
+    def _start_afresh(self, away_s: float, rows: int) -> None:
+        """Forget `rows` samples just read, and all that waits, after nobody has read for a while."""
+        with self._news:
+            self._pauses += 1
+            self._is_back = False
+            self._pause = f"nobody read for {away_s:.2f} s: this program or computer was suspended or too busy"
+            self._note(f"{self._pause}; what had piled up is thrown away")
+            self._news.notify_all()
+        self._earlier_lost += rows
+        self._discard_backlog()
+        with self._news:
+            self._fresh_from_ns = time.monotonic_ns()
+            self._same_rows = self._rate_since_ns = 0
 
     def _reconnect(self, cause: Exception) -> None:
         """Connect again to the same device; the first sample that comes then ends the failure."""
@@ -332,7 +395,7 @@ class StreamingSensor(ForceTorqueSensor):
             raise ConnectError(f"{self.name}: {info} answers where {self._info} was; open it again if that is meant")
         with self._news:
             self._start_watching()
-            self._newest_ns = time.monotonic_ns()  # silence is judged anew
+            self._newest_ns, self._heard_s = time.monotonic_ns(), awake_s()  # silence is judged anew
             self._reconnects += 1
             self._note("connected again")
 
@@ -350,12 +413,17 @@ class StreamingSensor(ForceTorqueSensor):
             block = self._newer_rows(block)
             if not len(block):
                 return
+            # the earlier look at the one clock, the later at the other: a pause between them makes it older, not newer
+            heard_s = self._turn_s - (time.monotonic_ns() - int(block.t_host_ns[-1])) / 1e9
+            block = self._fresh_rows(block, heard_s)
+            if not len(block):
+                return
             t_ns = int(block.t_host_ns[-1])
             self._judge_wrench(block)
-            self._judge_clock(block.t_device_s, t_ns)
             self._judge_rate(len(block), t_ns)
-            if self._received and t_ns - self._newest_ns > self._stale_after_s * 1e9:
+            if self._received and heard_s - self._heard_s > self._stale_after_s:
                 self._silences += 1
+            self._heard_s, self._is_back = heard_s, True
             self._received += len(block)
             self._arrivals.append((t_ns, len(block)))
             while self._arrivals[0][0] < t_ns - 1_000_000_000:
@@ -397,25 +465,45 @@ class StreamingSensor(ForceTorqueSensor):
         else:
             self._same_rows += len(block)
         same_s = (int(block.t_host_ns[-1]) - self._same_since_ns) / 1e9
-        if self._same_rows >= _FROZEN_SAMPLES and same_s >= _FROZEN_S:
+        fewest, most = _FROZEN_SAMPLES
+        enough = most if math.isnan(self._nominal_Hz) else min(most, max(fewest, _FROZEN_S * self._nominal_Hz))
+        if self._same_rows >= enough and same_s >= _FROZEN_S:
             raise DeviceFault(
                 f"{self.name}: frozen, {self._same_rows} identical samples in {same_s:.2f} s, and a sensor that "
                 "measures has noise; power it off and on"
             )
 
-    def _judge_clock(self, t_device_s: np.ndarray[tuple[int], np.dtype[np.float64]], t_host_ns: int) -> None:
-        """Raise when the device's clock goes back, or gains on ours in a step. Only durations are compared."""
+    def _fresh_rows(self, block: FtSamples, heard_s: float) -> FtSamples:
+        """Drop what was measured too long ago: it has waited in this computer, in the device or on its way."""
+        late_s = self._judge_clock(block.t_device_s, heard_s)
+        is_late = bool(late_s[-1] > self._stale_after_s)
+        if is_late and not self._is_late:
+            self._note(f"samples come {late_s[-1]:.2f} s late and are thrown away")
+        self._is_late = is_late
+        fresh = (block.t_host_ns >= self._fresh_from_ns) & (late_s <= self._stale_after_s)
+        if fresh.all():
+            return block
+        self._earlier_lost += int((~fresh).sum())
+        return _rows(block, fresh)
+
+    def _judge_clock(self, t_device_s: Array, heard_s: float) -> Array:
+        """Return how late each sample is, compared with the quickest so far; 0 where the device tells no time.
+
+        Raises when the device's clock goes back, or gains on ours in a step. Only durations are compared.
+        """
         newest_s = float(t_device_s[-1])
         if math.isnan(newest_s):
-            return
+            return np.zeros(len(t_device_s))
         if self._clock is None:
-            self._clock = newest_s, t_host_ns
-            before_s = float(t_device_s[0])
-        else:
-            before_s = float(self._newest.t_device_s[-1])
-        lead_s = (newest_s - self._clock[0]) - (t_host_ns - self._clock[1]) / 1e9
+            self._clock = newest_s, heard_s
+            self._clock_newest = float(t_device_s[0]), heard_s
+        before_s, heard_before_s = self._clock_newest
+        self._clock_newest = newest_s, heard_s
+        leads_s = (t_device_s - self._clock[0]) - (heard_s - self._clock[1])
+        lead_s = float(leads_s[-1])
         step_s = lead_s - self._lead_s
-        self._lead_s = max(self._lead_s, lead_s)
+        # a clock slower than ours falls behind for ever, and its samples are not late
+        self._lead_s = max(lead_s, self._lead_s - _CLOCK_DRIFT * (heard_s - heard_before_s))
         back_s = -float(np.diff(t_device_s, prepend=before_s).min())
         if back_s > 0:
             raise StreamBroken(
@@ -426,10 +514,11 @@ class StreamingSensor(ForceTorqueSensor):
             raise StreamBroken(
                 f"{self.name}: the device's clock jumped ahead by {step_s:.3f} s to {newest_s:.3f} s; open it again"
             )
+        return self._lead_s - leads_s
 
     def _judge_rate(self, samples: int, t_host_ns: int) -> None:
-        """Say once that the rate is not what the device says."""
-        if math.isnan(self._nominal_Hz) or self._rate_warned:
+        """Say that the rate is not what the device says, and when it is again."""
+        if math.isnan(self._nominal_Hz):
             return
         self._rate_samples += samples
         if not self._rate_since_ns:
@@ -439,8 +528,12 @@ class StreamingSensor(ForceTorqueSensor):
             return
         rate_Hz = self._rate_samples / elapsed_s
         self._rate_since_ns, self._rate_samples = t_host_ns, 0
-        if abs(rate_Hz / self._nominal_Hz - 1) > _RATE_TOLERANCE:
-            self._rate_warned = True
+        error = abs(rate_Hz / self._nominal_Hz - 1)
+        if self._rate_is_wrong and error < _RATE_TOLERANCE / 2:
+            self._rate_is_wrong = False
+            self._note(f"rate {rate_Hz:.1f} Hz, right again")
+        elif not self._rate_is_wrong and error > _RATE_TOLERANCE:
+            self._rate_is_wrong = True
             self._note(f"rate {rate_Hz:.1f} Hz instead of {self._nominal_Hz:g} Hz")
             log.warning(
                 "%s: %.1f Hz instead of %g Hz; samples are lost or the sensor is set differently, look at health()",
@@ -465,12 +558,17 @@ class StreamingSensor(ForceTorqueSensor):
                 raise ConnectError(f"{self.name}: {reason}") from self._failure
 
     def _age_s(self) -> float:
-        return (time.monotonic_ns() - self._newest_ns) / 1e9
+        return awake_s() - self._heard_s
+
+    def _settled_s(self) -> float:
+        """How long ago the last pause was over."""
+        return (time.monotonic_ns() - self._fresh_from_ns) / 1e9
 
     def _stale(self, age_s: float) -> DeviceTimeout:
-        return DeviceTimeout(
-            f"{self.name}: silent for {age_s:.3f} s (allowed: {self._stale_after_s:g} s); check cable and supply"
-        )
+        hint = "check cable and supply"
+        if self._was_away(awake_s() - self._turn_s) or not self._is_back:
+            hint = "nobody read, for this program or computer was suspended or too busy: try again"
+        return DeviceTimeout(f"{self.name}: silent for {age_s:.3f} s (allowed: {self._stale_after_s:g} s); {hint}")
 
     def _raise_failure(self) -> None:
         if self._failure is not None:

@@ -86,7 +86,7 @@ class Health:
 
     received: int
     lost: int
-    """Samples the device sent, or was asked for, that never arrived."""
+    """Samples the device sent, or was asked for, that never arrived, or too late to be new."""
     malformed: int
     """Frames that arrived damaged and were thrown away."""
     rate_Hz: float
@@ -98,13 +98,14 @@ class Health:
     out_of_order: int = 0
     """Samples that came after a newer one and were thrown away; `lost` counts them too."""
     stale: int = 0
-    """Silences longer than the stream allows, after which samples came again."""
+    """Silences longer than the stream allows, also while nobody read, after which samples came again."""
     reconnects: int = 0
     """Interruptions the driver has mended by itself; only where `recover` was asked for."""
     nominal_rate_Hz: float = math.nan
     """What the device says or documents about its rate; NaN where it does not."""
     events: tuple[tuple[int, str], ...] = ()
-    """(`t_host_ns`, what happened): interruptions, reconnections, a wrong rate. A recording stores them."""
+    """(`t_host_ns`, what happened): interruptions, reconnections, pauses in which nobody read, late samples, a wrong
+    rate and when it was right again. A recording stores them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -158,6 +158,12 @@ class AtiSerialSensor(StreamingSensor):
             status=np.full(n, self._status, np.uint32),
         )
 
+    def _discard_backlog(self) -> None:
+        """The port has overflowed, and there is no telling where a record begins: it is a slip."""
+        self._buffer.clear()
+        self._slipped = True
+        self._last_good_ns = self._last_good_ns or self._newest_ns
+
     def _look_at_status(self, t_host_ns: int) -> None:
         """Stop and read the status, as the error bit of a record asks; the sum does not cover it: it may be damage."""
         self._status = self._stop_stream()

@@ -13,7 +13,6 @@ import contextlib
 import logging
 import socket
 import struct
-import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -23,6 +22,7 @@ from itertools import accumulate, pairwise
 from types import MappingProxyType
 from typing import Final
 
+from drivers._stream import awake_s
 from drivers.errors import ConnectError, DeviceTimeout, DriverError, ProtocolError, StreamBroken
 
 log = logging.getLogger(__name__)
@@ -269,20 +269,13 @@ def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float) -> 
     return [name for name, kind in zip(names, recipe.types, strict=False) if kind == "IN_USE"]
 
 
-def _awake_s() -> float:
-    """Seconds of a clock that goes on while the computer sleeps, where there is one."""
-    if sys.platform == "linux":
-        return time.clock_gettime(time.CLOCK_BOOTTIME)
-    return time.monotonic()
-
-
 @dataclass(frozen=True, slots=True)
 class Sample:
     """What the controller told once."""
 
     t_host_ns: int
     t_awake_s: float
-    """When it came, by `_awake_s`."""
+    """When it came, by `awake_s`."""
     t_device_s: float
     outputs: Mapping[str, tuple[float, ...]]
 
@@ -365,7 +358,7 @@ class LiveReader:
 
     def live(self, *, max_age_s: float, limit_s: float) -> Sample:
         """Return the last sample that was new when it came, if that is `max_age_s` ago or less. Raises as `now_s`."""
-        oldest_s = _awake_s() - max_age_s
+        oldest_s = awake_s() - max_age_s
         return self._wait(
             lambda: self._live if self._live is not None and self._live.t_awake_s >= oldest_s else None, limit_s
         )
@@ -397,9 +390,9 @@ class LiveReader:
         """Follow the stream until it ends; what ended it is raised to whoever asks."""
         try:
             while True:
-                t0 = _awake_s()
+                t0 = awake_s()
                 outputs = dict(zip(self._names, stream.read(None), strict=True))
-                now_s = _awake_s()
+                now_s = awake_s()
                 with self._changed:
                     self._newest = Sample(time.monotonic_ns(), now_s, outputs["timestamp"][0], outputs)
                     if self._live_s[0] <= now_s - t0 <= self._live_s[1]:

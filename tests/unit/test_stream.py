@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers import _stream
 from drivers._stream import NOTHING, StreamingSensor
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, FtSamples
@@ -311,6 +312,12 @@ def block(seq: list[int], *, wrench: float | None = None, t_device_s: float = np
     )
 
 
+def at(t_s: float, seq: list[int], *, wrench: float | None = None, t_device_s: float = np.nan) -> FtSamples:
+    """Samples that come `t_s` from now."""
+    made = block(seq, wrench=wrench, t_device_s=t_device_s)
+    return replace(made, t_host_ns=made.t_host_ns + round(t_s * 1e9))
+
+
 def wait_for(condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + 5.0
     while not condition():
@@ -372,6 +379,72 @@ def test_few_identical_samples_or_a_short_while_are_not_frozen() -> None:
         sensor.check()
 
 
+@pytest.mark.parametrize(("nominal_Hz", "enough"), [(7000.0, 50), (200.0, 40), (100.0, 20), (10.0, 20), (np.nan, 50)])
+def test_how_many_identical_samples_are_enough_depends_on_the_rate(nominal_Hz: float, enough: int) -> None:
+    with FakeSensor(stale_after_s=1.0) as sensor:
+        sensor._nominal_Hz = nominal_Hz
+        frozen = [at(0.011 * number, [10 + number], wrench=3.0) for number in range(enough)]
+        for made in frozen[:-1]:
+            sensor.feed.put(made)
+        sensor.await_received(enough)
+        sensor.check()
+        sensor.feed.put(frozen[-1])
+        wait_for(lambda: failure_of(sensor) is DeviceFault)
+
+
+def test_what_has_piled_up_while_the_computer_slept_is_never_delivered(monkeypatch: pytest.MonkeyPatch) -> None:
+    asleep_s = [0.0]
+    awake_s = _stream.awake_s
+    monkeypatch.setattr(_stream, "awake_s", lambda: awake_s() + asleep_s[0])
+    with FakeSensor(stale_after_s=0.3) as sensor:
+        told: list[Exception] = []
+
+        def collect() -> None:
+            try:
+                sensor.collect(5.0)
+            except DeviceTimeout as exc:
+                told.append(exc)
+
+        feeder = feeding(sensor, 200, 1)
+        collecting = threading.Thread(target=collect)
+        collecting.start()
+        wait_for(lambda: sensor.health().received > 10)
+        asleep_s[0] = 3600.0
+        for _ in range(1000):
+            sensor.feed.put(1)
+        newest = sensor.latest(timeout_s=2.0)
+        assert newest.seq[0] > 1000
+        samples = sensor.collect(0.1)
+        assert 5 < len(samples) < 100
+        collecting.join()
+        feeder.join()
+        wait_for(lambda: sensor.health().lost + sensor.health().received == sensor.seq == 1 + 1000 + 200)
+        health = sensor.health()
+    assert "suspended" in str(told)
+    assert health.stale == 1
+    (event,) = health.events
+    assert "nobody read for 3600" in event[1]
+
+
+def test_samples_that_were_long_on_their_way_are_dropped_and_told(sensor: FakeSensor) -> None:
+    sensor.feed.put(at(0.0, [5], t_device_s=10.0))
+    for number in range(1, 11):  # all at once, half a second later
+        sensor.feed.put(at(0.5, [5 + number], t_device_s=10 + 0.01 * number))
+    sensor.feed.put(at(0.501, [60], t_device_s=10.48))
+    sensor.await_received(3)
+    health = sensor.health()
+    assert int(sensor.latest(timeout_s=0.1).seq[0]) == 60
+    assert health.lost == 10
+    assert [what for _, what in health.events] == ["samples come 0.48 s late and are thrown away"]
+
+
+def test_a_device_clock_that_is_a_hundredth_slow_is_not_late(sensor: FakeSensor) -> None:
+    for number in range(200):
+        sensor.feed.put(at(float(number), [5 + number], t_device_s=10 + 0.99 * number))
+    sensor.await_received(201)
+    assert sensor.health().events == ()
+
+
 @pytest.mark.parametrize(
     ("clock", "says"),
     [
@@ -412,6 +485,19 @@ def test_a_rate_off_by_more_than_a_tenth_is_said_once(caplog: pytest.LogCaptureF
         assert caplog.text.count(f"instead of {nominal_Hz:g} Hz; samples are lost") == said
         assert [what for _, what in health.events] == ["rate 200.0 Hz instead of 1000 Hz"] * said
         assert health.nominal_rate_Hz == nominal_Hz
+
+
+def test_a_rate_that_is_right_again_is_said_and_so_is_the_next_wrong_one() -> None:
+    with FakeSensor(stale_after_s=1.0) as sensor:
+        sensor._nominal_Hz = 200.0
+        t_s, seq = 0.0, 5
+        for rate_Hz in (100.0, 200.0, 100.0):
+            for _ in range(round(4.5 * rate_Hz)):
+                t_s, seq = t_s + 1 / rate_Hz, seq + 1
+                sensor.feed.put(at(t_s, [seq]))
+        sensor.await_received(1 + seq - 5)
+        told = ["again" in what for _, what in sensor.health().events]
+    assert told == [False, True, False]
 
 
 def test_silences_are_counted(sensor: FakeSensor) -> None:
