@@ -315,7 +315,7 @@ def belonging(result: CalibrationResult, serials: Mapping[str, str]) -> Belongin
             why = (
                 "it was made with told no serial number" if told == NOT_REPORTED else "connected tells no serial number"
             )
-            unknown.append(f"whether it is of this {role} cannot be checked, because the {role} {why}")
+            unknown.append(f"whether the calibration is of this {role} cannot be checked: the {role} {why}")
         elif told != found:
             others.append(f"the calibration was made with the {role} {told}, but the {role} {found} is connected")
     return Belonging(tuple(others), tuple(unknown))
