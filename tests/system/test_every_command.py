@@ -30,6 +30,8 @@ def names(command: click.Command, path: tuple[str, ...] = ()) -> Iterator[str]:
         yield from names(child, (*path, name))
 
 
+STREAM_FAILED = 4
+
 NEEDED: Mapping[str, tuple[str, ...]] = {
     "init": ("--yes", "--height", "33", "--tool", "0:60:90"),
     "calibrate": ("--minimal", "--yes"),
@@ -58,7 +60,10 @@ SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
 
 @pytest.mark.parametrize("command", list(names(cli)))
 def test_every_command_works_with_simulate_and_json(command: str, ftdrive: CommandLine) -> None:
-    outcome = ftdrive.run(*command.split(), *NEEDED.get(command, ()), "--simulate", "--json")
+    arguments = (*command.split(), *NEEDED.get(command, ()), "--simulate", "--json")
+    outcome = ftdrive.run(*arguments)
+    if outcome.returncode == STREAM_FAILED:  # where much else runs, an emulated sensor may get no time for 0.3 s
+        outcome = ftdrive.run(*arguments)
     assert outcome.returncode == 0, outcome.stderr
     assert "Exception" not in outcome.stderr
     *events, answer = map(json.loads, outcome.stdout.splitlines())
