@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, urlencode, urlsplit
 
 from ftdrive.config import CellConfig
 
@@ -75,6 +75,16 @@ class SensorAddress:
         return self.address if on_socketcan else None
 
     @property
+    def place(self) -> str | None:
+        """What `ftdrive devices --probe` takes to ask who is there; None where it cannot."""
+        if not self.scheme.endswith("-can"):
+            return None if self.serial_port is None else str(self.serial_port)
+        base = {key: self.options[key] for key in ("base",) if key in self.options}
+        if self.serial_port is not None:
+            return f"slcan://{self.address}?{urlencode({'bitrate': self.bitrate} | base)}"
+        return f"socketcan://{self.address}?{urlencode(base)}" if self.can_interface and base else self.can_interface
+
+    @property
     def bitrate(self) -> int:
         """Bit/s its bus must have."""
         if self.scheme == "robotous-can":
@@ -126,17 +136,19 @@ def check_serial_port(port: Path, *, sys: Path = SYS, dev: Path = DEV) -> list[C
     if not dev.is_dir():
         return [Check("permissions.port", "skipped", f"not applicable: {port} has no file on this system")]
     if not port.exists():
-        return [Check("permissions.port", "failed", f"there is no {port}", "plug it in; ftdrive devices")]
+        return [
+            Check("permissions.port", "failed", f"there is no {port}", "plug it in; ftdrive devices lists the ports")
+        ]
     real = Path(os.path.realpath(port))
     checks = [_check_access(port)]
-    names = {Path(os.path.realpath(link)): link for link in _links(dev / "serial" / "by-id")}
-    if port in names.values():
-        checks.append(Check("permissions.by-id", "ok", "the name survives replugging"))
-    elif real in names:
-        found = f"{port} may be another device after replugging"
-        checks.append(Check("permissions.by-id", "warning", found, f"write {names[real]} in the sensor's address"))
-    else:
+    name = name_by_id(port, dev=dev)
+    if name is None:
         checks.append(Check("permissions.by-id", "skipped", "not applicable: the port has no name by id"))
+    elif port.parent == name.parent:
+        checks.append(Check("permissions.by-id", "ok", "the name survives replugging"))
+    else:
+        found = f"{port} may be another device after replugging"
+        checks.append(Check("permissions.by-id", "warning", found, f"write {name} in the sensor's address"))
     timer = sys / "bus" / "usb-serial" / "devices" / real.name / "latency_timer"
     if not timer.exists():
         checks.append(Check("permissions.latency_timer", "skipped", "not applicable: the port has no latency timer"))
@@ -152,6 +164,13 @@ def check_serial_port(port: Path, *, sys: Path = SYS, dev: Path = DEV) -> list[C
         )
     )
     return checks
+
+
+def name_by_id(port: Path, *, dev: Path = DEV) -> Path | None:
+    """Find the name of a serial port that survives replugging; None where it has none."""
+    by_id, real = dev / "serial" / "by-id", os.path.realpath(port)
+    links = sorted(by_id.iterdir()) if by_id.is_dir() else []
+    return next((link for link in links if os.path.realpath(link) == real), None)
 
 
 def latency_command(tty: str) -> str:
@@ -172,8 +191,18 @@ def _check_access(port: Path) -> Check:
     if info.st_mode & stat.S_IRGRP and info.st_mode & stat.S_IWGRP and group != "root":
         fix = f"sudo usermod -aG {group} $USER    (then log out and in again)"
     else:
-        fix = f"a udev rule that gives {port} to the group dialout; until the next plugging: sudo chmod a+rw {port}"
+        install = _udev_command(Path(os.path.realpath(port)).name)
+        fix = f"{install}    (then log out and in again; until the next plugging: sudo chmod a+rw {port})"
     return Check("permissions.port", "failed", f"{port} may not be read and written", fix)
+
+
+def _udev_command(tty: str) -> str:
+    """Say how to install a rule that gives ports of this kind to the group dialout, and to join it."""
+    rule = f'SUBSYSTEM=="tty", KERNEL=="{tty.rstrip("0123456789")}[0-9]*", GROUP="dialout", MODE="0660"'
+    return (
+        f"echo '{rule}' | sudo tee /etc/udev/rules.d/60-ftdrive.rules && sudo udevadm control --reload && "
+        "sudo udevadm trigger --subsystem-match=tty && sudo usermod -aG dialout $USER"
+    )
 
 
 def can_interfaces(sys: Path = SYS) -> list[str]:
@@ -233,7 +262,3 @@ def check_can_interface(interface: str, bitrate: int, details: Mapping[str, Any]
     if state in {"ERROR-WARNING", "ERROR-PASSIVE"}:
         return Check(name, "warning", f"{interface} is up, {rate}, {state}", "check wiring and termination of the bus")
     return Check(name, "ok", f"{interface} is up, {rate}, {state}")
-
-
-def _links(folder: Path) -> list[Path]:
-    return sorted(folder.iterdir()) if folder.is_dir() else []

@@ -142,12 +142,25 @@ def load(config: Path | None = None, flags: Mapping[str, Flag] | None = None, *,
     return cell_of(settings(config, flags), devices=devices)
 
 
-def settings(config: Path | None = None, flags: Mapping[str, Flag] | None = None) -> dict[str, Setting]:
-    """Every key, such as "robot.host", with its value and where it comes from; parameters and errors as `load`."""
+def settings(
+    config: Path | None = None, flags: Mapping[str, Flag] | None = None, *, cell: CellConfig | None = None
+) -> dict[str, Setting]:
+    """Every key, such as "robot.host", with its value and where it comes from; errors as `load`.
+
+    Parameters
+    ----------
+    config, flags
+        As in `load`.
+    cell : CellConfig, optional
+        An emulated one, which counts in place of all files and variables.
+    """
     found: dict[str, Setting] = {}
-    for path in _files(config):
-        found |= _from_file(path)
-    found |= _from_environment()
+    if cell is not None:
+        found = _from_cell(cell)
+    else:
+        for path in _files(config):
+            found |= _from_file(path)
+        found |= _from_environment()
     for key, (option, value) in (flags or {}).items():
         if value is not None:
             found[key] = Setting(checked(option, key, value), option)
@@ -202,6 +215,11 @@ def _files(config: Path | None) -> list[Path]:
     if config is None:
         return found
     return [*(path for path in found if path == user_file()), config]
+
+
+def _from_cell(cell: CellConfig) -> dict[str, Setting]:
+    values = {key: getattr(getattr(cell, section), name) for key in _KEYS for section, name in [key.split(".")]}
+    return {key: Setting(value, "emulated cell") for key, value in values.items() if value is not None}
 
 
 def _from_file(path: Path) -> dict[str, Setting]:

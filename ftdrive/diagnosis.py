@@ -1,7 +1,10 @@
 """What `doctor` says of the devices, as functions of what was seen; nothing here opens one."""
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from socket import gaierror
 from types import MappingProxyType
 from typing import Any
 
@@ -11,12 +14,18 @@ from numpy.typing import NDArray
 from calib import CalibrationResult
 from calib.design import Guess, predicted_sigma, special
 from calib.noise import is_stationary, mean_and_covariance
-from drivers.interfaces import ArmStatus, DeviceInfo, Fact, FtSamples, Health
+from drivers.errors import ConnectError, DeviceFault, DriverError, ProtocolError
+from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
+from drivers.ur.kinematics import MODELS
 from ftdrive.checks import Check, SensorAddress, State, latency_command
 
 Array = NDArray[np.float64]
 
 _PUSH_N = 2.0
+_SERVICES = "Settings, Security, Services"
+_SLOWEST_SLIDER = 0.05
+_OLDEST_MINOR = 4
+"""Of PolyScope 3 and 5: ur_rtde cannot control older ones."""
 # ---------------------------------------------------------------------------------------------------------- the sensor
 
 
@@ -69,6 +78,28 @@ def _check_sign(fact: Fact | None) -> Check:
     if fact is None:
         return Check("sensor.sign", "ok", "the driver does not tell its sign")
     return Check("sensor.sign", "ok", f"sign {fact.value}, {_SAYS[fact.source]}; --push shows whether it is right")
+
+
+def check_sensor_error(name: str, error: DriverError, address: SensorAddress, permissions: Sequence[Check]) -> Check:
+    """Say what to do about the error of a sensor's driver: the port first, then the kind of error."""
+    wrong = next((check for check in permissions if check.state == "failed"), None)
+    kind = error.__cause__ if isinstance(error, ConnectError) and isinstance(error.__cause__, DriverError) else error
+    if wrong is not None and wrong.fix is not None and not isinstance(kind, DeviceFault):
+        cure = wrong.fix
+    elif isinstance(kind, DeviceFault):
+        cure = "take what loads it off, switch the sensor off and on, then ftdrive doctor again"
+    elif isinstance(kind, ProtocolError):
+        cure = f"switch the sensor off and on; is it the one its address names? {_ask_who(address)}"
+    else:
+        cure = f"check the sensor's supply and cable, then {_ask_who(address)}"
+    return Check(name, "failed", str(error), cure)
+
+
+def _ask_who(address: SensorAddress) -> str:
+    """Give the command that shows whether anybody answers there."""
+    if address.place is None:
+        return f"ping {address.address.partition('/')[0]}"
+    return f"ftdrive devices --probe {shlex.quote(address.place)}"
 
 
 def check_stream(samples: FtSamples, health: Health, address: SensorAddress, duration_s: float) -> list[Check]:
@@ -153,6 +184,56 @@ def check_noise(wrench: Array, duration_s: float, average_s: float, mass_kg: flo
 # ------------------------------------------------------------------------------------------------------------- the arm
 
 
+def found_and_cure(error: Exception, otherwise: str) -> tuple[str, str]:
+    """Split what an arm's driver says into what happened and what to do, which stands after the last colon."""
+    found, colon, cure = str(error).rstrip(".").rpartition(": ")
+    return (found, cure) if colon else (cure, otherwise)
+
+
+def check_unreachable(error: DriverError, host: str) -> Check:
+    """Say why an arm could not be opened, and what to do about just that."""
+    found, cure = found_and_cure(error, f"ping {host}")
+    if "cannot be reached" in found:
+        if isinstance(error.__cause__, ConnectionRefusedError):
+            cure = (
+                f"{host} is there and takes no RTDE: enable RTDE at the pendant under {_SERVICES}, if it is the robot"
+            )
+        elif isinstance(error.__cause__, gaierror):
+            cure = (
+                "write the controller's IPv4 address, at the pendant under Settings, System, Network, as [robot] host"
+            )
+        else:
+            cure = f"ping {host}"
+    elif "name the model" in cure:
+        cure = f'write model = "ur5e" under [robot] in ftdrive.toml, or give --model; it is one of {", ".join(MODELS)}'
+    elif "the dashboard server of" in found:
+        cure = f"enable the dashboard server at the pendant under {_SERVICES}; restart the controller if it is"
+    return Check("robot.reachable", "failed", found, cure)
+
+
+def check_arm(info: DeviceInfo) -> Check:
+    """Say who an arm is, and whether its PolyScope, such as "5.15.0.1261331", can be controlled."""
+    name, found = "robot.identity", f"{info.model}, serial {info.serial}, PolyScope {info.firmware}"
+    major, _, rest = info.firmware.partition(".")
+    minor = rest.partition(".")[0]
+    if minor.isdecimal() and int(minor) < _OLDEST_MINOR:
+        fix = f"update it to PolyScope {major}.{_OLDEST_MINOR} or later"
+        return Check(name, "failed", f"{found}, which ur_rtde can read and not control", fix)
+    return Check(name, "ok", found)
+
+
+def check_registers(taken: Sequence[str]) -> Check:
+    """Judge which of the RTDE registers that a control of ours needs belong to somebody else."""
+    name = "robot.registers"
+    if not taken:
+        return Check(name, "ok", "its RTDE registers are free: nobody else controls it")
+    fix = (
+        "end the other program that controls the arm, or disable EtherNet/IP and PROFINET at the pendant under "
+        "Installation, Fieldbus; after a cut cable wait for half a minute"
+    )
+    return Check(name, "failed", f"{len(taken)} RTDE registers are in use by another client, {taken[0]} first", fix)
+
+
 def check_status(status: ArmStatus) -> list[Check]:
     """Judge what the controller says of itself: may the arm move, does a program run, how fast, with what payload."""
     return [_check_safety(status), _check_program(status), _check_speed(status), _check_payload(status)]
@@ -177,6 +258,9 @@ def _check_program(status: ArmStatus) -> Check:
 
 def _check_speed(status: ArmStatus) -> Check:
     found = f"speed slider at {status.speed_slider:.0%}, the controller allows {status.speed_scaling:.0%}"
+    if status.speed_slider < _SLOWEST_SLIDER:
+        fix = "raise the speed slider at the pendant, to 100 % if nothing speaks against it: ftdrive never does"
+        return Check("robot.speed", "failed", f"{found}: the arm would hardly move", fix)
     return Check("robot.speed", "ok", found)
 
 
@@ -211,20 +295,43 @@ def check_clock(t_host_ns: Sequence[int], t_device_s: Sequence[float]) -> Check:
     return Check("clock.pace", "warning", found, "close other programs on this computer; look at the network's load")
 
 
-def check_calibration(result: CalibrationResult, serials: Mapping[str, str]) -> Check:
-    """See whether a calibration belongs to the devices that are connected."""
-    made_with = result.provenance.get("devices") or {}
+@dataclass(frozen=True, slots=True)
+class Belonging:
+    """What speaks against a calibration being of the devices that are connected, in words."""
+
+    others: tuple[str, ...]
+    """It was made with another one."""
+    unknown: tuple[str, ...]
+    """Cannot be told, because a serial number is not known."""
+
+
+def belonging(result: CalibrationResult, serials: Mapping[str, str]) -> Belonging:
+    """Compare the devices a calibration was made with and those that are connected, by role."""
+    made_with = result.provenance.get("devices")
+    others, unknown = [], []
     for role, found in serials.items():
-        told = made_with.get(role, {}).get("serial") if isinstance(made_with, Mapping) else None
-        if told is not None and told != found:
-            return Check(
-                "calibration.devices",
-                "failed",
-                f"it belongs to {role} {told}, connected is {role} {found}",
-                "ftdrive calibrate",
+        told = made_with.get(role, {}).get("serial", NOT_REPORTED) if isinstance(made_with, Mapping) else NOT_REPORTED
+        if NOT_REPORTED in {told, found}:
+            why = (
+                "it was made with told no serial number" if told == NOT_REPORTED else "connected tells no serial number"
             )
-    made = result.provenance.get("created_utc", "an unknown time")
-    return Check("calibration.devices", "ok", f"verdict {result.verdict}, made at {made}, with these devices")
+            unknown.append(f"whether the calibration is of this {role} cannot be checked: the {role} {why}")
+        elif told != found:
+            others.append(f"the calibration was made with the {role} {told}, but the {role} {found} is connected")
+    return Belonging(tuple(others), tuple(unknown))
+
+
+def check_calibration(result: CalibrationResult, serials: Mapping[str, str]) -> Check:
+    """See whether a calibration belongs to the devices that are connected, as far as any are."""
+    name = "calibration.devices"
+    belongs = belonging(result, serials)
+    if belongs.others:
+        return Check(name, "failed", "; ".join(belongs.others), "ftdrive calibrate")
+    made = f"verdict {result.verdict}, made at {result.provenance.get('created_utc', 'an unknown time')}"
+    if belongs.unknown:
+        fix = "add serial=… (its label) to the sensor's address, and calibrate with it once"
+        return Check(name, "warning", f"{made}; {'; '.join(belongs.unknown)}", fix)
+    return Check(name, "ok", f"{made}, with these devices" if serials else f"{made}; no device to compare with")
 
 
 def check_push(

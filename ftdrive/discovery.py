@@ -1,6 +1,5 @@
 """What answers at an address, and where a sensor may be. Robots and sensors are read, never changed or moved."""
 
-import os
 from contextlib import closing
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -14,7 +13,14 @@ from drivers.registry import Options
 from drivers.ur.kinematics import model_named
 from drivers.ur.library import ask_dashboard
 from drivers.ur.reading import CONNECT_S, Reader
-from ftdrive.checks import DEV, Check, can_details, can_interfaces, check_can_interface, check_serial_port
+from ftdrive.checks import (
+    Check,
+    can_details,
+    can_interfaces,
+    check_can_interface,
+    check_serial_port,
+    name_by_id,
+)
 from ftdrive.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.errors import ConfigError
 from ftdrive.wiring import build_sensor
@@ -116,7 +122,5 @@ def _must_pass(checks: list[Check]) -> None:
 
 def places() -> list[str]:
     """List where a sensor may be: CAN interfaces of the kernel, and serial ports on USB by id."""
-    by_id = DEV / "serial" / "by-id"
-    links = {os.path.realpath(link): str(link) for link in by_id.iterdir()} if by_id.is_dir() else {}
     ports = sorted(port.device for port in list_ports.comports() if port.vid is not None)
-    return can_interfaces() + [links.get(os.path.realpath(port), port) for port in ports]
+    return can_interfaces() + [str(name_by_id(Path(port)) or port) for port in ports]

@@ -4,6 +4,8 @@ import atexit
 import json
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, Self
@@ -31,6 +33,7 @@ EMULATED = "emulated://"
 
 PAYLOAD_KG = 1.5
 """What its controller is told about the tool, as somebody should have."""
+_CONNECTIONS_END_S = 3.0
 TOOL_MM = (0.0, 200.0, 100.0)
 
 
@@ -64,6 +67,7 @@ class Station:
         if self._process is None:
             return
         process, self._process = self._process, None
+        _let_connections_end()
         try:
             process.communicate(timeout=3)  # closes its stdin, which ends it
         except subprocess.TimeoutExpired:
@@ -114,6 +118,14 @@ class Station:
         )
 
 
+def _let_connections_end() -> None:
+    """Wait for what drivers do after `close`: ur_rtde says on stderr that its controller is gone, if that is first."""
+    deadline = time.monotonic() + _CONNECTIONS_END_S
+    for thread in threading.enumerate():
+        if thread.name.startswith("ur-rtde"):
+            thread.join(max(0.0, deadline - time.monotonic()))
+
+
 def sensor_url(url: str) -> str:
     """Return the address a driver understands: for emulated://NAME that of a sensor which is started for it.
 
@@ -131,7 +143,8 @@ def sensor_name(url: str | None) -> str:
     """Return the name in emulated://NAME; the first one where none is named. Raises `ConfigError`."""
     name = (url or EMULATED).removeprefix(EMULATED) or next(iter(SENSORS))
     if name not in SENSORS:
-        raise ConfigError(f"{url}: there is no such emulated sensor; known: {', '.join(EMULATED + n for n in SENSORS)}")
+        known = ", ".join(EMULATED + name for name in SENSORS)
+        raise ConfigError(f"{url} is no emulated sensor: leave --sensor out, or give one of {known}")
     return name
 
 

@@ -1,15 +1,17 @@
 """What several commands share: options, JSON on stdout."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 if TYPE_CHECKING:
     from calib import CalibrationResult
     from ftdrive.config import CellConfig
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 RUNS = click.option(
@@ -26,6 +28,29 @@ CONFIG = click.option(
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help="The cell, in TOML, in place of ftdrive.toml here.",
 )
+
+
+def simulate(words: str = "An emulated cell; --sensor emulated://NAME chooses its sensor.") -> Callable[[F], F]:
+    """Make the option --simulate, which every command has."""
+    return click.option("--simulate", is_flag=True, help=words)
+
+
+EMULATED_SENSOR = click.option("--sensor", metavar="emulated://NAME", help="With --simulate: the sensor it has.")
+
+
+def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated: Mapping[str, object] = {}) -> None:
+    """Raise `ConfigError` for an option, by name, that would be ignored.
+
+    Parameters
+    ----------
+    real, emulated : mapping
+        What goes only without, and only with --simulate; None, False and nothing at all were not given.
+    """
+    from ftdrive.errors import ConfigError
+
+    if said := [option for option, value in (real if simulate else emulated).items() if value]:
+        cure = "leave one of the two out" if simulate else "add --simulate, or leave it out"
+        raise ConfigError(f"{said[0]} {'does not go with' if simulate else 'goes only with'} --simulate: {cure}")
 
 
 def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> list[float]:
@@ -54,11 +79,12 @@ def write_json(value: Mapping[str, Any]) -> None:
     click.echo(json.dumps(value))
 
 
-def read_cell(config: Path | None, robot: str | None, sensor: str | None) -> "CellConfig":
+def read_cell(config: Path | None, robot: str | None, sensor: str | None, *, model: str | None = None) -> "CellConfig":
     """Take the cell from options, environment and files, in this order of precedence."""
     from ftdrive.config import load
 
-    return load(config, {"robot.host": ("--robot", robot), "sensor.url": ("--sensor", sensor)})
+    flags = {"robot.host": ("--robot", robot), "robot.model": ("--model", model), "sensor.url": ("--sensor", sensor)}
+    return load(config, flags)
 
 
 def stop_unless_accepted(result: "CalibrationResult") -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from ftdrive.commands.common import JSON, write_json
+from ftdrive.commands.common import EMULATED_SENSOR, JSON, check_simulate, simulate, write_json
 
 
 @click.group()
@@ -21,8 +21,10 @@ def config() -> None:
     help="In place of ftdrive.toml here.",
 )
 @click.option("--origin", is_flag=True, help="Where each value comes from.")
+@simulate("Show that of an emulated cell, whose addresses end with this command.")
+@EMULATED_SENSOR
 @JSON
-def show(path: Path | None, origin: bool, as_json: bool) -> None:
+def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as_json: bool) -> None:
     """Print the configuration that counts, as a file that could be used in its place.
 
     An option of a command comes first, then the environment, then ftdrive.toml here, then the user's file, then the
@@ -30,7 +32,14 @@ def show(path: Path | None, origin: bool, as_json: bool) -> None:
     """
     from ftdrive.config import FORMAT, as_toml, settings
 
-    found = settings(path)
+    check_simulate(simulate, real={"--config": path}, emulated={"--sensor": sensor})
+    if simulate:
+        from ftdrive.simulation import Station, sensor_name
+
+        with Station(sensor_name(sensor)) as station:
+            found = settings(cell=station.cell)
+    else:
+        found = settings(path)
     if as_json:
         values: dict[str, dict[str, Any]] = {}
         origins: dict[str, dict[str, str]] = {}

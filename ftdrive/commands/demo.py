@@ -7,10 +7,8 @@ import click
 import numpy as np
 
 from ftdrive.commands.common import JSON, RUNS, stop_unless_accepted, write_json
+from ftdrive.rehearsal import rehearse
 from ftdrive.report import errors_in_sigma, print_result
-from ftdrive.screen import open_operator
-from ftdrive.session.guided import Options
-from ftdrive.session.guided import calibrate as guide
 from ftdrive.simulation import SENSORS, Station
 from ftdrive.talk import talk
 
@@ -18,6 +16,7 @@ from ftdrive.talk import talk
 @click.command()
 @click.option("--sensor", type=click.Choice(list(SENSORS)), default="can", show_default=True, help="Which one.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Draws the truth and the noise.")
+@click.option("--simulate", is_flag=True, expose_value=False, help="As every command has it; a demo always is.")
 @RUNS
 @JSON
 def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
@@ -31,17 +30,7 @@ def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
         talk.print(
             f"An emulated UR5e, {SENSORS[sensor]}, tool of {truth['mass_kg']:.3f} kg. Nothing real is connected."
         )
-        options = Options(
-            runs,
-            "demo",
-            real=False,
-            questions=False,
-            description={"station": {"sensor": sensor, "options": station.options, "truth": truth}},
-        )
-        with open_operator(yes=True) as operator:
-            outcome = guide(station.cell, operator, options)
-    if outcome is None:
-        raise RuntimeError("a demo is never a dry run")
+        outcome = rehearse(station, runs, "demo")
     if as_json:
         write_json(
             {

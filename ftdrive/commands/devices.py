@@ -1,6 +1,5 @@
 """`ftdrive devices`: which ports and buses this computer has, and on request which known sensors are there."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +8,8 @@ from rich.console import Console
 from rich.markup import escape
 from serial.tools import list_ports
 
-from ftdrive.checks import DEV, Check, can_details, can_interfaces, check_serial_port
-from ftdrive.commands.common import JSON, write_json
-from ftdrive.errors import ConfigError
+from ftdrive.checks import Check, can_details, can_interfaces, check_serial_port, name_by_id
+from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
 from ftdrive.simulation import Station
 
 _PLACES = """\b
@@ -25,7 +23,7 @@ A PLACE is
 @click.option(
     "--probe", "places", multiple=True, metavar="PLACE", help="Ask which known sensors are there; may be repeated."
 )
-@click.option("--simulate", is_flag=True, help="Show the ports of an emulated cell instead.")
+@simulate("Show the ports of an emulated cell instead.")
 @JSON
 def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
     """List serial ports by id and CAN interfaces, and known sensors that answer where you tell it to ask.
@@ -37,8 +35,7 @@ def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
     at 1 Mbit/s only. Where something else sends on the identifiers of a sensor, nothing is sent and you are told.
     A wrong bit rate disturbs a bus in use.
     """
-    if simulate and places:
-        raise ConfigError("an emulated cell has just its own ports: give either --simulate or --probe")
+    check_simulate(simulate, real={"--probe": places})
     found = _emulated() if simulate else {"serial": _serial_ports(), "can": _can_interfaces()}
     if places:
         found["answers"] = [answer for place in places for answer in _answers(place)]
@@ -49,16 +46,14 @@ def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
 
 
 def _serial_ports() -> list[dict[str, Any]]:
-    by_id = DEV / "serial" / "by-id"
-    links = {os.path.realpath(link): str(link) for link in by_id.iterdir()} if by_id.is_dir() else {}
     ports = []
     for port in sorted(list_ports.comports()):
-        name = links.get(os.path.realpath(port.device))
-        checks = check_serial_port(Path(name or port.device))
+        name = name_by_id(Path(port.device))
+        checks = check_serial_port(name or Path(port.device))
         ports.append(
             {
                 "port": port.device,
-                "by_id": name,
+                "by_id": None if name is None else str(name),
                 "description": None if port.description == "n/a" else port.description,
                 "usb": None if port.vid is None else f"{port.vid:04x}:{port.pid:04x}",
                 "serial_number": port.serial_number,

@@ -1,9 +1,12 @@
 """`ftdrive doctor`: is the cell connected, quiet and permitted? Nothing moves."""
 
+import socket
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +19,12 @@ from rich.markup import escape
 from calib import CalibrationResult
 from drivers.errors import DriverError
 from drivers.interfaces import ArmStatus, ForceTorqueSensor, RobotArm
+from drivers.ur.library import Dashboard, ask_dashboard
+from drivers.ur.reading import CONNECT_S
+from drivers.ur.rtde import CONTROL_REGISTERS, registers_in_use
 from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
-from ftdrive.commands.common import JSON, RUNS, read_cell, write_json
+from ftdrive.commands.common import JSON, RUNS, check_simulate, read_cell, simulate, write_json
 from ftdrive.config import CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.simulation import Station, sensor_name, sensor_url
@@ -26,12 +32,15 @@ from ftdrive.talk import talk
 from ftdrive.wiring import build_arm, build_sensor
 
 Array = NDArray[np.float64]
+Blame = Callable[[str, DriverError], Check]
+"""From the name of a check and the error of a sensor's driver."""
 
 _CLOCK_S = 1.0
 _LOOK_S = 2.0
 _PUSH_S = 3.0
 _PUSH_WINDOW_S = 0.2
 _SIMULATED_PUSH_N = 15.0
+_SCRIPT_PORT = 30003
 _MARK = {"ok": "[green]✔[/]", "warning": "[yellow]![/]", "failed": "[red]✘[/]", "skipped": "-"}
 
 
@@ -39,7 +48,8 @@ _MARK = {"ok": "[green]✔[/]", "warning": "[yellow]![/]", "failed": "[red]✘[/
 @click.option("--config", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="The cell, in TOML.")
 @click.option("--robot", metavar="HOST", help="Address of the controller.")
 @click.option("--sensor", metavar="URL", help="Such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0.")
-@click.option("--simulate", is_flag=True, help="An emulated cell; --sensor emulated://NAME chooses its sensor.")
+@click.option("--model", help="Of the arm, where the controller does not tell it (CB3, PolyScope before 5.6).")
+@simulate()
 @click.option(
     "--calibration", "path", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Does it fit? FILE."
 )
@@ -53,6 +63,7 @@ def doctor(
     config: Path | None,
     robot: str | None,
     sensor: str | None,
+    model: str | None,
     simulate: bool,
     path: Path | None,
     mass_kg: float,
@@ -64,18 +75,21 @@ def doctor(
 
     The arm is only read, nothing moves, no program is touched. Exit code 7 if a check fails.
     """
+    check_simulate(simulate, real={"--config": config, "--robot": robot, "--model": model})
     calibration = None if path is None else CalibrationResult.load(path)
     found: list[Check] = []
     pushed: dict[str, Any] | None = None
     with ExitStack() as stack:
         station = stack.enter_context(Station(sensor_name(sensor), ["--time-scale", "1"])) if simulate else None
-        cell = read_cell(config, robot, sensor) if station is None else station.cell
+        cell = read_cell(config, robot, sensor, model=model) if station is None else station.cell
         address = SensorAddress.of(sensor_url(cell.sensor.url))
         device = build_sensor(cell)
 
         arm = _examine_robot(cell, found, stack)
-        alive = _examine_sensor(device, address, cell, mass_kg, found, stack)
-        found += [checks.check_workcell(cell), *checks.check_disk(runs), *checks.check_permissions(address)]
+        permissions = checks.check_permissions(address)
+        blame = partial(diagnosis.check_sensor_error, address=address, permissions=permissions)
+        alive = _examine_sensor(device, address, cell, mass_kg, found, blame, stack)
+        found += [checks.check_workcell(cell), *checks.check_disk(runs), *permissions]
         if calibration is not None:
             serials = {"sensor": device.identify().serial} if alive else {}
             if arm is not None:
@@ -85,7 +99,9 @@ def doctor(
             R_flange_sensor = None if calibration is None else calibration.R_flange_sensor
             if station is not None and calibration is None:
                 R_flange_sensor = np.array(station.truth["R_flange_sensor"])
-            pushed = _examine_push(device if alive else None, arm, R_flange_sensor, cell.sensor.sign, station, found)
+            pushed = _examine_push(
+                device if alive else None, arm, R_flange_sensor, cell.sensor.sign, station, found, blame
+            )
     failed = [check.name for check in found if check.state == "failed"]
     if as_json:
         answer = {
@@ -106,20 +122,50 @@ def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> Ro
     try:
         arm.open()
         info, status = arm.identify(), arm.status()
+        answer_s = ask_dashboard(host, _answer_s, timeout_s=CONNECT_S)
     except DriverError as error:
-        found.append(Check("robot.reachable", "failed", str(error), f"ping {host}"))
+        found.append(diagnosis.check_unreachable(error, host))
         return None
-    found.append(Check("robot.reachable", "ok", f"{host} answers"))
-    found.append(Check("robot.identity", "ok", f"{info.model}, serial {info.serial}, PolyScope {info.firmware}"))
+    found.append(Check("robot.reachable", "ok", f"{host} answers in {1e3 * answer_s:.1f} ms"))
+    found.append(diagnosis.check_arm(info))
     try:
         found.append(diagnosis.check_remote(arm.in_remote_control()))
     except DriverError as error:
-        fix = "enable the dashboard server under Settings, Security, Services"
-        found.append(Check("robot.remote", "failed", str(error), fix))
+        found.append(replace(diagnosis.check_unreachable(error, host), name="robot.remote"))
+    found.append(_registers(host))
+    found.append(_script_port(host))
     found += diagnosis.check_status(status)
     found.append(_flange(arm, status))
     found.append(_clock(arm))
     return arm
+
+
+def _answer_s(dashboard: Dashboard) -> float:
+    """Measure a question and its answer."""
+    begun_s = time.perf_counter()
+    dashboard.polyscopeVersion()
+    return time.perf_counter() - begun_s
+
+
+def _registers(host: str) -> Check:
+    try:
+        return diagnosis.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=CONNECT_S))
+    except DriverError as error:
+        return Check("robot.registers", "failed", *diagnosis.found_and_cure(error, f"ping {host}"))
+
+
+def _script_port(host: str) -> Check:
+    """See whether the controller takes programs, without sending one."""
+    name = "robot.programs"
+    try:
+        socket.create_connection((host, _SCRIPT_PORT), timeout=CONNECT_S).close()
+    except OSError as error:
+        fix = (
+            "enable the real-time client interface at the pendant under Settings, Security, Services; look for a "
+            f"firewall that stops port {_SCRIPT_PORT}"
+        )
+        return Check(name, "failed", f"port {_SCRIPT_PORT}, which takes programs, cannot be reached ({error})", fix)
+    return Check(name, "ok", f"port {_SCRIPT_PORT}, which takes programs, is open")
 
 
 def _flange(arm: RobotArm, status: ArmStatus) -> Check:
@@ -129,7 +175,7 @@ def _flange(arm: RobotArm, status: ArmStatus) -> Check:
     try:
         p_mm = 1e3 * arm.state().p_base_flange_m
     except DriverError as error:
-        return Check(name, "failed", str(error))
+        return Check(name, "failed", *diagnosis.found_and_cure(error, "check the robot and the network"))
     where = ", ".join(f"{value:.0f}" for value in p_mm)
     return Check(name, "ok", f"TCP told; the flange is at ({where}) mm in base, where the model has it")
 
@@ -144,7 +190,7 @@ def _clock(arm: RobotArm) -> Check:
             host_ns.append(status.t_host_ns)
             device_s.append(status.t_device_s)
     except DriverError as error:
-        return Check("clock.pace", "failed", str(error))
+        return Check("clock.pace", "failed", *diagnosis.found_and_cure(error, "check the robot and the network"))
     return diagnosis.check_clock(host_ns, device_s)
 
 
@@ -154,6 +200,7 @@ def _examine_sensor(
     cell: CellConfig,
     mass_kg: float,
     found: list[Check],
+    blame: Blame,
     stack: ExitStack,
 ) -> bool:
     name = "sensor.identity"
@@ -164,8 +211,7 @@ def _examine_sensor(
         samples = device.collect(_LOOK_S)
         health = device.health()
     except DriverError as error:
-        fix = "see the permissions below; ftdrive devices lists the ports"
-        found.append(Check(name, "failed", str(error), fix))
+        found.append(blame(name, error))
         return False
     found += diagnosis.check_stream(samples, health, address, _LOOK_S)
     found += diagnosis.check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg)
@@ -179,6 +225,7 @@ def _examine_push(
     sign: int,
     station: Station | None,
     found: list[Check],
+    blame: Blame,
 ) -> dict[str, Any] | None:
     if device is None:
         found.append(Check("push.sign", "skipped", "the sensor does not measure"))
@@ -192,14 +239,17 @@ def _examine_push(
         with ExitStack() as stack:
             if station is None:
                 words = f"Push the tool along +X of the base, about 20 N; press Enter and hold for {_PUSH_S:.0f} s"
-                click.prompt(words, err=True, default="", show_default=False)
+                click.echo(words, err=True)
+                if not sys.stdin.readline():
+                    found.append(Check("push.sign", "skipped", "nobody is there to push: the standard input is closed"))
+                    return None
             elif R_base_flange is not None and R_flange_sensor is not None:
                 force = (R_base_flange @ R_flange_sensor).T @ [_SIMULATED_PUSH_N, 0.0, 0.0]
                 station.control(do="push", wrench=[*force.tolist(), 0.0, 0.0, 0.0])
                 stack.callback(station.control, do="push", wrench=[0.0] * 6)
             changes = [force - before for force in _means(device, _PUSH_S if station is None else 0.5)]
     except DriverError as error:
-        found.append(Check("push.sign", "failed", str(error)))
+        found.append(blame("push.sign", error))
         return None
     largest = max(changes, key=lambda change: float(np.linalg.norm(change)))
     check, moved = diagnosis.check_push(largest, R_base_flange, R_flange_sensor, sign)

@@ -1,8 +1,14 @@
 """`ftdrive export`: what ftdrive knows, in the languages of others."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+
+from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
+
+if TYPE_CHECKING:
+    from ftdrive.planning.plan import Plan
 
 
 @click.group()
@@ -11,7 +17,9 @@ def export() -> None:
 
 
 @export.command()
-@click.argument("path", metavar="PLAN.json", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument(
+    "path", metavar="PLAN.json", required=False, type=click.Path(exists=True, dir_okay=False, path_type=Path)
+)
 @click.option(
     "--format",
     "target",
@@ -28,20 +36,41 @@ def export() -> None:
     show_default=True,
     help="Rest at each pose, seconds (urscript).",
 )
-def plan(path: Path, target: str, output: Path | None, dwell_s: float) -> None:
+@simulate("Export the plan of an emulated cell, in the posture that `ftdrive plan` takes.")
+@JSON
+def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, simulate: bool, as_json: bool) -> None:
     """Write a plan of `ftdrive plan --output` as a URScript program, or as a table.
 
     The program asks before it moves, and stops unless the arm is near its first pose: the way there is not planned. It
     has no guards of ours; `ftdrive calibrate` has.
     """
     from calib.files import write_new
+    from ftdrive.errors import ConfigError
     from ftdrive.exports import targets_csv, urscript
     from ftdrive.planning.plan import Plan
 
-    made = Plan.load(path)
-    text = urscript.program(made, dwell_s=dwell_s) if target == "urscript" else targets_csv.table(made)
-    if output is None:
-        click.echo(text, nl=False)
+    check_simulate(simulate, real={"PLAN.json": path})
+    if simulate:
+        made = _emulated()
+    elif path is not None:
+        made = Plan.load(path)
     else:
+        raise ConfigError("which plan? Give the file that `ftdrive plan --output` has written, or --simulate")
+    text = urscript.program(made, dwell_s=dwell_s) if target == "urscript" else targets_csv.table(made)
+    if output is not None:
         write_new(output, text)
         click.echo(f" Wrote {output}", err=True)
+    if as_json:
+        told = {"format": target, "plan": made.to_dict()["sha256"], "file": None if output is None else str(output)}
+        write_json({"schema_version": 1, **told, "text": text})
+    elif output is None:
+        click.echo(text, nl=False)
+
+
+def _emulated() -> "Plan":
+    from ftdrive.commands.plan import make_plan
+    from ftdrive.simulation import Station
+
+    with Station() as station:
+        made, _ = make_plan(station.cell)
+    return made

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
-from ftdrive.commands.common import rows
+from ftdrive.commands.common import JSON, check_simulate, rows, simulate, write_json
 
 T = TypeVar("T")
 
@@ -36,8 +37,9 @@ _SILENT = "did not answer when this was written"
 @click.option(
     "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="A new file.  [default: ftdrive.toml]"
 )
-@click.option("--simulate", is_flag=True, help="Robot and sensor are emulated; they end with this command.")
+@simulate("Robot and sensor are emulated, --sensor emulated://NAME is which; they end with this command.")
 @click.option("--yes", is_flag=True, help="Ask nothing: take what is given here, and defaults where there are any.")
+@JSON
 def init(
     robot: str | None,
     model: str | None,
@@ -54,6 +56,7 @@ def init(
     output: Path | None,
     simulate: bool,
     yes: bool,
+    as_json: bool,
 ) -> None:
     """Describe a cell: ask what cannot be found out, look at robot and sensor, write ftdrive.toml.
 
@@ -63,8 +66,9 @@ def init(
     from calib.files import write_new
     from ftdrive.cellfile import cell_file
     from ftdrive.config import FILE, CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, settings
-    from ftdrive.simulation import Station
+    from ftdrive.simulation import Station, sensor_name
 
+    check_simulate(simulate, real={"--robot": robot})
     path = output or Path(FILE)
     if path.exists():
         raise FileExistsError(
@@ -73,8 +77,8 @@ def init(
     said = settings()
     with ExitStack() as stack:
         if simulate:
-            station = stack.enter_context(Station(options=["--time-scale", "1"]))
-            robot, sensor = robot or station.cell.robot.host, sensor or station.cell.sensor.url
+            station = stack.enter_context(Station(sensor_name(sensor), ["--time-scale", "1"]))
+            robot, sensor = station.cell.robot.host, station.cell.sensor.url
         ask = Questions(yes)
         host, model, robot_told = _robot(ask, robot, said["robot.host"].value, model)
         url, sensor_told = _sensor(ask, sensor, said["sensor.url"].value)
@@ -122,6 +126,9 @@ def init(
         workcell,
     )
     write_new(path, cell_file(cell, [f"Robot: {robot_told}.", f"Sensor: {sensor_told}."]))
+    if as_json:
+        told = {"file": str(path), "robot": robot_told, "sensor": sensor_told}
+        write_json({"schema_version": 1, **told, "config": asdict(cell)})
     _say(f"Wrote {path}. Measure tool, planes and boxes, then set measured = true in it: nothing moves before.")
     _say("Next: ftdrive doctor, then ftdrive plan")
 

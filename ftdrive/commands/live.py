@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import click
@@ -17,11 +18,13 @@ from rich.table import Table
 from calib import CalibrationResult
 from calib.noise import LEAST_SAMPLES, PoseMean, mean_and_covariance
 from drivers.interfaces import DeviceInfo
-from ftdrive.commands.common import JSON, read_cell, write_json
+from ftdrive.commands.common import JSON, check_simulate, read_cell, simulate, stop_unless_accepted, write_json
 from ftdrive.config import CellConfig
+from ftdrive.diagnosis import belonging
 from ftdrive.errors import ConfigError
+from ftdrive.rehearsal import rehearse
 from ftdrive.runs import Run
-from ftdrive.simulation import Station
+from ftdrive.simulation import Station, sensor_name
 from ftdrive.talk import talk
 from ftdrive.wiring import build_arm, build_sensor
 
@@ -44,12 +47,15 @@ class Look:
 
 @click.command()
 @click.option(
-    "--calibration", "path", required=True, type=click.Path(exists=True, dir_okay=False, path_type=Path), help="FILE."
+    "--calibration",
+    "path",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="FILE; with --simulate one is made first where none is given.",
 )
 @click.option("--config", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="The cell, in TOML.")
 @click.option("--robot", metavar="HOST", help="Address of the controller.")
 @click.option("--sensor", metavar="URL", help="Such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0.")
-@click.option("--simulate", is_flag=True, help="An emulated cell: that of the demo which made the calibration.")
+@simulate("An emulated cell: that which the calibration is of, or that of --sensor emulated://NAME.")
 @click.option("--replay", type=click.Path(exists=True, file_okay=False, path_type=Path), help="A recorded run.")
 @click.option(
     "--axes", type=click.Choice(["sensor", "flange", "base"]), default="sensor", show_default=True, help="Shown along."
@@ -57,7 +63,7 @@ class Look:
 @click.option("--once", is_flag=True, help="One look, then end.")
 @JSON
 def live(
-    path: Path,
+    path: Path | None,
     config: Path | None,
     robot: str | None,
     sensor: str | None,
@@ -72,16 +78,17 @@ def live(
     The compensated wrench is what touches the tool: bias and weight of the tool are taken away. Both are shown about
     the sensor's origin, along the axes asked for. The arm is only read, never moved. With --json, one object a line.
     """
-    calibration = CalibrationResult.load(path)
+    check_simulate(simulate, real={"--config": config, "--robot": robot, "--replay": replay})
+    calibration = None if path is None else CalibrationResult.load(path)
     with ExitStack() as stack:
+        if simulate:
+            calibration, cell = _emulated(calibration, sensor, stack)
+        if calibration is None:
+            raise ConfigError("whose weight is to be taken away? Give --calibration FILE, or --simulate")
         if replay is not None:
             looks = _recorded_looks(Run(replay))
         else:
-            if simulate:
-                made_by = calibration.provenance.get("station") or {}
-                station = stack.enter_context(Station(made_by.get("sensor", "can"), made_by.get("options", ())))
-                cell = station.cell
-            else:
+            if not simulate:
                 cell = read_cell(config, robot, sensor)
             looks = stack.enter_context(_live_looks(cell, calibration))
         if once or as_json:
@@ -96,7 +103,24 @@ def live(
         else:
             with Live(console=talk, refresh_per_second=10) as screen:
                 for look in looks:
-                    screen.update(_screen(_reading(look, calibration, axes), path))
+                    screen.update(
+                        _screen(_reading(look, calibration, axes), "made for this" if path is None else str(path))
+                    )
+
+
+def _emulated(
+    calibration: CalibrationResult | None, sensor: str | None, stack: ExitStack
+) -> tuple[CalibrationResult, CellConfig]:
+    """Start the cell that a calibration is of, or make a short calibration of one."""
+    if calibration is not None:
+        made_by = calibration.provenance.get("station") or {}
+        name = sensor_name(sensor) if sensor else made_by.get("sensor", "can")
+        return calibration, stack.enter_context(Station(name, made_by.get("options", ()))).cell
+    station = stack.enter_context(Station(sensor_name(sensor)))
+    with TemporaryDirectory(prefix="ftdrive-") as runs:
+        result = rehearse(station, Path(runs), "simulated", poses=6).result
+    stop_unless_accepted(result)
+    return result, station.cell
 
 
 @contextmanager
@@ -133,14 +157,11 @@ def _recorded_looks(run: Run) -> Iterator[Look]:
 
 
 def _refuse_other_devices(calibration: CalibrationResult, found: dict[str, DeviceInfo]) -> None:
-    made_with = calibration.provenance.get("devices") or {}
-    for role, device in found.items():
-        serial = made_with.get(role, {}).get("serial")
-        if serial is not None and serial != device.serial:
-            raise ConfigError(
-                f"the calibration belongs to {role} {serial}, but {role} {device.serial} is connected: "
-                "calibrate this cell"
-            )
+    belongs = belonging(calibration, {role: device.serial for role, device in found.items()})
+    if belongs.others:
+        raise ConfigError(f"{belongs.others[0]}: calibrate this cell")
+    for words in belongs.unknown:
+        talk.print(f" {words}")
 
 
 def _reading(look: Look, calibration: CalibrationResult, axes: Axes) -> dict[str, Any]:
@@ -177,7 +198,7 @@ def _line(reading: dict[str, Any]) -> str:
     return f"F {force} N   T {torque} N·m   ({reading['axes']} axes, about the {reading['about']})"
 
 
-def _screen(reading: dict[str, Any], path: Path) -> Group:
+def _screen(reading: dict[str, Any], made: str) -> Group:
     table = Table(box=None)
     for title in ("", "raw", "contact", "± 1 sigma", ""):
         table.add_column(title, justify="right")
@@ -190,7 +211,7 @@ def _screen(reading: dict[str, Any], path: Path) -> Group:
         table.add_row(name, f"{raw:.{digits}f}", f"{contact:.{digits}f} {unit}", f"{sigma:.{digits}f}", bar)
     return Group(
         f"[bold]{reading['axes']} axes, about the {reading['about']}[/]   raw → bias and weight of the tool taken away",
-        f"{path}, {reading['verdict']}   mean of {_PERIOD_S} s   {reading['rate_Hz']:.0f} Hz, lost {reading['lost']}",
+        f"{made}, {reading['verdict']}   mean of {_PERIOD_S} s   {reading['rate_Hz']:.0f} Hz, lost {reading['lost']}",
         table,
         "Ctrl-C ends",
     )

@@ -1,17 +1,19 @@
 """`ftdrive plan`: where an arm would go and how clear it stays, without an arm."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import CONFIG, JSON, numbers, rows, write_json
+from ftdrive.commands.common import CONFIG, JSON, check_simulate, numbers, rows, simulate, write_json
 
 if TYPE_CHECKING:
+    from ftdrive.config import CellConfig
     from ftdrive.planning.certify import Certifier
     from ftdrive.planning.plan import Plan
 
-USUAL_POSTURE = "45,-100,60"
+USUAL_POSTURE_DEG = (45, -100, 60)
 USUAL_MASS_KG = 1.0
 
 
@@ -35,7 +37,7 @@ USUAL_MASS_KG = 1.0
 )
 @click.option(
     "--posture",
-    default=USUAL_POSTURE,
+    default=",".join(map(str, USUAL_POSTURE_DEG)),
     show_default=True,
     metavar="Q1,Q2,Q3",
     help="Of the first three joints, degrees.",
@@ -54,6 +56,7 @@ USUAL_MASS_KG = 1.0
 @click.option("--output", type=click.Path(dir_okay=False, path_type=Path), help="Save the plan as a new JSON file.")
 @click.option("--png", type=click.Path(dir_okay=False, path_type=Path), help="Save stick figures (needs ftdrive[viz]).")
 @click.option("--view", is_flag=True, help="Show it in the browser, in three dimensions (needs ftdrive[viz]).")
+@simulate("For arm and tool of an emulated cell, in place of those of the configuration.")
 @JSON
 def plan(
     config: Path | None,
@@ -72,6 +75,7 @@ def plan(
     output: Path | None,
     png: Path | None,
     view: bool,
+    simulate: bool,
     as_json: bool,
 ) -> None:
     """Plan a tour that is proven clear of the arm itself, of the tool and of planes and boxes. Needs no robot.
@@ -79,19 +83,20 @@ def plan(
     Arm, tool and surroundings come from the configuration where there is one; what is given here takes its place. Real
     cables, fixtures and people are not in the model: look at the ball before anything moves.
     """
-    import numpy as np
-
     from ftdrive.config import cell_of, settings
-    from ftdrive.errors import ConfigError, PlanRefused
-    from ftdrive.planning.cell import certifier_for
-    from ftdrive.planning.motion import Speeds
-    from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
+    from ftdrive.errors import ConfigError
+    from ftdrive.simulation import Station
     from ftdrive.talk import talk
 
     if quick and minimal:
         raise ConfigError("give --quick (12 poses) or --minimal (6), not both")
     if cone_deg is not None and box_mm is not None:
         raise ConfigError("give --cone or --free-box, not both")
+    check_simulate(simulate, real={"--config": config})
+    emulated = None
+    if simulate:
+        with Station() as station:
+            emulated = station.cell
     found = settings(
         config,
         {
@@ -103,32 +108,17 @@ def plan(
             "workcell.planes_mm": ("--plane", rows("--plane", planes, (4,))),
             "workcell.boxes_mm": ("--box", rows("--box", boxes, (6,))),
         },
+        cell=emulated,
     )
     cell = cell_of(found, devices=False)
-    if cell.robot.model is None:
-        raise ConfigError("which arm? Give --model, or [robot] model in ftdrive.toml")
-    if not cell.tool.cylinders_mm:
-        raise ConfigError("what is mounted? Give --tool FROM:TO:DIAMETER, or [tool] cylinders_mm in ftdrive.toml")
-    q_rad = USUAL_POSTURE_RAD.copy()
-    q_rad[:3] = np.radians(numbers("--posture", posture, ",", (3,)))
-    certifier = certifier_for(cell, cell.robot.model)
-    speeds = Speeds(
-        float(np.radians(cell.robot.speed_deg_s)),
-        float(np.radians(cell.robot.acceleration_deg_s2)),
-        None if tip_speed_limit == "none" else cell.robot.tip_speed_mm_s / 1e3,
+    made, certifier = make_plan(
+        cell,
+        numbers("--posture", posture, ",", (3,)),
+        6 if minimal else 12 if quick else 24,
+        cone_deg=cone_deg,
+        box_mm=box_mm,
+        tip_unlimited=tip_speed_limit == "none",
     )
-    poses = 6 if minimal else 12 if quick else 24
-    mass_kg = USUAL_MASS_KG if cell.tool.mass_kg is None else cell.tool.mass_kg
-    guess = guess_of(certifier, mass_kg)
-    if cone_deg is not None:
-        cone_rad = float(np.radians(cone_deg))
-        made = plan_cone(certifier, q_rad, poses, half_angle_rad=cone_rad, speeds=speeds, guess=guess)
-    elif box_mm is not None:
-        made = plan_box(certifier, q_rad, poses, half_size_m=box_mm / 1e3, speeds=speeds, guess=guess)
-    else:
-        made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess)
-    if not made.certified:
-        raise PlanRefused("a move of the plan could not be proven clear")
     described = {found[key].origin for key in ("tool.cylinders_mm", "workcell.planes_mm", "workcell.boxes_mm")}
     described -= {"default", "--tool", "--plane", "--box"}
     if described and not cell.workcell.measured:
@@ -145,6 +135,51 @@ def plan(
         _show(made)
     if view:
         _look(made, certifier)
+
+
+def make_plan(
+    cell: "CellConfig",
+    posture_deg: Sequence[float] = USUAL_POSTURE_DEG,
+    poses: int = 24,
+    *,
+    cone_deg: float | None = None,
+    box_mm: float | None = None,
+    tip_unlimited: bool = False,
+) -> "tuple[Plan, Certifier]":
+    """Plan for a cell, from a posture of its first three joints; also what has proven it clear.
+
+    Raises `ConfigError` where arm or tool are not named, and `PlanRefused`.
+    """
+    import numpy as np
+
+    from ftdrive.errors import ConfigError, PlanRefused
+    from ftdrive.planning.cell import certifier_for
+    from ftdrive.planning.motion import Speeds
+    from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
+
+    if cell.robot.model is None:
+        raise ConfigError("which arm? Give --model, or [robot] model in ftdrive.toml")
+    if not cell.tool.cylinders_mm:
+        raise ConfigError("what is mounted? Give --tool FROM:TO:DIAMETER, or [tool] cylinders_mm in ftdrive.toml")
+    q_rad = USUAL_POSTURE_RAD.copy()
+    q_rad[:3] = np.radians(posture_deg)
+    certifier = certifier_for(cell, cell.robot.model)
+    speeds = Speeds(
+        float(np.radians(cell.robot.speed_deg_s)),
+        float(np.radians(cell.robot.acceleration_deg_s2)),
+        None if tip_unlimited else cell.robot.tip_speed_mm_s / 1e3,
+    )
+    guess = guess_of(certifier, USUAL_MASS_KG if cell.tool.mass_kg is None else cell.tool.mass_kg)
+    if cone_deg is not None:
+        cone_rad = float(np.radians(cone_deg))
+        made = plan_cone(certifier, q_rad, poses, half_angle_rad=cone_rad, speeds=speeds, guess=guess)
+    elif box_mm is not None:
+        made = plan_box(certifier, q_rad, poses, half_size_m=box_mm / 1e3, speeds=speeds, guess=guess)
+    else:
+        made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess)
+    if not made.certified:
+        raise PlanRefused("a move of the plan could not be proven clear")
+    return made, certifier
 
 
 def _show(plan: "Plan") -> None:

@@ -7,9 +7,17 @@ import click
 
 from calib import CalibrationResult
 from calib.routine import PoseRecord, take_pose
-from ftdrive.commands.common import JSON, stop_unless_accepted, write_json
-from ftdrive.errors import NotAccepted
+from ftdrive.commands.common import (
+    EMULATED_SENSOR,
+    JSON,
+    check_simulate,
+    simulate,
+    stop_unless_accepted,
+    write_json,
+)
+from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.recorded import RecordedRun
+from ftdrive.rehearsal import rehearsed_run
 from ftdrive.report import print_result
 from ftdrive.runs import Run
 from ftdrive.session import sampling_of, solve_records
@@ -17,11 +25,23 @@ from ftdrive.talk import talk
 
 
 @click.command()
-@click.argument("folder", metavar="RUN", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("folder", metavar="RUN", required=False, type=click.Path(exists=True, file_okay=False, path_type=Path))
+@simulate("Record a short run of an emulated cell first, and repeat that.")
+@EMULATED_SENSOR
 @JSON
-def replay(folder: Path, as_json: bool) -> None:
+def replay(folder: Path | None, simulate: bool, sensor: str | None, as_json: bool) -> None:
     """Repeat the recorded RUN and compare the result with the one it saved: they must agree to the last digit."""
-    run = Run(folder)
+    check_simulate(simulate, real={"RUN": folder}, emulated={"--sensor": sensor})
+    if simulate:
+        with rehearsed_run(sensor) as recorded:
+            _repeat(Run(recorded), as_json)
+    elif folder is not None:
+        _repeat(Run(folder), as_json)
+    else:
+        raise ConfigError("which run? Give its folder, or --simulate")
+
+
+def _repeat(run: Run, as_json: bool) -> None:
     recorded = RecordedRun(run.records())
     records: list[PoseRecord] = []
     sampling = sampling_of(run.header())

@@ -1,6 +1,7 @@
 """`ftdrive solve`: from data on disk to a calibration, without any device."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,8 +16,16 @@ from calib.errors import CalibError
 from calib.ml import STANDARD_GRAVITY_M_S2, Drift
 from calib.result import Method
 from ftdrive.cli import exit_code
-from ftdrive.commands.common import JSON, stop_unless_accepted, write_json
+from ftdrive.commands.common import (
+    EMULATED_SENSOR,
+    JSON,
+    check_simulate,
+    simulate,
+    stop_unless_accepted,
+    write_json,
+)
 from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.rehearsal import rehearsed_run
 from ftdrive.report import print_comparison, print_result
 from ftdrive.runs import Run, versions
 from ftdrive.session import dataset_of
@@ -31,7 +40,7 @@ _METHODS = (
 
 
 @click.command()
-@click.argument("sources", metavar="DATASET...", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.argument("sources", metavar="DATASET...", nargs=-1, type=click.Path(exists=True, path_type=Path))
 @click.option("--method", type=click.Choice(_METHODS), default="ml", show_default=True, help="all: side by side.")
 @click.option(
     "--orientation",
@@ -52,6 +61,8 @@ _METHODS = (
 @click.option("--mounting-deg", metavar="RX,RY,RZ", help="Known rotation vector of the sensor in the flange.")
 @click.option("--output", "-o", type=click.Path(dir_okay=False, path_type=Path), help="Save the calibration here.")
 @click.option("--force", is_flag=True, help="Save even a rejected result; it stays marked as rejected.")
+@simulate("Solve a short run of an emulated cell.")
+@EMULATED_SENSOR
 @JSON
 def solve(
     sources: Sequence[Path],
@@ -63,6 +74,8 @@ def solve(
     mounting_deg: str | None,
     output: Path | None,
     force: bool,
+    simulate: bool,
+    sensor: str | None,
     as_json: bool,
 ) -> None:
     """Solve each DATASET: a run folder, a dataset.json, or a CSV file.
@@ -70,6 +83,9 @@ def solve(
     A CSV has a header with r11..r33 (or the rotation vector rx,ry,rz), fx,fy,fz,tx,ty,tz in N and N·m, and optionally
     t in seconds and sigma_fx..sigma_tz, the standard error of each pose's mean. With --json, one object a line.
     """
+    check_simulate(simulate, real={"DATASET": sources}, emulated={"--sensor": sensor})
+    if not (sources or simulate):
+        raise ConfigError("which data? Give a run folder, a dataset.json or a CSV file, or --simulate")
     if output is not None and (output.exists() or len(sources) > 1 or method == "all"):
         raise ConfigError(
             f"{output} exists and is never overwritten: choose another name"
@@ -77,6 +93,19 @@ def solve(
             else "--output takes one result: give one dataset and one method"
         )
     options = {"drift": drift, "known": _known(mass_kg, level_deg, mounting_deg)}
+    with rehearsed_run(sensor) if simulate else nullcontext() as run:
+        _solve_each(sources if run is None else [run], method, orientation, options, output, force, as_json)
+
+
+def _solve_each(
+    sources: Sequence[Path],
+    method: str,
+    orientation: Orientation,
+    options: dict[str, Any],
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
     first_failure: CalibError | NotAccepted | None = None
     for source in sources:
         try:

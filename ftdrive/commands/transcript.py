@@ -4,6 +4,7 @@ import time
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import click
@@ -13,10 +14,10 @@ from drivers.interfaces import ForceTorqueSensor
 from drivers.registry import BadUrl, sensor_from_url
 from drivers.transcript import Player, Transcript, Writer, recording
 from ftdrive.checks import SensorAddress
-from ftdrive.commands.common import JSON, write_json
+from ftdrive.commands.common import EMULATED_SENSOR, JSON, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs import versions
-from ftdrive.simulation import EMULATED, sensor_url
+from ftdrive.simulation import EMULATED, sensor_name, sensor_url
 from ftdrive.talk import talk
 
 _TAIL_S = 0.3
@@ -33,7 +34,7 @@ def transcript() -> None:
 
 @transcript.command()
 @click.option("--sensor", metavar="URL", help="Such as ati-serial:///dev/serial/by-id/NAME.")
-@click.option("--simulate", is_flag=True, help="An emulated ATI sensor on RS-485.")
+@simulate("An emulated sensor, on RS-485 from ATI unless --sensor emulated://NAME names another.")
 @click.option(
     "-o", "--output", "path", required=True, type=click.Path(dir_okay=False, path_type=Path), help="A new file."
 )
@@ -47,15 +48,28 @@ def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as
     Nothing is sent but what the driver sends anyway. If the sensor fails, the transcript of the failure is kept.
     """
     if simulate:
-        sensor = f"{EMULATED}serial"
+        sensor = _emulated(sensor)
     if sensor is None:
         raise ConfigError("which sensor? Give --sensor URL or --simulate")
-    sensor = sensor_url(sensor)
-    if SensorAddress.of(sensor).serial_port is None:
+    url, seen = _record(sensor, path, duration_s)
+    if as_json:
+        write_json({"schema_version": 1, "file": str(path), "url": url, "recorded": seen})
+    else:
+        talk.print(_words(seen))
+
+
+def _emulated(sensor: str | None) -> str:
+    return EMULATED + sensor_name(sensor or f"{EMULATED}serial")
+
+
+def _record(sensor: str, path: Path, duration_s: float) -> tuple[str, dict[str, Any]]:
+    """Record; returns the address that a driver was given, and what it saw."""
+    url = sensor_url(sensor)
+    if SensorAddress.of(url).serial_port is None:
         raise ConfigError(f"{sensor} is not on a serial port: only what passes one can be recorded")
-    device = _sensor(sensor)
+    device = _sensor(url)
     header = {
-        "url": sensor,
+        "url": url,
         "duration_s": duration_s,
         "utc": datetime.now(UTC).isoformat(),
         "t_ns": time.monotonic_ns(),
@@ -72,18 +86,26 @@ def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as
     finally:
         writer.end(**seen)
         talk.print(f" Saved {path}")
-    if as_json:
-        write_json({"schema_version": 1, "file": str(path), "url": sensor, "recorded": seen})
-    else:
-        talk.print(_words(seen))
+    return url, seen
 
 
 @transcript.command()
-@click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("file", required=False, type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@simulate("Record a second of an emulated sensor first, and play that.")
+@EMULATED_SENSOR
 @JSON
-def play(file: Path, as_json: bool) -> None:
+def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -> None:
     """Play the transcript FILE to the unmodified driver, and say what the driver makes of it this time."""
-    told = Transcript.load(file)
+    check_simulate(simulate, real={"FILE": file}, emulated={"--sensor": sensor})
+    if simulate:
+        with TemporaryDirectory(prefix="ftdrive-") as folder:
+            path = Path(folder) / "sensor.jsonl"
+            _record(_emulated(sensor), path, 1.0)
+            told = Transcript.load(path)
+    elif file is not None:
+        told = Transcript.load(file)
+    else:
+        raise ConfigError("which transcript? Give its FILE, or --simulate")
     player = Player(told)
     with player as port:
         device = _sensor(told.url_at(port))

@@ -1,6 +1,7 @@
 """`doctor`, `devices` and `transcript` as a user runs them: on a healthy cell, and on two that are not."""
 
 import json
+import re
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -8,7 +9,9 @@ from typing import Any, Protocol
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from ftdrive.cli import cli
 from ftdrive.config import CellConfig
 from ftdrive.simulation import Station
 
@@ -24,7 +27,7 @@ class CommandLine(Protocol):
 NAMED = {
     *("robot.reachable", "robot.identity", "robot.remote", "robot.safety", "robot.program", "robot.flange"),
     *("clock.pace", "sensor.identity", "sensor.rate", "sensor.lost", "sensor.age", "sensor.status", "sensor.counts"),
-    *("sensor.range", "sensor.sign", "robot.speed", "robot.payload"),
+    *("sensor.range", "sensor.sign", "robot.speed", "robot.payload", "robot.registers", "robot.programs"),
     *("noise.level", "noise.accuracy", "disk.runs", "workcell.measured"),
     *("permissions.port", "permissions.by-id", "permissions.latency_timer"),
 }
@@ -56,6 +59,7 @@ def test_a_healthy_cell(ftdrive: CommandLine) -> None:
     assert answer["push"]["base"]["force_N"] == pytest.approx([15, 0, 0], abs=0.2)
     assert np.linalg.norm(answer["push"]["sensor"]["force_N"]) == pytest.approx(15, abs=0.2)
     assert not any(ftdrive.folder.iterdir())  # it only looked
+    assert re.fullmatch(r"127\.[0-9.]+ answers in [0-9]+\.[0-9] ms", checks["robot.reachable"]["found"])
 
 
 def test_a_stopped_arm_in_local_control(station: Station, cell: Path, ftdrive: CommandLine) -> None:
@@ -78,6 +82,49 @@ def test_a_stopped_arm_in_local_control(station: Station, cell: Path, ftdrive: C
     assert after["bad_inputs"] == []
 
 
+def test_an_arm_that_cannot_be_controlled(station: Station, cell: Path, ftdrive: CommandLine) -> None:
+    station.control(do="claim-registers", range="lower")
+    station.control(do="slider", fraction=0.02)
+    station.control(do="listen", what="script", on=False)
+    checks = checks_of(ftdrive.run("doctor", "--config", cell, "--json"))
+    failed = {name: check["fix"] for name, check in checks.items() if check["state"] == "failed"}
+    assert failed.keys() == {"robot.registers", "robot.speed", "robot.programs"}
+    assert "EtherNet/IP" in failed["robot.registers"]
+    assert "speed slider" in failed["robot.speed"]
+    assert "real-time client interface" in failed["robot.programs"]
+    assert station.control(do="state")["bad_inputs"] == []
+
+
+@pytest.mark.parametrize(
+    ("polyscope", "request_", "found", "fix"),
+    [
+        ("5.4.0", None, "to the question for its model", 'write model = "ur5e" under [robot]'),
+        ("10.7.0", None, "PolyScope X", "PolyScope 5 or the CB3 generation is needed"),
+        ("5.15.0", {"do": "silent", "what": "dashboard"}, "did not answer", "enable the dashboard server"),
+        ("5.15.0", {"do": "listen", "what": "dashboard", "on": False}, "dashboard", "enable the dashboard server"),
+        ("5.15.0", {"do": "listen", "what": "rtde", "on": False}, "refused", "enable RTDE"),
+        ("5.15.0", {"do": "silent", "what": "rtde"}, "did not answer", "finished starting"),
+    ],
+)
+def test_each_way_not_to_reach_an_arm_has_its_own_cure(
+    polyscope: str, request_: dict[str, Any] | None, found: str, fix: str, tmp_path: Path
+) -> None:
+    with Station("serial", ["--time-scale", "1", "--polyscope", polyscope]) as station:
+        if request_ is not None:
+            station.control(**request_)
+        host, url = station.cell.robot.host, station.cell.sensor.url
+        arguments = ["doctor", "--robot", host, "--sensor", url, "--runs", str(tmp_path), "--json"]
+        checks = {check["name"]: check for check in json.loads(CliRunner().invoke(cli, arguments).stdout)["checks"]}
+        if polyscope == "5.4.0":
+            named = json.loads(CliRunner().invoke(cli, [*arguments, "--model", "ur5e"]).stdout)["checks"]
+            assert all(check["state"] != "failed" for check in named)
+    assert checks["robot.reachable"]["state"] == "failed"
+    assert found in checks["robot.reachable"]["found"]
+    assert fix in checks["robot.reachable"]["fix"]
+    assert "ping" not in checks["robot.reachable"]["fix"]
+    assert checks["sensor.rate"]["state"] == "ok"
+
+
 def test_an_unplugged_sensor(station: Station, cell: Path, ftdrive: CommandLine) -> None:
     # Not the path of an unplugged pseudo-terminal: the next one opened on this machine would take its name.
     cell.write_text(cell.read_text().replace(station.cell.sensor.url, "ati-serial:///dev/unplugged"))
@@ -91,11 +138,11 @@ def test_an_unplugged_sensor(station: Station, cell: Path, ftdrive: CommandLine)
 
 def test_an_arm_that_is_not_there(station: Station, ftdrive: CommandLine) -> None:
     url = station.cell.sensor.url
-    outcome = ftdrive.run("doctor", "--robot", "127.0.0.2", "--sensor", url, "--json")
+    outcome = ftdrive.run("doctor", "--robot", "no-such-arm.invalid", "--sensor", url, "--json")
     assert outcome.returncode == 7
     checks = checks_of(outcome)
     assert checks["robot.reachable"]["state"] == "failed"
-    assert "ping 127.0.0.2" in checks["robot.reachable"]["fix"]
+    assert "IPv4 address" in checks["robot.reachable"]["fix"]
     assert checks["sensor.rate"]["state"] != "skipped"
 
 
@@ -113,6 +160,15 @@ def test_a_person_pushes(station: Station, cell: Path, ftdrive: CommandLine) -> 
     assert pushed["sensor"]["axis"] == "-Z"
     assert pushed["sensor"]["force_N"][2] == pytest.approx(-20, abs=0.3)
     assert pushed["base"] is None  # nobody has told how the sensor is mounted
+
+
+def test_nobody_pushes(cell: Path, ftdrive: CommandLine) -> None:
+    outcome = ftdrive.run("doctor", "--config", cell, "--push", "--json")  # with an empty standard input
+    assert outcome.returncode == 0, outcome.stderr
+    checks = checks_of(outcome)
+    assert checks.keys() == NAMED | {"push.sign"}
+    assert checks["push.sign"]["state"] == "skipped"
+    assert "standard input is closed" in checks["push.sign"]["found"]
 
 
 def test_devices_of_this_computer_and_of_an_emulated_cell(station: Station, ftdrive: CommandLine) -> None:
@@ -150,9 +206,8 @@ def test_transcript_of_a_sensor(ftdrive: CommandLine) -> None:
     assert played["played"]["mean_force_N"] == pytest.approx(recorded["mean_force_N"], abs=0.02)
 
 
-def test_transcript_of_a_sensor_that_is_gone(station: Station, ftdrive: CommandLine) -> None:
-    url = station.cell.sensor.url
-    station.control(do="unplug", device="sensor")
+def test_transcript_of_a_sensor_that_is_gone(ftdrive: CommandLine) -> None:
+    url = "ati-serial:///dev/unplugged"  # as above: the path of an unplugged pseudo-terminal is soon that of another
     assert ftdrive.run("transcript", "record", "--sensor", url, "-o", "gone.jsonl").returncode == 3
     last = (ftdrive.folder / "gone.jsonl").read_text().splitlines()[-1]
     assert "the port does not open" in json.loads(last)["error"]

@@ -1,5 +1,6 @@
 """`ftdrive init` against an emulated cell: as a script calls it, as answers typed, and in a real terminal."""
 
+import codecs
 import os
 import pty
 import re
@@ -174,7 +175,7 @@ def test_in_a_terminal(station: Station) -> None:
         [sys.executable, "-m", "ftdrive", "init"], stdin=follower, stdout=follower, stderr=follower, close_fds=True
     )
     os.close(follower)
-    screen = ""
+    screen, decoder = "", codecs.getincrementaldecoder("utf-8")()  # a read may end within a letter
     talk = [
         (r"Robot address: ", station.cell.robot.host),
         (r"Sensor(, a number| address).*: ", station.endpoints["serial"]["port"]),
@@ -195,7 +196,7 @@ def test_in_a_terminal(station: Station) -> None:
             while not re.search(question, screen[before:]):
                 assert time.monotonic() < deadline, screen
                 if select.select([leader], [], [], 0.1)[0]:
-                    screen += os.read(leader, 4096).decode()
+                    screen += decoder.decode(os.read(leader, 4096))
             if answer is not None:
                 os.write(leader, f"{answer}\n".encode())
         assert process.wait(10) == 0

@@ -1,6 +1,7 @@
 """What doctor finds in states of a computer that can be made up, and what it says mends them."""
 
 import os
+import shlex
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -62,7 +63,8 @@ def test_a_port_that_is_not_there(computer: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("group", "mode", "fix"), [("uucp", 0o660, "sudo usermod -aG uucp $USER"), ("root", 0o600, "udev")]
+    ("group", "mode", "fix"),
+    [("uucp", 0o660, "sudo usermod -aG uucp $USER"), ("root", 0o600, 'KERNEL=="ttyUSB[0-9]*", GROUP="dialout"')],
 )
 def test_a_forbidden_port_names_its_group(
     computer: Path, monkeypatch: pytest.MonkeyPatch, group: str, mode: int, fix: str
@@ -73,6 +75,46 @@ def test_a_forbidden_port_names_its_group(
     found = port_checks(computer, "ttyUSB0")["port"]
     assert found.state == "failed"
     assert fix in str(found.fix)
+
+
+def test_an_udev_rule_comes_with_the_command_that_installs_it(computer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (computer / "dev/ttyUSB0").chmod(0o600)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    fix = str(port_checks(computer, "serial/by-id/usb-FTDI_X-if00-port0")["port"].fix)
+    words = shlex.split(fix.partition(" | ")[0])
+    assert words == ["echo", 'SUBSYSTEM=="tty", KERNEL=="ttyUSB[0-9]*", GROUP="dialout", MODE="0660"']
+    for command in (
+        "sudo tee /etc/udev/rules.d/",
+        "udevadm control --reload",
+        "udevadm trigger",
+        "usermod -aG dialout",
+    ):
+        assert command in fix
+
+
+def test_the_name_by_id_of_a_port(computer: Path) -> None:
+    link = computer / "dev/serial/by-id/usb-FTDI_X-if00-port0"
+    assert checks.name_by_id(computer / "dev/ttyUSB0", dev=computer / "dev") == link
+    assert checks.name_by_id(link, dev=computer / "dev") == link
+    assert checks.name_by_id(computer / "dev/ttyUSB1", dev=computer / "dev") is None
+    assert checks.name_by_id(computer / "dev/ttyUSB0", dev=computer) is None
+
+
+@pytest.mark.parametrize(
+    ("url", "place"),
+    [
+        ("bota:///dev/ttyUSB0?sinc=512", "/dev/ttyUSB0"),
+        ("ati-can://can0?bitrate=250000", "can0"),
+        ("ati-can://can0?base=0x7F", "socketcan://can0?base=0x7F"),
+        ("ati-can:///dev/ttyACM0?interface=slcan&bitrate=500000", "slcan:///dev/ttyACM0?bitrate=500000"),
+        ("robotous-can:///dev/ttyACM0?interface=slcan", "slcan:///dev/ttyACM0?bitrate=1000000"),
+        ("ati-can://PCAN_USBBUS1?interface=pcan", None),
+        ("ati-netft://192.168.1.1", None),
+        ("ur-ft://192.168.1.10?counts_per_N=1&counts_per_Nm=1", None),
+    ],
+)
+def test_an_address_names_the_place_that_can_be_probed(url: str, place: str | None) -> None:
+    assert SensorAddress.of(url).place == place
 
 
 @pytest.fixture

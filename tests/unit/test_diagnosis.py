@@ -1,6 +1,7 @@
 """What doctor finds in states of a sensor and an arm that can be made up, and what it says mends them."""
 
 from dataclasses import replace
+from socket import gaierror
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
 from ftdrive import diagnosis
 from ftdrive.checks import Check, SensorAddress
@@ -72,6 +74,7 @@ def test_a_ready_arm() -> None:
         ({"safety_mode": "reduced"}, "robot.safety", "warning", "normal mode"),
         ({"program": "playing"}, "robot.program", "warning", "would end it"),
         ({"payload_kg": 0.0}, "robot.payload", "warning", "at the pendant"),
+        ({"speed_slider": 0.04}, "robot.speed", "failed", "at the pendant"),
         ({"payload_kg": None}, "robot.payload", "skipped", ""),
     ],
 )
@@ -171,4 +174,92 @@ def test_calibration_of_another_sensor() -> None:
     assert diagnosis.check_calibration(result, {"arm": "A", "sensor": "S"}).state == "ok"
     other = diagnosis.check_calibration(result, {"arm": "A", "sensor": "T"})
     assert other.state == "failed"
-    assert "sensor S" in other.found
+    assert other.found == "the calibration was made with the sensor S, but the sensor T is connected"
+    unknown = diagnosis.check_calibration(result, {"arm": "A", "sensor": NOT_REPORTED})
+    assert unknown.state == "warning"
+    assert "cannot be checked" in unknown.found
+    assert "serial=" in str(unknown.fix)
+    both = diagnosis.check_calibration(result, {"arm": "B", "sensor": NOT_REPORTED})
+    assert (both.state, both.fix) == ("failed", "ftdrive calibrate")
+
+
+@pytest.mark.parametrize("devices", [{"sensor": {"serial": NOT_REPORTED}}, {"sensor": {}}, {}, None])
+def test_a_calibration_that_does_not_know_its_sensor_cannot_be_checked(devices: object) -> None:
+    result = cast(CalibrationResult, SimpleNamespace(provenance={"devices": devices}, verdict="good"))
+    for serial in ("FT12345", NOT_REPORTED):
+        (words,) = diagnosis.belonging(result, {"sensor": serial}).unknown
+        assert "was made with" in words
+        assert not diagnosis.belonging(result, {"sensor": serial}).others
+
+
+PORT = SensorAddress.of("bota:///dev/ttyUSB7")
+BY_NETWORK = SensorAddress.of("ati-netft://192.168.1.1")
+ALLOWED = Check("permissions.port", "ok", "may be read and written")
+FORBIDDEN = Check("permissions.port", "failed", "may not", "sudo usermod")
+
+
+def wrapped(error: Exception) -> ConnectError:
+    """As a driver tells what went wrong while it was opened."""
+    outer = ConnectError(str(error))
+    outer.__cause__ = error
+    return outer
+
+
+@pytest.mark.parametrize(
+    ("error", "address", "permission", "cure"),
+    [
+        (ConnectError("does not open"), PORT, FORBIDDEN, "sudo usermod"),
+        (ConnectError("does not open"), PORT, ALLOWED, "ftdrive devices --probe /dev/ttyUSB7"),
+        (
+            DeviceTimeout("silent for 0.4 s"),
+            PORT,
+            ALLOWED,
+            "supply and cable, then ftdrive devices --probe /dev/ttyUSB7",
+        ),
+        (DeviceTimeout("silent for 0.4 s"), BY_NETWORK, ALLOWED, "supply and cable, then ping 192.168.1.1"),
+        (wrapped(DeviceTimeout("no reply")), PORT, ALLOWED, "supply and cable"),
+        (StreamBroken("the port is gone"), PORT, FORBIDDEN, "sudo usermod"),
+        (DeviceFault("frozen"), PORT, FORBIDDEN, "switch the sensor off and on"),
+        (wrapped(DeviceFault("saturated")), PORT, ALLOWED, "take what loads it off"),
+        (ProtocolError("no intact record"), PORT, ALLOWED, "is it the one its address names? ftdrive devices --probe"),
+    ],
+)
+def test_the_cure_of_a_sensor_is_that_of_its_error(
+    error: DriverError, address: SensorAddress, permission: Check, cure: str
+) -> None:
+    found = diagnosis.check_sensor_error("sensor.stream", error, address, [permission])
+    assert (found.name, found.state, found.found) == ("sensor.stream", "failed", str(error))
+    assert cure in str(found.fix)
+    assert "see the permissions" not in str(found.fix)
+
+
+def test_an_arm_whose_sentence_names_no_cure_gets_one() -> None:
+    assert diagnosis.found_and_cure(StreamBroken("H:30004 was lost (x: y): check the robot."), "-") == (
+        "H:30004 was lost (x: y)",
+        "check the robot",
+    )
+    assert diagnosis.found_and_cure(StreamBroken("gone."), "look") == ("gone", "look")
+
+
+@pytest.mark.parametrize(("firmware", "state"), [("5.3.1.64192", "failed"), ("5.4.0", "ok"), ("3.15.8", "ok")])
+def test_a_polyscope_that_cannot_be_controlled(firmware: str, state: str) -> None:
+    check = diagnosis.check_arm(DeviceInfo("UR5e", "1", firmware))
+    assert check.state == state
+    assert ("update it to PolyScope 5.4" in str(check.fix)) == (state == "failed")
+
+
+@pytest.mark.parametrize(
+    ("cause", "cure"),
+    [
+        (TimeoutError("timed out"), "ping ur5"),
+        (OSError(113, "No route to host"), "ping ur5"),
+        (ConnectionRefusedError(111, "Connection refused"), "enable RTDE"),
+        (gaierror(-2, "Name or service not known"), "IPv4 address"),
+    ],
+)
+def test_an_arm_that_is_not_reached(cause: OSError, cure: str) -> None:
+    error = ConnectError(f"ur5:30004 cannot be reached ({cause}): check the address and the cable.")
+    error.__cause__ = cause
+    check = diagnosis.check_unreachable(error, "ur5")
+    assert (check.name, check.state) == ("robot.reachable", "failed")
+    assert cure in str(check.fix)

@@ -1,0 +1,112 @@
+"""Every command of the tree works without any hardware, and tells what it has found in one JSON object."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any, Protocol
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from ftdrive.cli import cli
+from ftdrive.errors import ConfigError
+
+
+class CommandLine(Protocol):
+    def run(self, *arguments: str | Path, typed: str = "") -> CompletedProcess[str]: ...
+
+
+def names(command: click.Command, path: tuple[str, ...] = ()) -> Iterator[str]:
+    """Walk the tree down to what can be called."""
+    if not isinstance(command, click.Group):
+        yield " ".join(path)
+        return
+    context = click.Context(command)
+    for name in command.list_commands(context):
+        child = command.get_command(context, name)
+        assert child is not None
+        yield from names(child, (*path, name))
+
+
+STREAM_FAILED = 4
+
+NEEDED: Mapping[str, tuple[str, ...]] = {
+    "init": ("--yes", "--height", "33", "--tool", "0:60:90"),
+    "calibrate": ("--minimal", "--yes"),
+    "live": ("--once",),
+    "export plan": ("--format", "csv"),
+    "transcript record": ("--output", "sensor.jsonl", "--duration", "0.5"),
+}
+"""What a command cannot do without; any other must work with --simulate and --json alone."""
+
+SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
+    "calibrate": lambda told: told["verdict"] != "rejected",
+    "config show": lambda told: told["config"]["robot"]["model"] == "UR5e" and told["config"]["workcell"]["measured"],
+    "demo": lambda told: told["result"]["verdict"] == "good",
+    "devices": lambda told: len(told["serial"]) == 2,
+    "doctor": lambda told: all(check["state"] != "failed" for check in told["checks"]),
+    "export plan": lambda told: told["text"].startswith("# ftdrive.targets/1") and told["file"] is None,
+    "init": lambda told: told["config"]["tool"]["cylinders_mm"] == [[0, 60, 90]] and "UR5e" in told["robot"],
+    "live": lambda told: sum(f**2 for f in told["compensated"]["force_N"]) ** 0.5 < 0.2,
+    "plan": lambda told: told["description"]["model"] == "UR5e" and told["poses"] == 24,
+    "replay": lambda told: told["n_poses"] == 6,
+    "solve": lambda told: told["n_poses"] == 6,
+    "transcript play": lambda told: told["played"]["samples"] > 1000,
+    "transcript record": lambda told: told["recorded"]["error"] is None,
+}
+
+
+@pytest.mark.parametrize("command", list(names(cli)))
+def test_every_command_works_with_simulate_and_json(command: str, ftdrive: CommandLine) -> None:
+    arguments = (*command.split(), *NEEDED.get(command, ()), "--simulate", "--json")
+    outcome = ftdrive.run(*arguments)
+    if outcome.returncode == STREAM_FAILED:  # where much else runs, an emulated sensor may get no time for 0.3 s
+        outcome = ftdrive.run(*arguments)
+    assert outcome.returncode == 0, outcome.stderr
+    assert "Exception" not in outcome.stderr
+    *events, answer = map(json.loads, outcome.stdout.splitlines())
+    assert bool(events) == (command == "calibrate")  # it tells what happens too, one object a line
+    assert answer["schema_version"] == 1
+    assert SHOWN.get(command, bool)(answer)
+
+
+@pytest.mark.parametrize(
+    ("command", "url"),
+    [
+        (("config", "show"), lambda told: told["config"]["sensor"]["url"]),
+        (("transcript", "record", "-o", "bota.jsonl", "--duration", "0.3"), lambda told: told["url"]),
+        (("transcript", "play"), lambda told: told["url"]),
+    ],
+    ids=["config show", "record", "play"],
+)
+def test_the_sensor_that_is_named_is_emulated(
+    command: tuple[str, ...],
+    url: Callable[[dict[str, Any]], str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    outcome = CliRunner().invoke(cli, [*command, "--simulate", "--sensor", "emulated://bota", "--json"])
+    assert outcome.exit_code == 0, (outcome.output, outcome.exception)
+    assert url(json.loads(outcome.stdout)).startswith("bota:///dev/pts/")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("doctor", "--simulate", "--sensor", "bota:///dev/nope"), "bota:///dev/nope is no emulated sensor"),
+        (("doctor", "--simulate", "--robot", "10.0.0.2"), "--robot does not go with --simulate"),
+        (("solve", "--simulate", "."), "DATASET does not go with --simulate"),
+        (("solve", "--sensor", "emulated://bota", "."), "--sensor goes only with --simulate"),
+        *(((command,), "--simulate") for command in ("solve", "replay", "live")),
+        (("transcript", "play"), "--simulate"),
+        (("export", "plan", "--format", "csv"), "--simulate"),
+    ],
+)
+def test_what_would_be_ignored_or_is_missing_is_refused(arguments: tuple[str, ...], words: str) -> None:
+    outcome = CliRunner().invoke(cli, arguments)
+    assert isinstance(outcome.exception, ConfigError)
+    assert words in str(outcome.exception)
+    assert outcome.stdout == ""
