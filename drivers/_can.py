@@ -7,46 +7,14 @@ from collections.abc import Iterable
 from typing import Any
 
 import can
+from can.interfaces.slcan import slcanBus
 
 from drivers._stream import LINK_ERRORS
 from drivers.errors import ConnectError, StreamBroken
 
 BUS_ERRORS = (can.CanError, ValueError, *LINK_ERRORS)
 _SEND_S = 0.1
-
-
-def open_bus(
-    owner: str, channel: str, interface: str, bitrate: int, filters: list[can.typechecking.CanFilter]
-) -> can.BusABC:
-    """Open a bus of python-can for a device called `owner`. Raises `ConnectError`."""
-    options: dict[str, Any] = {}
-    if interface == "slcan":
-        # python-can waits 2 s for adapters that reboot when their port is opened; a pseudo-terminal does not
-        tty = os.path.realpath(channel.split("@", maxsplit=1)[0])
-        if not os.access(tty, os.R_OK | os.W_OK):
-            raise ConnectError(f"{owner}: there is no {channel} that may be read and written")
-        if tty.startswith("/dev/pts/"):
-            options["sleep_after_open"] = 0.0
-    try:
-        return can.Bus(
-            channel, interface=interface, bitrate=bitrate, can_filters=filters, ignore_config=True, **options
-        )
-    except (NotImplementedError, *BUS_ERRORS) as exc:
-        raise ConnectError(
-            f"{owner}: the bus does not open ({exc}); is the adapter plugged in, and on socketcan "
-            f"'ip link set {channel} up type can bitrate {bitrate}' done?"
-        ) from exc
-
-
-def close_bus(bus: can.BusABC) -> None:
-    """Close a bus, and its serial port in any case."""
-    try:
-        bus.shutdown()
-    finally:
-        # the slcan bus says goodbye before it closes its port, and skips the second when the first fails
-        if port := getattr(bus, "serialPortOrig", None):
-            with contextlib.suppress(*LINK_ERRORS):
-                port.close()
+_DISCARD_S = 0.1
 
 
 class CanBus:
@@ -76,17 +44,44 @@ class CanBus:
 
     def open(self) -> None:
         """Join the bus. Raises `ConnectError`."""
+        self.malformed = 0
         filters: list[can.typechecking.CanFilter] = [
             {"can_id": identifier, "can_mask": 0x7FF, "extended": False} for identifier in self._identifiers
         ]
-        self._bus = open_bus(self._owner, self._channel, self._interface, self._bitrate, filters)
+        options: dict[str, Any] = {}
+        if self._interface == "slcan":
+            # python-can waits 2 s for adapters that reboot when their port is opened; a pseudo-terminal does not
+            tty = os.path.realpath(self._channel.split("@", maxsplit=1)[0])
+            if not os.access(tty, os.R_OK | os.W_OK):
+                raise ConnectError(f"{self._owner}: there is no {self._channel} that may be read and written")
+            if tty.startswith("/dev/pts/"):
+                options["sleep_after_open"] = 0.0
+        try:
+            self._bus = can.Bus(
+                self._channel,
+                interface=self._interface,
+                bitrate=self._bitrate,
+                can_filters=filters,
+                ignore_config=True,
+                **options,
+            )
+        except (NotImplementedError, *BUS_ERRORS) as exc:
+            raise ConnectError(
+                f"{self._owner}: the bus does not open ({exc}); is the adapter plugged in, and on socketcan "
+                f"'ip link set {self._channel} up type can bitrate {self._bitrate}' done?"
+            ) from exc
 
     def close(self) -> None:
         """Leave the bus. Idempotent."""
         bus, self._bus = self._bus, None
-        if bus is not None:
-            with contextlib.suppress(*BUS_ERRORS):
-                close_bus(bus)
+        if bus is None:
+            return
+        with contextlib.suppress(*BUS_ERRORS):
+            bus.shutdown()
+        # the slcan bus says goodbye before it closes its port, and skips the second when the first fails
+        if port := getattr(bus, "serialPortOrig", None):
+            with contextlib.suppress(*LINK_ERRORS):
+                port.close()
 
     def send(self, identifier: int, data: bytes) -> None:
         """Send one data frame. Raises `StreamBroken`."""
@@ -117,6 +112,16 @@ class CanBus:
             strange = message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd
             if not strange and (not self._identifiers or message.arbitration_id in self._identifiers):
                 return message.arbitration_id, bytes(message.data)
+
+    def discard(self) -> None:
+        """Throw away what has arrived. Raises `StreamBroken`."""
+        if isinstance(self._bus, slcanBus):
+            with contextlib.suppress(*BUS_ERRORS):  # `send` will tell
+                self._bus.flush()  # its `recv` sits out 1 ms before it says that there is nothing
+            return
+        deadline = time.monotonic() + _DISCARD_S
+        while self.receive(0.0) and time.monotonic() < deadline:
+            pass
 
     def _broken(self, exc: Exception) -> StreamBroken:
         return StreamBroken(f"{self._owner}: the CAN interface is gone ({exc}); plug it in and open it again")

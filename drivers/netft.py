@@ -1,7 +1,7 @@
 """ATI Net F/T, Ethernet Axia and OnRobot HEX force/torque sensors over Ethernet (RDT), through pynetft.
 
-Ref: ATI, "Net F/T User Manual" 9620-05-Net FT, and "Ethernet Axia" 9610-05-Ethernet Axia: RDT and netftapi2.xml, as in
-public drivers; OptoForce, "Ethernet Converter" manual, version 2.0.
+Ref: ATI, "Net F/T User Manual" 9620-05-Net FT, and "Ethernet Axia" 9610-05-Ethernet Axia: RDT, netftapi2.xml and
+netftcalapi.xml, as in public drivers; OptoForce, "Ethernet Converter" manual, version 2.0.
 Checked on hardware: no. Verified against: tests/unit/test_netft.py and the emulator (tests/wire).
 
 pynetft discovers the scale, keeps the socket drained and says why a stream has ended. It could also set the software
@@ -10,6 +10,7 @@ bias; this driver never does.
 
 import http.client
 import logging
+import math
 import re
 import time
 from collections.abc import Mapping
@@ -22,9 +23,9 @@ import numpy as np
 import pynetft
 
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
-from drivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM
-from drivers.errors import ConnectError, DeviceFault, StreamBroken
-from drivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples, Health
+from drivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM, units
+from drivers.errors import ConnectError, DeviceFault, ProtocolError, StreamBroken
+from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples, Health
 
 if TYPE_CHECKING:
     from drivers.registry import Options
@@ -114,17 +115,6 @@ ONROBOT_BITS: Mapping[int, str] = MappingProxyType(
     }
 )
 
-_FORCE_N = {"lbf": FORCE_UNITS_N[1], "N": FORCE_UNITS_N[2], "klbf": FORCE_UNITS_N[3], "kN": FORCE_UNITS_N[4]}
-_FORCE_N |= {"kgf": FORCE_UNITS_N[5]}
-_TORQUE_NM = {
-    "lbf-in": TORQUE_UNITS_NM[1],
-    "lbf-ft": TORQUE_UNITS_NM[2],
-    "N-m": TORQUE_UNITS_NM[3],
-    "N-mm": TORQUE_UNITS_NM[4],
-    "kgf-cm": TORQUE_UNITS_NM[5],
-    "kN-m": TORQUE_UNITS_NM[6],
-}
-
 
 def describe_status(status: int, bits: Mapping[int, str]) -> str:
     """Put a status word in words, e.g. ``0x80020000 (bit 17: …, bit 31: any error)``."""
@@ -132,17 +122,39 @@ def describe_status(status: int, bits: Mapping[int, str]) -> str:
     return f"0x{status:08X} ({', '.join(words) or 'ok'})"
 
 
-def serial_in(page: bytes) -> str:
-    """Find the serial number of the active calibration in ``netftapi2.xml``."""
-    match = re.search(rb"<cfgcalsn>\s*([\x20-\x3b\x3d-\x7e]{1,32}?)\s*</cfgcalsn>", page)
-    return match[1].decode("ascii") if match else NOT_REPORTED
+def text_in(page: bytes, element: str) -> str:
+    """Find the text of an element in a page of a sensor; empty where it is not."""
+    match = re.search(rf"<{element}>\s*([\x20-\x3b\x3d-\x7e]{{1,64}}?)\s*</{element}>".encode(), page)
+    return match[1].decode("ascii") if match else ""
+
+
+def numbers_in(page: bytes, element: str) -> list[float]:
+    """Find the positive numbers of an element, such as ``130;130;400;10;10;10``; none where it holds anything else."""
+    try:
+        numbers = [float(number) for number in text_in(page, element).split(";")]
+    except ValueError:
+        return []
+    return numbers if all(math.isfinite(number) and number > 0 for number in numbers) else []
+
+
+def range_in(page: bytes) -> tuple[float, ...] | None:
+    """Find the maximum ratings (6,) in N and N·m in ``netftcalapi.xml``."""
+    rating, codes = numbers_in(page, "calmr"), numbers_in(page, "calfu") + numbers_in(page, "caltu")
+    if len(rating) != 6 or len(codes) != 2:
+        return None
+    try:
+        unit_N, unit_Nm = units((int(codes[0]), int(codes[1])))
+    except ProtocolError:
+        return None
+    return (*(unit_N * force for force in rating[:3]), *(unit_Nm * torque for torque in rating[3:]))
 
 
 class NetFtSensor(StreamingSensor):
     """A sensor that speaks ATI's RDT.
 
-    `counts` are the six values as sent, `seq` is the RDT sequence number, `t_device_s` is NaN: the sensor numbers its
-    internal samples but does not tell their rate. Every status but a latched monitor condition is a `DeviceFault`.
+    `counts` are the six values as sent, `seq` is the RDT sequence number, `t_device_s` is NaN: records carry no time.
+    Nominal rate and range are known where the pages of the sensor tell them. Every status but a latched monitor
+    condition is a `DeviceFault`.
 
     Parameters
     ----------
@@ -180,7 +192,11 @@ class NetFtSensor(StreamingSensor):
         )
 
     def _connect(self) -> DeviceInfo:
-        serial = NOT_REPORTED if self._onrobot else self._read_serial()
+        # an OnRobot converter serves no pages
+        page = b"" if self._onrobot else self._read_page("/netftapi2.xml")
+        self._nominal_Hz, *_ = numbers_in(page, "comm?rdtrate") or [math.nan]  # both spellings are in use
+        index = text_in(page, "cfgcalsel")
+        rating = range_in(self._read_page(f"/netftcalapi.xml?index={index}")) if index.isdecimal() else None
         override = None
         if self._onrobot:
             override = pynetft.Calibration(*_ONROBOT_COUNTS, pynetft.ForceUnit.NEWTON, pynetft.TorqueUnit.NEWTON_METER)
@@ -204,20 +220,20 @@ class NetFtSensor(StreamingSensor):
             raise self._untold(exc) from exc
         told = self._start(self._client)
         scale = told.calibration
-        if scale.force_unit.value not in _FORCE_N or scale.torque_unit.value not in _TORQUE_NM:
+        if scale.force_unit.value not in FORCE_UNITS_N or scale.torque_unit.value not in TORQUE_UNITS_NM:
             raise ConnectError(
                 f"{self.name}: it measures in {scale.force_unit.value} and {scale.torque_unit.value}; "
                 "choose N and Nm on its configuration page"
             )
-        counts_per_N = scale.counts_per_force_unit / _FORCE_N[scale.force_unit.value]
-        counts_per_Nm = scale.counts_per_torque_unit / _TORQUE_NM[scale.torque_unit.value]
+        counts_per_N = scale.counts_per_force_unit / FORCE_UNITS_N[scale.force_unit.value]
+        counts_per_Nm = scale.counts_per_torque_unit / TORQUE_UNITS_NM[scale.torque_unit.value]
         self._counts_per_unit = np.repeat([counts_per_N, counts_per_Nm], 3)
         model = "OnRobot HEX (Ethernet)" if self._onrobot else told.product_name or "ATI Net F/T"
+        facts = scale_facts(counts_per_N, counts_per_Nm, "documented" if self._onrobot else "device")
+        if rating:
+            facts["range"] = Fact(rating, "device")
         return DeviceInfo(
-            model=model,
-            serial=serial,
-            firmware=NOT_REPORTED,
-            facts=scale_facts(counts_per_N, counts_per_Nm, "documented" if self._onrobot else "device"),
+            model=model, serial=text_in(page, "cfgcalsn") or NOT_REPORTED, firmware=NOT_REPORTED, facts=facts
         )
 
     def _read_block(self) -> FtSamples:
@@ -315,12 +331,12 @@ class NetFtSensor(StreamingSensor):
     def _fault(self, status: int) -> DeviceFault:
         return DeviceFault(f"{self.name}: status {describe_status(status, self._bits)}; its data must not be used")
 
-    def _read_serial(self) -> str:
-        """Ask for the serial number of the calibration in use, which pynetft does not."""
+    def _read_page(self, path: str) -> bytes:
+        """Ask for what pynetft does not: serial number of the calibration in use, rate, range."""
         try:
             with closing(http.client.HTTPConnection(self._host, self._http_port, timeout=_HTTP_S)) as connection:
-                connection.request("GET", "/netftapi2.xml")
-                return serial_in(connection.getresponse().read(65536))
+                connection.request("GET", path)
+                return connection.getresponse().read(65536)
         except (OSError, ValueError, http.client.HTTPException) as exc:
             raise self._untold(exc) from exc
 

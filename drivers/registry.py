@@ -68,6 +68,11 @@ class Options:
             raise BadUrl(f"{self._url}: option '{key}' is empty")
         return value
 
+    def optional(self, key: str) -> str | None:
+        """Take an option as it stands; None where it is not given."""
+        self._asked.add(key)
+        return self.text(key, "") if key in self._given else None
+
     def integer(self, key: str, default: int, lowest: int, highest: int) -> int:
         """Take an option as a number, decimal or 0x hexadecimal."""
         text = self.text(key, str(default))

@@ -16,37 +16,65 @@ from numpy.typing import NDArray
 from drivers.errors import ProtocolError
 from drivers.interfaces import Array
 
-FORCE_UNITS_N: Mapping[int, float] = MappingProxyType(
+FORCE_UNITS_N: Mapping[str, float] = MappingProxyType(
     {
-        1: 4.4482216152605,  # lbf
-        2: 1.0,  # N
-        3: 4448.2216152605,  # klbf
-        4: 1000.0,  # kN
-        5: 9.80665,  # kgf
-        6: 0.00980665,  # gf
+        "lbf": 4.4482216152605,
+        "N": 1.0,
+        "klbf": 4448.2216152605,
+        "kN": 1000.0,
+        "kgf": 9.80665,
+        "gf": 0.00980665,
     }
 )
-TORQUE_UNITS_NM: Mapping[int, float] = MappingProxyType(
+"""In the order of ATI's unit codes, 1 to 6; so are the torques."""
+TORQUE_UNITS_NM: Mapping[str, float] = MappingProxyType(
     {
-        1: 0.1129848290276167,  # lbf-in
-        2: 1.3558179483314004,  # lbf-ft
-        3: 1.0,  # N-m
-        4: 0.001,  # N-mm
-        5: 0.0980665,  # kgf-cm
-        6: 1000.0,  # kN-m
+        "lbf-in": 0.1129848290276167,
+        "lbf-ft": 1.3558179483314004,
+        "N-m": 1.0,
+        "N-mm": 0.001,
+        "kgf-cm": 0.0980665,
+        "kN-m": 1000.0,
     }
 )
 NEWTON, NEWTON_METRE = 2, 3
 
+_FORCES, _TORQUES = tuple(FORCE_UNITS_N), tuple(TORQUE_UNITS_NM)
 _LOWEST, _HIGHEST = -32768, 32767
+
+
+def unit_names(unit_codes: tuple[int, int]) -> tuple[str, str]:
+    """Name the units of force and torque. Raises `ProtocolError` for unknown codes."""
+    force, torque = unit_codes
+    if not (1 <= force <= len(_FORCES) and 1 <= torque <= len(_TORQUES)):
+        raise ProtocolError(f"unit codes are {force} (force) and {torque} (torque); codes 1 to 6 are known")
+    return _FORCES[force - 1], _TORQUES[torque - 1]
 
 
 def units(unit_codes: tuple[int, int]) -> tuple[float, float]:
     """Look up what one unit of force is in N, and one of torque in N·m. Raises `ProtocolError` for unknown codes."""
-    force, torque = unit_codes
-    if force not in FORCE_UNITS_N or torque not in TORQUE_UNITS_NM:
-        raise ProtocolError(f"unit codes are {force} (force) and {torque} (torque); codes 1 to 6 are known")
+    force, torque = unit_names(unit_codes)
     return FORCE_UNITS_N[force], TORQUE_UNITS_NM[torque]
+
+
+def parse_units(text: str) -> tuple[int, int]:
+    """Find the unit codes of an option such as ``lbf,lbf-in``. Raises `ValueError`."""
+    force, _, torque = text.partition(",")
+    if force not in _FORCES or torque not in _TORQUES:
+        raise ValueError(
+            f"units are '{text}'; they are one of {' '.join(_FORCES)}, a comma, and one of {' '.join(_TORQUES)}"
+        )
+    return _FORCES.index(force) + 1, _TORQUES.index(torque) + 1
+
+
+def parse_counts(text: str) -> tuple[int, int]:
+    """Find the counts per unit of force and of torque in an option such as ``1000000,1000000``. Raises `ValueError`."""
+    force, _, torque = text.partition(",")
+    if not (force.isdecimal() and torque.isdecimal() and int(force) and int(torque)):
+        raise ValueError(
+            f"counts are '{text}'; they are two whole numbers, per unit of force and of torque: 1000000,1000000"
+        )
+    return int(force), int(torque)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,19 +10,25 @@ report saturation, and falls back to calibration slot 0 after every reset: all t
 import contextlib
 import logging
 import time
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Literal, Self
 
-import can
 import numpy as np
-from can.interfaces.slcan import slcanBus
 
-from drivers._can import BUS_ERRORS, close_bus, open_bus
-from drivers._stream import LINK_ERRORS, NOTHING, StreamingSensor, scale_facts
+from drivers._can import CanBus
+from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.ati import codec
-from drivers.ati.calibration import NEWTON, NEWTON_METRE, Calibration, saturated_gauges
+from drivers.ati.calibration import (
+    NEWTON,
+    NEWTON_METRE,
+    Calibration,
+    parse_counts,
+    parse_units,
+    saturated_gauges,
+    unit_names,
+)
 from drivers.ati.codec import Op
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
-from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.interfaces import Array, DeviceInfo, FtSamples
 
 if TYPE_CHECKING:
     from drivers.registry import Options
@@ -38,6 +44,7 @@ _GRACE_S = 0.002
 _QUIET_S = 0.01
 _STRAGGLER_S = 0.004
 """How long a reading in the wrong order waits for a frame that would contradict it."""
+_MILLION = (1_000_000, 1_000_000)
 _PERIOD_S = 1e-3
 """About what a 250 kbit/s bus carries; polling a faster one, or an emulator, for all it gives would eat a CPU core."""
 
@@ -59,6 +66,9 @@ class AtiCanSensor(StreamingSensor):
         Base identifier, 0x00 to 0x7F; factory setting 0x20 (identifiers 0x200 to 0x20F).
     slot : int
         Calibration slot, 0 to 15.
+    unit_codes, counts_per_unit : (int, int), optional
+        For force, for torque, as on the calibration certificate: for firmware before 3.7, which does not tell them. A
+        sensor that tells others is refused. Without them N and N·m are assumed, and 1 000 000 counts.
     sign : int
         -1 for a sensor mounted or wired to report the reaction.
     """
@@ -71,55 +81,55 @@ class AtiCanSensor(StreamingSensor):
         bitrate: int = 250_000,
         base: int = 0x20,
         slot: int = 0,
+        unit_codes: tuple[int, int] | None = None,
+        counts_per_unit: tuple[int, int] | None = None,
         sign: int = 1,
     ) -> None:
         super().__init__(f"ATI CAN sensor 0x{base:02X} on {interface} {channel}", sign=sign)
-        self._channel = channel
-        self._interface = interface
-        self._bitrate = bitrate
+        replies = {base << 4 | opcode for reply in codec.REPLIES.values() for opcode in reply}
+        self._bus = CanBus(self.name, channel, interface, bitrate, replies)
         self._base = base
         self._slot = slot
-        self._bus: can.BusABC | None = None
+        self._unit_codes = unit_codes
+        self._counts_per_unit = counts_per_unit
         self._echoes = self._asked = False
         self._polls = self._missed = self._seen_status = 0
         self._next_poll_s = 0.0
 
     @classmethod
     def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
-        """Build from ``ati-can://can0?bitrate=250000&base=0x20&slot=0&interface=socketcan``."""
+        """Build from ``ati-can://can0?bitrate=250000&base=0x20&slot=0&interface=socketcan``.
+
+        Old firmware wants ``units=lbf,lbf-in`` and, if the certificate says so, ``counts=1000000,1000000``.
+        """
+        units, counts = options.optional("units"), options.optional("counts")
         return cls(
             address,
             interface=options.text("interface", "socketcan"),
             bitrate=options.integer("bitrate", 250_000, 1, 1_000_000),
             base=options.integer("base", 0x20, 0, 0x7F),
             slot=options.integer("slot", 0, 0, 15),
+            unit_codes=parse_units(units) if units else None,
+            counts_per_unit=parse_counts(counts) if counts else None,
             sign=sign,
         )
 
     def _connect(self) -> DeviceInfo:
-        self._bus = open_bus(
-            self.name,
-            self._channel,
-            self._interface,
-            self._bitrate,
-            [{"can_id": self._base << 4, "can_mask": 0x7F0, "extended": False}],
-        )
+        self._bus.open()
         self._echoes = self._asked = False
         self._polls = self._missed = self._seen_status = 0
         serial = codec.decode_serial(*self._ask(Op.SERIAL))
         firmware = codec.decode_firmware(*self._ask(Op.FIRMWARE))
         self._select_slot()
-        self._calibration = self._read_calibration(firmware)
+        matrix = self._read_matrix()
+        counts, unit_codes, source = self._read_scale(firmware)
+        self._calibration = Calibration.from_vendor(matrix, counts, unit_codes)
         self._judge(codec.decode_gauges(*self._ask(Op.GAUGES)))
         return DeviceInfo(
             model="ATI F/T (NETCANOEM, CAN)",
             serial=serial,
             firmware=f"{firmware.major}.{firmware.minor} build {firmware.build}",
-            facts=scale_facts(
-                self._calibration.counts_per_N,
-                self._calibration.counts_per_Nm,
-                "device" if firmware >= codec.COUNTS_PER_UNIT_SINCE else "assumed",
-            ),
+            facts=scale_facts(self._calibration.counts_per_N, self._calibration.counts_per_Nm, source),
         )
 
     def _read_block(self) -> FtSamples:
@@ -132,10 +142,12 @@ class AtiCanSensor(StreamingSensor):
         except (DeviceTimeout, ProtocolError):
             self._lost += 1
             self._missed += 1
-            self._drain(_QUIET_S)  # a late half must not pair up with the next reading
+            self._await_quiet()  # a late half must not pair up with the next reading
             if self._missed > 1:
                 self._select_slot()  # it may have restarted, and would be back at slot 0
             return NOTHING
+        finally:
+            self._malformed = self._bus.malformed
         t_host_ns, seq = time.monotonic_ns(), self._polls
         self._missed = 0
         if time.monotonic() >= self._next_poll_s:
@@ -155,35 +167,48 @@ class AtiCanSensor(StreamingSensor):
     def _poll(self) -> None:
         self._next_poll_s = max(self._next_poll_s + _PERIOD_S, time.monotonic())
         self._polls += 1
-        self._request(Op.GAUGES, b"", _POLL_S)
+        self._request(Op.GAUGES, b"")
         self._asked = True
 
     def _disconnect(self) -> None:
-        bus, self._bus = self._bus, None
-        if bus is not None:
-            close_bus(bus)
+        self._bus.close()
 
     def _select_slot(self) -> None:
         echo = codec.decode_slot(*self._ask(Op.SELECT_SLOT, self._slot))
         if echo != self._slot:
             raise ConnectError(f"{self.name}: asked for calibration slot {self._slot}, the sensor answered {echo}")
 
-    def _read_calibration(self, firmware: codec.Firmware) -> Calibration:
+    def _read_matrix(self) -> Array:
         matrix = np.array([codec.decode_matrix_row(*self._ask(Op.MATRIX_ROW, axis)) for axis in range(6)])
         if not matrix.any():
             raise DeviceFault(f"{self.name}: calibration slot {self._slot} is empty; select another slot")
-        if firmware >= codec.COUNTS_PER_UNIT_SINCE:
-            counts = codec.decode_counts_per_unit(*self._ask(Op.COUNTS_PER_UNIT))
-            units = codec.decode_unit_codes(*self._ask(Op.UNIT_CODES))
-        else:
-            counts, units = (1_000_000, 1_000_000), (NEWTON, NEWTON_METRE)
+        return matrix
+
+    def _read_scale(
+        self, firmware: codec.Firmware
+    ) -> tuple[tuple[int, int], tuple[int, int], Literal["device", "configured", "assumed"]]:
+        """Find counts per unit, unit codes, and where they are from. Raises `ConnectError` where two sources differ."""
+        if firmware < codec.COUNTS_PER_UNIT_SINCE:
+            counts = self._counts_per_unit or _MILLION  # for this firmware the manual fixes them
+            if self._unit_codes is not None:
+                return counts, self._unit_codes, "configured"
             log.warning(
-                "%s: firmware %d.%d does not tell its units; 1 000 000 counts per N and N·m assumed, "
-                "compare with the calibration certificate",
+                "%s: firmware %d.%d does not tell its units; %d counts per N and %d per N·m assumed, compare with the "
+                "calibration certificate and add them to the address, such as units=lbf,lbf-in&counts=1000000,1000000",
                 self.name,
                 *firmware[:2],
+                *counts,
             )
-        return Calibration.from_vendor(matrix, counts, units)
+            return counts, (NEWTON, NEWTON_METRE), "assumed"
+        counts = codec.decode_counts_per_unit(*self._ask(Op.COUNTS_PER_UNIT))
+        unit_codes = codec.decode_unit_codes(*self._ask(Op.UNIT_CODES))
+        configured = self._counts_per_unit or counts, self._unit_codes or unit_codes
+        if configured != (counts, unit_codes):
+            raise ConnectError(
+                f"{self.name}: the sensor tells {_scale_text(counts, unit_codes)}, configured are "
+                f"{_scale_text(*configured)}; check slot, or units and counts in its address"
+            )
+        return counts, unit_codes, "device"
 
     def _judge(self, reading: codec.GaugeReading) -> None:
         """Raise on what makes a reading unusable, log the rest of a status word once."""
@@ -216,19 +241,13 @@ class AtiCanSensor(StreamingSensor):
 
         Raises as `_answer`.
         """
-        self._request(op, data, timeout_s)
+        self._request(op, data)
         return self._answer(op, data, timeout_s)
 
-    def _request(self, op: Op, data: bytes, timeout_s: float) -> None:
+    def _request(self, op: Op, data: bytes) -> None:
         """Send a request, after throwing away what belongs to earlier ones; `_answer` must follow."""
-        if self._bus is None:
-            raise StreamBroken(f"{self.name}: closed")
-        self._drain()
-        message = can.Message(arbitration_id=self._base << 4 | op, data=data, is_extended_id=False)
-        try:
-            self._bus.send(message, timeout=timeout_s)
-        except BUS_ERRORS as exc:
-            raise self._broken(exc) from exc
+        self._bus.discard()
+        self._bus.send(self._base << 4 | op, data)
 
     def _answer(self, op: Op, data: bytes, timeout_s: float) -> list[bytes]:
         """Return the payloads of the reply to the request just sent, or raise `DeviceTimeout`: never half a reply.
@@ -246,55 +265,32 @@ class AtiCanSensor(StreamingSensor):
         while len(parts) < len(expected) or list(parts) != sorted(parts):
             whole = len(parts) == len(expected)
             left_s = deadline - time.monotonic()
-            message = None
+            frame = None
             if left_s > -timeout_s:
-                message = self._receive(_STRAGGLER_S if whole else max(left_s, _GRACE_S))
-            if message is None and whole:
+                frame = self._bus.receive(_STRAGGLER_S if whole else max(left_s, _GRACE_S))
+            if frame is None and whole:
                 break
-            if message is None:
+            if frame is None:
                 raise DeviceTimeout(f"{self.name}: no answer to {op.name} within {timeout_s} s")
-            opcode = message.arbitration_id & 0xF
-            payload = bytes(message.data)
+            identifier, payload = frame
+            opcode = identifier & 0xF
             if opcode in expected and len(payload) == expected[opcode]:
                 if skip_echo:
                     skip_echo = False
                 elif parts.setdefault(opcode, payload) != payload:
-                    self._malformed += 1
+                    self._bus.malformed += 1
                     raise ProtocolError(f"{self.name}: two different answers to {op.name}")
-            elif message.arbitration_id == request_id and payload == data:
+            elif identifier == request_id and payload == data:
                 self._echoes = True
         return [parts[opcode] for opcode in expected]
 
-    def _drain(self, quiet_s: float = 0.0) -> None:
-        """Throw away what has arrived, until nothing comes for `quiet_s`; at most for a transaction."""
-        if not quiet_s and isinstance(self._bus, slcanBus):
-            with contextlib.suppress(can.CanError):
-                self._bus.flush()  # its `recv` sits out 1 ms before it says that there is nothing
-            return
+    def _await_quiet(self) -> None:
+        """Throw away what arrives until nothing comes any more; at most for a transaction."""
         deadline = time.monotonic() + _TRANSACTION_S
-        while self._receive(quiet_s) is not None and time.monotonic() < deadline:
+        while self._bus.receive(_QUIET_S) and time.monotonic() < deadline:
             pass
 
-    def _receive(self, timeout_s: float) -> can.Message | None:
-        """Wait for a data frame with one of our identifiers."""
-        if self._bus is None:
-            raise StreamBroken(f"{self.name}: closed")
-        deadline = time.monotonic() + timeout_s
-        while True:
-            try:
-                message = self._bus.recv(timeout=max(0.0, deadline - time.monotonic()))
-            except (ValueError, LookupError):
-                self._malformed += 1  # an slcan line that is no frame
-                if time.monotonic() < deadline:
-                    continue
-                return None
-            except (can.CanError, *LINK_ERRORS) as exc:
-                raise self._broken(exc) from exc
-            if message is None:
-                return None
-            strange = message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd
-            if not strange and message.arbitration_id >> 4 == self._base:
-                return message
 
-    def _broken(self, exc: Exception) -> StreamBroken:
-        return StreamBroken(f"{self.name}: the CAN interface is gone ({exc}); plug it in and open it again")
+def _scale_text(counts: tuple[int, int], unit_codes: tuple[int, int]) -> str:
+    force, torque = unit_names(unit_codes)
+    return f"{counts[0]} counts per {force} and {counts[1]} per {torque}"

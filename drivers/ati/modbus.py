@@ -53,6 +53,7 @@ STATUS_BITS: Mapping[int, str] = MappingProxyType(
         15: "any error",
     }
 )
+WATCHDOG_RESET = 0x0001
 ANY_ERROR = 0x8000
 CRITICAL = 0x3EFE
 """All but watchdog reset, configuration, CAN and the summary bit."""
@@ -140,7 +141,6 @@ class CalibrationBlock:
 
     serial: str
     part_number: str
-    calibrated_at: str
     matrix: Array
     """(6, 6) counts per gauge count, rows Fx..Tz, columns G0..G5."""
     unit_codes: tuple[int, int]
@@ -162,7 +162,6 @@ def decode_calibration_block(data: bytes) -> CalibrationBlock:
     return CalibrationBlock(
         serial=decode_text(data[0:8]),
         part_number=decode_text(data[8:40]),
-        calibrated_at=decode_text(data[44:64]),
         matrix=matrix.astype(np.float64),
         unit_codes=(data[208], data[209]),
         max_rating=struct.unpack_from(">6f", data, 2 * 105),

@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from drivers._modbus import exchange
 from drivers._serial import SerialPort
 from drivers._stream import StreamingSensor, scale_facts
 from drivers.ati import modbus
 from drivers.ati.calibration import Calibration, saturated_gauges, units
 from drivers.ati.codec import describe_status
-from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
+from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 
 if TYPE_CHECKING:
@@ -44,8 +45,9 @@ class AtiSerialSensor(StreamingSensor):
     Records carry no time and no number: `t_host_ns` is the receipt of the batch of about 32 they came in, `t_device_s`
     is NaN, `seq` counts records, damaged ones included; what a restart of the stream lost is estimated from the clock.
     Damaged is a record whose sum is wrong or in which a byte came with wrong parity.
-    `status` is the status word as last read: a record itself has one error bit, on which the stream ends with the word
-    read anew. `counts` are the six gauges.
+    `status` is the status word as last read: a record itself has one error bit, on which the stream is stopped and the
+    word read anew. Where the word explains the bit and nothing critical is in it, measuring goes on. `counts` are the
+    six gauges.
 
     Parameters
     ----------
@@ -75,16 +77,11 @@ class AtiSerialSensor(StreamingSensor):
         return cls(address, calibration=options.integer("calibration", 1, 1, 16), sign=sign)
 
     def _connect(self) -> DeviceInfo:
-        self._seq = self._restarts = 0
+        self._seq = self._restarts = self._status = 0
         self._slipped, self._last_good_ns = False, None
         self._nominal_Hz = modbus.NOMINAL_RATE_Hz
         self._port.open()
-        self._status = self._stop_stream()
-        if self._status & modbus.CRITICAL:
-            raise self._fault()
-        if self._status:
-            text = describe_status(self._status, modbus.STATUS_BITS)
-            log.warning("%s: status %s; measuring goes on", self.name, text)
+        self._judge_status(self._stop_stream())
         block = modbus.decode_calibration_block(
             b"".join(
                 self._ask(modbus.read_registers(register, count))
@@ -125,7 +122,11 @@ class AtiSerialSensor(StreamingSensor):
         del self._buffer[:used]
         self._damaged = [place - used for place in self._damaged if place >= used]
         flagged = keep & records.error[:settled]
-        keep &= ~flagged
+        suspect = bool(flagged.any()) and not self._status & modbus.ANY_ERROR
+        if suspect:
+            keep &= ~flagged
+        elif keep.any() and not flagged.any():
+            self._status &= ~modbus.ANY_ERROR  # if there was an error it is over: the next one is a new one
         gauges = records.gauges[:settled][keep]
         seq = self._seq + 1 + np.flatnonzero(keep)
         if self._last_good_ns is not None and len(gauges):
@@ -134,6 +135,7 @@ class AtiSerialSensor(StreamingSensor):
             self._seq += missed
             self._lost += missed
             self._last_good_ns = None
+        if len(gauges) and not suspect:
             self._restarts = 0
         # what lies behind a slip has been sent, and is gone
         done = len(records.intact) if slipped else settled
@@ -143,7 +145,7 @@ class AtiSerialSensor(StreamingSensor):
         if slipped:
             self._slipped = True
             self._last_good_ns = self._last_good_ns or t_host_ns
-        if flagged.any():
+        if suspect:
             self._look_at_status(t_host_ns)
         if saturated := saturated_gauges(gauges):
             names = ", ".join(f"G{g}" for g in saturated)
@@ -166,10 +168,16 @@ class AtiSerialSensor(StreamingSensor):
 
     def _look_at_status(self, t_host_ns: int) -> None:
         """Stop and read the status, as the error bit of a record asks; the sum does not cover it: it may be damage."""
-        self._status = self._stop_stream()
-        if self._status & (modbus.CRITICAL | modbus.ANY_ERROR):
-            raise self._fault()
-        log.warning("%s: a record with its error bit set, but the status is ok; the stream goes on", self.name)
+        self._judge_status(self._stop_stream())
+        if not self._status & modbus.ANY_ERROR:
+            text = describe_status(self._status, modbus.STATUS_BITS)
+            self._restarts += 1
+            if self._restarts > _MAX_RESTARTS:
+                raise ProtocolError(
+                    f"{self.name}: records carry the error bit, but the status is {text}, {self._restarts} times in a "
+                    "row; check parity and wiring, power it off and on"
+                )
+            log.warning("%s: a record with its error bit set, but the status is %s; going on", self.name, text)
         self._start_stream()
         self._slipped = False
         self._last_good_ns = self._last_good_ns or t_host_ns
@@ -192,7 +200,7 @@ class AtiSerialSensor(StreamingSensor):
         try:
             return self._read_status()
         except (DeviceTimeout, ProtocolError) as exc:
-            raise DeviceTimeout(f"{exc}; is it the sensor, and are supply, wiring and termination right?") from exc
+            raise DeviceTimeout(f"{exc}; is it this sensor, and is the termination right?") from exc
 
     def _read_status(self) -> int:
         return int.from_bytes(self._exchange(modbus.read_registers(modbus.STATUS, 1)), "big")
@@ -216,7 +224,7 @@ class AtiSerialSensor(StreamingSensor):
                 f"{self.name}: no intact record after {_MAX_RESTARTS} restarts of the stream; check parity and wiring"
             )
         log.warning("%s: stream out of step, restarting it", self.name)
-        self._stop_stream()
+        self._judge_status(self._stop_stream())
         self._start_stream()
         self._slipped = False
 
@@ -240,24 +248,16 @@ class AtiSerialSensor(StreamingSensor):
 
     def _exchange(self, request: bytes) -> bytes:
         """Send a request and return the payload of its reply."""
-        self._port.write(request, discard=True)
-        deadline = time.monotonic() + _REPLY_S
-        reply = self._read_exactly(5, deadline)
-        if not reply[1] & 0x80:
-            reply += self._read_exactly(modbus.reply_size(request) - 5, deadline)
-        try:
-            return modbus.check_reply(request, reply)
-        except ProtocolError as exc:
-            raise type(exc)(f"{self.name}: {exc}") from exc
+        size = modbus.reply_size(request)
+        return exchange(self._port, self.name, request, size, modbus.check_reply, _REPLY_S)
 
-    def _read_exactly(self, size: int, deadline: float) -> bytes:
-        data = b""
-        while len(data) < size:
-            data += self._port.read(size - len(data))
-            if len(data) < size and time.monotonic() > deadline:
-                raise DeviceTimeout(f"{self.name}: no reply within {_REPLY_S} s ({len(data)} of {size} bytes)")
-        return data
-
-    def _fault(self) -> DeviceFault:
-        text = describe_status(self._status, modbus.STATUS_BITS)
-        return DeviceFault(f"{self.name}: status {text}; its data must not be used")
+    def _judge_status(self, status: int) -> None:
+        """Raise on what makes the data unusable, log the rest of a status word once."""
+        new, self._status = status & ~self._status, status
+        text = describe_status(status, modbus.STATUS_BITS)
+        if status & modbus.CRITICAL:
+            raise DeviceFault(f"{self.name}: status {text}; its data must not be used")
+        if self._seq and new & modbus.WATCHDOG_RESET:
+            raise StreamBroken(f"{self.name}: the sensor has reset itself and lost its gains; open it again")
+        if new:
+            log.warning("%s: status %s; measuring goes on", self.name, text)

@@ -22,10 +22,7 @@ FRAME_SIZE = 1 + _PAYLOAD.size + 2
 STATUS_BITS: Mapping[int, str] = MappingProxyType(
     {0: "application too slow", 1: "overrange", 2: "invalid measurement", 3: "raw measurement"}
 )
-TOO_SLOW, OVERRANGE, INVALID, RAW = 1, 2, 4, 8
-
-SINC_PERIOD_S = 19.53125e-6
-"""Sample period per unit of sinc length: 512 gives 10 ms."""
+OVERRANGE, INVALID, RAW = 2, 4, 8
 
 ENTER_SETUP, ENTER_RUN = b"C", b"R"
 BINARY_AND_CALIBRATED = b"c,0,1,0,4"

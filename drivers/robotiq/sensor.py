@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from drivers._frames import Deframer
+from drivers._modbus import exchange
 from drivers._serial import SerialPort
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
@@ -123,25 +124,8 @@ class RobotiqFt300(StreamingSensor):
         return self._exchange(request)
 
     def _exchange(self, request: bytes) -> tuple[int, ...]:
-        self._port.write(request)
-        deadline = time.monotonic() + _REPLY_S
-        reply = self._read_exactly(5, deadline)
-        if not reply[1] & 0x80:
-            reply += self._read_exactly(codec.reply_size(request) - 5, deadline)
-        try:
-            return codec.check_reply(request, reply)
-        except ProtocolError as exc:
-            raise type(exc)(f"{self.name}: {exc}") from exc
-
-    def _read_exactly(self, size: int, deadline: float) -> bytes:
-        data = b""
-        while len(data) < size:
-            data += self._port.read(size - len(data))
-            if len(data) < size and time.monotonic() > deadline:
-                raise DeviceTimeout(
-                    f"{self.name}: no reply within {_REPLY_S} s ({len(data)} of {size} bytes); check supply and wiring"
-                )
-        return data
+        size = codec.reply_size(request)
+        return exchange(self._port, self.name, request, size, codec.check_reply, _REPLY_S)
 
     def _watch_rate(self, t_host_ns: int, frames: int) -> None:
         """Once a second compare the rate with what a slow USB adapter makes of it."""

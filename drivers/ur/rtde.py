@@ -35,7 +35,6 @@ SETUP_OUTPUTS: Final = ord("O")
 SETUP_INPUTS: Final = ord("I")
 START: Final = ord("S")
 DATA: Final = ord("U")
-TEXT: Final = ord("M")
 
 _HEADER: Final = struct.Struct(">HB")  # size of the whole package, type
 _FORMATS: Final = {

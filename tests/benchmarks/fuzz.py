@@ -22,7 +22,7 @@ from drivers.ati import codec as ati
 from drivers.ati import modbus
 from drivers.bota import codec as bota
 from drivers.errors import ProtocolError
-from drivers.netft import serial_in
+from drivers.netft import range_in
 from drivers.robotiq import codec as robotiq
 from drivers.robotous import codec as robotous
 
@@ -108,7 +108,7 @@ def targets() -> list[Target]:
         Target("robotiq frames", robotiq_stream.feed, with_crc(crc16_modbus, robotiq.HEADER + bytes(12))),
         Target("bota.codec.decode_frame", bota.decode_frame, bota_frame),
         Target("bota frames", bota_stream.feed, bota_frame),
-        Target("netft.serial_in", serial_in, b"<netft><cfgcalsn>FT12345</cfgcalsn></netft>"),
+        Target("netft.range_in", range_in, b"<calfu>2</calfu><caltu>3</caltu><calmr>130;130;400;10;10;10</calmr>"),
     ]
 
 

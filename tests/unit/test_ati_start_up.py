@@ -22,7 +22,7 @@ import pytest
 
 from drivers.ati.can import AtiCanSensor
 from drivers.ati.serial import AtiSerialSensor
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
 from drivers.interfaces import Fact, FtSamples
 
 GAUGES = ["200 0000 0064 012C 01F4", "201 FF38 FE70 FDA8"]
@@ -45,6 +45,7 @@ _numbers = itertools.count()
 
 
 T = TypeVar("T")
+Pair: TypeAlias = tuple[int, int]
 Script: TypeAlias = Mapping[str, Sequence[T]]
 NONE: Mapping[str, Any] = MappingProxyType({})
 
@@ -69,8 +70,12 @@ class CanPeer:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
 
-    def sensor(self, slot: int = 0) -> AtiCanSensor:
-        return AtiCanSensor(self.channel, interface="virtual", slot=slot)
+    def sensor(
+        self, slot: int = 0, unit_codes: Pair | None = None, counts_per_unit: Pair | None = None
+    ) -> AtiCanSensor:
+        return AtiCanSensor(
+            self.channel, interface="virtual", slot=slot, unit_codes=unit_codes, counts_per_unit=counts_per_unit
+        )
 
     def __enter__(self) -> Self:
         self._bus = can.Bus(self.channel, interface="virtual", ignore_config=True)
@@ -129,7 +134,36 @@ def test_can_old_firmware_has_a_million_counts_per_newton(caplog: pytest.LogCapt
         assert sensor.latest(timeout_s=1).wrench[0].tolist() == pytest.approx(WRENCH)
         assert not {"207", "208"} & set(peer.requests)
         assert sensor.identify().facts["counts_per_N"] == Fact(1e6, "assumed")
-    assert "does not tell its units" in caplog.text
+    assert "does not tell its units; 1000000 counts per N and 1000000 per N·m assumed" in caplog.text
+
+
+def test_can_old_firmware_in_units_of_the_certificate(caplog: pytest.LogCaptureFixture) -> None:
+    old = {"20F": ["20F 03060001"], "207": [], "208": []}
+    lbf, lbf_in = 4.4482216152605, 0.1129848290276167
+    with CanPeer(old) as peer, peer.sensor(unit_codes=(1, 1)) as sensor:
+        wrench = sensor.latest(timeout_s=1).wrench[0]
+        assert wrench.tolist() == pytest.approx(np.array(WRENCH) * ([lbf] * 3 + [lbf_in] * 3))
+        facts = sensor.identify().facts
+        assert facts["counts_per_N"] == Fact(1e6 / lbf, "configured")
+        assert facts["counts_per_Nm"] == Fact(1e6 / lbf_in, "configured")
+    assert "does not tell" not in caplog.text
+    with CanPeer(old) as peer, peer.sensor(unit_codes=(2, 3), counts_per_unit=(500_000, 1_000_000)) as sensor:
+        assert sensor.latest(timeout_s=1).wrench[0, :3].tolist() == pytest.approx([2 * force for force in WRENCH[:3]])
+        assert sensor.identify().facts["counts_per_N"] == Fact(5e5, "configured")
+    with CanPeer(old) as peer, peer.sensor(counts_per_unit=(500_000, 1_000_000)) as sensor:
+        assert sensor.identify().facts["counts_per_N"] == Fact(5e5, "assumed")  # the unit is
+    assert "500000 counts per N and 1000000 per N·m assumed" in caplog.text
+
+
+def test_can_scale_that_the_sensor_contradicts_is_refused() -> None:
+    with CanPeer() as peer, peer.sensor(unit_codes=(2, 3), counts_per_unit=(1_000_000, 1_000_000)) as sensor:
+        assert sensor.identify().facts["counts_per_N"] == Fact(1e6, "device")
+    told = "tells 1000000 counts per N and 1000000 per N-m, configured are "
+    with CanPeer() as peer:
+        with pytest.raises(ConnectError, match=told + "1000000 counts per lbf and 1000000 per N-m"):
+            peer.sensor(unit_codes=(1, 3)).open()
+        with pytest.raises(ConnectError, match=told + "1000000 counts per N and 10000 per N-m"):
+            peer.sensor(counts_per_unit=(1_000_000, 10_000)).open()
 
 
 def test_can_halves_pair_up_by_identifier_among_foreign_frames() -> None:
@@ -500,6 +534,7 @@ def test_serial_error_bit_that_the_status_does_not_confirm_is_damage() -> None:
         before, samples = len(peer.requests), everything(sensor)
         peer.once.append(RECORD_ERROR)
         wait_for(lambda: START in peer.requests[before:])
+        wait_for(lambda: sensor.health().lost > 1)  # the stream is back
         wait_for_more(sensor)
         after = peer.requests[before:]
         assert (after[0], after[-1], set(after)) == (JAM, START, {JAM, STATUS, START})
@@ -507,6 +542,69 @@ def test_serial_error_bit_that_the_status_does_not_confirm_is_damage() -> None:
         health = sensor.health()
     assert health.malformed == 1
     assert gaps(samples()) == health.lost > 1
+
+
+def flagged(records: bytes) -> bytes:
+    """Set the error bit of every record."""
+    return bytes(byte | 0x80 if at % 13 == 12 else byte for at, byte in enumerate(records))
+
+
+@pytest.mark.parametrize("status", [0x8000, 0xC000, 0x8100, 0x8001])
+def test_serial_error_bit_that_nothing_critical_explains_is_no_damage(
+    status: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Such as of a NETCANOEM whose CAN side is not connected."""
+    with SerialPeer({STATUS: [read_reply(status.to_bytes(2, "big"))]}) as peer:
+        peer.records = flagged(RECORD * 7)
+        with peer.sensor() as sensor:
+            samples = sensor.collect(0.1)
+            assert (samples.status == status).all()
+            assert (samples.counts == [100, -200, 300, -400, 500, -600]).all()
+            assert sensor.health().lost == sensor.health().malformed == 0
+        assert peer.requests == [*SERIAL_START_UP, JAM]
+    assert caplog.text.count("measuring goes on") == 1
+
+
+def test_serial_error_bit_that_comes_later_is_looked_at_and_may_be_harmless(caplog: pytest.LogCaptureFixture) -> None:
+    fine, idle = bytes.fromhex("0A030200001D85"), read_reply(b"\xc0\0")
+    with SerialPeer({STATUS: [fine, idle]}) as peer, peer.sensor() as sensor:
+        before = len(peer.requests)
+        peer.records = flagged(RECORD * 7)
+        wait_for(lambda: START in peer.requests[before:])
+        wait_for_more(sensor)
+        sensor.collect(0.05)
+        assert sensor.latest(timeout_s=0.5).status[0] == 0xC000
+        assert peer.requests.count(START) == 2  # looked at once
+        peer.records = RECORD * 7
+        wait_for(lambda: sensor.latest(timeout_s=0.5).status[0] == 0x4000)  # it is over
+        peer.answers[STATUS] = itertools.chain([read_reply(b"\x80\x80")])
+        peer.once.append(RECORD_ERROR)  # and this is another one
+        with pytest.raises(DeviceFault, match="EEPROM error"):
+            sensor.collect(1.0)
+    assert "CAN bus error" in caplog.text
+
+
+def test_serial_watchdog_reset_during_a_stream_breaks_it() -> None:
+    """Gains and offsets are volatile: what is measured afterwards is wrong."""
+    status = [bytes.fromhex("0A030200001D85"), read_reply(b"\x80\x01")]
+    with SerialPeer({STATUS: status}) as peer, peer.sensor() as sensor:
+        peer.once.append(RECORD_ERROR)
+        with pytest.raises(StreamBroken, match="has reset itself"):
+            sensor.collect(1.0)
+
+
+@pytest.mark.parametrize("records", [flagged(RECORD) * 7, (flagged(RECORD) + RECORD) * 4])
+def test_serial_error_bits_that_the_status_never_confirms_end_the_stream(records: bytes) -> None:
+    with SerialPeer() as peer, peer.sensor() as sensor:
+        before = len(peer.requests)
+        peer.records = records
+        with pytest.raises(ProtocolError, match=r"error bit, but the status is 0x0000 \(ok\), 4 times in a row"):
+            sensor.collect(5.0)
+        assert peer.requests[before:].count(STATUS) == 4
+    with SerialPeer() as peer:
+        peer.records = flagged(RECORD) * 7
+        with pytest.raises(ConnectError, match="error bit"):
+            peer.sensor().open()
 
 
 def test_serial_saturation_is_a_fault() -> None:

@@ -1,5 +1,6 @@
 """RDT through pynetft: golden datagrams against a small scripted box, and what is done with its oddities."""
 
+import math
 import socket
 import struct
 import sys
@@ -13,7 +14,16 @@ import pytest
 
 from drivers.errors import ConnectError, DeviceFault, StreamBroken
 from drivers.interfaces import Fact
-from drivers.netft import AXIA_BITS, NET_FT_BITS, ONROBOT_BITS, NetFtSensor, describe_status, serial_in
+from drivers.netft import (
+    AXIA_BITS,
+    NET_FT_BITS,
+    ONROBOT_BITS,
+    NetFtSensor,
+    describe_status,
+    numbers_in,
+    range_in,
+    text_in,
+)
 from drivers.registry import BadUrl, sensor_from_url
 
 START, STOP = bytes.fromhex("1234 0002 0000 0000"), bytes.fromhex("1234 0000 0000 0000")
@@ -21,6 +31,9 @@ RECORD = bytes.fromhex("00000001 000003E8 00000000 0016E360 FFDDAAF0 00989680 00
 PAGE = (
     b"<netft><prodname>Ethernet Axia</prodname><cfgcpf>1000000</cfgcpf><cfgcpt>1000000</cfgcpt>"
     b"<scfgfu>N</scfgfu><scfgtu>Nm</scfgtu><cfgcalsn>FT12345</cfgcalsn></netft>"
+)
+CALIBRATION = (
+    b"<netftCalibration><calfu>2</calfu><caltu>4</caltu><calmr>25;25;50;250;250;250</calmr></netftCalibration>"
 )
 
 
@@ -31,19 +44,22 @@ def record(number: int, status: int = 0) -> bytes:
 class Box:
     """Sends the records it is given after START, then one each 2 ms; ignores the first `deaf` requests to start."""
 
-    def __init__(self, *records: bytes, deaf: int = 0) -> None:
+    def __init__(self, *records: bytes, deaf: int = 0, pages: tuple[bytes, bytes] = (PAGE, b"")) -> None:
         self._records = list(records)
         self._deaf = deaf
         self.heard: list[bytes] = []
+        self.asked = asked = list[str]()
         self.mute = False
         self._end = threading.Event()
 
         class Pages(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
+                asked.append(self.path)
+                page = pages["netftcalapi" in self.path]
                 self.send_response(200)
-                self.send_header("Content-Length", str(len(PAGE)))
+                self.send_header("Content-Length", str(len(page)))
                 self.end_headers()
-                self.wfile.write(PAGE)
+                self.wfile.write(page)
 
             def log_message(self, *_: object) -> None:
                 pass
@@ -168,11 +184,49 @@ def test_missing_library_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
         sensor_from_url("ati-netft://192.168.1.1")
 
 
-def test_serial_number_of_the_page() -> None:
-    assert serial_in(PAGE) == "FT12345"
-    assert serial_in(b"<cfgcalsn> FT 1 </cfgcalsn>") == "FT 1"
+def test_text_in_a_page() -> None:
+    assert text_in(PAGE, "cfgcalsn") == "FT12345"
+    assert text_in(b"<cfgcalsn> FT 1 </cfgcalsn>", "cfgcalsn") == "FT 1"
     for page in (b"", b"<cfgcalsn></cfgcalsn>", b"<cfgcalsn><b>x</b></cfgcalsn>", b"\xff" * 99):
-        assert serial_in(page) == "not reported"
+        assert not text_in(page, "cfgcalsn")
+
+
+def test_numbers_in_a_page() -> None:
+    assert numbers_in(b"<calmr>130;130;400.5;10;10;1e1</calmr>", "calmr") == [130, 130, 400.5, 10, 10, 10]
+    for element in ("comrdtrate", "commrdtrate"):
+        assert numbers_in(f"<{element}>500</{element}>".encode(), "comm?rdtrate") == [500]
+    for text in (b"", b"empty", b"0", b"130;;130", b"-1", b"nan", b"inf", b"1;0"):
+        assert numbers_in(b"<calmr>" + text + b"</calmr>", "calmr") == []
+
+
+@pytest.mark.parametrize(
+    ("page", "expected"),
+    [
+        (CALIBRATION, (25.0, 25.0, 50.0, 0.25, 0.25, 0.25)),
+        (CALIBRATION.replace(b">2<", b">1<"), (*[4.4482216152605 * 25] * 2, 4.4482216152605 * 50, *[0.25] * 3)),
+        (CALIBRATION.replace(b";250<", b"<"), None),
+        (CALIBRATION.replace(b"50;", b"0;"), None),
+        (CALIBRATION.replace(b">2<", b">7<"), None),
+        (CALIBRATION.replace(b"caltu", b"x"), None),
+        (b"not found", None),
+    ],
+)
+def test_range_in_a_page(page: bytes, expected: tuple[float, ...] | None) -> None:
+    assert range_in(page) == (expected and pytest.approx(expected))
+
+
+def test_rate_and_range_are_the_devices() -> None:
+    pages = PAGE.replace(b"</netft>", b"<cfgcalsel>3</cfgcalsel><comrdtrate>500</comrdtrate></netft>"), CALIBRATION
+    with Box(pages=pages) as box, box.sensor() as sensor:
+        told = sensor.identify().facts["range"]
+        assert told.source == "device"
+        assert told.value == pytest.approx((25, 25, 50, 0.25, 0.25, 0.25))
+        assert sensor.health().nominal_rate_Hz == 500
+        assert "/netftcalapi.xml?index=3" in box.asked
+    with Box() as box, box.sensor() as sensor:  # a page that tells neither
+        assert "range" not in sensor.identify().facts
+        assert math.isnan(sensor.health().nominal_rate_Hz)
+        assert set(box.asked) == {"/netftapi2.xml"}
 
 
 def test_status_in_words() -> None:

@@ -24,7 +24,11 @@ def test_can_addresses() -> None:
     sensor = sensor_from_url("ati-can://can0?bitrate=500000&base=0x7F&slot=3", sign=-1)
     assert isinstance(sensor, AtiCanSensor)
     assert sensor.name == "ATI CAN sensor 0x7F on socketcan can0"
-    assert (sensor._bitrate, sensor._slot, sensor._sign) == (500_000, 3, -1)
+    assert (sensor._bus._bitrate, sensor._slot, sensor._sign) == (500_000, 3, -1)
+    assert (sensor._unit_codes, sensor._counts_per_unit) == (None, None)
+    sensor = sensor_from_url("ati-can://can0?units=lbf,N-mm&counts=1000000,2000000")
+    assert isinstance(sensor, AtiCanSensor)
+    assert (sensor._unit_codes, sensor._counts_per_unit) == ((1, 4), (1_000_000, 2_000_000))
     sensor = sensor_from_url("ati-can:///dev/ttyACM0?interface=slcan")
     assert isinstance(sensor, AtiCanSensor)
     assert sensor.name == "ATI CAN sensor 0x20 on slcan /dev/ttyACM0"
@@ -66,8 +70,17 @@ def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: st
         ("ati-can://[can0", "write it like"),
         (
             "ati-can://can0?bitrat=1",
-            "bitrat; known: base, bitrate, interface, range, recover, serial, slot",
+            "bitrat; known: base, bitrate, counts, interface, range, recover, serial, slot, units",
         ),
+        (
+            "ati-can://can0?units=lbf",
+            "units are 'lbf'; they are one of lbf N klbf kN kgf gf, a comma, and one of lbf-in",
+        ),
+        ("ati-can://can0?units=N,Nm", "units are 'N,Nm'"),
+        ("ati-can://can0?units=", "empty"),
+        ("ati-can://can0?counts=1000000", "counts are '1000000'; they are two whole numbers"),
+        ("ati-can://can0?counts=1e6,1e6", "two whole numbers"),
+        ("ati-can://can0?counts=0,1000000", "two whole numbers"),
         ("ati-can://can0?bitrate=fast", "whole number"),
         ("ati-can://can0?base=0x80", "allowed are 0 to 127"),
         ("ati-can://can0?base=", "empty"),
@@ -96,8 +109,8 @@ def test_mistakes_are_named(url: str, message: str) -> None:
 ACME = """
 import time
 import numpy as np
-from drivers._stream import StreamingSensor
 from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.streaming import StreamingSensor
 from drivers.ur.arm import UrArm
 
 class Sensor(StreamingSensor):
