@@ -25,6 +25,7 @@ from drivers.errors import DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import Array, FtSamples
 from drivers.registry import sensor_from_url
 
+ROOT = Path(__file__).parents[2]
 STEPS = 400
 UNIT = np.array([0.1] * 3 + [0.01] * 3)
 """N and N·m per step: more than any sensor's resolution, less than its range when there are 400."""
@@ -39,6 +40,7 @@ from mocks.faults import Faults
 from mocks.netft import NetFtBox
 from mocks.robotiq import RobotiqBox
 from mocks.robotous import RobotousCanNode, RobotousSerialBox
+from tests.wire.emulated_wrist import EmulatedWrist
 
 class Counter:
     def __init__(self):
@@ -52,7 +54,8 @@ class Counter:
         return (steps - 200) * ([0.1] * 3 + [0.01] * 3)
 
 kinds = {"ati-can": AtiCanNode, "ati-serial": AtiSerialBox, "robotous-can": RobotousCanNode, "bota": BotaBox,
-         "robotous-serial": RobotousSerialBox, "robotiq-ft300": RobotiqBox, "ati-netft": NetFtBox}
+         "robotous-serial": RobotousSerialBox, "robotiq-ft300": RobotiqBox, "ati-netft": NetFtBox,
+         "ur-ft": EmulatedWrist}
 devices, counters = [], []
 for line in sys.stdin:
     word, argument, options = json.loads(line)
@@ -94,6 +97,7 @@ KINDS = {
         Kind("robotiq-ft300", ""),
         Kind("bota", "sinc=64", numbered=True),
         Kind("ati-netft", "", {"rdt_port": 0, "rate_hz": 1000}, numbered=True),
+        Kind("ur-ft", "counts_per_N=1&counts_per_Nm=1", numbered=True),
     )
 }
 
@@ -115,7 +119,7 @@ class Laboratory:
 
     def __init__(self, program: str = PROGRAM) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT
         )
         self._lock = threading.Lock()
 
@@ -145,9 +149,9 @@ class Emulator:
         self._number, where = self._laboratory.tell("start", self.kind.scheme, self._options)
         ports: list[str] = []
         if isinstance(where, dict):
-            ports = [f"{key}={where[key]}" for key in ("rdt_port", "http_port")]
-            self._options |= {key: where[key] for key in ("host", "rdt_port", "http_port")}
+            self._options |= where
             self._address = where["host"]
+            ports = [f"{key}={port}" for key, port in where.items() if key != "host"]
         else:
             self._link.unlink(missing_ok=True)
             self._link.symlink_to(where)
@@ -253,7 +257,12 @@ def chances(scheme: str, fault: str) -> dict[str, float]:
 
 
 def applies(scheme: str, fault: str) -> bool:
-    """Bytes on a serial line stay in order and have one sender; CAN and UDP frames are whole or not there."""
+    """Bytes on a serial line stay in order and have one sender; CAN and UDP frames are whole or not there.
+
+    TCP carries everything, if late and in other pieces.
+    """
+    if scheme == "ur-ft":
+        return fault == "delay"
     packets = scheme.endswith("-can") or scheme == "ati-netft"
     return packets if fault in {"swap", "foreign"} else not packets if fault in {"corrupt", "byte_slip"} else True
 
@@ -342,8 +351,8 @@ def test_reset_in_mid_stream(own: Callable[..., Emulator], scheme: str) -> None:
 
 
 def test_already_streaming_when_opened(own: Callable[..., Emulator], scheme: str) -> None:
-    if scheme == "ati-can":
-        pytest.skip("it is polled")
+    if scheme in {"ati-can", "ur-ft"}:
+        pytest.skip("nothing comes unasked")
     emulator = own(streaming_at_start=("127.0.0.1", 9) if scheme == "ati-netft" else True)
     with emulator.sensor() as sensor:
         watched = Watched(sensor)
