@@ -10,7 +10,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import TypeVar
 
@@ -43,7 +43,7 @@ class EmulatedWrist:
         """Listen; the address at which clients find the controller."""
         self._controller = Controller(self._measure)
         self._listener = first_that_works(
-            lambda host: socket.create_server((host, RTDE_PORT)), [self._host] if self._host else free_hosts()
+            lambda host: socket.create_server((host, RTDE_PORT)), [self._host] if self._host else wire_hosts()
         )
         self._listener.settimeout(0.02)
         self._run(self._accept)
@@ -126,3 +126,9 @@ def first_that_works(listen: Callable[[str], T], hosts: Iterable[str]) -> T:
         with suppress(OSError):
             return listen(host)
     raise OSError("none of these loopback addresses is free")
+
+
+def wire_hosts() -> Iterator[str]:
+    """Loopback addresses that no controller takes: a wire comes back at its own."""
+    for _ in range(100):
+        yield f"127.32.{random.randrange(256)}.{random.randrange(1, 255)}"
