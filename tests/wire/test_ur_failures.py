@@ -180,6 +180,9 @@ EVENTS = [
         LOST,
         "press the emergency",
     ),
+    Event(
+        "cable", on("silence-arm", on=True), on("silence-arm", on=False), LOST, "press the emergency", reachable=False
+    ),
     Event("freeze", on("freeze", on=True), on("freeze", on=False), LOST, "stood still", reachable=False),
     Event(
         "cut",
@@ -200,8 +203,7 @@ def station(kept: list[Station], start_station: Callable[..., Station]) -> Itera
     station = kept[0]
     for what in ("rtde", "dashboard", "script"):  # a test that failed may have left it like this
         station.do("listen", what=what, on=True)
-    for what in ("rtde", "dashboard"):
-        station.do("silent", what=what, on=False)
+    station.do("silence-arm", on=False)
     station.do("freeze", on=False)
     station.do("claim-registers", range="lower", on=False)
     before = len(station.do("state")["events"])
