@@ -285,14 +285,14 @@ def all_faults(laboratory: Laboratory, folder: Path, scheme: str, samples: int, 
             count = sum(pool.map(partial(suffered, samples=-(-samples // size)), emulators), Counter())
         for emulator in emulators:
             emulator.unplug()
-        received, wrong, undocumented = count.pop("received"), count.pop("wrong", 0), count["UNDOCUMENTED"]
+        received, wrong, undocumented = count.pop("received", 0), count.pop("wrong", 0), count["UNDOCUMENTED"]
         told = "".join(f", {number} {error}" for error, number in count.items() if number)
         allowed = most_wrong(scheme, fault, received)
         passed &= report(
             f"{scheme}, {fault}" + (f" ({size} at a time)" if size > 1 else ""),
             f"{wrong} wrong of {received}{told}",
             f"<= {allowed:.0f} wrong",
-            wrong <= allowed and not undocumented,
+            wrong <= allowed and not undocumented and received > 0,
         )
     return passed
 

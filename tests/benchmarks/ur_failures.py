@@ -14,11 +14,12 @@ import signal
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from functools import partial
-from math import nan, radians
+from math import isnan, nan, radians
 from pathlib import Path
 
 from drivers.errors import ConnectError, DriverError
@@ -40,8 +41,8 @@ ROOT = Path(__file__).parents[2]
 FROZEN = "freeze"
 SPEED_RAD_S = radians(60)
 TOLD_S, USABLE_S = 0.5, 2.0
-STOPPED_S = 1.0
-"""Told, and the braking of the move."""
+ENDED_S = defaultdict(lambda: 5.0, stopped=1.0, closed=1.5)
+"""Stopped: told, and the braking of the move."""
 
 Do = Callable[[Station, UrArm], object]
 Act = Callable[[Station], object]
@@ -49,23 +50,29 @@ Act = Callable[[Station], object]
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one event; nan where nobody was told."""
+    """What became of one event; nan where nobody was told, or nothing ended."""
 
     told_s: float
-    stood_s: float
-    arm: str
+    ended_s: float
+    how: str
     usable_s: float
 
     @property
     def passed(self) -> bool:
         """Whether every time is within its target."""
-        stopped = self.arm != "stopped" or self.stood_s < STOPPED_S
-        return not self.told_s >= TOLD_S and stopped and self.usable_s < USABLE_S
+        return not (self.told_s >= TOLD_S or self.ended_s >= ENDED_S[self.how] or self.usable_s >= USABLE_S)
 
     def __str__(self) -> str:
-        told = "" if self.told_s != self.told_s else f"{self.told_s:.2f} s"
-        stood = f"{self.arm} {self.stood_s:.2f} s" if self.arm == "stopped" else self.arm
-        return f"{told:>7}   {stood:26} {self.usable_s:5.2f} s"
+        told, ended = ("" if isnan(t_s) else f"{t_s:.2f} s" for t_s in (self.told_s, self.ended_s))
+        return f"{told:>7}   {self.how:25} {ended:>7}   {self.usable_s:6.2f} s"
+
+
+def worst(rows: list[Row]) -> Row:
+    """Take the longest of each time; they have to end alike."""
+    (how,) = {row.how for row in rows}
+    times = ((row.told_s, row.ended_s, row.usable_s) for row in rows)
+    told_s, ended_s, usable_s = map(max, zip(*times, strict=True))
+    return Row(told_s, ended_s, how, usable_s)
 
 
 def new_arm(host: str) -> UrArm:
@@ -167,7 +174,7 @@ def closed_while_frozen() -> Row:
         arm.close()
         closed_s = time.monotonic() - begin
         station.do("freeze", on=False)
-        return Row(nan, nan, f"closed after {closed_s:.2f} s", usable(arm))
+        return Row(nan, closed_s, "closed", usable(arm))
 
 
 def second_client() -> Row:
@@ -178,7 +185,7 @@ def second_client() -> Row:
             new_arm(station.host).open(control=True)
             raise AssertionError("two clients have control")
         refused_s = time.monotonic() - begin
-        return Row(nan, nan, f"it is refused after {refused_s:.2f} s", usable(arm))
+        return Row(nan, refused_s, "it is refused", usable(arm))
 
 
 def of_the_cell(do: Act) -> Do:
@@ -215,15 +222,15 @@ def main() -> int:
     parser.add_argument("--only", default="", metavar="TEXT", help="events with this in their name")
     options = parser.parse_args()
     passed = True
-    sys.stdout.write(f"{'event':42} {'told':>7}   {'the arm':26} usable after\n")
+    sys.stdout.write(f"{'event':42} {'told':>7}   {'the arm':25} {'after':>7}   usable after\n")
     for name, run in rows().items():
         if options.only not in name:
             continue
-        row = max((run() for _ in range(options.repeats)), key=lambda row: (not row.passed, row.told_s, row.usable_s))
+        row = worst([run() for _ in range(options.repeats)])
         passed &= row.passed
         sys.stdout.write(f"{name:42} {row}   {'pass' if row.passed else 'FAIL'}\n")
         sys.stdout.flush()
-    sys.stdout.write(f"targets: told < {TOLD_S} s, stopped < {STOPPED_S} s, usable < {USABLE_S} s\n")
+    sys.stdout.write(f"targets: told < {TOLD_S} s, stopped < {ENDED_S['stopped']} s, usable < {USABLE_S} s\n")
     return 0 if passed else 1
 
 
