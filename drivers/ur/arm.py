@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 _PROGRESS_S: Final = 0.4
 """A read of memory in the control process, done in 0.03 ms; the guard is not called meanwhile."""
 _OURS_EVERY_S: Final = 0.1
-_OURS_S: Final = 0.3
+_OURS_S: Final = 0.4
 """A question to our program on the controller, which answers within two control cycles."""
 _STOP_S: Final = 0.4
 _STOP_SILENT_S: Final = 0.15
@@ -444,8 +444,8 @@ class UrArm(RobotArm):
         try:
             control.call("tcp_offset", timeout_s=timeout_s, look_out=look_out)
         except DriverError as error:
-            if self._reader and self._reader.silent:  # the whole controller: that is no question of whose program it is
-                raise
+            if isinstance(error, DeviceTimeout) and control.alive:
+                raise  # said by `look_out`: the controller is silent, whosever program it runs
             log.info("%s: the control program does not answer: %s", self._host, error)
             return False
         return True
