@@ -213,7 +213,7 @@ class Transcript:
                         opened_ns, parity_marks = int(line["t_ns"]), line.get("parity_marks") is True
                     elif line.get("event") == "end":
                         end = line
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
             raise BadTranscript(
                 f"{path}, line {number}: not a line of a transcript ({error}): record it anew"
             ) from error

@@ -13,7 +13,7 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from math import radians
 from typing import Final
@@ -34,6 +34,11 @@ _PROGRESS_S: Final = 0.4
 _OURS_EVERY_S: Final = 0.1
 _OURS_S: Final = 0.4
 """A question to our program on the controller, which answers within two control cycles."""
+_STOP_S: Final = 0.4
+_STOP_SILENT_S: Final = 0.15
+_REACH_S: Final = 1.5
+"""The dashboard server stops the arm in 0.02 s. How long a caller waits for that, at most; the same when nothing has
+been heard of the controller for 0.2 s; and how long the attempt to connect goes on, one retransmission of TCP."""
 _SCRIPT_PORT: Final = 30003
 _RELEASE_S: Final = 1.0
 """A control process whose parent was killed needs half of that to stop the arm and let the registers go."""
@@ -81,6 +86,7 @@ class UrArm(RobotArm):
         self._left_behind = False  # a program of ours may be on the controller without us
         self._goal: list[float] | None = None
         self._stop_requested = threading.Event()
+        self._stop_wanted = threading.Event()  # by an attempt in the background
 
     # ------------------------------------------------------------------ opening and closing
 
@@ -149,6 +155,7 @@ class UrArm(RobotArm):
         look_out()
         self._find_script_port()
         self._claim_nothing_of_others()
+        self._stop_wanted.clear()  # an attempt that is still on its way would stop the new program
         ask_dashboard(self._host, prepare, timeout_s=CONNECT_S)
         self._left_behind = True
         self._control = ControlProcess(self._host, FREQUENCY_HZ)
@@ -183,7 +190,7 @@ class UrArm(RobotArm):
         if control is not None:
             self._end_program(control, reader)
         if self._left_behind:
-            self._stop_program(timeout_s=0.4)
+            self._stop_program(timeout_s=_STOP_S)
             self._left_behind = False
         if reader is not None:
             reader.close()
@@ -246,7 +253,7 @@ class UrArm(RobotArm):
         q = _joints(q_rad)
         control = self._in_control()
         try:
-            return bool(control.call("within_safety_limits", q))
+            return bool(control.call("within_safety_limits", q, look_out=self._look_out))
         except DriverError as error:
             if fault := self._fault():
                 raise fault from error
@@ -282,13 +289,13 @@ class UrArm(RobotArm):
         guard()
         self._moves_at_rad_s = speed
         with self._stopping_on_error():
-            if not control.call("move", q, speed, acceleration):
+            if not control.call("move", q, speed, acceleration, look_out=self._look_out):
                 raise self._fault() or DeviceFault(f"the controller did not accept the move to {_degrees(q)}.")
             checked = time.monotonic()
             for look in self._watch(timeout_s, guard, f"the move to {_degrees(q)} has not ended"):
                 if self._stop_requested.is_set():
                     raise DeviceFault("the arm was told to stop before it had arrived.")
-                ended, unwatched = control.call("progress", timeout_s=_PROGRESS_S)
+                ended, unwatched = control.call("progress", timeout_s=_PROGRESS_S, look_out=self._look_out)
                 if unwatched:
                     raise DeviceTimeout(
                         f"nothing was heard from this program for {UNWATCHED_S} s of a move, so the arm was stopped: "
@@ -389,14 +396,18 @@ class UrArm(RobotArm):
         finally:  # a second Ctrl-C is no reason to let the arm move on
             if not stopped:
                 control.kill()  # on a lost link ur_rtde would start the program again and again
-                self._stop_program(timeout_s=1.0)
+                silent = self._reader is not None and self._reader.silent
+                self._stop_program(timeout_s=_STOP_SILENT_S if silent else _STOP_S)
 
     def _stop_softly(self, control: ControlProcess) -> bool:
         try:
+            if self._reading().silent:
+                return False
             look = self._reading().look(limit_s=0.1)
             if not control.alive or look.safety_fault() or look.program_fault():
                 return False
-            control.call("stop", timeout_s=0.5 + self._moves_at_rad_s / DECELERATION_RAD_S2)
+            limit_s = 0.5 + self._moves_at_rad_s / DECELERATION_RAD_S2
+            control.call("stop", timeout_s=limit_s, look_out=self._look_out)
             for _ in range(10):  # ur_rtde does not say whether it was done
                 if max(map(abs, self._reading().look(limit_s=0.1).target_qd_rad_s)) <= _STANDING_RAD_S:
                     return True
@@ -405,25 +416,36 @@ class UrArm(RobotArm):
         return False
 
     def _stop_program(self, *, timeout_s: float) -> None:
+        """End our program through the dashboard server; an attempt that takes longer goes on in the background."""
+
+        def stop(dashboard: Dashboard) -> None:
+            if self._stop_wanted.is_set():
+                dashboard.stop()
+
+        self._stop_wanted.set()
         try:
-            ask_dashboard(self._host, lambda dashboard: dashboard.stop(), timeout_s=timeout_s)
+            ask_dashboard(self._host, stop, timeout_s=timeout_s, connect_s=_REACH_S)
             self._left_behind = False
         except DriverError as error:
             log.warning("%s could not be told to stop, press the emergency stop if it moves: %s", self._host, error)
 
     def _check_ours(self, control: ControlProcess) -> None:
         """Raise `DeviceFault` when the program that runs is not ours: its registers would say nothing."""
-        if not self._is_ours(control, timeout_s=_OURS_S):
+        if not self._is_ours(control, timeout_s=_OURS_S, look_out=self._look_out):
             self._left_behind = False
             raise self._fault() or DeviceFault(
                 f"the control program on {self._host} does not answer: somebody has started another program; end it, "
                 f"then open the arm again."
             )
 
-    def _is_ours(self, control: ControlProcess, *, timeout_s: float) -> bool:
+    def _is_ours(
+        self, control: ControlProcess, *, timeout_s: float, look_out: Callable[[], object] = lambda: None
+    ) -> bool:
         try:
-            control.call("tcp_offset", timeout_s=timeout_s)
+            control.call("tcp_offset", timeout_s=timeout_s, look_out=look_out)
         except DriverError as error:
+            if isinstance(error, DeviceTimeout) and control.alive:
+                raise  # said by `look_out`: the controller is silent, whosever program it runs
             log.info("%s: the control program does not answer: %s", self._host, error)
             return False
         return True

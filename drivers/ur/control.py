@@ -71,11 +71,17 @@ class ControlProcess:
         """
         self._answer(0, _STARTING_S, look_out)
 
-    def call(self, name: str, *args: object, timeout_s: float = _CALL_S) -> Any:
+    def call(
+        self,
+        name: str,
+        *args: object,
+        timeout_s: float = _CALL_S,
+        look_out: Callable[[], object] = lambda: None,
+    ) -> Any:
         """Call one of `control_child.Calls`.
 
-        Raises `StreamBroken` when the process is gone or says that the call failed, and `DeviceTimeout` after killing
-        one that hangs.
+        Raises `StreamBroken` when the process is gone or says that the call failed, `DeviceTimeout` after killing
+        one that hangs, and what `look_out` raises, which is called about 20 times a second until the answer comes.
         """
         with self._lock:
             self._last_id += 1
@@ -84,7 +90,7 @@ class ControlProcess:
                 self._requests.flush()
             except (OSError, ValueError):  # ValueError: closed by `kill`
                 raise self._loss() from None
-            return self._answer(self._last_id, timeout_s)
+            return self._answer(self._last_id, timeout_s, look_out)
 
     def quit(self, *, timeout_s: float) -> bool:
         """Stop the arm, end its script and the process; whether all that was confirmed in time."""
@@ -109,7 +115,7 @@ class ControlProcess:
                 with suppress(OSError):  # a request that was never read
                     pipe.close()
 
-    def _answer(self, to: int, timeout_s: float, look_out: Callable[[], object] = lambda: None) -> Any:
+    def _answer(self, to: int, timeout_s: float, look_out: Callable[[], object]) -> Any:
         left_s = timeout_s
         while True:
             t0 = time.monotonic()

@@ -112,12 +112,16 @@ def connect_receive(host: str) -> Receive:
         ) from error
 
 
-def ask_dashboard(host: str, ask: Callable[[Dashboard], T], *, timeout_s: float) -> T:
-    """Connect to the dashboard server, ask, disconnect. Raises `StreamBroken` or `DeviceTimeout`."""
+def ask_dashboard(host: str, ask: Callable[[Dashboard], T], *, timeout_s: float, connect_s: float | None = None) -> T:
+    """Connect to the dashboard server, ask, disconnect. Raises `StreamBroken` or `DeviceTimeout`.
+
+    What is not done within `timeout_s` goes on in a thread: for `connect_s`, which is `timeout_s` where not given, it
+    tries to connect, then it waits 2.5 s for the banner.
+    """
 
     def session() -> T:
         dashboard = cast(Dashboard, _load("dashboard_client").DashboardClient(host))
-        dashboard.connect(round(1000 * timeout_s))
+        dashboard.connect(round(1000 * (timeout_s if connect_s is None else connect_s)))
         try:
             return ask(dashboard)
         finally:

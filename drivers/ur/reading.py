@@ -175,6 +175,11 @@ class Reader:
         """Whether the controller tells its TCP offset without being controlled; old ones do not."""
         return self._live.tells_tcp
 
+    @property
+    def silent(self) -> bool:
+        """Whether nothing has come since `look` or another call said that the controller's clock stands still."""
+        return self._live.silent
+
     def status(self) -> ArmStatus:
         """Tell the controller's modes and settings, as one sample has them. Raises as `look`."""
         sample = self._live.live(max_age_s=_STATUS_S, limit_s=STALE_S)

@@ -319,6 +319,8 @@ class LiveReader:
         """What this controller does not know of what it was asked for, after `open`."""
         self.tells_tcp = False
         """Whether this controller tells its TCP offset; older ones do not."""
+        self.silent = False
+        """Whether nothing has come since somebody was told that the clock stands still."""
 
     def open(self, *, timeout_s: float) -> None:
         """Say hello and start to follow. Raises `ConnectError`."""
@@ -370,6 +372,7 @@ class LiveReader:
                 if (found := find()) is not None:
                     return found
                 if silent_s > limit_s:
+                    self.silent = True
                     stands = "" if self._newest is None else f" at {self._newest.t_device_s:.3f} s"
                     raise DeviceTimeout(
                         f"the clock of {self._host} has stood still{stands} for {silent_s:.2f} s: check the robot and "
@@ -393,6 +396,7 @@ class LiveReader:
                 outputs = dict(zip(self._names, stream.read(None), strict=True))
                 now_s = awake_s()
                 with self._changed:
+                    self.silent = False
                     self._newest = Sample(time.monotonic_ns(), now_s, outputs["timestamp"][0], outputs)
                     if self._live_s[0] <= now_s - t0 <= self._live_s[1]:
                         self._live = self._newest

@@ -1,4 +1,4 @@
-"""Random bytes and damaged golden frames into every codec: only documented exceptions, no hang, no growing memory.
+"""Random bytes and damaged golden frames into all that decodes: only documented exceptions, no hang, no growing memory.
 
     python tests/benchmarks/fuzz.py [--inputs 1000000] [--only matrix]
 
@@ -9,12 +9,19 @@ was kept, and pass or FAIL.
 
 import argparse
 import gc
+import io
+import json
 import random
+import struct
 import sys
 import time
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
+from itertools import count
+from pathlib import Path
+from typing import cast
 
 from drivers._crc import crc16_modbus, crc16_x25
 from drivers._frames import Deframer
@@ -23,8 +30,13 @@ from drivers.ati import modbus
 from drivers.bota import codec as bota
 from drivers.errors import ProtocolError
 from drivers.netft import range_in
+from drivers.registry import SENSORS, BadUrl, sensor_from_url
 from drivers.robotiq import codec as robotiq
 from drivers.robotous import codec as robotous
+from drivers.robotous.halves import Halves
+from drivers.transcript import FORMAT, BadTranscript, Transcript
+from drivers.ur import rtde
+from ftdrive.checks import SensorAddress
 
 LONGEST = 400
 SLOWEST_S = 0.5
@@ -39,6 +51,7 @@ class Target:
     name: str
     decode: Callable[[bytes], object]
     golden: bytes
+    documented: type[Exception] = ProtocolError
 
 
 def halves(*sizes: int) -> Callable[[bytes], list[bytes]]:
@@ -62,6 +75,65 @@ def robotiq_reply_to(request: bytes) -> Callable[[bytes], object]:
     return lambda data: robotiq.check_reply(request, data)
 
 
+def rtde_packages(data: bytes) -> None:
+    buffer = bytearray(data)
+    while rtde.take_package(buffer) is not None:
+        pass
+
+
+def rtde_data(data: bytes) -> object:
+    """Decode a recipe, whose size comes first, and by it the data after it."""
+    size = data[0] if data else 0
+    return rtde.Recipe.decode(data[1 : 1 + size]).unpack(data[1 + size :])
+
+
+def robotous_halves() -> Callable[[bytes], None]:
+    """Pair the halves of one sensor for ever: a byte that says which half it is and what came before, and the half."""
+    pairs, times_ns = Halves(0.001), count(0, 400_000)
+
+    def take(data: bytes) -> None:
+        for at in range(0, len(data), 9):
+            kind = data[at]
+            pairs.take(next(times_ns), data[at + 1 : at + 9], second=bool(kind & 1))
+            if kind & 2:
+                next(times_ns)
+                for field in pairs.silence():
+                    robotous.decode_sample(field.data)
+
+    return take
+
+
+class FileOf:
+    """A file with this in it, as far as it is read."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def open(self, encoding: str) -> io.TextIOWrapper:
+        return io.TextIOWrapper(io.BytesIO(self._data), encoding)
+
+
+def address(data: bytes) -> None:
+    """Build a sensor from an address; what is no mistake in it must say where the device is."""
+    scheme = sorted(SENSORS)[data[0] % len(SENSORS)] if data else ""
+    url = f"{scheme}://{data[1:].decode(errors='surrogateescape')}"
+    sensor_from_url(url)
+    parts = SensorAddress.of(url)
+    _ = parts.serial_port, parts.can_interface, parts.bitrate
+
+
+TRANSCRIPT = "\n".join(
+    json.dumps(line)
+    for line in (
+        {"format": FORMAT, "url": "bota:///dev/ttyUSB0?sinc=64", "duration_s": 1.5},
+        {"t_ns": 1, "event": "open", "baudrate": 460800},
+        {"t_ns": 20, "dir": "tx", "hex": "430d"},
+        {"t_ns": 31, "dir": "rx", "hex": "aa0042"},
+        {"t_ns": 99, "event": "end", "error": None},
+    )
+).encode()
+
+
 def targets() -> list[Target]:
     ati_row = halves(8, 8, 8)
     ati_pair = halves(8, 6)
@@ -76,6 +148,9 @@ def targets() -> list[Target]:
     calibration = bytes(2 * 117) + bytes.fromhex("000F4240000F4240") + bytes(338 - 2 * 117 - 8)
     bota_frame = bota.HEADER + with_crc(crc16_x25, bytes(34))
     frame = robotous.encode_frame(sample)
+    recipe = b"\1DOUBLE,VECTOR6D"
+    for driver in SENSORS.values():
+        import_module(driver.split(":")[0])  # a first use that takes half a second is no hang
 
     def keep(data: bytes) -> object:
         return modbus.keep_records(modbus.decode_records(data).intact)
@@ -95,6 +170,7 @@ def targets() -> list[Target]:
         Target("robotous.codec.decode_text", robotous.decode_text, b"\x01RFT60-HA01".ljust(16, b"\0")),
         Target("robotous.codec.decode_rate", robotous.decode_rate, bytes([0x10, 5]).ljust(16, b"\0")),
         Target("robotous.codec.check_set", robotous.check_set, bytes([0x0F, 1]).ljust(16, b"\0")),
+        Target("robotous.halves", robotous_halves(), b"\0" + sample[:8] + b"\3" + sample[8:]),
         Target("robotous frames", robotous_stream.feed, frame),
         Target(
             "robotiq.codec.check_reply",
@@ -106,9 +182,22 @@ def targets() -> list[Target]:
             "robotiq.codec.decode_serial", lambda d: robotiq.decode_serial([*map(big, words(d))]), b"FTS\0\x04\xd2\0\0"
         ),
         Target("robotiq frames", robotiq_stream.feed, with_crc(crc16_modbus, robotiq.HEADER + bytes(12))),
+        Target(
+            "robotiq.codec.decode_firmware",
+            lambda d: robotiq.decode_firmware([*map(big, halves(2, 2, 2)(d))]),
+            b"FTS\1\2\3",
+        ),
         Target("bota.codec.decode_frame", bota.decode_frame, bota_frame),
         Target("bota frames", bota_stream.feed, bota_frame),
         Target("netft.range_in", range_in, b"<calfu>2</calfu><caltu>3</caltu><calmr>130;130;400;10;10;10</calmr>"),
+        Target("ur.rtde.take_package", rtde_packages, rtde.encode(rtde.DATA, bytes(57)) * 2),
+        Target("ur.rtde.decode_version", rtde.decode_version, struct.pack(">4I", 5, 15, 0, 1)),
+        Target("ur.rtde.Recipe.decode", rtde.Recipe.decode, recipe),
+        Target("ur.rtde.Recipe.unpack", rtde_data, bytes([len(recipe)]) + recipe + b"\1" + bytes(56)),
+        Target(
+            "transcript.Transcript.load", lambda d: Transcript.load(cast(Path, FileOf(d))), TRANSCRIPT, BadTranscript
+        ),
+        Target("registry.sensor_from_url", address, b"\0can0?interface=slcan&bitrate=250000&base=0x20", BadUrl),
     ]
 
 
@@ -163,19 +252,19 @@ def allocated_bytes() -> int:
     return tracemalloc.get_traced_memory()[0]
 
 
-def fuzz(target: Target, count: int, *, seed: int = 1, batch: int = 10_000) -> Outcome:
+def fuzz(target: Target, inputs: int, *, seed: int = 1, batch: int = 10_000) -> Outcome:
     """Feed one codec; stops at the first exception that its document does not name."""
     rng = random.Random(seed)
     refused, slowest_s, undocumented, done = 0, 0.0, "", 0
     tracemalloc.start()
     before = None
     try:
-        while done < count and not undocumented:
-            for data in inputs_for(target.golden, min(batch, count - done), rng):
+        while done < inputs and not undocumented:
+            for data in inputs_for(target.golden, min(batch, inputs - done), rng):
                 begin = time.perf_counter()
                 try:
                     target.decode(data)
-                except ProtocolError:
+                except target.documented:
                     refused += 1
                 except Exception as exc:
                     undocumented = f"{exc!r} for {data.hex()}"

@@ -298,6 +298,8 @@ def test_a_player_that_nobody_opens_ends() -> None:
         ),
         ('{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns"', "line 2"),
         ("\x00\x01", "line 1"),
+        ('{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns": 1e999, "event": "open"}', "line 2"),
+        ("[" * 100_000, "line 1|line 0"),
     ],
 )
 def test_what_is_no_transcript_is_refused(tmp_path: Path, text: str, says: str) -> None:

@@ -343,7 +343,7 @@ def test_a_second_ctrl_c_does_not_let_the_arm_move_on(
     trigger = Trigger(arm, lambda: signal.raise_signal(signal.SIGINT))
     call = ControlProcess.call
 
-    def interrupted(self: ControlProcess, name: str, *args: object, **how: float) -> object:
+    def interrupted(self: ControlProcess, name: str, *args: object, **how: Any) -> object:
         if name == "stop":
             raise KeyboardInterrupt
         return call(self, name, *args, **how)

@@ -58,8 +58,7 @@ pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platfo
 ROOT = Path(__file__).parents[2]
 TIME_SCALE = 10  # a protective stop can be unlocked after 5 s of the controller's time
 STEP_RAD = 1.2  # 1.3 s
-DETECTED_S = 1.5  # 0.5 s, on a busy computer
-TRIED_S = 2.5  # the same, and a second of trying to stop an arm that cannot be reached
+DETECTED_S = 1.0  # 0.5 s, on a busy computer; tests/benchmarks/ur_failures.py measures it
 RESUMED_S = 4.0  # 2 s, on a busy computer
 
 
@@ -181,6 +180,9 @@ EVENTS = [
         LOST,
         "press the emergency",
     ),
+    Event(
+        "cable", on("silence-arm", on=True), on("silence-arm", on=False), LOST, "press the emergency", reachable=False
+    ),
     Event("freeze", on("freeze", on=True), on("freeze", on=False), LOST, "stood still", reachable=False),
     Event(
         "cut",
@@ -201,8 +203,7 @@ def station(kept: list[Station], start_station: Callable[..., Station]) -> Itera
     station = kept[0]
     for what in ("rtde", "dashboard", "script"):  # a test that failed may have left it like this
         station.do("listen", what=what, on=True)
-    for what in ("rtde", "dashboard"):
-        station.do("silent", what=what, on=False)
+    station.do("silence-arm", on=False)
     station.do("freeze", on=False)
     station.do("claim-registers", range="lower", on=False)
     before = len(station.do("state")["events"])
@@ -287,7 +288,7 @@ def test_in_move(station: Station, arm: UrArm, event: Event) -> None:
     provoke = Once(lambda: event.do(station), wait_until_moving(arm))
     with pytest.raises(event.error, match=event.says):
         arm.move_to(q, timeout_s=10, guard=provoke)
-    assert provoke.ago_s() < (DETECTED_S if event.reachable else TRIED_S)
+    assert provoke.ago_s() < DETECTED_S
     if event.reachable:
         station.wait_for(lambda state: not state["moving"] and state["runtime_state"] == "STOPPED", within_s=1.0)
         assert abs(station.do("state")["q_rad"][5] - q[5]) > 0.1
@@ -304,7 +305,7 @@ def test_at_rest(station: Station, arm: UrArm, event: Event) -> None:
         provoke = Once(lambda: event.do(station))
         with pytest.raises(event.error, match=event.says):
             arm.wait_until_still(timeout_s=5, guard=provoke)
-        assert provoke.ago_s() < (DETECTED_S if event.reachable else TRIED_S)
+        assert provoke.ago_s() < DETECTED_S
         event.cure(station)
         moves_again(arm)
     q = away(arm, 0.05)
@@ -312,7 +313,7 @@ def test_at_rest(station: Station, arm: UrArm, event: Event) -> None:
     t0 = time.monotonic()
     with pytest.raises(event.error, match=event.says):
         arm.move_to(q, timeout_s=10, guard=no_guard)
-    assert time.monotonic() - t0 < (DETECTED_S if event.reachable else TRIED_S)
+    assert time.monotonic() - t0 < DETECTED_S
     event.cure(station)
     moves_again(arm)
 
@@ -373,6 +374,33 @@ def test_what_disturbs_no_move(station: Station, arm: UrArm, do: Act, cure: Act)
     arm.wait_until_still(timeout_s=5, guard=no_guard)
     assert np.allclose(arm.state().q_rad, q, atol=1e-4)
     cure(station)
+
+
+def test_a_controller_that_comes_back_is_still_told_to_stop(station: Station, arm: UrArm) -> None:
+    q = away(arm)
+    provoke = Once(lambda: station.do("freeze", on=True), wait_until_moving(arm))
+    with pytest.raises(DeviceTimeout, match="press the emergency stop"):
+        arm.move_to(q, timeout_s=10, guard=provoke)
+    assert provoke.ago_s() < DETECTED_S
+    station.do("freeze", on=False)
+    station.wait_for(lambda state: not state["moving"] and state["runtime_state"] == "STOPPED", within_s=1.0)
+    assert abs(station.do("state")["q_rad"][5] - q[5]) > 0.1
+
+
+def test_an_old_attempt_to_stop_does_not_end_the_next_move(station: Station, arm: UrArm) -> None:
+    q = away(arm)
+    station.do("silent", what="dashboard", on=True)
+    station.do("silent", what="rtde", on=True)
+    with pytest.raises(LOST):
+        arm.move_to(q, timeout_s=10, guard=no_guard)
+    station.do("silent", what="rtde", on=False)
+    station.do("dashboard-stop")  # somebody else has stopped it meanwhile
+    before = len(station.do("state")["events"])
+    threading.Timer(0.8, lambda: station.do("silent", what="dashboard", on=False)).start()
+    moves_again(arm)
+    arm.close()
+    told = [event["what"] for event in station.do("state", since=before)["events"] if event["by"] == "dashboard"]
+    assert "stop" not in told
 
 
 def test_a_slider_at_zero(station: Station, arm: UrArm) -> None:
