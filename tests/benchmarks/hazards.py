@@ -220,15 +220,15 @@ def _moved_by_two(diary: Sequence[Json]) -> bool:
 def main() -> int:
     """Print the table; the exit code is the number of rows that failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="*", help="rows of the hazard table")
+    parser.add_argument("--only", nargs="*", help="rows of the hazard table, or names")
     parser.add_argument("--repeat", type=int, default=1)
     options = parser.parse_args()
 
-    def wanted(row: str) -> bool:
-        return not options.only or not {*row.split(", ")}.isdisjoint(options.only)
+    def wanted(row: Fault | Beforehand) -> bool:
+        return not options.only or not {row.name, *row.row.split(", ")}.isdisjoint(options.only)
 
-    faults = [fault for fault in FAULTS if wanted(fault.row)] * options.repeat
-    beforehand = [row for row in BEFOREHAND if wanted(row.row)]
+    faults = [*filter(wanted, FAULTS)] * options.repeat
+    beforehand = [*filter(wanted, BEFOREHAND)]
     folder = Path(tempfile.mkdtemp(prefix="ftdrive-hazards-"))
     table = Table(folder, len(faults) + len(beforehand))
     try:
