@@ -329,15 +329,20 @@ class ContactGuard(Guard):
     """(6,) of the samples of a resting sensor."""
     predict: Callable[[Array], Array | None] = lambda _: None
     """Wrench of a free tool at an orientation, once it is known."""
-    _start: Array = field(default_factory=lambda: np.zeros(6), init=False)
+    _start: Array | None = field(default=None, init=False)
     _sample: int = field(default=-1, init=False)
     _residual: Array | None = field(default=None, init=False)
     _turns_rad_s: list[float] = field(default_factory=list, init=False)
 
     def begin(self, seen: Seen) -> None:
-        """Take what is felt now as the free tool in this pose."""
-        self._start = seen.wrench
+        """Take what is felt first as the free tool, and nothing later: it may push still when a person resumes."""
+        if self._start is None:
+            self._start = seen.wrench
         self._residual = None
+
+    def forget(self) -> None:
+        """Take what is felt next as the free tool: the sensor was opened again, and its zero may be another."""
+        self._start = None
 
     def look(self, seen: Seen) -> None:
         """Compare with the running fit; before there is one, with what any tool could weigh."""
@@ -356,7 +361,8 @@ class ContactGuard(Guard):
         weight_N = self.heaviest_kg * G_M_S2
         limit_N = 2 * weight_N + self.limits.unknown_N
         limit_Nm = 2 * weight_N * self.lever_m + self.limits.unknown_Nm
-        self._trip(seen.wrench - self._start, limit_N, limit_Nm, "has changed by", "since the start")
+        start = seen.wrench if self._start is None else self._start
+        self._trip(seen.wrench - start, limit_N, limit_Nm, "has changed by", "since the start")
 
     def _known(self, seen: Seen, residual: Array) -> None:
         if self._residual is None:

@@ -455,6 +455,7 @@ class Tour:
         except DriverError:
             self._sensor.close()
             self._sensor.open()
+            self._contact.forget()
             self._seen_events = 0
         self._recheck()
         self._guards.begin()

@@ -24,6 +24,7 @@ QUIET: Final = ("--noise", "0.005,0.0002")
 DEEP_S: Final = 0.6
 """A fault comes so long after the arm has set off: it is at full speed then."""
 PATIENCE_S: Final = 120.0
+TRIES: Final = 15
 
 
 @dataclass
@@ -41,6 +42,10 @@ class Observed:
     resumed: Json | None = None
     words: str = ""
     diary: Sequence[Json] = ()
+    before: int = 0
+    """Holds before it was injected: of something else."""
+    last_words: str = ""
+    """Of the session, on stderr."""
 
 
 # -- conducting a session ----------------------------------------------------------------------------------------------
@@ -67,7 +72,7 @@ def conduct(scene: Scene, fault: Fault | None = None, seen: Observed | None = No
             if name == "question":
                 scene.child.say(_agree(event))
             continue
-        if name == "guard-tripped":
+        if name == "guard-tripped" and injected:
             hazards.append(event["hazard"])
             seen.told_ns, seen.words = seen.told_ns or at_ns, seen.words or event["words"]
         if _here(event, fault) and not injected:
@@ -79,6 +84,11 @@ def conduct(scene: Scene, fault: Fault | None = None, seen: Observed | None = No
             if "resume" not in event["answers"]:
                 scene.child.say(_agree(event))
                 continue
+            if not injected:  # something else has stopped it, such as a machine that is too busy
+                seen.before += 1
+                time.sleep(1.0)
+                scene.child.say("resume" if seen.before < TRIES else "quit")
+                continue
             if not tries:
                 _held(scene, fault, seen, hazards)
                 if fault.restart:
@@ -87,7 +97,7 @@ def conduct(scene: Scene, fault: Fault | None = None, seen: Observed | None = No
                 fault.mend(scene)
             tries += 1
             time.sleep(0.0 if tries == 1 else 1.0)
-            scene.child.say("resume" if tries < 15 else "quit")
+            scene.child.say("resume" if tries < TRIES else "quit")
     return None
 
 
@@ -212,7 +222,14 @@ def disturb(folder: Path, plan: Path, fault: Fault) -> Observed:
                 seen.resumed = conduct(scene)
         finally:
             scene.child.end()
+    seen.last_words = last_words(folder)
     return seen
+
+
+def last_words(folder: Path) -> str:
+    """Read what the newest session in the folder said last: its error, if it told one."""
+    words = (folder / "stderr.txt").read_text().strip().splitlines()
+    return next((line for line in words if line.startswith("error")), words[-1] if words else "")
 
 
 def begin(folder: Path, plan: Path, row: Beforehand) -> tuple[Json | None, int, bool, str]:
@@ -229,6 +246,4 @@ def begin(folder: Path, plan: Path, row: Beforehand) -> tuple[Json | None, int, 
         finally:
             scene.child.end()
         moved = any(e["by"] == "arm" and e["what"] == "moves" for e in scene.state()["events"])
-    words = (folder / "stderr.txt").read_text().strip().splitlines()
-    said = next((line for line in words if line.startswith("error")), words[-1] if words else "")
-    return answer, code, moved, said
+    return answer, code, moved, last_words(folder)

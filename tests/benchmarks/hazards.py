@@ -31,6 +31,8 @@ from tests.benchmarks.hazard_sessions import QUIET, Observed, begin, disturb, un
 BRAKING_S: Final = 0.35
 """From 60 deg/s with 4 rad/s2: 0.26 s; two looks of the guards, and the way of the command."""
 AT_DEG: Final = 0.1
+ATTEMPTS: Final = 3
+"""On a busy machine a session may be stopped before the fault comes: that says nothing about the fault."""
 GROUPS: Final = {
     "R": "R_flange_sensor",
     "F_b": "gravity_force_base_N",
@@ -53,7 +55,9 @@ class Known:
 
 def result_of(folder: Path, answer: Json) -> CalibrationResult:
     """Read the newest result of a run."""
-    found = (folder / answer["run"]).glob("calibration*.json")
+    found = list((folder / answer["run"]).glob("calibration*.json"))
+    if not found:
+        raise RuntimeError(f"{answer['verdict']}: {answer['reasons']}")
     return CalibrationResult.load(max(found, key=lambda path: path.stat().st_mtime))
 
 
@@ -125,7 +129,9 @@ class Table:
     def fault(self, fault: Fault) -> tuple[str, Sequence[str]]:
         """Judge what a fault did."""
         limit_s = fault.detect_s + (0.0 if fault.at == "sample" or fault.ends_its_move else BRAKING_S)
-        seen = disturb(self.folder, self.plan, fault)
+        seen, attempts = disturb(self.folder, self.plan, fault), 1
+        while not _came(fault, seen) and attempts < ATTEMPTS:
+            seen, attempts = disturb(self.folder, self.plan, fault), attempts + 1
         reacted_ns = seen.told_ns if fault.ends_its_move else seen.stands_ns
         took_s = None if reacted_ns is None else (reacted_ns - seen.injected_ns) / 1e9
         complaints = [*_wrong_reaction(fault, seen, took_s, limit_s), *self._wrong_end(fault, seen)]
@@ -141,8 +147,10 @@ class Table:
         how = "told" if fault.ends_its_move else "held" if fault.at == "sample" else "stopped"
         hazards = f", guard {seen.hazards[0]}" if seen.hazards else ""
         reaction = "none" if took_s is None else f"{how} after {took_s:.2f} s{hazards}"
-        if complaints and seen.words:
-            complaints.append(f"told: {seen.words[:160]}")
+        if complaints:
+            complaints.append(f"told: {(seen.words or seen.last_words)[:160]}")
+        if seen.before or attempts > 1:
+            differs += f"  (attempt {attempts}, held {seen.before} times before by something else)"
         return f"{reaction:30} {limit_s:5.2f} s {seen.kept:4}  {differs}", complaints
 
     def _wrong_end(self, fault: Fault, seen: Observed) -> Iterator[str]:
@@ -171,8 +179,13 @@ class Table:
         return f"goes on, and rightly: {in_groups(groups)}", complaints
 
 
+def _came(fault: Fault, seen: Observed) -> bool:
+    """Whether the fault was injected, and in a move where it should."""
+    return bool(seen.injected_ns and (seen.was_moving or fault.at not in {"move", "approach"}))
+
+
 def _wrong_reaction(fault: Fault, seen: Observed, took_s: float | None, limit_s: float) -> Iterator[str]:
-    if not seen.injected_ns or (fault.at in {"move", "approach"} and not seen.was_moving):
+    if not _came(fault, seen):
         yield "not injected in a move"
     if took_s is None:
         yield "no reaction"
@@ -207,15 +220,15 @@ def _moved_by_two(diary: Sequence[Json]) -> bool:
 def main() -> int:
     """Print the table; the exit code is the number of rows that failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="*", help="rows of the hazard table")
+    parser.add_argument("--only", nargs="*", help="rows of the hazard table, or names")
     parser.add_argument("--repeat", type=int, default=1)
     options = parser.parse_args()
 
-    def wanted(row: str) -> bool:
-        return not options.only or not {*row.split(", ")}.isdisjoint(options.only)
+    def wanted(row: Fault | Beforehand) -> bool:
+        return not options.only or not {row.name, *row.row.split(", ")}.isdisjoint(options.only)
 
-    faults = [fault for fault in FAULTS if wanted(fault.row)] * options.repeat
-    beforehand = [row for row in BEFOREHAND if wanted(row.row)]
+    faults = [*filter(wanted, FAULTS)] * options.repeat
+    beforehand = [*filter(wanted, BEFOREHAND)]
     folder = Path(tempfile.mkdtemp(prefix="ftdrive-hazards-"))
     table = Table(folder, len(faults) + len(beforehand))
     try:

@@ -595,6 +595,32 @@ def test_resume_before_the_cause_is_mended_is_not_believed(lab: Lab) -> None:
     assert len(lab.arm.moves) == 3
 
 
+def test_resume_with_something_still_pushing_is_not_believed_though_nobody_knows_the_tool(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: setattr(lab.sensor, "push", np.array([150.0, 0, 0, 0, 0, 0]))
+    lab.operator.answers["Type resume"] = ["resume", "quit"]
+    with pytest.raises(DeviceFault, match="unexpected contact"):
+        lab.calibrate()
+    (refused,) = [event for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
+    assert "unexpected contact" in refused.words
+    assert len(lab.arm.moves) == 3
+
+
+def test_a_sensor_that_was_switched_off_may_have_another_zero(lab: Lab) -> None:
+    def fail() -> None:
+        lab.sensor.failure = StreamBroken("gone")
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, StateChanged) and event.state is State.HOLD:
+            lab.sensor.heals = True
+            lab.sensor.push = np.array([150.0, 0, 0, 0, 0, 0])
+
+    lab.arm.at_move[2] = fail
+    lab.operator.on_event = on_event
+    lab.operator.answers["Type resume"] = ["resume"]
+    lab.calibrate()
+    assert not [event for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
+
+
 def test_a_sensor_that_comes_back_while_the_arm_stands_needs_nobody(lab: Lab) -> None:
     def fail() -> None:
         if len(lab.arm.moves) == 3 and not lab.sensor.heals:
