@@ -118,7 +118,7 @@ def test_variables_are_read_as_the_key_needs(
             "fast",
             ["FTDRIVE_ROBOT_SPEED_DEG_S", "robot", "speed_deg_s", "fast", "a number"],
         ),
-        ("FTDRIVE_ROBOT_SPEED_DEG_S", "4000", ["FTDRIVE_ROBOT_SPEED_DEG_S", "4000", "0.5 to 180"]),
+        ("FTDRIVE_ROBOT_SPEED_DEG_S", "4000", ["FTDRIVE_ROBOT_SPEED_DEG_S", "4000", "0.5 to 60"]),
         ("FTDRIVE_ROBOT_SPEED_DEG_S", "60\nmodel = 5", ["speed_deg_s", "a number"]),
         ("FTDRIVE_ROBOT_SPEED_DEG_S", "nan", ["a number"]),
         ("FTDRIVE_WORKCELL_MEASURED", "yes", ["true or false"]),

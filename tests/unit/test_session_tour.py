@@ -245,7 +245,7 @@ class Lab:
             SensorConfig("fake://"),
             ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),)),
             WorkcellConfig(measured=True),
-            Sampling(average_s=0.3),
+            Sampling(average_s=0.3, noise_record_s=0.0),
         )
         monkeypatch.setattr(guided, "build_arm", lambda _: self.arm)
         monkeypatch.setattr(guided, "build_sensor", lambda _: self.sensor)
@@ -276,7 +276,7 @@ def test_the_states_follow_one_another_and_all_is_written_down(lab: Lab) -> None
     assert outcome.result.mass_kg == pytest.approx(1.2, abs=0.01)
     states = lab.operator.states()
     one = [State.MOVE, State.SETTLE, State.SAMPLE]
-    assert states == [State.PREFLIGHT, State.APPROACH, *one[1:], *one * 6, State.CLOSE, State.REPORT]
+    assert states == [State.IDLE, State.PREFLIGHT, State.APPROACH, *one[1:], *one * 6, State.CLOSE, State.REPORT]
     assert [event.stop for event in lab.operator.of(PoseTaken)] == [1, 2, 3, 4, 5, 6, 7]
     run = lab.run()
     lines = (run.folder / "events.ndjson").read_text().splitlines()
