@@ -57,7 +57,7 @@ def cell_file(cell: CellConfig, found: Sequence[str]) -> str:
         "[sampling]",
         "# How long to average at each pose is chosen from a record of the sensor at rest, before the tour.",
         _line("# noise_record_s", cell.sampling.noise_record_s, "how long that record is; 0 for none"),
-        _line("# average_s", cell.sampling.average_s, "average so long instead, without a record"),
+        _line("# average_s", cell.sampling.average_s, "said alone: average so long, without a record"),
         "",
         "[site]",
         _line("# g_m_s2", cell.site.g_m_s2, "local gravity"),

@@ -3,7 +3,8 @@
 A value is taken from the first of these that tells it: an option of the command; the environment, where
 FTDRIVE_ROBOT_HOST is the key `host` of `[robot]`; the project's file, `ftdrive.toml` where the command is run, or
 `--config`; the user's file, `$XDG_CONFIG_HOME/ftdrive/ftdrive.toml`; the default. What must be measured has none. How
-long to average at a pose is chosen from a record of the sensor at rest, unless `average_s` says it.
+long to average at a pose is chosen from a record of the sensor at rest, unless `average_s` is said and no
+`noise_record_s` is.
 """
 
 import json
@@ -154,7 +155,7 @@ def settings(config: Path | None = None, flags: Mapping[str, Flag] | None = None
         if value is not None:
             found[key] = Setting(checked(option, key, value), option)
     if "sampling.average_s" in found:  # who says how long to average does not want it chosen
-        found["sampling.noise_record_s"] = Setting(0.0, found["sampling.average_s"].origin)
+        found.setdefault("sampling.noise_record_s", Setting(0.0, found["sampling.average_s"].origin))
     return {key: found.get(key) or _default(key) for key in _KEYS}
 
 
