@@ -107,11 +107,8 @@ def calibrate(
             description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
         else:
             said = Said(str(config.absolute()) if config else None, robot, sensor, tool)
-            if resume is None:
-                cell = said.cell()
-            else:
-                cell, said = _to_resume(resume, said)
             description = {"said": said.to_dict()}
+            cell = said.cell() if resume is None else _cell_to_resume(resume, said)
         options = Options(
             runs,
             poses=6 if minimal else 12 if quick else 24,
@@ -181,7 +178,7 @@ class Said:
         return cell_of(self.settings())
 
 
-def _to_resume(folder: Path, said: Said) -> tuple["CellConfig", Said]:
+def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
     """Cell of a run that goes on: with the options it was begun with, where they are not given anew.
 
     Tool and surroundings are those that files and environment describe now: when they are not those of the plan, it is
@@ -210,16 +207,15 @@ def _to_resume(folder: Path, said: Said) -> tuple["CellConfig", Said]:
         for key, value in (("robot.host", before.robot.host), ("sensor.url", before.sensor.url)):
             if found[key].value is None:
                 found[key] = Setting(value, str(folder))
-        return cell_of(found), said
+        return cell_of(found)
     talk.print("Settings as the run was begun: no file here describes tool and surroundings.", markup=False)
     cylinders_mm = found["tool.cylinders_mm"].value or before.tool.cylinders_mm
-    cell = replace(
+    return replace(
         before,
         robot=replace(before.robot, host=said.robot or before.robot.host),
         sensor=replace(before.sensor, url=said.sensor or before.sensor.url),
         tool=replace(before.tool, cylinders_mm=cylinders_mm),
     )
-    return cell, said
 
 
 def _as_json(outcome: "Outcome") -> dict[str, Any]:
