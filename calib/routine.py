@@ -42,8 +42,8 @@ class Sampling:
     still_timeout_s: float = 10.0
     attempts: int = 2
     """A pose that moves or drifts while it is averaged is averaged again, this often in all, and then kept as noisy."""
-    noise_record_s: float = 0.0
-    """Before the tour, listen to the sensor so long and choose from it how long to average; 0 takes `average_s`."""
+    noise_record_s: float = 12.0
+    """Before a tour, listen to the sensor so long and choose from it how long to average; 0 takes `average_s`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

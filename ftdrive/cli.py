@@ -69,7 +69,7 @@ class _Talk(logging.Handler):
 
 def exit_code(error: BaseException) -> int | None:
     """Exit code of an error that a user can mend; None for a defect of ours."""
-    from calib.errors import BadCalibration, BadDataset, NotObservable, TooFewSamples
+    from calib.errors import BadCalibration, BadDataset, CalibError, TooFewSamples
     from drivers.errors import ConnectError, DeviceFault, DriverError
     from drivers.transcript import BadTranscript
     from ftdrive.errors import ConfigError, NotAccepted
@@ -83,7 +83,7 @@ def exit_code(error: BaseException) -> int | None:
         (BadDataset, 6),
         (BadCalibration, 6),
         (BadTranscript, 6),
-        (NotObservable, 7),
+        (CalibError, 7),
         (NotAccepted, 7),
         (OSError, 6),
     ]

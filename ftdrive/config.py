@@ -2,7 +2,9 @@
 
 A value is taken from the first of these that tells it: an option of the command; the environment, where
 FTDRIVE_ROBOT_HOST is the key `host` of `[robot]`; the project's file, `ftdrive.toml` where the command is run, or
-`--config`; the user's file, `$XDG_CONFIG_HOME/ftdrive/ftdrive.toml`; the default. What must be measured has none.
+`--config`; the user's file, `$XDG_CONFIG_HOME/ftdrive/ftdrive.toml`; the default. What must be measured has none. How
+long to average at a pose is chosen from a record of the sensor at rest, unless `average_s` is said and no
+`noise_record_s` is.
 """
 
 import json
@@ -33,10 +35,10 @@ class RobotConfig:
     model: str | None = None
     """Such as "ur5e"; checked against the controller where it can tell."""
     speed_deg_s: float = 60.0
-    """Of the fastest joint in a move."""
+    """Of the fastest joint in a move; 60 at most."""
     acceleration_deg_s2: float = 80.0
     tip_speed_mm_s: float = 250.0
-    """Of the tool's farthest points."""
+    """Of the tool's farthest points; 250 at most, the reduced speed of ISO 10218-1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +63,8 @@ class ToolConfig:
     cylinders_mm: Rows = ()
     """(from, to, diameter[, x, y]) along the flange z axis from the flange face; x, y put the axis aside."""
     mass_kg: float | None = None
-    """Of what hangs on the sensor, about; for predictions only."""
+    """Of what hangs on the sensor, about. The payload told by the controller and the sensor's range are checked against
+    it, and until six poses are taken a change by more than it can weigh counts as contact."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +167,8 @@ def settings(
     for key, (option, value) in (flags or {}).items():
         if value is not None:
             found[key] = Setting(checked(option, key, value), option)
+    if "sampling.average_s" in found:  # who says how long to average does not want it chosen
+        found.setdefault("sampling.noise_record_s", Setting(0.0, found["sampling.average_s"].origin))
     return {key: found.get(key) or _default(key) for key in _KEYS}
 
 
@@ -302,9 +307,9 @@ _TYPES: Mapping[Any, tuple[str, Callable[[Any], bool]]] = {
 _TYPES = {**_TYPES, str | None: _TYPES[str], float | None: _TYPES[float]}
 
 _RANGES: Mapping[str, tuple[float, float]] = {
-    "robot.speed_deg_s": (0.5, 180),
+    "robot.speed_deg_s": (0.5, 60),
     "robot.acceleration_deg_s2": (1, 300),
-    "robot.tip_speed_mm_s": (1, 1000),
+    "robot.tip_speed_mm_s": (1, 250),
     "sensor.height_mm": (0, 500),
     "sensor.mass_kg": (0, 20),
     "tool.mass_kg": (0.001, 100),
@@ -348,6 +353,10 @@ def _wrong_sign(value: int) -> str | None:
     return None if value in {-1, 1} else "give 1, or -1 for a sensor that reports the reaction"
 
 
+def _wrong_record(value: float) -> str | None:
+    return None if value == 0 or value >= 3 else "give 3 or more, or 0 for none: a shorter one judges no average"
+
+
 def _wrong_mounting(value: str) -> str | None:
     try:
         usable = value in {"floor", "wall", "ceiling"} or isfinite(float(value))
@@ -387,6 +396,7 @@ _WRONG: Mapping[str, Callable[[Any], str | None]] = {
     "robot.model": _wrong_model,
     "sensor.url": _wrong_text,
     "sensor.sign": _wrong_sign,
+    "sampling.noise_record_s": _wrong_record,
     "tool.name": _wrong_text,
     "tool.cylinders_mm": _wrong_cylinders,
     "workcell.mounting": _wrong_mounting,

@@ -114,7 +114,7 @@ class Station:
             sensor=SensorConfig(url),
             tool=ToolConfig("emulated", (TOOL_MM,)),
             workcell=WorkcellConfig(self.mounting, measured=True),
-            sampling=Sampling(average_s=0.4),
+            sampling=Sampling(average_s=0.4, noise_record_s=0.0),
         )
 
 

@@ -1,16 +1,25 @@
 """`ftdrive calibrate`: the job on a real cell."""
 
+from collections.abc import Collection
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import JSON, RUNS, read_cell, stop_unless_accepted, write_json
+from ftdrive.commands.common import JSON, RUNS, rows, stop_unless_accepted, write_json
 
 if TYPE_CHECKING:
     from ftdrive.config import CellConfig
+    from ftdrive.session.outcome import Outcome
+
+_EXCLUDE_ONE_ANOTHER = (
+    ("--step", "--manual", "--listen"),
+    ("--quick", "--minimal", "--plan", "--resume"),
+    *((hand, poses) for hand in ("--manual", "--listen") for poses in ("--quick", "--minimal")),
+    *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
+)
 
 
 @click.command()
@@ -21,19 +30,23 @@ if TYPE_CHECKING:
     "--tool",
     multiple=True,
     metavar="FROM:TO:DIAMETER[:X:Y]",
-    help="A cylinder of what is mounted, sensor included, in mm from the flange face; instead of [tool]. Repeatable.",
+    help="A cylinder of what is mounted, sensor included, in mm from the flange face; not those of [tool]. Repeatable.",
 )
 @click.option("--simulate", is_flag=True, help="An emulated cell; --sensor emulated://NAME chooses its sensor.")
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses.")
 @click.option("--step", is_flag=True, help="Wait for Enter before each move.")
-@click.option("--fast", is_flag=True, help="At the plan's speed, up to 60 °/s, once it has run to its end slowly.")
+@click.option(
+    "--fast", is_flag=True, help="At the plan's speed, once it has run to its end slowly: 60 °/s, 250 mm/s at most."
+)
 @click.option("--manual", is_flag=True, help="No motion at all: you move the arm, ftdrive tells where to.")
 @click.option("--listen", is_flag=True, help="No motion at all: a program on the pendant moves the arm.")
 @click.option("--dry-run", is_flag=True, help="Plan, show and check everything; nothing moves.")
 @click.option("--plan", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="A plan made before.")
 @click.option(
-    "--resume", type=click.Path(exists=True, file_okay=False, path_type=Path), help="Go on with a run that was ended."
+    "--resume",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Go on with a run that was ended: in its way, with its options, and the files of settings as they are now.",
 )
 @click.option("--redo", type=int, multiple=True, metavar="N", help="With --resume: take pose N again. Repeatable.")
 @click.option("--yes", is_flag=True, help="Answer what may be answered without a person; never the first motion.")
@@ -64,7 +77,7 @@ def calibrate(
     Every move is proven clear and shown before it happens; a first motion needs a typed word and is slow. Where the arm
     has room only the three wrist joints move. Ctrl-C stops the arm; what was taken is kept and --resume goes on.
     """
-    from ftdrive.errors import ConfigError, Declined
+    from ftdrive.errors import Declined
     from ftdrive.report import print_result
     from ftdrive.screen import open_operator
     from ftdrive.session.guided import Options
@@ -72,10 +85,20 @@ def calibrate(
     from ftdrive.simulation import Station, sensor_name
     from ftdrive.talk import talk
 
-    if sum((step, manual, listen)) > 1 or (quick and minimal) or (plan and (quick or minimal or resume)):
-        raise ConfigError(
-            "--step, --manual and --listen exclude one another; so do --quick, --minimal, --plan, --resume"
-        )
+    given = {
+        "--step": step,
+        "--manual": manual,
+        "--listen": listen,
+        "--quick": quick,
+        "--minimal": minimal,
+        "--plan": plan,
+        "--resume": resume,
+        "--simulate": simulate,
+        "--config": config,
+        "--robot": robot,
+        "--tool": tool,
+    }
+    _refuse_contradictions([option for option, value in given.items() if value])
     with ExitStack() as stack:
         description: dict[str, Any] = {}
         if simulate:
@@ -83,7 +106,9 @@ def calibrate(
             cell = station.cell
             description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
         else:
-            cell = _cell(config, robot, sensor, tool, resume)
+            said = Said(str(config.absolute()) if config else None, robot, sensor, tool)
+            description = {"said": said.to_dict()}
+            cell = said.cell() if resume is None else _cell_to_resume(resume, said)
         options = Options(
             runs,
             poses=6 if minimal else 12 if quick else 24,
@@ -106,32 +131,103 @@ def calibrate(
         talk.print("A dry run: nothing has moved.")
         return
     if as_json:
-        write_json({"run": str(outcome.run.folder), **outcome.result.to_dict()})
+        write_json(_as_json(outcome))
     else:
         saved = None if outcome.result.verdict == "rejected" else outcome.run.calibration_path
         print_result(outcome.result, drift=outcome.drift, records=outcome.run.records(), saved=saved)
     stop_unless_accepted(outcome.result)
 
 
-def _cell(
-    config: Path | None, robot: str | None, sensor: str | None, tool: tuple[str, ...], resume: Path | None
-) -> "CellConfig":
-    """Put the cell together; a run that is resumed brings its own unless another is named."""
-    from ftdrive.config import ToolConfig, WorkcellConfig
+def _refuse_contradictions(given: Collection[str]) -> None:
     from ftdrive.errors import ConfigError
-    from ftdrive.runs import Run
-    from ftdrive.session import cell_of
 
-    if resume is not None and not (config or robot or sensor):
-        cell = cell_of(Run(resume).header())
-    else:
-        cell = read_cell(config, robot, sensor)
-    if tool:
-        try:
-            cylinders = tuple(tuple(float(part) for part in text.split(":")) for text in tool)
-        except ValueError:
-            raise ConfigError(f"--tool is {' '.join(tool)}: give numbers in mm, such as 0:200:100") from None
-        cell = replace(cell, tool=ToolConfig("tool", cylinders), workcell=replace(cell.workcell))
-        if config is None and cell.workcell == WorkcellConfig():
-            cell = replace(cell, workcell=WorkcellConfig(measured=True))  # said here and now, and nothing else is there
-    return cell
+    for group in _EXCLUDE_ONE_ANOTHER:
+        both = [option for option in group if option in given]
+        if len(both) > 1:
+            raise ConfigError(f"{both[0]} and {both[1]} exclude one another: leave one of them out")
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """Options that have a say in the cell. A run keeps them, so that it is resumed with the same."""
+
+    config: str | None = None
+    robot: str | None = None
+    sensor: str | None = None
+    tool: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give what run.json keeps."""
+        return {"config": self.config, "robot": self.robot, "sensor": self.sensor, "tool": list(self.tool)}
+
+    def settings(self) -> dict[str, Any]:
+        """Give these options, environment and files, in this order of precedence; see `ftdrive.config.settings`."""
+        from ftdrive.config import settings
+
+        flags = {
+            "robot.host": ("--robot", self.robot),
+            "sensor.url": ("--sensor", self.sensor),
+            "tool.cylinders_mm": ("--tool", rows("--tool", self.tool, (3, 5))),
+        }
+        return settings(None if self.config is None else Path(self.config), flags)
+
+    def cell(self) -> "CellConfig":
+        """Put the cell together."""
+        from ftdrive.config import cell_of
+
+        return cell_of(self.settings())
+
+
+def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
+    """Cell of a run that goes on: with the options it was begun with, where they are not given anew.
+
+    Tool and surroundings are those that files and environment describe now: when they are not those of the plan, it is
+    refused. Where nothing describes them any more, the run's own record counts.
+    """
+    from ftdrive.config import Setting, cell_of
+    from ftdrive.runs import Run
+    from ftdrive.session import cell_of as cell_of_run
+    from ftdrive.talk import talk
+
+    header = Run(folder).header()
+    begun: dict[str, Any] = {**Said().to_dict(), **header.get("said", {})}
+    if begun["config"] is not None and not Path(begun["config"]).is_file():
+        begun["config"] = None
+    said = Said(
+        said.config or begun["config"],
+        said.robot or begun["robot"],
+        said.sensor or begun["sensor"],
+        said.tool or tuple(begun["tool"]),
+    )
+    found, before = said.settings(), cell_of_run(header)
+    nobody = {"default", "not set", "--tool"}
+    origins = {one.origin for key, one in found.items() if key.startswith(("tool.", "workcell."))} - nobody
+    if origins:
+        talk.print(f"Tool and surroundings as they are described now: {', '.join(sorted(origins))}.", markup=False)
+        for key, value in (("robot.host", before.robot.host), ("sensor.url", before.sensor.url)):
+            if found[key].value is None:
+                found[key] = Setting(value, str(folder))
+        return cell_of(found)
+    talk.print("Settings as the run was begun: no file here describes tool and surroundings.", markup=False)
+    cylinders_mm = found["tool.cylinders_mm"].value or before.tool.cylinders_mm
+    return replace(
+        before,
+        robot=replace(before.robot, host=said.robot or before.robot.host),
+        sensor=replace(before.sensor, url=said.sensor or before.sensor.url),
+        tool=replace(before.tool, cylinders_mm=cylinders_mm),
+    )
+
+
+def _as_json(outcome: "Outcome") -> dict[str, Any]:
+    """Give the run, the result, and what the report says beside: pose 1 seen again, and what probably happened."""
+    from ftdrive.hints import hints
+
+    drift = outcome.drift
+    return {
+        "run": str(outcome.run.folder),
+        "drift_check": None
+        if drift is None
+        else {"change": drift.change.tolist(), "sigma": drift.sigma.tolist(), "elapsed_s": drift.elapsed_s},
+        "hints": list(hints(outcome.result, outcome.run.records())),
+        **outcome.result.to_dict(),
+    }

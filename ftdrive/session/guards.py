@@ -362,7 +362,8 @@ class ContactGuard(Guard):
         limit_N = 2 * weight_N + self.limits.unknown_N
         limit_Nm = 2 * weight_N * self.lever_m + self.limits.unknown_Nm
         start = seen.wrench if self._start is None else self._start
-        self._trip(seen.wrench - start, limit_N, limit_Nm, "has changed by", "since the start")
+        than = f"since the start, where a tool of {self.heaviest_kg:g} kg is assumed ([tool] mass_kg)"
+        self._trip(seen.wrench - start, limit_N, limit_Nm, "has changed by", than)
 
     def _known(self, seen: Seen, residual: Array) -> None:
         if self._residual is None:

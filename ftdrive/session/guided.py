@@ -10,15 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.allan import averaging_time
-from calib.noise import LEAST_SAMPLES, noise_level
+from calib.noise import LEAST_SAMPLES, mean_and_covariance, noise_level
 from calib.routine import PoseRecord, Sampling
 from drivers.errors import DriverError
 from drivers.interfaces import DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
 from ftdrive.config import CellConfig
-from ftdrive.errors import ConfigError, NotAccepted, PlanRefused
+from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
 from ftdrive.planning.cell import certifier_for
 from ftdrive.planning.constant_tour import constant_tour
-from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
 from ftdrive.planning.scene import Scene, lean_of
@@ -39,10 +38,11 @@ from ftdrive.session.guards import (
     StallGuard,
     Tripped,
 )
-from ftdrive.session.machine import SLOW_RAD_S, SLOW_RAD_S2, Desk, Pace, RunningFit, Tour, approach_to
+from ftdrive.session.machine import Desk, Pace, RunningFit, Tour, approach_to
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Operator
 from ftdrive.session.outcome import Outcome, solve_and_save
+from ftdrive.session.prospect import SLOW, USUAL_KG, at_most, moves_s, prediction, slower, speeds_of
 from ftdrive.session.running import Running
 from ftdrive.session.watch import Guards
 from ftdrive.wiring import build_arm, build_sensor
@@ -53,6 +53,7 @@ _GRID_RAD: Final = float(np.radians(0.1))
 """Plans are made where joints 1 to 3 stand, to this grid: the same place gives the same plan, and hash, again."""
 _TARGET_N, _TARGET_NM = 0.057, 0.0035
 """Of one average: 0.02 N of bias from 24 poses."""
+_BY_HAND: Final = ("manual", "listen")
 _HEAVIEST_KG: Final = {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5, "UR16e": 16.0, "UR20": 20.0}
 _HEAVIEST_OF_ALL_KG: Final = 30.0
 _EMULATED: Final = Limits(sensor_age_moving_s=0.3)
@@ -67,6 +68,7 @@ class Options:
     name: str = "calibrate"
     poses: int = 24
     mode: Literal["auto", "step", "manual", "listen"] = "auto"
+    """A run that is resumed keeps to its own where nothing else is said."""
     dry_run: bool = False
     fast: bool = False
     """At the plan's speeds, once it has run to its end slowly."""
@@ -93,7 +95,11 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
         It was broken off; what was taken stands in the run, which can be resumed.
     """
     desk = Desk(operator)
-    by_hand = options.mode in {"manual", "listen"}
+    desk.tell(StateChanged(state=State.IDLE))
+    options = _as_begun(options)
+    by_hand = options.mode in _BY_HAND
+    if options.resume is not None:
+        desk.keep_in(Run(options.resume))
     with build_sensor(cell) as sensor, closing(build_arm(cell)) as arm, preflight.awake() as kept_awake:
         arm.open(control=not by_hand)
         desk.tell(StateChanged(state=State.PREFLIGHT))
@@ -106,8 +112,29 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
             if options.dry_run:
                 return None
             run = begun.tour(devices)
+    if not run.stops():
+        raise Declined(f"ended before the first pose: {run.folder} holds nothing to solve")
     desk.tell(StateChanged(state=State.REPORT))
     return solve_and_save(run)
+
+
+def _as_begun(options: Options) -> Options:
+    """Give a run that is resumed the mode it was begun in; raises `ConfigError` for options that do not go together."""
+    begun = options.mode if options.resume is None else Run(options.resume).header().get("mode", "auto")
+    if options.mode != "auto" and (begun in _BY_HAND) != (options.mode in _BY_HAND):
+        way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
+        raise ConfigError(f"{options.resume} was begun {way} and can only go on like that: leave out --{options.mode}")
+    if begun not in _BY_HAND:
+        return options
+    no_motion = {
+        "--plan": options.plan is not None,
+        "--fast": options.fast,
+        "--dry-run": options.dry_run,
+        "--redo": bool(options.redo),
+    }
+    if wrong := [name for name, given in no_motion.items() if given]:
+        raise ConfigError(f"with --{begun} ftdrive plans and moves nothing: leave out {' and '.join(wrong)}")
+    return replace(options, mode=begun if options.mode == "auto" else options.mode)
 
 
 class _Begun:
@@ -127,12 +154,18 @@ class _Begun:
         info: DeviceInfo = arm.identify()
         self._certifier = certifier_for(cell, info.model)
         self._old = None if options.resume is None else Run(options.resume)
+        self._speeds = speeds_of(cell)
         self._plan = self._planned()
         document = self._plan.to_dict()
         self._key = (info.serial, str(document["sha256"]))
         self._known = not options.real or has_completed(*self._key)
+        speeds = slower(self._speeds, SLOW) if self._pace.slow else self._speeds
+        self._driven = at_most(self._plan, self._certifier, speeds)
         q = arm.state().q_rad
         self._todo, self._taken = self._what_is_left()
+        self._running: RunningFit = Running(g_m_s2=cell.site.g_m_s2, down_base=self._certifier.scene.down_base)
+        for record in self._taken:
+            desk.tell(self._running.add(record))
         first = self._todo[0] - 1 if self._todo else 0
         goal = np.array(self._plan.steps[first % len(self._plan.steps)].q_rad)
         self._before = preflight.Before(
@@ -141,16 +174,16 @@ class _Begun:
             sensor=sensor,
             certifier=self._certifier,
             plan=self._plan,
-            approach=approach_to(self._certifier, q, goal, Speeds(SLOW_RAD_S, SLOW_RAD_S2)),
+            approach=approach_to(self._certifier, q, goal, SLOW),
             runs=options.runs,
             known=self._known,
-            quiet=self._listen(),
+            quiet=self._listen(preflight.LISTEN_S),
             limits=limits,
             sensor_range=_range_of(sensor),
         )
         self._check(preflight.CHECKS)
-        self._sampling = self._chosen_sampling()
-        self._show()
+        self._sampling, self._noise = self._chosen_sampling()
+        self._show(q)
 
     def _planned(self) -> Plan:
         """The plan of the run that is resumed, or of a file, or one made where the arm stands."""
@@ -162,13 +195,8 @@ class _Begun:
         q = np.round(self._arm.state().q_rad / _GRID_RAD) * _GRID_RAD
         with suppress(ConfigError):  # the planner says what to do about it
             q = constant_tour(q)[0]  # wherever the wrist was left
-        speeds = Speeds(
-            float(np.radians(cell.robot.speed_deg_s)),
-            float(np.radians(cell.robot.acceleration_deg_s2)),
-            cell.robot.tip_speed_mm_s / 1e3,
-        )
-        guess = guess_of(self._certifier, cell.tool.mass_kg or 1.0)
-        return plan_tour(self._certifier, q, options.poses, speeds=speeds, guess=guess)
+        guess = guess_of(self._certifier, cell.tool.mass_kg or USUAL_KG)
+        return plan_tour(self._certifier, q, options.poses, speeds=self._speeds, guess=guess)
 
     def _what_is_left(self) -> tuple[list[int], list[PoseRecord]]:
         """Stops to take, and records that stand."""
@@ -177,7 +205,7 @@ class _Begun:
             if self._options.redo:
                 raise ConfigError("--redo takes poses of a run again: name the run with --resume RUN")
             return list(stops), []
-        self._require_same_devices(self._old)
+        _require_same_devices(self._old, self._arm, self._sensor)
         redo = set(self._options.redo)
         if wrong := sorted(redo - set(stops)):
             raise ConfigError(f"pose {wrong[0]} cannot be taken again: the run has poses 1 to {len(stops)}")
@@ -185,23 +213,15 @@ class _Begun:
         have = {record.stop for record in kept}
         return [stop for stop in stops if stop not in have], kept
 
-    def _require_same_devices(self, run: Run) -> None:
-        devices = run.header()["devices"]
-        for name, info in (("arm", self._arm.identify()), ("sensor", self._sensor.identify())):
-            if devices[name]["serial"] != info.serial:
-                raise PlanRefused(
-                    f"the run was made with the {name} {devices[name]['serial']}, this is {info.serial}: make a new run"
-                )
-
-    def _listen(self) -> FtSamples:
+    def _listen(self, duration_s: float) -> FtSamples:
         """Take samples of the resting sensor; one that fails, as after a killed session, is opened once more."""
         try:
-            return self._sensor.collect(preflight.LISTEN_S)
+            return self._sensor.collect(duration_s)
         except DriverError as error:
             self._desk.tell(Noted(words=f"{error}; trying once more", warning=True))
         self._sensor.close()
         self._sensor.open()
-        return self._sensor.collect(preflight.LISTEN_S)
+        return self._sensor.collect(duration_s)
 
     def _check(self, checks: Sequence[preflight.Check]) -> None:
         failed = []
@@ -213,13 +233,14 @@ class _Begun:
         if failed:
             raise NotAccepted("nothing moves: " + "; ".join(failed))
 
-    def _chosen_sampling(self) -> Sampling:
-        """How long to average: as configured, or as the noise of a record asks for."""
+    def _chosen_sampling(self) -> tuple[Sampling, Array]:
+        """How long to average, as configured or as the noise of a record asks; (6,) one sigma of such an average."""
         sampling = self._cell.sampling
-        if not sampling.noise_record_s:
-            return sampling
+        if not (sampling.noise_record_s and self._todo):
+            variance = np.diag(mean_and_covariance(self._before.quiet.wrench).covariance)
+            return sampling, np.sqrt(variance * preflight.LISTEN_S / sampling.average_s)
         self._desk.tell(Noted(words=f"listening to the sensor for {sampling.noise_record_s:g} s; do not touch the arm"))
-        record = self._sensor.collect(sampling.noise_record_s)
+        record = self._listen(sampling.noise_record_s)
         chosen = averaging_time(
             record.wrench,
             len(record) / sampling.noise_record_s,
@@ -227,37 +248,26 @@ class _Begun:
             target_torque_Nm=_TARGET_NM,
         )
         self._desk.tell(Noted(words=chosen.words))
-        return replace(sampling, average_s=chosen.seconds)
+        return replace(sampling, average_s=chosen.seconds), chosen.sigma
 
-    def _show(self) -> None:
-        plan, pace = self._plan, self._pace
+    def _show(self, q_rad: Array) -> None:
+        plan = self._plan
         for words in plan.why:
             self._desk.tell(Noted(words=words))
-        predicted, mass_kg = plan.predicted, plan.description["guess"]["mass_kg"]
-        self._desk.tell(
-            Noted(
-                words=f"predicted for {mass_kg:g} kg, one sigma: mass {1e3 * predicted['mass_kg']:.1f} g, force bias "
-                f"{max(predicted['force_bias_N']):.3f} N, compensation {predicted['force_rms_N']:.3f} N, "
-                f"{predicted['torque_rms_Nm']:.4f} N·m"
-            )
-        )
+        mass_kg, average_s = self._cell.tool.mass_kg, self._sampling.average_s
+        self._desk.tell(Noted(words=prediction(plan, self._certifier, mass_kg, average_s, self._noise)))
         q = np.degrees([step.q_rad for step in plan.steps])
         ranges = ", ".join(f"{low:.0f} to {high:.0f}" for low, high in zip(q.min(axis=0), q.max(axis=0), strict=True))
         self._desk.tell(Noted(words=f"joints 1 to 6 stay within {ranges} degrees: are cables long and slack enough?"))
-        if self._options.fast and pace.slow:
+        if self._options.fast and self._pace.slow:
             self._desk.tell(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
-        turn = np.array([step.turn_rad for step in plan.steps])
-        speed = np.array([step.speed_rad_s for step in plan.steps])
-        acceleration = plan.acceleration_rad_s2
-        if pace.slow:
-            speed, acceleration = np.minimum(speed, SLOW_RAD_S), min(acceleration, SLOW_RAD_S2)
-        into = np.array(self._todo, dtype=np.intp) - 2  # the move to a stop is told with the stop before
-        moves_s = float(move_duration_s(turn, speed, acceleration)[into].sum())
-        rest_s = len(into) * (self._sampling.average_s + 0.6)
+        fastest_rad_s = max(step.speed_rad_s for step in self._driven.steps)
+        total_s = moves_s(self._driven, self._todo, q_rad, self._before.approach)
+        total_s += len(self._todo) * (average_s + 0.6)
         self._desk.tell(
             Noted(
-                words=f"stops to come: {len(self._todo)}, at most {np.degrees(speed.max()):.0f}°/s: about "
-                f"{(moves_s + rest_s) / 60:.1f} min; {len(self._taken)} poses are there already"
+                words=f"stops to come: {len(self._todo)}, at most {np.degrees(fastest_rad_s):.0f}°/s: about "
+                f"{total_s / 60:.1f} min; {len(self._taken)} poses are there already"
             )
         )
 
@@ -273,11 +283,10 @@ class _Begun:
 
     def tour(self, devices: Mapping[str, Any]) -> Run:
         """Ask, move, keep."""
-        desk, plan, cell = self._desk, self._plan, self._cell
+        desk, plan, cell = self._desk, self._driven, self._cell
         if self._options.questions and self._todo:
             self._ask()
         run = self._run(devices)
-        desk.keep_in(run)
         quiet = self._before.quiet.wrench
         window = int(len(quiet) * min(1.0, self._sampling.average_s / preflight.LISTEN_S))
         quiet_std = noise_level(quiet, max(LEAST_SAMPLES, window))
@@ -296,7 +305,6 @@ class _Begun:
             SettingsGuard(),
             StallGuard(self._limits),
         )
-        running: RunningFit = Running(g_m_s2=cell.site.g_m_s2, down_base=self._certifier.scene.down_base)
 
         def on_trip(trip: Tripped) -> None:
             desk.tell(GuardTripped(hazard=trip.hazard, words=str(trip)))
@@ -309,7 +317,7 @@ class _Begun:
                 plan,
                 run,
                 desk,
-                running,
+                self._running,
                 guards,
                 contact=contact,
                 load=load,
@@ -317,13 +325,13 @@ class _Begun:
                 pace=self._pace,
                 recheck=self._recheck,
                 quiet_std=quiet_std,
-            ).run(self._todo, self._taken)
+            ).run(self._todo, ())  # the running fit knows what was taken
         if self._options.real:
             remember_completed(*self._key)
         return run
 
     def _recheck(self) -> None:
-        self._before = replace(self._before, quiet=self._listen())
+        self._before = replace(self._before, quiet=self._listen(preflight.LISTEN_S))
         self._check(preflight.AGAIN)
 
     def _ask(self) -> None:
@@ -344,7 +352,17 @@ class _Begun:
             return self._old
         run = Run.create(self._options.runs, self._options.name, _description(self._cell, devices, self._options))
         self._plan.save(run.plan_path)
+        self._desk.keep_in(run)
         return run
+
+
+def _require_same_devices(run: Run, arm: RobotArm, sensor: ForceTorqueSensor) -> None:
+    devices = run.header()["devices"]
+    for name, info in (("arm", arm.identify()), ("sensor", sensor.identify())):
+        if devices[name]["serial"] != info.serial:
+            raise PlanRefused(
+                f"the run was made with the {name} {devices[name]['serial']}, this is {info.serial}: make a new run"
+            )
 
 
 def _range_of(sensor: ForceTorqueSensor) -> Array | None:
@@ -375,10 +393,11 @@ def _by_hand(
     """No motion command at all: a person moves the arm, or a program on the pendant does."""
     if options.resume is None:
         run, earlier = Run.create(options.runs, options.name, _description(cell, devices, options)), []
+        desk.keep_in(run)
     else:
         run = Run(options.resume)
+        _require_same_devices(run, arm, sensor)
         earlier = run.records()
-    desk.keep_in(run)
     running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_of(cell))
     listen = options.mode == "listen"
     with _kept(desk, run):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.routine import Sampling
 from ftdrive.report import errors_in_sigma
 from ftdrive.session.guided import Options, calibrate
 from ftdrive.session.operators import PlainOperator
@@ -24,7 +25,7 @@ def main() -> int:
     failed = 0
     for poses, target_s in TARGETS_S.items():
         with Station("can", ["--seed", "2", "--time-scale", "1"]) as station, tempfile.TemporaryDirectory() as folder:
-            cell = replace(station.cell, sampling=replace(station.cell.sampling, average_s=2.0))
+            cell = replace(station.cell, sampling=Sampling())
             options = Options(Path(folder), poses=poses, real=False, questions=False)
             start_s = time.perf_counter()
             outcome = calibrate(cell, PlainOperator(yes=True), options)

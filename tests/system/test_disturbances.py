@@ -60,7 +60,7 @@ def station() -> Iterator[Station]:
 def tour(station: Station, tmp_path: Path) -> Callable[[Happening], tuple[Outcome, Nobody]]:
     def run(happening: Happening) -> tuple[Outcome, Nobody]:
         nobody = Nobody(happening)
-        cell = replace(station.cell, sampling=Sampling(average_s=0.3))
+        cell = replace(station.cell, sampling=Sampling(average_s=0.3, noise_record_s=0.0))
         outcome = calibrate(cell, nobody, Options(tmp_path, poses=POSES, real=False, questions=False))
         assert outcome is not None
         assert len(outcome.run.stops()) == POSES + 1

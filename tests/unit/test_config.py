@@ -118,7 +118,7 @@ def test_variables_are_read_as_the_key_needs(
             "fast",
             ["FTDRIVE_ROBOT_SPEED_DEG_S", "robot", "speed_deg_s", "fast", "a number"],
         ),
-        ("FTDRIVE_ROBOT_SPEED_DEG_S", "4000", ["FTDRIVE_ROBOT_SPEED_DEG_S", "4000", "0.5 to 180"]),
+        ("FTDRIVE_ROBOT_SPEED_DEG_S", "4000", ["FTDRIVE_ROBOT_SPEED_DEG_S", "4000", "0.5 to 60"]),
         ("FTDRIVE_ROBOT_SPEED_DEG_S", "60\nmodel = 5", ["speed_deg_s", "a number"]),
         ("FTDRIVE_ROBOT_SPEED_DEG_S", "nan", ["a number"]),
         ("FTDRIVE_WORKCELL_MEASURED", "yes", ["true or false"]),
@@ -135,6 +135,15 @@ def test_a_variable_that_cannot_be_used_is_named(
     with pytest.raises(ConfigError) as error:
         settings()
     assert all(word in str(error.value) for word in words), error.value
+
+
+@pytest.mark.parametrize(
+    ("said", "record_s"),
+    [("", 12), ("average_s = 1\n", 0), ("noise_record_s = 30\n", 30), ("average_s = 1\nnoise_record_s = 30\n", 30)],
+)
+def test_an_average_that_is_said_alone_needs_no_record(said: str, record_s: float) -> None:
+    Path("ftdrive.toml").write_text(f"{GOOD}[sampling]\n{said}")
+    assert load().sampling.noise_record_s == record_s
 
 
 def test_other_programs_variables_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,6 +166,8 @@ def test_other_programs_variables_are_left_alone(monkeypatch: pytest.MonkeyPatch
         (GOOD + "[sampling]\nattempts = 1.5\n", "attempts"),
         (GOOD + "[sampling]\naverage_s = inf\n", "average_s"),
         (GOOD + "[sampling]\naverage_s = 0\n", "0.05 to 600"),
+        (GOOD + "[sampling]\nnoise_record_s = 2\n", "3 or more"),
+        (GOOD.replace("host", "tip_speed_mm_s = 300\nhost"), "1 to 250"),
         (GOOD + "sign = true\n", "sign"),
         (GOOD + "sign = 0\n", "sign = 0.*-1 for"),
         (GOOD + "height_mm = 3300\n", "0 to 500"),

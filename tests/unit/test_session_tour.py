@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,27 @@ from calib.routine import PoseRecord, Sampling
 from drivers.errors import DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
 from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
-from ftdrive.errors import Declined, NotAccepted, PlanRefused
+from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
 from ftdrive.planning.arm_model import ArmModel, Cylinder
+from ftdrive.planning.cell import certifier_for
+from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import USUAL_POSTURE_RAD
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
 from ftdrive.runs import Run
 from ftdrive.session import guided, preflight
 from ftdrive.session.completed import has_completed
-from ftdrive.session.events import Asked, Checked, Event, GuardTripped, Noted, PoseTaken, State, StateChanged
+from ftdrive.session.events import (
+    Asked,
+    Checked,
+    Estimated,
+    Event,
+    GuardTripped,
+    Noted,
+    PoseTaken,
+    RunOpened,
+    State,
+    StateChanged,
+)
 from ftdrive.session.guided import Options
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.outcome import Outcome
@@ -46,6 +60,7 @@ class FakeArm(RobotArm):
         self.moves: list[tuple[Array, float, float]] = []
         self.stops = 0
         self.opened = 0
+        self.control = False
         self.at_move: dict[int, Callable[[], None]] = {}
         self.forbidden: Array | None = None
         self.halted = threading.Event()
@@ -54,7 +69,7 @@ class FakeArm(RobotArm):
 
     def open(self, *, control: bool = False) -> None:
         self.opened += 1
-        assert control
+        self.control = control
 
     def close(self) -> None:
         pass
@@ -98,6 +113,7 @@ class FakeArm(RobotArm):
         speed_rad_s: float | None = None,
         acceleration_rad_s2: float | None = None,
     ) -> None:
+        assert self.control
         assert timeout_s > 0
         assert speed_rad_s is not None
         assert acceleration_rad_s2 is not None
@@ -136,6 +152,7 @@ class FakeSensor(ForceTorqueSensor):
         self.arm = arm
         self.rng = np.random.default_rng(1)
         self.push = np.zeros(6)
+        self.noise = NOISE
         self.failure: DriverError | None = None
         self.stuck = False
         self.heals = False
@@ -159,7 +176,7 @@ class FakeSensor(ForceTorqueSensor):
             at = MODEL.frames(self.arm.q).R_base_flange[0]
             force = at.T @ [0, 0, -1.2 * 9.81]
             free = np.add(np.r_[force, np.cross([0.01, 0, 0.06], force)], [1, 2, 3, 0.1, 0.2, 0.3])
-            self._newest = free + self.push + self.rng.normal(0, NOISE)
+            self._newest = free + self.push + self.rng.normal(0, self.noise)
         return self._newest
 
     def collect(self, duration_s: float) -> FtSamples:
@@ -245,7 +262,7 @@ class Lab:
             SensorConfig("fake://"),
             ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),)),
             WorkcellConfig(measured=True),
-            Sampling(average_s=0.3),
+            Sampling(average_s=0.3, noise_record_s=0.0),
         )
         monkeypatch.setattr(guided, "build_arm", lambda _: self.arm)
         monkeypatch.setattr(guided, "build_sensor", lambda _: self.sensor)
@@ -276,7 +293,7 @@ def test_the_states_follow_one_another_and_all_is_written_down(lab: Lab) -> None
     assert outcome.result.mass_kg == pytest.approx(1.2, abs=0.01)
     states = lab.operator.states()
     one = [State.MOVE, State.SETTLE, State.SAMPLE]
-    assert states == [State.PREFLIGHT, State.APPROACH, *one[1:], *one * 6, State.CLOSE, State.REPORT]
+    assert states == [State.IDLE, State.PREFLIGHT, State.APPROACH, *one[1:], *one * 6, State.CLOSE, State.REPORT]
     assert [event.stop for event in lab.operator.of(PoseTaken)] == [1, 2, 3, 4, 5, 6, 7]
     run = lab.run()
     lines = (run.folder / "events.ndjson").read_text().splitlines()
@@ -314,6 +331,60 @@ def test_the_first_run_is_slow_whatever_was_asked_and_the_second_may_be_fast(lab
     lab.arm.moves.clear()
     lab.calibrate()
     assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
+
+
+def test_a_plan_for_any_speed_is_driven_at_no_more_than_is_allowed(lab: Lab) -> None:
+    certifier = certifier_for(lab.cell, "UR5e")
+    speeds = Speeds(float(np.radians(180)), float(np.radians(80)), None)
+    path = lab.folder / "plan.json"
+    plan_tour(certifier, USUAL_POSTURE_RAD, 6, speeds=speeds, guess=guess_of(certifier)).save(path)
+    lab.calibrate(plan=path)
+    assert has_completed("A1", str(Plan.load(path).to_dict()["sha256"]))
+    lab.arm.moves.clear()
+    lab.calibrate(plan=path, fast=True)
+    fastest = 0.0
+    for (start, *_), (goal, speed, _) in pairwise(lab.arm.moves):
+        assert speed <= np.radians(60) + 1e-9
+        way = start + np.linspace(0, 1, 200)[:, None] * (goal - start)
+        path_m = np.linalg.norm(np.diff(tips(MODEL, way), axis=0), axis=2).max() * 199
+        fastest = max(fastest, path_m * speed / np.abs(goal - start).max())
+    assert fastest == pytest.approx(0.25, rel=0.01)
+    lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, speed_deg_s=20.0, acceleration_deg_s2=30.0))
+    lab.arm.moves.clear()
+    lab.calibrate(plan=path, fast=True)
+    assert max(speed for _, speed, _ in lab.arm.moves[1:]) <= np.radians(20) + 1e-9
+    assert max(acceleration for *_, acceleration in lab.arm.moves[1:]) <= np.radians(30) + 1e-9
+
+
+def test_how_long_to_average_is_chosen_from_the_noise_of_the_sensor(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, sampling=Sampling())
+    lab.calibrate()
+    assert {pose.average_s for pose in lab.operator.of(PoseTaken)} == {1.0}
+    lab.operator.told.clear()
+    lab.sensor.noise = np.repeat([0.8, 0.001], 3)  # of 100 samples a second: 2 s give 0.057 N
+    lab.calibrate()
+    (average_s,) = {pose.average_s for pose in lab.operator.of(PoseTaken)}
+    assert 1.5 <= average_s <= 4.0
+    assert f"average {average_s:.1f} s at each pose" in " ".join(note.words for note in lab.operator.of(Noted))
+
+
+@pytest.mark.parametrize("sampling", [Sampling(), Sampling(average_s=0.3, noise_record_s=0.0)])
+def test_what_is_predicted_before_it_moves_comes_true(sampling: Sampling, lab: Lab) -> None:
+    lab.cell = replace(lab.cell, sampling=sampling, tool=replace(lab.cell.tool, mass_kg=1.2))
+    outcome = lab.calibrate()
+    assert outcome is not None
+    (words,) = [
+        note.words for note in lab.operator.of(Noted) if "predicted from that for 1.2 kg, one sigma" in note.words
+    ]
+    told_g = float(words.split("mass ")[1].split(" g")[0])
+    assert told_g == pytest.approx(1e3 * float(outcome.result.sigma["mass_kg"]), rel=0.7)
+
+
+def test_the_first_limit_of_contact_names_the_mass_it_assumes(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=1.2))
+    lab.arm.at_move[4] = lambda: setattr(lab.sensor, "push", np.array([60.0, 0, 0, 0, 0, 0]))
+    with pytest.raises(DeviceFault, match=r"a tool of 1.2 kg is assumed \(\[tool\] mass_kg\)"):
+        lab.calibrate()
 
 
 def test_a_run_that_was_ended_does_not_count_as_complete(lab: Lab) -> None:
@@ -723,6 +794,71 @@ def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None
     assert [event.stop for event in lab.operator.of(PoseTaken)] == [3]
     assert run.calibration_path.name == "calibration-2.json"
     assert (run.folder / "calibration.json").read_bytes() == first
+
+
+def test_a_resumed_run_is_open_with_its_poses_before_anything_is_checked(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
+    lab.operator.answers["Type resume"] = ["quit"]
+    with pytest.raises(Declined):
+        lab.calibrate()
+    run = lab.run()
+    lab.operator.told.clear()
+    assert lab.calibrate(resume=run.folder, dry_run=True) is None
+    kinds = [type(event) for event in lab.operator.told]
+    assert kinds.count(RunOpened) == 1
+    assert kinds.index(RunOpened) < kinds.index(Checked)
+    before = lab.operator.told[: kinds.index(Checked)]
+    assert [event.poses for event in before if isinstance(event, Estimated)] == [1, 2, 3]
+
+
+def test_a_run_is_not_gone_on_with_another_tool(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
+    lab.operator.answers["Type resume"] = ["quit"]
+    with pytest.raises(Declined):
+        lab.calibrate()
+    lab.arm.moves.clear()
+    lab.cell = replace(lab.cell, tool=ToolConfig(cylinders_mm=((0.0, 210.0, 100.0),)))
+    for options in ({}, {"redo": (1,)}):
+        with pytest.raises(NotAccepted, match="another tool"):
+            lab.calibrate(resume=lab.run().folder, **options)
+    assert lab.arm.moves == []
+
+
+# ----------------------------------------------------------------------------------------------------------- by hand
+
+
+@pytest.mark.parametrize("mode", ["manual", "listen"])
+def test_a_run_by_hand_goes_on_by_hand(mode: str, lab: Lab) -> None:
+    lab.operator.keys = [Key.STOP]
+    with pytest.raises(Declined, match="ended before the first pose"):
+        lab.calibrate(mode=mode)
+    run = lab.run()
+    assert not lab.arm.control
+    for asked in ("auto", mode):
+        lab.operator.told.clear()
+        lab.operator.keys = [Key.STOP]
+        with pytest.raises(Declined, match="ended before the first pose"):
+            lab.calibrate(resume=run.folder, mode=asked)
+        assert len(lab.operator.of(RunOpened)) == 1
+    assert not lab.arm.control
+    assert (run.folder / "run.json").exists()
+    with pytest.raises(ConfigError, match=f"with --{mode} and can only go on like that: leave out --step"):
+        lab.calibrate(resume=run.folder, mode="step")
+    with pytest.raises(ConfigError, match="leave out --redo"):
+        lab.calibrate(resume=run.folder, redo=(1,))
+
+
+def test_a_run_along_a_plan_does_not_go_on_by_hand(lab: Lab) -> None:
+    lab.calibrate()
+    with pytest.raises(ConfigError, match="along a plan"):
+        lab.calibrate(resume=lab.run().folder, mode="listen")
+
+
+@pytest.mark.parametrize("option", [{"dry_run": True}, {"fast": True}, {"plan": Path("plan.json")}])
+def test_by_hand_nothing_is_planned_or_moved(option: dict[str, Any], lab: Lab) -> None:
+    with pytest.raises(ConfigError, match="leave out --" + next(iter(option)).replace("_", "-")):
+        lab.calibrate(mode="manual", **option)
+    assert not (lab.folder / "runs").exists()
 
 
 def test_a_run_of_another_sensor_is_not_gone_on_with(lab: Lab) -> None:
