@@ -20,6 +20,9 @@ HUB_ROUNDING_M = 0.020
 """Of the edges of the housings at the joints. On the constant tour a UR3e then comes within 22 mm of itself; the convex
 hulls of its meshes stay 29 mm or more apart."""
 
+FOREARM_END_ROUNDING_M = 0.010
+"""The same where the forearm carries the wrist."""
+
 
 @dataclass(frozen=True, slots=True)
 class Shape:
@@ -32,36 +35,40 @@ class Shape:
     upper_arm_radius_m: float
     elbow_radius_m: float
     forearm_radius_m: float
+    forearm_end_radius_m: float
     wrist_radius_m: float
     upper_arm_hub_m: tuple[float, float]
     elbow_hub_m: tuple[float, float]
     forearm_hub_m: tuple[float, float]
     forearm_end_hub_m: tuple[float, float]
+    wrist_lid_m: float
+    """From the centres of joints 5 and 6 back to the lids of wrists 1 and 2."""
 
 
 _UR5E = Shape(
-    0.138, 0.007, 0.081, 0.088, 0.062, 0.062, 0.050, 0.048, (0.071, 0.210), (0.060, 0.207), (-0.035, 0.060),
-    (-0.049, 0.060),
+    0.138, 0.007, 0.081, 0.088, 0.062, 0.062, 0.050, 0.042, 0.048, (0.065, 0.217), (0.053, 0.217), (-0.035, 0.067),
+    (-0.052, 0.063), 0.057,
 )  # fmt: skip
 _UR10E = Shape(
-    0.1762, 0.0393, 0.101, 0.111, 0.077, 0.062, 0.055, 0.057, (0.095, 0.269), (0.09, 0.25), (-0.005, 0.106),
-    (-0.019, 0.106),
+    0.1762, 0.0393, 0.101, 0.111, 0.077, 0.062, 0.055, 0.048, 0.057, (0.089, 0.275), (0.084, 0.256), (-0.005, 0.112),
+    (-0.022, 0.109), 0.060,
 )  # fmt: skip
 _UR20 = Shape(
-    0.260, 0.043, 0.125, 0.150, 0.095, 0.085, 0.070, 0.065, (0.129, 0.352), (0.14, 0.34), (-0.036, 0.148), (-0.03, 0.14)
+    0.260, 0.043, 0.125, 0.150, 0.095, 0.085, 0.070, 0.070, 0.065, (0.123, 0.358), (0.134, 0.346), (-0.036, 0.154),
+    (-0.033, 0.143), 0.091,
 )  # fmt: skip
 SHAPES = {
     "UR3e": Shape(
-        0.120, 0.027, 0.069, 0.073, 0.048, 0.048, 0.040, 0.040, (0.063, 0.178), (0.065, 0.177), (0.004, 0.070),
-        (-0.020, 0.077),
+        0.120, 0.027, 0.069, 0.073, 0.048, 0.048, 0.040, 0.035, 0.040, (0.056, 0.185), (0.065, 0.177), (0.004, 0.070),
+        (-0.020, 0.080), 0.048,
     ),
     "UR5e": _UR5E,
     "UR7e": _UR5E,
     "UR10e": _UR10E,
     "UR12e": _UR10E,
     "UR16e": Shape(
-        0.176, 0.040, 0.101, 0.111, 0.077, 0.062, 0.055, 0.057, (0.095, 0.269), (0.09, 0.25), (-0.005, 0.107),
-        (-0.018, 0.107),
+        0.176, 0.040, 0.101, 0.111, 0.077, 0.062, 0.055, 0.048, 0.057, (0.089, 0.275), (0.084, 0.256), (-0.005, 0.113),
+        (-0.021, 0.110), 0.060,
     ),
     "UR20": _UR20,
     "UR30": _UR20,
@@ -158,6 +165,7 @@ class ArmModel:
         tube = s.upper_arm_offset_m * at.lift
         forearm = s.forearm_offset_m * at.lift
         half_way = (at.wrist_m + at.wrist_2_m) / 2
+        lid = s.wrist_lid_m - HUB_ROUNDING_M
         n = len(at.lift)
         ends = [
             (np.zeros((n, 3)), at.shoulder_m),
@@ -167,11 +175,11 @@ class ArmModel:
             _hub(at.elbow_m, at.lift, s.elbow_hub_m),
             _hub(at.elbow_m, at.lift, s.forearm_hub_m),
             (at.elbow_m + forearm, at.forearm_end_m + forearm),
-            _hub(at.forearm_end_m, at.lift, s.forearm_end_hub_m),
+            _hub(at.forearm_end_m, at.lift, s.forearm_end_hub_m, FOREARM_END_ROUNDING_M),
             (at.forearm_end_m + s.forearm_end_hub_m[1] * at.lift, at.wrist_m),
-            (at.wrist_m, half_way),
+            (at.wrist_m - lid * at.axis_5, half_way),
             (half_way, at.wrist_2_m),
-            (at.wrist_2_m, at.flange_m - s.wrist_radius_m * axis_6),
+            (at.wrist_2_m - lid * axis_6, at.flange_m - g.d6_m / 2 * axis_6),
             (at.flange_m - g.d6_m / 2 * axis_6, at.flange_m),
         ]
         for part in self.tool:
@@ -196,20 +204,20 @@ class ArmModel:
 
     def _half_lengths_and_radii(self) -> tuple[Array, Array, Array]:
         g, s = self.geometry, self.shape
-        hub = HUB_ROUNDING_M
+        hub, end, lid = HUB_ROUNDING_M, FOREARM_END_ROUNDING_M, s.wrist_lid_m - HUB_ROUNDING_M
         sizes = [  # length, radius and rounding of each cylinder
             (g.d1_m, 0.0, s.base_radius_m),
             (s.upper_arm_hub_m[0], 0.0, s.shoulder_radius_m),
             (_width(s.upper_arm_hub_m), s.upper_arm_radius_m - hub, hub),
             (-g.a2_m, 0.0, s.upper_arm_radius_m),
             (_width(s.elbow_hub_m), s.elbow_radius_m - hub, hub),
-            (_width(s.forearm_hub_m), s.forearm_radius_m - hub, hub),
+            (_width(s.forearm_hub_m), s.elbow_radius_m - hub, hub),
             (-g.a3_m, 0.0, s.forearm_radius_m),
-            (_width(s.forearm_end_hub_m), s.forearm_radius_m - hub, hub),
+            (_width(s.forearm_end_hub_m, end), s.forearm_end_radius_m - end, end),
             (g.d4_m - s.forearm_end_hub_m[1], 0.0, s.wrist_radius_m),
+            (lid + g.d5_m / 2, s.wrist_radius_m - hub, hub),
             (g.d5_m / 2, 0.0, s.wrist_radius_m),
-            (g.d5_m / 2, 0.0, s.wrist_radius_m),
-            (g.d6_m - s.wrist_radius_m, 0.0, s.wrist_radius_m),
+            (lid + g.d6_m / 2, s.wrist_radius_m - hub, hub),
             (g.d6_m / 2, s.wrist_radius_m, 0.0),
             *((part.to_m - part.from_m, part.diameter_m / 2, 0.0) for part in self.tool),
         ]
@@ -252,13 +260,15 @@ class ArmModel:
         return rows
 
 
-def _hub(centre_m: Array, lift: Array, range_m: tuple[float, float]) -> tuple[Array, Array]:
-    low, high = range_m[0] + HUB_ROUNDING_M, range_m[1] - HUB_ROUNDING_M
+def _hub(
+    centre_m: Array, lift: Array, range_m: tuple[float, float], rounding_m: float = HUB_ROUNDING_M
+) -> tuple[Array, Array]:
+    low, high = range_m[0] + rounding_m, range_m[1] - rounding_m
     return centre_m + low * lift, centre_m + high * lift
 
 
-def _width(range_m: tuple[float, float]) -> float:
-    return range_m[1] - range_m[0] - 2 * HUB_ROUNDING_M
+def _width(range_m: tuple[float, float], rounding_m: float = HUB_ROUNDING_M) -> float:
+    return range_m[1] - range_m[0] - 2 * rounding_m
 
 
 def _pairs(n_tool: int) -> NDArray[np.intp]:
