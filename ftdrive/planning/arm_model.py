@@ -1,7 +1,10 @@
 """The shapes of arm and tool, where they are at given joint angles, and how far a turn of a joint can move them.
 
 Radii and hub widths were measured from the convex hulls of the collision meshes in the ROS 2 description of the arms,
-version 2.4.5; they are generous. Models without measured shapes are refused.
+version 2.4.5. Those of UR3e and UR5e were then fitted to meshes with all lids and edges (tests/benchmarks/
+mesh_check.py): none stands out by more than 1 mm. The larger arms were widened alike. The lids of the UR10e's wrists
+are 3 mm behind those of a public mesh of it; those of UR20 and UR30 are scaled from the UR5e by the length of wrist 2.
+Models without measured shapes are refused.
 """
 
 from collections.abc import Sequence
@@ -18,7 +21,7 @@ from ftdrive.planning.shapes import Bodies
 
 HUB_ROUNDING_M = 0.020
 """Of the edges of the housings at the joints. On the constant tour a UR3e then comes within 22 mm of itself; the convex
-hulls of its meshes stay 29 mm or more apart."""
+hulls of its meshes stay 27 mm apart."""
 
 FOREARM_END_ROUNDING_M = 0.010
 """The same where the forearm carries the wrist."""
@@ -59,7 +62,7 @@ _UR20 = Shape(
 )  # fmt: skip
 SHAPES = {
     "UR3e": Shape(
-        0.120, 0.027, 0.069, 0.073, 0.048, 0.048, 0.040, 0.035, 0.040, (0.055, 0.186), (0.065, 0.177), (0.004, 0.070),
+        0.120, 0.027, 0.069, 0.073, 0.048, 0.048, 0.040, 0.035, 0.040, (0.054, 0.187), (0.062, 0.180), (0.004, 0.070),
         (-0.020, 0.080), 0.048,
     ),
     "UR5e": _UR5E,
@@ -115,11 +118,11 @@ _ARM = (
     ("upper arm", 2),
     ("upper arm", 2),
     ("elbow", 2),
-    *[("upper arm", 2)] * 4,
+    *[("upper arm", 2)] * 2,
     ("forearm", 3),
     ("forearm", 3),
     ("forearm", 3),
-    *[("forearm", 3)] * 4,
+    *[("forearm", 3)] * 2,
     ("wrist 1", 4),
     ("wrist 1", 4),
     ("wrist 2", 5),
@@ -127,11 +130,13 @@ _ARM = (
     ("wrist 3", 6),
 )
 """Name of each body of the arm, and how many joints move it."""
-_UPPER_ARM, _ELBOW_SIDE, _FOREARM = [*range(2, 9)], 9, [*range(10, 16)]
-_WRIST_1, _WRIST_2_ALONG_6, _WRIST_3, _TOOL = (16, 17), 19, 20, 21
+_UPPER_ARM, _ELBOW_SIDE, _FOREARM = [*range(2, 7)], 7, [*range(8, 12)]
+_WRIST_1, _WRIST_2_ALONG_6, _WRIST_3, _TOOL = (12, 13), 15, 16, 17
 
 _Part = tuple[Array, Array, float, float]
 """Ends (n, 3) of the axis of a body, its radius and its rounding."""
+_Housing = tuple[Array, tuple[float, float], float, float]
+"""Of a joint: its centre (n, 3), from where to where along the lift axis, its radius and its rounding."""
 
 
 class ArmModel:
@@ -181,13 +186,13 @@ class ArmModel:
         parts = [
             (np.zeros_like(at.lift), at.shoulder_m, 0.0, s.base_radius_m),
             (at.shoulder_m, shoulder_end, 0.0, s.shoulder_radius_m),
-            _hub(at.lift, *shoulder_side),
+            _hub(at.lift, shoulder_side),
             (at.shoulder_m + upper_arm, at.elbow_m + upper_arm, 0.0, s.upper_arm_radius_m),
-            _hub(at.lift, *elbow),
+            _hub(at.lift, elbow),
             *_edges(at.lift, shoulder_side, elbow),
-            _hub(at.lift, *elbow_side),
+            _hub(at.lift, elbow_side),
             (at.elbow_m + forearm, at.forearm_end_m + forearm, 0.0, s.forearm_radius_m),
-            _hub(at.lift, *wrist_side),
+            _hub(at.lift, wrist_side),
             *_edges(at.lift, elbow_side, wrist_side),
             (forearm_end, at.wrist_m, 0.0, s.wrist_radius_m),
             (at.wrist_m - lid * at.axis_5, half_way, *wrist_hub),
@@ -254,26 +259,26 @@ class ArmModel:
         return rows
 
 
-def _hub(lift: Array, centre_m: Array, range_m: tuple[float, float], radius_m: float, rounding_m: float) -> _Part:
-    """Housing of a joint: start, end, radius and rounding."""
-    low, high = range_m[0] + rounding_m, range_m[1] - rounding_m
-    return centre_m + low * lift, centre_m + high * lift, radius_m - rounding_m, rounding_m
+def _hub(lift: Array, housing: _Housing) -> _Part:
+    centre, (low, high), radius, rounding = housing
+    return centre + (low + rounding) * lift, centre + (high - rounding) * lift, radius - rounding, rounding
 
 
-def _edges(lift: Array, *hubs: tuple[Array, tuple[float, float], float, float]) -> list[_Part]:
-    """Four bars from housing to housing along the edges of their common hull, which the tube between does not fill."""
-    (first, *_), (second, *_) = hubs
+def _edges(lift: Array, *housings: _Housing) -> list[_Part]:
+    """Two bars from housing to housing, along the edges of their hull that look away from the shoulder.
+
+    The arm is hollow there, between its tube and the housings; nothing should be planned to go in.
+    """
+    (first, *_), (second, *_) = housings
     side = np.cross(lift, second - first)
     side /= np.linalg.norm(side, axis=1)[:, None]
     bars = []
     for sign in (-1, 1):
-        for end in (0, 1):
-            inwards = HUB_ROUNDING_M if end == 0 else -HUB_ROUNDING_M
-            start, stop = (
-                centre + (range_m[end] + inwards) * lift + sign * (radius - HUB_ROUNDING_M) * side
-                for centre, range_m, radius, _ in hubs
-            )
-            bars.append((start, stop, 0.0, HUB_ROUNDING_M))
+        start, stop = (
+            centre + (high - HUB_ROUNDING_M) * lift + sign * (radius - HUB_ROUNDING_M) * side
+            for centre, (_, high), radius, _ in housings
+        )
+        bars.append((start, stop, 0.0, HUB_ROUNDING_M))
     return bars
 
 
