@@ -118,7 +118,7 @@ _ARM = (
     ("upper arm", 2),
     ("upper arm", 2),
     ("elbow", 2),
-    *[("upper arm", 2)] * 2,
+    *[("upper arm", 2)] * 4,
     ("forearm", 3),
     ("forearm", 3),
     ("forearm", 3),
@@ -130,8 +130,8 @@ _ARM = (
     ("wrist 3", 6),
 )
 """Name of each body of the arm, and how many joints move it."""
-_UPPER_ARM, _ELBOW_SIDE, _FOREARM = [*range(2, 7)], 7, [*range(8, 12)]
-_WRIST_1, _WRIST_2_ALONG_6, _WRIST_3, _TOOL = (12, 13), 15, 16, 17
+_UPPER_ARM, _ELBOW_SIDE, _FOREARM = [*range(2, 9)], 9, [*range(10, 14)]
+_WRIST_1, _WRIST_2_ALONG_6, _WRIST_3, _TOOL = (14, 15), 17, 18, 19
 
 _Part = tuple[Array, Array, float, float]
 """Ends (n, 3) of the axis of a body, its radius and its rounding."""
@@ -189,11 +189,12 @@ class ArmModel:
             _hub(at.lift, shoulder_side),
             (at.shoulder_m + upper_arm, at.elbow_m + upper_arm, 0.0, s.upper_arm_radius_m),
             _hub(at.lift, elbow),
-            *_edges(at.lift, shoulder_side, elbow),
+            *_edges(at.lift, 0, shoulder_side, elbow),
+            *_edges(at.lift, 1, shoulder_side, elbow),
             _hub(at.lift, elbow_side),
             (at.elbow_m + forearm, at.forearm_end_m + forearm, 0.0, s.forearm_radius_m),
             _hub(at.lift, wrist_side),
-            *_edges(at.lift, elbow_side, wrist_side),
+            *_edges(at.lift, 1, elbow_side, wrist_side),
             (forearm_end, at.wrist_m, 0.0, s.wrist_radius_m),
             (at.wrist_m - lid * at.axis_5, half_way, *wrist_hub),
             (half_way, at.wrist_2_m, 0.0, s.wrist_radius_m),
@@ -264,19 +265,20 @@ def _hub(lift: Array, housing: _Housing) -> _Part:
     return centre + (low + rounding) * lift, centre + (high - rounding) * lift, radius - rounding, rounding
 
 
-def _edges(lift: Array, *housings: _Housing) -> list[_Part]:
-    """Two bars from housing to housing, along the edges of their hull that look away from the shoulder.
+def _edges(lift: Array, end: int, *housings: _Housing) -> list[_Part]:
+    """Two bars from housing to housing, along the edges of their hull at its low (0) or high (1) end of the lift axis.
 
     The arm is hollow there, between its tube and the housings; nothing should be planned to go in.
     """
     (first, *_), (second, *_) = housings
     side = np.cross(lift, second - first)
     side /= np.linalg.norm(side, axis=1)[:, None]
+    inwards = HUB_ROUNDING_M if end == 0 else -HUB_ROUNDING_M
     bars = []
     for sign in (-1, 1):
         start, stop = (
-            centre + (high - HUB_ROUNDING_M) * lift + sign * (radius - HUB_ROUNDING_M) * side
-            for centre, (_, high), radius, _ in housings
+            centre + (range_m[end] + inwards) * lift + sign * (radius - HUB_ROUNDING_M) * side
+            for centre, range_m, radius, _ in housings
         )
         bars.append((start, stop, 0.0, HUB_ROUNDING_M))
     return bars
