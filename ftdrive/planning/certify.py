@@ -151,7 +151,13 @@ class Certifier:
         distance = np.empty(len(pair))
         own = pair < n
         first, second = self._pairs[pair[own]].T
-        distance[own] = separation(bodies[row[own], first], bodies[row[own], second], enough_m[own])
+        at = row[own]
+        gap = bodies.centre_m[at, first] - bodies.centre_m[at, second]
+        reach = bodies.reach_m
+        apart = np.sqrt((gap * gap).sum(axis=1)) - reach[first] - reach[second]
+        near = apart < enough_m[own]
+        apart[near] = separation(bodies[at[near], first[near]], bodies[at[near], second[near]], enough_m[own][near])
+        distance[own] = apart
         planes = len(self.scene.planes)
         body, thing = self._of_scene[pair[~own] - n].T
         outside = self._to_scene(bodies, row[~own], body, thing, planes)

@@ -31,6 +31,11 @@ class Bodies:
     rounding_m: Array
     """(...)"""
 
+    @property
+    def reach_m(self) -> Array:
+        """(...) Radius of a ball about the centre that holds the body."""
+        return np.asarray(np.hypot(self.half_length_m, self.radius_m) + self.rounding_m)
+
     def __getitem__(self, index: tuple[NDArray[np.intp], NDArray[np.intp]] | NDArray[np.bool_]) -> "Bodies":
         """Take some of the bodies of (n, k): a pair of index arrays, or a mask of a flat list."""
         columns = index[1] if isinstance(index, tuple) else index
@@ -100,6 +105,7 @@ def separation_from_box(bodies: Bodies, low_m: Array, high_m: Array) -> Array:
 
 def _by_projections(a: Bodies, b: Bodies, on_b: Array) -> Array:
     best = np.full(len(on_b), -1.0)
+    open_ = np.arange(len(on_b))
     for _ in range(PROJECTIONS):
         on_a = _nearest(a, on_b)
         on_b = _nearest(b, on_a)
@@ -107,9 +113,11 @@ def _by_projections(a: Bodies, b: Bodies, on_b: Array) -> Array:
         length = np.sqrt(_dot(gap, gap))
         u = gap / np.maximum(length, TINY_M)[:, None]
         reach = _dot(u, b.centre_m - a.centre_m) - extent(a, u) - extent(b, u)
-        best = np.maximum(best, np.where(length > TINY_M, reach, -1.0))
-        if np.all(length - best < 1e-5):
+        best[open_] = np.maximum(best[open_], np.where(length > TINY_M, reach, -1.0))
+        still = length - best[open_] >= 1e-5
+        if not still.any():
             break
+        open_, on_b, a, b = open_[still], on_b[still], a[still], b[still]
     return best
 
 

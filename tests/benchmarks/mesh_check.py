@@ -31,7 +31,7 @@ from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.motion import Speeds
-from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_tour
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
 from ftdrive.planning.scene import Scene
 from tests.benchmarks.planning import FIXED_POINTS_M
 
@@ -47,6 +47,7 @@ HELD_APART = {(0, 2), (1, 3), (4, 6), (5, TOOL)}
 PAIRS = [(i, j) for i in range(8) for j in range(i + 2, 8) if (i, j) not in HELD_APART]
 STRETCHED_RAD = USUAL_POSTURE_RAD + np.radians([0, 70, -40, 0, 0, 0])
 """Where the constant tour has no room: another posture must be searched."""
+CONES_RAD = np.radians([60, 90, 180])
 Joints = list[tuple[Array, Array]]
 """Fixed transform (4, 4) and axis (3,) of each joint; the last one leads to the flange and is fixed."""
 Mesh = tuple[Array, NDArray[np.intp]]
@@ -149,13 +150,14 @@ def placing(arm: Arm) -> None:
 
 
 def planned(arm: Arm, certifier: Certifier) -> None:
-    """Check tours that the planner searches: of all poses and of 12 (--quick), and one in a box."""
-    guess, point = guess_of(certifier), FIXED_POINTS_M.get(arm.model)
-    for plan in (
-        plan_tour(certifier, STRETCHED_RAD, speeds=Speeds(), guess=guess),
-        plan_tour(certifier, STRETCHED_RAD, 12, speeds=Speeds(), guess=guess),
-        plan_box(certifier, poses=12, centre_m=point, speeds=Speeds(), guess=guess),
-    ):
+    """Check tours that the planner searches: of another posture, in a box, and in cones."""
+    guess, point, speeds = guess_of(certifier), FIXED_POINTS_M.get(arm.model), Speeds()
+    plans = [
+        *(plan_tour(certifier, STRETCHED_RAD, poses, speeds=speeds, guess=guess) for poses in (24, 12, 6)),
+        *(plan_box(certifier, poses=poses, centre_m=point, speeds=speeds, guess=guess) for poses in (24, 12)),
+        *(plan_cone(certifier, half_angle_rad=angle, speeds=speeds, guess=guess) for angle in CONES_RAD),
+    ]
+    for plan in plans:
         clearance_m = min(step.clearance_m for step in plan.steps)
         name = f"{plan.kind}, {len(plan.steps)} poses, {1e3 * clearance_m:.1f} mm certified"
         tour(arm, name, np.array([step.q_rad for step in plan.steps]))

@@ -96,6 +96,50 @@ def test_no_point_of_arm_or_tool_moves_faster_than_its_bound(model: str) -> None
             assert (moved <= arm.travel_m[:, joint] + 1e-4).all()
 
 
+FAR_POINTS_MM = {
+    "UR3e": [
+        ("upper arm", 2, (63, -9, -44)),
+        ("forearm", 3, (66, -5, -38)),
+        ("forearm", 3, (77, 31, 212)),
+        ("wrist 1", 4, (-3, 27, -44)),
+        ("wrist 2", 5, (28, 4, -40)),
+    ],
+    "UR5e": [
+        ("upper arm", 2, (209, 0, 369)),
+        ("upper arm", 2, (60, -24, 372)),
+        ("forearm", 3, (60, 29, -51)),
+        ("forearm", 3, (60, 48, -33)),
+        ("wrist 1", 4, (-4, -31, -55)),
+        ("wrist 2", 5, (32, -11, -51)),
+    ],
+}
+"""Points of meshes on lids and edges: along the lift axis (of wrist 2: axis 5), across, and along the limb, from the
+joint that moves it (of wrists: from the centre of the joint they carry)."""
+
+
+@pytest.mark.parametrize("model", FAR_POINTS_MM)
+def test_lids_and_edges_of_the_meshes_are_inside(model: str) -> None:
+    arm = ArmModel(model, TOOLS[0])
+    at, bodies = arm.frames(STANDS), arm.bodies(STANDS)
+    axes = {
+        2: (at.shoulder_m, at.lift, at.elbow_m - at.shoulder_m),
+        3: (at.elbow_m, at.lift, at.forearm_end_m - at.elbow_m),
+        4: (at.wrist_m, at.lift, at.axis_5),
+        5: (at.wrist_2_m, at.axis_5, at.R_base_flange[:, :, 2]),
+    }
+    for name, moved_by, point_mm in FAR_POINTS_MM[model]:
+        origin, x, along = (value[0] for value in axes[moved_by])
+        z = along / np.linalg.norm(along)
+        point = origin + np.array(point_mm) / 1e3 @ np.stack([x, np.cross(z, x), z])
+        own = np.flatnonzero(arm.moved_by == moved_by)
+        away = point - bodies.centre_m[0, own]
+        height = (away * bodies.axis[0, own]).sum(axis=1)
+        across = np.linalg.norm(away - height[:, None] * bodies.axis[0, own], axis=1)
+        beyond = np.abs(height) - bodies.half_length_m[own], across - bodies.radius_m[own]
+        outside = np.hypot(*np.maximum(beyond, 0)) - bodies.rounding_m[own]
+        assert outside.min() < 0.001, (name, point_mm)
+
+
 @pytest.mark.parametrize("tool", TOOLS)
 @pytest.mark.parametrize("model", MODELS)
 def test_constant_tour_is_clear(model: str, tool: tuple[Cylinder, ...]) -> None:
