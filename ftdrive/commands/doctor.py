@@ -54,7 +54,9 @@ _MARK = {"ok": "[green]✔[/]", "warning": "[yellow]![/]", "failed": "[red]✘[/
     "--calibration", "path", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Does it fit? FILE."
 )
 @click.option(
-    "--mass-kg", type=click.FloatRange(0, min_open=True), default=1.0, show_default=True, help="Expected, of the tool."
+    "--mass-kg",
+    type=click.FloatRange(0, min_open=True),
+    help="Expected, of the tool.  [default: [tool] mass_kg, else 1]",
 )
 @click.option("--push", is_flag=True, help="Find the sign of the sensor: you push the tool along +X of the base.")
 @RUNS
@@ -66,7 +68,7 @@ def doctor(
     model: str | None,
     simulate: bool,
     path: Path | None,
-    mass_kg: float,
+    mass_kg: float | None,
     push: bool,
     runs: Path,
     as_json: bool,
@@ -88,7 +90,7 @@ def doctor(
         arm = _examine_robot(cell, found, stack)
         permissions = checks.check_permissions(address)
         blame = partial(diagnosis.check_sensor_error, address=address, permissions=permissions)
-        alive = _examine_sensor(device, address, cell, mass_kg, found, blame, stack)
+        alive = _examine_sensor(device, address, cell, mass_kg or cell.tool.mass_kg or 1.0, found, blame, stack)
         found += [checks.check_workcell(cell), *checks.check_disk(runs), *permissions]
         if calibration is not None:
             serials = {"sensor": device.identify().serial} if alive else {}
