@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 @click.option("--manual", is_flag=True, help="No motion at all: you move the arm, ftdrive tells where to.")
 @click.option("--listen", is_flag=True, help="No motion at all: a program on the pendant moves the arm.")
 @click.option("--dry-run", is_flag=True, help="Plan, show and check everything; nothing moves.")
+@click.option("--output", type=click.Path(dir_okay=False, path_type=Path), help="Save the plan as a new JSON file.")
+@click.option("--png", type=click.Path(dir_okay=False, path_type=Path), help="Save stick figures (needs ftdrive[viz]).")
+@click.option("--view", is_flag=True, help="Show the plan in the browser first, until you answer (needs ftdrive[viz]).")
 @click.option("--plan", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="A plan made before.")
 @click.option(
     "--resume", type=click.Path(exists=True, file_okay=False, path_type=Path), help="Go on with a run that was ended."
@@ -52,6 +55,9 @@ def calibrate(
     manual: bool,
     listen: bool,
     dry_run: bool,
+    output: Path | None,
+    png: Path | None,
+    view: bool,
     plan: Path | None,
     resume: Path | None,
     redo: tuple[int, ...],
@@ -76,6 +82,11 @@ def calibrate(
         raise ConfigError(
             "--step, --manual and --listen exclude one another; so do --quick, --minimal, --plan, --resume"
         )
+    if (manual or listen) and (output or png or view):
+        raise ConfigError("--manual and --listen have no plan: leave --output, --png and --view out")
+    for path in (output, png):
+        if path is not None and path.exists():
+            raise ConfigError(f"{path} exists already and is never overwritten: choose another name")
     with ExitStack() as stack:
         description: dict[str, Any] = {}
         if simulate:
@@ -90,6 +101,9 @@ def calibrate(
             mode="step" if step else "manual" if manual else "listen" if listen else "auto",
             dry_run=dry_run,
             fast=fast,
+            output=output,
+            png=png,
+            view=view,
             plan=plan,
             resume=resume,
             redo=redo,
