@@ -13,8 +13,8 @@ def require_usable(plan: Plan) -> None:
     """Raise `PlanRefused` for placeholders, a move that is not proven clear, and numbers that no arm can follow."""
     if not plan.measured:
         raise PlanRefused(
-            "the plan was made with placeholders, nobody has measured tool, planes and boxes: measure them, set "
-            "measured = true in [workcell], and make a new plan"
+            "nobody has said that tool, planes and boxes of this plan were measured, they may be placeholders: "
+            "measure them, set measured = true in [workcell], and make a new plan"
         )
     if not plan.certified:
         raise PlanRefused("a move of the plan is not proven clear: it is not exported")

@@ -1,6 +1,6 @@
 """Stick figures of a plan."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,15 @@ from ftdrive.planning.arm_model import ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.kinematics import Frames
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.scene import Box, Plane
+from ftdrive.planning.scene import Plane, Scene
 
 VIEWS = ((1, 2, "along base x"), (0, 2, "along base y"), (0, 1, "from above"))
 """Axis to the right, axis up, title."""
 _ALONG = 0.1
 """A plane is drawn where it is seen from its edge: of its unit normal, the share along the view is below this."""
 _FAR_M = 20.0
-_AROUND_M = 0.3
+_NEAR_M, _EDGE_M = 1.0, 0.06
+"""How far from arm and ball surroundings are shown, and some room at the edge."""
 _TURN = np.linspace(0, 2 * np.pi, 100)
 
 
@@ -54,20 +55,23 @@ def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) 
     arm, scene = certifier.arm, certifier.scene
     poses = arm.frames([step.q_rad for step in plan.steps])
     before = np.reshape(np.asarray(way_rad, dtype=np.float64), (-1, 6))[:-1]
+    there = _skeletons(arm.frames(before)) if len(before) else np.zeros((0, 7, 3))
+    limits = _limits(plan, poses, there.reshape(-1, 3), scene)
     figure = Figure(figsize=(12, 4.9), layout="constrained")
     for column, (across, up, title) in enumerate(VIEWS):
         axes = figure.add_subplot(1, 3, column + 1)
         view = [across, up]
         for one in _skeletons(poses):
             axes.plot(*one[:, view].T, "-o", color="tab:gray", markersize=3, linewidth=1)
-        for one in _skeletons(arm.frames(before)) if len(before) else ():
+        for one in there:
             axes.plot(*one[:, view].T, "--o", color="tab:green", markersize=3, linewidth=1)
         for outline in _tools(arm, poses, view):
             axes.fill(*outline.T, facecolor="tab:orange", edgecolor="tab:orange", alpha=0.12, linewidth=1)
         centre = np.array(plan.ball_centre_m)[view, None]
         axes.plot(*(centre + plan.ball_m * np.array([np.cos(_TURN), np.sin(_TURN)])), ":", color="tab:blue")
         axes.plot(0, 0, "ks", markersize=5)
-        _surroundings(axes, scene.planes, scene.boxes, view)
+        _surroundings(axes, scene, view)
+        axes.set(xlim=limits[:, across], ylim=limits[:, up])
         axes.set_aspect("equal")
         axes.set_title(title)
         axes.set_xlabel(f"base {'xyz'[across]} [m]")
@@ -85,9 +89,7 @@ def title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:
         lines[0] += ", the WHOLE ARM moves"
     if on_its_way:
         lines.append("green: where the arm stands, and its way to the first pose")
-    if slanting := sum(
-        not any(_seen(plane, [across, up]) for across, up, _ in VIEWS) for plane in certifier.scene.planes
-    ):
+    if slanting := sum(not _drawn(plane) for plane in certifier.scene.planes):
         lines.append(f"not drawn: slanting planes ({slanting})")
     return "\n".join(lines)
 
@@ -114,16 +116,23 @@ def _rims(part: Cylinder) -> Array:
     return np.concatenate([np.stack([x, y, np.full_like(x, z)], axis=1) for z in (part.from_m, part.to_m)])
 
 
-def _surroundings(axes: Any, planes: Sequence[Plane], boxes: Sequence[Box], view: list[int]) -> None:
-    """Draw boxes, and planes that are seen from their edge; what is there already says how far one looks."""
-    left, right, bottom, top = axes.axis()
-    near = np.array([[left, bottom], [right, top]]) + np.array([[-_AROUND_M], [_AROUND_M]])
-    for box in boxes:
-        low, high = (np.clip(np.array(corner)[view], *near) for corner in (box.low_m, box.high_m))
-        x, y = zip(low, high, strict=True)
-        axes.fill([x[0], x[1], x[1], x[0]], [y[0], y[0], y[1], y[1]], color="tab:red", alpha=0.3)
-    limits = axes.axis()
-    for plane in planes:
+def _limits(plan: Plan, poses: Frames, before: Array, scene: Scene) -> Array:
+    """Low and high corner (2, 3) of what is looked at: the arm, the ball, and of the surroundings what is near."""
+    centre = np.array(plan.ball_centre_m)
+    points = np.concatenate([_skeletons(poses).reshape(-1, 3), before, [centre - plan.ball_m, centre + plan.ball_m]])
+    low, high = points.min(axis=0) - _NEAR_M, points.max(axis=0) + _NEAR_M
+    around = [np.array(corner) for box in scene.boxes for corner in (box.low_m, box.high_m)]
+    around += [plane.offset_m * np.array(plane.normal) for plane in scene.planes if _drawn(plane)]
+    points = np.concatenate([points, np.clip(np.reshape(around, (-1, 3)), low, high)])
+    return np.array([points.min(axis=0) - _EDGE_M, points.max(axis=0) + _EDGE_M])
+
+
+def _surroundings(axes: Any, scene: Scene, view: list[int]) -> None:
+    """Draw boxes, and planes that are seen from their edge."""
+    for box in scene.boxes:
+        (left, bottom), (right, top) = np.array([box.low_m, box.high_m])[:, view]
+        axes.fill([left, right, right, left], [bottom, bottom, top, top], color="tab:red", alpha=0.3)
+    for plane in scene.planes:
         if _seen(plane, view):
             normal = np.array(plane.normal)[view]
             length = np.linalg.norm(normal)
@@ -133,7 +142,10 @@ def _surroundings(axes: Any, planes: Sequence[Plane], boxes: Sequence[Box], view
             behind = np.concatenate([edge, edge[::-1] - _FAR_M * normal])
             axes.fill(*behind.T, color="tab:red", alpha=0.15, linewidth=0)
             axes.plot(*edge.T, color="tab:red", linewidth=1.5)
-    axes.axis(limits)
+
+
+def _drawn(plane: Plane) -> bool:
+    return any(_seen(plane, [across, up]) for across, up, _ in VIEWS)
 
 
 def _seen(plane: Plane, view: list[int]) -> bool:

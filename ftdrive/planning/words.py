@@ -77,7 +77,7 @@ def _table(plan: Plan) -> list[str]:
     for i, (step, q) in enumerate(zip(plan.steps, q_deg, strict=True), start=1):
         turn, speed = np.degrees([step.turn_rad, step.speed_rad_s])
         move = f"{turn:5.0f}{speed:5.0f}{step.duration_s:5.1f}{1e3 * step.clearance_m:9.0f}"
-        lines.append(f"{i:4}{step.number:>4}{angles(q)}{move}")
+        lines.append(f"{i:4}  {step.number:02d}{angles(q)}{move}")
     return [*lines, f"{'from':8}{angles(q_deg.min(axis=0))}", f"{'to':8}{angles(q_deg.max(axis=0))}"]
 
 
