@@ -31,6 +31,7 @@ from ftdrive.session.events import (
     Event,
     GuardTripped,
     Noted,
+    Planned,
     PoseTaken,
     RunOpened,
     State,
@@ -418,10 +419,10 @@ class Screen:
 
 
 def _history(event: Event) -> bool:
-    """Tell whether an event is worth a line above the frame."""
+    """Tell whether an event is worth words above the frame."""
     if isinstance(event, StateChanged):
         return event.state is State.HOLD
-    return isinstance(event, Asked | Checked | Noted | PoseTaken | GuardTripped)
+    return isinstance(event, Asked | Checked | Noted | Planned | PoseTaken | GuardTripped)
 
 
 @contextmanager

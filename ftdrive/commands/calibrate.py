@@ -14,10 +14,11 @@ if TYPE_CHECKING:
     from ftdrive.config import CellConfig
     from ftdrive.session.outcome import Outcome
 
+_OF_A_PLAN = ("--quick", "--minimal", "--output", "--png", "--view")
 _EXCLUDE_ONE_ANOTHER = (
     ("--step", "--manual", "--listen"),
     ("--quick", "--minimal", "--plan", "--resume"),
-    *((hand, poses) for hand in ("--manual", "--listen") for poses in ("--quick", "--minimal")),
+    *((hand, option) for hand in ("--manual", "--listen") for option in _OF_A_PLAN),
     *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
 )
 
@@ -42,6 +43,9 @@ _EXCLUDE_ONE_ANOTHER = (
 @click.option("--manual", is_flag=True, help="No motion at all: you move the arm, ftdrive tells where to.")
 @click.option("--listen", is_flag=True, help="No motion at all: a program on the pendant moves the arm.")
 @click.option("--dry-run", is_flag=True, help="Plan, show and check everything; nothing moves.")
+@click.option("--output", type=click.Path(dir_okay=False, path_type=Path), help="Save the plan as a new JSON file.")
+@click.option("--png", type=click.Path(dir_okay=False, path_type=Path), help="Save stick figures (needs ftdrive[viz]).")
+@click.option("--view", is_flag=True, help="Show the plan in the browser first, until you answer (needs ftdrive[viz]).")
 @click.option("--plan", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="A plan made before.")
 @click.option(
     "--resume",
@@ -65,6 +69,9 @@ def calibrate(
     manual: bool,
     listen: bool,
     dry_run: bool,
+    output: Path | None,
+    png: Path | None,
+    view: bool,
     plan: Path | None,
     resume: Path | None,
     redo: tuple[int, ...],
@@ -77,7 +84,7 @@ def calibrate(
     Every move is proven clear and shown before it happens; a first motion needs a typed word and is slow. Where the arm
     has room only the three wrist joints move. Ctrl-C stops the arm; what was taken is kept and --resume goes on.
     """
-    from ftdrive.errors import Declined
+    from ftdrive.errors import ConfigError, Declined
     from ftdrive.report import print_result
     from ftdrive.screen import open_operator
     from ftdrive.session.guided import Options
@@ -91,6 +98,9 @@ def calibrate(
         "--listen": listen,
         "--quick": quick,
         "--minimal": minimal,
+        "--output": output,
+        "--png": png,
+        "--view": view,
         "--plan": plan,
         "--resume": resume,
         "--simulate": simulate,
@@ -99,6 +109,9 @@ def calibrate(
         "--tool": tool,
     }
     _refuse_contradictions([option for option, value in given.items() if value])
+    for path in (output, png):
+        if path is not None and path.exists():
+            raise ConfigError(f"{path} exists already and is never overwritten: choose another name")
     with ExitStack() as stack:
         description: dict[str, Any] = {}
         if simulate:
@@ -115,6 +128,9 @@ def calibrate(
             mode="step" if step else "manual" if manual else "listen" if listen else "auto",
             dry_run=dry_run,
             fast=fast,
+            output=output,
+            png=png,
+            view=view,
             plan=plan,
             resume=resume,
             redo=redo,

@@ -1,6 +1,7 @@
 """`ftdrive plan`: where an arm would go and how clear it stays, without an arm."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -111,6 +112,12 @@ def plan(
         cell=emulated,
     )
     cell = cell_of(found, devices=False)
+    described = {found[key].origin for key in ("tool.cylinders_mm", "workcell.planes_mm", "workcell.boxes_mm")}
+    described -= {"default", "--tool", "--plane", "--box"}
+    if not described:  # said here and now, or nothing but the arm and its mounting is there
+        cell = replace(cell, workcell=replace(cell.workcell, measured=True))
+    if not cell.workcell.measured:
+        talk.print(f"Placeholders are in {', '.join(sorted(described))} (measured = false): a plan for the eye only.")
     made, certifier = make_plan(
         cell,
         numbers("--posture", posture, ",", (3,)),
@@ -119,20 +126,18 @@ def plan(
         box_mm=box_mm,
         tip_unlimited=tip_speed_limit == "none",
     )
-    described = {found[key].origin for key in ("tool.cylinders_mm", "workcell.planes_mm", "workcell.boxes_mm")}
-    described -= {"default", "--tool", "--plane", "--box"}
-    if described and not cell.workcell.measured:
-        talk.print(f"Placeholders are in {', '.join(sorted(described))} (measured = false): a plan for the eye only.")
     if output is not None:
         made.save(output)
     if png is not None:
         from ftdrive.planning.picture import draw
 
-        draw(made, certifier.arm, png)
+        draw(made, certifier, png)
     if as_json:
         write_json({"schema_version": 1} | made.to_dict())
     else:
-        _show(made)
+        from ftdrive.planning.words import plan_in_words
+
+        talk.print(plan_in_words(made))
     if view:
         _look(made, certifier)
 
@@ -179,73 +184,20 @@ def make_plan(
         made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess)
     if not made.certified:
         raise PlanRefused("a move of the plan could not be proven clear")
-    return made, certifier
-
-
-def _show(plan: "Plan") -> None:
-    import numpy as np
-    from rich.table import Table
-
-    from ftdrive.talk import talk
-
-    document = plan.to_dict()
-    for sentence in plan.why:
-        talk.print(sentence)
-    q_deg = np.degrees([step.q_rad for step in plan.steps])
-    shown = slice(3, 6) if plan.arm_rests else slice(0, 6)
-    if plan.arm_rests:
-        still = ", ".join(f"{angle:.0f}" for angle in q_deg[0, :3])
-        talk.print(f"Base, shoulder and elbow stay at {still} degrees.")
-    table = Table(title="Poses in degrees, and the move on to the next", title_justify="left", box=None)
-    joints = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
-    for title in ("", "R", *joints[shown], "turn", "°/s", "s", "clear mm"):
-        table.add_column(title, justify="right")
-    for i, (step, q) in enumerate(zip(plan.steps, q_deg, strict=True), start=1):
-        turn, speed = np.degrees([step.turn_rad, step.speed_rad_s])
-        cells = [f"{angle:.0f}" for angle in q[shown]] + [f"{turn:.0f}", f"{speed:.0f}", f"{step.duration_s:.1f}"]
-        table.add_row(str(i), f"{step.number:02d}", *cells, f"{1e3 * step.clearance_m:.0f}")
-    table.add_row("from", "", *(f"{angle:.0f}" for angle in q_deg[:, shown].min(axis=0)))
-    table.add_row("to", "", *(f"{angle:.0f}" for angle in q_deg[:, shown].max(axis=0)))
-    talk.print(table)
-    nearest = min(plan.steps, key=lambda step: step.clearance_m)
-    sigma = document["predicted_sigma"]
-    tilt = np.degrees([sigma["tilt_alpha_rad"], sigma["tilt_beta_rad"]])
-    guess = document["description"]["guess"]
-    talk.print(
-        f"\n{document['poses']} poses, {document['poses']} moves all proven clear, none above "
-        f"{document['max_move_deg']:.0f}°: {document['motion_time_s']:.0f} s of motion.\n"
-        f"Nearest: {document['min_clearance_mm']:.0f} mm, {nearest.limited_by}.\n"
-        f"{_room(plan)}\n"
-        f"Predicted for {guess['mass_kg']:g} kg and averages good to {guess['sigma_force_N']} N, "
-        f"{guess['sigma_torque_Nm']} N·m (one sigma): mass {1e3 * sigma['mass_kg']:.1f} g, "
-        f"centre of mass {1e3 * np.max(sigma['p_sensor_com_m']):.2f} mm, "
-        f"force bias {np.max(sigma['force_bias_N']):.3f} N, "
-        f"tilt {tilt.max():.2f}°; compensation {sigma['force_rms_N']:.3f} N, {sigma['torque_rms_Nm']:.4f} N·m."
-    )
-
-
-def _room(plan: "Plan") -> str:
-    x, y, z = (f"{value:.2f}" for value in plan.ball_centre_m)
-    ball = f"ball of {plan.ball_m:.2f} m around x {x}, y {y}, z {z} m in base"
-    if plan.arm_rests:
-        return f"All that moves stays in a {ball}, where the axes of wrist 1 and 2 cross: keep it free, cables slack."
-    return f"Wrist and tool stay in a {ball}, and the whole arm moves: keep the room of both free, cables slack."
+    return made.marked(measured=cell.workcell.measured), certifier
 
 
 def _look(made: "Plan", certifier: "Certifier") -> None:
     """Show the scene until Ctrl-C."""
-    import os
     import threading
-    import webbrowser
     from contextlib import suppress
 
-    from ftdrive.planning.view import shown
+    from ftdrive.planning.view import open_in_browser, shown
     from ftdrive.talk import talk
 
     with shown(made, certifier) as url, suppress(KeyboardInterrupt):
         talk.print(f"The plan is shown at {url} until Ctrl-C.")
-        if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
-            webbrowser.open(url)
+        open_in_browser(url)
         threading.Event().wait()
 
 

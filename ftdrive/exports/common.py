@@ -10,7 +10,12 @@ _SPELLED = {"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "
 
 
 def require_usable(plan: Plan) -> None:
-    """Raise `PlanRefused` for a move that is not proven clear, and for numbers that no arm can follow."""
+    """Raise `PlanRefused` for placeholders, a move that is not proven clear, and numbers that no arm can follow."""
+    if not plan.measured:
+        raise PlanRefused(
+            "nobody has said that tool, planes and boxes of this plan were measured, they may be placeholders: "
+            "measure them, set measured = true in [workcell], and make a new plan"
+        )
     if not plan.certified:
         raise PlanRefused("a move of the plan is not proven clear: it is not exported")
     angles = [angle for step in plan.steps for angle in step.q_rad]

@@ -10,6 +10,8 @@ from typing import Any
 
 from ftdrive.exports.common import plain, require_usable
 from ftdrive.planning.plan import Plan
+from ftdrive.planning.scene import MOUNTINGS
+from ftdrive.planning.words import point_in_words, room_in_words
 
 NEAR_RAD = radians(30)
 """The way to the first pose is not part of a plan: no joint may be farther from it than this at the start."""
@@ -45,17 +47,21 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield f"# for a {model} with this tool, mm from the flange face:"
     for part in plan.description["tool"]:
         yield f"#   {_cylinder(part)}"
+    yield "# proven clear, all along its moves, of itself and of these surroundings, mm, base axes:"
+    yield from (f"#   {plain(line)}" for line in _scene(plan.description["scene"]))
+    yield f"# {plain(room_in_words(plan))}"
     yield from (f"# {plain(sentence)}" for sentence in plan.why)
     yield "#"
     yield "# In PolyScope: a Script node of type File with this file, then one of type Line with ftdrive_tour()"
     yield "#"
     yield "# WARNINGS"
-    for warning in _warnings(plan, model):
+    for warning in _warnings(model):
         yield f"# - {warning}"
     yield ""
     yield f'textmsg("{name}: {len(steps)} poses")'
     yield (
-        f'popup("Only for a {model} with the tool of {name}. Keep a ball of {plan.ball_m:.2f} m around the wrist free, '
+        f'popup("Only for a {model} with the tool of {name}. Keep a ball of {plan.ball_m:.2f} m around '
+        f"{point_in_words(plan)} (the wrist){'' if plan.arm_rests else ' and the room of the whole arm'} free, "
         f'cables slack, hand on the emergency stop. First time: speed slider at 30 percent. Continue moves the arm.", '
         f'title="ftdrive", warning=True, blocking=True)'
     )
@@ -88,10 +94,9 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield 'popup("The tour is complete.", title="ftdrive", blocking=False)'
 
 
-def _warnings(plan: Plan, model: str) -> Iterator[str]:
+def _warnings(model: str) -> Iterator[str]:
     yield "This is no safety function. Real cables, fixtures and people are not in the plan."
     yield f"Run it on a {model} with exactly this tool and mounting; in another cell the moves are not proven clear."
-    yield f"All that moves stays in a ball of {plan.ball_m:.2f} m around the crossing of the axes of wrist 1 and 2."
     yield "The tool turns every way, upside down too: nothing loose, no fluid, nothing in the gripper."
     yield (
         f"The way to the first pose is not in the plan: the program stops unless each joint is within "
@@ -103,6 +108,21 @@ def _warnings(plan: Plan, model: str) -> Iterator[str]:
 
 def _joints(q_rad: tuple[float, ...]) -> str:
     return f"[{', '.join(f'{round(q, 6) + 0.0:.6f}' for q in q_rad)}]"
+
+
+def _scene(scene: dict[str, Any]) -> Iterator[str]:
+    """Say what stands around the arm; planes and boxes as `--plane` and `--box` take them."""
+    lean_rad = float(scene["lean_rad"])
+    names = [name for name, angle in MOUNTINGS.items() if abs(lean_rad - angle) < 1e-9]
+    yield f"mounted: {names[0] if names else f'base leans {degrees(lean_rad):.1f} deg about its y axis'}"
+    for plane in scene["planes"]:  # the first one is what the base is bolted to
+        normal = ":".join(f"{value:.6g}" for value in plane["normal"])
+        place_mm = 1e3 * float(plane["offset_m"])
+        yield f"plane {normal}:{place_mm:.1f}, the arm stays where normal times place is that or more"
+    for box in scene["boxes"]:
+        yield f"box {':'.join(f'{1e3 * float(value):.1f}' for value in (*box['low_m'], *box['high_m']))}"
+    if len(scene["planes"]) <= 1 and not scene["boxes"]:
+        yield "nothing else: free space around the arm. A table, wall or fixture that is there is NOT in the plan"
 
 
 def _cylinder(part: dict[str, Any]) -> str:

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,7 @@ class Plan:
     """(3,) in base; where the axes of joints 4 and 5 cross, if base, shoulder and elbow rest."""
     predicted: Mapping[str, Any]
     description: Mapping[str, Any]
-    """Model, tool, scene and speeds in words and numbers."""
+    """Model, tool, scene and speeds in words and numbers; whether a person has `measured` them, see `marked`."""
 
     @property
     def tour(self) -> tuple[TourPose, ...]:
@@ -74,6 +74,15 @@ class Plan:
     def arm_rests(self) -> bool:
         """Whether base, shoulder and elbow stand still all along the tour."""
         return len({step.q_rad[:3] for step in self.steps}) == 1
+
+    @property
+    def measured(self) -> bool:
+        """Whether a person has said that tool and scene are as measured; else they may be placeholders."""
+        return self.description.get("measured") is True
+
+    def marked(self, *, measured: bool) -> "Plan":
+        """Say in the description, and so in the file and its hash, whether tool and scene were measured."""
+        return replace(self, description={**self.description, "measured": measured})
 
     def to_dict(self) -> dict[str, Any]:
         """Give the contents of the file; its hash over all the rest shows a change by hand."""

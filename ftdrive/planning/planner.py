@@ -264,7 +264,9 @@ def _at_pan(q_rad: Array, numbers: Sequence[int]) -> Array:
 
 def _chosen_words(chosen: Chosen) -> list[str]:
     lost = chosen.force_rms_N / chosen.ideal_force_rms_N
-    words = [f"Of that, {lost:.2f} times the error of the poses that would be best if the arm reached them."]
+    words = [
+        f"Their predicted error is {lost:.2f} times that of the poses that would be best if the arm reached every one."
+    ]
     return [*words, _elsewhere_words(chosen.q_rad[0])] if chosen.elsewhere else words
 
 

@@ -1,8 +1,11 @@
 """A plan in three dimensions, in the browser, with a slider along the tour."""
 
-from collections.abc import Iterator
+import os
+import webbrowser
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,6 +16,7 @@ from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.scene import Plane
+from ftdrive.planning.words import room_in_words
 
 HOST = "127.0.0.1"
 """Nobody else on the network is shown the cell."""
@@ -23,7 +27,7 @@ _AROUND, _ARC = 24, 6
 
 
 @contextmanager
-def shown(plan: Plan, certifier: Certifier) -> Iterator[str]:
+def shown(plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Array = ()) -> Iterator[str]:
     """Serve the scene to browsers on this computer while the block runs; gives its address. Needs the extra `viz`.
 
     Parameters
@@ -31,6 +35,8 @@ def shown(plan: Plan, certifier: Certifier) -> Iterator[str]:
     plan : Plan
     certifier : Certifier
         For the same arm, tool and scene.
+    way_rad : array, shape (k + 1, 6), optional
+        From where the arm stands to the first pose; shown ahead of the tour.
     """
     try:
         from viser import ViserServer
@@ -39,15 +45,21 @@ def shown(plan: Plan, certifier: Certifier) -> Iterator[str]:
     with redirect_stdout(StringIO()):  # it prints a banner; our stdout is data
         server = ViserServer(host=HOST, label=f"ftdrive plan, {certifier.arm.name}", verbose=False)
     try:
-        _fill(server, plan, certifier)
+        _fill(server, plan, certifier, way_rad)
         yield f"http://{HOST}:{server.get_port()}"  # another port than usual when that is taken
     finally:
         with redirect_stdout(StringIO()):
             server.stop()
 
 
-def _fill(server: Any, plan: Plan, certifier: Certifier) -> None:
-    arm, (q, move) = certifier.arm, path(plan)
+def open_in_browser(url: str) -> None:
+    """Show a page where there is a screen."""
+    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(url)
+
+
+def _fill(server: Any, plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Array) -> None:
+    arm, (q, move) = certifier.arm, path(plan, way_rad)
     _draw_surroundings(server.scene, plan, certifier, q)
     look_at = 0.7 * arm.frames(q[:1]).wrist_m[0]
     server.initial_camera.look_at = look_at
@@ -77,25 +89,32 @@ def _fill(server: Any, plan: Plan, certifier: Certifier) -> None:
     show()
 
 
-def path(plan: Plan) -> tuple[Array, Any]:
-    """Joint vectors (m, 6) along the whole tour, back to the first pose, and the move (m,) that each belongs to."""
+def path(plan: Plan, way_rad: Sequence[Array] | Array = ()) -> tuple[Array, Any]:
+    """Joint vectors (m, 6) along all moves, and the move (m,) that each belongs to.
+
+    The way to the first pose is move -1; then comes the whole tour, back to the first pose.
+    """
     q = np.array([step.q_rad for step in plan.steps])
+    legs = [(-1, start, end) for start, end in pairwise(way_rad)]
+    legs += [(i, start, end) for i, (start, end) in enumerate(zip(q, np.roll(q, -1, axis=0), strict=True))]
     parts, moves = [], []
-    for i, (start, end) in enumerate(zip(q, np.roll(q, -1, axis=0), strict=True)):
+    for move, start, end in legs:
         n = max(1, int(np.ceil(np.abs(end - start).max() / _FRAME_RAD)))
         parts.append(start + np.linspace(0, 1, n, endpoint=False)[:, None] * (end - start))
-        moves += [i] * n
+        moves += [move] * n
     return np.concatenate([*parts, q[:1]]), np.array([*moves, len(q) - 1])
 
 
 def describe(plan: Plan, move: int) -> str:
     """Say in words what a move is."""
+    if move < 0:
+        return "From where the arm stands to the first pose.\n\nIt is asked for by itself."
     step, following = plan.steps[move], plan.steps[(move + 1) % len(plan.steps)]
     turn_deg, speed_deg_s = np.degrees([step.turn_rad, step.speed_rad_s])
     return (
         f"Move **{move + 1} of {len(plan.steps)}**, R{step.number:02d} to R{following.number:02d}: {turn_deg:.0f}° at "
         f"{speed_deg_s:.0f}°/s.\n\nNearest: {1e3 * step.clearance_m:.0f} mm, {step.limited_by}.\n\n"
-        f"All that moves stays in the ball of {plan.ball_m:.2f} m."
+        f"{room_in_words(plan)}"
     )
 
 
@@ -143,8 +162,7 @@ def _draw_surroundings(scene: Any, plan: Plan, certifier: Certifier, q_rad: Arra
     for i, box in enumerate(certifier.scene.boxes, start=1):
         low, high = np.array(box.low_m), np.array(box.high_m)
         scene.add_box(f"/surroundings/box {i}", _OBSTACLE, high - low, opacity=0.6, position=(low + high) / 2)
-    centre = arm.frames(q_rad[:1]).wrist_m[0]
-    scene.add_icosphere("/ball", plan.ball_m, _BALL, opacity=0.15, position=centre, cast_shadow=False)
+    scene.add_icosphere("/ball", plan.ball_m, _BALL, opacity=0.15, position=plan.ball_centre_m, cast_shadow=False)
     farthest = int(np.argmax([part.to_m for part in arm.tool]))
     tip = tips(arm, q_rad)[:, farthest]
     scene.add_line_segments("/path of the tool tip", np.stack([tip[:-1], tip[1:]], axis=1), _TIP, thickness=0.004)

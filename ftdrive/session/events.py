@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ftdrive.planning.plan import Plan
+
 Array = NDArray[np.float64]
 
 SCHEMA_VERSION = 1
@@ -78,6 +80,21 @@ class Checked(Event):
     passed: bool
     words: str
     """What was found; for one that failed, what to do."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Planned(Event):
+    """Every motion that is about to happen; told before anything is asked."""
+
+    plan: Plan
+    """Its file's contents in `to_dict`."""
+    way_rad: Array
+    """(k + 1, 6) joint vectors from where the arm stands to the first pose to be taken; (0, 6) where it is there."""
+    way_words: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give what `--json` writes, with the plan as its file has it."""
+        return Event.to_dict(self) | {"plan": self.plan.to_dict()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

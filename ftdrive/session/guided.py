@@ -21,10 +21,11 @@ from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
 from ftdrive.planning.scene import Scene, lean_of
+from ftdrive.planning.words import arm_moves, point_in_words, turns_in_words, way_in_words, way_of
 from ftdrive.runs import Run
 from ftdrive.session import preflight
 from ftdrive.session.completed import has_completed, remember_completed
-from ftdrive.session.events import GuardTripped, Noted, State, StateChanged
+from ftdrive.session.events import GuardTripped, Noted, Planned, State, StateChanged
 from ftdrive.session.guards import (
     ContactGuard,
     Guard,
@@ -73,6 +74,12 @@ class Options:
     fast: bool = False
     """At the plan's speeds, once it has run to its end slowly."""
     plan: Path | None = None
+    output: Path | None = None
+    """Save the plan as a new file."""
+    png: Path | None = None
+    """Draw it."""
+    view: bool = False
+    """Show it in the browser, until a person has seen it."""
     resume: Path | None = None
     redo: tuple[int, ...] = ()
     real: bool = True
@@ -131,6 +138,9 @@ def _as_begun(options: Options) -> Options:
         "--fast": options.fast,
         "--dry-run": options.dry_run,
         "--redo": bool(options.redo),
+        "--output": options.output is not None,
+        "--png": options.png is not None,
+        "--view": options.view,
     }
     if wrong := [name for name, given in no_motion.items() if given]:
         raise ConfigError(f"with --{begun} ftdrive plans and moves nothing: leave out {' and '.join(wrong)}")
@@ -181,9 +191,11 @@ class _Begun:
             limits=limits,
             sensor_range=_range_of(sensor),
         )
+        self._way = way_of(q, self._before.approach)
+        self._show()
         self._check(preflight.CHECKS)
         self._sampling, self._noise = self._chosen_sampling()
-        self._show(q)
+        self._show_prospect(q)
 
     def _planned(self) -> Plan:
         """The plan of the run that is resumed, or of a file, or one made where the arm stands."""
@@ -196,7 +208,8 @@ class _Begun:
         with suppress(ConfigError):  # the planner says what to do about it
             q = constant_tour(q)[0]  # wherever the wrist was left
         guess = guess_of(self._certifier, cell.tool.mass_kg or USUAL_KG)
-        return plan_tour(self._certifier, q, options.poses, speeds=self._speeds, guess=guess)
+        made = plan_tour(self._certifier, q, options.poses, speeds=self._speeds, guess=guess)
+        return made.marked(measured=cell.workcell.measured)
 
     def _what_is_left(self) -> tuple[list[int], list[PoseRecord]]:
         """Stops to take, and records that stand."""
@@ -250,15 +263,33 @@ class _Begun:
         self._desk.tell(Noted(words=chosen.words))
         return replace(sampling, average_s=chosen.seconds), chosen.sigma
 
-    def _show(self, q_rad: Array) -> None:
-        plan = self._plan
-        for words in plan.why:
-            self._desk.tell(Noted(words=words))
+    def _show(self) -> None:
+        """Show every motion to come: in words, and as the options ask in files and in the browser."""
+        options, plan, way = self._options, self._plan, self._way
+        words = "The arm stands at the first pose to be taken."
+        if len(way):
+            near = way_in_words(way, self._before.approach.clearance_m)
+            words = f"The way to the first pose to be taken, from where the arm stands: {near}."
+        self._desk.tell(Planned(plan=plan, way_rad=way, way_words=words))
+        if options.output is not None:
+            plan.save(options.output)
+            self._desk.tell(Noted(words=f"the plan is saved as {options.output}"))
+        if options.png is not None:
+            from ftdrive.planning.picture import draw
+
+            draw(plan, self._certifier, options.png, way)
+            self._desk.tell(Noted(words=f"the plan is drawn in {options.png}"))
+        if options.view:
+            from ftdrive.planning.view import open_in_browser, shown
+
+            with shown(plan, self._certifier, way) as url:
+                open_in_browser(url)
+                self._desk.require(f"The plan is shown at {url} until you answer. Go on?", assumed=False)
+
+    def _show_prospect(self, q_rad: Array) -> None:
+        """Tell what the plan is worth with this sensor's noise, and how long it takes."""
         mass_kg, average_s = self._cell.tool.mass_kg, self._sampling.average_s
-        self._desk.tell(Noted(words=prediction(plan, self._certifier, mass_kg, average_s, self._noise)))
-        q = np.degrees([step.q_rad for step in plan.steps])
-        ranges = ", ".join(f"{low:.0f} to {high:.0f}" for low, high in zip(q.min(axis=0), q.max(axis=0), strict=True))
-        self._desk.tell(Noted(words=f"joints 1 to 6 stay within {ranges} degrees: are cables long and slack enough?"))
+        self._desk.tell(Noted(words=prediction(self._plan, self._certifier, mass_kg, average_s, self._noise)))
         if self._options.fast and self._pace.slow:
             self._desk.tell(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
         fastest_rad_s = max(step.speed_rad_s for step in self._driven.steps)
@@ -335,11 +366,12 @@ class _Begun:
         self._check(preflight.AGAIN)
 
     def _ask(self) -> None:
-        x, y, z = (f"{value:.2f}" for value in self._plan.ball_centre_m)
         room = "" if self._plan.arm_rests else ", and the room of the whole arm, which moves too,"
+        if arm_moves(self._way):
+            room = f", and the room of the whole arm, which moves on its way there too ({turns_in_words(self._way)}),"
         for text in (
             "Is the tool free: nothing touches it, nothing is held, no fluid, cables slack, the base bolted?",
-            f"Is the ball of {self._plan.ball_m:.2f} m around x {x}, y {y}, z {z} m (base axes; the wrist){room} free, "
+            f"Is the ball of {self._plan.ball_m:.2f} m around {point_in_words(self._plan)} (the wrist){room} free, "
             "of people too?",
             "Is the emergency stop in reach, and tested?",
         ):

@@ -24,6 +24,7 @@ from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
+from ftdrive.planning.words import way_in_words, way_of
 from ftdrive.runs import Run
 from ftdrive.session.events import (
     Asked,
@@ -325,10 +326,9 @@ class Tour:
             return
         if words := forbidden(self._arm, np.vstack([q, approach.q_rad])):
             raise PlanRefused(words)
-        turn_deg = np.degrees(np.abs(np.diff(np.vstack([q, approach.q_rad]), axis=0)).max())
         words = (
-            f"the way to pose {stop}: {_moves(len(approach.q_rad))}, largest turn {turn_deg:.0f}°, proven clear by "
-            f"{1e3 * approach.clearance_m:.0f} mm, at {np.degrees(APPROACH_RAD_S):.0f}°/s at most"
+            f"the way to pose {stop} at {np.degrees(APPROACH_RAD_S):.0f}°/s at most: "
+            f"{way_in_words(way_of(q, approach), approach.clearance_m)}"
         )
         self._tell(State.APPROACH, stop, words)
         self._confirm(f"The arm goes {words}.")
@@ -474,10 +474,6 @@ class Tour:
         for t_host_ns, words in events[self._seen_events :]:
             self._desk.tell(Noted(words=f"sensor, at {t_host_ns} ns of the host's clock: {words}", warning=True))
         self._seen_events = len(events)
-
-
-def _moves(count: int) -> str:
-    return "1 move" if count == 1 else f"{count} moves"
 
 
 def approach_to(certifier: Certifier, q_rad: Array, goal_rad: Array, speeds: Speeds) -> Approach:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import textwrap
 from collections.abc import Mapping
 from threading import Lock
 from typing import Any, TextIO
@@ -9,6 +10,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from ftdrive.errors import Declined
+from ftdrive.planning.words import plan_in_words
 from ftdrive.session.events import (
     SCHEMA_VERSION,
     Asked,
@@ -17,12 +19,14 @@ from ftdrive.session.events import (
     Event,
     GuardTripped,
     Noted,
+    Planned,
     PoseTaken,
     RunOpened,
     State,
     StateChanged,
 )
 from ftdrive.session.operator import Key, Question
+from ftdrive.talk import talk
 
 
 def match(question: Question, typed: str) -> str | None:
@@ -152,12 +156,23 @@ class PlainOperator:
 
     def _write(self, text: str) -> None:
         with self._lock:
-            self._stderr.write(text)
+            self._stderr.write(folded(text, talk.width) if self._stderr.isatty() else text)
             self._stderr.flush()
 
 
+def folded(text: str, width: int) -> str:
+    """Break lines that a terminal would cut in the middle of a word; a file gets whole lines."""
+    lines = text.split("\n")
+    return "\n".join(_fold(line, width) if len(line) > width else line for line in lines)
+
+
+def _fold(line: str, width: int) -> str:
+    end = line[len(line.rstrip()) :]  # a prompt ends with a space
+    return textwrap.fill(line, width - 1, break_long_words=False, break_on_hyphens=False) + end
+
+
 def in_words(event: Event) -> str:
-    """Say an event in a line; nothing for those that only a screen can show."""
+    """Say an event, a plan in many lines, all else in one; nothing for those that only a screen can show."""
     match event:
         case RunOpened():
             return f"kept in {event.folder}; to continue after a stop: {event.resume}"
@@ -167,6 +182,8 @@ def in_words(event: Event) -> str:
             return f"{event.state}{': ' if event.words else ''}{event.words}"
         case Checked():
             return f"{'ok  ' if event.passed else 'FAIL'} {event.name}: {event.words}"
+        case Planned():
+            return f"{plan_in_words(event.plan)}\n{event.way_words}"
         case Noted():
             return f"{'! ' if event.warning else ''}{event.words}"
         case PoseTaken():

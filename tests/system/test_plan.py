@@ -51,6 +51,38 @@ def test_table_is_talk_and_the_file_is_the_plan(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("workcell", "measured"),
+    [("measured = false", False), ("measured = true", True), ("planes_mm = [[-1, 0, 0, -900]]", False), (None, True)],
+)
+def test_the_plan_says_whether_somebody_measured_what_it_is_for(
+    workcell: str | None, measured: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    tool = ["--tool", "0:200:100"]
+    if workcell is not None:
+        tool = []
+        Path("ftdrive.toml").write_text(
+            f'format = "ftdrive.config/1"\n[tool]\ncylinders_mm = [[0, 200, 100]]\n[workcell]\n{workcell}\n'
+        )
+    outcome = run("plan", "--model", "ur5e", *tool, "--minimal", "--output", "plan.json")
+    assert outcome.exit_code == 0, outcome.output
+    assert ("for the eye only" in outcome.stderr) is not measured
+    assert Plan.load(Path("plan.json")).measured is measured
+    exported = run("export", "plan", "plan.json", "--format", "urscript")
+    assert (exported.exit_code == 0) is measured
+
+
+@pytest.mark.parametrize("arguments", [[], ["--free-box", "100", "--minimal"]])
+def test_the_table_fits_into_80_columns(arguments: list[str]) -> None:
+    lines = run(*UR5E, *arguments).stderr.splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith("Poses in degrees"))
+    table = lines[start + 1 : lines.index("", start)]
+    assert max(map(len, table)) <= 80
+    assert len({len(line) for line in table[:-2]}) == 1  # headings stand above their numbers
+    assert ("shoulder" in table[0]) is bool(arguments)
+
+
+@pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["--tool", "0:200"], "3 or 5 numbers"),

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult
 from ftdrive.config import CellConfig
+from ftdrive.planning.plan import Plan
 from ftdrive.simulation import Station
 
 
@@ -77,9 +78,14 @@ def moves_of(station: Station) -> int:
 
 
 def test_a_dry_run_shows_everything_and_moves_nothing(station: Station, config: Path, ftdrive: CommandLine) -> None:
-    outcome = ftdrive.run("calibrate", "--config", config, "--dry-run")
+    path = ftdrive.folder / "tour.json"
+    outcome = ftdrive.run("calibrate", "--config", config, "--dry-run", "--output", path)
     assert outcome.returncode == 0, outcome.stderr
-    for words in ("24 moves proven clear", "the controller accepts", "joints 1 to 6", "nothing has moved"):
+    assert Plan.load(path).measured
+    again = ftdrive.run("calibrate", "--config", config, "--dry-run", "--output", path)
+    assert again.returncode == 2
+    assert "never overwritten" in again.stderr
+    for words in ("24 moves proven clear", "the controller accepts", "ball of 0.3", "wrist 3", "nothing has moved"):
         assert words in outcome.stderr
     assert moves_of(station) == 0
     assert not (ftdrive.folder / "runs").exists()

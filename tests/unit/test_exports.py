@@ -158,6 +158,42 @@ def test_header_says_what_it_is_for(plan: Plan) -> None:
     assert "within 30 degrees" in comments
 
 
+def test_header_tells_of_the_surroundings(plan: Plan) -> None:
+    text = urscript.program(plan, dwell_s=1.0)
+    assert "mounted: floor" in text
+    assert "free space around the arm" in text
+    assert text.count("x -0.07, y -0.25, z 0.83 m in base") == 2  # in the header, and where the operator is asked
+    scene = {
+        "planes": [{"normal": [0, 0, 1], "offset_m": 0}, {"normal": [-1, 0, 0], "offset_m": -0.8}],
+        "boxes": [{"low_m": [0.5, 0.5, 0], "high_m": [0.7, 0.7, 0.2]}],
+        "lean_rad": radians(30),
+    }
+    text = urscript.program(replace(plan, description={**plan.description, "scene": scene}), dwell_s=1.0)
+    for words in ("plane -1:0:0:-800.0", "box 500.0:500.0:0.0:700.0:700.0:200.0", "base leans 30.0 deg"):
+        assert words in text
+    assert "free space" not in text
+
+
+def test_a_program_that_moves_the_whole_arm_says_so(plan: Plan) -> None:
+    assert "whole arm" not in urscript.program(plan, dwell_s=1.0)
+    moved = replace(plan.steps[1], q_rad=(0.5, *plan.steps[1].q_rad[1:]))
+    lines = urscript.program(replace(plan, steps=(plan.steps[0], moved, *plan.steps[2:])), dwell_s=1.0).splitlines()
+    assert "and the room of the whole arm free" in next(line for line in lines if "popup(" in line)
+    assert any(line.startswith("  # ") and "the whole arm moves" in line for line in lines)
+
+
+@pytest.mark.parametrize("told", [{}, {"measured": False}])
+def test_placeholders_do_not_reach_the_pendant(told: dict[str, bool], plan: Plan, tmp_path: Path) -> None:
+    described = {key: value for key, value in plan.description.items() if key != "measured"}
+    path = tmp_path / "plan.json"
+    replace(plan, description=described | told).save(path)
+    for target in ("urscript", "csv"):
+        refused = export(path, "--format", target)
+        assert isinstance(refused.exception, PlanRefused)
+        assert "measured = true" in str(refused.exception)
+        assert refused.stdout == ""
+
+
 GOLDEN = """\
   movej([0.785398, -1.745329, 1.047198, -0.872665, 1.570796, 0.785398], a=0.349066, v=0.174533)
   textmsg("ftdrive plan HASH: pose 1 of 24, orientation R01")

@@ -22,7 +22,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Operator, Question
-from ftdrive.session.operators import JsonOperator, PlainOperator, match
+from ftdrive.session.operators import JsonOperator, PlainOperator, folded, match
 
 FREE = Question("Is the tool free?", assumed="yes")
 MOVE = Question("Type MOVE to let the arm move", ("MOVE",))
@@ -137,6 +137,16 @@ def test_nobody_to_answer_is_no_consent(operator: Callable[..., Operator]) -> No
         operator("", yes=True).ask(MOVE)  # --yes is not enough for what must be typed
     with pytest.raises(Declined):
         operator("maybe\n").ask(FREE)
+
+
+def test_a_terminal_cuts_no_word_and_keeps_the_space_of_a_prompt() -> None:
+    words = "Is the ball of 0.35 m around x -0.07, y -0.25, z 0.83 m in base (the wrist) free, of people too? [yes/no] "
+    table = "   1  01     -50      90"
+    lines = folded(f"{table}\n{words}", 40).split("\n")
+    assert lines[0] == table
+    assert max(map(len, lines)) <= 40
+    assert " ".join(lines[1:]) == words
+    assert folded("/a/path/that/is/longer/than/the/terminal.json", 20).count("\n") == 0
 
 
 def test_plain_lines_tell_what_is_worth_a_line() -> None:

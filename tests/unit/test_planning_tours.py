@@ -72,6 +72,7 @@ def test_cone_tour_stays_in_its_cone_clear_and_tells_what_the_cone_allows(
     certifier = certifier_of(model, tool)
     plan = plan_cone(certifier, half_angle_rad=np.radians(half_angle_deg), speeds=Speeds(), guess=guess_of(certifier))
     assert plan.kind == "cone"
+    assert plan.why[1].startswith("Their predicted error is")  # not "of that": nothing was said before
     assert plan.certified
     assert plan.arm_rests
     assert sampled_clear(certifier, plan)

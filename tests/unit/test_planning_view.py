@@ -41,6 +41,17 @@ def test_the_slider_goes_through_every_pose_and_back(plan: Plan) -> None:
     assert [describe(plan, int(i)).split("**")[1] for i in (0, len(poses) - 1)] == ["1 of 6", "6 of 6"]
 
 
+def test_the_slider_begins_where_the_arm_stands(plan: Plan) -> None:
+    first = np.array(plan.steps[0].q_rad)
+    way = first + np.radians([[-20.0, 0, 0, 10, 0, 0], [0.0, 0, 0, 10, 0, 0], [0.0] * 6])
+    q, move = path(plan, way)
+    alone, _ = path(plan)
+    np.testing.assert_allclose(q[0], way[0])
+    np.testing.assert_allclose(q[move >= 0], alone)
+    assert np.abs(np.diff(q, axis=0)).max() <= np.radians(3) + 1e-9
+    assert "From where the arm stands" in describe(plan, int(move[0]))
+
+
 @given(st.floats(0, 1), st.floats(0, 0.5), st.floats(0, 0.2))
 def test_bodies_have_their_size_and_are_closed(half_length: float, radius: float, rounding: float) -> None:
     vertices, faces = revolved(half_length, radius, rounding)

@@ -1,8 +1,10 @@
 """The state machine on a fake cell: states, questions, holds, keys, resume; each fault injected on the way."""
 
+import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -17,8 +19,10 @@ from drivers.errors import DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
 from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
+from ftdrive.planning import view
 from ftdrive.planning.arm_model import ArmModel, Cylinder
 from ftdrive.planning.cell import certifier_for
+from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
@@ -32,6 +36,7 @@ from ftdrive.session.events import (
     Event,
     GuardTripped,
     Noted,
+    Planned,
     PoseTaken,
     RunOpened,
     State,
@@ -39,6 +44,7 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.guided import Options
 from ftdrive.session.operator import Key, Question
+from ftdrive.session.operators import in_words
 from ftdrive.session.outcome import Outcome
 
 Array = NDArray[np.float64]
@@ -402,6 +408,64 @@ def test_a_dry_run_shows_all_and_moves_nothing(lab: Lab) -> None:
     assert lab.operator.asked == []
     assert not (lab.folder / "runs").exists()
     assert len(lab.operator.of(Checked)) == len(preflight.CHECKS)
+
+
+def test_the_plan_is_shown_before_the_checks_and_kept_where_asked(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, workcell=WorkcellConfig(measured=False))
+    path = lab.folder / "plan.json"
+    with pytest.raises(NotAccepted):
+        lab.calibrate(dry_run=True, output=path)
+    (shown,) = lab.operator.of(Planned)
+    assert lab.operator.told.index(shown) < lab.operator.told.index(lab.operator.of(Checked)[0])
+    words = in_words(shown)
+    for figure in ("wrist 3", "Nearest", "ball of 0.3", "Predicted", "1 move (wrist 1 ", "proven clear by"):
+        assert figure in words
+    assert "whole arm" not in words
+    told = json.loads(json.dumps(shown.to_dict(), allow_nan=False))
+    assert told["event"] == "planned"
+    assert told["plan"] == json.loads(path.read_text())
+    np.testing.assert_allclose(told["way_rad"], [lab.arm.q, told["plan"]["steps"][0]["q_rad"]])
+    assert not Plan.load(path).measured
+    lab.cell = replace(lab.cell, workcell=WorkcellConfig(measured=True))
+    with pytest.raises(FileExistsError):
+        lab.calibrate(dry_run=True, output=path)
+    assert lab.calibrate(dry_run=True, output=lab.folder / "measured.json") is None
+    assert Plan.load(lab.folder / "measured.json").measured
+
+
+def test_a_way_that_moves_the_whole_arm_asks_for_its_room(lab: Lab) -> None:
+    path = lab.folder / "plan.json"
+    lab.calibrate(dry_run=True, output=path)
+    lab.arm.q = lab.arm.q + np.radians([20.0, 0, 0, 0, 0, 0])
+    lab.calibrate(plan=path)
+    texts = [question.text for question in lab.operator.asked]
+    assert all(
+        any(word in text and "base 20°" in text and "whole arm" in text for text in texts)
+        for word in ("Is the ball of", "Type MOVE")
+    )
+
+
+def test_the_browser_is_waited_for(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    served: list[str] = []
+
+    @contextmanager
+    def shown(plan: Plan, certifier: Certifier, way_rad: Array) -> Iterator[str]:
+        assert len(plan.steps) == 6
+        assert certifier.arm.name == "UR5e"
+        assert len(way_rad) == 2
+        served.append("open")
+        yield "http://here"
+        served.append("closed")
+
+    monkeypatch.setattr(view, "shown", shown)
+    monkeypatch.setattr(view, "open_in_browser", served.append)
+    lab.operator.answers["http://here"] = ["yes", "no"]
+    assert lab.calibrate(dry_run=True, view=True) is None
+    assert served == ["open", "http://here", "closed"]
+    assert [question.assumed for question in lab.operator.asked] == [None]
+    with pytest.raises(Declined):
+        lab.calibrate(view=True)
+    assert lab.arm.moves == []
 
 
 def test_step_mode_waits_for_enter_before_each_move(lab: Lab) -> None:

@@ -23,7 +23,7 @@ SCRIPT_PORT = 30003
 @pytest.fixture(scope="module")
 def plan() -> Plan:
     certifier = Certifier(ArmModel("ur5e", [Cylinder(0.0, 0.2, 0.1)]), Scene())
-    return plan_tour(certifier, poses=24, speeds=Speeds(), guess=guess_of(certifier))
+    return plan_tour(certifier, poses=24, speeds=Speeds(), guess=guess_of(certifier)).marked(measured=True)
 
 
 @pytest.fixture

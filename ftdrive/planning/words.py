@@ -1,0 +1,105 @@
+"""A plan in words: what a person reads before anything moves."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drivers.ur.kinematics import Array
+from ftdrive.planning.approach import Approach
+from ftdrive.planning.plan import Plan
+
+JOINTS = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
+STILL_RAD = float(np.radians(0.5))
+"""A joint that turns less is not named: no part of any arm moves by 20 mm."""
+
+
+def plan_in_words(plan: Plan) -> str:
+    """Say why this plan, its poses and moves, joint ranges, clearances, time, room, and what it will be worth.
+
+    The table is 72 columns wide at most; sentences are whole lines.
+    """
+    still = ", ".join(f"{angle:.0f}" for angle in np.degrees(plan.steps[0].q_rad[:3]))
+    rest = [f"Base, shoulder and elbow stay at {still} degrees."] if plan.arm_rests else []
+    return "\n".join([*plan.why, *rest, *_table(plan), "", *_summary(plan)])
+
+
+def room_in_words(plan: Plan) -> str:
+    """Say what must be free."""
+    ball = f"ball of {plan.ball_m:.2f} m around {point_in_words(plan)}"
+    if plan.arm_rests:
+        return f"All that moves stays in a {ball}, where the axes of wrist 1 and 2 cross: keep it free, cables slack."
+    return f"Wrist and tool stay in a {ball}, and the whole arm moves: keep the room of both free, cables slack."
+
+
+def point_in_words(plan: Plan) -> str:
+    """Say where the centre of the ball is."""
+    x, y, z = (f"{value:.2f}" for value in plan.ball_centre_m)
+    return f"x {x}, y {y}, z {z} m in base"
+
+
+def way_of(q_rad: ArrayLike, approach: Approach) -> Array:
+    """Joint vectors (k + 1, 6) from where the arm stands to the first pose; none where it stands there already."""
+    return np.vstack([q_rad, approach.q_rad]) if len(approach.q_rad) else np.zeros((0, 6))
+
+
+def way_in_words(way_rad: ArrayLike, clearance_m: float) -> str:
+    """Say how many moves an approach has, which joints turn over which range, and whether all of the arm needs room."""
+    count = len(np.asarray(way_rad)) - 1
+    words = f"{'1 move' if count == 1 else f'{count} moves'} ({turns_in_words(way_rad)}), "
+    words += f"proven clear by {1e3 * clearance_m:.0f} mm"
+    return words + "; the whole arm moves: keep its room free" if arm_moves(way_rad) else words
+
+
+def turns_in_words(way_rad: ArrayLike) -> str:
+    """Name the joints that move along a way, each with the range it turns over."""
+    ranges_deg = np.degrees(np.ptp(np.asarray(way_rad), axis=0))
+    turns = [
+        f"{name} {turn:.0f}°" for name, turn in zip(JOINTS, ranges_deg, strict=True) if turn >= np.degrees(STILL_RAD)
+    ]
+    return ", ".join(turns) or "no joint by half a degree"
+
+
+def arm_moves(way_rad: ArrayLike) -> bool:
+    """Tell whether base, shoulder or elbow turn along a way (n, 6)."""
+    way = np.asarray(way_rad)
+    return len(way) > 0 and bool(np.ptp(way[:, :3], axis=0).max() >= STILL_RAD)
+
+
+def _table(plan: Plan) -> list[str]:
+    q_deg = np.degrees([step.q_rad for step in plan.steps])
+    shown = range(3 if plan.arm_rests else 0, 6)
+    widths = [max(len(JOINTS[j]), 5) + 1 for j in shown]
+
+    def angles(row: Array) -> str:
+        return "".join(f"{row[j]:{width}.0f}" for j, width in zip(shown, widths, strict=True))
+
+    names = "".join(f"{JOINTS[j]:>{width}}" for j, width in zip(shown, widths, strict=True))
+    lines = ["Poses in degrees, and the move on to the next:", f"{'':4}{'R':>4}{names} turn  °/s    s clear mm"]
+    for i, (step, q) in enumerate(zip(plan.steps, q_deg, strict=True), start=1):
+        turn, speed = np.degrees([step.turn_rad, step.speed_rad_s])
+        move = f"{turn:5.0f}{speed:5.0f}{step.duration_s:5.1f}{1e3 * step.clearance_m:9.0f}"
+        lines.append(f"{i:4}  {step.number:02d}{angles(q)}{move}")
+    return [*lines, f"{'from':8}{angles(q_deg.min(axis=0))}", f"{'to':8}{angles(q_deg.max(axis=0))}"]
+
+
+def _summary(plan: Plan) -> list[str]:
+    nearest = min(plan.steps, key=lambda step: step.clearance_m)
+    count, most = len(plan.steps), np.degrees(max(step.turn_rad for step in plan.steps))
+    proven = "all proven clear" if plan.certified else "NOT ALL PROVEN CLEAR"
+    sigma, guess = plan.predicted, plan.description["guess"]
+    tilt_deg = np.degrees(_largest([sigma["tilt_alpha_rad"], sigma["tilt_beta_rad"]]))
+    return [
+        f"{count} poses, {count} moves {proven}, none above {most:.0f}°: "
+        f"{sum(step.duration_s for step in plan.steps):.0f} s of motion at the plan's speeds.",
+        f"Nearest: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
+        room_in_words(plan),
+        f"Predicted for {guess['mass_kg']:g} kg and averages good to {guess['sigma_force_N']} N, "
+        f"{guess['sigma_torque_Nm']} N·m (one sigma): mass {1e3 * _largest(sigma['mass_kg']):.1f} g, "
+        f"centre of mass {1e3 * _largest(sigma['p_sensor_com_m']):.2f} mm, "
+        f"force bias {_largest(sigma['force_bias_N']):.3f} N, tilt {tilt_deg:.2f}°; "
+        f"compensation {_largest(sigma['force_rms_N']):.3f} N, {_largest(sigma['torque_rms_Nm']):.4f} N·m.",
+    ]
+
+
+def _largest(sigma: object) -> float:
+    """Largest of some; NaN where the poses do not tell, which is null in the file."""
+    return float(np.max(np.array(sigma, dtype=np.float64)))
