@@ -23,6 +23,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Key, Question
+from ftdrive.talk import in_whole_words
 
 
 def match(question: Question, typed: str) -> str | None:
@@ -152,7 +153,7 @@ class PlainOperator:
 
     def _write(self, text: str) -> None:
         with self._lock:
-            self._stderr.write(text)
+            self._stderr.write(in_whole_words(text, self._stderr))
             self._stderr.flush()
 
 

@@ -13,7 +13,8 @@ from calib import solve
 from calib.errors import TooFewSamples
 from calib.model import Array
 from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
-from drivers.interfaces import ArmState, FtSamples
+from drivers.errors import StreamBroken
+from drivers.interfaces import ArmState, FtSamples, Health
 from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, StateChanged
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Key, Question
@@ -59,6 +60,10 @@ class Cell:
         self.rate_Hz = RATE_HZ
         self.says: Callable[[float], Status] = lambda _: Status()
         self.fails: dict[str, float] = {}
+        self.recover = False
+        self.unplugged_s = np.inf
+        self.back_s = 0.0
+        self.events: tuple[tuple[int, str], ...] = ()
         starts = np.cumsum([0.0, *(dwell.seconds + MOVE_S for dwell in dwells)])
         self.starts, self.end_s = starts[:-1], float(starts[-1]) - MOVE_S
 
@@ -97,6 +102,10 @@ class Cell:
         t = self.now_s + np.arange(max(1, round(duration_s * self.rate_Hz))) / self.rate_Hz
         self.now_s += duration_s
         self._may_fail("sensor")
+        if self.now_s > self.unplugged_s:
+            self.back_s, self.unplugged_s = self.unplugged_s + 2.0, np.inf
+            self.events = ((17, "a cable came off"), (18, "connected again"))
+            raise StreamBroken("interrupted, connecting again")
         wrench = []
         for some in np.array_split(t, max(1, len(t) // 20)):  # the arm stands still for a tenth of a second each time
             R, _, k = self._where(some[0])
@@ -114,7 +123,12 @@ class Cell:
         )
 
     def check(self) -> None:
-        pass
+        if self.now_s < self.back_s:
+            self.now_s += 0.1
+            raise StreamBroken("interrupted, connecting again")
+
+    def health(self) -> Health:
+        return Health(0, 0, 0, RATE_HZ, 0.0, events=self.events)
 
 
 class Person:
