@@ -173,8 +173,7 @@ class _Collection:
         while not self._over:
             state = self._arm.state()
             self._collect(LOOK_S)  # paces the loop, and raises as soon as the sensor fails
-            while not self._over and (key := self._operator.pressed()):
-                self._obey(key)
+            self._obey_keys()
             if self._over or not self._may_measure():
                 continue
             if self._at_rest(state):
@@ -284,6 +283,11 @@ class _Collection:
             last = attempt == self._sampling.attempts
             advice = "It is kept and marked; press r to take it again." if last else "Let go of tool and cable."
             self._note(f"Pose {stop} is not quiet: {unrest}. {advice}", warning=True)
+        self._obey_keys()  # pressed while this one was not yet shown: r means the one before
+        if self._over or self._paused or self._dealt_with:
+            return False
+        if self._redo is not None:
+            stop = number = self._redo
         record = PoseRecord(stop, TourPose(number, before.q_rad), before, after, samples, steady=not unrest)
         self._keep(record, settle_s, attempt)
         return True
@@ -340,6 +344,10 @@ class _Collection:
                 found, unit = samples.wrench[:, c].std(ddof=1), "N" if c < 3 else "N·m"
                 return f"{CHANNELS[c]} scatters by {found:.2g} {unit}, at its quietest by {self._level[c]:.2g}"
         return "" if is_stationary(samples.wrench) else "its mean still changes"
+
+    def _obey_keys(self) -> None:
+        while not self._over and (key := self._operator.pressed()):
+            self._obey(key)
 
     def _obey(self, key: Key) -> None:
         if key is Key.STOP:
