@@ -22,6 +22,7 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from calib.routine import DriftCheck
+from ftdrive.errors import Declined
 from ftdrive.keyboard import Keyboard
 from ftdrive.report import drift_in_words
 from ftdrive.session.events import (
@@ -61,6 +62,8 @@ _FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _CUBE_WIDTH = 25
 _NUMBER_WIDTH = 9
 _TABLE_WIDTH = 53
+_ROUNDED = 1e-9
+"""A standard deviation below this, N or N·m, is one of rounding: what it belongs to is no part of the fit."""
 _ASCII = str.maketrans(
     dict(zip("┌┐└┘├┤┬┴┼─│", "+++++++++-|", strict=True)) | {"±": "+-", "°": " deg", "·": ".", "…": "~"}
 )
@@ -162,6 +165,8 @@ def _state(view: View, now_s: float, width: int) -> list[Text]:
     now = view.now
     if now is None:
         return [Text("starting")]
+    if view.keys == "asking" and now.state in {State.MOVE, State.SETTLE, State.SAMPLE}:
+        return [Text("WAITS for an answer", "bold cyan")]  # what was done before is over
     line = Text()
     if now.stop is not None:
         line.append(f"pose {now.stop}/{now.stops}" if now.stops is not None else f"pose {now.stop}", "bold")
@@ -277,23 +282,23 @@ def _drift(view: View) -> Text:
     if "drift" not in fit.values:
         return Text("drift  none seen so far")
     change, sigma = fit.values["drift"], fit.sigma["drift"]
-    sure = bool((np.abs(change) > 4 * sigma)[sigma > 0].any())
-    words = f"drift  {np.linalg.norm(change[:3]):.3f} ± {np.max(sigma[:3]):.3f} N"
-    if sigma[3:].any():  # else it is no part of the fit
-        words += f", {np.linalg.norm(change[3:]):.4f} N·m"
-    words += " since the first pose"
+    fitted = sigma > _ROUNDED
+    sure = bool((np.abs(change) > 4 * sigma)[fitted].any())
+    parts = [
+        f"{np.linalg.norm(change[some]):.{digits}f} ± {np.max(sigma[some]):.{digits}f} {unit}"
+        for some, digits, unit in ((slice(3), 3, "N"), (slice(3, 6), 4, "N·m"))
+        if fitted[some].any()
+    ]
+    words = f"drift  {', '.join(parts)} since the first pose"
     return Text(words if sure else f"{words}, perhaps", "yellow" if sure else "")
 
 
 def _keys(view: View) -> list[Text]:
     if view.keys != "live":
         return [Text("Enter sends the answer; Ctrl-C ends, poses are kept", "dim")] if view.keys == "asking" else []
-    now = view.now
-    useful = {Key.PAUSE, Key.STOP}
-    if now is not None and now.stop is not None:
-        useful |= (
-            {Key.REDO, Key.SKIP} if now.stops is not None else set(KEYS)
-        )  # by hand nobody knows how many there are
+    useful: set[Key] = set()  # before and after the poses nobody listens
+    if view.now is not None and view.now.stop is not None:
+        useful = set(KEYS) if view.now.stops is None else set(KEYS) - {Key.KEEP}  # by hand there is no last one
     line = Text()
     for key, word in KEYS.items():
         if key not in useful:
@@ -412,7 +417,11 @@ class Screen:
             for line in lines:
                 self._console.print(line)
             self._console.print(last, end=" ", soft_wrap=True)
-            typed = read_line(self._stdin, question)
+            try:
+                typed = read_line(self._stdin, question)
+            except (KeyboardInterrupt, Declined):
+                self._console.file.write("\n")  # what is told next begins a line
+                raise
             used += len(lines) + (last.cell_len + 1 + cell_len(typed.rstrip("\n"))) // width + 1
             if (answer := match(question, typed)) is not None:
                 break

@@ -175,7 +175,7 @@ class Witness:
         """Tell what has happened since the last time."""
         events = self._sensor.health().events
         for t_host_ns, words in events[self._told :]:
-            self._tell(Noted(words=f"sensor, at {t_host_ns} ns of the host's clock: {words}", warning=True))
+            self._tell(Noted(words=f"sensor: {words} (host clock {t_host_ns / 1e9:.3f} s)", warning=True))
         self._told = len(events)
 
 

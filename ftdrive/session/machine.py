@@ -249,7 +249,7 @@ class Tour:
             raise Declined("ended by a person between two poses")
         if answer == "s":
             self._skip()
-        elif answer == "r" and self._may_redo():
+        elif answer == "r" and self._redoable() is not None:
             self._redo()
         return answer == ""
 
@@ -263,7 +263,7 @@ class Tour:
         largest = f"largest turn {np.degrees(turn_rad.max()):.0f}°"
         speed_rad_s = self._own_speed(index)
         if speed_rad_s is None:
-            return f"{joints}, {largest}, no move of the plan: Enter plans the way and shows it"
+            return f"Enter plans the way and shows it, {joints}, {largest}"
         if self._pace.slow:
             speed_rad_s = min(speed_rad_s, SLOW_RAD_S)
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
@@ -283,11 +283,11 @@ class Tour:
                 if self._under_way is not None:
                     raise Turned(key)
                 self._note("s skips a pose while the arm goes there or measures: none is under way")
-            if key is Key.REDO and self._may_redo():
+            if key is Key.REDO and (last := self._redoable()) is not None:
                 self._again = True
                 if not moving:
                     raise Turned(key)
-                self._note("the arm ends its move first, then goes back")
+                self._note(f"the arm ends its move, then goes back to pose {last}")
 
     def _turn(self, key: Key) -> None:
         if key is Key.REDO:
@@ -297,14 +297,15 @@ class Tour:
             self._arm.stop()
         self._skip()
 
-    def _may_redo(self) -> bool:
+    def _redoable(self) -> int | None:
+        """Stop that r takes again; None, and why, where there is none."""
         if self._last is None:
             self._note("there is no pose yet to be taken again")
         elif self._todo[0] == self._last.stop:
             self._note(f"pose {self._last.stop} is being taken again already")
         else:
-            return True
-        return False
+            return self._last.stop
+        return None
 
     def _redo(self) -> None:
         self._again = False

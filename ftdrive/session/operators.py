@@ -140,7 +140,11 @@ class PlainOperator:
         self._asked = question.text
         while True:
             self._write(prompt(question))
-            typed = read_line(self._stdin, question)
+            try:
+                typed = read_line(self._stdin, question)
+            except (KeyboardInterrupt, Declined):
+                self._write("\n")  # what is told next begins a line
+                raise
             if not self._stdin.isatty():
                 self._write(typed)
             if (answer := match(question, typed)) is not None:

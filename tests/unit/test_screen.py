@@ -169,7 +169,7 @@ def test_only_keys_that_do_something_are_offered() -> None:
     by_hand = keys(state=State.SAMPLE, stop=3)
     assert by_hand == " k  finish   r  redo   s  skip   p  pause   q  stop  Ctrl-C ends, poses are kept"
     before = keys(state=State.PREFLIGHT)
-    assert before == " p  pause   q  stop  Ctrl-C ends, poses are kept"
+    assert before == "Ctrl-C ends, poses are kept"
 
 
 def test_before_a_run_there_is_no_table_of_nothing() -> None:
@@ -210,7 +210,7 @@ def test_the_first_pose_seen_again_tells_the_drift() -> None:
 
 
 def test_a_drift_of_the_force_alone_is_told_for_sure_and_without_torque() -> None:
-    change, sigma = np.array([0.3, 0, 0.01, 0, 0, 0]), np.array([6e-4, 6e-4, 6e-4, 0, 0, 0])
+    change, sigma = np.array([0.3, 0, 0.01, 3e-20, 0, 0]), np.array([6e-4, 6e-4, 6e-4, 2e-21, 0, 3e-12])
     fitted = estimated(values=VALUES | {"drift": change}, sigma=SIGMA | {"drift": sigma})
     assert "drift  0.300 ± 0.001 N since the first pose" in drawn(view(*MIDDLE, fitted))
     doubtful = estimated(values=VALUES | {"drift": change / 200}, sigma=SIGMA | {"drift": sigma})
@@ -227,6 +227,12 @@ def test_a_reason_stands_once_on_the_screen() -> None:
     assert "\n".join(drawn(held)).count("77 N") == 1
     by_key = view(*MIDDLE, StateChanged(state=State.HOLD, words="paused by a person"))
     assert "\n".join(drawn(by_key)).count("paused by a person") == 1
+
+
+def test_while_a_question_waits_nothing_is_measured() -> None:
+    asking = view(*MIDDLE)
+    asking.keys = "asking"
+    assert drawn(asking)[1] == "WAITS for an answer"
 
 
 def test_numbers_never_touch() -> None:

@@ -772,7 +772,7 @@ def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> Non
     lab.calibrate()
     assert taken(lab) == [1, 1, 2, 3, 3, 4, 5, 5, 6, 7]
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
-    assert "ends its move first" in said(lab)
+    assert "the arm ends its move, then goes back to pose 3" in said(lab)
     ways = [question.text for question in lab.operator.asked if "the way to pose" in question.text]
     assert len(ways) == 1  # the first approach: back and forth it goes along the plan's own moves
 
