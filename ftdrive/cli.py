@@ -3,6 +3,7 @@
 import importlib
 import logging
 import signal
+import sys
 
 import click
 
@@ -112,5 +113,7 @@ def main() -> int:
         code = exit_code(error)
         if code is None:
             raise
-        click.echo(f"error: {error}", err=True)
+        from ftdrive.talk import in_whole_words
+
+        click.echo(in_whole_words(f"error: {error}", sys.stderr), err=True)
         return code

@@ -5,6 +5,7 @@ import os
 import re
 import select
 import termios
+import time
 import tty
 from collections import deque
 from collections.abc import Iterator
@@ -17,6 +18,11 @@ from ftdrive.session.operator import Key
 
 _ESCAPE = re.compile(rb"\x1b(\[[0-?]*[ -/]*[@-~]|O.|.)?")
 """Arrows and function keys arrive as escape, then letters that would be read as keys."""
+_KEYS = {key.value: key for key in Key}
+_WORD_S = 0.3
+"""A letter that follows another so soon belongs to a word, such as an answer that was typed too late."""
+_ALWAYS = {Key.PAUSE, Key.STOP}
+"""Heard in a word too: better stopped once too often."""
 
 
 class Keyboard:
@@ -98,7 +104,7 @@ class Keyboard:
         atexit.unregister(self._restore)
 
     def _read(self, wake: int) -> None:
-        known = {key.value.encode(): key for key in Key}
+        word, typed_s = "", 0.0
         try:
             while True:
                 ready, _, _ = select.select([self._fd, wake], [], [])
@@ -107,8 +113,15 @@ class Keyboard:
                 typed = os.read(self._fd, 64)
                 if not typed:
                     return
-                letters = _ESCAPE.sub(b"", typed).lower()
-                self._keys.extend(known[letter] for k in range(len(letters)) if (letter := letters[k : k + 1]) in known)
+                letters = _ESCAPE.sub(b"", typed).decode(errors="replace").lower()
+                now_s = time.monotonic()
+                word, typed_s = (word if now_s - typed_s < _WORD_S else ""), now_s
+                alone = not word and len(set(letters)) == 1
+                for letter in dict.fromkeys(letters):
+                    key = _KEYS.get(letter)
+                    if key is not None and letter not in word and (alone or key in _ALWAYS):
+                        self._keys.append(key)
+                word += letters
         except OSError:
             return  # the terminal is gone: SIGHUP says so to everybody
         finally:

@@ -22,6 +22,7 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from calib.routine import DriftCheck
+from ftdrive.errors import Declined
 from ftdrive.keyboard import Keyboard
 from ftdrive.report import drift_in_words
 from ftdrive.session.events import (
@@ -45,7 +46,7 @@ from ftdrive.talk import talk
 Array = NDArray[np.float64]
 
 REFRESH_HZ = 4
-KEYS = {Key.KEEP: "keep", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "stop"}
+KEYS = {Key.KEEP: "finish", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "stop"}
 
 # Label and unit, factor from SI to it, name; and what goes first where there is no room, see `frame`.
 _ROWS = (
@@ -62,6 +63,8 @@ _FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _CUBE_WIDTH = 25
 _NUMBER_WIDTH = 9
 _TABLE_WIDTH = 53
+_ROUNDED = 1e-9
+"""A standard deviation below this, N or N·m, is one of rounding: what it belongs to is no part of the fit."""
 _ASCII = str.maketrans(
     dict(zip("┌┐└┘├┤┬┴┼─│", "+++++++++-|", strict=True)) | {"±": "+-", "°": " deg", "·": ".", "…": "~"}
 )
@@ -83,6 +86,8 @@ class View:
     drift: DriftCheck | None = None
     note: str = ""
     waiting: tuple[Key, ...] = ()
+    ascii_only: bool = False
+    """Whether the terminal knows nothing else."""
     keys: Literal["live", "asking", "over"] = "live"
     """Whether keys do anything now."""
 
@@ -99,6 +104,10 @@ class View:
                 self.estimated = event
             case Noted(warning=True) | GuardTripped():
                 self.note = in_words(event)
+
+    def shown(self, text: str) -> str:
+        """Replace what the terminal's encoding lacks; before anything is measured or cut, for it gets longer."""
+        return text.translate(_ASCII) if self.ascii_only else text
 
     def _take(self, event: PoseTaken, now_s: float) -> None:
         self.taken[event.stop] = event, now_s
@@ -125,7 +134,7 @@ def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Gro
             (5, [_drift(view)]),
         ]
     blocks += [
-        (1, _folded(view.note, width, "bold red" if view.note.startswith("STOP") else "yellow")),
+        (1, _folded(view, view.note, width, "bold red" if view.note.startswith("STOP") else "yellow")),
         (9, [_rule(width)]),
         (0, _keys(view)),
         (0, _kept(view, width)),
@@ -134,8 +143,9 @@ def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Gro
         blocks.remove(max(blocks, key=lambda block: block[0]))
     lines = [line for _, some in blocks for line in some]
     for line in lines:
+        line.plain = view.shown(line.plain)
         line.no_wrap, line.overflow = True, "crop"
-        line.truncate(width, overflow="ellipsis")
+        line.truncate(width, overflow="crop" if view.ascii_only else "ellipsis")
     return Group(*lines)
 
 
@@ -156,6 +166,8 @@ def _state(view: View, now_s: float, width: int) -> list[Text]:
     now = view.now
     if now is None:
         return [Text("starting")]
+    if view.keys == "asking" and now.state in {State.MOVE, State.SETTLE, State.SAMPLE}:
+        return [Text("WAITS for an answer", "bold cyan")]  # what was done before is over
     line = Text()
     if now.stop is not None:
         line.append(f"pose {now.stop}/{now.stops}" if now.stops is not None else f"pose {now.stop}", "bold")
@@ -163,9 +175,10 @@ def _state(view: View, now_s: float, width: int) -> list[Text]:
     stopped = now.state in {State.STOP, State.HOLD}
     line.append(now.state.upper(), "bold red" if stopped else "bold cyan")
     line.append(f"  {_minutes(now_s - view.since_s)}" if now.state is not State.HOLD else "")
-    if len(line) + 2 + len(now.words) > width:
-        return [line, *_folded(now.words, width)]
-    line.append(f"  {now.words}" if now.words else "")
+    words = "" if now.words in view.note else now.words
+    if len(line) + 2 + len(words) > width:
+        return [line, *_folded(view, words, width)]
+    line.append(f"  {words}" if words else "")
     return [line]
 
 
@@ -201,6 +214,7 @@ def _estimates(view: View, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
     if with_cube:
         cube = [Text("gravity by flange axis", "dim"), *(Text(line) for line in _cube(counts, newest))]
         for row, picture in zip(rows, cube, strict=True):
+            row.plain = view.shown(row.plain)
             row.truncate(_TABLE_WIDTH, pad=True)
             row.append(" ")
             row.append_text(picture)
@@ -256,7 +270,7 @@ def _coverage(view: View, width: int) -> list[tuple[int, list[Text]]]:
         line.append(f"   {what} {value:.1f}" if value < 100 else f"   {what} >100")
         line.append("" if value <= goal else f" (goal {goal:g})")
     line.append(f"   gap {fit.empty_cap_deg:.0f}°")
-    return [(1, [line]), (4, _folded(f"helps most: {fit.hint}" if fit.hint else "", width))]
+    return [(1, [line]), (4, _folded(view, f"helps most: {fit.hint}" if fit.hint else "", width))]
 
 
 def _drift(view: View) -> Text:
@@ -269,17 +283,27 @@ def _drift(view: View) -> Text:
     if "drift" not in fit.values:
         return Text("drift  none seen so far")
     change, sigma = fit.values["drift"], fit.sigma["drift"]
-    force_N, torque_Nm = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
-    sure = bool(np.max(np.abs(change) / sigma) > 4)
-    words = f"drift  {force_N:.3f} ± {np.max(sigma[:3]):.3f} N, {torque_Nm:.4f} N·m since the first pose"
+    fitted = sigma > _ROUNDED
+    sure = bool((np.abs(change) > 4 * sigma)[fitted].any())
+    parts = [
+        f"{np.linalg.norm(change[some]):.{digits}f} ± {np.max(sigma[some]):.{digits}f} {unit}"
+        for some, digits, unit in ((slice(3), 3, "N"), (slice(3, 6), 4, "N·m"))
+        if fitted[some].any()
+    ]
+    words = f"drift  {', '.join(parts)} since the first pose"
     return Text(words if sure else f"{words}, perhaps", "yellow" if sure else "")
 
 
 def _keys(view: View) -> list[Text]:
     if view.keys != "live":
         return [Text("Enter sends the answer; Ctrl-C ends, poses are kept", "dim")] if view.keys == "asking" else []
+    useful: set[Key] = set()  # before and after the poses nobody listens
+    if view.now is not None and view.now.stop is not None:
+        useful = set(KEYS) if view.now.stops is None else set(KEYS) - {Key.KEEP}  # by hand there is no last one
     line = Text()
     for key, word in KEYS.items():
+        if key not in useful:
+            continue
         line.append(f" {key.value} ", "reverse")
         line.append(f" {word.upper()} asked  " if key in view.waiting else f" {word}  ")
     line.append("Ctrl-C ends, poses are kept")
@@ -299,8 +323,9 @@ def _rule(width: int) -> Text:
     return Text("─" * width, "dim")
 
 
-def _folded(text: str, width: int, style: str = "") -> list[Text]:
-    return [Text(line, style) for line in textwrap.wrap(text, width, max_lines=3, placeholder=" …")]
+def _folded(view: View, text: str, width: int, style: str = "") -> list[Text]:
+    lines = textwrap.wrap(view.shown(text), width, max_lines=3, placeholder=view.shown(" …"))
+    return [Text(line, style) for line in lines]
 
 
 def _end_of(text: str, width: int) -> str:
@@ -360,7 +385,7 @@ class Screen:
         """Show an event."""
         with self._lock:
             self._view.update(event, self._clock())
-        if _history(event) and (words := in_words(event)):
+        if _history(event, self._view) and (words := in_words(event)):
             style = "bold red" if isinstance(event, GuardTripped) else ""
             self._console.print(self._plain(Text(words, style)))
 
@@ -393,7 +418,11 @@ class Screen:
             for line in lines:
                 self._console.print(line)
             self._console.print(last, end=" ", soft_wrap=True)
-            typed = read_line(self._stdin, question)
+            try:
+                typed = read_line(self._stdin, question)
+            except (KeyboardInterrupt, Declined):
+                self._console.file.write("\n")  # what is told next begins a line
+                raise
             used += len(lines) + (last.cell_len + 1 + cell_len(typed.rstrip("\n"))) // width + 1
             if (answer := match(question, typed)) is not None:
                 break
@@ -408,8 +437,8 @@ class Screen:
         size = self._console.size
         with self._lock:
             self._view.waiting = () if self._keyboard is None else self._keyboard.waiting
-            group = frame(self._view, self._clock(), width=size.width, height=size.height)
-        return Group(*(self._plain(line) for line in group.renderables if isinstance(line, Text)))
+            self._view.ascii_only = self._console.options.ascii_only
+            return frame(self._view, self._clock(), width=size.width, height=size.height)
 
     def _plain(self, text: Text) -> Text:
         """Replace what the terminal's encoding lacks."""
@@ -418,11 +447,13 @@ class Screen:
         return text
 
 
-def _history(event: Event) -> bool:
-    """Tell whether an event is worth words above the frame."""
+def _history(event: Event, view: View) -> bool:
+    """Tell whether an event is worth a line above the frame."""
     if isinstance(event, StateChanged):
-        return event.state is State.HOLD
-    return isinstance(event, Asked | Checked | Noted | Planned | PoseTaken | GuardTripped)
+        return event.state is State.HOLD and event.words not in view.note  # which stands there already
+    if isinstance(event, Asked):
+        return event.answer != ""
+    return isinstance(event, Checked | Noted | Planned | PoseTaken | GuardTripped)
 
 
 @contextmanager

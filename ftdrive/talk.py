@@ -1,8 +1,29 @@
 """Where people are told things: stderr, for stdout is for data."""
 
+import os
 import sys
+import textwrap
+from typing import TextIO
 
 from rich.console import Console
 
 talk = Console(stderr=True, highlight=False, soft_wrap=not sys.stderr.isatty())
 """A terminal gets whole words, a file whole lines."""
+
+
+def in_whole_words(text: str, file: TextIO) -> str:
+    """Break lines between words where they are longer than the terminal is wide; as it is for a file or pipe.
+
+    For what is written without `talk`. A word that is longer by itself, such as a path, stays whole.
+    """
+    try:
+        width = os.get_terminal_size(file.fileno()).columns
+    except (OSError, ValueError):  # no terminal; nothing of the system
+        return text
+    if width == 0:  # a terminal that does not know
+        return text
+    fold = textwrap.TextWrapper(width, break_long_words=False, break_on_hyphens=False, replace_whitespace=False)
+    return "\n".join(
+        fold.fill(line) + line[len(line.rstrip()) :]
+        for line in text.split("\n")  # a prompt ends with a space
+    )

@@ -1,10 +1,10 @@
 """What a session tells while it runs: the screen shows these, `--json` writes them, the run folder keeps them."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +69,7 @@ class StateChanged(Event):
     number: int | None = None
     """Of the orientation."""
     words: str = ""
-    """Why, for STOP and HOLD."""
+    """Why, for STOP and HOLD; else what happens or is to be done."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -147,7 +147,7 @@ class Estimated(Event):
     light: str
     """green, amber or red: is what was seen enough?"""
     hint: str
-    """The next pose that would help most, in words; empty when the light is green."""
+    """The next pose that would help most, in words; empty when the light is green, or the arm is not moved by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -166,6 +166,34 @@ class Asked(Event):
 
     question: str
     answer: str
+
+
+class _Health(Protocol):
+    @property
+    def events(self) -> tuple[tuple[int, str], ...]:
+        """(`t_host_ns`, what happened)."""
+
+
+class Streaming(Protocol):
+    """A sensor that keeps what its stream has been through; see `drivers.interfaces.Health`."""
+
+    def health(self) -> _Health:
+        """Tell it, since the sensor was opened."""
+
+
+class Witness:
+    """Tells what a sensor has been through, each thing once: interruptions, connections that came back."""
+
+    def __init__(self, sensor: Streaming, tell: Callable[[Event], None]) -> None:
+        self._sensor, self._tell = sensor, tell
+        self._told = 0
+
+    def tell_news(self) -> None:
+        """Tell what has happened since the last time."""
+        events = self._sensor.health().events
+        for t_host_ns, words in events[self._told :]:
+            self._tell(Noted(words=f"sensor: {words} (host clock {t_host_ns / 1e9:.3f} s)", warning=True))
+        self._told = len(events)
 
 
 def _plain(value: Any) -> Any:

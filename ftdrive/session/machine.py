@@ -9,7 +9,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -36,6 +37,7 @@ from ftdrive.session.events import (
     RunOpened,
     State,
     StateChanged,
+    Witness,
 )
 from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, by_safety, out_of_sight
 from ftdrive.session.operator import Key, Operator, Question
@@ -52,6 +54,8 @@ SLOW_RAD_S2: Final = float(np.radians(40))
 _AT_RAD: Final = float(np.radians(0.5))
 _PATIENCE: Final = 20.0
 """A slow slider stretches a move; one that stands still is seen by its guard."""
+_NEAR_RAD: Final = float(np.radians(10))
+"""A way that comes so close to a skipped posture passes it."""
 _FIRST_WORD: Final = "MOVE"
 _LOOK_AGAIN_S: Final = 0.4
 
@@ -70,7 +74,19 @@ class RunningFit(Protocol):
 
 
 class Stopped(Exception):
-    """A person stopped the arm with a key."""
+    """A person stopped the arm with a key, to pause or to end."""
+
+    def __init__(self, key: Key) -> None:
+        super().__init__("paused by a person" if key is Key.PAUSE else "stopped by a person")
+        self.for_good = key is Key.STOP
+
+
+class Turned(Exception):
+    """A person wants another pose than the one under way: the next, or the last one again."""
+
+    def __init__(self, key: Key) -> None:
+        super().__init__(key.name)
+        self.key = key
 
 
 class Desk:
@@ -171,10 +187,12 @@ class Tour:
         self._todo: deque[int] = deque()
         self._at: int | None = None  # index of the pose where the arm was left
         self._moved = False
-        self._last: int | None = None  # stop taken last
-        self._asked: set[Key] = set()
+        self._under_way: int | None = None  # stop that the arm goes to or stands at to be measured
+        self._last: PoseRecord | None = None  # taken last
+        self._again = False  # the last one is to be taken again
+        self._skipped: set[int] = set()  # indices of postures where the arm should not go
         self._reopened: set[int] = set()
-        self._seen_events = 0
+        self._witness = Witness(sensor, desk.tell)
 
     # -------------------------------------------------------------------------------------------- the tour
 
@@ -189,74 +207,131 @@ class Tour:
             What stopped the arm, when a person then ended it.
         """
         for record in taken:
-            self._desk.tell(self._running.add(record))
+            self._learn(record)
         self._contact.predict = self._running.predict
         self._todo = deque(todo)
         self._guards.begin()
         while self._todo:
             try:
                 self._next()
+            except Turned as turned:
+                self._turn(turned.key)
             except (Tripped, DriverError, OSError, Stopped, TooFewSamples, NotAccepted) as error:
                 self._hold(error)
-        self._tell_sensor_events()
+        self._witness.tell_news()
         self._tell(State.CLOSE)
 
     def _next(self) -> None:
-        self._obey_keys()
+        self._under_way = None
+        self._hear()
         stop = self._todo[0]
-        index = (stop - 1) % len(self._nodes)
-        if self._pace.step and not self._step(stop):
+        index = self._index(stop)
+        if self._pace.step and not self._step(stop, index):
             return
+        self._under_way = stop
         self._go(index, stop)
-        self._take(stop, index)
-        if self._todo and self._todo[0] == stop:
-            self._todo.popleft()
-        self._last = stop
+        self._hear()
+        self._last = self._take(stop, index)
+        self._todo.popleft()
 
-    def _step(self, stop: int) -> bool:
+    def _index(self, stop: int) -> int:
+        return (stop - 1) % len(self._nodes)
+
+    def _step(self, stop: int, index: int) -> bool:
         """Ask for Enter; whether to go."""
-        step = self._plan.steps[(stop - 1) % len(self._nodes)]
         answer = self._desk.ask(
             Question(
-                f"Pose {stop} of {self._stops}, orientation {step.number:02d}: Enter moves the arm, s skips it, r "
-                "takes the last pose again, q ends",
+                f"Pose {stop} of {self._stops}, orientation {self._plan.steps[index].number:02d}: {self._way(index)}, "
+                "s skips it, r takes the last pose again, q ends",
                 ("", "s", "r", "q"),
             )
         )
         if answer == "q":
             raise Declined("ended by a person between two poses")
         if answer == "s":
-            self._skip(stop)
-        elif answer == "r":
+            self._skip()
+        elif answer == "r" and self._redoable() is not None:
             self._redo()
         return answer == ""
 
-    def _obey_keys(self) -> None:
+    def _way(self, index: int) -> str:
+        """Say what Enter does in step mode."""
+        turn_rad = np.abs(self._nodes[index] - self._arm.state().q_rad)
+        moving = [str(joint + 1) for joint in np.flatnonzero(turn_rad > _AT_RAD)]
+        if not moving:
+            return "the arm stands there, Enter measures"
+        joints = f"joint{'s' if len(moving) > 1 else ''} {', '.join(moving)}"
+        largest = f"largest turn {np.degrees(turn_rad.max()):.0f}°"
+        speed_rad_s = self._own_speed(index)
+        if speed_rad_s is None:
+            return f"Enter plans the way and shows it, {joints}, {largest}"
+        if self._pace.slow:
+            speed_rad_s = min(speed_rad_s, SLOW_RAD_S)
+        return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
+
+    def _hear(self) -> None:
+        """Take the keys. Each means what the screen shows: r the pose taken last, s the one under way.
+
+        Called between two looks, so before another pose is shown.
+        """
+        moving = self._under_way is not None and self._at is None
+        if self._again and not moving:
+            raise Turned(Key.REDO)
         while (key := self._desk.pressed()) is not None:
-            self._asked.add(key)
-        asked, self._asked = self._asked, set()
-        if Key.STOP in asked or Key.PAUSE in asked:
-            raise Stopped("paused by a person")
-        if Key.REDO in asked:
+            if key in {Key.STOP, Key.PAUSE}:
+                raise Stopped(key)
+            if key is Key.SKIP:
+                if self._under_way is not None:
+                    raise Turned(key)
+                self._note("s skips a pose while the arm goes there or measures: none is under way")
+            if key is Key.REDO and (last := self._redoable()) is not None:
+                self._again = True
+                if not moving:
+                    raise Turned(key)
+                self._note(f"the arm ends its move, then goes back to pose {last}")
+
+    def _turn(self, key: Key) -> None:
+        if key is Key.REDO:
             self._redo()
-        elif Key.SKIP in asked:
-            self._skip(self._todo[0])
+            return
+        if self._at is None:
+            self._arm.stop()
+        self._skip()
+
+    def _redoable(self) -> int | None:
+        """Stop that r takes again; None, and why, where there is none."""
+        if self._last is None:
+            self._note("there is no pose yet to be taken again")
+        elif self._todo[0] == self._last.stop:
+            self._note(f"pose {self._last.stop} is being taken again already")
+        else:
+            return self._last.stop
+        return None
 
     def _redo(self) -> None:
+        self._again = False
         if self._last is None:
-            self._desk.tell(Noted(words="there is no pose yet to be taken again"))
             return
-        self._running.remove(self._last)
-        self._todo.appendleft(self._last)
-        self._desk.tell(Noted(words=f"pose {self._last} is taken again"))
-        self._last = None
+        self._running.remove(self._last.stop)
+        self._todo.appendleft(self._last.stop)
+        self._skipped.discard(self._index(self._last.stop))
+        self._note(f"pose {self._last.stop} is taken again")
 
-    def _skip(self, stop: int) -> None:
-        self._desk.tell(Noted(words=f"pose {stop} is skipped; --resume takes it later", warning=True))
-        self._go((stop - 1) % len(self._nodes), stop)
-        self._todo.popleft()
+    def _skip(self) -> None:
+        """Drop the pose, and the return to it: the arm does not go there."""
+        index = self._index(self._todo[0])
+        self._skipped.add(index)
+        dropped = [stop for stop in self._todo if self._index(stop) == index]
+        self._todo = deque(stop for stop in self._todo if stop not in dropped)
+        if self._last is not None and self._last.stop in dropped:  # was to be taken again
+            self._learn(self._last)
+            self._note(f"pose {self._last.stop} stays as it was taken", warning=True)
+            return
+        names = " and ".join(str(stop) for stop in dropped)
+        way = f"the arm goes on to pose {self._todo[0]}" if self._todo else "it was the last"
+        self._note(f"skipped: pose {names}, {way}; --resume takes what was skipped", warning=True)
 
-    def _take(self, stop: int, index: int) -> None:
+    def _take(self, stop: int, index: int) -> PoseRecord:
         step = self._plan.steps[index]
         pose = TourPose(step.number, np.array(step.q_rad))
         began_s, settled_s, attempts = time.monotonic(), 0.0, 0
@@ -296,8 +371,9 @@ class Tour:
             ),
             sync=True,
         )
-        self._tell_sensor_events()
-        self._desk.tell(self._running.add(record))
+        self._witness.tell_news()
+        self._learn(record)
+        return record
 
     # -------------------------------------------------------------------------------------------- moving
 
@@ -308,44 +384,64 @@ class Tour:
         if at is not None and np.abs(q - self._nodes[at]).max() > _AT_RAD:
             self._at = None
             raise Tripped(21, DeviceFault("the arm is not where this program left it: somebody has moved it"))
-        n = len(self._nodes)
-        if at is None or (index - at) % n not in {0, 1, n - 1}:
+        if index == at:
+            return
+        speed_rad_s = self._own_speed(index)
+        self._at = None
+        if speed_rad_s is None:
             self._approach(q, index, stop)
-        elif index != at:
-            forward = (index - at) % n == 1
-            speed = self._plan.steps[at if forward else index].speed_rad_s
-            self._at = None
+        else:
             self._tell(State.MOVE, stop)
-            self._move(q, self._nodes[index], speed, self._plan.acceleration_rad_s2)
+            self._move(q, self._nodes[index], speed_rad_s, self._plan.acceleration_rad_s2)
         self._at = index
 
+    def _own_speed(self, index: int) -> float | None:
+        """Speed of the plan's own move from where the arm was left to a pose, rad/s; None where it has none."""
+        at, n = self._at, len(self._nodes)
+        if at is None or (index - at) % n not in {1, n - 1}:
+            return None
+        return self._plan.steps[at if (index - at) % n == 1 else index].speed_rad_s
+
     def _approach(self, q: Array, index: int, stop: int) -> None:
-        self._at = None
         approach = approach_to(self._certifier, q, self._nodes[index], Speeds(SLOW_RAD_S, SLOW_RAD_S2))
         if not len(approach.q_rad):
             return
         if words := forbidden(self._arm, np.vstack([q, approach.q_rad])):
             raise PlanRefused(words)
+        passed = self._passed(np.vstack([q, approach.q_rad]), index)
         words = (
             f"the way to pose {stop} at {np.degrees(APPROACH_RAD_S):.0f}°/s at most: "
             f"{way_in_words(way_of(q, approach), approach.clearance_m)}"
         )
+        if passed:
+            words += f"; it passes close to the skipped pose {' and '.join(passed)} and does not stop there"
         self._tell(State.APPROACH, stop, words)
-        self._confirm(f"The arm goes {words}.")
+        self._confirm(f"The arm goes {words}.", by_person=bool(passed))
         for goal, speed in zip(approach.q_rad, approach.speed_rad_s, strict=True):
             self._move(q, goal, min(float(speed), APPROACH_RAD_S), SLOW_RAD_S2)
             q = goal
         if stop == 1:
             self._confirm(f"The arm stands at the first pose. The tour has {self._stops} stops. Begin?")
 
-    def _confirm(self, text: str) -> None:
+    def _passed(self, way: Array, goal: int) -> list[str]:
+        """Skipped poses that a way (k, 6), which ends at another one, comes close to."""
+        share = np.linspace(0.0, 1.0, 181)[:, None]
+        points = np.concatenate([start + share * (end - start) for start, end in pairwise(way)])
+        return [
+            str(index + 1)
+            for index in sorted(self._skipped - {goal})
+            if np.abs(points - self._nodes[index]).max(axis=1).min() < _NEAR_RAD
+        ]
+
+    def _confirm(self, text: str, *, by_person: bool = False) -> None:
         """Ask before a motion; the first one of a workcell wants a word."""
         if not self._pace.asks:
             return
+        trusted = self._pace.trusted and not by_person
         if self._moved:
-            self._desk.require(text, assumed=self._pace.trusted)
+            self._desk.require(text, assumed=trusted)
             return
-        assumed = _FIRST_WORD if self._pace.trusted else None
+        assumed = _FIRST_WORD if trusted else None
         question = Question(f"{text} Hand on the emergency stop. Type {_FIRST_WORD}", (_FIRST_WORD,), assumed)
         if self._desk.ask(question) != _FIRST_WORD:
             raise Declined("the word was not typed: nothing moves")
@@ -369,17 +465,16 @@ class Tour:
 
     def _between_looks(self) -> None:
         self._guards.check()
-        key = self._desk.pressed()
-        if key is Key.STOP or key is Key.PAUSE:
-            raise Stopped("stopped by a person")
-        if key is not None:
-            self._asked.add(key)
+        self._hear()
 
     # -------------------------------------------------------------------------------------------- stop and hold
 
     def _hold(self, error: Exception) -> None:
         """Say why the arm stands, and wait for a person; returns when it may go on. The arm was stopped before."""
         self._arm.stop()
+        if isinstance(error, Stopped) and error.for_good:
+            self._tell(State.STOP, words=str(error))
+            raise Declined(str(error))
         trip = self._cause(error)
         if trip is not None and self._mended(trip):
             return
@@ -388,13 +483,12 @@ class Tour:
         if trip is not None and trip is not self._guards.tripped(wait_s=0.0):
             self._desk.tell(GuardTripped(hazard=trip.hazard, words=words))
         self._tell(State.STOP, words=words)
-        self._tell_sensor_events()
-        kept = len(self._run.stops())
-        self._tell(State.HOLD, words=f"{words}. {kept} poses are kept in {self._run.folder}")
+        self._witness.tell_news()
+        self._tell(State.HOLD, words=words)
         cause = error if trip is None else trip.error
+        when = "to go on" if isinstance(error, Stopped) else "when it is mended"
         question = Question(
-            f"{words}. {kept} poses are kept. Type resume when it is mended, or quit and go on later with "
-            f"ftdrive calibrate --resume {self._run.folder}",
+            f"{len(self._run.stops())} poses are kept. Type resume {when}, or quit: --resume goes on later",
             ("resume", "quit"),
         )
         while True:
@@ -453,10 +547,11 @@ class Tour:
         try:
             self._sensor.check()
         except DriverError:
+            self._witness.tell_news()
             self._sensor.close()
             self._sensor.open()
             self._contact.forget()
-            self._seen_events = 0
+            self._witness = Witness(self._sensor, self._desk.tell)
         self._recheck()
         self._guards.begin()
         q = self._arm.state().q_rad
@@ -466,14 +561,15 @@ class Tour:
     # -------------------------------------------------------------------------------------------- telling
 
     def _tell(self, state: State, stop: int | None = None, words: str = "") -> None:
-        number = None if stop is None else self._plan.steps[(stop - 1) % len(self._nodes)].number
+        number = None if stop is None else self._plan.steps[self._index(stop)].number
         self._desk.tell(StateChanged(state=state, stop=stop, stops=self._stops, number=number, words=words))
 
-    def _tell_sensor_events(self) -> None:
-        events = self._sensor.health().events
-        for t_host_ns, words in events[self._seen_events :]:
-            self._desk.tell(Noted(words=f"sensor, at {t_host_ns} ns of the host's clock: {words}", warning=True))
-        self._seen_events = len(events)
+    def _note(self, words: str, *, warning: bool = False) -> None:
+        self._desk.tell(Noted(words=words, warning=warning))
+
+    def _learn(self, record: PoseRecord) -> None:
+        """Take a pose into the running fit. What pose would help most is not told: the plan has chosen."""
+        self._desk.tell(replace(self._running.add(record), hint=""))
 
 
 def approach_to(certifier: Certifier, q_rad: Array, goal_rad: Array, speeds: Speeds) -> Approach:

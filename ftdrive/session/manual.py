@@ -4,6 +4,7 @@ Nothing here commands the arm, which may be open for reading only. Each time it 
 orientation that is new, the sensor is averaged and the pose is put on disk.
 """
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import degrees, radians
@@ -15,8 +16,18 @@ from calib.errors import TooFewSamples
 from calib.noise import CHANNELS, LEAST_SAMPLES, is_stationary, restless_channels
 from calib.ports import Sensor, WrenchSamples
 from calib.routine import PoseRecord, Sampling, TourPose, turned_rad
+from drivers.errors import DeviceTimeout, StreamBroken
 from drivers.interfaces import ArmState
-from ftdrive.session.events import Array, Estimated, Noted, PoseTaken, State, StateChanged
+from ftdrive.session.events import (
+    Array,
+    Estimated,
+    Noted,
+    PoseTaken,
+    State,
+    StateChanged,
+    Streaming,
+    Witness,
+)
 from ftdrive.session.operator import Key, Operator
 
 STILL_S: Final = 1.0
@@ -30,6 +41,8 @@ REPEAT_RAD: Final = radians(10)
 RETURN_RAD: Final = radians(0.1)
 """A program comes back to its first pose as exactly as this."""
 LOOK_S: Final = 0.1
+BACK_S: Final = 12.0
+"""A driver that may recover gives up after 10 s."""
 SURPRISE_SIGMA: Final = 5.0
 SURPRISE_N: Final = 0.5
 """A pose that differs from the others by both was probably touched."""
@@ -59,6 +72,10 @@ class WatchedArm(Protocol):
         """Tell the controller's modes, or raise."""
 
 
+class WatchedSensor(Sensor, Streaming, Protocol):
+    """A sensor that is measured, and tells what its stream went through."""
+
+
 class Fit(Protocol):
     """The running fit; see `ftdrive.session.running`."""
 
@@ -68,7 +85,7 @@ class Fit(Protocol):
 
 def collect_manually(
     arm: WatchedArm,
-    sensor: Sensor,
+    sensor: WatchedSensor,
     sampling: Sampling,
     operator: Operator,
     running: Fit,
@@ -86,7 +103,7 @@ def collect_manually(
     Parameters
     ----------
     arm, sensor
-        Open; the arm for reading.
+        Open; the arm for reading. A sensor with `recover` is waited for when its stream was interrupted.
     running : Fit
         Is given each pose; judges whether they are enough, and says what would help.
     commit : callable
@@ -117,7 +134,7 @@ class _Collection:
     def __init__(
         self,
         arm: WatchedArm,
-        sensor: Sensor,
+        sensor: WatchedSensor,
         sampling: Sampling,
         operator: Operator,
         running: Fit,
@@ -126,6 +143,7 @@ class _Collection:
         earlier: Sequence[PoseRecord],
     ) -> None:
         self._arm, self._sensor, self._sampling = arm, sensor, sampling
+        self._witness = Witness(sensor, operator.tell)
         self._operator, self._running, self._commit = operator, running, commit
         self._listen = listen
         self._earlier = earlier
@@ -154,15 +172,40 @@ class _Collection:
         self._tell_state(State.MOVE)
         while not self._over:
             state = self._arm.state()
-            self._sensor.collect(LOOK_S)  # paces the loop, and raises as soon as the sensor fails
-            while not self._over and (key := self._operator.pressed()):
-                self._obey(key)
+            self._collect(LOOK_S)  # paces the loop, and raises as soon as the sensor fails
+            self._obey_keys()
             if self._over or not self._may_measure():
                 continue
             if self._at_rest(state):
                 self._take(state)
             elif self._program == "stopped" and self._dealt_with and self._rests_at is not None:
                 self._end("The program has ended")
+
+    def _collect(self, duration_s: float) -> WrenchSamples | None:
+        """Samples of the time to come; None when they were interrupted and the driver has the sensor back."""
+        try:
+            samples = self._sensor.collect(duration_s)
+        except (StreamBroken, DeviceTimeout):
+            if not getattr(self._sensor, "recover", False):
+                raise
+            self._await_sensor()
+            return None
+        finally:
+            self._witness.tell_news()
+        return samples
+
+    def _await_sensor(self) -> None:
+        deadline = time.monotonic() + BACK_S
+        while True:
+            try:
+                self._sensor.check()
+            except (StreamBroken, DeviceTimeout):
+                if time.monotonic() > deadline:
+                    raise
+            else:
+                return
+            self._witness.tell_news()
+            time.sleep(LOOK_S)
 
     def _may_measure(self) -> bool:
         """Tell whether a standstill now is one to measure at."""
@@ -180,7 +223,8 @@ class _Collection:
         still = float(np.abs(state.qd_rad_s).max()) < STILL_RAD_S
         if self._rests_at is not None and turned_rad(self._rests_at, state) > LEFT_RAD:
             self._rests_at = None
-            self._tell_state(State.MOVE)
+            if not self._dealt_with:
+                self._tell_state(State.MOVE)
         if self._rests_at is None:
             if not still:
                 return False
@@ -202,12 +246,12 @@ class _Collection:
         back = self._listen and len(others) > 1 and nearest == first and others[first] < RETURN_RAD
         returned = back and self._light == "green" and not self._passes_first
         if others and others[nearest] < REPEAT_RAD and not returned:
-            self._dealt_with = True
             self._passes_first |= back
             self._note(
                 f"This is pose {nearest} again, {degrees(others[nearest]):.0f}° from it: it is left out."
                 + ("" if self._listen else " Turn the tool further.")
             )
+            self._deal_with()
             return
         stop = self._next_stop()
         number = self._taken[first].pose.number if returned else stop
@@ -219,7 +263,9 @@ class _Collection:
         for attempt in range(1, self._sampling.attempts + 1):
             self._tell_state(State.SAMPLE)
             before = self._arm.state()
-            samples = self._sensor.collect(self._sampling.average_s)
+            if (found := self._collect(self._sampling.average_s)) is None:
+                return False
+            samples = found
             after = self._arm.state()
             if turned_rad(before, after) >= CREPT_RAD or np.abs(after.qd_rad_s).max() >= STILL_RAD_S:
                 self._still_since_s = after.t_device_s
@@ -237,6 +283,11 @@ class _Collection:
             last = attempt == self._sampling.attempts
             advice = "It is kept and marked; press r to take it again." if last else "Let go of tool and cable."
             self._note(f"Pose {stop} is not quiet: {unrest}. {advice}", warning=True)
+        self._obey_keys()  # pressed while this one was not yet shown: r means the one before
+        if self._over or self._paused or self._dealt_with:
+            return False
+        if self._redo is not None:
+            stop = number = self._redo
         record = PoseRecord(stop, TourPose(number, before.q_rad), before, after, samples, steady=not unrest)
         self._keep(record, settle_s, attempt)
         return True
@@ -244,7 +295,6 @@ class _Collection:
     def _keep(self, record: PoseRecord, settle_s: float, attempts: int) -> None:
         self._commit(record)
         self._redo = None
-        self._dealt_with = True
         self._operator.tell(
             PoseTaken(
                 stop=record.stop,
@@ -261,6 +311,12 @@ class _Collection:
             )
         )
         self._learn(record)
+        self._deal_with()
+
+    def _deal_with(self) -> None:
+        """Be done with where the arm stands, and say so: the state must not go on as if something were measured."""
+        self._dealt_with = True
+        self._tell_state(State.MOVE, "the program goes on" if self._listen else "move on to another orientation")
 
     def _learn(self, record: PoseRecord) -> None:
         """Take in what a pose that is on disk tells, and tell it."""
@@ -289,6 +345,10 @@ class _Collection:
                 return f"{CHANNELS[c]} scatters by {found:.2g} {unit}, at its quietest by {self._level[c]:.2g}"
         return "" if is_stationary(samples.wrench) else "its mean still changes"
 
+    def _obey_keys(self) -> None:
+        while not self._over and (key := self._operator.pressed()):
+            self._obey(key)
+
     def _obey(self, key: Key) -> None:
         if key is Key.STOP:
             self._end("Stopped")
@@ -301,8 +361,8 @@ class _Collection:
             self._dealt_with = False
             self._note(f"The next pose takes the place of pose {self._redo}.")
         elif key is Key.SKIP and self._rests_at is not None:
-            self._dealt_with = True
             self._note("This pose is left out: move on.")
+            self._deal_with()
         elif key is Key.PAUSE:
             self._paused = not self._paused
             self._rests_at = None
@@ -329,8 +389,8 @@ class _Collection:
         enough = "" if self._light == "green" else f"; the light is {self._light}, a calibration of them may be refused"
         self._note(f"{why}: {kept}{enough}.", warning=bool(enough))
 
-    def _tell_state(self, state: State) -> None:
-        self._operator.tell(StateChanged(state=state, stop=self._next_stop()))
+    def _tell_state(self, state: State, words: str = "") -> None:
+        self._operator.tell(StateChanged(state=state, stop=self._next_stop(), words=words))
 
     def _next_stop(self) -> int:
         return self._redo or max(self._taken, default=0) + 1

@@ -2,7 +2,6 @@
 
 import json
 import sys
-import textwrap
 from collections.abc import Mapping
 from threading import Lock
 from typing import Any, TextIO
@@ -26,7 +25,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Key, Question
-from ftdrive.talk import talk
+from ftdrive.talk import in_whole_words
 
 
 def match(question: Question, typed: str) -> str | None:
@@ -143,7 +142,11 @@ class PlainOperator:
         self._asked = question.text
         while True:
             self._write(prompt(question))
-            typed = read_line(self._stdin, question)
+            try:
+                typed = read_line(self._stdin, question)
+            except (KeyboardInterrupt, Declined):
+                self._write("\n")  # what is told next begins a line
+                raise
             if not self._stdin.isatty():
                 self._write(typed)
             if (answer := match(question, typed)) is not None:
@@ -156,19 +159,8 @@ class PlainOperator:
 
     def _write(self, text: str) -> None:
         with self._lock:
-            self._stderr.write(folded(text, talk.width) if self._stderr.isatty() else text)
+            self._stderr.write(in_whole_words(text, self._stderr))
             self._stderr.flush()
-
-
-def folded(text: str, width: int) -> str:
-    """Break lines that a terminal would cut in the middle of a word; a file gets whole lines."""
-    lines = text.split("\n")
-    return "\n".join(_fold(line, width) if len(line) > width else line for line in lines)
-
-
-def _fold(line: str, width: int) -> str:
-    end = line[len(line.rstrip()) :]  # a prompt ends with a space
-    return textwrap.fill(line, width - 1, break_long_words=False, break_on_hyphens=False) + end
 
 
 def in_words(event: Event) -> str:

@@ -2,6 +2,10 @@
 
 import io
 import json
+import os
+import pty
+import sys
+import termios
 from collections.abc import Callable
 from typing import Any
 
@@ -22,7 +26,8 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Operator, Question
-from ftdrive.session.operators import JsonOperator, PlainOperator, folded, match
+from ftdrive.session.operators import JsonOperator, PlainOperator, match
+from ftdrive.talk import in_whole_words
 
 FREE = Question("Is the tool free?", assumed="yes")
 MOVE = Question("Type MOVE to let the arm move", ("MOVE",))
@@ -139,16 +144,6 @@ def test_nobody_to_answer_is_no_consent(operator: Callable[..., Operator]) -> No
         operator("maybe\n").ask(FREE)
 
 
-def test_a_terminal_cuts_no_word_and_keeps_the_space_of_a_prompt() -> None:
-    words = "Is the ball of 0.35 m around x -0.07, y -0.25, z 0.83 m in base (the wrist) free, of people too? [yes/no] "
-    table = "   1  01     -50      90"
-    lines = folded(f"{table}\n{words}", 40).split("\n")
-    assert lines[0] == table
-    assert max(map(len, lines)) <= 40
-    assert " ".join(lines[1:]) == words
-    assert folded("/a/path/that/is/longer/than/the/terminal.json", 20).count("\n") == 0
-
-
 def test_plain_lines_tell_what_is_worth_a_line() -> None:
     stderr = io.StringIO()
     operator: Operator = PlainOperator(stdin=io.StringIO("what\nMOVE\n"), stderr=stderr)
@@ -184,3 +179,21 @@ def test_plain_lines_tell_what_is_worth_a_line() -> None:
         "Is the tool free? yes",
     ]
     assert "\x1b" not in stderr.getvalue()
+
+
+def test_a_terminal_gets_whole_words_and_a_file_whole_lines() -> None:
+    person, program = pty.openpty()
+    termios.tcsetwinsize(program, (24, 40))
+    path = "/home/somebody/" + "deep/" * 8 + "run"
+    text = f"error: the sensor must be measured, set it in the file {path} then start again: "
+    with os.fdopen(program, "w", encoding="utf-8") as file:
+        folded = in_whole_words(text, file)
+        operator = PlainOperator(stdin=io.StringIO("MOVE\n"), stderr=file)
+        assert operator.ask(Question("The arm goes the way to pose 1. Type MOVE", ("MOVE",))) == "MOVE"
+    os.close(person)
+    lines = folded.split("\n")
+    assert all(len(line) <= 40 or line == path for line in lines)
+    assert " ".join(folded.split()) == text.strip()
+    assert folded.endswith("again: ")
+    assert in_whole_words("a\n  b\n", sys.__stderr__ or sys.stderr) == "a\n  b\n"
+    assert in_whole_words(text, io.StringIO()) == text

@@ -3,6 +3,7 @@
 import io
 import os
 import pty
+import select
 import subprocess
 import sys
 import termios
@@ -21,6 +22,7 @@ from rich.console import Console
 from ftdrive.keyboard import Keyboard
 from ftdrive.screen import Screen, View, frame, open_operator
 from ftdrive.session.events import (
+    Asked,
     Estimated,
     Event,
     GuardTripped,
@@ -135,7 +137,7 @@ def test_everything_needed_is_on_a_screen_of_80_by_24() -> None:
         "drift  none seen so far",
         "! R12 was repeated",
         "─" * 80,
-        " k  keep   r  redo   s  skip   p  pause   q  stop  Ctrl-C ends, poses are kept",
+        " r  redo   s  skip   p  pause   q  stop  Ctrl-C ends, poses are kept",
         "kept in runs/2026-11-20T211503Z-gripper_a",
         "resume  " + RESUME,
     ]
@@ -148,12 +150,26 @@ def test_nothing_wraps_and_what_matters_most_stays(width: int, height: int) -> N
     assert len(lines) < height
     assert max(cell_len(line) for line in lines) <= width
     text = "\n".join(lines)
-    for needed in ("pose 7/25", " k  keep", "gripper_a", "kept in"):
+    for needed in ("pose 7/25", " r  redo", "gripper_a", "kept in"):
         assert needed in text
     if height > 12 and width > 20:
         assert "AMBER" in text
         assert "mass kg" in text
         assert "0.0011" in text or width < 50
+
+
+def test_only_keys_that_do_something_are_offered() -> None:
+    def keys(**changed: Any) -> str:
+        (line,) = [line for line in drawn(view(MIDDLE[0], StateChanged(**changed))) if "Ctrl-C" in line]
+        return line
+
+    tour = keys(state=State.SAMPLE, stop=3, stops=25)
+    assert "redo" in tour
+    assert "finish" not in tour
+    by_hand = keys(state=State.SAMPLE, stop=3)
+    assert by_hand == " k  finish   r  redo   s  skip   p  pause   q  stop  Ctrl-C ends, poses are kept"
+    before = keys(state=State.PREFLIGHT)
+    assert before == "Ctrl-C ends, poses are kept"
 
 
 def test_before_a_run_there_is_no_table_of_nothing() -> None:
@@ -191,6 +207,32 @@ def test_the_first_pose_seen_again_tells_the_drift() -> None:
     assert any("0.500 N" in line and "15 N/min" in line for line in drawn(drifted))
     fitted = estimated(values=VALUES | {"drift": np.full(6, 0.3)}, sigma=SIGMA | {"drift": np.full(6, 0.02)})
     assert any("drift  0.520 ± 0.020 N" in line for line in drawn(view(*MIDDLE, fitted)))
+
+
+def test_a_drift_of_the_force_alone_is_told_for_sure_and_without_torque() -> None:
+    change, sigma = np.array([0.3, 0, 0.01, 3e-20, 0, 0]), np.array([6e-4, 6e-4, 6e-4, 2e-21, 0, 3e-12])
+    fitted = estimated(values=VALUES | {"drift": change}, sigma=SIGMA | {"drift": sigma})
+    assert "drift  0.300 ± 0.001 N since the first pose" in drawn(view(*MIDDLE, fitted))
+    doubtful = estimated(values=VALUES | {"drift": change / 200}, sigma=SIGMA | {"drift": sigma})
+    assert "drift  0.002 ± 0.001 N since the first pose, perhaps" in drawn(view(*MIDDLE, doubtful))
+
+
+def test_a_reason_stands_once_on_the_screen() -> None:
+    words = "a force of 77 N where a free tool gives 3 N"
+    held = view(
+        *MIDDLE,
+        GuardTripped(hazard=14, words=words),
+        *(StateChanged(state=s, words=words) for s in (State.STOP, State.HOLD)),
+    )
+    assert "\n".join(drawn(held)).count("77 N") == 1
+    by_key = view(*MIDDLE, StateChanged(state=State.HOLD, words="paused by a person"))
+    assert "\n".join(drawn(by_key)).count("paused by a person") == 1
+
+
+def test_while_a_question_waits_nothing_is_measured() -> None:
+    asking = view(*MIDDLE)
+    asking.keys = "asking"
+    assert drawn(asking)[1] == "WAITS for an answer"
 
 
 def test_numbers_never_touch() -> None:
@@ -254,19 +296,47 @@ class Shown:
             pass  # the terminal was closed
 
 
-def test_keys_arrive_without_enter_and_escapes_and_letters_without_meaning_do_not() -> None:
+def test_keys_arrive_without_enter_and_escapes_and_letters_without_meaning_do_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ftdrive.keyboard._WORD_S", 0.0)
     with terminal() as (person, program), Keyboard(program) as keyboard:
-        os.write(person, b"krspq")
-        taken: list[Key] = []
-        eventually(lambda: len(keyboard.waiting) == 5)
-        while (key := keyboard.pressed()) is not None:
-            taken.append(key)
-        assert taken == [Key.KEEP, Key.REDO, Key.SKIP, Key.PAUSE, Key.STOP]
+        for letter, key in zip(b"krspq", (Key.KEEP, Key.REDO, Key.SKIP, Key.PAUSE, Key.STOP), strict=True):
+            os.write(person, bytes([letter]))
+            eventually(lambda: keyboard.waiting)
+            assert keyboard.pressed() is key
         for noise in (b"\x1bOS", b"\x1bOq", b"\x1b[15;2~", b"\x1b[A", b"xyz1 "):  # F4, keypad 1, shift-F5, up
             os.write(person, noise)
         os.write(person, b"Q")
         eventually(lambda: keyboard.waiting)
         assert keyboard.waiting == (Key.STOP,)
+
+
+@pytest.mark.parametrize(
+    ("strokes", "heard"),
+    [
+        (("y", "e", "s"), []),
+        (("yes\n",), []),
+        (("s\n",), []),
+        (("\n", "s"), []),
+        (("rs",), []),
+        (("s", "s", "s"), [Key.SKIP]),  # held down
+        (("p", "p"), [Key.PAUSE]),
+        (("s", "k", "i", "p"), [Key.SKIP, Key.PAUSE]),  # the first came alone
+        (("resume, please\n",), [Key.PAUSE]),
+    ],
+)
+def test_letters_of_a_word_are_no_keys_but_those_that_stop(
+    strokes: tuple[str, ...], heard: list[Key], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ftdrive.keyboard._WORD_S", 60.0)
+    with terminal() as (person, program), Keyboard(program) as keyboard:
+        for stroke in strokes:
+            os.write(person, stroke.encode())
+            eventually(lambda: not select.select([program], [], [], 0)[0])
+        os.write(person, b"q")  # heard in a word too
+        eventually(lambda: Key.STOP in keyboard.waiting)
+        assert list(keyboard.waiting) == [*heard, Key.STOP]
 
 
 def test_the_terminal_is_restored_after_success_failure_and_while_suspended() -> None:
@@ -367,6 +437,29 @@ def test_a_terminal_that_knows_only_ascii_gets_ascii() -> None:
     text = file.read()
     assert "+- 0.0011" in text
     assert "|-y 3*|" in text
+
+
+def test_ascii_is_longer_and_nothing_is_cut_off_for_it() -> None:
+    hint = "point the middle of the tool's -x, -y and -z axes down: tilt it about y by -45°"
+    found = view(
+        *MIDDLE, estimated(hint=hint), Noted(words="turned by 45° 45° 45° 45° 45° 45° 45° 45° 45° 45°", warning=True)
+    )
+    found.ascii_only = True
+    lines = drawn(found)
+    text = " ".join(lines)
+    assert "tilt it about y by -45 deg" in text
+    assert text.count("45 deg") == 11
+    assert all(line.isascii() and len(line) <= 80 for line in lines)
+    assert len({line.index("|") for line in lines if line.endswith("|-y 3*|")} | {60}) == 1  # the cube stays in line
+
+
+def test_enter_in_step_mode_leaves_no_line_behind() -> None:
+    console = Console(file=(file := io.StringIO()), width=80, height=24, force_terminal=True, color_system=None)
+    with Screen(console, stdin=io.StringIO()) as operator:
+        operator.tell(Asked(question="Pose 3 of 25: Enter moves joint 4", answer=""))
+        operator.tell(Asked(question="Is the tool free?", answer="yes"))
+    assert "Enter moves" not in file.getvalue()
+    assert "Is the tool free? yes" in file.getvalue()
 
 
 def test_without_a_terminal_there_are_plain_lines_and_json_where_asked_for() -> None:

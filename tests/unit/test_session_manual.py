@@ -13,8 +13,10 @@ from calib import solve
 from calib.errors import TooFewSamples
 from calib.model import Array
 from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
-from drivers.interfaces import ArmState, FtSamples
-from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, StateChanged
+from drivers.errors import StreamBroken
+from drivers.interfaces import ArmState, FtSamples, Health
+from ftdrive.session import manual
+from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Key, Question
 
@@ -59,6 +61,11 @@ class Cell:
         self.rate_Hz = RATE_HZ
         self.says: Callable[[float], Status] = lambda _: Status()
         self.fails: dict[str, float] = {}
+        self.recover = False
+        self.unplugged_s = np.inf
+        self.back_s = 0.0
+        self.away_s = 0.3
+        self.events: tuple[tuple[int, str], ...] = ()
         starts = np.cumsum([0.0, *(dwell.seconds + MOVE_S for dwell in dwells)])
         self.starts, self.end_s = starts[:-1], float(starts[-1]) - MOVE_S
 
@@ -97,6 +104,10 @@ class Cell:
         t = self.now_s + np.arange(max(1, round(duration_s * self.rate_Hz))) / self.rate_Hz
         self.now_s += duration_s
         self._may_fail("sensor")
+        if self.now_s > self.unplugged_s:
+            self.back_s, self.unplugged_s = self.now_s + self.away_s, np.inf
+            self.events = ((17, "a cable came off"), (18, "connected again"))
+            raise StreamBroken("interrupted, connecting again")
         wrench = []
         for some in np.array_split(t, max(1, len(t) // 20)):  # the arm stands still for a tenth of a second each time
             R, _, k = self._where(some[0])
@@ -114,7 +125,12 @@ class Cell:
         )
 
     def check(self) -> None:
-        pass
+        if self.now_s < self.back_s:
+            self.now_s += 0.1
+            raise StreamBroken("interrupted, connecting again")
+
+    def health(self) -> Health:
+        return Health(0, 0, 0, RATE_HZ, 0.0, events=self.events)
 
 
 class Person:
@@ -233,9 +249,8 @@ def test_a_pose_is_on_disk_before_it_is_told() -> None:
         for event in told
         if not isinstance(event, Estimated)
     ]
-    assert kinds[1:-1] == [
-        *["move", "settle", "sample", "committed 1", "pose", "move", "settle", "sample", "committed 2", "pose"]
-    ]
+    one = ["settle", "sample", "committed 1", "pose", "move"]
+    assert kinds[1:-1] == ["move", *one, *(words.replace("1", "2") for words in one)]
     taken = next(event for event in told if isinstance(event, PoseTaken))
     np.testing.assert_allclose(taken.gravity_flange, [0, 0, -1])
     assert taken.settle_s == pytest.approx(1.0, abs=0.3)
@@ -300,6 +315,45 @@ def test_skip_and_pause() -> None:
     assert [r.before.R_base_flange[2, 2].round(3) for r in skipped.kept] == [1.0, 0.0]
     paused = Outcome(dwells(UP, DOWN, LEFT), keys={5.0: Key.PAUSE, 10.9: Key.PAUSE})
     assert [r.before.R_base_flange[2, 2].round(3) for r in paused.kept] == [1.0, 0.0]
+
+
+def test_keys_pressed_while_a_pose_is_averaged_mean_what_is_shown_then() -> None:
+    redone = Outcome(dwells(UP, DOWN, LEFT), keys={7.5: Key.REDO})  # pose 1 is shown, pose 2 is averaged
+    assert redone.stops == [1, 1, 2]
+    np.testing.assert_allclose(redone.fit.poses[1].before.R_base_flange, DOWN.as_matrix(), atol=1e-9)
+    skipped = Outcome(dwells(UP, DOWN, LEFT), keys={7.5: Key.SKIP})
+    assert [r.before.R_base_flange[2, 2].round(3) for r in skipped.kept] == [1.0, 0.0]
+    paused = Outcome(dwells(UP, DOWN), keys={7.5: Key.PAUSE})
+    assert paused.stops == [1]
+
+
+@pytest.mark.parametrize("listen", [False, True])
+def test_a_pose_that_is_done_with_is_no_longer_measured_on_the_screen(listen: bool) -> None:
+    told = Outcome(dwells(UP, DOWN, UP), listen=listen).person.told
+    after = False
+    for event in told:
+        if isinstance(event, StateChanged):
+            assert not after or (event.state is State.MOVE and event.words)
+            after = False
+        after |= isinstance(event, PoseTaken) or (isinstance(event, Noted) and "left out" in event.words)
+    words = [event.words for event in told if isinstance(event, StateChanged) and event.words]
+    assert words == (["the program goes on"] if listen else ["move on to another orientation"]) * 3
+
+
+def test_a_sensor_that_recovers_is_waited_for_and_what_it_went_through_is_told_once() -> None:
+    outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), recover=True, unplugged_s=9.5)  # while pose 2 is averaged
+    assert outcome.stops == [1, 2, 3]
+    assert outcome.person.words().count("a cable came off") == 1
+    assert outcome.person.words().count("connected again") == 1
+    outcome = Outcome(dwells(UP, DOWN), unplugged_s=8.0, raises=pytest.raises(StreamBroken))
+    assert outcome.stops == [1]
+    assert "a cable came off" in outcome.person.words()
+
+
+def test_a_sensor_that_does_not_come_back_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(manual, "BACK_S", 0.05)
+    outcome = Outcome(dwells(UP, DOWN), recover=True, unplugged_s=8.0, away_s=1e9, raises=pytest.raises(StreamBroken))
+    assert outcome.stops == [1]
 
 
 def trembling(t: Array) -> Array:

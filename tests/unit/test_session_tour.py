@@ -27,7 +27,7 @@ from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
 from ftdrive.runs import Run
-from ftdrive.session import guided, preflight
+from ftdrive.session import guided, machine, preflight
 from ftdrive.session.completed import has_completed
 from ftdrive.session.events import (
     Asked,
@@ -472,13 +472,46 @@ def test_step_mode_waits_for_enter_before_each_move(lab: Lab) -> None:
     lab.operator.answers["Pose 3 of 7"] = ["s"]
     lab.operator.answers["Pose 5 of 7"] = ["r", ""]
     lab.calibrate(mode="step")
+    third = np.array(Plan.load(lab.run().plan_path).steps[2].q_rad)
+    assert min(np.abs(goal - third).max() for goal, *_ in lab.arm.moves) > np.radians(5)  # never sent there
+    (way,) = [question for question in lab.operator.asked if "the way to pose 4" in question.text]
+    assert way.text.startswith("The arm goes")  # certified anew, shown, and confirmed
+    assert lab.arm.moves[2][1] <= np.radians(15) + 1e-9
     asked = [question.text.split(",")[0] for question in lab.operator.asked if question.text.startswith("Pose")]
     assert asked == [f"Pose {stop} of 7" for stop in (1, 2, 3, 4, 5, 4, 5, 6, 7)]
     assert lab.stops() == [1, 2, 4, 5, 6, 7]
     assert (lab.run().folder / "poses" / "04-2.npz").exists()
 
 
+def test_a_first_pose_that_is_skipped_is_not_returned_to(lab: Lab) -> None:
+    lab.operator.answers["Pose 1 of 7"] = ["s"]
+    lab.calibrate(mode="step")
+    assert lab.stops() == [2, 3, 4, 5, 6]
+    first = np.array(Plan.load(lab.run().plan_path).steps[0].q_rad)
+    assert min(np.abs(goal - first).max() for goal, *_ in lab.arm.moves) > np.radians(5)
+    assert "skipped: pose 1 and 7" in said(lab)
+
+
+def test_step_mode_says_what_enter_does(lab: Lab) -> None:
+    lab.operator.answers["Pose 3 of 7"] = ["r", ""]
+    lab.calibrate(mode="step")
+    steps = Plan.load(lab.run().plan_path).steps
+    asked = [question.text for question in lab.operator.asked if question.text.startswith("Pose")]
+    assert "Enter plans the way and shows it" in asked[0]
+    for text, start, goal in ((asked[1], 0, 1), (asked[4], 1, 2), (asked[5], 2, 3)):
+        turn_deg = np.degrees(np.abs(np.subtract(steps[goal].q_rad, steps[start].q_rad)))
+        joints = ", ".join(str(joint + 1) for joint in np.flatnonzero(turn_deg > 0.5))
+        assert f"joint{'s' if ',' in joints else ''} {joints}, largest turn {turn_deg.max():.0f}°" in text
+        assert "at 30°/s" in text  # slow, as in any first run
+    assert "the arm stands there, Enter measures" in asked[3]  # pose 2 again, where the arm is
+    assert "moves" not in asked[3]
+
+
 # ------------------------------------------------------------------------------------------ what is checked before
+
+
+def said(lab: Lab) -> str:
+    return "\n".join(event.words for event in lab.operator.of(Noted))
 
 
 def refuse(lab: Lab, words: str) -> None:
@@ -810,39 +843,162 @@ def test_saturated_samples_discard_the_pose(lab: Lab, monkeypatch: pytest.Monkey
 # ------------------------------------------------------------------------------------------------- keys, resume, redo
 
 
-@pytest.mark.parametrize("key", [Key.STOP, Key.PAUSE])
-def test_a_key_stops_the_arm_on_its_way_and_ends_or_goes_on(key: Key, lab: Lab) -> None:
-    lab.arm.at_move[3] = lambda: lab.operator.keys.append(key)
-    lab.operator.answers["Type resume"] = ["resume"]
+def test_pause_holds_the_arm_on_its_way_and_goes_on_or_ends(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
+    lab.operator.answers["Type resume to go on"] = ["resume"]
     lab.calibrate()
     assert lab.operator.states().count(State.HOLD) == 1
     assert lab.operator.of(GuardTripped) == []
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     lab.arm.moves.clear()
-    lab.arm.at_move[3] = lambda: lab.operator.keys.append(key)
-    lab.operator.answers["Type resume"] = ["quit"]
-    with pytest.raises(Declined):
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
+    lab.operator.answers["Type resume to go on"] = ["quit"]
+    with pytest.raises(Declined, match="paused by a person"):
         lab.calibrate()
 
 
-def test_redo_and_skip_keys(lab: Lab) -> None:
+def test_stop_ends_the_session_without_a_question_and_says_how_to_go_on(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined, match="stopped by a person"):
+        lab.calibrate()
+    assert lab.arm.halted.is_set()
+    assert State.HOLD not in lab.operator.states()
+    assert "resume" not in lab.operator.asked[-1].text
+    assert lab.stops() == [1, 2]
+    assert f"--resume {lab.run().folder}" in lab.operator.of(Noted)[-1].words
+
+
+def press(lab: Lab, *presses: tuple[Key, type[Event], int]) -> None:
+    """Press each key once, when an event of its kind is told of its stop."""
+    left = list(presses)
+
     def on_event(event: Event) -> None:
-        if isinstance(event, PoseTaken) and event.stop == 2 and Key.REDO not in pressed:
-            pressed.append(Key.REDO)
-            lab.operator.keys.append(Key.REDO)
-        if isinstance(event, PoseTaken) and event.stop == 4:
+        for one in left:
+            key, kind, stop = one
+            if isinstance(event, kind) and getattr(event, "stop", None) == stop:
+                left.remove(one)
+                lab.operator.keys.append(key)
+                return
+
+    lab.operator.on_event = on_event
+
+
+def taken(lab: Lab) -> list[int]:
+    return [event.stop for event in lab.operator.of(PoseTaken)]
+
+
+def test_skip_on_the_way_stops_the_arm_and_goes_round_that_pose(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.SKIP)
+    lab.calibrate()
+    assert taken(lab) == [1, 2, 3, 5, 6, 7]
+    assert lab.arm.stops == 1
+    fourth = np.array(Plan.load(lab.run().plan_path).steps[3].q_rad)
+    assert [np.abs(goal - fourth).max() < 1e-9 for goal, *_ in lab.arm.moves].count(True) == 1  # the one broken off
+    assert [question for question in lab.operator.asked if "the way to pose 5" in question.text]
+    assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
+    assert State.HOLD not in lab.operator.states()
+    assert "skipped: pose 4, the arm goes on to pose 5" in said(lab)
+
+
+def test_skip_while_a_pose_is_measured_skips_that_one(lab: Lab) -> None:
+    def skip() -> None:
+        if len(lab.arm.moves) == 4 and not skipped:
+            skipped.append(True)
             lab.operator.keys.append(Key.SKIP)
 
-    pressed: list[Key] = []
-    lab.operator.on_event = on_event
+    skipped: list[bool] = []
+    lab.sensor.collecting = skip
     lab.calibrate()
-    assert [event.stop for event in lab.operator.of(PoseTaken)] == [1, 2, 2, 3, 4, 6, 7]
-    assert len(lab.arm.moves) == 7  # nowhere twice, and past the skipped pose
+    assert taken(lab) == [1, 2, 3, 5, 6, 7]
+    assert not [question for question in lab.operator.asked if "the way to pose 5" in question.text]
+    assert len(lab.arm.moves) == 7
+
+
+def test_skip_with_no_pose_under_way_skips_none(lab: Lab) -> None:
+    press(lab, (Key.SKIP, PoseTaken, 4), (Key.KEEP, StateChanged, 5))
+    lab.calibrate()
+    assert taken(lab) == [1, 2, 3, 4, 5, 6, 7]
+    assert "none is under way" in said(lab)
+
+
+def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> None:
+    def redo() -> None:
+        if len(lab.arm.moves) == 8 and not again:
+            again.append(True)
+            lab.operator.keys.append(Key.REDO)
+
+    again: list[bool] = []
+    lab.sensor.collecting = redo  # while pose 6 is measured: pose 5 is the last that was shown
+    press(lab, (Key.REDO, PoseTaken, 1), (Key.REDO, StateChanged, 4))  # while the arm stands, and on its way
+    lab.calibrate()
+    assert taken(lab) == [1, 1, 2, 3, 3, 4, 5, 5, 6, 7]
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+    assert "the arm ends its move, then goes back to pose 3" in said(lab)
+    ways = [question.text for question in lab.operator.asked if "the way to pose" in question.text]
+    assert len(ways) == 1  # the first approach: back and forth it goes along the plan's own moves
+
+
+def test_redo_before_any_pose_or_twice_does_nothing_more(lab: Lab) -> None:
+    def twice(event: Event) -> None:
+        if isinstance(event, StateChanged) and event.state is State.APPROACH:
+            lab.operator.keys.append(Key.REDO)
+        if isinstance(event, PoseTaken) and taken(lab) == [1, 2]:
+            lab.operator.keys.extend([Key.REDO, Key.REDO])
+
+    lab.operator.on_event = twice
+    lab.calibrate()
+    assert taken(lab) == [1, 2, 2, 3, 4, 5, 6, 7]
+    assert "no pose yet" in said(lab)
+    assert "pose 2 is being taken again already" in said(lab)
+
+
+def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> None:
+    def skip() -> None:
+        if len(lab.arm.moves) == 3 and len(taken(lab)) == 3 and not skipped:
+            skipped.append(True)
+            lab.operator.keys.append(Key.SKIP)
+
+    skipped: list[bool] = []
+    lab.sensor.collecting = skip
+    press(lab, (Key.REDO, PoseTaken, 3))
+    outcome = lab.calibrate()
+    assert taken(lab) == [1, 2, 3, 4, 5, 6, 7]
+    assert "pose 3 stays as it was taken" in said(lab)
+    assert outcome is not None
+    assert outcome.result.n_poses == 6
+    assert [event.poses for event in lab.operator.of(Estimated)][:5] == [1, 2, 3, 3, 4]
+
+
+def test_a_way_past_a_skipped_pose_is_told_and_confirmed_by_a_person(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.calibrate()  # trusted from here on
+    lab.operator.asked.clear()
+    lab.operator.answers["Pose 3 of 7"] = ["s"] * 2
+    lab.calibrate(mode="step")
+    monkeypatch.setattr(machine, "_NEAR_RAD", np.pi)
+    lab.calibrate(mode="step")
+    ways = [question for question in lab.operator.asked if "the way to pose 4" in question.text]
+    assert ["skipped pose 3" in question.text for question in ways] == [False, True]
+    assert [question.assumed for question in ways] == ["yes", None]
+
+
+def test_what_would_help_most_is_not_told_where_the_plan_chooses(lab: Lab) -> None:
+    lab.calibrate()
+    assert {event.hint for event in lab.operator.of(Estimated)} == {""}
+
+
+def test_a_hold_tells_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.arm.set_status(fault="protective stop: …", safety_mode="protective stop")
+    lab.operator.answers["Type resume when it is mended"] = ["quit"]
+    with pytest.raises(DeviceFault):
+        lab.calibrate()
+    (hold,) = [event for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
+    assert str(lab.folder) not in hold.words + lab.operator.asked[-1].text
+    assert "protective stop" in hold.words
+    assert "3 poses are kept" in lab.operator.asked[-1].text
 
 
 def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
-    lab.operator.answers["Type resume"] = ["quit"]
     with pytest.raises(Declined):
         lab.calibrate()
     run = lab.run()
