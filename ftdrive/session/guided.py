@@ -39,11 +39,11 @@ from ftdrive.session.guards import (
     StallGuard,
     Tripped,
 )
-from ftdrive.session.machine import Desk, Pace, RunningFit, Tour, approach_to
+from ftdrive.session.machine import SLOW, Desk, Pace, RunningFit, Tour, approach_to
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Operator
 from ftdrive.session.outcome import Outcome, solve_and_save
-from ftdrive.session.prospect import SLOW, USUAL_KG, at_most, moves_s, prediction, slower, speeds_of
+from ftdrive.session.prospect import USUAL_KG, at_most, moves_s, prediction, slower, speeds_of
 from ftdrive.session.running import Running
 from ftdrive.session.watch import Guards
 from ftdrive.wiring import build_arm, build_sensor

@@ -49,8 +49,7 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 APPROACH_RAD_S: Final = float(np.radians(15))
-SLOW_RAD_S: Final = float(np.radians(30))
-SLOW_RAD_S2: Final = float(np.radians(40))
+SLOW: Final = Speeds.first_run()
 _AT_RAD: Final = float(np.radians(0.5))
 _PATIENCE: Final = 20.0
 """A slow slider stretches a move; one that stands still is seen by its guard."""
@@ -266,7 +265,7 @@ class Tour:
         if speed_rad_s is None:
             return f"Enter plans the way and shows it, {joints}, {largest}"
         if self._pace.slow:
-            speed_rad_s = min(speed_rad_s, SLOW_RAD_S)
+            speed_rad_s = min(speed_rad_s, SLOW.joint_rad_s)
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
 
     def _hear(self) -> None:
@@ -403,7 +402,7 @@ class Tour:
         return self._plan.steps[at if (index - at) % n == 1 else index].speed_rad_s
 
     def _approach(self, q: Array, index: int, stop: int) -> None:
-        approach = approach_to(self._certifier, q, self._nodes[index], Speeds(SLOW_RAD_S, SLOW_RAD_S2))
+        approach = approach_to(self._certifier, q, self._nodes[index], SLOW)
         if not len(approach.q_rad):
             return
         if words := forbidden(self._arm, np.vstack([q, approach.q_rad])):
@@ -418,7 +417,7 @@ class Tour:
         self._tell(State.APPROACH, stop, words)
         self._confirm(f"The arm goes {words}.", by_person=bool(passed))
         for goal, speed in zip(approach.q_rad, approach.speed_rad_s, strict=True):
-            self._move(q, goal, min(float(speed), APPROACH_RAD_S), SLOW_RAD_S2)
+            self._move(q, goal, min(float(speed), APPROACH_RAD_S), SLOW.joint_rad_s2)
             q = goal
         if stop == 1:
             self._confirm(f"The arm stands at the first pose. The tour has {self._stops} stops. Begin?")
@@ -451,7 +450,10 @@ class Tour:
         if not self._moved:
             self._confirm("The arm begins the tour.")
         if self._pace.slow:
-            speed_rad_s, acceleration_rad_s2 = min(speed_rad_s, SLOW_RAD_S), min(acceleration_rad_s2, SLOW_RAD_S2)
+            speed_rad_s, acceleration_rad_s2 = (
+                min(speed_rad_s, SLOW.joint_rad_s),
+                min(acceleration_rad_s2, SLOW.joint_rad_s2),
+            )
         turn = np.abs(goal - start).max()
         duration_s = float(move_duration_s(turn, speed_rad_s, acceleration_rad_s2))
         with self._guards.watching(start, goal, moving=True):

@@ -15,13 +15,12 @@ from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of
-from ftdrive.session.machine import APPROACH_RAD_S
+from ftdrive.session.machine import APPROACH_RAD_S, SLOW
 
 Array = NDArray[np.float64]
 
 USUAL_KG: Final = 1.0
 """What a tool is expected to weigh that nobody has weighed."""
-SLOW: Final = Speeds.first_run()
 FASTEST: Final = Speeds(joint_rad_s2=float(np.radians(300)))
 """Nothing goes faster, whatever a plan, or the configuration of an old run, says."""
 
