@@ -56,7 +56,7 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[str
     if len(pulled) > 1:
         together = ", ".join(names[row] for row in pulled)
         words.append(f"something pulls in {together}: a cable that is too short there? Give it slack, repeat these")
-    if again is not None and (np.abs(again.change) > _SIGNIFICANT * again.sigma).any():
+    if again is not None and np.abs(again.change / again.sigma).max() > _SIGNIFICANT:
         if result.drift is not None:
             words.append("the sensor drifts: let it warm up for 15 to 30 min, then calibrate again")
         elif np.abs(again.change / _sigma(result)).max() > np.sqrt(2) * _SIGNIFICANT:
