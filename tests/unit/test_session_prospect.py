@@ -11,8 +11,8 @@ from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
 from ftdrive.planning.scene import BASE_PLANE, Scene
-from ftdrive.session.machine import APPROACH_RAD_S
-from ftdrive.session.prospect import SLOW, at_most, moves_s, speeds_of
+from ftdrive.session.machine import APPROACH_RAD_S, SLOW
+from ftdrive.session.prospect import at_most, moves_s, speeds_of
 
 
 @pytest.fixture(scope="module")
