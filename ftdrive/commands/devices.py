@@ -1,5 +1,6 @@
 """`ftdrive devices`: which ports and buses this computer has, and on request which known sensors are there."""
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +93,7 @@ def _emulated() -> dict[str, Any]:
 
 
 def _print(found: dict[str, Any]) -> None:
-    data = Console(highlight=False, soft_wrap=True)
+    data = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
     for port in found["serial"]:
         words = [port.get("by_id") or port["port"], *(port.get(key) for key in ("description", "usb", "url"))]
         data.print(" serial  " + escape("   ".join(word for word in words if word)))

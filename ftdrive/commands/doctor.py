@@ -266,7 +266,7 @@ def _means(device: ForceTorqueSensor, duration_s: float) -> Iterator[Array]:
 
 
 def _print(found: list[Check]) -> None:
-    data = Console(highlight=False, soft_wrap=True)
+    data = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
     subject = ""
     for check in found:
         first, _, _ = check.name.partition(".")
