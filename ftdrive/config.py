@@ -39,6 +39,8 @@ class RobotConfig:
     acceleration_deg_s2: float = 80.0
     tip_speed_mm_s: float = 250.0
     """Of the tool's farthest points; 250 at most, the reduced speed of ISO 10218-1."""
+    driver: str = "ur"
+    """Of another package, by its entry point: drivers/README."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -394,6 +396,7 @@ def _wrong_boxes(rows: Sequence[Sequence[float]]) -> str | None:
 _WRONG: Mapping[str, Callable[[Any], str | None]] = {
     "robot.host": _wrong_text,
     "robot.model": _wrong_model,
+    "robot.driver": _wrong_text,
     "sensor.url": _wrong_text,
     "sensor.sign": _wrong_sign,
     "sampling.noise_record_s": _wrong_record,

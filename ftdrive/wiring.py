@@ -14,7 +14,10 @@ from ftdrive.simulation import sensor_url
 
 def build_arm(cell: CellConfig) -> RobotArm:
     """Build the arm's driver, not yet open; it moves at the speed of the cell unless a move names its own."""
-    build = cast("Callable[..., RobotArm]", arm_class())
+    try:
+        build = cast("Callable[..., RobotArm]", arm_class(cell.robot.driver))
+    except ValueError as error:
+        raise ConfigError(f"[robot] driver: {error}") from error
     arm = build(
         cell.robot.host,
         model=cell.robot.model,

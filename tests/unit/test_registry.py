@@ -18,6 +18,9 @@ from drivers.robotous.can import RobotousCan
 from drivers.robotous.serial import RobotousSerial
 from drivers.ur.arm import UrArm
 from drivers.ur.sensor import UrWristSensor
+from ftdrive.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.errors import ConfigError
+from ftdrive.wiring import build_arm
 
 
 def test_can_addresses() -> None:
@@ -175,6 +178,10 @@ def test_another_package_brings_a_sensor_and_an_arm(install: Install) -> None:
         sensor_from_url("acme:///dev/acme0")
     assert issubclass(arm_class("acme"), UrArm)
     assert arm_class("acme") is not UrArm
+    anything = SensorConfig("acme-usb:///dev/acme0")
+    assert type(build_arm(CellConfig(RobotConfig("127.0.0.1", driver="acme"), anything))) is arm_class("acme")
+    with pytest.raises(ConfigError, match=r"\[robot\] driver: unknown arm 'acmee'; known: acme, ur|known: ur, acme"):
+        build_arm(CellConfig(RobotConfig("127.0.0.1", driver="acmee"), anything))
 
 
 PLAIN = """
