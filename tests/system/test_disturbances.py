@@ -1,5 +1,6 @@
 """Sessions on an emulated cell that something disturbs: it is named in words, and the result holds or is refused."""
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -90,9 +91,11 @@ def begins(event: Event, state: State, stop: int) -> bool:
 
 
 def assert_near(outcome: Outcome, truth: dict[str, Any]) -> None:
-    """Within 4 standard deviations: one of fifteen numbers is beyond 3 in every 25th undisturbed run."""
-    for key, errors in errors_in_sigma(outcome.result, truth).items():
-        assert np.abs(errors).max() < 4, (key, errors)
+    """Within 3 standard deviations, save one of fifteen numbers: it is beyond 3 in every 25th undisturbed run."""
+    errors = errors_in_sigma(outcome.result, truth)
+    away = np.sort(np.abs(np.concatenate(list(errors.values()))))
+    assert away[-2] < 3, errors
+    assert away[-1] < 4, errors
 
 
 def test_pushes_and_a_tap_while_poses_are_averaged(
@@ -177,7 +180,7 @@ def test_a_sensor_that_drifts_by_half_a_newton(
     ("shift", "kind"),
     [
         ({"p_sensor_com_m": [0.002, 0.001, 0.004]}, "the centre of mass is"),
-        ({"mass_kg": -0.02}, "the load weighs 0.2 N less"),
+        ({"mass_kg": -0.02}, r"the load weighs 0\.(19|2|21) N less"),
     ],
     ids=["centre of mass", "mass"],
 )
@@ -198,7 +201,7 @@ def test_a_payload_that_shifts_in_mid_run(
     outcome, _ = tour(happening)
     text = words_of(outcome)
     (first,) = names(outcome, since)
-    assert f"? from {first} on {kind}" in text
+    assert re.search(rf"\? from {first} on {kind}", text)
     assert "REJECTED" in text
-    assert f"the poses do not belong to one tool: from pose {since} on {kind}" in text
+    assert re.search(f"the poses do not belong to one tool: from pose {since} on {kind}", text)
     assert not list(outcome.run.folder.glob("calibration*.json"))
