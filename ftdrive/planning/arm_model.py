@@ -1,10 +1,9 @@
 """The shapes of arm and tool, where they are at given joint angles, and how far a turn of a joint can move them.
 
 Radii and hub widths were measured from the convex hulls of the collision meshes in the ROS 2 description of the arms,
-version 2.4.5. Those of UR3e and UR5e were then fitted to meshes with all lids and edges (tests/benchmarks/
-mesh_check.py): none stands out by more than 1 mm. The larger arms were widened alike. The lids of the UR10e's wrists
-are 3 mm behind those of a public mesh of it; those of UR20 and UR30 are scaled from the UR5e by the length of wrist 2.
-Models without measured shapes are refused.
+version 2.4.5. Those of UR3e, UR5e, UR10e and UR16e were then fitted to meshes with all lids and edges (tests/benchmarks/
+mesh_check.py): none stands out by more than 1 mm. Those of UR20 and UR30 were widened alike, their lids scaled from the
+UR5e by the length of wrist 2. Models without measured shapes are refused.
 """
 
 from collections.abc import Sequence
@@ -53,11 +52,11 @@ _UR5E = Shape(
     (-0.052, 0.063), 0.057,
 )  # fmt: skip
 _UR10E = Shape(
-    0.1762, 0.0393, 0.101, 0.111, 0.077, 0.062, 0.055, 0.048, 0.057, (0.089, 0.275), (0.084, 0.256), (-0.005, 0.112),
+    0.1762, 0.0393, 0.101, 0.111, 0.077, 0.071, 0.059, 0.048, 0.057, (0.084, 0.275), (0.084, 0.256), (-0.005, 0.112),
     (-0.022, 0.109), 0.060,
 )  # fmt: skip
 _UR20 = Shape(
-    0.260, 0.043, 0.125, 0.150, 0.095, 0.085, 0.070, 0.070, 0.065, (0.123, 0.358), (0.134, 0.346), (-0.036, 0.154),
+    0.260, 0.043, 0.125, 0.150, 0.095, 0.097, 0.075, 0.070, 0.065, (0.117, 0.358), (0.134, 0.346), (-0.036, 0.154),
     (-0.033, 0.143), 0.091,
 )  # fmt: skip
 SHAPES = {
@@ -70,7 +69,7 @@ SHAPES = {
     "UR10e": _UR10E,
     "UR12e": _UR10E,
     "UR16e": Shape(
-        0.176, 0.040, 0.101, 0.111, 0.077, 0.062, 0.055, 0.048, 0.057, (0.089, 0.275), (0.084, 0.256), (-0.005, 0.113),
+        0.176, 0.040, 0.101, 0.111, 0.077, 0.071, 0.059, 0.048, 0.057, (0.084, 0.275), (0.084, 0.256), (-0.005, 0.113),
         (-0.021, 0.110), 0.060,
     ),
     "UR20": _UR20,

@@ -4,13 +4,11 @@ Distances come from `coal`, the placing of the links from a URDF by code of its 
 the joint angles of its tours and, to compare, its own distances. A link is the convex hull of its meshes; hulls fill
 what is hollow, so the distance of the meshes themselves stands beside theirs.
 
-Install: uv pip install coal airo-models example-robot-data
+Install: uv pip install coal airo-models; uv pip install --no-deps compas-fab
   airo-models 0.0.12 (MIT): UR3e and UR5e, airo_models/arms/ur5e/ur5e.urdf.
-  example-robot-data 6.0.0 (BSD-3-Clause): the older UR3, UR5 and UR10, in share/example-robot-data/robots/
-  ur_description/urdf/ur10_robot.urdf. `--stretch` places them by the lengths of an arm that is planned for. As they
-  are, the hulls of their forearm and wrist 2 are never more than 16 to 20 mm apart, whatever the angles.
+  compas-fab 2.0.1 (MIT): UR10e, compas_fab/data/robot_library/ur10e_robot/urdf/robot_description.urdf.
 
-Run: python -m tests.benchmarks.mesh_check --urdf .../ur5e.urdf [--stretch UR10e] [--tool 0:200:100]
+Run: python -m tests.benchmarks.mesh_check --urdf .../ur5e.urdf [--tool 0:200:100]
 """
 
 import argparse
@@ -27,7 +25,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from drivers.ur.kinematics import MODELS, Array, forward
-from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder
+from ftdrive.planning.arm_model import ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.motion import Speeds
@@ -38,14 +36,13 @@ from tests.benchmarks.planning import FIXED_POINTS_M
 coal: Any = importlib.import_module("coal")
 TARGET_M = 0.015
 STEP_RAD = np.radians(1.0)
-FITS_M = 0.002
 RANDOM = 3000
 PARTS = ("base", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3", "tool")
 TOOL = 7
 HELD_APART = {(0, 2), (1, 3), (4, 6), (5, TOOL)}
 """No turn of the joint between them brings them together."""
 PAIRS = [(i, j) for i in range(8) for j in range(i + 2, 8) if (i, j) not in HELD_APART]
-STRETCHED_RAD = USUAL_POSTURE_RAD + np.radians([0, 70, -40, 0, 0, 0])
+CRAMPED_RAD = USUAL_POSTURE_RAD + np.radians([0, 70, -40, 0, 0, 0])
 """Where the constant tour has no room: another posture must be searched."""
 CONES_RAD = np.radians([60, 90, 180])
 Joints = list[tuple[Array, Array]]
@@ -117,22 +114,17 @@ def main() -> None:
     """Check the placing, then the tours, then our shapes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--urdf", type=Path, required=True)
-    parser.add_argument("--stretch", choices=sorted(MODELS), help="place the links by the lengths of this model")
     parser.add_argument("--tool", default="0:200:100", help="from:to:diameter in mm from the flange")
     arguments = parser.parse_args()
     tool = Cylinder(*(float(value) / 1e3 for value in arguments.tool.split(":")))
     arm = read(arguments.urdf, tool)
-    if arguments.stretch:
-        stretch(arm, arguments.stretch)
-    show(f"{arm.model}, meshes of {arguments.urdf.name}")
+    show(f"{arm.model}, meshes of {arguments.urdf}")
     placing(arm)
     tour(arm, "constant tour", constant_tour(USUAL_POSTURE_RAD))
-    if arm.model in SHAPES:
-        certifier = Certifier(ArmModel(arm.model, [tool]), Scene())
-        planned(arm, certifier)
-        if not arguments.stretch:
-            compare(arm, certifier)
-            cover(arm, certifier.arm)
+    certifier = Certifier(ArmModel(arm.model, [tool]), Scene())
+    planned(arm, certifier)
+    compare(arm, certifier)
+    cover(arm, certifier.arm)
 
 
 def placing(arm: Arm) -> None:
@@ -153,7 +145,7 @@ def planned(arm: Arm, certifier: Certifier) -> None:
     """Check tours that the planner searches: of another posture, in a box, and in cones."""
     guess, point, speeds = guess_of(certifier), FIXED_POINTS_M.get(arm.model), Speeds()
     plans = [
-        *(plan_tour(certifier, STRETCHED_RAD, poses, speeds=speeds, guess=guess) for poses in (24, 12, 6)),
+        *(plan_tour(certifier, CRAMPED_RAD, poses, speeds=speeds, guess=guess) for poses in (24, 12, 6)),
         *(plan_box(certifier, poses=poses, centre_m=point, speeds=speeds, guess=guess) for poses in (24, 12)),
         *(plan_cone(certifier, half_angle_rad=angle, speeds=speeds, guess=guess) for angle in CONES_RAD),
     ]
@@ -238,37 +230,25 @@ def read(urdf: Path, tool: Cylinder) -> Arm:
         found[-1] += [(moved(points, pose), facets) for points, facets in meshes_of(urdf, links[child])]
     joints.append((pose, np.zeros(3)))
     bodies = [joined(meshes) for meshes in found]
-    model = {name.lower(): name for name in MODELS}[urdf.stem.partition("_")[0]]
+    model = {name.lower(): name for name in MODELS}[root.get("name").partition("_")[0]]
     body = coal.Cylinder(tool.diameter_m / 2, tool.to_m - tool.from_m)
     hulls, meshes = [hull_of(points) for points, _ in bodies], [mesh_of(*mesh) for mesh in bodies]
     return Arm(model, joints, bodies, [*hulls, body], [*meshes, body], (tool.from_m + tool.to_m) / 2)
 
 
 def meshes_of(urdf: Path, link: Any) -> list[Mesh]:
-    """Read the OBJ files of a link that are seen, else its STL files for collisions."""
-    for kind in ("visual", "collision"):
-        found = []
-        for body in link.findall(kind):
-            mesh = body.find("geometry/mesh")
-            # That of airo-models with its cable is 0.4 m long.
-            name = "" if mesh is None else mesh.get("filename").replace("base_cable_labels", "base")
-            path = urdf.parent / name
-            if "/meshes/" in name:
-                path = urdf.parent.parent / "meshes" / name.split("/meshes/")[1]
-            if path.suffix in READERS:
-                points, facets = READERS[path.suffix](path.read_bytes())
-                found.append((moved(points, transform(body.find("origin"))), facets))
-        if found:
-            return found
-    return []
-
-
-def read_stl(data: bytes) -> Mesh:
-    """Read a binary STL."""
-    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("pad", "<u2")])
-    count = int.from_bytes(data[80:84], "little")
-    points = np.frombuffer(data[84:], dtype=kind, count=count)["corners"].reshape(-1, 3).astype(float)
-    return points, np.arange(len(points)).reshape(-1, 3)
+    """Read what is seen of a link, in OBJ files."""
+    found = []
+    for body in link.findall("visual"):
+        # That of airo-models with its cable is 0.4 m long.
+        name = body.find("geometry/mesh").get("filename").replace("base_cable_labels", "base")
+        path = urdf.parent / name
+        if "/meshes/" in name:  # of the ROS package around the folder of the URDF, or beside it
+            (folder,) = urdf.parent.parent.glob("**/meshes")
+            path = folder / name.split("/meshes/")[1]
+        points, facets = read_obj(path.read_bytes())
+        found.append((moved(points, transform(body.find("origin"))), facets))
+    return found
 
 
 def read_obj(data: bytes) -> Mesh:
@@ -277,9 +257,6 @@ def read_obj(data: bytes) -> Mesh:
     points = np.array([line[1:4] for line in words if line[:1] == ["v"]], dtype=float)
     faces = [[int(corner.partition("/")[0]) - 1 for corner in line[1:]] for line in words if line[:1] == ["f"]]
     return points, np.array([(f[0], f[k], f[k + 1]) for f in faces for k in range(1, len(f) - 1)])
-
-
-READERS = {".stl": read_stl, ".obj": read_obj}
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
@@ -332,26 +309,6 @@ def posed(R: Rotation, p_m: Any = (0, 0, 0)) -> Array:
 def moved(points_m: Array, X: Array) -> Array:
     """Move points (n, 3)."""
     return np.asarray(points_m @ X[:3, :3].T + X[:3, 3])
-
-
-def stretch(arm: Arm, model: str) -> None:
-    """Put the lengths of another model into the joints' transforms."""
-    g, joints = MODELS[model], arm.joints
-    if max(abs(joints[2][0][2, 3] + g.a2_m), abs(joints[3][0][2, 3] + g.a3_m)) > FITS_M:
-        raise SystemExit(f"upper arm and forearm of the {model} have other lengths than the meshes: they do not fit")
-    # d4 is spread over three joints: the two offsets along the lift axis stay, wrist 1 takes the rest.
-    offsets = joints[1][0][1, 3] + joints[2][0][1, 3]
-    lengths = (
-        (0, 2, g.d1_m),
-        (2, 2, -g.a2_m),
-        (3, 2, -g.a3_m),
-        (4, 1, g.d4_m - offsets),
-        (5, 2, g.d5_m),
-        (6, 1, g.d6_m),
-    )
-    for joint, axis, length in lengths:
-        joints[joint][0][axis, 3] = length
-    arm.model = model
 
 
 def show(line: str) -> None:
