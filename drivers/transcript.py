@@ -1,16 +1,18 @@
-"""The bytes on the wire of a serial device, kept in a file, and played back to the unmodified driver.
+"""The bytes on the wire of a serial or CAN device, kept in a file, and played back to the unmodified driver.
 
 A transcript (``ftdrive.transcript/1``) is JSON lines. The first says which sensor, when and with which versions; then
 come, with `time.monotonic_ns()` as `t_ns`:
 
-{"t_ns", "event": "open", "port", "baudrate", "bytesize", "parity", "stopbits", "parity_marks"}
+{"t_ns", "event": "open", "port", "baudrate", "bytesize", "parity", "stopbits", "parity_marks"}   a serial port
+{"t_ns", "event": "open", "port", "frames": true}                                                 a CAN interface
 {"t_ns", "dir": "tx", "hex"}    one write of the driver
 {"t_ns", "dir": "rx", "hex"}    what the driver read within 2 ms, stamped with its first byte
 {"t_ns", "event": "end", ...}   what the driver made of it, or the error it ended with
 
 Where `parity_marks` is true, the bytes that were read hold the marks of `drivers/_parity.py`; older transcripts do not
-say it and hold none. Sensors behind an slcan adapter are on a serial port too. Other CAN interfaces and Ethernet are
-not recorded.
+say it and hold none. An slcan adapter is on a serial port too. The frames of any other CAN interface are written as the
+lines that an slcan adapter would carry, and such an adapter plays them; what python-can tells it is not compared.
+Ethernet is not recorded.
 """
 
 import contextlib
@@ -24,9 +26,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Final, Self
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, urlencode, urlsplit
 
+import can
 import serial
+from can.interfaces.slcan import slcanBus
 
 from drivers._parity import leave_marks_to_far_side, marks_asked_for
 
@@ -39,6 +43,7 @@ _TOGETHER_NS: Final = 2_000_000
 _EARLY_S: Final = 0.05
 """A driver may ask this much earlier than it did; what the device had sent before is then sent at once."""
 _PORT_CLASS: Final = "Serial"
+_BUS_CLASS: Final = "Bus"
 
 
 class BadTranscript(Exception):
@@ -123,11 +128,11 @@ class Writer:
 
 @contextlib.contextmanager
 def recording(writer: Writer) -> Iterator[None]:
-    """Write down everything that passes through the serial ports which are opened inside the `with` block.
+    """Write down everything that passes through the serial ports and CAN buses which are opened in the `with` block.
 
-    The ports are pyserial's own, with the driver's own settings: the device sees no difference.
+    They are those of pyserial and python-can, with the driver's own settings: the device sees no difference.
     """
-    plain = serial.Serial
+    plain, plain_bus = serial.Serial, can.Bus
 
     class RecordedPort(serial.Serial):
         _told = False
@@ -162,11 +167,41 @@ def recording(writer: Writer) -> Iterator[None]:
                 writer.received(super().read(waiting))
             super().reset_input_buffer()
 
+    def recorded_bus(channel: str, **options: Any) -> can.BusABC:
+        bus = plain_bus(channel, **options)
+        if isinstance(bus, slcanBus):  # on a recorded port
+            return bus
+        writer.event("open", port=channel, frames=True)
+        receive, send = bus.recv, bus.send
+
+        def recv(timeout: float | None = None) -> can.Message | None:
+            if (message := receive(timeout)) is not None:
+                writer.received(_slcan_line(message))
+            return message
+
+        def recorded_send(message: can.Message, timeout: float | None = None) -> None:
+            writer.sent(_slcan_line(message))
+            send(message, timeout)
+
+        vars(bus).update(recv=recv, send=recorded_send)
+        return bus
+
     setattr(serial, _PORT_CLASS, RecordedPort)
+    setattr(can, _BUS_CLASS, recorded_bus)
     try:
         yield
     finally:
         setattr(serial, _PORT_CLASS, plain)
+        setattr(can, _BUS_CLASS, plain_bus)
+
+
+def _slcan_line(frame: can.Message) -> bytes:
+    """Write a frame as an slcan adapter does; nothing for one that it cannot carry."""
+    if frame.is_error_frame or frame.is_fd:
+        return b""
+    kind, data = ("r", "") if frame.is_remote_frame else ("t", frame.data.hex().upper())
+    head = f"{kind.upper()}{frame.arbitration_id:08X}" if frame.is_extended_id else f"{kind}{frame.arbitration_id:03X}"
+    return f"{head}{frame.dlc}{data}\r".encode()
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,13 +226,15 @@ class Transcript:
     """What the driver made of it; empty if the recording was broken off."""
     parity_marks: bool = False
     """Whether what was received holds marks of bytes with wrong parity."""
+    frames: bool = False
+    """Whether these are frames of a CAN interface, as lines of slcan."""
 
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a file. Raises `BadTranscript`, or `OSError` when it cannot be read."""
         header: Mapping[str, Any] = {}
         opened_ns: int | None = None
-        parity_marks = False
+        parity_marks = frames = False
         passages: list[Passage] = []
         end: Mapping[str, Any] = {}
         number = 0
@@ -211,6 +248,7 @@ class Transcript:
                         passages.append(Passage(int(line["t_ns"]), line["dir"] == "tx", bytes.fromhex(line["hex"])))
                     elif line.get("event") == "open" and opened_ns is None:
                         opened_ns, parity_marks = int(line["t_ns"]), line.get("parity_marks") is True
+                        frames = line.get("frames") is True
                     elif line.get("event") == "end":
                         end = line
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
@@ -221,12 +259,13 @@ class Transcript:
             raise BadTranscript(f"{path} is empty: record it anew")
         if opened_ns is None:
             raise BadTranscript(f"{path}: no port was opened in it, there is nothing to play: {end.get('error')}")
-        return cls(header, opened_ns, tuple(passages), end, parity_marks)
+        return cls(header, opened_ns, tuple(passages), end, parity_marks, frames)
 
     def url_at(self, port: str) -> str:
-        """Give the sensor's address with another port in it."""
+        """Give the sensor's address with the port of a player in it."""
         parts = urlsplit(str(self.header["url"]))
-        return f"{parts.scheme}://{port}" + (f"?{parts.query}" if parts.query else "")
+        options = dict(parse_qsl(parts.query)) | ({"interface": "slcan"} if self.frames else {})
+        return f"{parts.scheme}://{port}" + (f"?{urlencode(options)}" if options else "")
 
 
 def _checked_header(path: Path, line: Any) -> Mapping[str, Any]:
@@ -248,6 +287,8 @@ class Player:
     def __init__(self, transcript: Transcript) -> None:
         self._passages = transcript.passages
         self._parity_marks = transcript.parity_marks
+        self._frames = transcript.frames
+        self._line = b""
         self._next = 0
         self._t_ns = transcript.opened_ns  # of the recording, at `_t`
         self._t = 0.0
@@ -294,10 +335,16 @@ class Player:
             readable, _, _ = select.select([self._master], [], [], wait_s)
             if readable:
                 try:
-                    self._asked += os.read(self._master, 4096)
+                    data = os.read(self._master, 4096)
                 except OSError:
                     return  # the driver has closed the port
+                self._asked += self._frames_of(data) if self._frames else data
                 self._listen()
+
+    def _frames_of(self, data: bytes) -> bytes:
+        """Leave out what the adapter is told: it was another one in the recording."""
+        *lines, self._line = (self._line + data).split(b"\r")
+        return b"".join(line + b"\r" for line in lines if line[:1] in {b"t", b"T", b"r", b"R"})
 
     def _play(self) -> float:
         """Send what is due; return the seconds until something else may be."""

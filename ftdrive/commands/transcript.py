@@ -1,4 +1,4 @@
-"""`ftdrive transcript`: the bytes of a serial sensor into a file, and back to the driver."""
+"""`ftdrive transcript`: the bytes of a sensor's wire into a file, and back to the driver."""
 
 import time
 from dataclasses import asdict
@@ -26,9 +26,9 @@ _TAIL_S = 0.3
 
 @click.group()
 def transcript() -> None:
-    """Record the bytes on the wire of a serial sensor, or play them to the driver: a bug report becomes a test.
+    """Record the bytes on a sensor's wire, or play them to the driver: a bug report becomes a test.
 
-    Sensors on a serial port, and on CAN behind an slcan adapter. Other CAN interfaces and Ethernet are not recorded.
+    Sensors on a serial port or a CAN bus. Ethernet is not recorded.
     """
 
 
@@ -65,8 +65,9 @@ def _emulated(sensor: str | None) -> str:
 def _record(sensor: str, path: Path, duration_s: float) -> tuple[str, dict[str, Any]]:
     """Record; returns the address that a driver was given, and what it saw."""
     url = sensor_url(sensor)
-    if SensorAddress.of(url).serial_port is None:
-        raise ConfigError(f"{sensor} is not on a serial port: only what passes one can be recorded")
+    address = SensorAddress.of(url)
+    if address.serial_port is None and not address.scheme.endswith("-can"):
+        raise ConfigError(f"{sensor} is not on a serial port or a CAN bus: only what passes one can be recorded")
     device = _sensor(url)
     header = {
         "url": url,

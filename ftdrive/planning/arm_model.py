@@ -1,9 +1,9 @@
 """The shapes of arm and tool, where they are at given joint angles, and how far a turn of a joint can move them.
 
 Radii and hub widths were measured from the convex hulls of the collision meshes in the ROS 2 description of the arms,
-version 2.4.5. Those of UR3e, UR5e, UR10e and UR16e were then fitted to meshes with all lids and edges (tests/benchmarks/
-mesh_check.py): none stands out by more than 1 mm. Those of UR20 and UR30 were widened alike, their lids scaled from the
-UR5e by the length of wrist 2. Models without measured shapes are refused.
+version 2.4.5. Those of UR3e, UR5e, UR10e and UR16e were then fitted to meshes with all lids and edges: none stands out
+by more than 1 mm (tests/benchmarks/mesh_check.py). Those of UR20 and UR30 were widened alike, their lids scaled from
+the UR5e by the length of wrist 2. Models without measured shapes are refused.
 """
 
 from collections.abc import Sequence

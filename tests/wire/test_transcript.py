@@ -1,4 +1,4 @@
-"""What a serial sensor and its driver say to each other, recorded, and played to the driver again."""
+"""What a sensor and its driver say to each other, recorded, and played to the driver again."""
 
 import itertools
 import json
@@ -6,10 +6,12 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import can
 import numpy as np
 import pytest
 import serial
@@ -32,6 +34,7 @@ NOISE = np.array([0.03] * 3 + [0.001] * 3)
 STEPS = np.array([0.02] * 3 + [0.001] * 3)
 """Of the numbers of the coarsest device."""
 DURATION_S = 0.6
+PLAIN_BUS = can.Bus
 
 
 def measured() -> Any:
@@ -54,6 +57,18 @@ def url(request: pytest.FixtureRequest) -> Iterator[str]:
     device = kind(measured(), seed=1)
     yield f"{request.param}://{device.start()}{query}"
     device.stop()
+
+
+@contextmanager
+def joined(port: str, channel: str) -> Iterator[None]:
+    """Join the bus of an slcan adapter to a CAN interface that is no serial port: python-can's own."""
+    with (
+        can.Bus(port, interface="slcan", bitrate=250_000, sleep_after_open=0.0) as adapter,
+        can.Bus(channel, interface="virtual") as bus,
+        can.Notifier(adapter, [bus.send], timeout=0.01),
+        can.Notifier(bus, [adapter.send], timeout=0.01),
+    ):
+        yield
 
 
 def look(sensor: ForceTorqueSensor, duration_s: float) -> tuple[DeviceInfo, np.ndarray[Any, Any]]:
@@ -82,6 +97,55 @@ def test_the_driver_sees_in_the_transcript_what_it_saw_on_the_wire(url: str, tmp
     assert (np.abs(played.mean(axis=0) - wrench.mean(axis=0)) < tolerance).all()
     recorded = {row.tobytes() for row in wrench}  # not another noise of the same device but these very samples
     assert sum(row.tobytes() in recorded for row in played) > 0.7 * len(played)
+
+
+def test_frames_of_a_can_interface_are_played_by_an_slcan_adapter(tmp_path: Path) -> None:
+    path = tmp_path / "sensor.jsonl"
+    url = "ati-can://transcript?interface=virtual&bitrate=250000"
+    writer = Writer(path, {"url": url, "duration_s": DURATION_S})
+    device = AtiCanNode(measured(), seed=1)
+    try:
+        with joined(device.start(), "transcript"), recording(writer):
+            identity, wrench = look(sensor_from_url(url), DURATION_S + 0.3)
+    finally:
+        device.stop()
+    writer.end(error=None)
+    assert can.Bus is PLAIN_BUS
+
+    transcript = Transcript.load(path)
+    assert transcript.frames
+    assert transcript.passages[0].data == b"t2050\r"  # the serial number is asked for first
+    player = Player(transcript)
+    with player as port:
+        again, played = look(sensor_from_url(transcript.url_at(port)), DURATION_S)
+    assert player.divergence is None
+    assert again == identity
+    recorded = {row.tobytes() for row in wrench}
+    assert sum(row.tobytes() in recorded for row in played) > 0.7 * len(played) > 0.3 * len(wrench)
+
+
+@pytest.mark.parametrize(
+    ("frame", "line"),
+    [
+        (can.Message(arbitration_id=0x2A, is_extended_id=False, data=b"\x01\xff"), b"t02A201FF\r"),
+        (can.Message(arbitration_id=0x12345, is_extended_id=True, data=b""), b"T000123450\r"),
+        (can.Message(arbitration_id=0x2A, is_extended_id=False, is_remote_frame=True, dlc=3), b"r02A3\r"),
+        (can.Message(is_error_frame=True), b""),
+        (can.Message(arbitration_id=0x2A, is_extended_id=False, is_fd=True, data=bytes(12)), b""),
+    ],
+)
+def test_a_frame_becomes_a_line(frame: can.Message, line: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "frames.jsonl"
+    writer = Writer(path, {"url": "x", "duration_s": 1})
+    with (
+        can.Bus("lines", interface="virtual") as other,
+        recording(writer),
+        can.Bus("lines", interface="virtual") as bus,
+    ):
+        other.send(frame)
+        assert bus.recv(1.0) is not None
+    writer.end()
+    assert b"".join(passage.data for passage in Transcript.load(path).passages) == line
 
 
 @pytest.fixture
