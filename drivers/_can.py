@@ -51,7 +51,9 @@ class CanBus:
         options: dict[str, Any] = {}
         if self._interface == "slcan":
             # python-can waits 2 s for adapters that reboot when their port is opened; a pseudo-terminal does not
-            tty = os.path.realpath(self._channel.split("@", maxsplit=1)[0])
+            tty = self._channel.split("@", maxsplit=1)[0]
+            with contextlib.suppress(OSError):  # the link to an adapter may vanish while it is followed
+                tty = os.path.realpath(tty)
             if not os.access(tty, os.R_OK | os.W_OK):
                 raise ConnectError(f"{self._owner}: there is no {self._channel} that may be read and written")
             if tty.startswith("/dev/pts/"):
