@@ -20,7 +20,7 @@ from ftdrive.planning.chosen import Chosen, chosen_tour
 from ftdrive.planning.free_box import box_tour
 from ftdrive.planning.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds
-from ftdrive.planning.nodes import wrist_nodes
+from ftdrive.planning.nodes import WRIST_6_RAD, wrist_nodes
 from ftdrive.planning.plan import Plan, make_plan
 from ftdrive.planning.postures import with_room
 from ftdrive.planning.tours import clear_tour
@@ -93,11 +93,13 @@ def plan_tour(
     if (found := _wrist(certifier, stands, numbers, speeds)) is not None:
         why = [f"{reason}: the wrist visits them in the order that is fastest here, base, shoulder and elbow at rest."]
         return made("wrist", why, found)
-    for posture, constant in _postures(certifier, stands):
-        elsewhere = constant if poses == 24 else _wrist(certifier, posture, numbers, speeds)
+    for tour in _clear_tours(certifier, stands):
+        elsewhere: Found | None = constant_tour.NUMBERS, tour
+        if poses != 24 or not _winds_little(tour, stands):
+            elsewhere = _wrist(certifier, np.append(tour[0, :5], stands[5]), numbers, speeds)
         if elsewhere is not None:
             return made(
-                "posture", [f"{reason}, and the wrist alone finds no way there.", _elsewhere_words(posture)], elsewhere
+                "posture", [f"{reason}, and the wrist alone finds no way there.", _elsewhere_words(tour[0])], elsewhere
             )
     nowhere = f"{reason}, and no posture of joints 1 to 3 that was tried lets the wrist alone visit the orientations."
     for centre_m in _box_centres(certifier, stands):
@@ -225,9 +227,14 @@ def _numbers(poses: int) -> tuple[int, ...]:
 
 def _constant(certifier: Certifier, q_rad: Array) -> Found | None:
     q = constant_tour.constant_tour(q_rad)
-    if not certifier.certify(q, np.roll(q, -1, axis=0), tight=False).clear.all():
+    if not (_winds_little(q, q_rad) and certifier.certify(q, np.roll(q, -1, axis=0), tight=False).clear.all()):
         return None
     return constant_tour.NUMBERS, q
+
+
+def _winds_little(q_rad: Array, stands: Array) -> bool:
+    """Say whether joint 6 stays in its window about where it stands."""
+    return bool(np.abs(q_rad[:, 5] - stands[5]).max() <= WRIST_6_RAD + 1e-9)
 
 
 def _wrist(certifier: Certifier, q_rad: Array, numbers: Sequence[int], speeds: Speeds) -> Found | None:
@@ -238,10 +245,11 @@ def _wrist(certifier: Certifier, q_rad: Array, numbers: Sequence[int], speeds: S
     return None if order is None else ([numbers[g] for g in group[order]], q[order])
 
 
-def _postures(certifier: Certifier, q_rad: Array) -> Iterator[tuple[Array, Found]]:
+def _clear_tours(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
+    """Constant tours (24, 6) in other postures of joints 1 to 3."""
     for tour in with_room(certifier, q_rad):
         if certifier.certify(tour, np.roll(tour, -1, axis=0), tight=False).clear.all():
-            yield tour[0], (constant_tour.NUMBERS, tour)
+            yield tour
 
 
 def _box(

@@ -205,14 +205,18 @@ class SettingsGuard(Guard):
                 8,
                 DeviceFault(f"the active TCP was set to {_rounded(now.tcp_offset)}: find out what did, then go on"),
             )
-        if _changed(before.payload_kg, now.payload_kg):
-            raise Tripped(
-                7,
-                DeviceFault(
-                    f"the controller's payload was changed from {before.payload_kg:.2f} to {now.payload_kg:.2f} kg: "
-                    "find out what set it, then go on"
-                ),
-            )
+        for what, was, told in (
+            ("payload in kg", before.payload_kg, now.payload_kg),
+            ("centre of the payload in m", before.p_flange_payload_m, now.p_flange_payload_m),
+        ):
+            if _changed(was, told):
+                raise Tripped(
+                    7,
+                    DeviceFault(
+                        f"the controller's {what} was changed from {_rounded(was)} to {_rounded(told)}: find out what "
+                        "set it, then go on"
+                    ),
+                )
 
 
 @dataclass
@@ -416,5 +420,5 @@ def _changed(before: Any, now: Any) -> bool:
     return before is not None and now is not None and bool(np.abs(np.subtract(before, now)).max() > 1e-3)
 
 
-def _rounded(values: Sequence[float] | None) -> list[float]:
-    return [round(value, 3) for value in values or ()]
+def _rounded(values: float | Sequence[float] | None) -> Any:
+    return np.round(0.0 if values is None else values, 3).tolist()

@@ -188,6 +188,7 @@ class _Begun:
             runs=options.runs,
             known=self._known,
             quiet=self._listen(preflight.LISTEN_S),
+            resumed=self._old is not None,
             limits=limits,
             sensor_range=_range_of(sensor),
         )
@@ -206,7 +207,7 @@ class _Begun:
             return Plan.load(options.plan)
         q = np.round(self._arm.state().q_rad / _GRID_RAD) * _GRID_RAD
         with suppress(ConfigError):  # the planner says what to do about it
-            q = constant_tour(q)[0]  # wherever the wrist was left
+            q[3:5] = constant_tour(q)[0, 3:5]  # wherever the wrist was left; joint 6 tells how the cable is wound
         guess = guess_of(self._certifier, cell.tool.mass_kg or USUAL_KG)
         made = plan_tour(self._certifier, q, options.poses, speeds=self._speeds, guess=guess)
         return made.marked(measured=cell.workcell.measured)

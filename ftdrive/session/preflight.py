@@ -22,6 +22,7 @@ from ftdrive.config import CellConfig
 from ftdrive.errors import PlanRefused
 from ftdrive.planning.approach import Approach
 from ftdrive.planning.certify import Certifier
+from ftdrive.planning.nodes import WRIST_6_RAD
 from ftdrive.planning.plan import Plan
 from ftdrive.session.events import Checked
 from ftdrive.session.guards import AXES, G_M_S2, Limits, ModelGuard, Tripped
@@ -35,8 +36,12 @@ _LATENCY_S: Final = 0.1
 _FREE_BYTES: Final = 200_000_000
 _EDGE_RAD: Final = float(np.radians(5))
 """Each question takes the controller some 10 ms. Between two points no part is more than 1 mm off their chord."""
+_ROUNDED_RAD: Final = float(np.radians(1))
+"""A plan is made for where the arm stands, rounded."""
 _LOAD: Final = 0.8
 _PAYLOAD_KG, _PAYLOAD_SHARE = 0.5, 0.3
+_PAYLOAD_M: Final = 0.1
+"""How far outside of the described tool the centre of the payload may be."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +59,8 @@ class Before:
     """Whether this plan has run to its end on this arm before: its edges were asked of the controller then."""
     quiet: FtSamples
     """Two seconds of the sensor at rest."""
+    resumed: bool
+    """Whether the arm has been on this tour before."""
     limits: Limits
     sensor_range: Array | None = None
 
@@ -69,8 +76,10 @@ def check_workcell(before: Before) -> Checked:
             "workcell",
             "nobody has measured tool, planes and boxes: measure them, then set measured = true in [workcell]",
         )
-    found = f"{len(work.planes_mm)} planes, {len(work.boxes_mm)} boxes and the surface the arm is mounted on"
-    return _passed("workcell", f"measured: {found}")
+    return _passed(
+        "workcell",
+        f"measured; planes: {len(work.planes_mm)}, boxes: {len(work.boxes_mm)}, and the surface the arm is mounted on",
+    )
 
 
 def check_plan(before: Before) -> Checked:
@@ -92,6 +101,24 @@ def check_approach(before: Before) -> Checked:
         return _passed("approach", "the arm stands at the first pose")
     return _passed(
         "approach", f"moves: {len(approach.q_rad)}, proven clear, nearest {1e3 * approach.clearance_m:.0f} mm"
+    )
+
+
+def check_cable(before: Before) -> Checked:
+    """Row 1: wrist 3 stays in its window about where it stands, for that is how the cable lies."""
+    stands = before.arm.state().q_rad[5]
+    turns = np.append([step.q_rad[5] for step in before.plan.steps], before.approach.q_rad[:, 5])
+    low, high = turns.min(), turns.max()
+    where, least, most = np.degrees([stands, low, high])
+    found = f"wrist 3 stands at {where:.0f}°, it turns between {least:.0f}° and {most:.0f}°"
+    has_been_there = before.resumed and low <= stands <= high
+    if has_been_there or max(high - stands, stands - low) <= WRIST_6_RAD + _ROUNDED_RAD:
+        return _passed("cable", found)
+    window = np.degrees(WRIST_6_RAD)
+    return _failed(
+        "cable",
+        f"{found}, more than {window:.0f}° to one side, which may wind up the cable: jog it to between "
+        f"{most - window:.0f}° and {least + window:.0f}°, or make a new plan where it stands",
     )
 
 
@@ -146,9 +173,11 @@ def check_payload(before: Before) -> Checked:
             "payload",
             "the controller believes that nothing hangs on the flange: set payload and its centre at the pendant",
         )
+    if words := _misplaced(before):
+        return _failed("payload", words)
     parts = (before.cell.tool.mass_kg, before.cell.sensor.mass_kg)
     if parts[0] is None:
-        return _passed("payload", f"the controller carries {told:.2f} kg; is that sensor, adapter and tool together?")
+        return _passed("payload", f"the controller carries {told:.2f} kg; nothing in [tool] to compare it with")
     expected = sum(part for part in parts if part is not None)
     if abs(told - expected) > max(_PAYLOAD_KG, _PAYLOAD_SHARE * expected):
         return _failed(
@@ -156,6 +185,23 @@ def check_payload(before: Before) -> Checked:
             f"the controller carries {told:.2f} kg, sensor and tool are {expected:.2f} kg: correct one of the two",
         )
     return _passed("payload", f"the controller carries {told:.2f} kg, sensor and tool are {expected:.2f} kg")
+
+
+def _misplaced(before: Before) -> str:
+    """Say that the controller has the payload's centre where no tool is; empty if it has not, or does not tell."""
+    told = before.arm.status().p_flange_payload_m
+    if told is None:
+        return ""
+    tool = before.certifier.arm.tool
+    across, along = float(np.hypot(told[0], told[1])), told[2]
+    reach, length = max(part.reach_m for part in tool), max(part.to_m for part in tool)
+    if across <= reach + _PAYLOAD_M and -_PAYLOAD_M <= along <= length + _PAYLOAD_M:
+        return ""
+    x, y, z = (1e3 * value for value in told)
+    return (
+        f"the controller has the payload's centre at ({x:.0f}, {y:.0f}, {z:.0f}) mm from the flange, where the tool is "
+        "not: correct it at the pendant, or the tool's cylinders"
+    )
 
 
 def check_slider(before: Before) -> Checked:
@@ -237,6 +283,7 @@ CHECKS: Final[Sequence[Check]] = (
     check_workcell,
     check_plan,
     check_approach,
+    check_cable,
     check_safety_limits,
     check_disk,
 )

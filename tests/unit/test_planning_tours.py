@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from calib.design import special
+from calib.design import T12, special
 from drivers.ur.kinematics import MODELS
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.arm_model import ArmModel, Cylinder
@@ -51,6 +51,18 @@ def test_constant_tour_takes_24_moves_of_90_degrees_and_leaves_cables_alone() ->
     assert np.allclose(tour[0], USUAL_POSTURE_RAD)
     shapes = np.round(tour[:, 3:5], 6)
     assert len(np.unique(shapes, axis=0)) == len(np.unique(shapes[list(DIFFERENT_SHAPES)], axis=0)) == 6
+
+
+@pytest.mark.parametrize(("model", "q6_deg"), [("UR5e", -170), ("UR5e", 90), ("UR3e", 80), ("UR10e", 180)])
+@pytest.mark.parametrize("poses", [24, 12])
+def test_wrist_3_stays_within_200_degrees_of_where_it_stands(model: str, q6_deg: float, poses: int) -> None:
+    certifier = certifier_of(model)
+    stands = np.radians([45, -100, 60, -50, 90, q6_deg])
+    plan = plan_tour(certifier, stands, poses, speeds=Speeds(), guess=guess_of(certifier))
+    q = np.array([step.q_rad for step in plan.steps])
+    assert np.degrees(np.abs(q[:, 5] - stands[5]).max()) <= 200 + 1e-6
+    assert sampled_clear(certifier, plan)
+    assert sorted(step.number for step in plan.steps) == sorted(NUMBERS if poses == 24 else T12)
 
 
 @pytest.mark.parametrize(("q2", "q3", "q4"), [(-100, 60, -50), (-100, 60, 310), (-60, -120, 200), (-350, -340, 0)])

@@ -120,6 +120,7 @@ def test_settings_changed_on_the_way_are_seen() -> None:
     assert looks.trips(20) is None
     assert looks.trip(status=replace(STATUS, tcp_offset=(0.0, 0.0, 0.1, 0.0, 0.0, 0.0))).hazard == 8
     assert looks.trip(status=replace(STATUS, payload_kg=0.0)).hazard == 7
+    assert looks.trip(status=replace(STATUS, p_flange_payload_m=(0.0, 0.0, 0.1))).hazard == 7
 
 
 @pytest.mark.parametrize(

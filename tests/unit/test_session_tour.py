@@ -531,11 +531,29 @@ def test_a_workcell_nobody_measured_is_refused(lab: Lab) -> None:
     [
         ({"fault": "protective stop: clear it", "safety_mode": "protective stop"}, "protective stop"),
         ({"payload_kg": 0.0}, "nothing hangs"),
+        (
+            {"p_flange_payload_m": (0.0, 0.0, -0.15)},
+            r"centre at \(0, 0, -150\) mm from the flange, where the tool is not",
+        ),
+        ({"p_flange_payload_m": (0.3, 0.0, 0.05)}, r"centre at \(300, 0, 50\) mm"),
     ],
 )
 def test_a_controller_that_is_not_ready_is_refused(different: dict[str, Any], words: str, lab: Lab) -> None:
     lab.arm.set_status(**different)
     refuse(lab, words)
+
+
+def test_a_tour_that_would_wind_up_the_cable_is_refused(lab: Lab, tmp_path: Path) -> None:
+    lab.arm.q[5] = np.radians(-90)
+    made_there = tmp_path / "there.json"
+    assert lab.calibrate(dry_run=True, output=made_there) is None
+    assert "wrist 3 stands at -90°" in next(e.words for e in lab.operator.of(Checked) if e.name == "cable")
+    lab.arm.q[5] = np.radians(160)
+    lab.operator.told.clear()
+    refuse_plan = pytest.raises(NotAccepted, match=r"wrist 3 stands at 160°.*jog it to between -?\d+° and -?\d+°")
+    with refuse_plan:
+        lab.calibrate(plan=made_there)
+    assert lab.arm.moves == []
 
 
 def test_a_payload_that_is_not_that_of_the_tool_is_refused(lab: Lab) -> None:
