@@ -434,8 +434,8 @@ class UrArm(RobotArm):
         if not self._is_ours(control, timeout_s=_OURS_S, look_out=self._look_out):
             self._left_behind = False
             raise self._fault() or DeviceFault(
-                f"the control program on {self._host} does not answer: somebody has started another program; end it, "
-                f"then open the arm again."
+                f"the control program on {self._host} does not answer: another program may have been started, or "
+                "controller or computer are too busy; look at the pendant, then open the arm again."
             )
 
     def _is_ours(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import JSON, RUNS, rows, stop_unless_accepted, write_json
+from ftdrive.commands.common import RUNS, rows, stop_unless_accepted, write_json
 
 if TYPE_CHECKING:
     from ftdrive.config import CellConfig
@@ -55,7 +55,9 @@ _EXCLUDE_ONE_ANOTHER = (
 @click.option("--redo", type=int, multiple=True, metavar="N", help="With --resume: take pose N again. Repeatable.")
 @click.option("--yes", is_flag=True, help="Answer what may be answered without a person; never the first motion.")
 @RUNS
-@JSON
+@click.option(
+    "--json", "as_json", is_flag=True, help="One JSON object a line on stdout: events, questions, the result."
+)
 def calibrate(
     config: Path | None,
     robot: str | None,

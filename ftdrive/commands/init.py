@@ -64,8 +64,10 @@ def init(
     no default, and `measured = false` in the file stays until you change it.
     """
     from calib.files import write_new
+    from drivers.ur.kinematics import model_named
     from ftdrive.cellfile import cell_file
     from ftdrive.config import FILE, CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, settings
+    from ftdrive.planning.arm_model import SHAPES
     from ftdrive.simulation import Station, sensor_name
 
     check_simulate(simulate, real={"--robot": robot})
@@ -81,6 +83,8 @@ def init(
             robot, sensor = station.cell.robot.host, station.cell.sensor.url
         ask = Questions(yes)
         host, model, robot_told = _robot(ask, robot, said["robot.host"].value, model)
+        if model is not None and model_named(model, controller_major=0) not in SHAPES:
+            _say(f"  ! the shape of the {model} is not measured, so no motion can be planned: use calibrate --manual")
         url, sensor_told = _sensor(ask, sensor, said["sensor.url"].value)
     height_mm = ask.number("Sensor height above the flange, mm (measure it)", "sensor.height_mm", "--height", height)
     sensor_kg = ask.number(

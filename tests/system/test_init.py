@@ -70,6 +70,13 @@ def test_a_script_needs_no_questions(station: Station) -> None:
     assert cell.workcell.boxes_mm == ((5, 5, 0, 9, 9, 9),)
 
 
+def test_an_arm_that_cannot_be_planned_for_is_said_to_be_one() -> None:
+    with Station("serial", ["--polyscope", "3.15.0", "--time-scale", "1"]) as old:
+        outcome = run("--robot", old.cell.robot.host, "--model", "ur5", "--sensor", old.cell.sensor.url, *TOOL, "--yes")
+    assert outcome.exit_code == 0, outcome.output
+    assert "the shape of the UR5 is not measured, so no motion can be planned: use calibrate --manual" in outcome.output
+
+
 def test_a_bus_is_asked_what_is_there(station: Station) -> None:
     can = station.endpoints["can"]
     bus = f"slcan://{can['channel']}?bitrate={can['bitrate']}"

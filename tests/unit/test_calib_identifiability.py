@@ -206,7 +206,7 @@ def test_three_orientations_are_never_enough_although_their_rank_is_full() -> No
 @pytest.mark.parametrize(
     ("R", "words"),
     [
-        (ANY[:3], "3 poses are too few, at least 4 are needed: add 3 or more"),
+        (ANY[:3], "3 poses are too few, at least 4 are needed: add 1, better 3"),
         (np.tile(ANY[:1], (9, 1, 1)), "all 9 poses have the same orientation"),
         (turned("z", tilt_deg=150), "only the last joint was turned: .*; add a pose: from the last one, tilt the tool"),
         (leaning(40), "all poses keep the tool's own axis .* at one angle to gravity, 40° .*; add a pose: from the"),
@@ -221,7 +221,7 @@ def test_refusals_are_one_sentence_with_the_cure(R: Array, words: str) -> None:
 
 def test_without_parameters_only_the_count_is_checked() -> None:
     require_orientations(leaning(40))
-    with pytest.raises(NotObservable, match="4 poses are too few, at least 5 are needed: add 2 or more"):
+    with pytest.raises(NotObservable, match="4 poses are too few, at least 5 are needed: add 1, better 2"):
         require_orientations(ANY[:4], least=5)
 
 

@@ -178,8 +178,8 @@ def spin(axis: str, tilt_deg: float, n: int = 8) -> Array:
 @pytest.mark.parametrize(
     ("R", "method", "words"),
     [
-        (R24[:3], "ml", "3 poses are too few, at least 4 are needed: add 3 or more"),
-        (R24[:4], "lrom", "4 poses are too few, at least 5 are needed: add 2 or more"),
+        (R24[:3], "ml", "3 poses are too few, at least 4 are needed: add 1, better 3"),
+        (R24[:4], "lrom", "4 poses are too few, at least 5 are needed: add 1, better 2"),
         (np.tile(R24[:1], (9, 1, 1)), "ml", "all 9 poses have the same orientation: turn and tilt"),
         (np.tile(R24[:3], (3, 1, 1)), "ml", "the 9 poses have only 3 different orientations, at least 4"),
         (
