@@ -60,7 +60,7 @@ class Before:
     quiet: FtSamples
     """Two seconds of the sensor at rest."""
     resumed: bool
-    """Whether the arm has been on this tour before."""
+    """Whether a part of the plan has run before."""
     limits: Limits
     sensor_range: Array | None = None
 
@@ -111,7 +111,7 @@ def check_cable(before: Before) -> Checked:
     low, high = turns.min(), turns.max()
     where, least, most = np.degrees([stands, low, high])
     found = f"wrist 3 stands at {where:.0f}°, it turns between {least:.0f}° and {most:.0f}°"
-    has_been_there = before.resumed and low <= stands <= high
+    has_been_there = (before.known or before.resumed) and low <= stands <= high
     if has_been_there or max(high - stands, stands - low) <= WRIST_6_RAD + _ROUNDED_RAD:
         return _passed("cable", found)
     window = np.degrees(WRIST_6_RAD)
