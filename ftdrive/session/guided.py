@@ -357,7 +357,7 @@ class _Begun:
                 recheck=self._recheck,
                 quiet_std=quiet_std,
             ).run(self._todo, ())  # the running fit knows what was taken
-        if self._options.real:
+        if self._pace.slow and run.stops() == list(range(1, len(plan.steps) + 2)):
             remember_completed(*self._key)
         return run
 

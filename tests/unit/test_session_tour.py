@@ -402,6 +402,29 @@ def test_a_run_that_was_ended_does_not_count_as_complete(lab: Lab) -> None:
     assert len(lab.arm.moves) == 1
 
 
+def test_only_a_run_with_every_pose_counts_as_complete(lab: Lab) -> None:
+    lab.operator.answers["Pose 3 of 7"] = ["s"]
+    lab.operator.answers["Pose 7 of 7"] = ["s"]
+    lab.calibrate(mode="step")
+    run = lab.run()
+    key = "A1", str(Plan.load(run.plan_path).to_dict()["sha256"])
+    assert not has_completed(*key)
+    lab.operator.answers["Pose 7 of 7"] = ["s"]
+    lab.calibrate(resume=run.folder, mode="step", fast=True)
+    assert lab.stops() == [1, 2, 3, 4, 5, 6]
+    assert not has_completed(*key)
+    lab.calibrate(resume=run.folder)
+    assert has_completed(*key)
+
+
+def test_a_run_in_which_nothing_moved_does_not_count_as_complete(lab: Lab) -> None:
+    lab.operator.answers["Pose "] = ["s"] * 6
+    with pytest.raises(Declined, match="ended before the first pose"):
+        lab.calibrate(mode="step")
+    assert lab.arm.moves == []
+    assert not has_completed("A1", str(Plan.load(lab.run().plan_path).to_dict()["sha256"]))
+
+
 def test_a_dry_run_shows_all_and_moves_nothing(lab: Lab) -> None:
     assert lab.calibrate(dry_run=True) is None
     assert lab.arm.moves == []
