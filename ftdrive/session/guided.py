@@ -131,7 +131,8 @@ def _as_begun(options: Options) -> Options:
     if options.mode != "auto" and (begun in _BY_HAND) != (options.mode in _BY_HAND):
         way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
         raise ConfigError(f"{options.resume} was begun {way} and can only go on like that: leave out --{options.mode}")
-    if begun not in _BY_HAND:
+    options = replace(options, mode=begun if options.mode == "auto" else options.mode)
+    if options.mode not in _BY_HAND:
         return options
     no_motion = {
         "--plan": options.plan is not None,
@@ -143,8 +144,8 @@ def _as_begun(options: Options) -> Options:
         "--view": options.view,
     }
     if wrong := [name for name, given in no_motion.items() if given]:
-        raise ConfigError(f"with --{begun} ftdrive plans and moves nothing: leave out {' and '.join(wrong)}")
-    return replace(options, mode=begun if options.mode == "auto" else options.mode)
+        raise ConfigError(f"with --{options.mode} ftdrive plans and moves nothing: leave out {' and '.join(wrong)}")
+    return options
 
 
 class _Begun:

@@ -1039,6 +1039,19 @@ def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None
     assert (run.folder / "calibration.json").read_bytes() == first
 
 
+@pytest.mark.parametrize(
+    ("begun", "asked", "in_steps"), [("step", "auto", True), ("auto", "step", True), ("auto", "auto", False)]
+)
+def test_a_run_goes_on_in_its_own_mode_or_in_steps(begun: str, asked: str, in_steps: bool, lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined):
+        lab.calibrate(mode=begun)
+    lab.operator.asked.clear()
+    lab.calibrate(resume=lab.run().folder, mode=asked)
+    steps = [question.text.split(",")[0] for question in lab.operator.asked if "Enter" in question.text]
+    assert steps == [f"Pose {stop} of 7" for stop in (4, 5, 6, 7) if in_steps]
+
+
 def test_a_resumed_run_is_open_with_its_poses_before_anything_is_checked(lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
     lab.operator.answers["Type resume"] = ["quit"]
