@@ -53,7 +53,11 @@ _EXCLUDE_ONE_ANOTHER = (
     help="Go on with a run that was ended: in its way, with its options, and the files of settings as they are now.",
 )
 @click.option("--redo", type=int, multiple=True, metavar="N", help="With --resume: take pose N again. Repeatable.")
-@click.option("--yes", is_flag=True, help="Answer what may be answered without a person; never the first motion.")
+@click.option(
+    "--yes",
+    is_flag=True,
+    help="Answer what may be answered without a person; never a first run, nor a way of the whole arm.",
+)
 @RUNS
 @JSON
 def calibrate(

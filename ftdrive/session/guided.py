@@ -367,6 +367,7 @@ class _Begun:
         self._check(preflight.AGAIN)
 
     def _ask(self) -> None:
+        assumed = self._known and not arm_moves(self._way)  # nobody has seen this way
         room = "" if self._plan.arm_rests else ", and the room of the whole arm, which moves too,"
         if arm_moves(self._way):
             room = f", and the room of the whole arm, which moves on its way there too ({turns_in_words(self._way)}),"
@@ -376,9 +377,9 @@ class _Begun:
             "of people too?",
             "Is the emergency stop in reach, and tested?",
         ):
-            self._desk.require(text, assumed=self._known)
+            self._desk.require(text, assumed=assumed)
         if self._arm.status().safety_mode == "reduced":
-            self._desk.require("The controller is in reduced mode. Is that as it should be?", assumed=self._known)
+            self._desk.require("The controller is in reduced mode. Is that as it should be?", assumed=assumed)
 
     def _run(self, devices: Mapping[str, Any]) -> Run:
         if self._old is not None:

@@ -25,7 +25,7 @@ from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.words import way_in_words, way_of
+from ftdrive.planning.words import arm_moves, way_in_words, way_of
 from ftdrive.runs import Run
 from ftdrive.session.events import (
     Asked,
@@ -405,17 +405,18 @@ class Tour:
         approach = approach_to(self._certifier, q, self._nodes[index], SLOW)
         if not len(approach.q_rad):
             return
-        if words := forbidden(self._arm, np.vstack([q, approach.q_rad])):
+        way = way_of(q, approach)
+        if words := forbidden(self._arm, way):
             raise PlanRefused(words)
-        passed = self._passed(np.vstack([q, approach.q_rad]), index)
+        passed = self._passed(way, index)
         words = (
             f"the way to pose {stop} at {np.degrees(APPROACH_RAD_S):.0f}°/s at most: "
-            f"{way_in_words(way_of(q, approach), approach.clearance_m)}"
+            f"{way_in_words(way, approach.clearance_m)}"
         )
         if passed:
             words += f"; it passes close to the skipped pose {' and '.join(passed)} and does not stop there"
         self._tell(State.APPROACH, stop, words)
-        self._confirm(f"The arm goes {words}.", by_person=bool(passed))
+        self._confirm(f"The arm goes {words}.", by_person=bool(passed) or arm_moves(way))
         for goal, speed in zip(approach.q_rad, approach.speed_rad_s, strict=True):
             self._move(q, goal, min(float(speed), APPROACH_RAD_S), SLOW.joint_rad_s2)
             q = goal

@@ -468,6 +468,37 @@ def test_a_way_that_moves_the_whole_arm_asks_for_its_room(lab: Lab) -> None:
     )
 
 
+@pytest.mark.parametrize(("away_deg", "assumed"), [((0.0, 0.0), True), ((0.0, 9.0), True), ((9.0, 0.0), False)])
+def test_a_way_of_the_whole_arm_is_confirmed_by_a_person_though_the_plan_is_known(
+    away_deg: tuple[float, float], assumed: bool, lab: Lab
+) -> None:
+    lab.calibrate()
+    plan = lab.run().plan_path
+    lab.operator.asked.clear()
+    elbow, wrist = away_deg
+    lab.arm.q = lab.arm.q + np.radians([0, 0, elbow, 0, 0, wrist])
+    lab.calibrate(plan=plan, fast=True)
+    texts = {question.text: question.assumed is not None for question in lab.operator.asked}
+    assert [texts[text] for text in texts if text.startswith("Is the")] == [assumed] * 3
+    (way,) = [texts[text] for text in texts if "Type MOVE" in text]
+    assert way == assumed
+
+
+def test_a_run_that_goes_on_from_elsewhere_is_confirmed_by_a_person(lab: Lab) -> None:
+    lab.calibrate()  # trusted from here on
+    for joint, assumed in ((5, True), (0, False)):
+        lab.operator.asked.clear()
+        lab.operator.told.clear()
+        lab.arm.moves.clear()
+        lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
+        with pytest.raises(Declined):
+            lab.calibrate()
+        lab.arm.q = lab.arm.q + np.radians(9.0) * (np.arange(6) == joint)
+        lab.operator.asked.clear()
+        lab.calibrate(resume=Path(lab.operator.of(RunOpened)[-1].folder))
+        assert [question.assumed is not None for question in lab.operator.asked] == [assumed] * 4
+
+
 def test_the_browser_is_waited_for(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     served: list[str] = []
 
