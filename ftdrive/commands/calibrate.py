@@ -139,10 +139,11 @@ def calibrate(
             resume=resume,
             redo=redo,
             real=not simulate,
+            yes=yes,
             description=description,
         )
         try:
-            with open_operator(as_json=as_json, yes=yes) as operator:
+            with open_operator(as_json=as_json) as operator:
                 outcome = guide(cell, operator, options)
         except Declined as error:
             talk.print(str(error))

@@ -85,6 +85,8 @@ class Options:
     real: bool = True
     """Something real moves. An emulated cell needs no typed word and no slow first run."""
     questions: bool = True
+    yes: bool = False
+    """Nobody is asked what a question assumes."""
     description: Mapping[str, Any] = field(default_factory=dict)
     """Goes into run.json."""
 
@@ -101,7 +103,7 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
     DriverError, OSError
         It was broken off; what was taken stands in the run, which can be resumed.
     """
-    desk = Desk(operator)
+    desk = Desk(operator, yes=options.yes)
     desk.tell(StateChanged(state=State.IDLE))
     options = _as_begun(options)
     by_hand = options.mode in _BY_HAND

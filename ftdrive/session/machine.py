@@ -89,10 +89,16 @@ class Turned(Exception):
 
 
 class Desk:
-    """The person, and the diary: every event goes to both, from any thread, one at a time."""
+    """The person, and the diary: every event goes to both, from any thread, one at a time.
 
-    def __init__(self, operator: Operator) -> None:
-        self._operator = operator
+    Parameters
+    ----------
+    yes : bool
+        Take what questions assume, where they assume something; the person is asked the others.
+    """
+
+    def __init__(self, operator: Operator, *, yes: bool = False) -> None:
+        self._operator, self._yes = operator, yes
         self._lock = threading.RLock()
         self._run: Run | None = None
         self._early: list[Event] = []
@@ -119,9 +125,10 @@ class Desk:
                 log.warning("events.ndjson cannot be written: %s", error)
 
     def ask(self, question: Question) -> str:
-        """Ask, and keep the answer."""
-        answer = self._operator.ask(question)
-        self.tell(Asked(question=question.text, answer=answer))
+        """Ask, and keep the answer, and who gave it."""
+        assumed = question.assumed if self._yes else None
+        answer = self._operator.ask(question) if assumed is None else assumed
+        self.tell(Asked(question=question.text, answer=answer, by="person" if assumed is None else "--yes"))
         return answer
 
     def require(self, text: str, *, assumed: bool) -> None:

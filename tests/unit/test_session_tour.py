@@ -317,6 +317,20 @@ def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> 
     assert len(lab.operator.of(Asked)) == 5
 
 
+def test_the_diary_says_where_nobody_was_asked(lab: Lab) -> None:
+    lab.calibrate(yes=True)  # a first run: --yes answers nothing
+    assert {event.by for event in lab.operator.of(Asked)} == {"person"}
+    lab.operator.told.clear()
+    lab.operator.asked.clear()
+    lab.operator.answers["tool free"] = ["no"]
+    lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 0, 5.0])
+    lab.calibrate(yes=True)
+    assert lab.operator.asked == []
+    answered = [(event.answer, event.by) for event in lab.operator.of(Asked)]
+    assert answered == [(answer, "--yes") for answer in ("yes", "yes", "yes", "MOVE", "yes")]
+    assert all(in_words(event).endswith(f"{event.answer} (--yes)") for event in lab.operator.of(Asked))
+
+
 @pytest.mark.parametrize("word", ["tool free", "ball", "emergency stop in reach", "MOVE"])
 def test_without_an_answer_nothing_moves(word: str, lab: Lab) -> None:
     lab.operator.answers[word] = ["no"]
