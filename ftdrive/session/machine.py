@@ -286,6 +286,8 @@ class Tour:
         while (key := self._desk.pressed()) is not None:
             if key in {Key.STOP, Key.PAUSE}:
                 raise Stopped(key)
+            if key is Key.KEEP:
+                self._note("a pose is kept by itself; r takes it again")
             if key is Key.SKIP:
                 if self._under_way is not None:
                     raise Turned(key)

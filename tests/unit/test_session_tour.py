@@ -989,6 +989,13 @@ def test_skip_with_no_pose_under_way_skips_none(lab: Lab) -> None:
     assert "none is under way" in said(lab)
 
 
+def test_keep_has_nothing_to_do_in_a_tour_and_says_so(lab: Lab) -> None:
+    press(lab, (Key.KEEP, PoseTaken, 3))
+    lab.calibrate()
+    assert taken(lab) == [1, 2, 3, 4, 5, 6, 7]
+    assert said(lab).count("a pose is kept by itself; r takes it again") == 1
+
+
 def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> None:
     def redo() -> None:
         if len(lab.arm.moves) == 8 and not again:
