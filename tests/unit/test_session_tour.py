@@ -4,7 +4,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -829,6 +829,90 @@ def test_resume_before_the_cause_is_mended_is_not_believed(lab: Lab) -> None:
         lab.calibrate()
     assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet")]) == 2
     assert len(lab.arm.moves) == 3
+
+
+def push_on_the_way(lab: Lab, *moves: int) -> None:
+    """Let something be in the way of these moves, and be gone when a person is asked."""
+
+    def push() -> None:
+        lab.sensor.push = np.array([150.0, 0, 0, 0, 0, 0])
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, StateChanged) and event.state is State.HOLD:
+            lab.sensor.push = np.zeros(6)
+
+    lab.arm.at_move |= dict.fromkeys(moves, push)
+    lab.operator.on_event = on_event
+
+
+def holds(lab: Lab) -> list[tuple[str, ...]]:
+    return [question.answers for question in lab.operator.asked if "resume" in question.answers]
+
+
+def goals(lab: Lab) -> list[int]:
+    """Poses that the arm was sent to, by their place in the plan."""
+    nodes = np.array([step.q_rad for step in Plan.load(lab.run().plan_path).steps])
+    return [int(np.abs(nodes - goal).max(axis=1).argmin()) + 1 for goal, *_ in lab.arm.moves]
+
+
+def test_after_a_contact_the_arm_goes_back_or_round_it_where_a_person_says_so(lab: Lab) -> None:
+    push_on_the_way(lab, 4, 5, 7)  # to pose 4, back to pose 3, to pose 4 again
+    lab.operator.answers["Type resume"] = ["back", "back", "resume", "skip"]
+    lab.calibrate()
+    anywhere = ("resume", "skip", "back", "quit")
+    assert holds(lab) == [anywhere, anywhere, ("resume", "skip", "quit"), anywhere]
+    assert [event.hazard for event in lab.operator.of(GuardTripped)] == [14, 14, 14]
+    assert goals(lab) == [1, 2, 3, 4, 3, 3, 4, 5, 6, 1]
+    assert max(speed for _, speed, _ in lab.arm.moves[4:6]) <= np.radians(10) + 1e-9
+    ways = [question.text for question in lab.operator.asked if question.text.startswith("The arm goes the way")]
+    assert [text.split(" at ")[0].split("way ")[1] for text in ways] == [
+        "to pose 1",
+        "back to pose 3",
+        "back to pose 3",
+        "to pose 4",
+        "to pose 5",
+    ]
+    reasons = [event.words for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
+    assert reasons[2].startswith("back at pose 3; what stopped the arm: unexpected contact")
+    assert taken(lab) == [1, 2, 3, 5, 6, 7]
+    assert "skipped: pose 4, the arm goes on to pose 5" in said(lab)
+
+
+def test_the_way_back_is_confirmed_by_a_person_though_the_plan_is_known(lab: Lab) -> None:
+    lab.calibrate()  # trusted from here on
+    for answer, words in (("resume", "the way to pose 4"), ("back", "the way back to pose 3")):
+        lab.operator.asked.clear()
+        lab.arm.moves.clear()
+        push_on_the_way(lab, 3)
+        lab.operator.answers["Type resume"] = [answer, "quit"]
+        lab.operator.answers["the way back"] = ["no"]
+        with suppress(Declined):
+            lab.calibrate()
+        (way,) = [question for question in lab.operator.asked if words in question.text]
+        assert (way.assumed is None) == (answer == "back")
+    assert len(lab.arm.moves) == 3
+
+
+def test_back_is_offered_only_on_the_way_from_a_pose_that_was_not_skipped(lab: Lab) -> None:
+    press(lab, (Key.PAUSE, StateChanged, 1), (Key.PAUSE, PoseTaken, 2))  # on the first approach; where the arm stands
+    lab.operator.answers["Type resume"] = ["resume"] * 3
+
+    def skip_then_pause() -> None:
+        if len(lab.arm.moves) == 5 and not done:
+            done.append(True)
+            lab.operator.keys.append(Key.SKIP)
+            lab.arm.at_move[6] = lambda: lab.operator.keys.append(Key.PAUSE)
+
+    done: list[bool] = []
+    lab.sensor.collecting = skip_then_pause
+    lab.calibrate()
+    assert holds(lab) == [("resume", "skip", "quit")] * 3
+
+
+def test_a_pause_with_nobody_to_end_it_is_no_fault(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
+    with pytest.raises(Declined, match="paused by a person"):
+        lab.calibrate()
 
 
 def test_resume_with_something_still_pushing_is_not_believed_though_nobody_knows_the_tool(lab: Lab) -> None:
