@@ -15,7 +15,7 @@ def rehearse(station: Station, runs: Path, name: str, *, poses: int = 24) -> Out
     """Take an emulated cell through a calibration without a question; the run is kept in `runs`."""
     description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
     options = Options(runs, name, poses=poses, real=False, questions=False, description=description)
-    with open_operator(yes=True) as operator:
+    with open_operator() as operator:
         outcome = calibrate(station.cell, operator, options)
     if outcome is None:
         raise RuntimeError("a rehearsal is never a dry run")

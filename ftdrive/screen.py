@@ -346,8 +346,6 @@ class Screen:
         Where it is drawn; a terminal.
     keyboard : Keyboard, optional
         None: no keys; questions are answered by lines all the same.
-    yes : bool
-        Take what questions assume, where they assume something.
     """
 
     def __init__(
@@ -355,11 +353,10 @@ class Screen:
         console: Console,
         keyboard: Keyboard | None = None,
         *,
-        yes: bool = False,
         stdin: TextIO | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._console, self._keyboard, self._yes, self._stdin = console, keyboard, yes, stdin or sys.stdin
+        self._console, self._keyboard, self._stdin = console, keyboard, stdin or sys.stdin
         self._clock = clock
         self._view = View()
         self._lock = RLock()
@@ -391,8 +388,6 @@ class Screen:
 
     def ask(self, question: Question) -> str:
         """Ask below the frame, which stands still meanwhile."""
-        if self._yes and question.assumed is not None:
-            return question.assumed
         self._view.keys = "asking"
         self._live.stop()
         with self._keyboard.suspended() if self._keyboard is not None else nullcontext():
@@ -457,17 +452,17 @@ def _history(event: Event, view: View) -> bool:
 
 
 @contextmanager
-def open_operator(*, as_json: bool = False, yes: bool = False) -> Iterator[Operator]:
+def open_operator(*, as_json: bool = False) -> Iterator[Operator]:
     """Give the operator that fits: JSON where asked for, a live screen at a terminal, else plain lines.
 
     The screen goes to stderr, like everything said to a person; a dumb terminal gets plain lines.
     """
     if as_json:
-        yield JsonOperator(yes=yes)
+        yield JsonOperator()
         return
     if not talk.is_terminal or talk.is_dumb_terminal or not os.isatty(0):
-        yield PlainOperator(yes=yes)
+        yield PlainOperator()
         return
     keyboard = Keyboard(0) if Keyboard.usable(0) else None
-    with Screen(talk, keyboard, yes=yes) as screen:
+    with Screen(talk, keyboard) as screen:
         yield screen

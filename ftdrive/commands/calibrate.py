@@ -53,7 +53,11 @@ _EXCLUDE_ONE_ANOTHER = (
     help="Go on with a run that was ended: in its way, with its options, and the files of settings as they are now.",
 )
 @click.option("--redo", type=int, multiple=True, metavar="N", help="With --resume: take pose N again. Repeatable.")
-@click.option("--yes", is_flag=True, help="Answer what may be answered without a person; never the first motion.")
+@click.option(
+    "--yes",
+    is_flag=True,
+    help="Answer what may be answered without a person; never a first run, nor a way of the whole arm.",
+)
 @RUNS
 @click.option(
     "--json", "as_json", is_flag=True, help="One JSON object a line on stdout: events, questions, the result."
@@ -137,10 +141,11 @@ def calibrate(
             resume=resume,
             redo=redo,
             real=not simulate,
+            yes=yes,
             description=description,
         )
         try:
-            with open_operator(as_json=as_json, yes=yes) as operator:
+            with open_operator(as_json=as_json) as operator:
                 outcome = guide(cell, operator, options)
         except Declined as error:
             talk.print(str(error))

@@ -25,7 +25,7 @@ def has_completed(arm_serial: str, plan_sha256: str) -> bool:
 
 
 def remember_completed(arm_serial: str, plan_sha256: str) -> None:
-    """Note that it has."""
+    """Note that it has: slowly, and every pose of it was taken."""
     path = state_file()
     path.parent.mkdir(parents=True, exist_ok=True)
     line = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256, "utc": datetime.now(UTC).isoformat()}

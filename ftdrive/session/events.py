@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,10 +162,12 @@ class GuardTripped(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Asked(Event):
-    """A person was asked, and answered."""
+    """A question that the session does not go on without, and its answer."""
 
     question: str
     answer: str
+    by: Literal["person", "--yes"]
+    """Who answered: whoever was asked, or nobody but the option, which takes what the question assumes."""
 
 
 class _Health(Protocol):

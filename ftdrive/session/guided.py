@@ -85,6 +85,8 @@ class Options:
     real: bool = True
     """Something real moves. An emulated cell needs no typed word and no slow first run."""
     questions: bool = True
+    yes: bool = False
+    """Nobody is asked what a question assumes."""
     description: Mapping[str, Any] = field(default_factory=dict)
     """Goes into run.json."""
 
@@ -101,7 +103,7 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
     DriverError, OSError
         It was broken off; what was taken stands in the run, which can be resumed.
     """
-    desk = Desk(operator)
+    desk = Desk(operator, yes=options.yes)
     desk.tell(StateChanged(state=State.IDLE))
     options = _as_begun(options)
     by_hand = options.mode in _BY_HAND
@@ -131,7 +133,8 @@ def _as_begun(options: Options) -> Options:
     if options.mode != "auto" and (begun in _BY_HAND) != (options.mode in _BY_HAND):
         way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
         raise ConfigError(f"{options.resume} was begun {way} and can only go on like that: leave out --{options.mode}")
-    if begun not in _BY_HAND:
+    options = replace(options, mode=begun if options.mode == "auto" else options.mode)
+    if options.mode not in _BY_HAND:
         return options
     no_motion = {
         "--plan": options.plan is not None,
@@ -143,8 +146,8 @@ def _as_begun(options: Options) -> Options:
         "--view": options.view,
     }
     if wrong := [name for name, given in no_motion.items() if given]:
-        raise ConfigError(f"with --{begun} ftdrive plans and moves nothing: leave out {' and '.join(wrong)}")
-    return replace(options, mode=begun if options.mode == "auto" else options.mode)
+        raise ConfigError(f"with --{options.mode} ftdrive plans and moves nothing: leave out {' and '.join(wrong)}")
+    return options
 
 
 class _Begun:
@@ -358,7 +361,7 @@ class _Begun:
                 recheck=self._recheck,
                 quiet_std=quiet_std,
             ).run(self._todo, ())  # the running fit knows what was taken
-        if self._options.real:
+        if self._pace.slow and run.stops() == list(range(1, len(plan.steps) + 2)):
             remember_completed(*self._key)
         return run
 
@@ -367,6 +370,7 @@ class _Begun:
         self._check(preflight.AGAIN)
 
     def _ask(self) -> None:
+        assumed = self._known and not arm_moves(self._way)  # nobody has seen this way
         room = "" if self._plan.arm_rests else ", and the room of the whole arm, which moves too,"
         if arm_moves(self._way):
             room = f", and the room of the whole arm, which moves on its way there too ({turns_in_words(self._way)}),"
@@ -376,9 +380,9 @@ class _Begun:
             "of people too?",
             "Is the emergency stop in reach, and tested?",
         ):
-            self._desk.require(text, assumed=self._known)
+            self._desk.require(text, assumed=assumed)
         if self._arm.status().safety_mode == "reduced":
-            self._desk.require("The controller is in reduced mode. Is that as it should be?", assumed=self._known)
+            self._desk.require("The controller is in reduced mode. Is that as it should be?", assumed=assumed)
 
     def _run(self, devices: Mapping[str, Any]) -> Run:
         if self._old is not None:

@@ -25,7 +25,7 @@ from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.words import way_in_words, way_of
+from ftdrive.planning.words import arm_moves, way_in_words, way_of
 from ftdrive.runs import Run
 from ftdrive.session.events import (
     Asked,
@@ -49,6 +49,8 @@ log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 APPROACH_RAD_S: Final = float(np.radians(15))
+BACK_RAD_S: Final = float(np.radians(10))
+"""To the pose the arm came from, after it was stopped on its way."""
 SLOW: Final = Speeds.first_run()
 _AT_RAD: Final = float(np.radians(0.5))
 _PATIENCE: Final = 20.0
@@ -73,11 +75,11 @@ class RunningFit(Protocol):
 
 
 class Stopped(Exception):
-    """A person stopped the arm with a key, to pause or to end."""
+    """A person had the arm stop, to pause or to end, or sent it back and has to say how it goes on."""
 
-    def __init__(self, key: Key) -> None:
-        super().__init__("paused by a person" if key is Key.PAUSE else "stopped by a person")
-        self.for_good = key is Key.STOP
+    def __init__(self, words: str, *, for_good: bool = False) -> None:
+        super().__init__(words)
+        self.for_good = for_good
 
 
 class Turned(Exception):
@@ -89,10 +91,16 @@ class Turned(Exception):
 
 
 class Desk:
-    """The person, and the diary: every event goes to both, from any thread, one at a time."""
+    """The person, and the diary: every event goes to both, from any thread, one at a time.
 
-    def __init__(self, operator: Operator) -> None:
-        self._operator = operator
+    Parameters
+    ----------
+    yes : bool
+        Take what questions assume, where they assume something; the person is asked the others.
+    """
+
+    def __init__(self, operator: Operator, *, yes: bool = False) -> None:
+        self._operator, self._yes = operator, yes
         self._lock = threading.RLock()
         self._run: Run | None = None
         self._early: list[Event] = []
@@ -119,9 +127,10 @@ class Desk:
                 log.warning("events.ndjson cannot be written: %s", error)
 
     def ask(self, question: Question) -> str:
-        """Ask, and keep the answer."""
-        answer = self._operator.ask(question)
-        self.tell(Asked(question=question.text, answer=answer))
+        """Ask, and keep the answer, and who gave it."""
+        assumed = question.assumed if self._yes else None
+        answer = self._operator.ask(question) if assumed is None else assumed
+        self.tell(Asked(question=question.text, answer=answer, by="person" if assumed is None else "--yes"))
         return answer
 
     def require(self, text: str, *, assumed: bool) -> None:
@@ -185,6 +194,8 @@ class Tour:
         self._stops = len(self._nodes) + 1
         self._todo: deque[int] = deque()
         self._at: int | None = None  # index of the pose where the arm was left
+        self._stood_at: int | None = None  # index of the pose where it stood last
+        self._back: tuple[int, str] | None = None  # index of the pose to return to, and why the arm was stopped
         self._moved = False
         self._under_way: int | None = None  # stop that the arm goes to or stands at to be measured
         self._last: PoseRecord | None = None  # taken last
@@ -221,6 +232,8 @@ class Tour:
         self._tell(State.CLOSE)
 
     def _next(self) -> None:
+        if self._back is not None:
+            self._go_back(*self._back)
         self._under_way = None
         self._hear()
         stop = self._todo[0]
@@ -277,8 +290,12 @@ class Tour:
         if self._again and not moving:
             raise Turned(Key.REDO)
         while (key := self._desk.pressed()) is not None:
-            if key in {Key.STOP, Key.PAUSE}:
-                raise Stopped(key)
+            if key is Key.PAUSE:
+                raise Stopped("paused by a person")
+            if key is Key.STOP:
+                raise Stopped("stopped by a person", for_good=True)
+            if key is Key.KEEP:
+                self._note("a pose is kept by itself; r takes it again")
             if key is Key.SKIP:
                 if self._under_way is not None:
                     raise Turned(key)
@@ -381,18 +398,24 @@ class Tour:
         q = self._arm.state().q_rad
         at = self._at
         if at is not None and np.abs(q - self._nodes[at]).max() > _AT_RAD:
-            self._at = None
+            self._at = self._stood_at = None
             raise Tripped(21, DeviceFault("the arm is not where this program left it: somebody has moved it"))
         if index == at:
             return
         speed_rad_s = self._own_speed(index)
-        self._at = None
         if speed_rad_s is None:
             self._approach(q, index, stop)
         else:
             self._tell(State.MOVE, stop)
             self._move(q, self._nodes[index], speed_rad_s, self._plan.acceleration_rad_s2)
+        self._at = self._stood_at = index
+
+    def _go_back(self, index: int, why: str) -> None:
+        """Return to the pose the arm came from, then raise `Stopped`: a person decides again."""
+        self._back, self._under_way = None, self._todo[0]
+        self._approach(self._arm.state().q_rad, index, index + 1, back=True)
         self._at = index
+        raise Stopped(f"back at pose {index + 1}; what stopped the arm: {why}")
 
     def _own_speed(self, index: int) -> float | None:
         """Speed of the plan's own move from where the arm was left to a pose, rad/s; None where it has none."""
@@ -401,25 +424,27 @@ class Tour:
             return None
         return self._plan.steps[at if (index - at) % n == 1 else index].speed_rad_s
 
-    def _approach(self, q: Array, index: int, stop: int) -> None:
+    def _approach(self, q: Array, index: int, stop: int, *, back: bool = False) -> None:
         approach = approach_to(self._certifier, q, self._nodes[index], SLOW)
         if not len(approach.q_rad):
             return
-        if words := forbidden(self._arm, np.vstack([q, approach.q_rad])):
+        way = way_of(q, approach)
+        if words := forbidden(self._arm, way):
             raise PlanRefused(words)
-        passed = self._passed(np.vstack([q, approach.q_rad]), index)
+        passed = self._passed(way, index)
+        most_rad_s = BACK_RAD_S if back else APPROACH_RAD_S
         words = (
-            f"the way to pose {stop} at {np.degrees(APPROACH_RAD_S):.0f}°/s at most: "
-            f"{way_in_words(way_of(q, approach), approach.clearance_m)}"
+            f"the way {'back ' if back else ''}to pose {stop} at {np.degrees(most_rad_s):.0f}°/s at most: "
+            f"{way_in_words(way, approach.clearance_m)}"
         )
         if passed:
             words += f"; it passes close to the skipped pose {' and '.join(passed)} and does not stop there"
         self._tell(State.APPROACH, stop, words)
-        self._confirm(f"The arm goes {words}.", by_person=bool(passed))
+        self._confirm(f"The arm goes {words}.", by_person=back or bool(passed) or arm_moves(way))
         for goal, speed in zip(approach.q_rad, approach.speed_rad_s, strict=True):
-            self._move(q, goal, min(float(speed), APPROACH_RAD_S), SLOW.joint_rad_s2)
+            self._move(q, goal, min(float(speed), most_rad_s), SLOW.joint_rad_s2)
             q = goal
-        if stop == 1:
+        if stop == 1 and not back:
             self._confirm(f"The arm stands at the first pose. The tour has {self._stops} stops. Begin?")
 
     def _passed(self, way: Array, goal: int) -> list[str]:
@@ -456,6 +481,7 @@ class Tour:
             )
         turn = np.abs(goal - start).max()
         duration_s = float(move_duration_s(turn, speed_rad_s, acceleration_rad_s2))
+        self._at = None
         with self._guards.watching(start, goal, moving=True):
             self._arm.move_to(
                 goal.tolist(),
@@ -480,6 +506,7 @@ class Tour:
         trip = self._cause(error)
         if trip is not None and self._mended(trip):
             return
+        stop, back = self._todo[0], self._left_behind()
         self._at = None
         words = str(error if trip is None else trip).rstrip(".")
         if trip is not None and trip is not self._guards.tripped(wait_s=0.0):
@@ -487,25 +514,36 @@ class Tour:
         self._tell(State.STOP, words=words)
         self._witness.tell_news()
         self._tell(State.HOLD, words=words)
-        cause = error if trip is None else trip.error
-        when = "to go on" if isinstance(error, Stopped) else "when it is mended"
-        question = Question(
-            f"{len(self._run.stops())} poses are kept. Type resume {when}, or quit: --resume goes on later",
-            ("resume", "quit"),
-        )
+        by_person = isinstance(error, Stopped)
+        end = Declined(words) if by_person else error if trip is None else trip.error
+        ways = {"resume": f"resume {'to go on' if by_person else 'when it is mended'}"}
+        ways["skip"] = f"skip to leave pose {stop} out"
+        if back is not None:
+            ways["back"] = f"back to return to pose {back + 1} at {np.degrees(BACK_RAD_S):.0f}°/s"
+        ways["quit"] = "or quit: --resume goes on later"
+        question = Question(f"{len(self._run.stops())} poses are kept. Type {', '.join(ways.values())}", tuple(ways))
         while True:
             try:
                 answer = self._desk.ask(question)
             except Declined:
-                raise cause from error
-            if answer != "resume":
-                raise cause if not isinstance(error, Stopped) else Declined(words)
+                raise end from error
+            if answer == "quit":
+                raise end
             try:
                 self._recover()
             except (Tripped, DriverError, NotAccepted) as again:
                 self._desk.tell(Noted(words=f"not yet: {again}", warning=True))
                 continue
+            if answer == "skip":
+                self._skip()
+            if answer == "back" and back is not None:
+                self._back = back, words
             return
+
+    def _left_behind(self) -> int | None:
+        """Index of the pose that the arm came from, where it was stopped on its way to another."""
+        gone = {self._index(self._todo[0]), *self._skipped}
+        return None if self._at is not None or self._stood_at in gone else self._stood_at
 
     def _cause(self, error: Exception) -> Tripped | None:
         """What a guard has to say about it, or the row of the table that the error belongs to."""

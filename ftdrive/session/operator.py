@@ -26,7 +26,7 @@ class Question:
     answers: tuple[str, ...] = ("yes", "no")
     """What may be answered; a single one must be typed in full and is never assumed."""
     assumed: str | None = None
-    """What `--yes` answers; None when a person must."""
+    """What `--yes` answers in the place of a person; None when a person must."""
 
 
 class Operator(Protocol):

@@ -66,15 +66,9 @@ class JsonOperator:
 
     A question is told as `{"event": "question", "text", "answers", "error"}`; the next line of stdin is its answer,
     `error` says why the last one was none.
-
-    Parameters
-    ----------
-    yes : bool
-        Take what questions assume, where they assume something.
     """
 
-    def __init__(self, *, yes: bool = False, stdin: TextIO | None = None, stdout: TextIO | None = None) -> None:
-        self._yes = yes
+    def __init__(self, *, stdin: TextIO | None = None, stdout: TextIO | None = None) -> None:
         self._stdin, self._stdout = stdin or sys.stdin, stdout or sys.stdout
         self._lock = Lock()
 
@@ -84,8 +78,6 @@ class JsonOperator:
 
     def ask(self, question: Question) -> str:
         """Answer from stdin; raises `Declined` at its end."""
-        if self._yes and question.assumed is not None:
-            return question.assumed
         error = None
         while True:
             self._write(
@@ -114,16 +106,9 @@ class JsonOperator:
 
 
 class PlainOperator:
-    """One line for everything worth reading later, without colour and without keys.
+    """One line for everything worth reading later, without colour and without keys."""
 
-    Parameters
-    ----------
-    yes : bool
-        Take what questions assume, where they assume something.
-    """
-
-    def __init__(self, *, yes: bool = False, stdin: TextIO | None = None, stderr: TextIO | None = None) -> None:
-        self._yes = yes
+    def __init__(self, *, stdin: TextIO | None = None, stderr: TextIO | None = None) -> None:
         self._stdin, self._stderr = stdin or sys.stdin, stderr or sys.stderr
         self._lock = Lock()
         self._asked = ""
@@ -137,8 +122,6 @@ class PlainOperator:
 
     def ask(self, question: Question) -> str:
         """Answer from stdin; raises `Declined` at its end."""
-        if self._yes and question.assumed is not None:
-            return question.assumed
         self._asked = question.text
         while True:
             self._write(prompt(question))
@@ -185,7 +168,7 @@ def in_words(event: Event) -> str:
         case GuardTripped():
             return f"STOPPED by guard {event.hazard}: {event.words}"
         case Asked():
-            return f"{event.question} {event.answer}"
+            return f"{event.question} {event.answer}{' (--yes)' if event.by == '--yes' else ''}"
         case _:
             return ""
 

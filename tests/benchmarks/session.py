@@ -28,7 +28,7 @@ def main() -> int:
             cell = replace(station.cell, sampling=Sampling())
             options = Options(Path(folder), poses=poses, real=False, questions=False)
             start_s = time.perf_counter()
-            outcome = calibrate(cell, PlainOperator(yes=True), options)
+            outcome = calibrate(cell, PlainOperator(), options)
             took_s = time.perf_counter() - start_s
             if outcome is None:
                 raise RuntimeError("this is no dry run")

@@ -111,12 +111,12 @@ def test_a_push_stops_the_arm_until_a_person_says_go_on(station: Station, config
     say(process, QUESTIONS + FIRST_MOTION)
     wait_for_poses(ftdrive, process, 8)
     station.control(do="push", wrench=[0, 40, 0, 0, 0, 0])
-    said = listen_for(process, "[resume/quit]")
+    said = listen_for(process, "/quit]")
     assert "unexpected contact" in said
     assert not station.control(do="state")["moving"]
     kept = len(ftdrive.poses())
     say(process, "resume\n")
-    assert "not yet: unexpected contact" in listen_for(process, "[resume/quit]")
+    assert "not yet: unexpected contact" in listen_for(process, "/quit]")
     station.control(do="push", wrench=[0, 0, 0, 0, 0, 0])
     _, err = process.communicate("resume\nyes\nyes\n", timeout=60)
     assert process.returncode == 0, err
@@ -134,9 +134,9 @@ def test_after_a_protective_stop_the_operator_clears_it_and_the_tour_goes_on(
     say(process, QUESTIONS + FIRST_MOTION)
     wait_for_poses(ftdrive, process, 2)
     station.control(do="protective-stop")
-    listen_for(process, "[resume/quit]")
+    listen_for(process, "/quit]")
     say(process, "resume\n")
-    assert "not yet" in listen_for(process, "[resume/quit]")
+    assert "not yet" in listen_for(process, "/quit]")
     deadline = time.monotonic() + 10
     while station.control(do="state")["safety_mode"] != "NORMAL":
         station.control(do="unlock")
@@ -157,7 +157,7 @@ def test_a_sensor_that_repeats_itself_stops_the_arm(station: Station, config: Pa
     say(process, QUESTIONS + FIRST_MOTION)
     wait_for_poses(ftdrive, process, 3)
     station.control(do="freeze-sensor", on=True)
-    listen_for(process, "[resume/quit]")
+    listen_for(process, "/quit]")
     assert not station.control(do="state")["moving"]
     station.control(do="freeze-sensor", on=False)
     _, err = process.communicate("resume\nyes\nyes\n", timeout=60)

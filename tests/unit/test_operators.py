@@ -31,6 +31,7 @@ from ftdrive.talk import in_whole_words
 
 FREE = Question("Is the tool free?", assumed="yes")
 MOVE = Question("Type MOVE to let the arm move", ("MOVE",))
+ASKED = Asked(question="?", answer="yes", by="--yes")
 STEP = Question("Next pose?", ("", "stop"))
 
 
@@ -94,9 +95,8 @@ def test_a_word_that_must_be_typed_can_be_refused() -> None:
 
 def test_a_script_reads_events_and_answers_questions() -> None:
     stdin, stdout = io.StringIO("no idea\nMOVE\n"), io.StringIO()
-    operator: Operator = JsonOperator(yes=True, stdin=stdin, stdout=stdout)
+    operator: Operator = JsonOperator(stdin=stdin, stdout=stdout)
     operator.tell(StateChanged(state=State.MOVE, stop=1, stops=25, number=19))
-    assert operator.ask(FREE) == "yes"  # nothing is asked
     assert operator.ask(MOVE) == "MOVE"
     operator.tell(estimated())
     operator.tell(POSE)
@@ -121,25 +121,26 @@ def test_every_event_is_one_line_of_json_and_arrives_at_once() -> None:
 
     stdout = Pipe()
     operator = JsonOperator(stdin=io.StringIO(), stdout=stdout)
-    for event in (Noted(words="two\nlines"), GuardTripped(hazard=7, words="31 N"), Asked(question="?", answer="yes")):
+    for event in (Noted(words="two\nlines"), GuardTripped(hazard=7, words="31 N"), ASKED):
         operator.tell(event)
         assert stdout.flushed.endswith("}\n")
     assert len(stdout.flushed.splitlines()) == 3
     assert json.loads(stdout.flushed.splitlines()[0])["words"] == "two\nlines"
+    assert json.loads(stdout.flushed.splitlines()[2])["by"] == "--yes"
 
 
-def json_operator(typed: str, *, yes: bool = False) -> Operator:
-    return JsonOperator(yes=yes, stdin=io.StringIO(typed), stdout=io.StringIO())
+def json_operator(typed: str) -> Operator:
+    return JsonOperator(stdin=io.StringIO(typed), stdout=io.StringIO())
 
 
-def plain_operator(typed: str, *, yes: bool = False) -> Operator:
-    return PlainOperator(yes=yes, stdin=io.StringIO(typed), stderr=io.StringIO())
+def plain_operator(typed: str) -> Operator:
+    return PlainOperator(stdin=io.StringIO(typed), stderr=io.StringIO())
 
 
 @pytest.mark.parametrize("operator", [json_operator, plain_operator])
 def test_nobody_to_answer_is_no_consent(operator: Callable[..., Operator]) -> None:
     with pytest.raises(Declined, match=r"nobody answered 'Type MOVE to let the arm move:'"):
-        operator("", yes=True).ask(MOVE)  # --yes is not enough for what must be typed
+        operator("").ask(MOVE)
     with pytest.raises(Declined):
         operator("maybe\n").ask(FREE)
 
@@ -161,8 +162,8 @@ def test_plain_lines_tell_what_is_worth_a_line() -> None:
     for event in events:
         operator.tell(event)
     assert operator.ask(MOVE) == "MOVE"
-    operator.tell(Asked(question=MOVE.text, answer="MOVE"))  # stands there already
-    operator.tell(Asked(question=FREE.text, answer="yes"))  # assumed, never shown
+    operator.tell(Asked(question=MOVE.text, answer="MOVE", by="person"))  # stands there already
+    operator.tell(Asked(question=FREE.text, answer="yes", by="--yes"))  # never asked
     assert stderr.getvalue().splitlines() == [
         "preflight",
         "FAIL robot: remote control is off: switch it on",
@@ -176,7 +177,7 @@ def test_plain_lines_tell_what_is_worth_a_line() -> None:
         "Type MOVE to let the arm move: what",
         "'what' is none of the answers.",
         "Type MOVE to let the arm move: MOVE",
-        "Is the tool free? yes",
+        "Is the tool free? yes (--yes)",
     ]
     assert "\x1b" not in stderr.getvalue()
 

@@ -419,10 +419,10 @@ def test_the_screen_draws_asks_and_goes_on() -> None:
         eventually(lambda: shown.text.count("\x1b[?25l") == shown.text.count("\x1b[?25h"))  # the cursor is back
 
 
-def test_yes_answers_what_is_assumed_and_nothing_else() -> None:
+def test_a_person_is_asked_what_a_question_assumes_and_needs_no_keyboard() -> None:
     console = Console(file=io.StringIO(), width=80, height=24)
-    with Screen(console, yes=True, stdin=io.StringIO("MOVE\n")) as operator:
-        assert operator.ask(Question("Free?", assumed="yes")) == "yes"
+    with Screen(console, stdin=io.StringIO("no\nMOVE\n")) as operator:
+        assert operator.ask(Question("Free?", assumed="yes")) == "no"
         assert operator.ask(Question("Go?", ("MOVE",))) == "MOVE"
         assert operator.pressed() is None
 
@@ -456,10 +456,10 @@ def test_ascii_is_longer_and_nothing_is_cut_off_for_it() -> None:
 def test_enter_in_step_mode_leaves_no_line_behind() -> None:
     console = Console(file=(file := io.StringIO()), width=80, height=24, force_terminal=True, color_system=None)
     with Screen(console, stdin=io.StringIO()) as operator:
-        operator.tell(Asked(question="Pose 3 of 25: Enter moves joint 4", answer=""))
-        operator.tell(Asked(question="Is the tool free?", answer="yes"))
+        operator.tell(Asked(question="Pose 3 of 25: Enter moves joint 4", answer="", by="person"))
+        operator.tell(Asked(question="Is the tool free?", answer="yes", by="--yes"))
     assert "Enter moves" not in file.getvalue()
-    assert "Is the tool free? yes" in file.getvalue()
+    assert "Is the tool free? yes (--yes)" in file.getvalue()
 
 
 def test_without_a_terminal_there_are_plain_lines_and_json_where_asked_for() -> None:

@@ -4,7 +4,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -317,6 +317,20 @@ def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> 
     assert len(lab.operator.of(Asked)) == 5
 
 
+def test_the_diary_says_where_nobody_was_asked(lab: Lab) -> None:
+    lab.calibrate(yes=True)  # a first run: --yes answers nothing
+    assert {event.by for event in lab.operator.of(Asked)} == {"person"}
+    lab.operator.told.clear()
+    lab.operator.asked.clear()
+    lab.operator.answers["tool free"] = ["no"]
+    lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 0, 5.0])
+    lab.calibrate(yes=True)
+    assert lab.operator.asked == []
+    answered = [(event.answer, event.by) for event in lab.operator.of(Asked)]
+    assert answered == [(answer, "--yes") for answer in ("yes", "yes", "yes", "MOVE", "yes")]
+    assert all(in_words(event).endswith(f"{event.answer} (--yes)") for event in lab.operator.of(Asked))
+
+
 @pytest.mark.parametrize("word", ["tool free", "ball", "emergency stop in reach", "MOVE"])
 def test_without_an_answer_nothing_moves(word: str, lab: Lab) -> None:
     lab.operator.answers[word] = ["no"]
@@ -402,6 +416,29 @@ def test_a_run_that_was_ended_does_not_count_as_complete(lab: Lab) -> None:
     assert len(lab.arm.moves) == 1
 
 
+def test_only_a_run_with_every_pose_counts_as_complete(lab: Lab) -> None:
+    lab.operator.answers["Pose 3 of 7"] = ["s"]
+    lab.operator.answers["Pose 7 of 7"] = ["s"]
+    lab.calibrate(mode="step")
+    run = lab.run()
+    key = "A1", str(Plan.load(run.plan_path).to_dict()["sha256"])
+    assert not has_completed(*key)
+    lab.operator.answers["Pose 7 of 7"] = ["s"]
+    lab.calibrate(resume=run.folder, mode="step", fast=True)
+    assert lab.stops() == [1, 2, 3, 4, 5, 6]
+    assert not has_completed(*key)
+    lab.calibrate(resume=run.folder)
+    assert has_completed(*key)
+
+
+def test_a_run_in_which_nothing_moved_does_not_count_as_complete(lab: Lab) -> None:
+    lab.operator.answers["Pose "] = ["s"] * 6
+    with pytest.raises(Declined, match="ended before the first pose"):
+        lab.calibrate(mode="step")
+    assert lab.arm.moves == []
+    assert not has_completed("A1", str(Plan.load(lab.run().plan_path).to_dict()["sha256"]))
+
+
 def test_a_dry_run_shows_all_and_moves_nothing(lab: Lab) -> None:
     assert lab.calibrate(dry_run=True) is None
     assert lab.arm.moves == []
@@ -443,6 +480,37 @@ def test_a_way_that_moves_the_whole_arm_asks_for_its_room(lab: Lab) -> None:
         any(word in text and "base 20°" in text and "whole arm" in text for text in texts)
         for word in ("Is the ball of", "Type MOVE")
     )
+
+
+@pytest.mark.parametrize(("away_deg", "assumed"), [((0.0, 0.0), True), ((0.0, 9.0), True), ((9.0, 0.0), False)])
+def test_a_way_of_the_whole_arm_is_confirmed_by_a_person_though_the_plan_is_known(
+    away_deg: tuple[float, float], assumed: bool, lab: Lab
+) -> None:
+    lab.calibrate()
+    plan = lab.run().plan_path
+    lab.operator.asked.clear()
+    elbow, wrist = away_deg
+    lab.arm.q = lab.arm.q + np.radians([0, 0, elbow, 0, 0, wrist])
+    lab.calibrate(plan=plan, fast=True)
+    texts = {question.text: question.assumed is not None for question in lab.operator.asked}
+    assert [texts[text] for text in texts if text.startswith("Is the")] == [assumed] * 3
+    (way,) = [texts[text] for text in texts if "Type MOVE" in text]
+    assert way == assumed
+
+
+def test_a_run_that_goes_on_from_elsewhere_is_confirmed_by_a_person(lab: Lab) -> None:
+    lab.calibrate()  # trusted from here on
+    for joint, assumed in ((5, True), (0, False)):
+        lab.operator.asked.clear()
+        lab.operator.told.clear()
+        lab.arm.moves.clear()
+        lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
+        with pytest.raises(Declined):
+            lab.calibrate()
+        lab.arm.q = lab.arm.q + np.radians(9.0) * (np.arange(6) == joint)
+        lab.operator.asked.clear()
+        lab.calibrate(resume=Path(lab.operator.of(RunOpened)[-1].folder))
+        assert [question.assumed is not None for question in lab.operator.asked] == [assumed] * 4
 
 
 def test_the_browser_is_waited_for(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -781,6 +849,90 @@ def test_resume_before_the_cause_is_mended_is_not_believed(lab: Lab) -> None:
     assert len(lab.arm.moves) == 3
 
 
+def push_on_the_way(lab: Lab, *moves: int) -> None:
+    """Let something be in the way of these moves, and be gone when a person is asked."""
+
+    def push() -> None:
+        lab.sensor.push = np.array([150.0, 0, 0, 0, 0, 0])
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, StateChanged) and event.state is State.HOLD:
+            lab.sensor.push = np.zeros(6)
+
+    lab.arm.at_move |= dict.fromkeys(moves, push)
+    lab.operator.on_event = on_event
+
+
+def holds(lab: Lab) -> list[tuple[str, ...]]:
+    return [question.answers for question in lab.operator.asked if "resume" in question.answers]
+
+
+def goals(lab: Lab) -> list[int]:
+    """Poses that the arm was sent to, by their place in the plan."""
+    nodes = np.array([step.q_rad for step in Plan.load(lab.run().plan_path).steps])
+    return [int(np.abs(nodes - goal).max(axis=1).argmin()) + 1 for goal, *_ in lab.arm.moves]
+
+
+def test_after_a_contact_the_arm_goes_back_or_round_it_where_a_person_says_so(lab: Lab) -> None:
+    push_on_the_way(lab, 4, 5, 7)  # to pose 4, back to pose 3, to pose 4 again
+    lab.operator.answers["Type resume"] = ["back", "back", "resume", "skip"]
+    lab.calibrate()
+    anywhere = ("resume", "skip", "back", "quit")
+    assert holds(lab) == [anywhere, anywhere, ("resume", "skip", "quit"), anywhere]
+    assert [event.hazard for event in lab.operator.of(GuardTripped)] == [14, 14, 14]
+    assert goals(lab) == [1, 2, 3, 4, 3, 3, 4, 5, 6, 1]
+    assert max(speed for _, speed, _ in lab.arm.moves[4:6]) <= np.radians(10) + 1e-9
+    ways = [question.text for question in lab.operator.asked if question.text.startswith("The arm goes the way")]
+    assert [text.split(" at ")[0].split("way ")[1] for text in ways] == [
+        "to pose 1",
+        "back to pose 3",
+        "back to pose 3",
+        "to pose 4",
+        "to pose 5",
+    ]
+    reasons = [event.words for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
+    assert reasons[2].startswith("back at pose 3; what stopped the arm: unexpected contact")
+    assert taken(lab) == [1, 2, 3, 5, 6, 7]
+    assert "skipped: pose 4, the arm goes on to pose 5" in said(lab)
+
+
+def test_the_way_back_is_confirmed_by_a_person_though_the_plan_is_known(lab: Lab) -> None:
+    lab.calibrate()  # trusted from here on
+    for answer, words in (("resume", "the way to pose 4"), ("back", "the way back to pose 3")):
+        lab.operator.asked.clear()
+        lab.arm.moves.clear()
+        push_on_the_way(lab, 3)
+        lab.operator.answers["Type resume"] = [answer, "quit"]
+        lab.operator.answers["the way back"] = ["no"]
+        with suppress(Declined):
+            lab.calibrate()
+        (way,) = [question for question in lab.operator.asked if words in question.text]
+        assert (way.assumed is None) == (answer == "back")
+    assert len(lab.arm.moves) == 3
+
+
+def test_back_is_offered_only_on_the_way_from_a_pose_that_was_not_skipped(lab: Lab) -> None:
+    press(lab, (Key.PAUSE, StateChanged, 1), (Key.PAUSE, PoseTaken, 2))  # on the first approach; where the arm stands
+    lab.operator.answers["Type resume"] = ["resume"] * 3
+
+    def skip_then_pause() -> None:
+        if len(lab.arm.moves) == 5 and not done:
+            done.append(True)
+            lab.operator.keys.append(Key.SKIP)
+            lab.arm.at_move[6] = lambda: lab.operator.keys.append(Key.PAUSE)
+
+    done: list[bool] = []
+    lab.sensor.collecting = skip_then_pause
+    lab.calibrate()
+    assert holds(lab) == [("resume", "skip", "quit")] * 3
+
+
+def test_a_pause_with_nobody_to_end_it_is_no_fault(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
+    with pytest.raises(Declined, match="paused by a person"):
+        lab.calibrate()
+
+
 def test_resume_with_something_still_pushing_is_not_believed_though_nobody_knows_the_tool(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: setattr(lab.sensor, "push", np.array([150.0, 0, 0, 0, 0, 0]))
     lab.operator.answers["Type resume"] = ["resume", "quit"]
@@ -939,6 +1091,13 @@ def test_skip_with_no_pose_under_way_skips_none(lab: Lab) -> None:
     assert "none is under way" in said(lab)
 
 
+def test_keep_has_nothing_to_do_in_a_tour_and_says_so(lab: Lab) -> None:
+    press(lab, (Key.KEEP, PoseTaken, 3))
+    lab.calibrate()
+    assert taken(lab) == [1, 2, 3, 4, 5, 6, 7]
+    assert said(lab).count("a pose is kept by itself; r takes it again") == 1
+
+
 def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> None:
     def redo() -> None:
         if len(lab.arm.moves) == 8 and not again:
@@ -1032,6 +1191,19 @@ def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None
     assert [event.stop for event in lab.operator.of(PoseTaken)] == [3]
     assert run.calibration_path.name == "calibration-2.json"
     assert (run.folder / "calibration.json").read_bytes() == first
+
+
+@pytest.mark.parametrize(
+    ("begun", "asked", "in_steps"), [("step", "auto", True), ("auto", "step", True), ("auto", "auto", False)]
+)
+def test_a_run_goes_on_in_its_own_mode_or_in_steps(begun: str, asked: str, in_steps: bool, lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined):
+        lab.calibrate(mode=begun)
+    lab.operator.asked.clear()
+    lab.calibrate(resume=lab.run().folder, mode=asked)
+    steps = [question.text.split(",")[0] for question in lab.operator.asked if "Enter" in question.text]
+    assert steps == [f"Pose {stop} of 7" for stop in (4, 5, 6, 7) if in_steps]
 
 
 def test_a_resumed_run_is_open_with_its_poses_before_anything_is_checked(lab: Lab) -> None:
