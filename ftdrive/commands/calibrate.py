@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import JSON, RUNS, rows, stop_unless_accepted, write_json
+from ftdrive.commands.common import JSON, rows, runs, stop_unless_accepted, write_json
 
 if TYPE_CHECKING:
     from ftdrive.config import CellConfig
@@ -54,7 +54,7 @@ _EXCLUDE_ONE_ANOTHER = (
 )
 @click.option("--redo", type=int, multiple=True, metavar="N", help="With --resume: take pose N again. Repeatable.")
 @click.option("--yes", is_flag=True, help="Answer what may be answered without a person; never the first motion.")
-@RUNS
+@runs()
 @JSON
 def calibrate(
     config: Path | None,
