@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import sys
 import time
 from collections.abc import Iterable
 from typing import Any
@@ -9,8 +10,12 @@ from typing import Any
 import can
 from can.interfaces.slcan import slcanBus
 
+from drivers._serial import refusal
 from drivers._stream import LINK_ERRORS
 from drivers.errors import ConnectError, StreamBroken
+
+if sys.platform != "win32":
+    import fcntl
 
 BUS_ERRORS = (can.CanError, ValueError, *LINK_ERRORS)
 _SEND_S = 0.1
@@ -39,6 +44,8 @@ class CanBus:
         self._bitrate = bitrate
         self._identifiers = frozenset(identifiers)
         self._bus: can.BusABC | None = None
+        self._lock: int | None = None
+        """What keeps the serial port of an slcan adapter ours, a file descriptor."""
         self.malformed = 0
         """Lines of an slcan adapter that are no frame."""
 
@@ -49,9 +56,10 @@ class CanBus:
             {"can_id": identifier, "can_mask": 0x7FF, "extended": False} for identifier in self._identifiers
         ]
         options: dict[str, Any] = {}
+        tty = self._channel
         if self._interface == "slcan":
             # python-can waits 2 s for adapters that reboot when their port is opened; a pseudo-terminal does not
-            tty = self._channel.split("@", maxsplit=1)[0]
+            tty = tty.split("@", maxsplit=1)[0]
             with contextlib.suppress(OSError):  # the link to an adapter may vanish while it is followed
                 tty = os.path.realpath(tty)
             if not os.access(tty, os.R_OK | os.W_OK):
@@ -59,6 +67,8 @@ class CanBus:
             if tty.startswith("/dev/pts/"):
                 options["sleep_after_open"] = 0.0
         try:
+            if self._interface == "slcan":
+                self._take(tty)
             self._bus = can.Bus(
                 self._channel,
                 interface=self._interface,
@@ -67,23 +77,34 @@ class CanBus:
                 ignore_config=True,
                 **options,
             )
-        except (NotImplementedError, *BUS_ERRORS) as exc:
-            raise ConnectError(
-                f"{self._owner}: the bus does not open ({exc}); is the adapter plugged in, and on socketcan "
-                f"'ip link set {self._channel} up type can bitrate {self._bitrate}' done?"
-            ) from exc
+        except Exception as exc:  # an adapter whose library is missing fails in a way of its own
+            self.close()
+            cure = "is the adapter plugged in, and is what python-can needs for it installed?"
+            if self._interface == "socketcan":
+                up = f"sudo ip link set {self._channel} up type can bitrate {self._bitrate}"
+                cure = f"is the adapter plugged in, and '{up}' done?"
+            raise refusal(self._owner, tty, exc, f"the bus does not open ({exc}); {cure}") from exc
+
+    def _take(self, tty: str) -> None:
+        """Take a serial port for this process alone, before python-can speaks to the adapter: it would not ask."""
+        if sys.platform != "win32":  # where a port opens only once
+            self._lock = os.open(tty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def close(self) -> None:
         """Leave the bus. Idempotent."""
         bus, self._bus = self._bus, None
-        if bus is None:
-            return
-        with contextlib.suppress(*BUS_ERRORS):
-            bus.shutdown()
-        # the slcan bus says goodbye before it closes its port, and skips the second when the first fails
-        if port := getattr(bus, "serialPortOrig", None):
-            with contextlib.suppress(*LINK_ERRORS):
-                port.close()
+        if bus is not None:
+            with contextlib.suppress(*BUS_ERRORS):
+                bus.shutdown()
+            # the slcan bus says goodbye before it closes its port, and skips the second when the first fails
+            if port := getattr(bus, "serialPortOrig", None):
+                with contextlib.suppress(*LINK_ERRORS):
+                    port.close()
+        lock, self._lock = self._lock, None
+        if lock is not None:
+            with contextlib.suppress(OSError):
+                os.close(lock)
 
     def send(self, identifier: int, data: bytes) -> None:
         """Send one data frame. Raises `StreamBroken`."""

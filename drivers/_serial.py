@@ -1,15 +1,25 @@
 """A serial port that fails in our words: opened once, every wait bounded."""
 
 import contextlib
+import errno
 import os
+import shlex
 
 import serial
 
 from drivers._parity import Unmarker, ask_for_marks
 from drivers._stream import LINK_ERRORS
-from drivers.errors import ConnectError, StreamBroken
+from drivers.errors import ConnectError, PortInUse, StreamBroken
 
 _WRITE_S = 0.2
+
+
+def refusal(owner: str, path: str, error: Exception, otherwise: str) -> ConnectError:
+    """Say that another program has a port, where the error of opening it tells so; else what is given."""
+    if isinstance(error, OSError) and error.errno in {errno.EAGAIN, errno.EBUSY}:
+        cure = f"end it, `fuser -v {shlex.quote(path)}` names it"
+        return PortInUse(f"{owner}: the port is in use by another program: {cure}")
+    return ConnectError(f"{owner}: {otherwise}")
 
 
 class SerialPort:
@@ -56,9 +66,8 @@ class SerialPort:
             self._marks = Unmarker() if self._even_parity and ask_for_marks(self._port) else None
         except (ValueError, *LINK_ERRORS) as exc:
             self.close()
-            raise ConnectError(
-                f"{self._owner}: the port does not open ({exc}); is it plugged in, free, and are you in its group?"
-            ) from exc
+            otherwise = f"the port does not open ({exc}); is it plugged in, free, and are you in its group?"
+            raise refusal(self._owner, self._path, exc, otherwise) from exc
         with contextlib.suppress(ValueError, NotImplementedError, *LINK_ERRORS):
             self._port.set_low_latency_mode(True)  # a courtesy of some adapters: 1 ms instead of 16 ms
 

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, Frozen, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
 
 if sys.platform == "win32":
@@ -468,7 +468,7 @@ class StreamingSensor(ForceTorqueSensor):
         fewest, most = _FROZEN_SAMPLES
         enough = most if math.isnan(self._nominal_Hz) else min(most, max(fewest, _FROZEN_S * self._nominal_Hz))
         if self._same_rows >= enough and same_s >= _FROZEN_S:
-            raise DeviceFault(
+            raise Frozen(
                 f"{self.name}: frozen, {self._same_rows} identical samples in {same_s:.2f} s, and a sensor that "
                 "measures has noise; power it off and on"
             )
@@ -536,10 +536,11 @@ class StreamingSensor(ForceTorqueSensor):
             self._rate_is_wrong = True
             self._note(f"rate {rate_Hz:.1f} Hz instead of {self._nominal_Hz:g} Hz")
             log.warning(
-                "%s: %.1f Hz instead of %g Hz; samples are lost or the sensor is set differently, look at health()",
+                "%s: %.1f Hz instead of %g Hz; samples %s or the sensor is set differently, look at health()",
                 self.name,
                 rate_Hz,
                 self._nominal_Hz,
+                "are lost" if rate_Hz < self._nominal_Hz else "come twice",
             )
 
     def _let_go(self) -> None:
@@ -565,10 +566,14 @@ class StreamingSensor(ForceTorqueSensor):
         return (time.monotonic_ns() - self._fresh_from_ns) / 1e9
 
     def _stale(self, age_s: float) -> DeviceTimeout:
-        hint = "check cable and supply"
+        hint = self._why_silent()
         if self._was_away(awake_s() - self._turn_s) or not self._is_back:
             hint = "nobody read, for this program or computer was suspended or too busy: try again"
         return DeviceTimeout(f"{self.name}: silent for {age_s:.3f} s (allowed: {self._stale_after_s:g} s); {hint}")
+
+    def _why_silent(self) -> str:
+        """Say what to do about a silence; a subclass may know more."""
+        return "check cable and supply"
 
     def _raise_failure(self) -> None:
         if self._failure is not None:

@@ -2,10 +2,12 @@
 
 DriverError
 ├── ConnectError     the device could not be opened, or is not what it should be
+│   └── PortInUse    another program has its port
 ├── StreamBroken     the connection was lost after it had worked
 ├── DeviceTimeout    nothing arrived in time (also a TimeoutError)
 ├── ProtocolError    bytes arrived that the document does not allow
 └── DeviceFault      the device itself reports a fault: sensor status, protective or emergency stop
+    └── Frozen       a sensor says the same again and again
 
 Every message says what happened, with the value, and what to do next.
 """
@@ -17,6 +19,10 @@ class DriverError(Exception):
 
 class ConnectError(DriverError):
     """The device could not be opened, or is not what it should be."""
+
+
+class PortInUse(ConnectError):
+    """Another program has the port of the device."""
 
 
 class StreamBroken(DriverError):
@@ -33,3 +39,7 @@ class ProtocolError(DriverError):
 
 class DeviceFault(DriverError):
     """The device reports a fault of its own."""
+
+
+class Frozen(DeviceFault):
+    """A sensor says the same again and again, and one that measures has noise."""

@@ -10,9 +10,9 @@ come, with `time.monotonic_ns()` as `t_ns`:
 {"t_ns", "event": "end", ...}   what the driver made of it, or the error it ended with
 
 Where `parity_marks` is true, the bytes that were read hold the marks of `drivers/_parity.py`; older transcripts do not
-say it and hold none. An slcan adapter is on a serial port too. The frames of any other CAN interface are written as the
-lines that an slcan adapter would carry, and such an adapter plays them; what python-can tells it is not compared.
-Ethernet is not recorded.
+say it and hold none. Some CAN adapters, such as those of slcan, are on a serial port too. The frames of any other CAN
+interface are written as the lines that an slcan adapter would carry, and such an adapter plays them; what python-can
+tells it is not compared. Ethernet is not recorded.
 """
 
 import contextlib
@@ -30,7 +30,6 @@ from urllib.parse import parse_qsl, urlencode, urlsplit
 
 import can
 import serial
-from can.interfaces.slcan import slcanBus
 
 from drivers._parity import leave_marks_to_far_side, marks_asked_for
 
@@ -75,7 +74,11 @@ class Writer:
         self._lock = threading.Lock()
         self._received = bytearray()
         self._received_ns = 0
-        self._file: IO[str] | None = self._partial.open("x", encoding="utf-8")
+        try:
+            self._file: IO[str] | None = self._partial.open("x", encoding="utf-8")
+        except OSError as error:
+            cure = "give a file in a folder that exists and is yours"
+            raise OSError(f"{path} cannot be written ({error.strerror}): {cure}") from error
         self._line({"format": FORMAT, **header})
 
     def event(self, name: str, **content: Any) -> None:
@@ -133,6 +136,7 @@ def recording(writer: Writer) -> Iterator[None]:
     They are those of pyserial and python-can, with the driver's own settings: the device sees no difference.
     """
     plain, plain_bus = serial.Serial, can.Bus
+    opened: list[serial.Serial] = []
 
     class RecordedPort(serial.Serial):
         _told = False
@@ -140,6 +144,7 @@ def recording(writer: Writer) -> Iterator[None]:
         def open(self) -> None:
             super().open()
             self._told = False
+            opened.append(self)
 
         def _tell(self) -> None:
             """Note how the port is set: at its first use, for who opens it sets the marks after pyserial is done."""
@@ -168,8 +173,9 @@ def recording(writer: Writer) -> Iterator[None]:
             super().reset_input_buffer()
 
     def recorded_bus(channel: str, **options: Any) -> can.BusABC:
+        before = len(opened)
         bus = plain_bus(channel, **options)
-        if isinstance(bus, slcanBus):  # on a recorded port
+        if len(opened) > before:  # it is on a recorded port, like slcan
             return bus
         writer.event("open", port=channel, frames=True)
         receive, send = bus.recv, bus.send

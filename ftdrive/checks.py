@@ -25,6 +25,7 @@ DEV = Path("/dev")
 _CAN_INTERFACE = "280"
 """ARPHRD_CAN, in /sys/class/net/*/type."""
 _ON_SERIAL = ("ati-serial", "bota", "robotiq-ft300", "robotous-serial")
+_ON_ETHERNET = ("ati-netft", "ur-ft")
 _FREE_BYTES = 1_000_000_000
 
 
@@ -75,12 +76,17 @@ class SensorAddress:
         return self.address if on_socketcan else None
 
     @property
+    def host(self) -> str | None:
+        """Whom it is asked from over Ethernet."""
+        return self.address.partition("/")[0] if self.scheme in _ON_ETHERNET else None
+
+    @property
     def place(self) -> str | None:
         """What `ftdrive devices --probe` takes to ask who is there; None where it cannot."""
         if not self.scheme.endswith("-can"):
             return None if self.serial_port is None else str(self.serial_port)
         base = {key: self.options[key] for key in ("base",) if key in self.options}
-        if self.serial_port is not None:
+        if self.options.get("interface") == "slcan":
             return f"slcan://{self.address}?{urlencode({'bitrate': self.bitrate} | base)}"
         return f"socketcan://{self.address}?{urlencode(base)}" if self.can_interface and base else self.can_interface
 

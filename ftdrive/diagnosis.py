@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib import CalibrationResult
 from calib.design import Guess, predicted_sigma, special
 from calib.noise import is_stationary, mean_and_covariance
-from drivers.errors import ConnectError, DeviceFault, DriverError, ProtocolError
+from drivers.errors import ConnectError, DeviceFault, DriverError, Frozen, PortInUse, ProtocolError
 from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
 from drivers.ur.kinematics import MODELS
 from ftdrive.checks import Check, SensorAddress, State, latency_command
@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 _PUSH_N = 2.0
 _SERVICES = "Settings, Security, Services"
+_BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs on this computer"
 _SLOWEST_SLIDER = 0.05
 _OLDEST_MINOR = 4
 """Of PolyScope 3 and 5: ur_rtde cannot control older ones."""
@@ -39,13 +40,17 @@ _SAYS: Mapping[str, str] = MappingProxyType(
 )
 
 
+def who(info: DeviceInfo) -> str:
+    """Name a device in words."""
+    return f"{info.model}, serial {info.serial}, firmware {info.firmware}"
+
+
 def check_identity(info: DeviceInfo) -> list[Check]:
     """Say who a sensor is and what its numbers mean, and from where each of it is known."""
-    who = f"{info.model}, serial {info.serial}, firmware {info.firmware}"
-    identity = Check("sensor.identity", "ok", who)
+    identity = Check("sensor.identity", "ok", who(info))
     if "serial" not in info.facts:
         fix = "add serial=… (its label) to the sensor's address, so that a calibration knows its sensor"
-        identity = Check("sensor.identity", "warning", who, fix)
+        identity = Check("sensor.identity", "warning", who(info), fix)
     facts = info.facts
     return [
         identity,
@@ -84,8 +89,12 @@ def check_sensor_error(name: str, error: DriverError, address: SensorAddress, pe
     """Say what to do about the error of a sensor's driver: the port first, then the kind of error."""
     wrong = next((check for check in permissions if check.state == "failed"), None)
     kind = error.__cause__ if isinstance(error, ConnectError) and isinstance(error.__cause__, DriverError) else error
+    if isinstance(kind, PortInUse):
+        return Check(name, "failed", *found_and_cure(kind, "end the other program"))
     if wrong is not None and wrong.fix is not None and not isinstance(kind, DeviceFault):
         cure = wrong.fix
+    elif isinstance(kind, Frozen):
+        cure = "switch the sensor off and on; if it is loaded, take the load off first"
     elif isinstance(kind, DeviceFault):
         cure = "take what loads it off, switch the sensor off and on, then ftdrive doctor again"
     elif isinstance(kind, ProtocolError):
@@ -97,16 +106,16 @@ def check_sensor_error(name: str, error: DriverError, address: SensorAddress, pe
 
 def _ask_who(address: SensorAddress) -> str:
     """Give the command that shows whether anybody answers there."""
-    if address.place is None:
-        return f"ping {address.address.partition('/')[0]}"
-    return f"ftdrive devices --probe {shlex.quote(address.place)}"
+    if address.host is not None:
+        return f"ping {address.host}"
+    return "ftdrive doctor again" if address.place is None else f"ftdrive devices --probe {shlex.quote(address.place)}"
 
 
 def check_stream(samples: FtSamples, health: Health, address: SensorAddress, duration_s: float) -> list[Check]:
     """Judge two seconds of a sensor: rate, losses, age, status."""
     return [
         _check_rate(len(samples) / duration_s, health.nominal_rate_Hz, address),
-        _check_lost(health),
+        _check_lost(health, address),
         Check("sensor.age", "ok", f"the newest sample is {1e3 * health.age_s:.1f} ms old"),
         _check_status(samples.status),
     ]
@@ -115,23 +124,28 @@ def check_stream(samples: FtSamples, health: Health, address: SensorAddress, dur
 def _check_rate(rate_Hz: float, nominal_Hz: float, address: SensorAddress) -> Check:
     if math.isnan(nominal_Hz):
         return Check("sensor.rate", "ok", f"{rate_Hz:.0f} Hz (as fast as it answers, or as it is set)")
-    found = f"{rate_Hz:.1f} Hz (nominal {nominal_Hz:g})"
-    if rate_Hz > 0.95 * nominal_Hz:
+    found, share = f"{rate_Hz:.1f} Hz (nominal {nominal_Hz:g})", rate_Hz / nominal_Hz
+    if 0.95 < share < 1.1:
         return Check("sensor.rate", "ok", found)
     port = address.serial_port
     fix = "close other programs, and try another USB port or cable"
-    if port is not None and (tty := port.resolve().name).startswith("ttyUSB"):
+    if share > 1:
+        fix = "records come twice, or the sensor is set differently: set its rate anew, then ftdrive doctor again"
+    elif address.host is not None:
+        fix = _BETTER_NETWORK
+    elif port is not None and (tty := port.resolve().name).startswith("ttyUSB"):
         fix = latency_command(tty)
-    return Check("sensor.rate", "failed" if rate_Hz < 0.5 * nominal_Hz else "warning", found, fix)
+    return Check("sensor.rate", "warning" if 0.5 < share < 1.5 else "failed", found, fix)
 
 
-def _check_lost(health: Health) -> Check:
+def _check_lost(health: Health, address: SensorAddress) -> Check:
     found = f"{health.lost} lost, {health.malformed} damaged of {health.received}"
     bad = max(health.lost, health.malformed)
     if not bad:
         return Check("sensor.lost", "ok", found)
     state: State = "failed" if bad > 0.01 * health.received else "warning"
-    return Check("sensor.lost", state, found, "check the cable, its shield and the termination of the bus")
+    fix = "check the cable, its shield and the termination of the bus" if address.host is None else _BETTER_NETWORK
+    return Check("sensor.lost", state, found, fix)
 
 
 def _check_status(status: NDArray[np.uint32]) -> Check:
@@ -207,6 +221,7 @@ def check_unreachable(error: DriverError, host: str) -> Check:
     elif "name the model" in cure:
         cure = f'write model = "ur5e" under [robot] in ftdrive.toml, or give --model; it is one of {", ".join(MODELS)}'
     elif "the dashboard server of" in found:
+        found = str(error).rstrip(".")  # what it says is no cure
         cure = f"enable the dashboard server at the pendant under {_SERVICES}; restart the controller if it is"
     return Check("robot.reachable", "failed", found, cure)
 
@@ -267,10 +282,13 @@ def _check_speed(status: ArmStatus) -> Check:
 def _check_payload(status: ArmStatus) -> Check:
     name = "robot.payload"
     if status.payload_kg is None or status.p_flange_payload_m is None:
-        return Check(name, "skipped", "not applicable: this PolyScope does not tell its payload")
+        return Check(name, "skipped", "not applicable: this controller does not tell its payload")
     if not status.payload_kg:
         fix = "set mass and centre of mass of all that hangs on the flange at the pendant; else the arm may stop itself"
         return Check(name, "warning", "the controller was told of no payload", fix)
+    if not any(status.p_flange_payload_m):
+        found = f"payload {status.payload_kg:.2f} kg, its centre in the middle of the flange face, where nothing hangs"
+        return Check(name, "warning", found, "set the centre of gravity at the pendant: Installation, Payload")
     where = ", ".join(f"{1e3 * value:.0f}" for value in status.p_flange_payload_m)
     return Check(name, "ok", f"payload {status.payload_kg:.2f} kg at ({where}) mm from the flange")
 

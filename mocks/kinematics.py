@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
 """Six joint values or a UR pose: plain floats, because the 500 Hz loop is scalar arithmetic."""
 
@@ -51,6 +52,12 @@ def vector6(values: Sequence[float] | Array) -> Vector6:
     """Six plain floats out of any sequence of six numbers."""
     a, b, c, d, e, f = (float(v) for v in values)
     return (a, b, c, d, e, f)
+
+
+def vector3(values: Sequence[float] | Array) -> Vector3:
+    """Three plain floats out of any sequence of three numbers."""
+    x, y, z = (float(v) for v in values)
+    return (x, y, z)
 
 
 def _nominal(lengths: Vector6, speeds_deg_s: Sequence[float]) -> Dh:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from mocks.kinematics import MODELS, Array, Vector6, rotation, vector6
+from mocks.kinematics import MODELS, Array, Vector6, rotation, vector3, vector6
 from mocks.sensors import WRIST, Sensor
 from mocks.ur.operator import Operator
 from mocks.ur.robot import Robot, RobotSettings
@@ -107,6 +107,7 @@ class Station:
                 serial_number=options.serial_number,
                 tcp=vector6(options.tcp),
                 payload_kg=options.payload,
+                payload_cog_m=vector3(options.payload_cog),
                 joint_limit_rad=math.radians(options.joint_limit_deg),
                 plane=options.plane,
                 unknown_outputs=frozenset({"tcp_offset"} if options.no_tcp_offset else ()),

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 COMMAND, FIRST_HALF, SECOND_HALF = 0x64, 0x01, 0x02
 BITRATE = 1_000_000
 _WAIT_S = 0.05
+_HEARD_S = 0.15
+"""Since the last half: shorter than the silence that is an error, longer than the slowest sensor's period."""
 _OVERSLEPT_S = 0.002
 """Where a wait ends so much too late the host was busy, and frames may be there: it has to look once more."""
 
@@ -33,11 +35,17 @@ class CanLink:
         self.fastest_Hz = 1000
         self._bus = CanBus(self.name, channel, interface, BITRATE, (FIRST_HALF, SECOND_HALF))
         self._halves = Halves()
+        self._heard_ns: int | None = None
 
     @property
     def damaged(self) -> int:
         """Samples that are missing, by the clock, or were not certain to be whole."""
         return self._halves.lost
+
+    @property
+    def unpaired(self) -> bool:
+        """Whether halves come: where no fields do, they are not believed, as on a computer that is too busy."""
+        return self._heard_ns is not None and time.monotonic_ns() - self._heard_ns < _HEARD_S * 1e9
 
     def open(self) -> None:
         """Join the bus."""
@@ -64,7 +72,8 @@ class CanLink:
             fields: list[Field] = []
             if frame := self._bus.receive(wait_s):
                 identifier, data = frame
-                self._halves.take(time.monotonic_ns(), data, second=identifier == SECOND_HALF)
+                self._heard_ns = time.monotonic_ns()
+                self._halves.take(self._heard_ns, data, second=identifier == SECOND_HALF)
                 overslept = False
             elif overslept or time.monotonic() - begin_s < wait_s + _OVERSLEPT_S:
                 fields = self._halves.silence()

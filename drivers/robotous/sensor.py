@@ -34,6 +34,10 @@ class Link(Protocol):
     def damaged(self) -> int:
         """How many fields arrived damaged or in part."""
 
+    @property
+    def unpaired(self) -> bool:
+        """Whether what comes at this moment makes no fields."""
+
     def open(self) -> None:
         """Open the wire."""
 
@@ -125,6 +129,11 @@ class RobotousSensor(StreamingSensor):
             self._link.send(codec.encode(Command.STOP))
         finally:
             self._link.close()
+
+    def _why_silent(self) -> str:
+        if self._link.unpaired:
+            return "frames come but cannot be paired: give this computer less to do"
+        return super()._why_silent()
 
     def _ask(self, command: Command, *parameters: int) -> bytes:
         """Stop whatever streams, send a command and return the field that answers it."""

@@ -35,6 +35,11 @@ class SerialLink:
         """Frames thrown away."""
         return self._frames.damaged
 
+    @property
+    def unpaired(self) -> bool:
+        """Never: a frame is whole or none."""
+        return False
+
     def open(self) -> None:
         """Open the port."""
         self._frames = _new_deframer()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import RUNS, rows, stop_unless_accepted, write_json
+from ftdrive.commands.common import rows, runs, stop_unless_accepted, write_json
 
 if TYPE_CHECKING:
     from ftdrive.config import CellConfig
@@ -58,7 +58,7 @@ _EXCLUDE_ONE_ANOTHER = (
     is_flag=True,
     help="Answer what may be answered without a person; never a first run, nor a way of the whole arm.",
 )
-@RUNS
+@runs()
 @click.option(
     "--json", "as_json", is_flag=True, help="One JSON object a line on stdout: events, questions, the result."
 )

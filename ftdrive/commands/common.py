@@ -14,13 +14,12 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
-RUNS = click.option(
-    "--runs",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("runs"),
-    show_default=True,
-    help="Folder in which the run's own folder is made.",
-)
+
+
+def runs(words: str = "Folder in which the run's own folder is made.") -> Callable[[F], F]:
+    """Make the option --runs."""
+    kind = click.Path(file_okay=False, path_type=Path)
+    return click.option("--runs", type=kind, default=Path("runs"), show_default=True, help=words)
 
 
 CONFIG = click.option(

@@ -6,7 +6,7 @@ from typing import Any
 import click
 import numpy as np
 
-from ftdrive.commands.common import JSON, RUNS, stop_unless_accepted, write_json
+from ftdrive.commands.common import JSON, runs, stop_unless_accepted, write_json
 from ftdrive.rehearsal import rehearse
 from ftdrive.report import errors_in_sigma, print_result
 from ftdrive.simulation import SENSORS, Station
@@ -17,7 +17,7 @@ from ftdrive.talk import talk
 @click.option("--sensor", type=click.Choice(list(SENSORS)), default="can", show_default=True, help="Which one.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Draws the truth and the noise.")
 @click.option("--simulate", is_flag=True, expose_value=False, help="As every command has it; a demo always is.")
-@RUNS
+@runs()
 @JSON
 def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
     """Calibrate an emulated cell: nothing is connected, nothing real moves.

@@ -24,7 +24,7 @@ A PLACE is
 @click.option(
     "--probe", "places", multiple=True, metavar="PLACE", help="Ask which known sensors are there; may be repeated."
 )
-@simulate("Show the ports of an emulated cell instead.")
+@simulate("Show the two ports of an emulated cell instead, and ask which sensors are there.")
 @JSON
 def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
     """List serial ports by id and CAN interfaces, and known sensors that answer where you tell it to ask.
@@ -32,9 +32,9 @@ def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
     Nothing is opened and no byte is sent, except at each PLACE: there it listens, and then sends requests to read in
     the protocols of the sensors it knows. Do not probe a serial port with something else on it.
 
-    On CAN, ATI sensors are looked for at base identifier 0x20 (another: socketcan://can0?base=0x7F), Robotous sensors
-    at 1 Mbit/s only. Where something else sends on the identifiers of a sensor, nothing is sent and you are told.
-    A wrong bit rate disturbs a bus in use.
+    Of CAN adapters only those of the kernel (can0) and slcan can be asked. ATI sensors are looked for at base
+    identifier 0x20 (another: socketcan://can0?base=0x7F), Robotous sensors at 1 Mbit/s only. Where something else sends
+    on the identifiers of a sensor, nothing is sent and you are told. A wrong bit rate disturbs a bus in use.
     """
     check_simulate(simulate, real={"--probe": places})
     found = _emulated() if simulate else {"serial": _serial_ports(), "can": _can_interfaces()}
@@ -83,19 +83,18 @@ def _answers(place: str) -> list[dict[str, Any]]:
 def _emulated() -> dict[str, Any]:
     with Station("both") as station:
         serial, can = station.endpoints["serial"], station.endpoints["can"]
+        places = (serial["port"], f"slcan://{can['channel']}?bitrate={can['bitrate']}")
         return {
-            "serial": [
-                {"port": serial["port"], "url": f"ati-serial://{serial['port']}"},
-                {"port": can["channel"], "url": f"ati-can://{can['channel']}?interface=slcan&bitrate={can['bitrate']}"},
-            ],
+            "serial": [{"port": serial["port"]}, {"port": can["channel"]}],
             "can": [],
+            "answers": [answer for place in places for answer in _answers(place)],
         }
 
 
 def _print(found: dict[str, Any]) -> None:
     data = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
     for port in found["serial"]:
-        words = [port.get("by_id") or port["port"], *(port.get(key) for key in ("description", "usb", "url"))]
+        words = [port.get("by_id") or port["port"], *(port.get(key) for key in ("description", "usb"))]
         data.print(" serial  " + escape("   ".join(word for word in words if word)))
         for finding in port.get("findings", ()):
             data.print(f"         [yellow]![/] {escape(finding['found'])}")

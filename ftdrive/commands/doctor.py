@@ -24,7 +24,7 @@ from drivers.ur.reading import CONNECT_S
 from drivers.ur.rtde import CONTROL_REGISTERS, registers_in_use
 from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
-from ftdrive.commands.common import JSON, RUNS, check_simulate, read_cell, simulate, write_json
+from ftdrive.commands.common import JSON, check_simulate, read_cell, runs, simulate, write_json
 from ftdrive.config import CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.simulation import Station, sensor_name, sensor_url
@@ -41,6 +41,7 @@ _PUSH_S = 3.0
 _PUSH_WINDOW_S = 0.2
 _SIMULATED_PUSH_N = 15.0
 _SCRIPT_PORT = 30003
+_NOT_UR = Check("robot.programs", "skipped", "not applicable: only a UR has dashboard, RTDE registers and port 30003")
 _MARK = {"ok": "[green]✔[/]", "warning": "[yellow]![/]", "failed": "[red]✘[/]", "skipped": "-"}
 
 
@@ -59,7 +60,7 @@ _MARK = {"ok": "[green]✔[/]", "warning": "[yellow]![/]", "failed": "[red]✘[/
     help="Expected, of the tool.  [default: [tool] mass_kg, else 1]",
 )
 @click.option("--push", is_flag=True, help="Find the sign of the sensor: you push the tool along +X of the base.")
-@RUNS
+@runs("Folder of the runs, whose disk is checked.")
 @JSON
 def doctor(
     config: Path | None,
@@ -111,7 +112,7 @@ def doctor(
             "checks": [asdict(check) for check in found],
             "verdict": checks.verdict(found),
         }
-        write_json(answer if pushed is None else {**answer, "push": pushed})
+        write_json({**answer, "push": pushed} if push else answer)
     else:
         _print(found)
     if failed:
@@ -119,23 +120,22 @@ def doctor(
 
 
 def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> RobotArm | None:
-    host, arm = cell.robot.host, build_arm(cell)
+    host, arm, is_ur = cell.robot.host, build_arm(cell), cell.robot.driver == "ur"
     stack.callback(arm.close)
     try:
         arm.open()
         info, status = arm.identify(), arm.status()
-        answer_s = ask_dashboard(host, _answer_s, timeout_s=CONNECT_S)
+        after = f" in {1e3 * ask_dashboard(host, _answer_s, timeout_s=CONNECT_S):.1f} ms" if is_ur else ""
     except DriverError as error:
         found.append(diagnosis.check_unreachable(error, host))
         return None
-    found.append(Check("robot.reachable", "ok", f"{host} answers in {1e3 * answer_s:.1f} ms"))
-    found.append(diagnosis.check_arm(info))
+    found.append(Check("robot.reachable", "ok", f"{host} answers{after}"))
+    found.append(diagnosis.check_arm(info) if is_ur else Check("robot.identity", "ok", diagnosis.who(info)))
     try:
         found.append(diagnosis.check_remote(arm.in_remote_control()))
     except DriverError as error:
         found.append(replace(diagnosis.check_unreachable(error, host), name="robot.remote"))
-    found.append(_registers(host))
-    found.append(_script_port(host))
+    found += [_registers(host), _script_port(host)] if is_ur else [_NOT_UR]
     found += diagnosis.check_status(status)
     found.append(_flange(arm, status))
     found.append(_clock(arm))

@@ -51,7 +51,7 @@ def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as
         sensor = _emulated(sensor)
     if sensor is None:
         raise ConfigError("which sensor? Give --sensor URL or --simulate")
-    url, seen = _record(sensor, path, duration_s)
+    url, seen = _record(sensor, path, duration_s, saved=f" Saved {path}")
     if as_json:
         write_json({"schema_version": 1, "file": str(path), "url": url, "recorded": seen})
     else:
@@ -62,8 +62,8 @@ def _emulated(sensor: str | None) -> str:
     return EMULATED + sensor_name(sensor or f"{EMULATED}serial")
 
 
-def _record(sensor: str, path: Path, duration_s: float) -> tuple[str, dict[str, Any]]:
-    """Record; returns the address that a driver was given, and what it saw."""
+def _record(sensor: str, path: Path, duration_s: float, *, saved: str = "") -> tuple[str, dict[str, Any]]:
+    """Record, and say so when the file is there; returns the address that a driver was given, and what it saw."""
     url = sensor_url(sensor)
     address = SensorAddress.of(url)
     if address.serial_port is None and not address.scheme.endswith("-can"):
@@ -86,7 +86,8 @@ def _record(sensor: str, path: Path, duration_s: float) -> tuple[str, dict[str, 
         raise
     finally:
         writer.end(**seen)
-        talk.print(f" Saved {path}")
+        if saved:
+            talk.print(saved)
     return url, seen
 
 

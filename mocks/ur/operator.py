@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mocks.kinematics import ZERO6, vector6
+from mocks.kinematics import ZERO6, vector3, vector6
 from mocks.ur import dashboard
 from mocks.ur.modes import PERMITTED, RobotMode, SafetyMode
 from mocks.ur.robot import Robot
@@ -121,8 +121,11 @@ class Operator:
         payload_kg = float(request["payload_kg"])
         if not 0.0 <= payload_kg < math.inf:
             raise ValueError(f"payload {payload_kg} kg")
-        self._robot.payload_kg = payload_kg
-        self._robot.note("operator", "set-payload", payload_kg=payload_kg)
+        cog_m = vector3(request.get("payload_cog_m", self._robot.payload_cog_m))
+        if not all(map(math.isfinite, cog_m)):
+            raise ValueError(f"centre of gravity {cog_m} m")
+        self._robot.payload_kg, self._robot.payload_cog_m = payload_kg, cog_m
+        self._robot.note("operator", "set-payload", payload_kg=payload_kg, payload_cog_m=list(cog_m))
         return {"done": "set-payload"}
 
     def _push_joint(self, request: Request) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mocks.kinematics import ZERO6, Array, Dh, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
+from mocks.kinematics import ZERO6, Array, Dh, Vector3, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
 from mocks.ur.events import Event, happened
 from mocks.ur.library import ScriptError
 from mocks.ur.modes import PAUSING, PERMITTED, POWERED, POWERLESS, RobotMode, Runtime, SafetyMode
@@ -28,8 +28,6 @@ POWER_STEP_S = 0.5
 COMMAND_REGISTERS = {"input_int_register_0", "input_int_register_24"}
 HAND_ACCELERATION_RAD_S2 = 1.5
 WATCHDOG_STEP_S = 0.01  # a stall of this process may age the watchdog by no more than this
-
-Vector3 = tuple[float, float, float]
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,7 @@ def test_a_healthy_cell(ftdrive: CommandLine) -> None:
     assert answer["push"]["base"]["force_N"] == pytest.approx([15, 0, 0], abs=0.2)
     assert np.linalg.norm(answer["push"]["sensor"]["force_N"]) == pytest.approx(15, abs=0.2)
     assert not any(ftdrive.folder.iterdir())  # it only looked
+    assert checks["robot.payload"]["found"] == "payload 1.50 kg at (0, 0, 60) mm from the flange"
     assert re.fullmatch(r"127\.[0-9.]+ answers in [0-9]+\.[0-9] ms", checks["robot.reachable"]["found"])
 
 
@@ -167,6 +168,7 @@ def test_nobody_pushes(cell: Path, ftdrive: CommandLine) -> None:
     assert outcome.returncode == 0, outcome.stderr
     checks = checks_of(outcome)
     assert checks.keys() == NAMED | {"push.sign"}
+    assert json.loads(outcome.stdout)["push"] is None
     assert checks["push.sign"]["state"] == "skipped"
     assert "standard input is closed" in checks["push.sign"]["found"]
 
@@ -177,7 +179,8 @@ def test_devices_of_this_computer_and_of_an_emulated_cell(station: Station, ftdr
     assert all(port["port"].startswith("/dev/") for port in own["serial"])
     assert [answer["url"] for answer in own["answers"]] == [url]
     emulated = ftdrive.json("devices", "--simulate")
-    assert [port["url"].partition(":")[0] for port in emulated["serial"]] == ["ati-serial", "ati-can"]
+    assert [answer["url"].partition(":")[0] for answer in emulated["answers"]] == ["ati-serial", "ati-can"]
+    assert all("FT12345" in answer["what"] for answer in emulated["answers"])  # asked, not known
 
 
 def test_devices_asks_serial_port_and_can_bus_where_it_is_told_to(ftdrive: CommandLine) -> None:
@@ -199,11 +202,23 @@ def test_devices_asks_serial_port_and_can_bus_where_it_is_told_to(ftdrive: Comma
 
 
 def test_transcript_of_a_sensor(ftdrive: CommandLine) -> None:
-    recorded = ftdrive.json("transcript", "record", "--simulate", "-o", "sensor.jsonl", "--duration", "1")["recorded"]
+    recording = ftdrive.run("transcript", "record", "--simulate", "-o", "sensor.jsonl", "--duration", "1", "--json")
+    assert "Saved sensor.jsonl" in recording.stderr
+    recorded = json.loads(recording.stdout)["recorded"]
     played = ftdrive.json("transcript", "play", ftdrive.folder / "sensor.jsonl")
     assert played["recorded"] == recorded
     assert played["played"]["identity"] == recorded["identity"]
     assert played["played"]["mean_force_N"] == pytest.approx(recorded["mean_force_N"], abs=0.02)
+
+
+def test_the_transcript_of_a_simulated_play_is_not_said_to_be_saved(ftdrive: CommandLine) -> None:
+    played = ftdrive.run("transcript", "play", "--simulate")
+    assert played.returncode == 0, played.stderr
+    assert "Saved" not in played.stderr
+    refused = ftdrive.run("transcript", "record", "--simulate", "-o", "nope/sensor.jsonl", "--duration", "0.1")
+    assert refused.returncode == 6
+    assert "nope/sensor.jsonl cannot be written" in refused.stderr
+    assert "Saved" not in refused.stderr
 
 
 def test_transcript_of_a_sensor_that_is_gone(ftdrive: CommandLine) -> None:

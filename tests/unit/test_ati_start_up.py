@@ -242,11 +242,19 @@ def test_can_empty_slot_is_a_fault() -> None:
 
 @pytest.mark.parametrize(
     ("interface", "channel"),
-    [("slcan", "/dev/does-not-exist"), ("socketcan", "no-such-can"), ("no-such-interface", "x")],
+    [
+        ("slcan", "/dev/does-not-exist"),
+        ("socketcan", "no-such-can"),
+        ("no-such-interface", "x"),
+        ("kvaser", "0"),  # these three without their libraries: NameError, ImportError, TypeError
+        ("neovi", "0"),
+        ("socketcand", "can0"),
+    ],
 )
 def test_can_bus_that_does_not_open(interface: str, channel: str) -> None:
-    with pytest.raises(ConnectError, match=channel):
+    with pytest.raises(ConnectError, match=f"on {interface} {channel}: ") as caught:
         AtiCanSensor(channel, interface=interface).open()
+    assert ("sudo ip link set no-such-can up" in str(caught.value)) == (interface == "socketcan")
 
 
 # The serial peer -----------------------------------------------------------------------------------------------------
@@ -667,5 +675,5 @@ def test_serial_port_that_is_not_there() -> None:
 
 
 def test_serial_port_is_ours_alone() -> None:
-    with SerialPeer() as peer, peer.sensor(), pytest.raises(ConnectError, match="does not open"):
+    with SerialPeer() as peer, peer.sensor(), pytest.raises(ConnectError, match="in use by another program"):
         peer.sensor().open()

@@ -109,6 +109,7 @@ def test_the_name_by_id_of_a_port(computer: Path) -> None:
         ("ati-can:///dev/ttyACM0?interface=slcan&bitrate=500000", "slcan:///dev/ttyACM0?bitrate=500000"),
         ("robotous-can:///dev/ttyACM0?interface=slcan", "slcan:///dev/ttyACM0?bitrate=1000000"),
         ("ati-can://PCAN_USBBUS1?interface=pcan", None),
+        ("ati-can:///dev/ttyUSB0?interface=robotell", None),
         ("ati-netft://192.168.1.1", None),
         ("ur-ft://192.168.1.10?counts_per_N=1&counts_per_Nm=1", None),
     ],

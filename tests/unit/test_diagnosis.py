@@ -12,7 +12,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
+from drivers.errors import (
+    ConnectError,
+    DeviceFault,
+    DeviceTimeout,
+    DriverError,
+    Frozen,
+    PortInUse,
+    ProtocolError,
+    StreamBroken,
+)
 from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
 from ftdrive import diagnosis
 from ftdrive.checks import Check, SensorAddress
@@ -74,6 +83,7 @@ def test_a_ready_arm() -> None:
         ({"safety_mode": "reduced"}, "robot.safety", "warning", "normal mode"),
         ({"program": "playing"}, "robot.program", "warning", "would end it"),
         ({"payload_kg": 0.0}, "robot.payload", "warning", "at the pendant"),
+        ({"p_flange_payload_m": (0.0, 0.0, 0.0)}, "robot.payload", "warning", "centre of gravity at the pendant"),
         ({"speed_slider": 0.04}, "robot.speed", "failed", "at the pendant"),
         ({"payload_kg": None}, "robot.payload", "skipped", ""),
     ],
@@ -90,7 +100,14 @@ def test_remote_control(remote: bool | None, state: str) -> None:
     assert diagnosis.check_remote(remote).state == state
 
 
-def stream(rate_Hz: float, *, nominal_Hz: float = 100.0, lost: int = 0, status: int = 0) -> dict[str, Check]:
+PORT = SensorAddress.of("bota:///dev/ttyUSB7")
+BY_NETWORK = SensorAddress.of("ati-netft://192.168.1.1")
+BY_PCAN = SensorAddress.of("ati-can://PCAN_USBBUS1?interface=pcan")
+
+
+def stream(
+    rate_Hz: float, *, nominal_Hz: float = 100.0, lost: int = 0, status: int = 0, address: SensorAddress = PORT
+) -> dict[str, Check]:
     n = round(2 * rate_Hz)
     samples = FtSamples(
         t_host_ns=np.arange(n, dtype=np.int64),
@@ -101,7 +118,6 @@ def stream(rate_Hz: float, *, nominal_Hz: float = 100.0, lost: int = 0, status: 
         status=np.full(n, status, np.uint32),
     )
     health = Health(received=n, lost=lost, malformed=0, rate_Hz=rate_Hz, age_s=0.001, nominal_rate_Hz=nominal_Hz)
-    address = SensorAddress.of("robotiq-ft300:///dev/ttyUSB7")
     return {check.name: check for check in diagnosis.check_stream(samples, health, address, 2.0)}
 
 
@@ -115,6 +131,24 @@ def test_a_healthy_stream_and_three_that_are_not() -> None:
     assert stream(100, lost=20)["sensor.lost"].state == "failed"
     assert stream(100, status=0x4000)["sensor.status"].found == "status 0x4000"
     assert stream(7, nominal_Hz=np.nan)["sensor.rate"].state == "ok"
+
+
+@pytest.mark.parametrize(("rate_Hz", "state"), [(96, "ok"), (109, "ok"), (115, "warning"), (200, "failed")])
+def test_a_rate_that_is_too_high(rate_Hz: float, state: str) -> None:
+    rate = stream(rate_Hz)["sensor.rate"]
+    assert rate.state == state
+    assert ("records come twice" in str(rate.fix)) == (state != "ok")
+
+
+@pytest.mark.parametrize(
+    "address", [BY_NETWORK, SensorAddress.of("ur-ft://192.168.1.10?counts_per_N=1&counts_per_Nm=1")]
+)
+def test_a_sensor_on_ethernet_gets_no_advice_about_cables_it_has_not(address: SensorAddress) -> None:
+    found = stream(80, lost=1, address=address)
+    for name in ("sensor.rate", "sensor.lost"):
+        assert found[name].fix == "give the sensor a network of its own, or run fewer programs on this computer"
+    on_can = stream(80, lost=1, address=BY_PCAN)
+    assert "termination" in str(on_can["sensor.lost"].fix)
 
 
 def test_noise_at_rest_under_a_hand_and_none_at_all() -> None:
@@ -192,8 +226,6 @@ def test_a_calibration_that_does_not_know_its_sensor_cannot_be_checked(devices: 
         assert not diagnosis.belonging(result, {"sensor": serial}).others
 
 
-PORT = SensorAddress.of("bota:///dev/ttyUSB7")
-BY_NETWORK = SensorAddress.of("ati-netft://192.168.1.1")
 ALLOWED = Check("permissions.port", "ok", "may be read and written")
 FORBIDDEN = Check("permissions.port", "failed", "may not", "sudo usermod")
 
@@ -219,7 +251,9 @@ def wrapped(error: Exception) -> ConnectError:
         (DeviceTimeout("silent for 0.4 s"), BY_NETWORK, ALLOWED, "supply and cable, then ping 192.168.1.1"),
         (wrapped(DeviceTimeout("no reply")), PORT, ALLOWED, "supply and cable"),
         (StreamBroken("the port is gone"), PORT, FORBIDDEN, "sudo usermod"),
-        (DeviceFault("frozen"), PORT, FORBIDDEN, "switch the sensor off and on"),
+        (DeviceTimeout("silent for 0.4 s"), BY_PCAN, ALLOWED, "supply and cable, then ftdrive doctor again"),
+        (DeviceFault("overload"), PORT, FORBIDDEN, "switch the sensor off and on"),
+        (Frozen("50 identical samples"), PORT, ALLOWED, "switch the sensor off and on; if it is loaded, take the load"),
         (wrapped(DeviceFault("saturated")), PORT, ALLOWED, "take what loads it off"),
         (ProtocolError("no intact record"), PORT, ALLOWED, "is it the one its address names? ftdrive devices --probe"),
     ],
@@ -231,6 +265,13 @@ def test_the_cure_of_a_sensor_is_that_of_its_error(
     assert (found.name, found.state, found.found) == ("sensor.stream", "failed", str(error))
     assert cure in str(found.fix)
     assert "see the permissions" not in str(found.fix)
+
+
+def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable() -> None:
+    error = PortInUse("sensor: the port is in use by another program: end it, `fuser -v /dev/ttyUSB7` names it")
+    found = diagnosis.check_sensor_error("sensor.identity", error, PORT, [FORBIDDEN])
+    assert found.found == "sensor: the port is in use by another program"
+    assert found.fix == "end it, `fuser -v /dev/ttyUSB7` names it"
 
 
 def test_an_arm_whose_sentence_names_no_cure_gets_one() -> None:
@@ -263,3 +304,10 @@ def test_an_arm_that_is_not_reached(cause: OSError, cure: str) -> None:
     check = diagnosis.check_unreachable(error, "ur5")
     assert (check.name, check.state) == ("robot.reachable", "failed")
     assert cure in str(check.fix)
+
+
+def test_what_a_dashboard_server_says_is_not_lost() -> None:
+    error = StreamBroken("the dashboard server of ur5 says: Timeout connecting to UR dashboard server.")
+    check = diagnosis.check_unreachable(error, "ur5")
+    assert check.found == "the dashboard server of ur5 says: Timeout connecting to UR dashboard server"
+    assert "enable the dashboard server" in str(check.fix)

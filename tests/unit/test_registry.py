@@ -1,10 +1,12 @@
 """Addresses of sensors: what they build, and what is refused before any device is touched."""
 
 import contextlib
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from drivers._stream import StreamingSensor
 from drivers.ati.can import AtiCanSensor
@@ -18,7 +20,8 @@ from drivers.robotous.can import RobotousCan
 from drivers.robotous.serial import RobotousSerial
 from drivers.ur.arm import UrArm
 from drivers.ur.sensor import UrWristSensor
-from ftdrive.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.commands import doctor
+from ftdrive.config import FORMAT, CellConfig, RobotConfig, SensorConfig
 from ftdrive.errors import ConfigError
 from ftdrive.wiring import build_arm
 
@@ -112,7 +115,7 @@ def test_mistakes_are_named(url: str, message: str) -> None:
 ACME = """
 import time
 import numpy as np
-from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.interfaces import ArmStatus, DeviceInfo, FtSamples
 from drivers.streaming import StreamingSensor
 from drivers.ur.arm import UrArm
 
@@ -137,7 +140,21 @@ class Sensor(StreamingSensor):
         pass
 
 class Arm(UrArm):
-    pass
+    def open(self, *, control=False):
+        pass
+
+    def close(self):
+        pass
+
+    def identify(self):
+        return DeviceInfo("Acme arm", "7", "2.0")
+
+    def in_remote_control(self):
+        return None
+
+    def status(self):
+        now_ns = time.monotonic_ns()
+        return ArmStatus(now_ns, now_ns / 1e9, "running", "normal", "stopped", None, 1.0, 1.0, None, None, None)
 """
 
 Install = Callable[..., None]
@@ -182,6 +199,28 @@ def test_another_package_brings_a_sensor_and_an_arm(install: Install) -> None:
     assert type(build_arm(CellConfig(RobotConfig("127.0.0.1", driver="acme"), anything))) is arm_class("acme")
     with pytest.raises(ConfigError, match=r"\[robot\] driver: unknown arm 'acmee'; known: acme, ur|known: ur, acme"):
         build_arm(CellConfig(RobotConfig("127.0.0.1", driver="acmee"), anything))
+
+
+def test_doctor_asks_the_arm_of_another_package_only_what_any_arm_knows(
+    install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = "[ftdrive.sensors]\nacme-usb = acme_arm:Sensor\n[ftdrive.arms]\nacme = acme_arm:Arm\n"
+    install("acme_arm", points, ACME)
+    monkeypatch.setattr(doctor, "_CLOCK_S", 0.1)
+    path = tmp_path / "ftdrive.toml"
+    path.write_text(
+        f'format = "{FORMAT}"\n[robot]\nhost = "127.0.0.1"\ndriver = "acme"\n[sensor]\nurl = "acme-usb:///dev/acme0"\n',
+        encoding="utf-8",
+    )
+    arguments = ["--config", str(path), "--runs", str(tmp_path), "--json"]
+    outcome = CliRunner().invoke(doctor.doctor, arguments)
+    checks = {check["name"]: check for check in json.loads(outcome.stdout)["checks"]}
+    robot = {name: check for name, check in checks.items() if name.startswith("robot.")}
+    assert robot["robot.reachable"]["found"] == "127.0.0.1 answers"
+    assert robot["robot.identity"]["found"] == "Acme arm, serial 7, firmware 2.0"
+    assert "only a UR has" in robot["robot.programs"]["found"]
+    assert {check["state"] for check in robot.values()} == {"ok", "skipped"}
+    assert checks["clock.pace"]["state"] == "ok"
 
 
 PLAIN = """

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.robotous.can import CanLink
+from drivers.robotous.can import CanLink, RobotousCan
 from drivers.robotous.halves import Halves
 
 PERIOD_S = 0.005
@@ -188,3 +188,17 @@ def test_a_silence_the_host_slept_through_is_none(slept_s: float, fields: int, m
 
     monkeypatch.setattr(link._bus, "receive", receive)
     assert len(link.receive()) == fields
+
+
+def test_a_silence_while_halves_come_is_not_the_fault_of_cable_or_supply(monkeypatch: pytest.MonkeyPatch) -> None:
+    link = CanLink("can0")
+    sensor = RobotousCan(link)
+    clock_ns = time.monotonic_ns()
+    monkeypatch.setattr(time, "monotonic_ns", lambda: clock_ns)
+    sensor._is_back = True
+    assert "check cable and supply" in str(sensor._stale(0.4))
+    monkeypatch.setattr(link._bus, "receive", lambda _: (1, data(1)))  # first halves only
+    assert link.receive() == []
+    assert "frames come but cannot be paired: give this computer less to do" in str(sensor._stale(0.4))
+    clock_ns += 200_000_000
+    assert "check cable and supply" in str(sensor._stale(0.4))

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import re
+import sys
 import threading
 import tty
 from collections.abc import Callable, Iterator
@@ -10,9 +11,10 @@ from typing import Any, Self
 
 import numpy as np
 import pytest
+import serial
 
 from drivers import probe_can as module
-from drivers.errors import ConnectError
+from drivers.errors import ConnectError, PortInUse
 from drivers.probe_can import probe_can
 from drivers.registry import sensor_from_url
 from mocks.ati_can import AtiCanNode
@@ -206,3 +208,19 @@ def test_a_bus_that_does_not_open() -> None:
         probe_can("no-such-can", interface="socketcan", bitrate=None)
     with Bus() as bus, pytest.raises(ConnectError, match="Invalid bitrate"):
         probe_can(bus.path, interface="slcan", bitrate=300_000)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there a port opens only once")
+def test_an_adapter_that_another_program_reads_is_left_alone(start: Callable[..., str]) -> None:
+    port = start(AtiCanNode)
+    with sensor_from_url(f"ati-can://{port}?interface=slcan") as sensor:
+        with pytest.raises(PortInUse, match=f"in use by another program: end it, `fuser -v {port}` names it"):
+            probe_can(port, interface="slcan", bitrate=250_000)
+        with pytest.raises(serial.SerialException):
+            serial.Serial(port, exclusive=True)
+        assert len(sensor.collect(0.2))
+        assert sensor.health().stale == sensor.health().lost == 0
+    with serial.Serial(port, exclusive=True), pytest.raises(PortInUse):
+        probe_can(port, interface="slcan", bitrate=250_000)
+    (answer,) = probe_can(port, interface="slcan", bitrate=250_000)
+    assert answer.url

@@ -1,5 +1,6 @@
 """The serial port of a driver on a pseudo-terminal; the far side, played by the test, checks parity and makes marks."""
 
+import errno
 import os
 import select
 import sys
@@ -13,7 +14,7 @@ import pytest
 import serial
 
 from drivers._serial import SerialPort
-from drivers.errors import ConnectError
+from drivers.errors import ConnectError, PortInUse
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
 
@@ -163,6 +164,26 @@ def test_what_came_before_the_flags_is_thrown_away(far_side: FarSide, monkeypatc
         assert read_until(port, 1) == (b"b", [])
     finally:
         port.close()
+
+
+def test_a_port_that_another_program_has_is_said_to_be_in_use(far_side: FarSide) -> None:
+    port = SerialPort("sensor", far_side.path, 115_200)
+    fuser = f"in use by another program: end it, `fuser -v {far_side.path}` names it"
+    with serial.Serial(far_side.path, exclusive=True), pytest.raises(PortInUse, match=fuser):
+        port.open()
+    port.open()
+    port.close()
+
+
+def test_a_port_that_is_busy_is_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one that another program has marked with TIOCEXCL."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise serial.SerialException(errno.EBUSY, "Device or resource busy")
+
+    monkeypatch.setattr(serial, "Serial", refuse)
+    with pytest.raises(PortInUse):
+        SerialPort("sensor", "/dev/ttyUSB0", 115_200).open()
 
 
 def test_a_port_that_takes_no_flags_is_freed(far_side: FarSide, monkeypatch: pytest.MonkeyPatch) -> None:

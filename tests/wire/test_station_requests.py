@@ -95,6 +95,7 @@ def test_cables_drift_and_payload(station: Answering) -> None:
         ("hand-move", {"q_rad": [0] * 6, "speed_rad_s": 0}, "positive speed"),
         ("push-joint", {"joint": 0, "off_deg": 1}, "joint 0"),
         ("set-payload", {"payload_kg": -1}, "payload -1"),
+        ("set-payload", {"payload_kg": 1, "payload_cog_m": [0, 0]}, "not enough values"),
         ("slider", {"fraction": 2}, "not between"),
     ],
 )
@@ -121,8 +122,10 @@ def test_a_pushed_joint_and_a_changed_payload(station: Answering) -> None:
     assert pushed["target_q_rad"] == before["target_q_rad"]
     station.do("push-joint", joint=2, off_deg=0)
     station.until(lambda s: s["q_rad"] == pytest.approx(before["q_rad"], abs=1e-6))
-    station.do("set-payload", payload_kg=2.5)
-    assert station.do("state")["payload_kg"] == 2.5
+    station.do("set-payload", payload_kg=2.5, payload_cog_m=[0.01, 0, 0.05])
+    station.do("set-payload", payload_kg=2.6)  # its centre stays
+    state = station.do("state")
+    assert (state["payload_kg"], state["payload_cog_m"]) == (2.6, [0.01, 0, 0.05])
 
 
 def test_another_client_moves_the_arm(station: Answering) -> None:

@@ -2,9 +2,11 @@
 
 import itertools
 import json
+import os
 import sys
 import threading
 import time
+import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -148,6 +150,22 @@ def test_a_frame_becomes_a_line(frame: can.Message, line: bytes, tmp_path: Path)
     assert b"".join(passage.data for passage in Transcript.load(path).passages) == line
 
 
+def test_a_can_adapter_on_a_serial_port_is_recorded_once(tmp_path: Path) -> None:
+    path = tmp_path / "adapter.jsonl"
+    writer = Writer(path, {"url": "x", "duration_s": 1})
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    with recording(writer), can.Bus(os.ttyname(slave), interface="serial") as bus:
+        bus.send(can.Message(arbitration_id=0x2A, is_extended_id=False, data=b"\x01", timestamp=0.0))
+    writer.end()
+    sent = os.read(master, 100)
+    os.close(master)
+    os.close(slave)
+    transcript = Transcript.load(path)
+    assert not transcript.frames
+    assert [passage.data for passage in transcript.passages] == [sent]
+
+
 @pytest.fixture
 def ati() -> Iterator[str]:
     device = AtiSerialBox(measured(), seed=1)
@@ -268,6 +286,12 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
         first.end()
     assert (tmp_path / "b.jsonl").read_text() == "mine"
     assert (tmp_path / "a.jsonl").read_text() == "mine"
+
+
+def test_a_folder_that_is_not_there_is_said_to_be_the_fault(tmp_path: Path) -> None:
+    path = tmp_path / "nope" / "a.jsonl"
+    with pytest.raises(OSError, match=f"^{path} cannot be written .No such file.*: give a file in a folder"):
+        Writer(path, {"url": "x", "duration_s": 1})
 
 
 def test_bytes_of_both_directions_keep_their_order(tmp_path: Path) -> None:
