@@ -25,6 +25,7 @@ from ftdrive.planning.words import arm_moves, point_in_words, turns_in_words, wa
 from ftdrive.runs import Run
 from ftdrive.session import preflight
 from ftdrive.session.completed import has_completed, remember_completed
+from ftdrive.session.desk import Desk
 from ftdrive.session.events import GuardTripped, Noted, Planned, State, StateChanged
 from ftdrive.session.guards import (
     ContactGuard,
@@ -39,7 +40,7 @@ from ftdrive.session.guards import (
     StallGuard,
     Tripped,
 )
-from ftdrive.session.machine import SLOW, Desk, Pace, RunningFit, Tour, approach_to
+from ftdrive.session.machine import SLOW, Pace, RunningFit, Tour, approach_to
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Operator
 from ftdrive.session.outcome import Outcome, solve_and_save
