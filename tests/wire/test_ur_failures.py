@@ -168,7 +168,7 @@ EVENTS = [
         on("foreign-program"),
         on("dashboard-stop"),
         DeviceFault,
-        "another program; end it|ended or paused by somebody else",
+        "another program may have been started|ended or paused by somebody else",
         hits_opening=False,
     ),
     Event("rtde-fin", on("drop", what="rtde"), nothing, StreamBroken, "check the robot and the cable"),
