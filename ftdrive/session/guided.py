@@ -177,7 +177,8 @@ class _Begun:
         self._driven = at_most(self._plan, self._certifier, speeds)
         q = arm.state().q_rad
         self._todo, self._taken = self._what_is_left()
-        self._running: RunningFit = Running(g_m_s2=cell.site.g_m_s2, down_base=self._certifier.scene.down_base)
+        down_base = self._certifier.scene.down_base
+        self._running: RunningFit = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base, advise=False)
         for record in self._taken:
             desk.tell(self._running.add(record))
         first = self._todo[0] - 1 if self._todo else 0
@@ -361,7 +362,7 @@ class _Begun:
                 pace=self._pace,
                 recheck=self._recheck,
                 quiet_std=quiet_std,
-            ).run(self._todo, ())  # the running fit knows what was taken
+            ).run(self._todo)
         if self._pace.slow and run.stops() == list(range(1, len(plan.steps) + 2)):
             remember_completed(*self._key)
         return run

@@ -8,7 +8,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final, Protocol
 
@@ -150,7 +150,7 @@ class Tour:
 
     # -------------------------------------------------------------------------------------------- the tour
 
-    def run(self, todo: Sequence[int], taken: Sequence[PoseRecord]) -> None:
+    def run(self, todo: Sequence[int]) -> None:
         """Take the poses of these stops, counted from 1; the return to the first pose is the last.
 
         Raises
@@ -160,8 +160,6 @@ class Tour:
         Tripped, DriverError, OSError
             What stopped the arm, when a person then ended it.
         """
-        for record in taken:
-            self._learn(record)
         self._contact.predict = self._running.predict
         self._todo = deque(todo)
         self._guards.begin()
@@ -284,7 +282,7 @@ class Tour:
         dropped = [stop for stop in self._todo if self._index(stop) == index]
         self._todo = deque(stop for stop in self._todo if stop not in dropped)
         if self._last is not None and self._last.stop in dropped:  # was to be taken again
-            self._learn(self._last)
+            self._desk.tell(self._running.add(self._last))
             self._note(f"pose {self._last.stop} stays as it was taken", warning=True)
             return
         names = " and ".join(str(stop) for stop in dropped)
@@ -332,7 +330,7 @@ class Tour:
             sync=True,
         )
         self._witness.tell_news()
-        self._learn(record)
+        self._desk.tell(self._running.add(record))
         return record
 
     # -------------------------------------------------------------------------------------------- moving
@@ -550,10 +548,6 @@ class Tour:
 
     def _note(self, words: str, *, warning: bool = False) -> None:
         self._desk.tell(Noted(words=words, warning=warning))
-
-    def _learn(self, record: PoseRecord) -> None:
-        """Take a pose into the running fit. What pose would help most is not told: the plan has chosen."""
-        self._desk.tell(replace(self._running.add(record), hint=""))
 
 
 def approach_to(certifier: Certifier, q_rad: Array, goal_rad: Array, speeds: Speeds) -> Approach:

@@ -45,10 +45,15 @@ class Running:
         Local gravity.
     down_base : array_like, shape (3,)
         Unit vector down in base, for the coverage as long as the fit cannot tell: another one for an arm on a wall.
+    advise : bool
+        Say which pose would help most; False where a plan has chosen.
     """
 
-    def __init__(self, *, g_m_s2: float = STANDARD_GRAVITY_M_S2, down_base: ArrayLike = (0.0, 0.0, -1.0)) -> None:
+    def __init__(
+        self, *, g_m_s2: float = STANDARD_GRAVITY_M_S2, down_base: ArrayLike = (0.0, 0.0, -1.0), advise: bool = True
+    ) -> None:
         self._g_m_s2 = g_m_s2
+        self._advise = advise
         self._down_base = np.asarray(down_base, dtype=np.float64)
         self._records: dict[int, PoseRecord] = {}
         self._result: CalibrationResult | None = None
@@ -79,7 +84,7 @@ class Running:
             cond_u1=coverage.cond_u1,
             empty_cap_deg=empty_cap_deg(gravity_flange),
             light=light,
-            hint="" if light == "green" else hint(R_base_flange, self._guess(), down),
+            hint=hint(R_base_flange, self._guess(), down) if self._advise and light != "green" else "",
         )
 
     def remove(self, stop: int) -> None:
