@@ -88,6 +88,10 @@ class Certifier:
         touching = row[self._distance(q, row, pair, needed) <= needed]
         return ~np.isin(np.arange(len(q)), touching)
 
+    def clear_around(self, q_rad: Array) -> bool:
+        """Say whether all moves of a closed tour through joint vectors (n, 6) are proven clear."""
+        return bool(self.certify(q_rad, np.roll(q_rad, -1, axis=0), tight=False).clear.all())
+
     def certify(self, start_rad: ArrayLike, end_rad: ArrayLike, *, tight: bool = True) -> Certificate:
         """Judge straight joint moves.
 

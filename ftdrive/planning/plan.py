@@ -145,7 +145,7 @@ class Plan:
         if changed:
             raise PlanRefused(f"the plan was made for another {' and another '.join(changed)}: make a new one")
         q = np.array([step.q_rad for step in self.steps])
-        if not certifier.certify(q, np.roll(q, -1, axis=0), tight=False).clear.all():
+        if not certifier.clear_around(q):
             raise PlanRefused("a move of the plan cannot be proven clear: make a new plan")
 
 

@@ -227,9 +227,7 @@ def _numbers(poses: int) -> tuple[int, ...]:
 
 def _constant(certifier: Certifier, q_rad: Array) -> Found | None:
     q = constant_tour.constant_tour(q_rad)
-    if not (_winds_little(q, q_rad) and certifier.certify(q, np.roll(q, -1, axis=0), tight=False).clear.all()):
-        return None
-    return constant_tour.NUMBERS, q
+    return (constant_tour.NUMBERS, q) if _winds_little(q, q_rad) and certifier.clear_around(q) else None
 
 
 def _winds_little(q_rad: Array, stands: Array) -> bool:
@@ -247,9 +245,7 @@ def _wrist(certifier: Certifier, q_rad: Array, numbers: Sequence[int], speeds: S
 
 def _clear_tours(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
     """Constant tours (24, 6) in other postures of joints 1 to 3."""
-    for tour in with_room(certifier, q_rad):
-        if certifier.certify(tour, np.roll(tour, -1, axis=0), tight=False).clear.all():
-            yield tour
+    return (tour for tour in with_room(certifier, q_rad) if certifier.clear_around(tour))
 
 
 def _box(
