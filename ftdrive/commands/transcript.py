@@ -51,7 +51,7 @@ def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as
         sensor = _emulated(sensor)
     if sensor is None:
         raise ConfigError("which sensor? Give --sensor URL or --simulate")
-    url, seen = _record(sensor, path, duration_s, saved=f" Saved {path}")
+    url, seen = _record(sensor, path, duration_s)
     if as_json:
         write_json({"schema_version": 1, "file": str(path), "url": url, "recorded": seen})
     else:
@@ -62,8 +62,8 @@ def _emulated(sensor: str | None) -> str:
     return EMULATED + sensor_name(sensor or f"{EMULATED}serial")
 
 
-def _record(sensor: str, path: Path, duration_s: float, *, saved: str = "") -> tuple[str, dict[str, Any]]:
-    """Record, and say so when the file is there; returns the address that a driver was given, and what it saw."""
+def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) -> tuple[str, dict[str, Any]]:
+    """Record, and name the file if it is kept; returns the address that a driver was given, and what it saw."""
     url = sensor_url(sensor)
     address = SensorAddress.of(url)
     if address.serial_port is None and not address.scheme.endswith("-can"):
@@ -86,8 +86,8 @@ def _record(sensor: str, path: Path, duration_s: float, *, saved: str = "") -> t
         raise
     finally:
         writer.end(**seen)
-        if saved:
-            talk.print(saved)
+        if kept:
+            talk.print(f" Saved {path}")
     return url, seen
 
 
@@ -102,7 +102,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     if simulate:
         with TemporaryDirectory(prefix="ftdrive-") as folder:
             path = Path(folder) / "sensor.jsonl"
-            _record(_emulated(sensor), path, 1.0)
+            _record(_emulated(sensor), path, 1.0, kept=False)
             told = Transcript.load(path)
     elif file is not None:
         told = Transcript.load(file)
