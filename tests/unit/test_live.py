@@ -46,7 +46,7 @@ def test_a_slow_sensor_is_averaged_over_the_newest_samples(monkeypatch: pytest.M
     monkeypatch.setattr(live, "build_sensor", lambda _: sensor)
     monkeypatch.setattr(live, "build_arm", lambda _: Slow())
     calibration: Any = SimpleNamespace(provenance={})
-    with live._live_looks(SimpleNamespace(), calibration) as looks:  # type: ignore[arg-type]
+    with live._live_looks(SimpleNamespace(), calibration) as looks:  # type: ignore[arg-type]  # nothing is asked of it
         for _ in range(3):
             look = next(looks)
             newest = np.arange(sensor.sent - LEAST_SAMPLES, sensor.sent)

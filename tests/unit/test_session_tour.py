@@ -632,7 +632,7 @@ def test_a_payload_that_is_not_that_of_the_tool_is_refused(lab: Lab) -> None:
 def test_a_pose_the_controller_forbids_is_refused(lab: Lab) -> None:
     assert lab.calibrate(dry_run=True) is None
     lab.arm.forbidden = lab.arm.q.round(12)
-    lab.arm.within_safety_limits = lambda q_rad: q_rad[4] < 2.0  # type: ignore[method-assign]
+    lab.arm.within_safety_limits = lambda q_rad: q_rad[4] < 2.0  # type: ignore[method-assign]  # this arm only
     refuse(lab, "safety limits forbid")
 
 
@@ -643,7 +643,7 @@ def test_another_model_or_tcp_is_refused(lab: Lab) -> None:
         state = right()
         return replace(state, p_base_flange_m=np.add(state.p_base_flange_m, [0, 0, 0.02]))
 
-    lab.arm.state = elsewhere  # type: ignore[method-assign]
+    lab.arm.state = elsewhere  # type: ignore[method-assign]  # this arm only
     refuse(lab, "check the model and the active TCP")
 
 
