@@ -1,0 +1,304 @@
+"""A fake cell for the guided session: an arm, a sensor and an operator that do what a test says."""
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.routine import Sampling
+from drivers.errors import DeviceFault, DriverError
+from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
+from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.errors import Declined
+from ftdrive.planning.arm_model import ArmModel, Cylinder
+from ftdrive.planning.planner import USUAL_POSTURE_RAD
+from ftdrive.runs import Run
+from ftdrive.session import guided, preflight
+from ftdrive.session.events import (
+    Event,
+    Noted,
+    PoseTaken,
+    State,
+    StateChanged,
+)
+from ftdrive.session.guided import Options
+from ftdrive.session.operator import Key, Question
+from ftdrive.session.outcome import Outcome
+
+Array = NDArray[np.float64]
+
+STATUS = ArmStatus(0, 0.0, "running", "normal", "playing", None, 1.0, 1.0, 1.5, (0.0, 0.0, 0.05), (0.0,) * 6)
+MODEL = ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)])
+NOISE = np.repeat([0.02, 0.001], 3)
+
+
+class FakeArm(RobotArm):
+    """Joints that go where they are sent, in steps; faults by `at_move`."""
+
+    def __init__(self) -> None:
+        self.q = USUAL_POSTURE_RAD + np.radians([0, 0, 0, 3.0, -2, 4])
+        self._status = STATUS
+        self.push_rad = np.zeros(6)
+        self.moves: list[tuple[Array, float, float]] = []
+        self.stops = 0
+        self.opened = 0
+        self.control = False
+        self.at_move: dict[int, Callable[[], None]] = {}
+        self.forbidden: Array | None = None
+        self.halted = threading.Event()
+        self.gone: DriverError | None = None
+        self.gone_status: dict[str, Any] = {}
+
+    def open(self, *, control: bool = False) -> None:
+        self.opened += 1
+        self.control = control
+
+    def close(self) -> None:
+        pass
+
+    def identify(self) -> DeviceInfo:
+        return DeviceInfo("UR5e", "A1", "5.15")
+
+    def state(self) -> ArmState:
+        if self.gone:
+            if self.gone_status:
+                self.set_status(**self.gone_status)
+            raise self.gone
+        q = self.q + self.push_rad
+        at = MODEL.frames(q)
+        return ArmState(time.monotonic_ns(), 0.0, q, np.zeros(6), at.R_base_flange[0], at.flange_m[0])
+
+    def status(self) -> ArmStatus:
+        return self._status
+
+    def set_status(self, **different: Any) -> None:
+        self._status = replace(STATUS, **different)
+
+    def lose_power(self) -> None:
+        """An emergency stop, of which the joints tell before the status does."""
+        self.gone_status = {"fault": "emergency stop: …", "safety_mode": "robot emergency stop"}
+        self.gone = DeviceFault("the joints are not measured")
+
+    def power_up(self) -> None:
+        self.gone_status, self.gone = {}, None
+        self.set_status()
+
+    def within_safety_limits(self, q_rad: Sequence[float]) -> bool:
+        return self.forbidden is None or not np.allclose(q_rad, self.forbidden)
+
+    def move_to(
+        self,
+        q_rad: Sequence[float],
+        *,
+        timeout_s: float,
+        guard: Guard,
+        speed_rad_s: float | None = None,
+        acceleration_rad_s2: float | None = None,
+    ) -> None:
+        assert self.control
+        assert timeout_s > 0
+        assert speed_rad_s is not None
+        assert acceleration_rad_s2 is not None
+        goal = np.array(q_rad)
+        self.moves.append((goal, speed_rad_s, acceleration_rad_s2))
+        self.halted.clear()
+        start, steps = self.q, 4
+        fault = self.at_move.pop(len(self.moves), None)
+        for step in range(1, steps + 1):
+            guard()
+            if self.halted.is_set():
+                raise DeviceFault("the arm was told to stop before it had arrived.")
+            self.q = start + step / steps * (goal - start)
+            if fault is not None and step == 2:
+                fault()
+                deadline = time.monotonic() + 20  # held here until something stops it
+                while not self.halted.is_set():
+                    guard()
+                    assert time.monotonic() < deadline
+                    time.sleep(0.002)
+            time.sleep(0.001)
+
+    def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
+        assert timeout_s > 0
+        guard()
+
+    def stop(self) -> None:
+        self.stops += 1
+        self.halted.set()
+
+
+class FakeSensor(ForceTorqueSensor):
+    """Feels 1.2 kg hanging on the arm's flange, and what pushes."""
+
+    def __init__(self, arm: FakeArm) -> None:
+        self.arm = arm
+        self.rng = np.random.default_rng(1)
+        self.push = np.zeros(6)
+        self.noise = NOISE
+        self.failure: DriverError | None = None
+        self.stuck = False
+        self.heals = False
+        self.collecting: Callable[[], None] = lambda: None
+        self._newest = np.zeros(6)
+        self._seq = 0
+        self.events: tuple[tuple[int, str], ...] = ()
+
+    def open(self) -> None:
+        if self.heals:
+            self.failure, self.stuck = None, False
+
+    def close(self) -> None:
+        pass
+
+    def identify(self) -> DeviceInfo:
+        return DeviceInfo("fake", "S1", "1")
+
+    def _wrench(self) -> Array:
+        if not self.stuck:
+            at = MODEL.frames(self.arm.q).R_base_flange[0]
+            force = at.T @ [0, 0, -1.2 * 9.81]
+            free = np.add(np.r_[force, np.cross([0.01, 0, 0.06], force)], [1, 2, 3, 0.1, 0.2, 0.3])
+            self._newest = free + self.push + self.rng.normal(0, self.noise)
+        return self._newest
+
+    def collect(self, duration_s: float) -> FtSamples:
+        self.check()
+        n = max(40, int(duration_s * 100))
+        self.collecting()
+        rows = np.array([self._wrench() for _ in range(n)])
+        now = time.monotonic_ns()
+        self._seq += n
+        return FtSamples(
+            now - (np.arange(n)[::-1] * 1_000_000).astype(np.int64),
+            np.full(n, np.nan),
+            np.arange(n, dtype=np.int64),
+            np.zeros((n, 0), np.int32),
+            rows,
+            np.zeros(n, np.uint32),
+        )
+
+    def latest(self, *, timeout_s: float) -> FtSamples:
+        assert timeout_s == 0
+        self.check()
+        self._seq += 1
+        return FtSamples(
+            np.array([time.monotonic_ns()]),
+            np.array([np.nan]),
+            np.array([self._seq]),
+            np.zeros((1, 0), np.int32),
+            self._wrench()[None],
+            np.zeros(1, np.uint32),
+        )
+
+    def check(self) -> None:
+        if self.failure is not None:
+            raise self.failure
+
+    def health(self) -> Health:
+        return Health(self._seq, 0, 0, 1000.0, 0.001, events=self.events)
+
+
+@dataclass
+class Scripted:
+    """An operator that agrees to everything, but for what a test says."""
+
+    answers: dict[str, list[str]] = field(default_factory=dict)
+    on_event: Callable[[Event], None] = lambda _: None
+    keys: list[Key] = field(default_factory=list)
+    told: list[Event] = field(default_factory=list)
+    asked: list[Question] = field(default_factory=list)
+
+    def tell(self, event: Event) -> None:
+        self.told.append(event)
+        self.on_event(event)
+
+    def ask(self, question: Question) -> str:
+        self.asked.append(question)
+        for word, answers in self.answers.items():
+            if word in question.text and answers:
+                return answers.pop(0)
+        if "resume" in question.answers:
+            raise Declined("nobody")
+        return question.answers[0]
+
+    def pressed(self) -> Key | None:
+        return self.keys.pop(0) if self.keys else None
+
+    def states(self) -> list[State]:
+        return [event.state for event in self.told if isinstance(event, StateChanged)]
+
+    def of(self, kind: type[Any]) -> list[Any]:
+        return [event for event in self.told if isinstance(event, kind)]
+
+
+class Lab:
+    """A fake cell and what a test wants of it."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder = folder
+        self.arm = FakeArm()
+        self.sensor = FakeSensor(self.arm)
+        self.operator = Scripted()
+        self.cell = CellConfig(
+            RobotConfig("fake"),
+            SensorConfig("fake://"),
+            ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),)),
+            WorkcellConfig(measured=True),
+            Sampling(average_s=0.3, noise_record_s=0.0),
+        )
+        monkeypatch.setattr(guided, "build_arm", lambda _: self.arm)
+        monkeypatch.setattr(guided, "build_sensor", lambda _: self.sensor)
+        monkeypatch.setattr(preflight, "_LINK_S", 0.02)
+        monkeypatch.setattr("shutil.which", lambda _: None)
+
+    def calibrate(self, **options: Any) -> Outcome | None:
+        return guided.calibrate(self.cell, self.operator, Options(self.folder / "runs", poses=6, **options))
+
+    def run(self) -> Run:
+        (folder,) = (self.folder / "runs").iterdir()
+        return Run(folder)
+
+    def stops(self) -> list[int]:
+        return [record.stop for record in self.run().records()]
+
+    def said(self) -> str:
+        return "\n".join(event.words for event in self.operator.of(Noted))
+
+    def taken(self) -> list[int]:
+        return [event.stop for event in self.operator.of(PoseTaken)]
+
+    def holds(self) -> list[tuple[str, ...]]:
+        return [question.answers for question in self.operator.asked if "resume" in question.answers]
+
+    def press(self, *presses: tuple[Key, type[Event], int]) -> None:
+        """Press each key once, when an event of its kind is told of its stop."""
+        left = list(presses)
+
+        def on_event(event: Event) -> None:
+            for one in left:
+                key, kind, stop = one
+                if isinstance(event, kind) and getattr(event, "stop", None) == stop:
+                    left.remove(one)
+                    self.operator.keys.append(key)
+                    return
+
+        self.operator.on_event = on_event
+
+    def push_on_the_way(self, *moves: int) -> None:
+        """Let something be in the way of these moves, and be gone when a person is asked."""
+
+        def push() -> None:
+            self.sensor.push = np.array([150.0, 0, 0, 0, 0, 0])
+
+        def on_event(event: Event) -> None:
+            if isinstance(event, StateChanged) and event.state is State.HOLD:
+                self.sensor.push = np.zeros(6)
+
+        self.arm.at_move |= dict.fromkeys(moves, push)
+        self.operator.on_event = on_event

@@ -1,0 +1,281 @@
+"""Keys, and how a run goes on, on the fake cell: pause, stop, skip, redo, --resume, by hand."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.errors import DeviceFault
+from drivers.interfaces import DeviceInfo
+from ftdrive.config import ToolConfig
+from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
+from ftdrive.planning.plan import Plan
+from ftdrive.session import machine
+from ftdrive.session.events import (
+    Checked,
+    Estimated,
+    Event,
+    GuardTripped,
+    Noted,
+    PoseTaken,
+    RunOpened,
+    State,
+    StateChanged,
+)
+from ftdrive.session.operator import Key
+from tests.unit.fake_cell import Lab
+
+
+def test_pause_holds_the_arm_on_its_way_and_goes_on_or_ends(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
+    lab.operator.answers["Type resume to go on"] = ["resume"]
+    lab.calibrate()
+    assert lab.operator.states().count(State.HOLD) == 1
+    assert lab.operator.of(GuardTripped) == []
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+    lab.arm.moves.clear()
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
+    lab.operator.answers["Type resume to go on"] = ["quit"]
+    with pytest.raises(Declined, match="paused by a person"):
+        lab.calibrate()
+
+
+def test_stop_ends_the_session_without_a_question_and_says_how_to_go_on(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined, match="stopped by a person"):
+        lab.calibrate()
+    assert lab.arm.halted.is_set()
+    assert State.HOLD not in lab.operator.states()
+    assert "resume" not in lab.operator.asked[-1].text
+    assert lab.stops() == [1, 2]
+    assert f"--resume {lab.run().folder}" in lab.operator.of(Noted)[-1].words
+
+
+def test_skip_on_the_way_stops_the_arm_and_goes_round_that_pose(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.SKIP)
+    lab.calibrate()
+    assert lab.taken() == [1, 2, 3, 5, 6, 7]
+    assert lab.arm.stops == 1
+    fourth = np.array(Plan.load(lab.run().plan_path).steps[3].q_rad)
+    assert [np.abs(goal - fourth).max() < 1e-9 for goal, *_ in lab.arm.moves].count(True) == 1  # the one broken off
+    assert [question for question in lab.operator.asked if "the way to pose 5" in question.text]
+    assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
+    assert State.HOLD not in lab.operator.states()
+    assert "skipped: pose 4, the arm goes on to pose 5" in lab.said()
+
+
+def test_skip_while_a_pose_is_measured_skips_that_one(lab: Lab) -> None:
+    def skip() -> None:
+        if len(lab.arm.moves) == 4 and not skipped:
+            skipped.append(True)
+            lab.operator.keys.append(Key.SKIP)
+
+    skipped: list[bool] = []
+    lab.sensor.collecting = skip
+    lab.calibrate()
+    assert lab.taken() == [1, 2, 3, 5, 6, 7]
+    assert not [question for question in lab.operator.asked if "the way to pose 5" in question.text]
+    assert len(lab.arm.moves) == 7
+
+
+def test_skip_with_no_pose_under_way_skips_none(lab: Lab) -> None:
+    lab.press((Key.SKIP, PoseTaken, 4), (Key.KEEP, StateChanged, 5))
+    lab.calibrate()
+    assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
+    assert "none is under way" in lab.said()
+
+
+def test_keep_has_nothing_to_do_in_a_tour_and_says_so(lab: Lab) -> None:
+    lab.press((Key.KEEP, PoseTaken, 3))
+    lab.calibrate()
+    assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
+    assert lab.said().count("a pose is kept by itself; r takes it again") == 1
+
+
+def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> None:
+    def redo() -> None:
+        if len(lab.arm.moves) == 8 and not again:
+            again.append(True)
+            lab.operator.keys.append(Key.REDO)
+
+    again: list[bool] = []
+    lab.sensor.collecting = redo  # while pose 6 is measured: pose 5 is the last that was shown
+    lab.press((Key.REDO, PoseTaken, 1), (Key.REDO, StateChanged, 4))  # while the arm stands, and on its way
+    lab.calibrate()
+    assert lab.taken() == [1, 1, 2, 3, 3, 4, 5, 5, 6, 7]
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+    assert "the arm ends its move, then goes back to pose 3" in lab.said()
+    ways = [question.text for question in lab.operator.asked if "the way to pose" in question.text]
+    assert len(ways) == 1  # the first approach: back and forth it goes along the plan's own moves
+
+
+def test_redo_before_any_pose_or_twice_does_nothing_more(lab: Lab) -> None:
+    def twice(event: Event) -> None:
+        if isinstance(event, StateChanged) and event.state is State.APPROACH:
+            lab.operator.keys.append(Key.REDO)
+        if isinstance(event, PoseTaken) and lab.taken() == [1, 2]:
+            lab.operator.keys.extend([Key.REDO, Key.REDO])
+
+    lab.operator.on_event = twice
+    lab.calibrate()
+    assert lab.taken() == [1, 2, 2, 3, 4, 5, 6, 7]
+    assert "no pose yet" in lab.said()
+    assert "pose 2 is being taken again already" in lab.said()
+
+
+def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> None:
+    def skip() -> None:
+        if len(lab.arm.moves) == 3 and len(lab.taken()) == 3 and not skipped:
+            skipped.append(True)
+            lab.operator.keys.append(Key.SKIP)
+
+    skipped: list[bool] = []
+    lab.sensor.collecting = skip
+    lab.press((Key.REDO, PoseTaken, 3))
+    outcome = lab.calibrate()
+    assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
+    assert "pose 3 stays as it was taken" in lab.said()
+    assert outcome is not None
+    assert outcome.result.n_poses == 6
+    assert [event.poses for event in lab.operator.of(Estimated)][:5] == [1, 2, 3, 3, 4]
+
+
+def test_a_way_past_a_skipped_pose_is_told_and_confirmed_by_a_person(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.calibrate()  # trusted from here on
+    lab.operator.asked.clear()
+    lab.operator.answers["Pose 3 of 7"] = ["s"] * 2
+    lab.calibrate(mode="step")
+    monkeypatch.setattr(machine, "_NEAR_RAD", np.pi)
+    lab.calibrate(mode="step")
+    ways = [question for question in lab.operator.asked if "the way to pose 4" in question.text]
+    assert ["skipped pose 3" in question.text for question in ways] == [False, True]
+    assert [question.assumed for question in ways] == ["yes", None]
+
+
+def test_what_would_help_most_is_not_told_where_the_plan_chooses(lab: Lab) -> None:
+    lab.calibrate()
+    assert {event.hint for event in lab.operator.of(Estimated)} == {""}
+
+
+def test_a_hold_tells_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.arm.set_status(fault="protective stop: …", safety_mode="protective stop")
+    lab.operator.answers["Type resume when it is mended"] = ["quit"]
+    with pytest.raises(DeviceFault):
+        lab.calibrate()
+    (hold,) = [event for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
+    assert str(lab.folder) not in hold.words + lab.operator.asked[-1].text
+    assert "protective stop" in hold.words
+    assert "3 poses are kept" in lab.operator.asked[-1].text
+
+
+def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined):
+        lab.calibrate()
+    run = lab.run()
+    lab.operator.told.clear()
+    outcome = lab.calibrate(resume=run.folder)
+    assert outcome is not None
+    assert outcome.run.folder == run.folder
+    assert [event.stop for event in lab.operator.of(PoseTaken)] == [4, 5, 6, 7]
+    assert len((run.folder / "events.ndjson").read_text().splitlines()) > len(lab.operator.told)
+    first = run.calibration_path.read_bytes()
+    lab.operator.told.clear()
+    assert lab.calibrate(resume=run.folder, redo=(3,)) is not None
+    assert [event.stop for event in lab.operator.of(PoseTaken)] == [3]
+    assert run.calibration_path.name == "calibration-2.json"
+    assert (run.folder / "calibration.json").read_bytes() == first
+
+
+@pytest.mark.parametrize(
+    ("begun", "asked", "in_steps"), [("step", "auto", True), ("auto", "step", True), ("auto", "auto", False)]
+)
+def test_a_run_goes_on_in_its_own_mode_or_in_steps(begun: str, asked: str, in_steps: bool, lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined):
+        lab.calibrate(mode=begun)
+    lab.operator.asked.clear()
+    lab.calibrate(resume=lab.run().folder, mode=asked)
+    steps = [question.text.split(",")[0] for question in lab.operator.asked if "Enter" in question.text]
+    assert steps == [f"Pose {stop} of 7" for stop in (4, 5, 6, 7) if in_steps]
+
+
+def test_a_resumed_run_is_open_with_its_poses_before_anything_is_checked(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
+    lab.operator.answers["Type resume"] = ["quit"]
+    with pytest.raises(Declined):
+        lab.calibrate()
+    run = lab.run()
+    lab.operator.told.clear()
+    assert lab.calibrate(resume=run.folder, dry_run=True) is None
+    kinds = [type(event) for event in lab.operator.told]
+    assert kinds.count(RunOpened) == 1
+    assert kinds.index(RunOpened) < kinds.index(Checked)
+    before = lab.operator.told[: kinds.index(Checked)]
+    assert [event.poses for event in before if isinstance(event, Estimated)] == [1, 2, 3]
+
+
+def test_a_run_is_not_gone_on_with_another_tool(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
+    lab.operator.answers["Type resume"] = ["quit"]
+    with pytest.raises(Declined):
+        lab.calibrate()
+    lab.arm.moves.clear()
+    lab.cell = replace(lab.cell, tool=ToolConfig(cylinders_mm=((0.0, 210.0, 100.0),)))
+    for options in ({}, {"redo": (1,)}):
+        with pytest.raises(NotAccepted, match="another tool"):
+            lab.calibrate(resume=lab.run().folder, **options)
+    assert lab.arm.moves == []
+
+
+# ----------------------------------------------------------------------------------------------------------- by hand
+
+
+@pytest.mark.parametrize("mode", ["manual", "listen"])
+def test_a_run_by_hand_goes_on_by_hand(mode: str, lab: Lab) -> None:
+    lab.operator.keys = [Key.STOP]
+    with pytest.raises(Declined, match="ended before the first pose"):
+        lab.calibrate(mode=mode)
+    run = lab.run()
+    assert not lab.arm.control
+    for asked in ("auto", mode):
+        lab.operator.told.clear()
+        lab.operator.keys = [Key.STOP]
+        with pytest.raises(Declined, match="ended before the first pose"):
+            lab.calibrate(resume=run.folder, mode=asked)
+        assert len(lab.operator.of(RunOpened)) == 1
+    assert not lab.arm.control
+    assert (run.folder / "run.json").exists()
+    with pytest.raises(ConfigError, match=f"with --{mode} and can only go on like that: leave out --step"):
+        lab.calibrate(resume=run.folder, mode="step")
+    with pytest.raises(ConfigError, match="leave out --redo"):
+        lab.calibrate(resume=run.folder, redo=(1,))
+
+
+def test_a_run_along_a_plan_does_not_go_on_by_hand(lab: Lab) -> None:
+    lab.calibrate()
+    with pytest.raises(ConfigError, match="along a plan"):
+        lab.calibrate(resume=lab.run().folder, mode="listen")
+
+
+@pytest.mark.parametrize("option", [{"dry_run": True}, {"fast": True}, {"plan": Path("plan.json")}])
+def test_by_hand_nothing_is_planned_or_moved(option: dict[str, Any], lab: Lab) -> None:
+    with pytest.raises(ConfigError, match="leave out --" + next(iter(option)).replace("_", "-")):
+        lab.calibrate(mode="manual", **option)
+    assert not (lab.folder / "runs").exists()
+
+
+def test_a_run_of_another_sensor_is_not_gone_on_with(lab: Lab) -> None:
+    lab.calibrate()
+    lab.sensor.identify = lambda: DeviceInfo("fake", "S2", "1")  # type: ignore[method-assign]
+    with pytest.raises(PlanRefused, match="S1, this is S2"):
+        lab.calibrate(resume=lab.run().folder)
+
+
+def test_what_the_sensor_went_through_is_written_down(lab: Lab) -> None:
+    lab.sensor.events = ((17, "connected again"),)
+    lab.calibrate()
+    told = [event for event in lab.operator.of(Noted) if "connected again" in event.words]
+    assert len(told) == 1
