@@ -13,8 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, Frozen, ProtocolError, StreamBroken
-from drivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
+from drivers._plausible import DeviceClock, Liveness, Rate
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
 
 if sys.platform == "win32":
     LINK_ERRORS: tuple[type[Exception], ...] = (OSError,)
@@ -46,20 +47,11 @@ def scale_facts(
 
 _JOIN_S = 0.6
 _FIRST_SAMPLE_S = 1.0
-_FROZEN_S = 0.2
-_FROZEN_SAMPLES = (20, 50)
-"""A living sensor has noise: identical readings over so long a time are none, if they are as many as come in that time,
-but at least and at most so many. README.md says why, under Decisions."""
-_CLOCK_JUMP_S = 0.5
-"""How far the device's clock may gain on ours from one block to the next; a late block makes it fall behind only."""
-_CLOCK_DRIFT = 0.02
-"""How much slower than ours the device's clock may run before its samples are taken for late ones."""
 _AWAY_S = 0.3
 """A shorter pause between two reads is not told from a busy computer."""
 _SETTLE_S, _WAITED_S, _DISCARD_S = 0.05, 0.001, 0.5
 """After a pause: how long an adapter may still deliver what it has held back, how long a read lasts that had to wait
 for something new, and how long to try for one."""
-_RATE_TOLERANCE, _RATE_WINDOW_S = 0.1, 2.0
 _RECOVER_S = 10.0
 _RETRY_S = 0.2
 _EVENTS = 1000
@@ -301,17 +293,16 @@ class StreamingSensor(ForceTorqueSensor):
         self._lost = self._malformed = 0
         """Since the last `_connect`; a subclass may count or assign them."""
         self._events: deque[tuple[int, str]] = deque(maxlen=_EVENTS)
-        self._rate_is_wrong = False
+        self._rate = Rate(self.name)
         self._seq_offset = 0
         self._start_watching()
 
     def _start_watching(self) -> None:
         """Forget what the checks of a running stream compare with."""
-        self._same_rows, self._same_since_ns = 0, 0
-        self._clock: tuple[float, float] | None = None
-        self._lead_s = 0.0
+        self._liveness = Liveness(self.name)
+        self._device_clock = DeviceClock(self.name)
+        self._rate.forget()
         self._is_late = False
-        self._rate_since_ns, self._rate_samples = 0, 0
 
     def _run(self) -> None:
         cause: Exception | None = None
@@ -367,7 +358,8 @@ class StreamingSensor(ForceTorqueSensor):
         self._discard_backlog()
         with self._news:
             self._fresh_from_ns = time.monotonic_ns()
-            self._same_rows = self._rate_since_ns = 0
+            self._liveness.forget()
+            self._rate.forget()
 
     def _reconnect(self, cause: Exception) -> None:
         """Connect again to the same device; the first sample that comes then ends the failure."""
@@ -419,8 +411,9 @@ class StreamingSensor(ForceTorqueSensor):
             if not len(block):
                 return
             t_ns = int(block.t_host_ns[-1])
-            self._judge_wrench(block)
-            self._judge_rate(len(block), t_ns)
+            self._liveness.judge(block, self._nominal_Hz)
+            if note := self._rate.judge(len(block), t_ns, self._nominal_Hz):
+                self._note(note)
             if self._received and heard_s - self._heard_s > self._stale_after_s:
                 self._silences += 1
             self._heard_s, self._is_back = heard_s, True
@@ -453,29 +446,9 @@ class StreamingSensor(ForceTorqueSensor):
         self._out_of_order += int((seq < top).sum())
         return _rows(block, newer)
 
-    def _judge_wrench(self, block: FtSamples) -> None:
-        """Raise on numbers that are none, and on a sensor that says the same again and again."""
-        wrench = block.wrench
-        if not np.isfinite(wrench).all():
-            raise ProtocolError(f"{self.name}: the sensor sends a wrench that is not finite; power it off and on")
-        other = np.flatnonzero((wrench != wrench[-1]).any(axis=1))
-        if len(other) or not self._same_rows or (wrench[-1] != self._newest.wrench[-1]).any():
-            first = int(other[-1]) + 1 if len(other) else 0
-            self._same_rows, self._same_since_ns = len(block) - first, int(block.t_host_ns[first])
-        else:
-            self._same_rows += len(block)
-        same_s = (int(block.t_host_ns[-1]) - self._same_since_ns) / 1e9
-        fewest, most = _FROZEN_SAMPLES
-        enough = most if math.isnan(self._nominal_Hz) else min(most, max(fewest, _FROZEN_S * self._nominal_Hz))
-        if self._same_rows >= enough and same_s >= _FROZEN_S:
-            raise Frozen(
-                f"{self.name}: frozen, {self._same_rows} identical samples in {same_s:.2f} s, and a sensor that "
-                "measures has noise; power it off and on"
-            )
-
     def _fresh_rows(self, block: FtSamples, heard_s: float) -> FtSamples:
         """Drop what was measured too long ago: it has waited in this computer, in the device or on its way."""
-        late_s = self._judge_clock(block.t_device_s, heard_s)
+        late_s = self._device_clock.late_s(block.t_device_s, heard_s)
         is_late = bool(late_s[-1] > self._stale_after_s)
         if is_late and not self._is_late:
             self._note(f"samples come {late_s[-1]:.2f} s late and are thrown away")
@@ -485,63 +458,6 @@ class StreamingSensor(ForceTorqueSensor):
             return block
         self._earlier_lost += int((~fresh).sum())
         return _rows(block, fresh)
-
-    def _judge_clock(self, t_device_s: Array, heard_s: float) -> Array:
-        """Return how late each sample is, compared with the quickest so far; 0 where the device tells no time.
-
-        Raises when the device's clock goes back, or gains on ours in a step. Only durations are compared.
-        """
-        newest_s = float(t_device_s[-1])
-        if math.isnan(newest_s):
-            return np.zeros(len(t_device_s))
-        if self._clock is None:
-            self._clock = newest_s, heard_s
-            self._clock_newest = float(t_device_s[0]), heard_s
-        before_s, heard_before_s = self._clock_newest
-        self._clock_newest = newest_s, heard_s
-        leads_s = (t_device_s - self._clock[0]) - (heard_s - self._clock[1])
-        lead_s = float(leads_s[-1])
-        step_s = lead_s - self._lead_s
-        # a clock slower than ours falls behind for ever, and its samples are not late
-        self._lead_s = max(lead_s, self._lead_s - _CLOCK_DRIFT * (heard_s - heard_before_s))
-        back_s = -float(np.diff(t_device_s, prepend=before_s).min())
-        if back_s > 0:
-            raise StreamBroken(
-                f"{self.name}: the device's clock jumped back by {back_s:.3f} s to {newest_s:.3f} s: it has "
-                "restarted, open it again"
-            )
-        if step_s > _CLOCK_JUMP_S:
-            raise StreamBroken(
-                f"{self.name}: the device's clock jumped ahead by {step_s:.3f} s to {newest_s:.3f} s; open it again"
-            )
-        return self._lead_s - leads_s
-
-    def _judge_rate(self, samples: int, t_host_ns: int) -> None:
-        """Say that the rate is not what the device says, and when it is again."""
-        if math.isnan(self._nominal_Hz):
-            return
-        self._rate_samples += samples
-        if not self._rate_since_ns:
-            self._rate_since_ns, self._rate_samples = t_host_ns, 0
-        elapsed_s = (t_host_ns - self._rate_since_ns) / 1e9
-        if elapsed_s < _RATE_WINDOW_S:
-            return
-        rate_Hz = self._rate_samples / elapsed_s
-        self._rate_since_ns, self._rate_samples = t_host_ns, 0
-        error = abs(rate_Hz / self._nominal_Hz - 1)
-        if self._rate_is_wrong and error < _RATE_TOLERANCE / 2:
-            self._rate_is_wrong = False
-            self._note(f"rate {rate_Hz:.1f} Hz, right again")
-        elif not self._rate_is_wrong and error > _RATE_TOLERANCE:
-            self._rate_is_wrong = True
-            self._note(f"rate {rate_Hz:.1f} Hz instead of {self._nominal_Hz:g} Hz")
-            log.warning(
-                "%s: %.1f Hz instead of %g Hz; samples %s or the sensor is set differently, look at health()",
-                self.name,
-                rate_Hz,
-                self._nominal_Hz,
-                "are lost" if rate_Hz < self._nominal_Hz else "come twice",
-            )
 
     def _let_go(self) -> None:
         try:

@@ -321,7 +321,7 @@ RECORD_SATURATED = bytes.fromhex("0064012C01F4FF38FE707FFF") + bytes(
 @pytest.fixture(autouse=True)
 def _peers_repeat_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scripted peers send one record over and over: on a busy computer for long enough to look frozen."""
-    monkeypatch.setattr("drivers._stream._FROZEN_S", math.inf)
+    monkeypatch.setattr("drivers._plausible._FROZEN_S", math.inf)
 
 
 def marked(data: bytes, *damaged: int) -> bytes:

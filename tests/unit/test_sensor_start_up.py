@@ -266,7 +266,7 @@ def test_robotiq_that_refuses_to_stream() -> None:
 def test_robotiq_slow_usb_adapter_is_named_with_its_cure(
     period_s: float, hints: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drivers._stream._FROZEN_S", math.inf)  # the peer repeats one frame
+    monkeypatch.setattr("drivers._plausible._FROZEN_S", math.inf)  # the peer repeats one frame
     with ft300(period_s=period_s) as peer, RobotiqFt300(peer.path) as sensor:
         sensor.collect(1.3)
     assert caplog.text.count("latency_timer") == hints
@@ -318,7 +318,7 @@ def test_bota_is_configured_when_asked() -> None:
 
 
 def test_bota_clock_wraps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers._stream._FROZEN_S", math.inf)  # the peer repeats one wrench
+    monkeypatch.setattr("drivers._plausible._FROZEN_S", math.inf)  # the peer repeats one wrench
     begin = 2**32 - 150_000
     with Bota(times=[begin + 10_000 * k for k in range(30)]) as peer, BotaSensor(peer.path) as sensor:
         samples = sensor.collect(0.25)
@@ -328,7 +328,7 @@ def test_bota_clock_wraps(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_bota_gaps_are_seen_on_its_clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers._stream._FROZEN_S", math.inf)  # the peer repeats one wrench
+    monkeypatch.setattr("drivers._plausible._FROZEN_S", math.inf)  # the peer repeats one wrench
     times = [10_000 * k for k in range(1, 40) if k not in {25, 26, 30}]
     with Bota(times=times) as peer, BotaSensor(peer.path) as sensor:
         samples = sensor.collect(0.35)
