@@ -1,6 +1,7 @@
 """What `doctor` says of the devices, as functions of what was seen; nothing here opens one."""
 
 import math
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,15 @@ from numpy.typing import NDArray
 from calib import CalibrationResult
 from calib.design import Guess, predicted_sigma, special
 from calib.noise import is_stationary, mean_and_covariance
-from drivers.errors import ConnectError, DeviceFault, DriverError, Frozen, PortInUse, ProtocolError
+from drivers.errors import (
+    ConnectError,
+    DeviceFault,
+    DeviceTimeout,
+    DriverError,
+    PortInUse,
+    ProtocolError,
+    StreamBroken,
+)
 from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
 from drivers.ur.kinematics import MODELS
 from ftdrive.checks import Check, SensorAddress, State, latency_command
@@ -27,6 +36,28 @@ _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs o
 _SLOWEST_SLIDER = 0.05
 _OLDEST_MINOR = 4
 """Of PolyScope 3 and 5: ur_rtde cannot control older ones."""
+
+
+def found_and_cure(error: Exception, otherwise: str) -> tuple[str, str]:
+    """Split what a driver says into what happened and what to do.
+
+    An arm's driver ends with a full stop, and what to do stands after its last colon; a sensor's says it after the
+    first semicolon that is not in brackets.
+    """
+    words = str(error)
+    if words.endswith("."):
+        found, colon, cure = words.rstrip(".").rpartition(": ")
+        return (found, cure) if colon else (cure, otherwise)
+    for semicolon in re.finditer("; ", words):
+        found, cure = words[: semicolon.start()], words[semicolon.end() :]
+        if found.count("(") == found.count(")"):
+            return found, cure
+    if isinstance(error, PortInUse) and ": " in words:
+        found, _, cure = words.rpartition(": ")
+        return found, cure
+    return words, otherwise
+
+
 # ---------------------------------------------------------------------------------------------------------- the sensor
 
 
@@ -86,22 +117,31 @@ def _check_sign(fact: Fact | None) -> Check:
 
 
 def check_sensor_error(name: str, error: DriverError, address: SensorAddress, permissions: Sequence[Check]) -> Check:
-    """Say what to do about the error of a sensor's driver: the port first, then the kind of error."""
-    wrong = next((check for check in permissions if check.state == "failed"), None)
+    """Say what to do about the error of a sensor's driver.
+
+    That is what its message says; for a sensor that was not reached, what mends the way to it, if anything is wrong
+    there; and only where neither is known, what usually helps against errors of this kind.
+    """
     kind = error.__cause__ if isinstance(error, ConnectError) and isinstance(error.__cause__, DriverError) else error
-    if isinstance(kind, PortInUse):
-        return Check(name, "failed", *found_and_cure(kind, "end the other program"))
-    if wrong is not None and wrong.fix is not None and not isinstance(kind, DeviceFault):
-        cure = wrong.fix
-    elif isinstance(kind, Frozen):
-        cure = "switch the sensor off and on; if it is loaded, take the load off first"
-    elif isinstance(kind, DeviceFault):
-        cure = "take what loads it off, switch the sensor off and on, then ftdrive doctor again"
-    elif isinstance(kind, ProtocolError):
-        cure = f"switch the sensor off and on; is it the one its address names? {_ask_who(address)}"
-    else:
-        cure = f"check the sensor's supply and cable, then {_ask_who(address)}"
-    return Check(name, "failed", str(error), cure)
+    found, own = found_and_cure(error, "")
+    way = next((check.fix for check in permissions if check.state == "failed"), None)
+    if way is not None and not isinstance(kind, PortInUse | DeviceFault) and (_not_reached(kind) or not own):
+        own = way
+    return Check(name, "failed", found, own or _usual_cure(kind, address))
+
+
+def _not_reached(error: BaseException) -> bool:
+    """Tell whether nothing came from a device; one that is refused for what it says has no other error behind it."""
+    silent = isinstance(error, DeviceTimeout | StreamBroken)
+    return silent or (isinstance(error, ConnectError) and error.__cause__ is not None)
+
+
+def _usual_cure(error: BaseException, address: SensorAddress) -> str:
+    if isinstance(error, DeviceFault):
+        return "look the fault up in the sensor's manual; switch it off and on, then ftdrive doctor again"
+    if isinstance(error, ProtocolError):
+        return f"switch the sensor off and on; is it the one its address names? {_ask_who(address)}"
+    return f"check the sensor's supply and cable, then {_ask_who(address)}"
 
 
 def _ask_who(address: SensorAddress) -> str:
@@ -139,11 +179,13 @@ def _check_rate(rate_Hz: float, nominal_Hz: float, address: SensorAddress) -> Ch
 
 
 def _check_lost(health: Health, address: SensorAddress) -> Check:
-    found = f"{health.lost} lost, {health.malformed} damaged of {health.received}"
-    bad = max(health.lost, health.malformed)
-    if not bad:
+    strange = ((health.out_of_order, "out of order"), (health.duplicated, "twice"))
+    came = "".join(f", {count} came {how}" for count, how in strange if count)
+    found = f"{health.lost} lost, {health.malformed} damaged of {health.received}{came}"
+    gone = max(health.lost, health.malformed, health.out_of_order)
+    if not gone and not health.duplicated:
         return Check("sensor.lost", "ok", found)
-    state: State = "failed" if bad > 0.01 * health.received else "warning"
+    state: State = "failed" if gone > 0.01 * health.received else "warning"  # of what comes twice nothing is missing
     fix = "check the cable, its shield and the termination of the bus" if address.host is None else _BETTER_NETWORK
     return Check("sensor.lost", state, found, fix)
 
@@ -196,12 +238,6 @@ def check_noise(wrench: Array, duration_s: float, average_s: float, mass_kg: flo
 
 
 # ------------------------------------------------------------------------------------------------------------- the arm
-
-
-def found_and_cure(error: Exception, otherwise: str) -> tuple[str, str]:
-    """Split what an arm's driver says into what happened and what to do, which stands after the last colon."""
-    found, colon, cure = str(error).rstrip(".").rpartition(": ")
-    return (found, cure) if colon else (cure, otherwise)
 
 
 def check_unreachable(error: DriverError, host: str) -> Check:

@@ -106,7 +106,12 @@ BY_PCAN = SensorAddress.of("ati-can://PCAN_USBBUS1?interface=pcan")
 
 
 def stream(
-    rate_Hz: float, *, nominal_Hz: float = 100.0, lost: int = 0, status: int = 0, address: SensorAddress = PORT
+    rate_Hz: float,
+    *,
+    nominal_Hz: float = 100.0,
+    status: int = 0,
+    address: SensorAddress = PORT,
+    **counted: Any,
 ) -> dict[str, Check]:
     n = round(2 * rate_Hz)
     samples = FtSamples(
@@ -117,7 +122,8 @@ def stream(
         wrench=np.zeros((n, 6)),
         status=np.full(n, status, np.uint32),
     )
-    health = Health(received=n, lost=lost, malformed=0, rate_Hz=rate_Hz, age_s=0.001, nominal_rate_Hz=nominal_Hz)
+    health = Health(received=n, lost=0, malformed=0, rate_Hz=rate_Hz, age_s=0.001, nominal_rate_Hz=nominal_Hz)
+    health = replace(health, **counted)
     return {check.name: check for check in diagnosis.check_stream(samples, health, address, 2.0)}
 
 
@@ -131,6 +137,22 @@ def test_a_healthy_stream_and_three_that_are_not() -> None:
     assert stream(100, lost=20)["sensor.lost"].state == "failed"
     assert stream(100, status=0x4000)["sensor.status"].found == "status 0x4000"
     assert stream(7, nominal_Hz=np.nan)["sensor.rate"].state == "ok"
+
+
+@pytest.mark.parametrize(
+    ("counted", "state", "words"),
+    [
+        ({"duplicated": 60}, "warning", "0 lost, 0 damaged of 200, 60 came twice"),
+        ({"lost": 1, "out_of_order": 1}, "warning", "1 lost, 0 damaged of 200, 1 came out of order"),
+        ({"out_of_order": 3}, "failed", "3 came out of order"),
+        ({"malformed": 3, "duplicated": 1}, "failed", "3 damaged of 200, 1 came twice"),
+    ],
+)
+def test_what_comes_twice_or_too_late_is_told(counted: dict[str, Any], state: str, words: str) -> None:
+    lost = stream(100, **counted)["sensor.lost"]
+    assert lost.state == state
+    assert words in lost.found
+    assert lost.fix
 
 
 @pytest.mark.parametrize(("rate_Hz", "state"), [(96, "ok"), (109, "ok"), (115, "warning"), (200, "failed")])
@@ -237,38 +259,89 @@ def wrapped(error: Exception) -> ConnectError:
     return outer
 
 
+def not_opened(words: str) -> ConnectError:
+    """As a driver tells that the system refused its port."""
+    outer = ConnectError(words)
+    outer.__cause__ = OSError(13, "Permission denied")
+    return outer
+
+
+@pytest.mark.parametrize(
+    ("error", "found", "cure"),
+    [
+        (
+            ConnectError("sensor: serial number A answers, B is configured; check the address, or its option serial"),
+            "sensor: serial number A answers, B is configured",
+            "check the address, or its option serial",
+        ),
+        (
+            wrapped(ProtocolError("this calibration slot is empty (counts per unit 0 and 0); choose another")),
+            "this calibration slot is empty (counts per unit 0 and 0)",
+            "choose another",
+        ),
+        (
+            DeviceFault("sensor: status 0x0008 (bit 3: raw): these are no newtons; ?sinc=512 configures it"),
+            "sensor: status 0x0008 (bit 3: raw): these are no newtons",
+            "?sinc=512 configures it",
+        ),
+        (
+            DeviceTimeout("sensor: silent for 0.4 s; check cable; try again"),
+            "sensor: silent for 0.4 s",
+            "check cable; try again",
+        ),
+        (
+            DeviceTimeout("sensor: no reply (closed (x; y); z); check wiring"),
+            "sensor: no reply (closed (x; y); z)",
+            "check wiring",
+        ),
+        (
+            Frozen("sensor: frozen, 50 samples; power it off and on"),
+            "sensor: frozen, 50 samples",
+            "power it off and on",
+        ),
+        (ConnectError("H:30004 cannot be reached (x: y): ask; look."), "H:30004 cannot be reached (x: y)", "ask; look"),
+    ],
+)
+@pytest.mark.parametrize("address", [PORT, BY_NETWORK, BY_PCAN])
+def test_the_cure_that_a_message_names_is_the_one_shown(
+    error: DriverError, found: str, cure: str, address: SensorAddress
+) -> None:
+    check = diagnosis.check_sensor_error("sensor.stream", error, address, [ALLOWED])
+    assert check == Check("sensor.stream", "failed", found, cure)
+
+
 @pytest.mark.parametrize(
     ("error", "address", "permission", "cure"),
     [
-        (ConnectError("does not open"), PORT, FORBIDDEN, "sudo usermod"),
+        (not_opened("the port does not open"), PORT, FORBIDDEN, "sudo usermod"),
+        (not_opened("the port does not open (13); is it plugged in?"), PORT, FORBIDDEN, "sudo usermod"),
+        (DeviceTimeout("silent for 0.4 s; check cable and supply"), PORT, FORBIDDEN, "sudo usermod"),
+        (StreamBroken("the port is gone (x); plug it in"), PORT, FORBIDDEN, "sudo usermod"),
+        (ConnectError("no port that may be read and written"), PORT, FORBIDDEN, "sudo usermod"),
+        (ConnectError("serial number A answers; check the address"), PORT, FORBIDDEN, "check the address"),
+        (wrapped(ProtocolError("slot 3 is empty; choose another")), PORT, FORBIDDEN, "choose another"),
         (ConnectError("does not open"), PORT, ALLOWED, "ftdrive devices --probe /dev/ttyUSB7"),
-        (
-            DeviceTimeout("silent for 0.4 s"),
-            PORT,
-            ALLOWED,
-            "supply and cable, then ftdrive devices --probe /dev/ttyUSB7",
-        ),
-        (DeviceTimeout("silent for 0.4 s"), BY_NETWORK, ALLOWED, "supply and cable, then ping 192.168.1.1"),
+        (DeviceTimeout("silent"), PORT, ALLOWED, "supply and cable, then ftdrive devices --probe /dev/ttyUSB7"),
+        (DeviceTimeout("silent"), BY_NETWORK, ALLOWED, "supply and cable, then ping 192.168.1.1"),
         (wrapped(DeviceTimeout("no reply")), PORT, ALLOWED, "supply and cable"),
-        (StreamBroken("the port is gone"), PORT, FORBIDDEN, "sudo usermod"),
-        (DeviceTimeout("silent for 0.4 s"), BY_PCAN, ALLOWED, "supply and cable, then ftdrive doctor again"),
-        (DeviceFault("overload"), PORT, FORBIDDEN, "switch the sensor off and on"),
-        (Frozen("50 identical samples"), PORT, ALLOWED, "switch the sensor off and on; if it is loaded, take the load"),
-        (wrapped(DeviceFault("saturated")), PORT, ALLOWED, "take what loads it off"),
+        (DeviceTimeout("silent"), BY_PCAN, ALLOWED, "supply and cable, then ftdrive doctor again"),
+        (StreamBroken("interrupted (silent; check cable)"), BY_PCAN, ALLOWED, "supply and cable"),
+        (DeviceFault("status 4"), PORT, FORBIDDEN, "in the sensor's manual; switch it off and on"),
+        (wrapped(DeviceFault("status 4")), PORT, ALLOWED, "in the sensor's manual; switch it off and on"),
         (ProtocolError("no intact record"), PORT, ALLOWED, "is it the one its address names? ftdrive devices --probe"),
     ],
 )
-def test_the_cure_of_a_sensor_is_that_of_its_error(
+def test_another_cure_is_shown_where_the_way_to_a_sensor_is_wrong_or_its_message_names_none(
     error: DriverError, address: SensorAddress, permission: Check, cure: str
 ) -> None:
     found = diagnosis.check_sensor_error("sensor.stream", error, address, [permission])
-    assert (found.name, found.state, found.found) == ("sensor.stream", "failed", str(error))
+    assert (found.name, found.state, found.found) == ("sensor.stream", "failed", diagnosis.found_and_cure(error, "")[0])
     assert cure in str(found.fix)
-    assert "see the permissions" not in str(found.fix)
 
 
-def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable() -> None:
-    error = PortInUse("sensor: the port is in use by another program: end it, `fuser -v /dev/ttyUSB7` names it")
+@pytest.mark.parametrize("mark", [";", ":"])
+def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable(mark: str) -> None:
+    error = PortInUse(f"sensor: the port is in use by another program{mark} end it, `fuser -v /dev/ttyUSB7` names it")
     found = diagnosis.check_sensor_error("sensor.identity", error, PORT, [FORBIDDEN])
     assert found.found == "sensor: the port is in use by another program"
     assert found.fix == "end it, `fuser -v /dev/ttyUSB7` names it"
