@@ -8,9 +8,12 @@ import click
 from rich.console import Console
 from rich.markup import escape
 from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
+from drivers.errors import DriverError
 from ftdrive.checks import Check, can_details, can_interfaces, check_serial_port, name_by_id
 from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
+from ftdrive.errors import ConfigError
 from ftdrive.simulation import Station
 
 _PLACES = """\b
@@ -37,31 +40,32 @@ def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
     on the identifiers of a sensor, nothing is sent and you are told. A wrong bit rate disturbs a bus in use.
     """
     check_simulate(simulate, real={"--probe": places})
-    found = _emulated() if simulate else {"serial": _serial_ports(), "can": _can_interfaces()}
+    failures: list[Exception] = []
+    found = _emulated(failures) if simulate else {"serial": _serial_ports(), "can": _can_interfaces()}
     if places:
-        found["answers"] = [answer for place in places for answer in _answers(place)]
+        found["answers"] = [answer for place in places for answer in _answers(place, failures)]
     if as_json:
         write_json({"schema_version": 1, **found})
     else:
         _print(found)
+    if failures:
+        raise failures[0]
 
 
 def _serial_ports() -> list[dict[str, Any]]:
-    ports = []
-    for port in sorted(list_ports.comports()):
-        name = name_by_id(Path(port.device))
-        checks = check_serial_port(name or Path(port.device))
-        ports.append(
-            {
-                "port": port.device,
-                "by_id": None if name is None else str(name),
-                "description": None if port.description == "n/a" else port.description,
-                "usb": None if port.vid is None else f"{port.vid:04x}:{port.pid:04x}",
-                "serial_number": port.serial_number,
-                "findings": _findings(checks),
-            }
-        )
-    return ports
+    return [_serial_port(port) for port in sorted(list_ports.comports())]
+
+
+def _serial_port(port: ListPortInfo) -> dict[str, Any]:
+    name = name_by_id(Path(port.device))
+    return {
+        "port": port.device,
+        "by_id": None if name is None else str(name),
+        "description": None if port.description == "n/a" else port.description,
+        "usb": None if port.vid is None else f"{port.vid:04x}:{port.pid:04x}",
+        "serial_number": port.serial_number,
+        "findings": _findings(check_serial_port(name or Path(port.device))),
+    }
 
 
 def _findings(checks: list[Check]) -> list[dict[str, Any]]:
@@ -73,30 +77,36 @@ def _can_interfaces() -> list[dict[str, Any]]:
     return [{"interface": name, **can_details(name)} for name in can_interfaces()]
 
 
-def _answers(place: str) -> list[dict[str, Any]]:
+def _answers(place: str, failures: list[Exception]) -> list[dict[str, Any]]:
+    """Ask at one place; why it cannot be asked is told with the answers of the others, and added to `failures`."""
     from ftdrive.discovery import ask
 
-    answers = [{"port": place, "url": answer.url, "what": answer.what} for answer in ask(place)]
-    return answers or [{"port": place, "url": None, "what": "no known sensor answers"}]
+    nothing = {"port": place, "url": None, "what": "no known sensor answers", "error": None}
+    try:
+        answers = [{"port": place, "url": answer.url, "what": answer.what, "error": None} for answer in ask(place)]
+    except (ConfigError, DriverError, OSError) as error:
+        failures.append(error)
+        return [nothing | {"what": "could not be asked", "error": str(error)}]
+    return answers or [nothing]
 
 
-def _emulated() -> dict[str, Any]:
+def _emulated(failures: list[Exception]) -> dict[str, Any]:
     with Station("both") as station:
         serial, can = station.endpoints["serial"], station.endpoints["can"]
         places = (serial["port"], f"slcan://{can['channel']}?bitrate={can['bitrate']}")
         return {
-            "serial": [{"port": serial["port"]}, {"port": can["channel"]}],
+            "serial": [_serial_port(ListPortInfo(path)) for path in (serial["port"], can["channel"])],
             "can": [],
-            "answers": [answer for place in places for answer in _answers(place)],
+            "answers": [answer for place in places for answer in _answers(place, failures)],
         }
 
 
 def _print(found: dict[str, Any]) -> None:
     data = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
     for port in found["serial"]:
-        words = [port.get("by_id") or port["port"], *(port.get(key) for key in ("description", "usb"))]
+        words = [port["by_id"] or port["port"], port["description"], port["usb"]]
         data.print(" serial  " + escape("   ".join(word for word in words if word)))
-        for finding in port.get("findings", ()):
+        for finding in port["findings"]:
             data.print(f"         [yellow]![/] {escape(finding['found'])}")
             data.print(f"           fix: {escape(finding['fix'] or '-')}")
     for interface in found["can"]:
@@ -106,5 +116,6 @@ def _print(found: dict[str, Any]) -> None:
         if not found[kind]:
             data.print(f" no {name}")
     for answer in found.get("answers", ()):
-        words = [answer["port"], answer["what"], answer["url"]]
+        what = answer["what"] if answer["error"] is None else f"{answer['what']}: {answer['error']}"
+        words = [answer["port"], what, answer["url"]]
         data.print(" probed  " + escape("   ".join(word for word in words if word)))
