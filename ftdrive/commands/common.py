@@ -16,6 +16,11 @@ F = TypeVar("F", bound=Callable[..., Any])
 JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 
 
+MODEL = click.option(
+    "--model", help="Of the arm, where the controller does not tell it (CB3 before 3.12, e-Series before 5.6)."
+)
+
+
 def runs(words: str = "Folder in which the run's own folder is made.") -> Callable[[F], F]:
     """Make the option --runs."""
     kind = click.Path(file_okay=False, path_type=Path)

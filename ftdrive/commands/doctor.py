@@ -24,7 +24,7 @@ from drivers.ur.reading import CONNECT_S
 from drivers.ur.rtde import CONTROL_REGISTERS, registers_in_use
 from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
-from ftdrive.commands.common import JSON, check_simulate, read_cell, runs, simulate, write_json
+from ftdrive.commands.common import JSON, MODEL, check_simulate, read_cell, runs, simulate, write_json
 from ftdrive.config import CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.simulation import Station, sensor_name, sensor_url
@@ -49,7 +49,7 @@ _MARK = {"ok": "[green]✔[/]", "warning": "[yellow]![/]", "failed": "[red]✘[/
 @click.option("--config", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="The cell, in TOML.")
 @click.option("--robot", metavar="HOST", help="Address of the controller.")
 @click.option("--sensor", metavar="URL", help="Such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0.")
-@click.option("--model", help="Of the arm, where the controller does not tell it (CB3, PolyScope before 5.6).")
+@MODEL
 @simulate()
 @click.option(
     "--calibration", "path", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Does it fit? FILE."

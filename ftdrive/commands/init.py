@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import click
 
-from ftdrive.commands.common import JSON, check_simulate, rows, simulate, write_json
+from ftdrive.commands.common import JSON, MODEL, check_simulate, rows, simulate, write_json
 
 T = TypeVar("T")
 
@@ -18,7 +18,7 @@ _SILENT = "did not answer when this was written"
 
 @click.command()
 @click.option("--robot", metavar="HOST", help="Address of the controller.")
-@click.option("--model", help="Of the arm, where the controller does not tell it (CB3).")
+@MODEL
 @click.option("--sensor", metavar="URL|PLACE", help="Its address, or what `ftdrive devices --probe` takes.")
 @click.option("--height", metavar="MM", help="Of the sensor above the flange face. Measure it.")
 @click.option("--sensor-mass", metavar="KG", help="Of sensor and adapter.")
