@@ -181,6 +181,8 @@ def test_devices_of_this_computer_and_of_an_emulated_cell(station: Station, ftdr
     emulated = ftdrive.json("devices", "--simulate")
     assert [answer["url"].partition(":")[0] for answer in emulated["answers"]] == ["ati-serial", "ati-can"]
     assert all("FT12345" in answer["what"] for answer in emulated["answers"])  # asked, not known
+    told = {"port", "by_id", "description", "usb", "serial_number", "findings"}
+    assert all(port.keys() == told for port in (*own["serial"], *emulated["serial"]))
 
 
 def test_devices_asks_serial_port_and_can_bus_where_it_is_told_to(ftdrive: CommandLine) -> None:
@@ -195,10 +197,37 @@ def test_devices_asks_serial_port_and_can_bus_where_it_is_told_to(ftdrive: Comma
         shown = ftdrive.run("devices", "--probe", bus, "--probe", f"{bus}&base=0x7F").stdout
         assert f" probed  {bus}   {can_answer['what']}   {url}\n" in shown
         assert f" probed  {bus}&base=0x7F   no known sensor answers\n" in shown
-    gone = ftdrive.run("devices", "--probe", "no-can")
-    assert gone.returncode == 3
-    assert "sudo ip link set no-can up type can bitrate 250000" in gone.stderr
-    assert "Traceback" not in gone.stderr
+
+
+def test_a_place_that_cannot_be_asked_does_not_take_the_answers_of_the_others(
+    station: Station, ftdrive: CommandLine
+) -> None:
+    url = station.cell.sensor.url
+    places = ["--probe", "no-can", "--probe", url.removeprefix("ati-serial://"), "--probe", "ftp://x"]
+    up = "sudo ip link set no-can up type can bitrate 250000"
+    outcome = ftdrive.run("devices", *places, "--json")
+    assert outcome.returncode == 3
+    gone, there, wrong = json.loads(outcome.stdout)["answers"]
+    assert (gone["url"], there["url"], wrong["url"]) == (None, url, None)
+    assert up in gone["error"]
+    assert there["error"] is None
+    assert "ftp://x is no place to ask" in wrong["error"]
+    assert up in outcome.stderr
+    assert "Traceback" not in outcome.stderr
+    shown = ftdrive.run("devices", *places[2:])
+    assert shown.returncode == 2
+    assert url in shown.stdout
+    assert "probed  ftp://x   could not be asked: ftp://x is no place" in shown.stdout
+
+
+def test_a_sensor_that_is_configured_otherwise_gets_the_cure_its_driver_names(
+    station: Station, cell: Path, ftdrive: CommandLine
+) -> None:
+    cell.write_text(cell.read_text().replace(station.cell.sensor.url, f"{station.cell.sensor.url}?serial=WRONG"))
+    identity = checks_of(ftdrive.run("doctor", "--config", cell, "--json"))["sensor.identity"]
+    assert identity["state"] == "failed"
+    assert identity["found"].endswith("serial number FT12345 answers, WRONG is configured")
+    assert identity["fix"] == "check the address, or its option serial"
 
 
 def test_transcript_of_a_sensor(ftdrive: CommandLine) -> None:
