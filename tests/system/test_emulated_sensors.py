@@ -58,7 +58,7 @@ def test_a_driver_reads_the_truth_of_the_cell_and_refuses_what_is_none(name: str
 
 
 def test_a_hiccup_of_the_station_is_no_jump_of_its_sensor() -> None:
-    """The arm lives 20 times faster; the clock of its own sensor does not, and counts as lost what the hiccup cost."""
+    """The arm lives 20 times faster, the clock of its own sensor does not, and what was due meanwhile is sent."""
     with Station("ur-ft") as station, build_sensor(station.cell) as sensor:
         sensor.collect(0.2)
         for _ in range(3):
@@ -66,8 +66,7 @@ def test_a_hiccup_of_the_station_is_no_jump_of_its_sensor() -> None:
             time.sleep(0.05)
             os.kill(station.pid, signal.SIGCONT)
             sensor.collect(0.1)
-        health = sensor.health()
-        assert 60 <= health.lost < health.received, "25 for each hiccup; 20 times as many as arrive on the arm's time"
+        assert sensor.health().lost <= 5, "they come late; on the arm's time, 19 of 20 would be lost"
 
 
 def test_an_emulated_address_starts_a_sensor_without_an_arm() -> None:
