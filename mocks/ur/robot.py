@@ -1,7 +1,8 @@
 """The controller without its sockets: arm, modes, safety, program and registers, one step per control cycle.
 
 Time: a cycle takes one control period of real time; the controller and its arm live through `time_scale` times as much
-in it (clock, motion, settling, the waiting times of the controller). The watchdog, which watches us, keeps real time.
+in it (clock, motion, settling, the waiting times of the controller). The watchdog, which watches us, keeps real time,
+and so does the clock when the arm's own sensor is the station's: every sensor samples in real time.
 """
 
 from collections.abc import Callable
@@ -145,8 +146,9 @@ class Robot:
 
     @property
     def timestamp_s(self) -> float:
-        """Controller clock on the wire."""
-        return 100.0 + self.cycle * self.period_s * self.settings.time_scale
+        """Controller clock on the wire; where it stamps the samples of the station's sensor, it keeps real time."""
+        scale = 1.0 if self.wrist_sensor else self.settings.time_scale
+        return 100.0 + self.cycle * self.period_s * scale
 
     def tick(self) -> None:
         """One control cycle: program, then motion."""

@@ -165,9 +165,9 @@ class RtdeClient(Client):
             self.server.reject(str(error))
             self.close()
 
-    def sample(self, first_cycle: int, last_cycle: int) -> None:
-        """Send the present outputs if one of these cycles is due; skip them when the client lags."""
-        due = last_cycle // self._every > (first_cycle - 1) // self._every
+    def sample(self) -> None:
+        """Send the present outputs if this cycle is due; skip them when the client lags."""
+        due = self.robot.cycle % self._every == 0
         if self._started and due and not self.lagging and self._outputs is not None:
             self.send(self._outputs.pack([read(self.robot) for read in self._readers]))
 
@@ -388,13 +388,15 @@ class UrServer:
         cycles = min(due, CATCH_UP_CYCLES)
         self.dropped_cycles += due - cycles
         self.robot.skip(due - cycles)
-        first = self.robot.cycle + 1
+        self.robot.watch(due * period_s)
         for _ in range(cycles):
             self.robot.tick()
-        self.robot.watch(due * period_s)
+            self._send_samples()
+
+    def _send_samples(self) -> None:
         for client in list(self._clients):
             if client.kind in self._silent:
                 continue
             client.flush()
             if self.streaming and isinstance(client, RtdeClient):
-                client.sample(first, self.robot.cycle)
+                client.sample()

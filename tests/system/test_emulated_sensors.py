@@ -1,6 +1,9 @@
 """Every emulated sensor behind its real driver, on the wrist of an emulated arm or by itself."""
 
 import math
+import os
+import signal
+import time
 
 import numpy as np
 import pytest
@@ -52,6 +55,18 @@ def test_a_driver_reads_the_truth_of_the_cell_and_refuses_what_is_none(name: str
                 station.control(do="saturate", axis=1)
                 with pytest.raises(DeviceFault):
                     sensor.collect(1.0)
+
+
+def test_a_hiccup_of_the_station_is_no_jump_of_its_sensor() -> None:
+    """The arm lives 20 times faster, the clock of its own sensor does not, and what was due meanwhile is sent."""
+    with Station("ur-ft") as station, build_sensor(station.cell) as sensor:
+        sensor.collect(0.2)
+        for _ in range(3):
+            os.kill(station.pid, signal.SIGSTOP)
+            time.sleep(0.05)
+            os.kill(station.pid, signal.SIGCONT)
+            sensor.collect(0.1)
+        assert sensor.health().lost <= 5, "they come late; on the arm's time, 19 of 20 would be lost"
 
 
 def test_an_emulated_address_starts_a_sensor_without_an_arm() -> None:

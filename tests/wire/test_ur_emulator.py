@@ -400,6 +400,22 @@ def test_rate_follows_the_request_and_the_real_clock(station: Station) -> None:
         assert len(stamps) <= 54
 
 
+def test_the_clock_of_a_fast_arm_with_a_sensor_of_its_own_is_real() -> None:
+    """It stamps what the sensor measures: one control period a sample, and a stall is as long as it was."""
+    cell = Station("--sensor", "ur-ft", "--time-scale", "20")
+    try:
+        with RtdeSocket(cell.host) as client:
+            client.ask("O", struct.pack(">d", 500.0) + b"timestamp")
+            client.ask("S")
+            stamps, begun = [], time.monotonic()
+            while time.monotonic() < begun + 0.5:
+                stamps.append(struct.unpack_from(">d", client.answer(), 4)[0])
+            assert stamps[-1] - stamps[0] == pytest.approx(time.monotonic() - begun, abs=0.2)
+            assert min(b - a for a, b in itertools.pairwise(stamps)) == pytest.approx(0.002)
+    finally:
+        cell.close()
+
+
 # -- the unmodified ur_rtde -------------------------------------------------------------------------------------------
 
 
