@@ -12,6 +12,11 @@ DriverError
 Every message says what happened, with the value, and what to do next.
 """
 
+from typing import Final
+
+SERVICE: Final = "check load, supply and cable, then power it off and on"
+"""What to do about a status that forbids the use of the data."""
+
 
 class DriverError(Exception):
     """Base of all device errors."""
