@@ -84,8 +84,7 @@ class CanBus:
             self.close()
             cure = "is the adapter plugged in, and is what python-can needs for it installed?"
             if "/" in self._channel and self._interface == "socketcan":
-                cure = f"{self._channel} is no CAN interface; an adapter on a serial port wants interface=slcan in its "
-                cure += "address"
+                cure = "this is no CAN interface: an adapter on a serial port wants interface=slcan in its address"
             elif self._interface == "socketcan":
                 up = f"sudo ip link set {self._channel} up type can bitrate {self._bitrate}"
                 cure = f"is the adapter plugged in, and '{up}' done?"

@@ -14,8 +14,8 @@ Every message says what happened, with the value, and what to do next.
 
 from typing import Final
 
-SERVICE: Final = "check load, supply and cable, then power it off and on"
-"""What to do about a status that forbids the use of the data."""
+UNUSABLE: Final = "its data must not be used: check load, supply and cable, then power it off and on"
+"""What follows from a critical status."""
 
 
 class DriverError(Exception):

@@ -24,7 +24,7 @@ import pynetft
 
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM, units
-from drivers.errors import SERVICE, ConnectError, DeviceFault, ProtocolError, StreamBroken
+from drivers.errors import UNUSABLE, ConnectError, DeviceFault, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples, Health
 
 if TYPE_CHECKING:
@@ -336,9 +336,7 @@ class NetFtSensor(StreamingSensor):
             self._warned = True
 
     def _fault(self, status: int) -> DeviceFault:
-        return DeviceFault(
-            f"{self.name}: status {describe_status(status, self._bits)}; its data must not be used: {SERVICE}"
-        )
+        return DeviceFault(f"{self.name}: status {describe_status(status, self._bits)}; {UNUSABLE}")
 
     def _read_page(self, path: str) -> bytes:
         """Ask for what pynetft does not: serial number of the calibration in use, rate, range."""

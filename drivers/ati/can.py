@@ -27,7 +27,7 @@ from drivers.ati.calibration import (
     unit_names,
 )
 from drivers.ati.codec import Op
-from drivers.errors import SERVICE, ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
+from drivers.errors import UNUSABLE, ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import Array, DeviceInfo, FtSamples
 
 if TYPE_CHECKING:
@@ -221,9 +221,7 @@ class AtiCanSensor(StreamingSensor):
         """Raise on what makes a reading unusable, log the rest of a status word once."""
         status = reading.status
         if status & codec.CRITICAL:
-            raise DeviceFault(
-                f"{self.name}: status {codec.describe_status(status)}; its data must not be used: {SERVICE}"
-            )
+            raise DeviceFault(f"{self.name}: status {codec.describe_status(status)}; {UNUSABLE}")
         if self._polls and status & ~self._seen_status & codec.WATCHDOG_RESET:
             raise StreamBroken(
                 f"{self.name}: the sensor has reset itself and may be back at calibration slot 0; open it again"

@@ -20,7 +20,7 @@ from drivers._stream import StreamingSensor, scale_facts
 from drivers.ati import modbus
 from drivers.ati.calibration import Calibration, saturated_gauges, units
 from drivers.ati.codec import describe_status
-from drivers.errors import SERVICE, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
+from drivers.errors import UNUSABLE, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 
 if TYPE_CHECKING:
@@ -261,7 +261,7 @@ class AtiSerialSensor(StreamingSensor):
         new, self._status = status & ~self._status, status
         text = describe_status(status, modbus.STATUS_BITS)
         if status & modbus.CRITICAL:
-            raise DeviceFault(f"{self.name}: status {text}; its data must not be used: {SERVICE}")
+            raise DeviceFault(f"{self.name}: status {text}; {UNUSABLE}")
         if self._seq and new & modbus.WATCHDOG_RESET:
             raise StreamBroken(f"{self.name}: the sensor has reset itself and lost its gains; open it again")
         if new:

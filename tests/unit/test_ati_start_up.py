@@ -279,7 +279,7 @@ def test_can_bus_that_does_not_open(interface: str, channel: str) -> None:
 
 
 def test_an_adapter_on_a_serial_port_without_its_interface_is_told_so() -> None:
-    with pytest.raises(ConnectError, match=r"/dev/ttyACM0 is no CAN interface; .* wants interface=slcan") as caught:
+    with pytest.raises(ConnectError, match=r"this is no CAN interface: .* wants interface=slcan") as caught:
         AtiCanSensor("/dev/ttyACM0").open()
     assert "ip link" not in str(caught.value)
 
