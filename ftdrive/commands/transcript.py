@@ -90,7 +90,7 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
         seen = {"error": f"{type(error).__name__}: {error}"}
         raise
     finally:
-        if not writer.has_port:
+        if not writer.has_port and seen["error"] in {None, INTERRUPTED}:  # a port that does not open is worth a report
             writer.discard()
         else:
             writer.end(**seen)
