@@ -84,8 +84,9 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
     seen: dict[str, Any] = {"error": INTERRUPTED}
     try:
         with recording(writer), device:
-            seen = _watch(device, duration_s)
+            whole = _watch(device, duration_s)
             device.collect(_TAIL_S)
+        seen = whole
     except Exception as error:
         seen = {"error": f"{type(error).__name__}: {error}"}
         raise
