@@ -63,7 +63,10 @@ class CanBus:
             with contextlib.suppress(OSError):  # the link to an adapter may vanish while it is followed
                 tty = os.path.realpath(tty)
             if not os.access(tty, os.R_OK | os.W_OK):
-                raise ConnectError(f"{self._owner}: there is no {self._channel} that may be read and written")
+                raise ConnectError(
+                    f"{self._owner}: there is no {self._channel} that may be read and written; is the adapter plugged "
+                    "in, and are you in the group of its port?"
+                )
             if tty.startswith("/dev/pts/"):
                 options["sleep_after_open"] = 0.0
         try:
@@ -80,7 +83,9 @@ class CanBus:
         except Exception as exc:  # an adapter whose library is missing fails in a way of its own
             self.close()
             cure = "is the adapter plugged in, and is what python-can needs for it installed?"
-            if self._interface == "socketcan":
+            if "/" in self._channel and self._interface == "socketcan":
+                cure = "this is no CAN interface: an adapter on a serial port wants interface=slcan in its address"
+            elif self._interface == "socketcan":
                 up = f"sudo ip link set {self._channel} up type can bitrate {self._bitrate}"
                 cure = f"is the adapter plugged in, and '{up}' done?"
             raise refusal(self._owner, tty, exc, f"the bus does not open ({exc}); {cure}") from exc

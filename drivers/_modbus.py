@@ -20,7 +20,7 @@ def exchange(
     DeviceTimeout
         The reply is not whole within `timeout_s`.
     ProtocolError
-        What `check` raises, with the name of the device before it.
+        What `check` raises, with the name of the device before it and what to do behind.
     """
     port.write(request, discard=True)
     deadline = time.monotonic() + timeout_s
@@ -36,4 +36,5 @@ def exchange(
     try:
         return check(request, reply)
     except ProtocolError as exc:
-        raise type(exc)(f"{name}: {exc}") from exc
+        cure = "is it the sensor that its address names? Check its wiring, power it off and on"
+        raise type(exc)(f"{name}: {exc}; {cure}") from exc

@@ -68,8 +68,8 @@ class StreamingSensor(ForceTorqueSensor):
     """A sensor whose samples are fetched by a thread of its own.
 
     A subclass says how to connect, how to read the next samples and how to let go; this class does the waiting. The
-    first exception in the reader thread ends the stream: every later call raises a copy of it, until `close`. What has
-    piled up while this program or computer was suspended is thrown away: it would be old and look new.
+    first exception in the reader thread ends the stream: every later call raises a copy of it, until `open` or `close`.
+    What has piled up while this program or computer was suspended is thrown away: it would be old and look new.
 
     Parameters
     ----------
@@ -140,7 +140,10 @@ class StreamingSensor(ForceTorqueSensor):
                 return
 
     def open(self) -> None:
-        """Connect, start the stream and wait for its first sample. Idempotent.
+        """Connect, start the stream and wait for its first sample.
+
+        Does nothing where the stream is open, or the driver is connecting again by itself (`recover`); opens one that
+        has ended anew.
 
         Raises
         ------
@@ -149,15 +152,16 @@ class StreamingSensor(ForceTorqueSensor):
         DeviceFault
             Connected, but the device reports a fault.
         """
-        if self._thread is not None:
+        if self._thread is not None and not self._has_ended:
             return
+        self.close()
         self._reset()
         try:
             self._info = self._connect_and_identify()
         except BaseException as exc:
             self._let_go()
             if isinstance(exc, DriverError) and not isinstance(exc, ConnectError | DeviceFault):
-                raise ConnectError(str(exc)) from exc
+                raise ConnectError(self._named(exc)) from exc
             raise
         self._opened_ns = time.monotonic_ns()
         self._thread = threading.Thread(target=self._run, name=f"reader of {self.name}", daemon=True)
@@ -279,6 +283,7 @@ class StreamingSensor(ForceTorqueSensor):
 
     def _reset(self) -> None:
         self._failure = None
+        self._has_ended = False
         self._newest = NOTHING
         self._opened_ns = self._newest_ns = time.monotonic_ns()
         self._heard_s = self._turn_s = awake_s()
@@ -317,7 +322,7 @@ class StreamingSensor(ForceTorqueSensor):
                 with self._news:
                     if not self._is_mine():
                         return
-                    self._failure = exc
+                    self._failure, self._has_ended = exc, not recoverable
                     if recoverable:
                         self._failure = StreamBroken(f"{self.name}: interrupted, connecting again ({exc})")
                     self._note(str(exc) if recoverable else f"ended: {exc}")
@@ -458,6 +463,10 @@ class StreamingSensor(ForceTorqueSensor):
             return block
         self._earlier_lost += int((~fresh).sum())
         return _rows(block, fresh)
+
+    def _named(self, error: DriverError) -> str:
+        """Put the device's name before what a codec says, which knows none."""
+        return str(error) if str(error).startswith(self.name) else f"{self.name}: {error}"
 
     def _let_go(self) -> None:
         try:

@@ -12,6 +12,11 @@ DriverError
 Every message says what happened, with the value, and what to do next.
 """
 
+from typing import Final
+
+UNUSABLE: Final = "its data must not be used: check load, supply and cable, then power it off and on"
+"""What follows from a critical status."""
+
 
 class DriverError(Exception):
     """Base of all device errors."""

@@ -165,7 +165,10 @@ class ForceTorqueSensor(_Device):
 
     @abstractmethod
     def open(self) -> None:
-        """Connect and start the stream. Idempotent. Raises `ConnectError`."""
+        """Connect and start the stream. Raises `ConnectError`.
+
+        Does nothing while there is a stream; opens one that has ended anew.
+        """
 
     @abstractmethod
     def collect(self, duration_s: float) -> FtSamples:

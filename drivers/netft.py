@@ -24,7 +24,7 @@ import pynetft
 
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM, units
-from drivers.errors import ConnectError, DeviceFault, ProtocolError, StreamBroken
+from drivers.errors import UNUSABLE, ConnectError, DeviceFault, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples, Health
 
 if TYPE_CHECKING:
@@ -259,21 +259,28 @@ class NetFtSensor(StreamingSensor):
         )
 
     def _disconnect(self) -> None:
-        client, self._client = self._client, None
-        if client is not None:
-            client.stop()
+        with self._news:
+            client, self._client = self._client, None
+            if client is None:
+                return
+            told = client.health()
+            self._earlier_malformed += told.malformed_count
+            self._duplicated += told.duplicate_count
+            self._out_of_order += told.out_of_order_count
+        client.stop()
 
     def health(self) -> Health:
         """Counters since `open`; what came twice or too late pynetft has thrown away and counted."""
-        health, client = super().health(), self._client
-        if client is None:
-            return health
-        told = client.health()
+        with self._news:
+            health, client = super().health(), self._client
+            if client is None:
+                return health
+            told = client.health()
         return replace(
             health,
-            malformed=told.malformed_count,
-            duplicated=told.duplicate_count,
-            out_of_order=told.out_of_order_count,
+            malformed=health.malformed + told.malformed_count,
+            duplicated=health.duplicated + told.duplicate_count,
+            out_of_order=health.out_of_order + told.out_of_order_count,
         )
 
     def _start(self, client: pynetft.Client) -> pynetft.SensorConfiguration:
@@ -329,7 +336,7 @@ class NetFtSensor(StreamingSensor):
             self._warned = True
 
     def _fault(self, status: int) -> DeviceFault:
-        return DeviceFault(f"{self.name}: status {describe_status(status, self._bits)}; its data must not be used")
+        return DeviceFault(f"{self.name}: status {describe_status(status, self._bits)}; {UNUSABLE}")
 
     def _read_page(self, path: str) -> bytes:
         """Ask for what pynetft does not: serial number of the calibration in use, rate, range."""

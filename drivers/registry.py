@@ -9,6 +9,7 @@ in the group ``ftdrive.arms``. What this project brings itself cannot be replace
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from math import isfinite
 from types import MappingProxyType
@@ -126,6 +127,27 @@ class Options:
             raise BadUrl(f"{self._url}: unknown option {', '.join(unknown)}; known: {known}")
 
 
+@dataclass(frozen=True, slots=True)
+class UrlParts:
+    """The parts of an address, as it is written and not yet judged."""
+
+    scheme: str
+    address: str
+    """Where the device is, without %20 and the like."""
+    query: str
+    """The options as they stand."""
+    fragment: str
+
+
+def split_url(url: str) -> UrlParts:
+    """Take an address apart. Raises `BadUrl` for what is none."""
+    try:
+        parts = urlsplit(url)
+    except ValueError as exc:
+        raise BadUrl(f"{url}: {exc}; write it like {', '.join(_EXAMPLES)}") from exc
+    return UrlParts(parts.scheme, unquote(parts.netloc + parts.path), parts.query, parts.fragment)
+
+
 class _FromUrl(Protocol):
     def from_url(self, address: str, options: Options, *, sign: int = 1) -> ForceTorqueSensor: ...
 
@@ -146,22 +168,20 @@ def sensor_from_url(url: str, *, sign: int = 1) -> ForceTorqueSensor:
     BadUrl
         Unknown scheme or option, a value out of range, no device, or a driver that cannot be imported.
     """
-    try:
-        parts = urlsplit(url)
-    except ValueError as exc:
-        raise BadUrl(f"{url}: {exc}; write it like {', '.join(_EXAMPLES)}") from exc
+    parts = split_url(url)
     entry = _find("ftdrive.sensors", SENSORS, parts.scheme)
     if entry is None:
         known = ", ".join(_names("ftdrive.sensors", SENSORS))
         raise BadUrl(f"{url}: unknown sensor '{parts.scheme}'; known: {known}, as in {_EXAMPLES[0]}")
-    address = unquote(parts.netloc + parts.path)
-    if not address or parts.fragment or not url.lower().startswith(f"{parts.scheme}://"):
+    if not parts.address or parts.fragment or not url.lower().startswith(f"{parts.scheme}://"):
         raise BadUrl(f"{url}: which device? Write it like {', '.join(_EXAMPLES)}")
     driver = cast("_FromUrl", _load(entry))
+    if not hasattr(driver, "from_url"):
+        raise BadUrl(f"{url}: {entry.value} has no from_url, so it is no driver: reinstall {_package(entry)}")
     options = Options(url, parts.query)
     recover, configured = bool(options.integer("recover", 0, 0, 1)), options.configured()
     try:
-        sensor = driver.from_url(address, options, sign=sign)
+        sensor = driver.from_url(parts.address, options, sign=sign)
     except BadUrl:
         raise
     except ValueError as exc:
@@ -209,10 +229,10 @@ def _names(group: str, own: Mapping[str, str]) -> list[str]:
 def _load(entry: EntryPoint) -> Any:
     try:
         return entry.load()
-    except (ImportError, AttributeError, SyntaxError) as exc:
+    except Exception as exc:  # whatever a module of another package does when it is imported
         extra = _EXTRAS.get(getattr(exc, "name", None) or "")
         cure = f"pip install 'ftdrive[{extra}]'" if extra else f"reinstall {_package(entry)}"
-        raise BadUrl(f"the driver '{entry.name}' cannot be imported ({exc}): {cure}") from exc
+        raise BadUrl(f"the driver '{entry.name}' cannot be imported ({type(exc).__name__}: {exc}): {cure}") from exc
 
 
 def _package(entry: EntryPoint) -> str:

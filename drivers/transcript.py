@@ -7,7 +7,8 @@ come, with `time.monotonic_ns()` as `t_ns`:
 {"t_ns", "event": "open", "port", "frames": true}                                                 a CAN interface
 {"t_ns", "dir": "tx", "hex"}    one write of the driver
 {"t_ns", "dir": "rx", "hex"}    what the driver read within 2 ms, stamped with its first byte
-{"t_ns", "event": "end", ...}   what the driver made of it, or the error it ended with
+{"t_ns", "event": "end", "error"}   the error it ended with; where there was none, what the driver made of it:
+                                    "identity", "samples", "mean_force_N", "mean_torque_Nm" and more
 
 Where `parity_marks` is true, the bytes that were read hold the marks of `drivers/_parity.py`; older transcripts do not
 say it and hold none. Some CAN adapters, such as those of slcan, are on a serial port too. The frames of any other CAN
@@ -17,6 +18,7 @@ tells it is not compared. Ethernet is not recorded.
 
 import contextlib
 import json
+import math
 import os
 import select
 import sys
@@ -26,12 +28,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Final, Self
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from urllib.parse import parse_qsl, urlencode
 
 import can
 import serial
 
 from drivers._parity import leave_marks_to_far_side, marks_asked_for
+from drivers.registry import split_url
 
 if sys.platform != "win32":
     import tty
@@ -39,6 +42,8 @@ if sys.platform != "win32":
 FORMAT: Final = "ftdrive.transcript/1"
 
 _TOGETHER_NS: Final = 2_000_000
+INTERRUPTED: Final = "interrupted"
+"""The error of a recording that was broken off by the user."""
 _EARLY_S: Final = 0.05
 """A driver may ask this much earlier than it did; what the device had sent before is then sent at once."""
 _PORT_CLASS: Final = "Serial"
@@ -66,8 +71,10 @@ class Writer:
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
+        self.has_port = False
+        """Whether a port or a bus was opened: without one there is nothing to play."""
         self._path = path
-        self._partial = path.with_name(path.name + ".partial")
+        self._partial = path.parent / (path.name + ".partial")
         for existing in (path, self._partial):
             if existing.exists():
                 raise FileExistsError(f"{existing} exists already and is not overwritten: give another name")
@@ -85,6 +92,7 @@ class Writer:
         """Note something that is not bytes."""
         with self._lock:
             self._flush_received()
+            self.has_port |= name == "open"
             self._line({"t_ns": time.monotonic_ns(), "event": name, **content})
 
     def sent(self, data: bytes) -> None:
@@ -118,6 +126,14 @@ class Writer:
         if self._path.exists():
             raise FileExistsError(f"{self._path} appeared meanwhile; the transcript is kept in {self._partial}")
         self._partial.rename(self._path)
+
+    def discard(self) -> None:
+        """Leave no file."""
+        with self._lock:
+            file, self._file = self._file, None
+        if file is not None:
+            file.close()
+            self._partial.unlink()
 
     def _flush_received(self) -> None:
         if self._received:
@@ -235,6 +251,11 @@ class Transcript:
     frames: bool = False
     """Whether these are frames of a CAN interface, as lines of slcan."""
 
+    @property
+    def is_broken_off(self) -> bool:
+        """Whether the recording was interrupted, or the file has lost its end."""
+        return bool(self.end.get("error", INTERRUPTED) == INTERRUPTED)
+
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a file. Raises `BadTranscript`, or `OSError` when it cannot be read."""
@@ -251,12 +272,12 @@ class Transcript:
                     if number == 1:
                         header = _checked_header(path, line)
                     elif "dir" in line:
-                        passages.append(Passage(int(line["t_ns"]), line["dir"] == "tx", bytes.fromhex(line["hex"])))
+                        passages.append(Passage(_time_ns(line), line["dir"] == "tx", bytes.fromhex(line["hex"])))
                     elif line.get("event") == "open" and opened_ns is None:
-                        opened_ns, parity_marks = int(line["t_ns"]), line.get("parity_marks") is True
+                        opened_ns, parity_marks = _time_ns(line), line.get("parity_marks") is True
                         frames = line.get("frames") is True
                     elif line.get("event") == "end":
-                        end = line
+                        end = _checked_end(line)
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
             raise BadTranscript(
                 f"{path}, line {number}: not a line of a transcript ({error}): record it anew"
@@ -269,7 +290,7 @@ class Transcript:
 
     def url_at(self, port: str) -> str:
         """Give the sensor's address with the port of a player in it."""
-        parts = urlsplit(str(self.header["url"]))
+        parts = split_url(str(self.header["url"]))
         options = dict(parse_qsl(parts.query)) | ({"interface": "slcan"} if self.frames else {})
         return f"{parts.scheme}://{port}" + (f"?{urlencode(options)}" if options else "")
 
@@ -280,7 +301,24 @@ def _checked_header(path: Path, line: Any) -> Mapping[str, Any]:
         raise BadTranscript(f"{path}: the first line must say {FORMAT}, found {found!r}")
     if not isinstance(line.get("url"), str) or not isinstance(line.get("duration_s"), int | float):
         raise BadTranscript(f"{path}: the first line must hold url and duration_s")
+    split_url(line["url"])
+    if not 0 < float(line["duration_s"]) < math.inf:
+        raise ValueError(f"duration_s is {line['duration_s']}")
     return dict(line)
+
+
+def _checked_end(line: Mapping[str, Any]) -> Mapping[str, Any]:
+    if "identity" in line:
+        _ = line["identity"]["model"], line["identity"]["serial"], line["samples"]
+        for x, y, z in (line["mean_force_N"], line["mean_torque_Nm"]):
+            if not all(map(math.isfinite, (x, y, z))):
+                raise ValueError(f"a mean of {x}, {y}, {z}")
+    return line
+
+
+def _time_ns(line: Mapping[str, Any]) -> int:
+    float(line["t_ns"])  # beyond its range no time can be told from another
+    return int(line["t_ns"])
 
 
 class Player:
@@ -305,6 +343,12 @@ class Player:
         self._thread: threading.Thread | None = None
         self.divergence: str | None = None
         """What the driver asked that the recording cannot answer."""
+
+    @property
+    def left_s(self) -> float:
+        """How much of the recording is not yet played, in its own time."""
+        left = self._passages[self._next :]
+        return (left[-1].t_ns - left[0].t_ns) / 1e9 if left else 0.0
 
     def __enter__(self) -> str:
         """Open the pseudo-terminal and return its path."""

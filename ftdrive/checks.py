@@ -13,9 +13,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
-from urllib.parse import parse_qs, urlencode, urlsplit
+from urllib.parse import parse_qsl, urlencode
 
+from drivers.registry import BadUrl, split_url
 from ftdrive.config import CellConfig
+from ftdrive.errors import ConfigError
 
 State = Literal["ok", "warning", "failed", "skipped"]
 
@@ -57,10 +59,12 @@ class SensorAddress:
 
     @classmethod
     def of(cls, url: str) -> "SensorAddress":
-        """Take a sensor's address apart."""
-        parts = urlsplit(url)
-        options = {key: values[-1] for key, values in parse_qs(parts.query).items()}
-        return cls(parts.scheme, parts.netloc + parts.path, options)
+        """Take a sensor's address apart. Raises `ConfigError` for what is none."""
+        try:
+            parts = split_url(url)
+        except BadUrl as error:
+            raise ConfigError(str(error)) from error
+        return cls(parts.scheme, parts.address, dict(parse_qsl(parts.query)))
 
     @property
     def serial_port(self) -> Path | None:

@@ -104,7 +104,7 @@ class Calibration:
         """
         unit_N, unit_Nm = units(unit_codes)
         if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix) < 6:
-            raise ProtocolError("the calibration matrix is not invertible; the slot is empty, select another one")
+            raise ProtocolError("the calibration matrix is not invertible, as if it were empty")
         counts_per_N, counts_per_Nm = counts_per_unit[0] / unit_N, counts_per_unit[1] / unit_Nm
         return cls(matrix / np.repeat([counts_per_N, counts_per_Nm], 3)[:, np.newaxis], counts_per_N, counts_per_Nm)
 

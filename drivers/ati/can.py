@@ -27,7 +27,7 @@ from drivers.ati.calibration import (
     unit_names,
 )
 from drivers.ati.codec import Op
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
+from drivers.errors import UNUSABLE, ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import Array, DeviceInfo, FtSamples
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ _GRACE_S = 0.002
 _QUIET_S = 0.01
 _STRAGGLER_S = 0.004
 """How long a reading in the wrong order waits for a frame that would contradict it."""
+_ANOTHER_SLOT = "choose another, slot=0 to 15 in its address"
 _MILLION = (1_000_000, 1_000_000)
 _PERIOD_S = 1e-3
 """About what a 250 kbit/s bus carries; polling a faster one, or an emulator, for all it gives would eat a CPU core."""
@@ -121,9 +122,12 @@ class AtiCanSensor(StreamingSensor):
         serial = codec.decode_serial(*self._ask(Op.SERIAL))
         firmware = codec.decode_firmware(*self._ask(Op.FIRMWARE))
         self._select_slot()
-        matrix = self._read_matrix()
-        counts, unit_codes, source = self._read_scale(firmware)
-        self._calibration = Calibration.from_vendor(matrix, counts, unit_codes)
+        try:
+            matrix = self._read_matrix()
+            counts, unit_codes, source = self._read_scale(firmware)
+            self._calibration = Calibration.from_vendor(matrix, counts, unit_codes)
+        except ProtocolError as exc:
+            raise ProtocolError(f"{self.name}: calibration slot {self._slot}: {exc}; {_ANOTHER_SLOT}") from exc
         self._judge(codec.decode_gauges(*self._ask(Op.GAUGES)))
         return DeviceInfo(
             model="ATI F/T (NETCANOEM, CAN)",
@@ -176,12 +180,15 @@ class AtiCanSensor(StreamingSensor):
     def _select_slot(self) -> None:
         echo = codec.decode_slot(*self._ask(Op.SELECT_SLOT, self._slot))
         if echo != self._slot:
-            raise ConnectError(f"{self.name}: asked for calibration slot {self._slot}, the sensor answered {echo}")
+            raise ConnectError(
+                f"{self.name}: asked for calibration slot {self._slot}, the sensor answered {echo}; end other programs "
+                f"that use it, or {_ANOTHER_SLOT}"
+            )
 
     def _read_matrix(self) -> Array:
         matrix = np.array([codec.decode_matrix_row(*self._ask(Op.MATRIX_ROW, axis)) for axis in range(6)])
         if not matrix.any():
-            raise DeviceFault(f"{self.name}: calibration slot {self._slot} is empty; select another slot")
+            raise DeviceFault(f"{self.name}: calibration slot {self._slot} is empty; {_ANOTHER_SLOT}")
         return matrix
 
     def _read_scale(
@@ -214,7 +221,7 @@ class AtiCanSensor(StreamingSensor):
         """Raise on what makes a reading unusable, log the rest of a status word once."""
         status = reading.status
         if status & codec.CRITICAL:
-            raise DeviceFault(f"{self.name}: status {codec.describe_status(status)}; its data must not be used")
+            raise DeviceFault(f"{self.name}: status {codec.describe_status(status)}; {UNUSABLE}")
         if self._polls and status & ~self._seen_status & codec.WATCHDOG_RESET:
             raise StreamBroken(
                 f"{self.name}: the sensor has reset itself and may be back at calibration slot 0; open it again"

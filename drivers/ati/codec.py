@@ -100,7 +100,7 @@ def decode_matrix_row(first: bytes, second: bytes, third: bytes) -> NDArray[np.f
     """Decode one row (6,) of the calibration matrix, counts per gauge count, columns G0..G5."""
     row = np.array([_unpack(">ff", part, "part of a matrix row") for part in (first, second, third)]).ravel()
     if not np.isfinite(row).all():
-        raise ProtocolError(f"a calibration matrix row is not finite: {row}; select another calibration slot")
+        raise ProtocolError(f"a calibration matrix row is not finite: {row}")
     return row
 
 

@@ -108,7 +108,7 @@ def check_reply(request: bytes, reply: bytes) -> bytes:
     """
     text = reply.hex(" ")
     if len(reply) < 5 or crc16_modbus(reply[:-2]) != int.from_bytes(reply[-2:], "little"):
-        raise ProtocolError(f"reply is damaged ({text or 'empty'}); check baud rate, parity and termination")
+        raise ProtocolError(f"reply is damaged ({text or 'empty'})")
     function = request[1]
     if reply[0] == ADDRESS and reply[1] == function | 0x80 and len(reply) == 5:
         reason = _EXCEPTIONS.get(reply[2], "unknown reason")
@@ -158,7 +158,7 @@ def decode_calibration_block(data: bytes) -> CalibrationBlock:
     matrix = np.frombuffer(data, ">f4", 36, offset=2 * 32).reshape(6, 6)
     force, torque = struct.unpack_from(">ii", data, 2 * 117)
     if not np.isfinite(matrix).all() or force <= 0 or torque <= 0:
-        raise ProtocolError(f"this calibration slot is empty (counts per unit {force} and {torque}); choose another")
+        raise ProtocolError(f"it is empty, with counts per unit {force} and {torque}")
     return CalibrationBlock(
         serial=decode_text(data[0:8]),
         part_number=decode_text(data[8:40]),

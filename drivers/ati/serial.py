@@ -20,7 +20,7 @@ from drivers._stream import StreamingSensor, scale_facts
 from drivers.ati import modbus
 from drivers.ati.calibration import Calibration, saturated_gauges, units
 from drivers.ati.codec import describe_status
-from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
+from drivers.errors import UNUSABLE, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 
 if TYPE_CHECKING:
@@ -82,13 +82,18 @@ class AtiSerialSensor(StreamingSensor):
         self._nominal_Hz = modbus.NOMINAL_RATE_Hz
         self._port.open()
         self._judge_status(self._stop_stream())
-        block = modbus.decode_calibration_block(
-            b"".join(
-                self._ask(modbus.read_registers(register, count))
-                for register, count in modbus.calibration_reads(self._calibration_index)
-            )
+        stored = b"".join(
+            self._ask(modbus.read_registers(register, count))
+            for register, count in modbus.calibration_reads(self._calibration_index)
         )
-        self._calibration = Calibration.from_vendor(block.matrix, block.counts_per_unit, block.unit_codes)
+        try:
+            block = modbus.decode_calibration_block(stored)
+            self._calibration = Calibration.from_vendor(block.matrix, block.counts_per_unit, block.unit_codes)
+        except ProtocolError as exc:
+            raise ProtocolError(
+                f"{self.name}: calibration slot {self._calibration_index}: {exc}; choose another, calibration=1 to 16 "
+                "in its address"
+            ) from exc
         self._ask(modbus.UNLOCK)
         try:
             self._ask(modbus.write_registers(modbus.GAINS, block.gains))
@@ -256,7 +261,7 @@ class AtiSerialSensor(StreamingSensor):
         new, self._status = status & ~self._status, status
         text = describe_status(status, modbus.STATUS_BITS)
         if status & modbus.CRITICAL:
-            raise DeviceFault(f"{self.name}: status {text}; its data must not be used")
+            raise DeviceFault(f"{self.name}: status {text}; {UNUSABLE}")
         if self._seq and new & modbus.WATCHDOG_RESET:
             raise StreamBroken(f"{self.name}: the sensor has reset itself and lost its gains; open it again")
         if new:

@@ -56,7 +56,7 @@ def check_reply(request: bytes, reply: bytes) -> tuple[int, ...]:
     """Check a whole reply against its request and return the registers it carries; none for a write."""
     text = reply.hex(" ")
     if len(reply) < 5 or _crc(reply[:-2]) != reply[-2:]:
-        raise ProtocolError(f"reply is damaged ({text or 'empty'}); check wiring and termination")
+        raise ProtocolError(f"reply is damaged ({text or 'empty'})")
     if len(reply) == 5 and reply[0] == ADDRESS and reply[1] == request[1] | 0x80:
         raise Refused(f"the sensor refused function 0x{request[1]:02X} with Modbus exception {reply[2]}")
     is_read = request[1] == READ_HOLDING

@@ -83,7 +83,7 @@ def decode_text(field: bytes) -> str:
     _expect_size(field)
     text = field[1:].split(b"\0")[0].strip()
     if not text or not all(0x20 <= byte < 0x7F for byte in text):
-        raise ProtocolError(f"the reply to command 0x{field[0]:02X} is no text: {field.hex(' ')}")
+        raise ProtocolError(f"the reply to command 0x{field[0]:02X} is no text: {field.hex(' ')}; power it off and on")
     return text.decode("ascii")
 
 
@@ -93,7 +93,7 @@ def decode_rate(field: bytes) -> int:
     for rate_Hz, code in RATE_CODES.items():
         if field[1] in {code, 0} and (field[1] or rate_Hz == 200):
             return rate_Hz
-    raise ProtocolError(f"the sensor tells output rate code {field[1]}; codes 0 to 8 are known")
+    raise ProtocolError(f"the sensor tells output rate code {field[1]}, known are 0 to 8; power it off and on")
 
 
 def check_set(field: bytes) -> None:
@@ -101,7 +101,8 @@ def check_set(field: bytes) -> None:
     _expect_size(field)
     if field[1] != 1:
         reason = _FAILURES.get(field[2], "unknown reason")
-        raise ProtocolError(f"the sensor refused command 0x{field[0]:02X}: {field[2]} ({reason})")
+        cure = "leave rate out of its address, or power it off and on"
+        raise ProtocolError(f"the sensor refused command 0x{field[0]:02X}: {field[2]} ({reason}); {cure}")
 
 
 def decode_sample(field: bytes) -> Sample:
@@ -123,7 +124,8 @@ def counts_per_unit(model: str) -> tuple[int, int]:
     match = re.match(r"RFT-?(\d\d)", model)
     if match is None or match[1] not in _COUNTS_PER_NM:
         known = ", ".join(f"RFT{number}" for number in _COUNTS_PER_NM)
-        raise ProtocolError(f"the scale of model '{model}' is not known; known are {known}")
+        cure = "add its scale, from its manual, to drivers/robotous/codec.py"
+        raise ProtocolError(f"the scale of model '{model}' is not known, only those of {known}; {cure}")
     return COUNTS_PER_N, _COUNTS_PER_NM[match[1]]
 
 

@@ -1,5 +1,6 @@
 """`ftdrive transcript`: the bytes of a sensor's wire into a file, and back to the driver."""
 
+import math
 import time
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -8,11 +9,12 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import click
+import numpy as np
 
-from drivers.errors import ProtocolError
+from drivers.errors import ConnectError, DeviceTimeout, ProtocolError
 from drivers.interfaces import ForceTorqueSensor
 from drivers.registry import BadUrl, sensor_from_url
-from drivers.transcript import Player, Transcript, Writer, recording
+from drivers.transcript import INTERRUPTED, BadTranscript, Player, Transcript, Writer, recording
 from ftdrive.checks import SensorAddress
 from ftdrive.commands.common import EMULATED_SENSOR, JSON, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
@@ -20,6 +22,8 @@ from ftdrive.runs import versions
 from ftdrive.simulation import EMULATED, sensor_name, sensor_url
 from ftdrive.talk import talk
 
+_PIECE_S = 60.0
+"""One `collect` of a million samples would end at 143 s with an ATI sensor on a serial port."""
 _TAIL_S = 0.3
 """Recorded beyond the duration, so that a replay which begins a little later still has enough."""
 
@@ -77,17 +81,24 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
         "versions": versions(),
     }
     writer = Writer(path, header)
-    seen: dict[str, Any] = {"error": "interrupted"}
+    seen: dict[str, Any] = {"error": INTERRUPTED}
     try:
-        with recording(writer):
-            seen = _watch(device, duration_s, tail_s=_TAIL_S)
+        with recording(writer), device:
+            whole = _watch(device, duration_s)
+            device.collect(_TAIL_S)
+        seen = whole
     except Exception as error:
         seen = {"error": f"{type(error).__name__}: {error}"}
         raise
     finally:
-        writer.end(**seen)
-        if kept:
-            talk.print(f" Saved {path}")
+        if not writer.has_port and seen["error"] in {None, INTERRUPTED}:  # a port that does not open is worth a report
+            writer.discard()
+        else:
+            writer.end(**seen)
+            if kept:
+                talk.print(f" Saved {path}")
+    if not writer.has_port:
+        raise ConfigError(f"the driver of {sensor} uses neither pyserial nor python-can: only these can be recorded")
     return url, seen
 
 
@@ -97,7 +108,10 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
 @EMULATED_SENSOR
 @JSON
 def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -> None:
-    """Play the transcript FILE to the unmodified driver, and say what the driver makes of it this time."""
+    """Play the transcript FILE to the unmodified driver, and say what the driver makes of it this time.
+
+    A recording that was broken off is played as far as it goes.
+    """
     check_simulate(simulate, real={"FILE": file}, emulated={"--sensor": sensor})
     if simulate:
         with TemporaryDirectory(prefix="ftdrive-") as folder:
@@ -111,11 +125,20 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     player = Player(told)
     with player as port:
         device = _sensor(told.url_at(port))
+        duration_s = float(told.header["duration_s"])
         try:
-            played = _watch(device, float(told.header["duration_s"]))
+            with device:
+                if told.is_broken_off:
+                    duration_s = min(duration_s, player.left_s - _TAIL_S)
+                played = _watch(device, duration_s)
         except Exception as error:
             if player.divergence:
                 raise ProtocolError(f"{error}; the transcript does not answer: {player.divergence}") from error
+            silent = isinstance(error, ConnectError | DeviceTimeout)
+            if silent and told.is_broken_off and player.left_s < _TAIL_S:
+                raise BadTranscript(
+                    f"the recording was broken off before there was anything to measure ({error}): record it anew"
+                ) from error
             raise
     recorded = {key: value for key, value in told.end.items() if key not in {"event", "t_ns"}}
     if as_json:
@@ -123,6 +146,8 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     else:
         talk.print(f" recorded  {_words(recorded)}")
         talk.print(f" played    {_words(played)}")
+    if duration_s < told.header["duration_s"]:
+        talk.print(f" The recording was broken off: {duration_s:.3g} s of {told.header['duration_s']:g} s were played.")
 
 
 def _sensor(url: str) -> ForceTorqueSensor:
@@ -132,21 +157,25 @@ def _sensor(url: str) -> ForceTorqueSensor:
         raise ConfigError(str(error)) from error
 
 
-def _watch(device: ForceTorqueSensor, duration_s: float, *, tail_s: float = 0.0) -> dict[str, Any]:
-    """Open the sensor, collect, close; as measured, with the sign the sensor has."""
-    with device:
-        samples = device.collect(duration_s)
-        if tail_s:
-            device.collect(tail_s)
-        health = device.health()
-        return {
-            "error": None,
-            "identity": asdict(device.identify()),
-            "samples": len(samples),
-            "lost": health.lost,
-            "mean_force_N": samples.wrench[:, :3].mean(axis=0).tolist(),
-            "mean_torque_Nm": samples.wrench[:, 3:].mean(axis=0).tolist(),
-        }
+def _watch(device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:
+    """Collect from an open sensor, in pieces, for a `collect` is bounded; as measured, with the sign the sensor has."""
+    pieces = math.ceil(duration_s / _PIECE_S)
+    samples, total = 0, np.zeros(6)
+    for _ in range(pieces):
+        wrench = device.collect(duration_s / pieces).wrench
+        samples, total = samples + len(wrench), total + wrench.sum(axis=0)
+    if not samples:
+        raise DeviceTimeout(f"no sample came in {duration_s:g} s: record for longer, with --duration")
+    force_N, torque_Nm = np.split(total / samples, 2)
+    return {
+        "error": None,
+        "identity": asdict(device.identify()),
+        "duration_s": duration_s,
+        "samples": samples,
+        "lost": device.health().lost,
+        "mean_force_N": force_N.tolist(),
+        "mean_torque_Nm": torque_Nm.tolist(),
+    }
 
 
 def _words(seen: dict[str, Any]) -> str:

@@ -118,8 +118,29 @@ def test_can_start_up_is_golden_and_then_only_gauges_are_asked() -> None:
 def test_can_slot_is_selected_and_its_echo_checked() -> None:
     with CanPeer({"206 03": ["206 03"]}) as peer, peer.sensor(slot=3):
         assert "206 03" in peer.requests
-    with CanPeer({"206 03": ["206 00"]}) as peer, pytest.raises(ConnectError, match="slot 3, the sensor answered 0"):
+    with (
+        CanPeer({"206 03": ["206 00"]}) as peer,
+        pytest.raises(ConnectError, match="slot 3, the sensor answered 0; end"),
+    ):
         peer.sensor(slot=3).open()
+
+
+@pytest.mark.parametrize(
+    "answers",
+    [
+        {"207": ["207 0000000000000000"]},
+        {"208": ["208 0903"]},
+        {"202 00": [f"20{n} {'7FC00000' * 2}" for n in (2, 3, 4)]},
+        {"202 00": [f"20{n} {'00' * 8}" for n in (2, 3, 4)]},
+    ],
+    ids=["counts", "units", "not finite", "singular"],
+)
+def test_can_calibration_that_is_none_names_device_slot_and_cure(answers: dict[str, list[str]]) -> None:
+    with CanPeer(answers) as peer, pytest.raises(ConnectError) as caught:
+        peer.sensor().open()
+    assert str(caught.value).startswith("ATI CAN sensor 0x20 on ")
+    assert ": calibration slot 0: " in str(caught.value)
+    assert str(caught.value).endswith("; choose another, slot=0 to 15 in its address")
 
 
 def test_can_bus_that_echoes_does_not_fake_the_slot_echo() -> None:
@@ -255,6 +276,12 @@ def test_can_bus_that_does_not_open(interface: str, channel: str) -> None:
     with pytest.raises(ConnectError, match=f"on {interface} {channel}: ") as caught:
         AtiCanSensor(channel, interface=interface).open()
     assert ("sudo ip link set no-such-can up" in str(caught.value)) == (interface == "socketcan")
+
+
+def test_an_adapter_on_a_serial_port_without_its_interface_is_told_so() -> None:
+    with pytest.raises(ConnectError, match=r"this is no CAN interface: .* wants interface=slcan") as caught:
+        AtiCanSensor("/dev/ttyACM0").open()
+    assert "ip link" not in str(caught.value)
 
 
 # The serial peer -----------------------------------------------------------------------------------------------------
@@ -658,8 +685,10 @@ def test_serial_lost_start_reply_is_recovered_by_a_jam() -> None:
     ],
 )
 def test_serial_refusals_end_the_start_up(request_: str, reply: str, message: str) -> None:
-    with SerialPeer({request_: [bytes.fromhex(reply)]}) as peer, pytest.raises(ConnectError, match=message):
+    with SerialPeer({request_: [bytes.fromhex(reply)]}) as peer, pytest.raises(ConnectError, match=message) as caught:
         peer.sensor().open()
+    assert str(caught.value).startswith("ATI serial sensor on ")
+    assert "; is it " in str(caught.value)  # what to do next
 
 
 def test_serial_refusal_is_not_asked_again() -> None:

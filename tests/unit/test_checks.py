@@ -10,6 +10,7 @@ import pytest
 
 from ftdrive import checks
 from ftdrive.checks import Check, SensorAddress
+from ftdrive.errors import ConfigError
 
 
 @pytest.fixture
@@ -110,6 +111,7 @@ def test_the_name_by_id_of_a_port(computer: Path) -> None:
         ("robotous-can:///dev/ttyACM0?interface=slcan", "slcan:///dev/ttyACM0?bitrate=1000000"),
         ("ati-can://PCAN_USBBUS1?interface=pcan", None),
         ("ati-can:///dev/ttyUSB0?interface=robotell", None),
+        ("bota:///dev/serial/by-id/my%20port", "/dev/serial/by-id/my port"),
         ("ati-netft://192.168.1.1", None),
         ("ur-ft://192.168.1.10?counts_per_N=1&counts_per_Nm=1", None),
     ],
@@ -184,12 +186,18 @@ def test_can_details_are_taken_from_what_ip_says(tmp_path: Path, monkeypatch: py
         ("ati-netft://192.168.1.1", None, None),
         ("ati-can://PCAN_USBBUS1?interface=pcan", None, None),
         ("bota://COM3", "COM3", None),
+        ("bota:///dev/serial/by-id/my%20port", "/dev/serial/by-id/my port", None),
     ],
 )
 def test_what_an_address_says(url: str, port: str | None, interface: str | None) -> None:
     address = SensorAddress.of(url)
     assert address.serial_port == (None if port is None else Path(port))
     assert address.can_interface == interface
+
+
+def test_what_is_no_address_is_a_mistake_of_the_user() -> None:
+    with pytest.raises(ConfigError, match=r"ati-can://\[can0: Invalid IPv6 URL; write it like ati-can://can0"):
+        SensorAddress.of("ati-can://[can0")
 
 
 def test_a_network_sensor_has_no_port() -> None:

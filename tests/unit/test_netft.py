@@ -167,6 +167,33 @@ def test_silence_ends_the_stream() -> None:
         assert time.monotonic() - begin < 0.6
 
 
+def test_what_was_thrown_away_is_counted_since_open() -> None:
+    with Box(*map(record, [1, 2, 2, 3, 5, 4, 6]), RECORD[:-1]) as box:
+        sensor = box.sensor()
+        sensor.recover = True
+        with sensor:
+            sensor.collect(0.1)
+            before = sensor.health()
+            assert (before.duplicated, before.out_of_order, before.malformed) == (1, 1, 1)
+            box.mute = True
+            deadline = time.monotonic() + 5
+            while sensor.health().reconnects == 0:
+                assert time.monotonic() < deadline
+                during = sensor.health()
+                assert (during.duplicated, during.out_of_order, during.malformed) == (1, 1, 1)
+                if sensor._failure is not None and box.mute:
+                    box._records = [*map(record, [1, 2, 2, 3])]
+                    box.mute = False
+                time.sleep(0.005)
+            sensor.latest(timeout_s=1.0)
+            sensor.collect(0.1)
+        after = sensor.health()
+        assert (after.duplicated, after.out_of_order, after.malformed) == (2, 1, 1)
+        sensor.open()
+        assert sensor.health().duplicated == 0
+        sensor.close()
+
+
 def test_nobody_there() -> None:
     with pytest.raises(ConnectError, match="does not tell its configuration"):
         NetFtSensor("127.0.0.1", http_port=1).open()

@@ -258,9 +258,23 @@ def test_two_packages_with_one_name_are_both_named(install: Install) -> None:
         sensor_from_url("shared://x")
 
 
-@pytest.mark.parametrize("source", ["import no_such_library", "", "def broken(:"])
-def test_a_package_that_cannot_be_imported_is_named(install: Install, source: str) -> None:
+@pytest.mark.parametrize(
+    ("source", "error"),
+    [
+        ("import no_such_library", "ModuleNotFoundError: No module named 'no_such_library'"),
+        ("", "AttributeError: .*"),
+        ("def broken(:", "SyntaxError: .*"),
+        ("{}['board']", "KeyError: 'board'"),
+    ],
+)
+def test_a_package_that_cannot_be_imported_is_named(install: Install, source: str, error: str) -> None:
     name = f"broken_ft_{len(source)}"
     install(name, f"[ftdrive.sensors]\nbroken = {name}:Sensor\n", source)
-    with pytest.raises(BadUrl, match=f"the driver 'broken' cannot be imported .*: reinstall {name}"):
+    with pytest.raises(BadUrl, match=f"the driver 'broken' cannot be imported .{error}.: reinstall {name}"):
         sensor_from_url("broken://x")
+
+
+def test_a_class_that_is_no_driver_is_named(install: Install) -> None:
+    install("odd_ft", "[ftdrive.sensors]\nodd = odd_ft:Sensor\n", "class Sensor:\n    pass\n")
+    with pytest.raises(BadUrl, match=r"odd://x: odd_ft:Sensor has no from_url, .*: reinstall odd_ft"):
+        sensor_from_url("odd://x")

@@ -234,9 +234,31 @@ def test_open_after_a_failure_starts_clean(sensor: FakeSensor) -> None:
     sensor.feed.put(StreamBroken("gone"))
     with pytest.raises(StreamBroken, match="gone"):
         sensor.latest(timeout_s=1.0) if sensor._failure else sensor.collect(1.0)
-    sensor.close()
     sensor.open()
     sensor.check()
+    assert (sensor.connects, sensor.disconnects) == (2, 1)
+    assert sensor.health().received == 1
+
+
+def test_open_leaves_a_driver_alone_that_connects_again_by_itself() -> None:
+    with FakeSensor() as sensor:
+        sensor.recover = True
+        sensor.connect_error = StreamBroken("still gone")
+        sensor.feed.put(StreamBroken("gone"))
+        wait_for(lambda: sensor.connects >= 2)
+        sensor.open()
+        with pytest.raises(StreamBroken, match="connecting again"):
+            sensor.check()
+        sensor.connect_error = None
+        wait_for(lambda: sensor.health().reconnects == 1)
+
+
+def test_what_a_codec_says_gets_the_name_of_the_device() -> None:
+    fake = FakeSensor()
+    for said in ("odd", "fake: odd"):
+        fake.connect_error = ProtocolError(said)
+        with pytest.raises(ConnectError, match=r"^fake: odd$"):
+            fake.open()
 
 
 @pytest.mark.parametrize(

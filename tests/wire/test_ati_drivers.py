@@ -190,7 +190,7 @@ def test_serial_refused_start(start: Start) -> None:
 
 
 def test_serial_empty_calibration(start: Start) -> None:
-    with pytest.raises(ConnectError, match="slot is empty"):
+    with pytest.raises(ConnectError, match=r"^ATI serial.*: calibration slot 9: it is empty.*; choose another"):
         start("ati-serial").sensor("calibration=9").open()
 
 

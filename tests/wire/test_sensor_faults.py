@@ -362,10 +362,14 @@ def unplugged(emulator: Emulator, before_s: float) -> list[Watched]:
         with pytest.raises(StreamBroken, match="again"):
             sensor.collect(5.0)
         assert time.monotonic() - begin < 1.5, emulator.kind.scheme
+        emulator.plug_in()
+        sensor.open()
+        second = Watched(sensor, 0.1)
+    emulator.unplug()
     emulator.plug_in()
     with sensor:
-        second = Watched(sensor, 0.1)
-    return [first, second]
+        third = Watched(sensor, 0.1)
+    return [first, second, third]
 
 
 def mended(emulator: Emulator, before_s: float) -> list[Watched]:

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import os
 import sys
 import threading
@@ -294,6 +295,19 @@ def test_a_folder_that_is_not_there_is_said_to_be_the_fault(tmp_path: Path) -> N
         Writer(path, {"url": "x", "duration_s": 1})
 
 
+def test_a_file_without_a_name_is_said_to_be_the_fault() -> None:
+    with pytest.raises(FileExistsError, match="give another name"):
+        Writer(Path(), {"url": "x", "duration_s": 1})
+
+
+def test_a_transcript_of_nothing_can_be_thrown_away(tmp_path: Path) -> None:
+    writer = Writer(tmp_path / "a.jsonl", {"url": "x", "duration_s": 1})
+    assert not writer.has_port
+    writer.discard()
+    writer.discard()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_bytes_of_both_directions_keep_their_order(tmp_path: Path) -> None:
     writer = Writer(tmp_path / "a.jsonl", {"url": "x", "duration_s": 1})
     for data in (b"\x01", b"\x02"):
@@ -345,6 +359,22 @@ def test_a_request_is_answered_after_the_recorded_time(dialogue: tuple[Player, s
     assert port.read(1) == b"2"
 
 
+def test_the_player_knows_how_much_is_left(dialogue: tuple[Player, serial.Serial]) -> None:
+    player, port = dialogue
+    assert player.left_s == pytest.approx(0.12)
+    port.write(b"ab")
+    assert port.read(1) == b"1"
+    assert player.left_s <= 0.07
+    port.write(b"cd")
+    assert port.read(1) == b"2"
+    port.write(b"ef")
+    deadline = time.monotonic() + 2
+    while player._next < 5:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    assert player.left_s == 0
+
+
 def test_a_request_may_be_left_out(dialogue: tuple[Player, serial.Serial]) -> None:
     player, port = dialogue
     port.write(b"cd")
@@ -372,6 +402,24 @@ def test_a_player_that_nobody_opens_ends() -> None:
     assert threading.active_count() == before
 
 
+OPENED = '{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns": 1, "event": "open"}\n'
+END = {
+    "identity": {"model": "A", "serial": "1"},
+    "samples": 5,
+    "mean_force_N": [1, 2, 3],
+    "mean_torque_Nm": [0.1, 0.2, 0.3],
+}
+
+WRONG_ENDS: tuple[dict[str, Any], ...] = (
+    {"identity": {}},
+    {"identity": "bota"},
+    {"mean_force_N": [1, 2]},
+    {"mean_force_N": ["1", "2", "3"]},
+    {"mean_torque_Nm": None},
+    {"mean_torque_Nm": [1, 2, math.nan]},
+)
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -388,9 +436,32 @@ def test_a_player_that_nobody_opens_ends() -> None:
         ("\x00\x01", "line 1"),
         ('{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns": 1e999, "event": "open"}', "line 2"),
         ("[" * 100_000, "line 1|line 0"),
+        *(
+            (OPENED.replace('"duration_s": 1', f'"duration_s": {duration_s}'), "line 1")
+            for duration_s in ("0", "-1", "NaN", "Infinity", "1" + "0" * 400)
+        ),
+        ('{"format": "ftdrive.transcript/1", "url": "bota://[x", "duration_s": 1}', r"line 1: .*bota://\[x: Invalid"),
+        (OPENED + f'{{"t_ns": 1{"0" * 400}, "dir": "rx", "hex": "00"}}', "line 3"),
+        *(
+            (OPENED + json.dumps({"t_ns": 9, "event": "end", "error": None} | END | wrong), "line 3")
+            for wrong in WRONG_ENDS
+        ),
     ],
 )
 def test_what_is_no_transcript_is_refused(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "bad.jsonl").write_text(text)
     with pytest.raises(BadTranscript, match=says):
         Transcript.load(tmp_path / "bad.jsonl")
+
+
+def test_a_transcript_that_is_right_is_not_refused(tmp_path: Path) -> None:
+    (tmp_path / "good.jsonl").write_text(OPENED + json.dumps({"t_ns": 9, "event": "end", "error": None} | END))
+    assert Transcript.load(tmp_path / "good.jsonl").end["mean_force_N"] == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("end", "is_broken_off"),
+    [({}, True), ({"error": "interrupted"}, True), ({"error": None}, False), ({"error": "x"}, False)],
+)
+def test_a_recording_without_its_end_is_broken_off(end: dict[str, Any], is_broken_off: bool) -> None:
+    assert replace(DIALOGUE, end=end).is_broken_off == is_broken_off
