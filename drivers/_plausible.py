@@ -86,7 +86,7 @@ class DeviceClock:
         if back_s > 0:
             raise StreamBroken(
                 f"{self._name}: the device's clock jumped back by {back_s:.3f} s to {newest_s:.3f} s: it has "
-                "restarted, open it again"
+                "restarted; open it again"
             )
         if step_s > _CLOCK_JUMP_S:
             raise StreamBroken(

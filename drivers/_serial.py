@@ -18,7 +18,7 @@ def refusal(owner: str, path: str, error: Exception, otherwise: str) -> ConnectE
     """Say that another program has a port, where the error of opening it tells so; else what is given."""
     if isinstance(error, OSError) and error.errno in {errno.EAGAIN, errno.EBUSY}:
         cure = f"end it, `fuser -v {shlex.quote(path)}` names it"
-        return PortInUse(f"{owner}: the port is in use by another program: {cure}")
+        return PortInUse(f"{owner}: the port is in use by another program; {cure}")
     return ConnectError(f"{owner}: {otherwise}")
 
 

@@ -9,7 +9,8 @@ DriverError
 └── DeviceFault      the device itself reports a fault: sensor status, protective or emergency stop
     └── Frozen       a sensor says the same again and again
 
-Every message says what happened, with the value, and what to do next.
+Every message says what happened, with the value, and what to do next: a sensor's after "; ", an arm's, which is a
+sentence, after its last colon.
 """
 
 from typing import Final

@@ -52,9 +52,6 @@ def found_and_cure(error: Exception, otherwise: str) -> tuple[str, str]:
         found, cure = words[: semicolon.start()], words[semicolon.end() :]
         if found.count("(") == found.count(")"):
             return found, cure
-    if isinstance(error, PortInUse) and ": " in words:
-        found, _, cure = words.rpartition(": ")
-        return found, cure
     return words, otherwise
 
 
@@ -127,6 +124,8 @@ def check_sensor_error(name: str, error: DriverError, address: SensorAddress, pe
     way = next((check.fix for check in permissions if check.state == "failed"), None)
     if way is not None and not isinstance(kind, PortInUse | DeviceFault) and (_not_reached(kind) or not own):
         own = way
+    elif own and isinstance(kind, DeviceTimeout):
+        own = f"{own}; see whom the address reaches: {_ask_who(address)}"
     return Check(name, "failed", found, own or _usual_cure(kind, address))
 
 

@@ -149,7 +149,7 @@ class BotaSensor(StreamingSensor):
         step_us = (t_us - self._t_us) % _CLOCK
         if step_us > _CLOCK // 2:
             raise StreamBroken(
-                f"{self.name}: the sensor's clock went back to {t_us} µs: it has restarted, open it again"
+                f"{self.name}: the sensor's clock went back to {t_us} µs: it has restarted; open it again"
             )
         self._t_us += step_us
         if not step_us:

@@ -163,8 +163,8 @@ class Reader:
         says = model_named(told, major)
         if model is None and says is None:
             raise ConnectError(
-                f"{self._host} says {told!r} to the question for its model, which is no known one (before PolyScope "
-                f"5.6 nothing is): name the model of the arm."
+                f"{self._host} says {told!r} to the question for its model, which is no known one (CB3 before "
+                f"3.12 and e-Series before 5.6 do not tell it): name the model of the arm."
             )
         if model is not None and says is not None and MODELS[says] != MODELS[model]:
             raise ConnectError(f"{self._host} is a {says}, not a {model}: check the address and the model.")

@@ -285,12 +285,12 @@ def not_opened(words: str) -> ConnectError:
             "?sinc=512 configures it",
         ),
         (
-            DeviceTimeout("sensor: silent for 0.4 s; check cable; try again"),
+            StreamBroken("sensor: silent for 0.4 s; check cable; try again"),
             "sensor: silent for 0.4 s",
             "check cable; try again",
         ),
         (
-            DeviceTimeout("sensor: no reply (closed (x; y); z); check wiring"),
+            ProtocolError("sensor: no reply (closed (x; y); z); check wiring"),
             "sensor: no reply (closed (x; y); z)",
             "check wiring",
         ),
@@ -308,6 +308,14 @@ def test_the_cure_that_a_message_names_is_the_one_shown(
 ) -> None:
     check = diagnosis.check_sensor_error("sensor.stream", error, address, [ALLOWED])
     assert check == Check("sensor.stream", "failed", found, cure)
+
+
+@pytest.mark.parametrize(
+    ("address", "ask"), [(PORT, "ftdrive devices --probe "), (BY_NETWORK, "ping ")], ids=["serial port", "network"]
+)
+def test_to_the_cure_of_a_silence_belongs_how_to_see_who_answers(address: SensorAddress, ask: str) -> None:
+    check = diagnosis.check_sensor_error("sensor.stream", DeviceTimeout("silent; check cable"), address, [ALLOWED])
+    assert str(check.fix).startswith("check cable; see whom the address reaches: " + ask)
 
 
 @pytest.mark.parametrize(
@@ -339,9 +347,8 @@ def test_another_cure_is_shown_where_the_way_to_a_sensor_is_wrong_or_its_message
     assert cure in str(found.fix)
 
 
-@pytest.mark.parametrize("mark", [";", ":"])
-def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable(mark: str) -> None:
-    error = PortInUse(f"sensor: the port is in use by another program{mark} end it, `fuser -v /dev/ttyUSB7` names it")
+def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable() -> None:
+    error = PortInUse("sensor: the port is in use by another program; end it, `fuser -v /dev/ttyUSB7` names it")
     found = diagnosis.check_sensor_error("sensor.identity", error, PORT, [FORBIDDEN])
     assert found.found == "sensor: the port is in use by another program"
     assert found.fix == "end it, `fuser -v /dev/ttyUSB7` names it"

@@ -214,7 +214,7 @@ def test_a_bus_that_does_not_open() -> None:
 def test_an_adapter_that_another_program_reads_is_left_alone(start: Callable[..., str]) -> None:
     port = start(AtiCanNode)
     with sensor_from_url(f"ati-can://{port}?interface=slcan") as sensor:
-        with pytest.raises(PortInUse, match=f"in use by another program: end it, `fuser -v {port}` names it"):
+        with pytest.raises(PortInUse, match=f"in use by another program; end it, `fuser -v {port}` names it"):
             probe_can(port, interface="slcan", bitrate=250_000)
         with pytest.raises(serial.SerialException):
             serial.Serial(port, exclusive=True)

@@ -168,7 +168,7 @@ def test_what_came_before_the_flags_is_thrown_away(far_side: FarSide, monkeypatc
 
 def test_a_port_that_another_program_has_is_said_to_be_in_use(far_side: FarSide) -> None:
     port = SerialPort("sensor", far_side.path, 115_200)
-    fuser = f"in use by another program: end it, `fuser -v {far_side.path}` names it"
+    fuser = f"in use by another program; end it, `fuser -v {far_side.path}` names it"
     with serial.Serial(far_side.path, exclusive=True), pytest.raises(PortInUse, match=fuser):
         port.open()
     port.open()
