@@ -15,9 +15,9 @@ from ftdrive.simulation import Station
 
 _PLACES = """\b
 A PLACE is
-  /dev/ttyUSB0                            a serial port
-  can0                                    a CAN interface that is up, at its own bit rate
-  slcan:///dev/ttyACM0?bitrate=250000     a CAN adapter on a serial port"""
+  /dev/ttyUSB0                         a serial port
+  can0                                 a CAN interface that is up, at its rate
+  slcan:///dev/ttyACM0?bitrate=250000  a CAN adapter on a serial port"""
 
 
 @click.command(epilog=_PLACES)
@@ -92,7 +92,7 @@ def _emulated() -> dict[str, Any]:
 
 
 def _print(found: dict[str, Any]) -> None:
-    data = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
+    data = Console(highlight=False, emoji=False, soft_wrap=not sys.stdout.isatty())
     for port in found["serial"]:
         words = [port.get("by_id") or port["port"], *(port.get(key) for key in ("description", "usb"))]
         data.print(" serial  " + escape("   ".join(word for word in words if word)))
