@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 
-from ftdrive import checks
+from ftdrive import checks, config
 from ftdrive.checks import Check, SensorAddress
-from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 
 
 @pytest.fixture
@@ -32,12 +31,12 @@ def port_checks(computer: Path, port: str) -> dict[str, Check]:
 
 
 def test_the_workcell_is_counted_and_what_cannot_be_is_named() -> None:
-    tool = ToolConfig(cylinders_mm=((0, 60, 90),))
-    work = WorkcellConfig(planes_mm=((0, 0, 1, 0), (-1, 0, 0, -800)), boxes_mm=((600, 600, 0, 800, 800, 200),))
-    cell = CellConfig(RobotConfig(""), SensorConfig(""), tool, replace(work, measured=True))
+    tool = config.ToolConfig(cylinders_mm=((0, 60, 90),))
+    work = config.WorkcellConfig(planes_mm=((0, 0, 1, 0), (-1, 0, 0, -800)), boxes_mm=((600, 600, 0, 800, 800, 200),))
+    cell = config.CellConfig(config.RobotConfig(""), config.SensorConfig(""), tool, replace(work, measured=True))
     found = checks.check_workcell(cell, "UR5e")
     assert (found.state, found.found) == ("ok", "tool of 1 cylinder, 2 planes, 1 box, measured")
-    wrong = replace(cell, workcell=WorkcellConfig(planes_mm=((1, 0, 0, 800),)))
+    wrong = replace(cell, workcell=config.WorkcellConfig(planes_mm=((1, 0, 0, 800),)))
     found = checks.check_workcell(wrong, "UR5e")
     assert (found.name, found.state) == ("workcell.measured", "failed")
     assert "wrong side of the plane [1, 0, 0, 800]" in found.found
