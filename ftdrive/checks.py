@@ -116,19 +116,29 @@ def check_disk(folder: Path) -> list[Check]:
     return [Check("disk.runs", "ok", found)]
 
 
-def check_workcell(cell: CellConfig) -> Check:
-    """See whether tool and surroundings are described as a person has measured them."""
+def check_workcell(cell: CellConfig, model: str | None) -> Check:
+    """See whether tool and surroundings can be as they are described for an arm, and are as a person measured them."""
+    from ftdrive.planning.cell import require_possible
+
     name = "workcell.measured"
     if not cell.tool.cylinders_mm:
         cure = "describe what is mounted: [tool] cylinders_mm in ftdrive.toml, or --tool of calibrate"
         return Check(name, "warning", "no tool is described", cure)
+    try:
+        require_possible(cell, model)
+    except ConfigError as error:
+        found, _, cure = str(error).rpartition(": ")
+        return Check(name, "failed", found, cure)
     if not cell.workcell.measured:
         cure = "measure tool, planes and boxes, then set measured = true in [workcell] of ftdrive.toml"
         return Check(name, "failed", "tool and surroundings are placeholders", cure)
-    planes, boxes = len(cell.workcell.planes_mm), len(cell.workcell.boxes_mm)
-    return Check(
-        name, "ok", f"tool of {len(cell.tool.cylinders_mm)} cylinders, {planes} planes, {boxes} boxes, measured"
-    )
+    rows = (cell.tool.cylinders_mm, "cylinder"), (cell.workcell.planes_mm, "plane"), (cell.workcell.boxes_mm, "box")
+    cylinders, planes, boxes = (_counted(len(row), one) for row, one in rows)
+    return Check(name, "ok", f"tool of {cylinders}, {planes}, {boxes}, measured")
+
+
+def _counted(count: int, one: str) -> str:
+    return f"{count} {one if count == 1 else 'boxes' if one == 'box' else one + 's'}"
 
 
 def check_permissions(address: SensorAddress, *, sys: Path = SYS, dev: Path = DEV) -> list[Check]:

@@ -4,6 +4,7 @@ import importlib
 import logging
 import signal
 import sys
+from io import StringIO
 
 import click
 
@@ -25,7 +26,7 @@ _COMMANDS = {
     "transcript": ("ftdrive.commands.transcript", "Record or play the bytes on a sensor's wire."),
 }
 
-_EPILOG = """\b
+_EPILOG = """\
 Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,
 5 device fault, 6 file unreadable or not what it should be, 7 not acceptable (not observable, rejected),
 130 interrupted (data kept)."""
@@ -102,7 +103,10 @@ def main() -> int:
         _siblings.check()
         return int(cli.main(prog_name="ftdrive", standalone_mode=False) or 0)
     except click.ClickException as error:
-        error.show()
+        from ftdrive.talk import in_whole_words
+
+        error.show(told := StringIO())
+        click.echo(in_whole_words(told.getvalue(), sys.stderr), err=True, nl=False)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         click.echo("interrupted", err=True)

@@ -367,12 +367,21 @@ def _wrong_mounting(value: str) -> str | None:
     return None if usable else "give floor, wall, ceiling, or degrees about base y"
 
 
+_THINNEST_MM = 5.0
+"""A cylinder given in metres or inches is thinner."""
+
+
 def _wrong_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
     for row in rows:
         if len(row) not in {3, 5} or not (0 <= row[0] < row[1] <= 2000 and 0 < row[2] <= 1000):
             return (
                 f"{list(row)} is no cylinder of the tool: give [from, to, diameter] or [from, to, diameter, x, y], mm "
                 "from the flange face, from 0 up, to at most 2000, diameter at most 1000"
+            )
+        if min(row[1] - row[0], row[2]) < _THINNEST_MM:
+            return (
+                f"{list(row)} is shorter or thinner than {_THINNEST_MM:g} mm, are these mm? Give from, to and diameter "
+                f"in mm, and {_THINNEST_MM:g} mm for what is thinner"
             )
     return None
 

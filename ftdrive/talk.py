@@ -7,7 +7,7 @@ from typing import TextIO
 
 from rich.console import Console
 
-talk = Console(stderr=True, highlight=False, soft_wrap=not sys.stderr.isatty())
+talk = Console(stderr=True, highlight=False, emoji=False, soft_wrap=not sys.stderr.isatty())
 """A terminal gets whole words, a file whole lines."""
 
 

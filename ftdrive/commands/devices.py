@@ -18,9 +18,9 @@ from ftdrive.simulation import Station
 
 _PLACES = """\b
 A PLACE is
-  /dev/ttyUSB0                            a serial port
-  can0                                    a CAN interface that is up, at its own bit rate
-  slcan:///dev/ttyACM0?bitrate=250000     a CAN adapter on a serial port"""
+  /dev/ttyUSB0                         a serial port
+  can0                                 a CAN interface that is up, at its rate
+  slcan:///dev/ttyACM0?bitrate=250000  a CAN adapter on a serial port"""
 
 
 @click.command(epilog=_PLACES)
@@ -102,7 +102,7 @@ def _emulated(failures: list[Exception]) -> dict[str, Any]:
 
 
 def _print(found: dict[str, Any]) -> None:
-    data = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
+    data = Console(highlight=False, emoji=False, soft_wrap=not sys.stdout.isatty())
     for port in found["serial"]:
         words = [port["by_id"] or port["port"], port["description"], port["usb"]]
         data.print(" serial  " + escape("   ".join(word for word in words if word)))

@@ -92,7 +92,8 @@ def doctor(
         permissions = checks.check_permissions(address)
         blame = partial(diagnosis.check_sensor_error, address=address, permissions=permissions)
         alive = _examine_sensor(device, address, cell, mass_kg or cell.tool.mass_kg or 1.0, found, blame, stack)
-        found += [checks.check_workcell(cell), *checks.check_disk(runs), *permissions]
+        told = cell.robot.model if arm is None else arm.identify().model
+        found += [checks.check_workcell(cell, told), *checks.check_disk(runs), *permissions]
         if calibration is not None:
             serials = {"sensor": device.identify().serial} if alive else {}
             if arm is not None:
@@ -266,7 +267,7 @@ def _means(device: ForceTorqueSensor, duration_s: float) -> Iterator[Array]:
 
 
 def _print(found: list[Check]) -> None:
-    data = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
+    data = Console(highlight=False, emoji=False, soft_wrap=not sys.stdout.isatty())
     subject = ""
     for check in found:
         first, _, _ = check.name.partition(".")

@@ -1,8 +1,9 @@
 """`ftdrive init`: from "robot and sensor are connected" to a file that describes the cell. Nothing moves."""
 
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,6 +13,9 @@ import click
 from ftdrive.commands.common import JSON, MODEL, check_simulate, rows, simulate, write_json
 
 T = TypeVar("T")
+
+Judge = Callable[[Any], None]
+"""Raises `ConfigError` for a row, or for all rows, of an answer."""
 
 _SILENT = "did not answer when this was written"
 
@@ -68,6 +72,7 @@ def init(
     from ftdrive.cellfile import cell_file
     from ftdrive.config import FILE, CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, settings
     from ftdrive.planning.arm_model import SHAPES
+    from ftdrive.planning.cell import require_possible
     from ftdrive.simulation import Station, sensor_name
 
     check_simulate(simulate, real={"--robot": robot})
@@ -94,14 +99,16 @@ def init(
         sensor_mass,
         "",
     )
+    begun = CellConfig(RobotConfig(host, model), SensorConfig(url, height_mm=height_mm))
     name = ask.text("Name of the tool", "tool.name", "--tool-name", tool_name, said["tool.name"].value)
     cylinders = ask.rows(
-        "What is mounted, first cylinder, sensor included: FROM:TO:DIAMETER in mm from the flange, such as 0:60:90",
+        "What is mounted, first cylinder, sensor included: FROM:TO:DIAMETER in mm from the flange (such as 0:60:90)",
         "tool.cylinders_mm",
         "--tool",
         tool,
         (3, 5),
         needed=True,
+        whole=lambda rows: require_possible(replace(begun, tool=ToolConfig(cylinders_mm=rows)), model),
     )
     tool_kg = ask.number("Tool, kg, about (Enter: not known)", "tool.mass_kg", "--tool-mass", tool_mass, "")
     workcell = WorkcellConfig(
@@ -118,8 +125,16 @@ def init(
             "--plane",
             planes,
             (4,),
+            each=lambda row: require_possible(replace(begun, workcell=WorkcellConfig(planes_mm=(row,))), model),
         ),
-        ask.rows("First block, two corners X:Y:Z:X:Y:Z in mm", "workcell.boxes_mm", "--box", boxes, (6,)),
+        ask.rows(
+            "First block, two corners X:Y:Z:X:Y:Z in mm",
+            "workcell.boxes_mm",
+            "--box",
+            boxes,
+            (6,),
+            each=lambda row: require_possible(replace(begun, workcell=WorkcellConfig(boxes_mm=(row,))), model),
+        ),
     )
     usual = said["robot.speed_deg_s"].value
     speed_deg_s = ask.number("Speed of the fastest joint, deg/s", "robot.speed_deg_s", "--speed", speed, f"{usual:g}")
@@ -133,8 +148,16 @@ def init(
     if as_json:
         told = {"file": str(path), "robot": robot_told, "sensor": sensor_told}
         write_json({"schema_version": 1, **told, "config": asdict(cell)})
-    _say(f"Wrote {path}. Measure tool, planes and boxes, then set measured = true in it: nothing moves before.")
-    _say("Next: ftdrive doctor, then ftdrive plan")
+    if simulate:
+        _say(f"Wrote {path}, to look at only: the emulated robot and sensor in it have ended with this command.")
+        _say("Next: ftdrive doctor --simulate, then ftdrive plan --simulate")
+    else:
+        _say(f"Wrote {path}. Measure tool, planes and boxes, then set measured = true in it: nothing moves before.")
+        _say("Next: ftdrive doctor, then ftdrive plan")
+
+
+def _anything(_: Any) -> None:
+    """Take every answer."""
 
 
 class Questions:
@@ -151,6 +174,7 @@ class Questions:
     def ask(self, words: str, flag: str, given: str | None, usual: str | None, read: Callable[[str], T]) -> T:
         """Return what was given, or the answer; `usual` is what Enter and `--yes` say, None where they must not."""
         from ftdrive.errors import ConfigError
+        from ftdrive.talk import in_whole_words
 
         if given is None and self._yes:
             if usual is None:
@@ -159,7 +183,8 @@ class Questions:
         if given is not None:
             return read(given)
         while True:
-            answer = click.prompt(words, default=usual, show_default=bool(usual), err=True)
+            shown = in_whole_words(f"{words} [{usual}]: " if usual else f"{words}: ", sys.stderr)
+            answer = click.prompt(shown, default=usual, show_default=False, prompt_suffix="", err=True)
             try:
                 return read(answer)
             except ConfigError as error:
@@ -176,19 +201,36 @@ class Questions:
         return self.ask(words, flag, given, usual, partial(_number, key, flag))
 
     def rows(
-        self, words: str, key: str, flag: str, given: Sequence[str], counts: Sequence[int], *, needed: bool = False
+        self,
+        words: str,
+        key: str,
+        flag: str,
+        given: Sequence[str],
+        counts: Sequence[int],
+        *,
+        needed: bool = False,
+        each: Judge = _anything,
+        whole: Judge = _anything,
     ) -> Any:
-        """Ask for rows of numbers until an empty answer; at least one when `needed`."""
+        """Ask for rows of numbers until an empty answer; at least one when `needed`. Each and all are judged."""
         from ftdrive.config import checked
 
+        found: list[Any] = []
+
         def read(text: str) -> Any:
-            return checked(flag, key, rows(flag, [text], counts))[0] if text else None
+            if not text:
+                whole(tuple(found))
+                return None
+            row = checked(flag, key, rows(flag, [text], counts))[0]
+            each(row)
+            return row
 
         if given:
-            return tuple(read(text) for text in given)
+            found += map(read, given)
+            whole(tuple(found))
+            return tuple(found)
         if self._yes and not needed:
             return ()
-        found: list[Any] = []
         while True:
             if found:
                 row = self.ask("  next (Enter: no more)", flag, None, "", read)

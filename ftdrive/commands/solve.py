@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from textwrap import fill
 from typing import Any, Literal
 
 import click
@@ -37,11 +38,21 @@ _METHODS = (
     *("ml", "srom", "lrom", "carlson-relaxation", "carlson-cayley", "carlson-eigen", "carlson-nullspace"),
     *("carlson-iterative", "carlson-polynomial", "known-rotation", "yaw-only", "all"),
 )
+_NAMES = "\b\nMETHOD is one of\n" + fill(
+    ", ".join(_METHODS), 76, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False
+)
 
 
-@click.command()
+@click.command(epilog=_NAMES)
 @click.argument("sources", metavar="DATASET...", nargs=-1, type=click.Path(exists=True, path_type=Path))
-@click.option("--method", type=click.Choice(_METHODS), default="ml", show_default=True, help="all: side by side.")
+@click.option(
+    "--method",
+    metavar="METHOD",
+    type=click.Choice(_METHODS),
+    default="ml",
+    show_default=True,
+    help="Below; all: side by side.",
+)
 @click.option(
     "--orientation",
     type=click.Choice(["R_base_flange", "R_flange_base"]),

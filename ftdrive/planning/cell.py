@@ -5,10 +5,19 @@ from typing import Protocol
 
 import numpy as np
 
+from drivers.ur.kinematics import MODELS, model_named
 from ftdrive.errors import ConfigError
-from ftdrive.planning.arm_model import ArmModel, Cylinder
-from ftdrive.planning.certify import Certifier
+from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder
+from ftdrive.planning.certify import Certifier, Margins
 from ftdrive.planning.scene import BASE_PLANE, Box, Plane, Scene, lean_of
+
+
+class Sensor(Protocol):
+    """Between flange and tool."""
+
+    @property
+    def height_mm(self) -> float | None:
+        """Of its origin above the flange face."""
 
 
 class Tool(Protocol):
@@ -39,6 +48,10 @@ class Cell(Protocol):
     """The parts of a cell's configuration that a plan depends on."""
 
     @property
+    def sensor(self) -> Sensor:
+        """Between flange and tool."""
+
+    @property
     def tool(self) -> Tool:
         """What the flange carries."""
 
@@ -61,11 +74,93 @@ def certifier_for(cell: Cell, model: str) -> Certifier:
     Raises
     ------
     ConfigError
-        The tool is empty, a shape is impossible, or the arm has no measured shape.
+        The tool is empty, a shape is impossible, the arm has no measured shape, or see `require_possible`.
     """
     planes = (BASE_PLANE, *map(plane_from_mm, cell.workcell.planes_mm))
     scene = Scene(planes, tuple(map(box_from_mm, cell.workcell.boxes_mm)), lean_of(cell.workcell.mounting))
-    return Certifier(ArmModel(model, [cylinder_from_mm(values) for values in cell.tool.cylinders_mm]), scene)
+    certifier = Certifier(ArmModel(model, [cylinder_from_mm(values) for values in cell.tool.cylinders_mm]), scene)
+    require_possible(cell, model)
+    return certifier
+
+
+def require_possible(cell: Cell, model: str | None) -> None:
+    """Refuse what no cell looks like: a tool shorter than its sensor, a plane or box with the arm itself inside.
+
+    Judged is the shoulder, which no motion takes away: of what is refused here nothing could be proven clear. What is
+    at the base, such as a table around its plate, stays allowed.
+
+    Parameters
+    ----------
+    cell : CellConfig
+        Without cylinders the tool is not judged.
+    model : str or None
+        Of the arm; without a measured shape planes and boxes are not judged.
+
+    Raises
+    ------
+    ConfigError
+        With the cylinders, plane or box, and what to do after the last colon.
+    """
+    end_mm, height_mm = max((row[1] for row in cell.tool.cylinders_mm), default=np.inf), cell.sensor.height_mm
+    if height_mm is not None and end_mm < height_mm:
+        raise ConfigError(
+            f"the tool ends {end_mm:g} mm from the flange, before the sensor's origin at {height_mm:g} mm ([sensor] "
+            "height_mm): describe all that is mounted, the sensor too, in mm from the flange"
+        )
+    name = None if model is None else model_named(model, controller_major=0)
+    if name not in SHAPES:
+        return
+    shoulder = _Shoulder(name)
+    for words in (
+        *map(shoulder.against_plane, cell.workcell.planes_mm),
+        *map(shoulder.against_box, cell.workcell.boxes_mm),
+    ):
+        if words:
+            raise ConfigError(words)
+
+
+class _Shoulder:
+    """The ball that the shoulder of an arm fills in every posture."""
+
+    def __init__(self, name: str) -> None:
+        self._centre_m = np.array([0.0, 0.0, MODELS[name].d1_m])
+        self._radius_m, self._margin_m = SHAPES[name].shoulder_radius_m, Margins().scene_m
+
+    def against_plane(self, row: Sequence[float]) -> str:
+        """Say what is wrong with a plane, and what it may have been meant to be; empty if nothing is."""
+        gap_m, (x, y, z, place) = self._above_m(row), row
+        if gap_m >= self._margin_m:
+            return ""
+        meant = (-x, -y, -z, -place), (x, y, z, -place)
+        same, opposite = (_words(one) if self._above_m(one) >= self._margin_m else "" for one in meant)
+        if gap_m > -self._radius_m or not same:
+            return self._too_near(f"the plane {_words(row)}", gap_m)
+        return (
+            f"the arm's own {'base' if place > 0 else 'shoulder'} stands on the wrong side of the plane {_words(row)}, "
+            f"for the arm stays where normal times point is {place:g} mm or more: give {same} if the plane is there"
+            + (f", {opposite} if it is on the other side of the base" if opposite else "")
+        )
+
+    def against_box(self, row: Sequence[float]) -> str:
+        """Say what is wrong with a box; empty if nothing is."""
+        box = box_from_mm(row)
+        away_m = float(np.linalg.norm(self._centre_m - np.clip(self._centre_m, box.low_m, box.high_m)))
+        gap_m = away_m - self._radius_m
+        return "" if gap_m >= self._margin_m else self._too_near(f"the box {_words(row)}", gap_m)
+
+    def _above_m(self, row: Sequence[float]) -> float:
+        plane = plane_from_mm(row)
+        return float(np.dot(plane.normal, self._centre_m)) - plane.offset_m - self._radius_m
+
+    def _too_near(self, what: str, gap_m: float) -> str:
+        return (
+            f"{what} is {1e3 * max(gap_m, 0.0):.0f} mm from the arm's shoulder, which no motion takes away, and "
+            f"{1e3 * self._margin_m:.0f} mm are kept: measure it again, in mm from the centre of the base, in its axes"
+        )
+
+
+def _words(row: Sequence[float]) -> str:
+    return f"[{', '.join(f'{value + 0.0:g}' for value in row)}]"
 
 
 def cylinder_from_mm(values: Sequence[float]) -> Cylinder:

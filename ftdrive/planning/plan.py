@@ -182,6 +182,9 @@ def make_plan(
     duration = move_duration_s(turn, speed, speeds.joint_rad_s2)
     prediction = predicted_sigma(R, guess)
     all_24 = predicted_sigma(special(range(1, 25)), guess).force_rms_N
+    words = f"Predicted error of force compensation: {prediction.force_rms_N:.3f} N"
+    if set(numbers) != set(range(1, 25)):
+        words += f", {prediction.force_rms_N / all_24:.2f} times that of all 24 poses"
     ball_centre_m, ball_m = _ball(certifier, q_rad, following)
     steps = tuple(
         Step(
@@ -199,11 +202,7 @@ def make_plan(
     )
     return Plan(
         kind,
-        (
-            *why,
-            f"Predicted error of force compensation: {prediction.force_rms_N:.3f} N, "
-            f"{prediction.force_rms_N / all_24:.2f} times that of all 24 poses.",
-        ),
+        (*why, f"{words}."),
         fingerprints(certifier),
         steps,
         speeds.joint_rad_s2,

@@ -1,6 +1,8 @@
 """Every command of the tree works without any hardware, and tells what it has found in one JSON object."""
 
 import json
+import os
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -10,7 +12,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from ftdrive.cli import cli
+from ftdrive.cli import cli, main
 from ftdrive.errors import ConfigError
 
 
@@ -56,6 +58,25 @@ SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     "transcript play": lambda told: told["played"]["samples"] > 1000,
     "transcript record": lambda told: told["recorded"]["error"] is None,
 }
+
+
+@pytest.mark.parametrize("command", ["", *names(cli)])
+def test_help_fits_into_80_columns(command: str) -> None:
+    outcome = CliRunner().invoke(cli, [*command.split(), "--help"], terminal_width=80)
+    assert outcome.exit_code == 0
+    assert max(map(len, outcome.stdout.splitlines())) <= 80
+
+
+def test_a_wrong_option_is_told_in_whole_words(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+    monkeypatch.setattr("os.get_terminal_size", lambda *_: os.terminal_size((80, 24)))
+    monkeypatch.setattr(sys, "argv", ["ftdrive", "solve", "--method", "x"])
+    assert main() == 2
+    told = capfd.readouterr().err
+    assert "'carlson-iterative'" in told
+    assert max(map(len, told.splitlines())) <= 80
 
 
 @pytest.mark.parametrize("command", list(names(cli)))

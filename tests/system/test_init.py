@@ -1,12 +1,15 @@
 """`ftdrive init` against an emulated cell: as a script calls it, as answers typed, and in a real terminal."""
 
 import codecs
+import fcntl
 import os
 import pty
 import re
 import select
+import struct
 import subprocess
 import sys
+import termios
 import time
 import tomllib
 from collections.abc import Iterator
@@ -20,6 +23,7 @@ from ftdrive.cli import cli, exit_code
 from ftdrive.config import load
 from ftdrive.simulation import Station
 
+COLUMNS = 80
 TOOL = ["--height", "33", "--tool", "0:33:80", "--tool", "33:200:100:0:5"]
 
 
@@ -139,7 +143,9 @@ def test_a_robot_that_does_not_answer_is_exit_code_3(station: Station) -> None:
 
 def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
     answers = ["127.99.99.9", station.cell.robot.host, "ati-nonsense://x", station.endpoints["serial"]["port"]]
-    answers += ["high", "3300", "33", "", "", "0:33", "0:33:80", "33:20:100", "33:200:100", "", "", "", "", "", "", ""]
+    answers += ["high", "3300", "33", "", ""]
+    answers += ["0:x:33", "0:0.2:0.1", "0:20:80", "", "20:33:80", "33:20:100", "33:200:100", "", "", ""]
+    answers += ["1:0:0:800", "-1:0:0:-800", "", "-50:-50:0:50:50:400", "300:300:0:500:500:400", "", ""]
     outcome = run(typed="\n".join(answers) + "\n")
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)
     for words in (
@@ -148,12 +154,19 @@ def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
         "is not a number",
         "out of range",
         "3 or 5 numbers",
+        "'0:x:33'",
         "no cylinder",
+        "are these mm",
+        "ends 20 mm from the flange",
+        "wrong side of the plane [1, 0, 0, 800]",
+        "the box [-50, -50, 0, 50, 50, 400]",
     ):
         assert words in outcome.stderr
     cell = load()
     assert cell.robot.host == station.cell.robot.host
-    assert cell.tool.cylinders_mm == ((0, 33, 80), (33, 200, 100))
+    assert cell.tool.cylinders_mm == ((0, 20, 80), (20, 33, 80), (33, 200, 100))
+    assert cell.workcell.planes_mm == ((-1, 0, 0, -800),)
+    assert cell.workcell.boxes_mm == ((300, 300, 0, 500, 500, 400),)
     assert (cell.sensor.height_mm, cell.sensor.mass_kg) == (33, None)
 
 
@@ -173,11 +186,14 @@ def test_simulated(tmp_path: Path) -> None:
     cell = load(tmp_path / "cell.toml")
     assert cell.robot.model == "UR5e"
     assert cell.sensor.url.startswith("ati-can://")
+    assert "have ended" in outcome.stderr
+    assert "Next: ftdrive doctor --simulate" in outcome.stderr
 
 
 def test_in_a_terminal(station: Station) -> None:
     """Every question is read on the screen before it is answered."""
     leader, follower = pty.openpty()
+    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("4H", 24, COLUMNS, 0, 0))
     process = subprocess.Popen(
         [sys.executable, "-m", "ftdrive", "init"], stdin=follower, stdout=follower, stderr=follower, close_fds=True
     )
@@ -189,11 +205,11 @@ def test_in_a_terminal(station: Station) -> None:
         (r"measure it\): ", "33"),
         (r"Sensor and adapter, kg .*: ", "0.255"),
         (r"Name of the tool \[tool\]: ", ""),
-        (r"such as 0:60:90: ", "0:33:80"),
+        (r"such\s+as\s+0:60:90\): ", "0:33:80"),
         (r"next \(Enter: no more\): ", ""),
         (r"Tool, kg, about .*: ", "1.2"),
         (r"Mounting: floor, wall, ceiling or degrees \[floor\]: ", ""),
-        (r"First wall or table.*: ", ""),
+        (r"First wall or table[^?]*none\): ", ""),
         (r"First block.*: ", ""),
         (r"deg/s \[60\]: ", ""),
     ]
@@ -215,3 +231,6 @@ def test_in_a_terminal(station: Station) -> None:
     assert "remote control ON" in screen
     assert re.search(r"✔ ati-serial://\S+: ATI", screen)
     assert load().sensor.height_mm == 33
+    addresses = (station.cell.robot.host, station.endpoints["serial"]["port"])
+    long = [line for line in screen.splitlines() if len(line) > COLUMNS and not any(a in line for a in addresses)]
+    assert not long  # a terminal would break it within a word

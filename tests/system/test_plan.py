@@ -72,6 +72,13 @@ def test_the_plan_says_whether_somebody_measured_what_it_is_for(
     assert (exported.exit_code == 0) is measured
 
 
+def test_a_plane_with_its_sign_wrong_is_named_at_once() -> None:
+    error = run(*UR5E, "--plane", "0:1:0:-900", "--plane", "0:0:1:300").exception
+    assert error is not None
+    assert exit_code(error) == 2
+    assert "wrong side of the plane [0, 0, 1, 300]" in str(error)
+
+
 @pytest.mark.parametrize("arguments", [[], ["--free-box", "100", "--minimal"]])
 def test_the_table_fits_into_80_columns(arguments: list[str]) -> None:
     lines = run(*UR5E, *arguments).stderr.splitlines()
@@ -103,7 +110,7 @@ def test_what_cannot_be_used_is_said_in_a_sentence(arguments: list[str], said: s
 
 
 def test_no_way_is_exit_code_7() -> None:
-    error = run(*UR5E, "--plane", "0:0:1:500").exception
+    error = run(*UR5E, "--plane", "-1:0:0:-130", "--plane", "1:0:0:-130").exception
     assert error is not None
     assert exit_code(error) == 7
 

@@ -2,13 +2,14 @@
 
 import os
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from ftdrive import checks
+from ftdrive import checks, config
 from ftdrive.checks import Check, SensorAddress
 from ftdrive.errors import ConfigError
 
@@ -28,6 +29,19 @@ def computer(tmp_path: Path) -> Path:
 def port_checks(computer: Path, port: str) -> dict[str, Check]:
     found = checks.check_serial_port(computer / "dev" / port, sys=computer / "sys", dev=computer / "dev")
     return {check.name.removeprefix("permissions."): check for check in found}
+
+
+def test_the_workcell_is_counted_and_what_cannot_be_is_named() -> None:
+    tool = config.ToolConfig(cylinders_mm=((0, 60, 90),))
+    work = config.WorkcellConfig(planes_mm=((0, 0, 1, 0), (-1, 0, 0, -800)), boxes_mm=((600, 600, 0, 800, 800, 200),))
+    cell = config.CellConfig(config.RobotConfig(""), config.SensorConfig(""), tool, replace(work, measured=True))
+    found = checks.check_workcell(cell, "UR5e")
+    assert (found.state, found.found) == ("ok", "tool of 1 cylinder, 2 planes, 1 box, measured")
+    wrong = replace(cell, workcell=config.WorkcellConfig(planes_mm=((1, 0, 0, 800),)))
+    found = checks.check_workcell(wrong, "UR5e")
+    assert (found.name, found.state) == ("workcell.measured", "failed")
+    assert "wrong side of the plane [1, 0, 0, 800]" in found.found
+    assert str(found.fix).startswith("give [-1, 0, 0, -800]")
 
 
 def test_a_slow_adapter_with_a_short_name(computer: Path) -> None:

@@ -178,6 +178,8 @@ def test_other_programs_variables_are_left_alone(monkeypatch: pytest.MonkeyPatch
         (GOOD + "[tool]\ncylinders_mm = [0, 200, 100]\n", "list of lists"),
         (GOOD + "[tool]\ncylinders_mm = [[200, 100, 50]]\n", "cylinder"),
         (GOOD + "[tool]\ncylinders_mm = [[0, 200, 100, 5]]\n", "cylinder"),
+        (GOOD + "[tool]\ncylinders_mm = [[0, 0.2, 0.1]]\n", "are these mm"),
+        (GOOD + "[tool]\ncylinders_mm = [[0, 60, 90], [60, 200, 4]]\n", "5 mm for what is thinner"),
         (GOOD + "[workcell]\nplanes_mm = [[0, 0, 0, 5]]\n", "plane"),
         (GOOD + "[workcell]\nboxes_mm = [[0, 0, 0, 1, 1, 0]]\n", "box"),
         (GOOD + '[workcell]\nmounting = "sideways"\n', "mounting"),

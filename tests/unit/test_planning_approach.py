@@ -104,6 +104,7 @@ def cell(**changes: object) -> SimpleNamespace:
     tool = {"cylinders_mm": ((0, 200, 100), (20, 60, 30, 70, -10))}
     workcell = {"mounting": "wall", "planes_mm": ((0, -2, 0, -800),), "boxes_mm": ((400, 0, 300, 300, -600, 0),)}
     return SimpleNamespace(
+        sensor=SimpleNamespace(height_mm=None),
         tool=SimpleNamespace(**{k: changes.get(k, v) for k, v in tool.items()}),
         workcell=SimpleNamespace(**{k: changes.get(k, v) for k, v in workcell.items()}),
     )

@@ -38,6 +38,7 @@ def test_title_tells_whether_the_whole_arm_moves(plan: Plan) -> None:
     title = title_of(plan, certifier_of(), on_its_way=False)
     assert "all that moves stays in this ball" in title
     assert "WHOLE ARM" not in title
+    assert "grey: arm, orange: tool" in title
     title = title_of(moving, certifier_of(), on_its_way=True)
     assert "all that moves" not in title
     assert "WHOLE ARM moves" in title
