@@ -261,6 +261,12 @@ def check_can_interface(interface: str, bitrate: int, details: Mapping[str, Any]
     """
     name = "permissions.can"
     up = f"sudo ip link set {interface} up type can bitrate {bitrate}"
+    if "/" in interface or interface.startswith("tty"):
+        port = interface if "/" in interface else f"/dev/{interface}"
+        fix = (
+            f"a sensor on a serial port is asked at {port}, a bus behind an adapter at slcan://{port}?bitrate={bitrate}"
+        )
+        return Check(name, "failed", f"{interface} is no CAN interface", fix)
     folder = sys / "class" / "net" / interface
     if not folder.exists():
         fix = f"plug the adapter in (ftdrive devices lists the interfaces), then {up}"

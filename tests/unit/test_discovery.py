@@ -93,6 +93,15 @@ def test_a_place_that_is_not_written_well(place: str, words: str, asked: list[An
     assert asked == []
 
 
+@pytest.mark.parametrize(
+    ("place", "port"), [("ttyUSB0", "/dev/ttyUSB0"), ("socketcan:///dev/null", "/dev/null")], ids=["name", "path"]
+)
+def test_a_serial_port_is_no_can_interface(place: str, port: str, asked: list[Any]) -> None:
+    with pytest.raises(ConnectError, match=rf"is no CAN interface: .* {port}, .* slcan://{port}\?bitrate=250000$"):
+        ask(place)
+    assert asked == []
+
+
 def test_an_interface_that_cannot_be_asked(can0: Path, asked: list[Any]) -> None:
     with pytest.raises(ConnectError, match=r"no interface can1: .*sudo ip link set can1 up type can bitrate 250000$"):
         ask("can1")
