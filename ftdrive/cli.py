@@ -48,7 +48,7 @@ class _LazyGroup(click.Group):
 
 @click.group(cls=_LazyGroup, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("-v", "--verbose", count=True, help="Say more on stderr; twice for everything.")
-@click.option("-q", "--quiet", is_flag=True, help="Only errors on stderr.")
+@click.option("-q", "--quiet", is_flag=True, help="Only errors on stderr; before a question, what it is about.")
 @click.version_option(__version__, prog_name="ftdrive")
 def cli(verbose: int, quiet: bool) -> None:
     """Calibrate a wrist force/torque sensor on a Universal Robots arm, and see the true contact force.
@@ -56,7 +56,12 @@ def cli(verbose: int, quiet: bool) -> None:
     New here? `ftdrive demo` needs no hardware.
     """
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[_Talk()])
+    logger = logging.StreamHandler() if quiet else _Talk()
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[logger])
+    if quiet:
+        from ftdrive.talk import talk
+
+        talk.quiet = True
 
 
 class _Talk(logging.Handler):
@@ -65,7 +70,7 @@ class _Talk(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         from ftdrive.talk import talk
 
-        talk.print(self.format(record), markup=False)
+        talk.print(self.format(record))
 
 
 def exit_code(error: BaseException) -> int | None:

@@ -12,6 +12,7 @@ import io
 import json
 import os
 import platform
+import shlex
 import sys
 import threading
 import time
@@ -103,6 +104,16 @@ class Run:
     def plan_path(self) -> Path:
         """Where the plan is kept."""
         return self.folder / "plan.json"
+
+    @property
+    def resume_command(self) -> str:
+        """What to type to go on with it."""
+        return f"ftdrive calibrate --resume {shlex.quote(str(self.folder))}"
+
+    @property
+    def solve_command(self) -> str:
+        """What to type to solve the poses that are there."""
+        return f"ftdrive solve {shlex.quote(str(self.folder))}"
 
     def new_path(self, name: str) -> Path:
         """Give the next free path for a file that may be written again: name.json, name-2.json and so on."""

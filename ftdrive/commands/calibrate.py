@@ -226,12 +226,12 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
     nobody = {"default", "not set", "--tool"}
     origins = {one.origin for key, one in found.items() if key.startswith(("tool.", "workcell."))} - nobody
     if origins:
-        talk.print(f"Tool and surroundings as they are described now: {', '.join(sorted(origins))}.", markup=False)
+        talk.print(f"Tool and surroundings as they are described now: {', '.join(sorted(origins))}.")
         for key, value in (("robot.host", before.robot.host), ("sensor.url", before.sensor.url)):
             if found[key].value is None:
                 found[key] = Setting(value, str(folder))
         return cell_of(found)
-    talk.print("Settings as the run was begun: no file here describes tool and surroundings.", markup=False)
+    talk.print("Settings as the run was begun: no file here describes tool and surroundings.")
     cylinders_mm = found["tool.cylinders_mm"].value or before.tool.cylinders_mm
     return replace(
         before,

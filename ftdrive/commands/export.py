@@ -48,6 +48,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     from ftdrive.errors import ConfigError
     from ftdrive.exports import targets_csv, urscript
     from ftdrive.planning.plan import Plan
+    from ftdrive.talk import talk
 
     check_simulate(simulate, real={"PLAN.json": path})
     if simulate:
@@ -59,7 +60,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     text = urscript.program(made, dwell_s=dwell_s) if target == "urscript" else targets_csv.table(made)
     if output is not None:
         write_new(output, text)
-        click.echo(f" Wrote {output}", err=True)
+        talk.print(f" Wrote {output}")
     if as_json:
         told = {"format": target, "plan": made.to_dict()["sha256"], "file": None if output is None else str(output)}
         write_json({"schema_version": 1, **told, "text": text})

@@ -136,6 +136,8 @@ class Cell:
 class Person:
     """Hears everything, presses keys at given times, and q a while after the arm's last dwell."""
 
+    has_keys = True
+
     def __init__(self, cell: Cell, keys: dict[float, Key]) -> None:
         self.cell = cell
         self.keys = keys | {cell.end_s + 20: Key.STOP}
