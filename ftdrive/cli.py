@@ -96,6 +96,13 @@ def exit_code(error: BaseException) -> int | None:
     return next((code for kind, code in codes if isinstance(error, kind)), None)
 
 
+def in_a_sentence(error: BaseException) -> str:
+    """Say an error; one of the system with its file and what to look at, where it would be a number and two words."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}: check this path, and who may read and write there"
+    return str(error)
+
+
 def main() -> int:
     """Run the command line; return the exit code."""
     # Ctrl-C, `kill` and a terminal that closes all end a command the same way: the arm is stopped first. Set even where
@@ -120,5 +127,5 @@ def main() -> int:
             raise
         from ftdrive.talk import in_whole_words
 
-        click.echo(in_whole_words(f"error: {error}", sys.stderr), err=True)
+        click.echo(in_whole_words(f"error: {in_a_sentence(error)}", sys.stderr), err=True)
         return code

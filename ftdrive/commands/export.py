@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
+from ftdrive.commands.common import JSON, NewFile, check_simulate, simulate, write_json
 
 if TYPE_CHECKING:
     from ftdrive.planning.plan import Plan
@@ -27,7 +27,7 @@ def export() -> None:
     type=click.Choice(["urscript", "csv"]),
     help="A program for the pendant, or a table of joint targets.",
 )
-@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="A new file; without it, stdout.")
+@click.option("-o", "--output", type=NewFile(), help="A new file; without it, stdout.")
 @click.option(
     "--dwell",
     "dwell_s",

@@ -390,7 +390,7 @@ class _Collection:
                 f"of them let go of the tool and {self._hold_still()}."
             )
         if self._ends_by_itself:
-            self._note("It ends by itself once the poses are enough; Ctrl-C ends it before.")
+            self._note("It ends by itself, and solves, once the coverage is green; Ctrl-C ends it before.")
 
     def _hold_still(self) -> str:
         seconds = STILL_S + self._sampling.average_s + 3 * LOOK_S
