@@ -118,7 +118,7 @@ def calibrate(
     _refuse_contradictions([option for option, value in given.items() if value])
     with ExitStack() as stack:
         description: dict[str, Any] = {}
-        made_by = {} if resume is None else Run(resume).header().get("station") or {}
+        made_by = {} if resume is None else Run(resume).header_to_resume().get("station") or {}
         simulate = simulate or bool(made_by and not (config or robot or tool))  # a run goes on where it was begun
         if simulate:
             name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
