@@ -228,7 +228,7 @@ def _newest(path: Path) -> Path:
 
 def _read_record(path: Path) -> PoseRecord:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             data = {name: file[name] for name in file.files}
         found = str(data.get("format"))
         if found != RECORDING_FORMAT:
