@@ -13,7 +13,6 @@ from calib import solve
 from calib.routine import PoseRecord, TourPose, dataset_from, drift_check
 from drivers.errors import StreamBroken
 from drivers.interfaces import ArmState, RobotArm
-from ftdrive.config import CellConfig
 from ftdrive.planning.constant_tour import NUMBERS, constant_tour
 from ftdrive.report import errors_in_sigma
 from ftdrive.runs import Run
@@ -22,7 +21,6 @@ from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Key, Question
 from ftdrive.simulation import Station
 from ftdrive.wiring import build_arm, build_sensor
-from tests.system.conftest import CommandLine
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 
@@ -169,34 +167,6 @@ def test_watching_finds_the_truth(station: Station, listen: bool, tmp_path: Path
     assert (drift is not None) == listen
     if drift is not None:
         assert np.all(np.abs(drift.change) < 4.5 * drift.sigma)
-
-
-def test_without_a_screen_the_command_ends_by_itself_with_a_calibration(
-    station: Station, ftdrive: CommandLine, write_config: Callable[[CellConfig], Path]
-) -> None:
-    process = ftdrive.start("calibrate", "--config", write_config(station.cell), "--manual")
-    assert process.stderr is not None
-    told = list[str]()
-    with closing(build_arm(station.cell)) as theirs:
-        theirs.open(control=True)
-        tour = [
-            TourPose(number, q)
-            for number, q in zip(NUMBERS, constant_tour(theirs.state().q_rad), strict=True)
-            if number in QUICK
-        ]
-        mover = Mover(theirs, tour)
-        with mover:
-            for line in process.stderr:
-                told.append(line)
-                if "settled" in line:
-                    mover.measured()
-                    if len(ftdrive.poses()) == len(tour):
-                        process.terminate()
-    process.communicate(timeout=20)
-    assert process.returncode == 0, "".join(told)
-    poses = ftdrive.poses()
-    assert 6 <= len(poses) < len(tour)
-    assert (poses[0].parent.parent / "calibration.json").exists()
 
 
 def test_a_lost_sensor_ends_it_with_the_poses_on_disk(station: Station, tmp_path: Path) -> None:
