@@ -29,9 +29,7 @@ def write_new(path: Path, content: str | bytes) -> None:
     OSError
         The folder is missing, the disk is full, …; nothing is left behind.
     """
-    _refuse_existing(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"the folder {path.parent} does not exist: create it first")
+    require_new(path)
     partial = path.with_name(path.name + ".partial")
     try:
         with partial.open("wb") as file:
@@ -49,6 +47,13 @@ def write_new(path: Path, content: str | bytes) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def require_new(path: Path) -> None:
+    """Raise an `OSError` unless the file is not there yet, and its folder is."""
+    _refuse_existing(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"the folder {path.parent} does not exist: create it first")
 
 
 def _refuse_existing(path: Path) -> None:

@@ -49,7 +49,7 @@ class _LazyGroup(click.Group):
 
 @click.group(cls=_LazyGroup, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("-v", "--verbose", count=True, help="Say more on stderr; twice for everything.")
-@click.option("-q", "--quiet", is_flag=True, help="Only errors on stderr.")
+@click.option("-q", "--quiet", is_flag=True, help="Only errors on stderr; before a question, what it is about.")
 @click.version_option(__version__, prog_name="ftdrive")
 def cli(verbose: int, quiet: bool) -> None:
     """Calibrate a wrist force/torque sensor on a Universal Robots arm, and see the true contact force.
@@ -57,7 +57,12 @@ def cli(verbose: int, quiet: bool) -> None:
     New here? `ftdrive demo` needs no hardware.
     """
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[_Talk()])
+    logger = logging.StreamHandler() if quiet else _Talk()
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[logger])
+    if quiet:
+        from ftdrive.talk import talk
+
+        talk.quiet = True
 
 
 class _Talk(logging.Handler):
@@ -66,7 +71,7 @@ class _Talk(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         from ftdrive.talk import talk
 
-        talk.print(self.format(record), markup=False)
+        talk.print(self.format(record))
 
 
 def exit_code(error: BaseException) -> int | None:
@@ -90,6 +95,13 @@ def exit_code(error: BaseException) -> int | None:
         (OSError, 6),
     ]
     return next((code for kind, code in codes if isinstance(error, kind)), None)
+
+
+def in_a_sentence(error: BaseException) -> str:
+    """Say an error; one of the system with its file and what to look at, where it would be a number and two words."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}: check this path, and who may read and write there"
+    return str(error)
 
 
 def main() -> int:
@@ -119,5 +131,5 @@ def main() -> int:
             raise
         from ftdrive.talk import in_whole_words
 
-        click.echo(in_whole_words(f"error: {error}", sys.stderr), err=True)
+        click.echo(in_whole_words(f"error: {in_a_sentence(error)}", sys.stderr), err=True)
         return code

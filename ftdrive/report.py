@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
+from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult
@@ -17,7 +18,7 @@ from ftdrive.talk import talk
 
 Array = NDArray[np.float64]
 
-_MARK = {"good": "[bold green]GOOD[/]", "usable": "[bold yellow]USABLE[/]", "rejected": "[bold red]REJECTED[/]"}
+_STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
 
 
 def print_result(
@@ -44,8 +45,12 @@ def print_result(
     data = result.to_dict()
     force_N, torque_Nm = result.predicted_error()
     talk.print(
-        f"\n {_MARK[result.verdict]}  {result.n_poses} poses, method {result.method}; compensation error "
-        f"{force_N:.4f} N, {torque_Nm:.5f} N·m rms over all orientations (predicted)"
+        Text.assemble(
+            "\n ",
+            (result.verdict.upper(), _STYLE[result.verdict]),
+            f"  {result.n_poses} poses, method {result.method}; compensation error "
+            f"{force_N:.4f} N, {torque_Nm:.5f} N·m rms over all orientations (predicted)",
+        )
     )
     for reason in result.reasons:
         talk.print(f"   {reason}")
@@ -83,9 +88,9 @@ def print_result(
         )
     if records:
         for hint in hints(result, records):
-            talk.print(f" ? {hint}", style="yellow", markup=False)
+            talk.print(f" ? {hint}", style="yellow")
     if saved is not None:
-        talk.print(f" Saved {saved}", markup=False)
+        talk.print(f" Saved {saved}")
 
 
 def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:

@@ -12,10 +12,12 @@ import io
 import json
 import os
 import platform
+import shlex
 import sys
 import threading
 import time
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -31,10 +33,15 @@ from calib.errors import BadDataset
 from calib.files import check_format, read_object, write_new
 from calib.routine import PoseRecord, TourPose
 from ftdrive import __version__
+from ftdrive.config import recorded
+from ftdrive.errors import ConfigError
 
 RUN_FORMAT = "ftdrive.run/1"
 RECORDING_FORMAT = "ftdrive.recording/1"
 
+_RESTORE = "take it from a copy"
+_DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+"""What numpy raises for a file with wrong bytes in it."""
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 
 Array = NDArray[np.float64]
@@ -104,6 +111,16 @@ class Run:
         """Where the plan is kept."""
         return self.folder / "plan.json"
 
+    @property
+    def resume_command(self) -> str:
+        """What to type to go on with it."""
+        return f"ftdrive calibrate --resume {shlex.quote(str(self.folder))}"
+
+    @property
+    def solve_command(self) -> str:
+        """What to type to solve the poses that are there."""
+        return f"ftdrive solve {shlex.quote(str(self.folder))}"
+
     def new_path(self, name: str) -> Path:
         """Give the next free path for a file that may be written again: name.json, name-2.json and so on."""
         return _next(self.folder / f"{name}.json")
@@ -121,11 +138,27 @@ class Run:
         path = self.folder / "run.json"
         if not path.exists():
             raise BadDataset(f"{self.folder} is not a run folder: it has no run.json")
-        header = read_object(path, BadDataset)
         try:
+            header = read_object(path, BadDataset)
             check_format(header, RUN_FORMAT, BadDataset)
-        except BadDataset as error:
+            for name in header.keys() & {"config", "devices"}:
+                _require_objects(name, header[name])
+            if "config" in header:
+                header["config"] = recorded(header["config"])
+        except (BadDataset, ConfigError) as error:
             raise BadDataset(f"{path}: {error}") from error
+        return _Whole(path, header)
+
+    def header_to_resume(self) -> Mapping[str, Any]:
+        """Read run.json; raises `BadDataset`, also where a plan was followed and is lost."""
+        header = self.header()
+        for section, key in (("robot", "host"), ("sensor", "url")):
+            header["config"][section][key]  # tells where it is missing
+        if header.get("mode", "auto") in ("auto", "step") and not self.plan_path.is_file():
+            raise BadDataset(
+                f"{self.plan_path} is lost, and without its plan a run cannot go on: {_RESTORE}, or solve the poses "
+                f"that are there with {self.solve_command}"
+            )
         return header
 
     def commit(self, record: PoseRecord) -> None:
@@ -155,7 +188,26 @@ class Run:
 
     def stops(self) -> list[int]:
         """Tell which places of the tour are taken, without reading them."""
-        return sorted({int(path.stem.partition("-")[0]) for path in (self.folder / "poses").glob("*.npz")})
+        names = {path.stem.partition("-")[0] for path in (self.folder / "poses").glob("*.npz")}
+        return sorted(int(name) for name in names if name.isdecimal())
+
+
+def _require_objects(name: str, found: Any) -> None:
+    if not isinstance(found, dict) or not all(isinstance(one, dict) for one in found.values()):
+        raise BadDataset(f"'{name}' is {found!r}, the file is damaged: {_RESTORE}")
+
+
+class _Whole(dict[str, Any]):
+    """An object of run.json that says which file is damaged where something is missing."""
+
+    def __init__(self, path: Path, content: Mapping[str, Any]) -> None:
+        super().__init__(
+            {name: _Whole(path, value) if isinstance(value, dict) else value for name, value in content.items()}
+        )
+        self._path = path
+
+    def __missing__(self, name: str) -> Any:
+        raise BadDataset(f"{self._path} is damaged, it has no '{name}': {_RESTORE}")
 
 
 def _numbered(path: Path) -> Iterator[Path]:
@@ -176,13 +228,19 @@ def _newest(path: Path) -> Path:
 
 def _read_record(path: Path) -> PoseRecord:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             data = {name: file[name] for name in file.files}
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise BadDataset(f"{path} is not a recording of a pose: {error}") from error
-    found = str(data.get("format"))
-    if found != RECORDING_FORMAT:
-        raise BadDataset(f"{path} has format {found!r}: this version reads {RECORDING_FORMAT}")
+        found = str(data.get("format"))
+        if found != RECORDING_FORMAT:
+            raise BadDataset(f"{path} has format {found!r}: this version reads {RECORDING_FORMAT}")
+        return _record(data)
+    except _DAMAGE as error:
+        raise BadDataset(
+            f"{path} is not a recording of a pose ({error}): {_RESTORE}, or move it away and --resume the run"
+        ) from error
+
+
+def _record(data: Mapping[str, Any]) -> PoseRecord:
     before, after = (
         Reading(int(data[f"{when}_t_host_ns"]), data[f"{when}_q_rad"], data[f"{when}_R_base_flange"])
         for when in ("before", "after")

@@ -397,6 +397,11 @@ class Screen:
         self._live.start(refresh=True)
         return answer
 
+    @property
+    def has_keys(self) -> bool:
+        """Whether the terminal's keys are ours."""
+        return self._keyboard is not None
+
     def pressed(self) -> Key | None:
         """Take the oldest key that was pressed and not yet taken."""
         return None if self._keyboard is None else self._keyboard.pressed()
@@ -455,13 +460,14 @@ def _history(event: Event, view: View) -> bool:
 def open_operator(*, as_json: bool = False) -> Iterator[Operator]:
     """Give the operator that fits: JSON where asked for, a live screen at a terminal, else plain lines.
 
-    The screen goes to stderr, like everything said to a person; a dumb terminal gets plain lines.
+    The screen goes to stderr, like everything said to a person; a dumb terminal gets plain lines, and so does who wants
+    it quiet.
     """
     if as_json:
         yield JsonOperator()
         return
-    if not talk.is_terminal or talk.is_dumb_terminal or not os.isatty(0):
-        yield PlainOperator()
+    if talk.quiet or not talk.is_terminal or talk.is_dumb_terminal or not os.isatty(0):
+        yield PlainOperator(quiet=talk.quiet)
         return
     keyboard = Keyboard(0) if Keyboard.usable(0) else None
     with Screen(talk, keyboard) as screen:

@@ -7,8 +7,8 @@ from typing import TextIO
 
 from rich.console import Console
 
-talk = Console(stderr=True, highlight=False, emoji=False, soft_wrap=not sys.stderr.isatty())
-"""A terminal gets whole words, a file whole lines."""
+talk = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
+"""A terminal gets whole words, a file whole lines. Brackets and colons stand as they are: paths have them too."""
 
 
 def in_whole_words(text: str, file: TextIO) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import rows, runs, stop_unless_accepted, write_json
+from ftdrive.commands.common import NewFile, rows, runs, stop_unless_accepted, write_json
 
 if TYPE_CHECKING:
     from ftdrive.config import CellConfig
@@ -43,8 +43,8 @@ _EXCLUDE_ONE_ANOTHER = (
 @click.option("--manual", is_flag=True, help="No motion at all: you move the arm, ftdrive tells where to.")
 @click.option("--listen", is_flag=True, help="No motion at all: a program on the pendant moves the arm.")
 @click.option("--dry-run", is_flag=True, help="Plan, show and check everything; nothing moves.")
-@click.option("--output", type=click.Path(dir_okay=False, path_type=Path), help="Save the plan as a new JSON file.")
-@click.option("--png", type=click.Path(dir_okay=False, path_type=Path), help="Save stick figures (needs ftdrive[viz]).")
+@click.option("--output", type=NewFile(), help="Save the plan as a new JSON file.")
+@click.option("--png", type=NewFile(), help="Save stick figures (needs ftdrive[viz]).")
 @click.option("--view", is_flag=True, help="Show the plan in the browser first, until you answer (needs ftdrive[viz]).")
 @click.option("--plan", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="A plan made before.")
 @click.option(
@@ -90,8 +90,9 @@ def calibrate(
     Every move is proven clear and shown before it happens; a first motion needs a typed word and is slow. Where the arm
     has room only the three wrist joints move. Ctrl-C stops the arm; what was taken is kept and --resume goes on.
     """
-    from ftdrive.errors import ConfigError, Declined
+    from ftdrive.errors import Declined
     from ftdrive.report import print_result
+    from ftdrive.runs import Run
     from ftdrive.screen import open_operator
     from ftdrive.session.guided import Options
     from ftdrive.session.guided import calibrate as guide
@@ -115,13 +116,13 @@ def calibrate(
         "--tool": tool,
     }
     _refuse_contradictions([option for option, value in given.items() if value])
-    for path in (output, png):
-        if path is not None and path.exists():
-            raise ConfigError(f"{path} exists already and is never overwritten: choose another name")
     with ExitStack() as stack:
         description: dict[str, Any] = {}
+        made_by = {} if resume is None else Run(resume).header_to_resume().get("station") or {}
+        simulate = simulate or bool(made_by and not (config or robot or tool))  # a run goes on where it was begun
         if simulate:
-            station = stack.enter_context(Station(sensor_name(sensor)))
+            name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
+            station = stack.enter_context(Station(name, made_by.get("options", ())))
             cell = station.cell
             description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
         else:
@@ -226,12 +227,12 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
     nobody = {"default", "not set", "--tool"}
     origins = {one.origin for key, one in found.items() if key.startswith(("tool.", "workcell."))} - nobody
     if origins:
-        talk.print(f"Tool and surroundings as they are described now: {', '.join(sorted(origins))}.", markup=False)
+        talk.print(f"Tool and surroundings as they are described now: {', '.join(sorted(origins))}.")
         for key, value in (("robot.host", before.robot.host), ("sensor.url", before.sensor.url)):
             if found[key].value is None:
                 found[key] = Setting(value, str(folder))
         return cell_of(found)
-    talk.print("Settings as the run was begun: no file here describes tool and surroundings.", markup=False)
+    talk.print("Settings as the run was begun: no file here describes tool and surroundings.")
     cylinders_mm = found["tool.cylinders_mm"].value or before.tool.cylinders_mm
     return replace(
         before,

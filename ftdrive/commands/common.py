@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from os import fsdecode
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -32,6 +33,25 @@ CONFIG = click.option(
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help="The cell, in TOML, in place of ftdrive.toml here.",
 )
+
+
+class NewFile(click.Path):
+    """A file that a command makes: refused before any work where one is there already, or where its folder is not."""
+
+    def __init__(self) -> None:
+        super().__init__(dir_okay=False, path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path; raises `ConfigError`."""
+        from calib.files import require_new
+        from ftdrive.errors import ConfigError
+
+        path = Path(fsdecode(super().convert(value, param, ctx)))
+        try:
+            require_new(path)
+        except OSError as error:
+            raise ConfigError(str(error)) from error
+        return path
 
 
 def simulate(words: str = "An emulated cell; --sensor emulated://NAME chooses its sensor.") -> Callable[[F], F]:

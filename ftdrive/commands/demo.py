@@ -1,6 +1,7 @@
 """`ftdrive demo`: the whole job on an emulated cell, truth beside estimate."""
 
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import click
@@ -48,9 +49,9 @@ def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
         print_result(outcome.result, truth=truth, drift=outcome.drift, records=outcome.run.records())
         talk.print(
             "\n Try next:"
-            f"\n   ftdrive live --calibration {outcome.run.calibration_path} --simulate"
-            f"\n   ftdrive replay {outcome.run.folder}"
-            f"\n   ftdrive solve {outcome.run.folder} --method lrom"
+            f"\n   ftdrive live --calibration {quote(str(outcome.run.calibration_path))} --simulate"
+            f"\n   ftdrive replay {quote(str(outcome.run.folder))}"
+            f"\n   {outcome.run.solve_command} --method lrom"
             f"\n Saved {outcome.run.calibration_path}"
         )
     stop_unless_accepted(outcome.result)

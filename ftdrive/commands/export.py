@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
+from ftdrive.commands.common import JSON, NewFile, check_simulate, simulate, write_json
 
 if TYPE_CHECKING:
     from ftdrive.planning.plan import Plan
@@ -27,7 +27,7 @@ def export() -> None:
     type=click.Choice(["urscript", "csv"]),
     help="A program for the pendant, or a table of joint targets.",
 )
-@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="A new file; without it, stdout.")
+@click.option("-o", "--output", type=NewFile(), help="A new file; without it, stdout.")
 @click.option(
     "--dwell",
     "dwell_s",
@@ -48,6 +48,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     from ftdrive.errors import ConfigError
     from ftdrive.exports import targets_csv, urscript
     from ftdrive.planning.plan import Plan
+    from ftdrive.talk import talk
 
     check_simulate(simulate, real={"PLAN.json": path})
     if simulate:
@@ -59,7 +60,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     text = urscript.program(made, dwell_s=dwell_s) if target == "urscript" else targets_csv.table(made)
     if output is not None:
         write_new(output, text)
-        click.echo(f" Wrote {output}", err=True)
+        talk.print(f" Wrote {output}")
     if as_json:
         told = {"format": target, "plan": made.to_dict()["sha256"], "file": None if output is None else str(output)}
         write_json({"schema_version": 1, **told, "text": text})

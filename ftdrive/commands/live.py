@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rich.console import Group
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from calib import CalibrationResult
 from calib.noise import LEAST_SAMPLES, PoseMean, mean_and_covariance
@@ -207,10 +208,13 @@ def _screen(reading: dict[str, Any], made: str) -> Group:
         raw, contact, sigma = (column[i] for column in columns)
         unit, full, digits = ("N", 20.0, 3) if i < 3 else ("N·m", 2.0, 5)
         filled = min(20, round(20 * abs(contact) / full))
-        bar = ("[red]" if contact < 0 else "[green]") + "█" * filled + "[/]" + "·" * (20 - filled)
+        bar = Text.assemble(("█" * filled, "red" if contact < 0 else "green"), "·" * (20 - filled))
         table.add_row(name, f"{raw:.{digits}f}", f"{contact:.{digits}f} {unit}", f"{sigma:.{digits}f}", bar)
     return Group(
-        f"[bold]{reading['axes']} axes, about the {reading['about']}[/]   raw → bias and weight of the tool taken away",
+        Text.assemble(
+            (f"{reading['axes']} axes, about the {reading['about']}", "bold"),
+            "   raw → bias and weight of the tool taken away",
+        ),
         f"{made}, {reading['verdict']}   mean of {_PERIOD_S} s   {reading['rate_Hz']:.0f} Hz, lost {reading['lost']}",
         table,
         "Ctrl-C ends",

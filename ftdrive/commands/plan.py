@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import CONFIG, JSON, check_simulate, numbers, rows, simulate, write_json
+from ftdrive.commands.common import CONFIG, JSON, NewFile, check_simulate, numbers, rows, simulate, write_json
 
 if TYPE_CHECKING:
     from ftdrive.config import CellConfig
@@ -54,8 +54,8 @@ USUAL_MASS_KG = 1.0
 @click.option("--box", "boxes", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block, two corners in mm, base axes.")
 @click.option("--tip-speed-limit", metavar="MM/S|none", help="Of the tool's farthest points.  [default: 250]")
 @click.option("--mass", "mass_kg", type=float, help="Of the tool in kg, for the prediction.  [default: 1]")
-@click.option("--output", type=click.Path(dir_okay=False, path_type=Path), help="Save the plan as a new JSON file.")
-@click.option("--png", type=click.Path(dir_okay=False, path_type=Path), help="Save stick figures (needs ftdrive[viz]).")
+@click.option("--output", type=NewFile(), help="Save the plan as a new JSON file.")
+@click.option("--png", type=NewFile(), help="Save stick figures (needs ftdrive[viz]).")
 @click.option("--view", is_flag=True, help="Show it in the browser, in three dimensions (needs ftdrive[viz]).")
 @simulate("For arm and tool of an emulated cell, in place of those of the configuration.")
 @JSON
@@ -124,7 +124,7 @@ def plan(
         6 if minimal else 12 if quick else 24,
         cone_deg=cone_deg,
         box_mm=box_mm,
-        tip_unlimited=tip_speed_limit == "none",
+        tip_unlimited=_unlimited(tip_speed_limit),
     )
     if output is not None:
         made.save(output)
@@ -204,9 +204,13 @@ def _look(made: "Plan", certifier: "Certifier") -> None:
 def _tip_speed(text: str | None) -> float | None:
     from ftdrive.errors import ConfigError
 
-    if text is None or text == "none":
+    if text is None or _unlimited(text):
         return None
-    (speed_mm_s,) = numbers("--tip-speed-limit", text, " ", (1,))
-    if speed_mm_s <= 0:
-        raise ConfigError(f"--tip-speed-limit is {text}: give mm/s above zero, or none")
-    return speed_mm_s
+    try:
+        return float(text)
+    except ValueError:
+        raise ConfigError(f"--tip-speed-limit is '{text}': give mm/s, such as 250, or none") from None
+
+
+def _unlimited(tip_speed_limit: str | None) -> bool:
+    return tip_speed_limit is not None and tip_speed_limit.lower() == "none"

@@ -20,6 +20,7 @@ from ftdrive.cli import exit_code
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
     JSON,
+    NewFile,
     check_simulate,
     simulate,
     stop_unless_accepted,
@@ -70,7 +71,7 @@ _NAMES = "\b\nMETHOD is one of\n" + fill(
 @click.option("--mass-kg", type=float, help="Known mass of what hangs on the sensor.")
 @click.option("--level-deg", type=float, help="The base is level within this many degrees (one sigma).")
 @click.option("--mounting-deg", metavar="RX,RY,RZ", help="Known rotation vector of the sensor in the flange.")
-@click.option("--output", "-o", type=click.Path(dir_okay=False, path_type=Path), help="Save the calibration here.")
+@click.option("--output", "-o", type=NewFile(), help="Save the calibration here.")
 @click.option("--force", is_flag=True, help="Save even a rejected result; it stays marked as rejected.")
 @simulate("Solve a short run of an emulated cell.")
 @EMULATED_SENSOR
@@ -97,12 +98,8 @@ def solve(
     check_simulate(simulate, real={"DATASET": sources}, emulated={"--sensor": sensor})
     if not (sources or simulate):
         raise ConfigError("which data? Give a run folder, a dataset.json or a CSV file, or --simulate")
-    if output is not None and (output.exists() or len(sources) > 1 or method == "all"):
-        raise ConfigError(
-            f"{output} exists and is never overwritten: choose another name"
-            if output.exists()
-            else "--output takes one result: give one dataset and one method"
-        )
+    if output is not None and (len(sources) > 1 or method == "all"):
+        raise ConfigError("--output takes one result: give one dataset and one method")
     options = {"drift": drift, "known": _known(mass_kg, level_deg, mounting_deg)}
     with rehearsed_run(sensor) if simulate else nullcontext() as run:
         _solve_each(sources if run is None else [run], method, orientation, options, output, force, as_json)

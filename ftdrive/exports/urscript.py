@@ -50,6 +50,7 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield "# proven clear, all along its moves, of itself and of these surroundings, mm, base axes:"
     yield from (f"#   {plain(line)}" for line in _scene(plan.description["scene"]))
     yield f"# {plain(room_in_words(plan))}"
+    yield f"# Speed: {_speeds(plan)}."
     yield from (f"# {plain(sentence)}" for sentence in plan.why)
     yield "#"
     yield "# In PolyScope: a Script node of type File with this file, then one of type Line with ftdrive_tour()"
@@ -62,7 +63,8 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield (
         f'popup("Only for a {model} with the tool of {name}. Keep a ball of {plan.ball_m:.2f} m around '
         f"{point_in_words(plan)} (the wrist){'' if plan.arm_rests else ' and the room of the whole arm'} free, "
-        f'cables slack, hand on the emergency stop. First time: speed slider at 30 percent. Continue moves the arm.", '
+        f"cables slack, hand on the emergency stop. Speed: {_speeds(plan)}. "
+        'First time: speed slider at 30 percent. Continue moves the arm.", '
         f'title="ftdrive", warning=True, blocking=True)'
     )
     yield f"local first = {first}"
@@ -104,6 +106,13 @@ def _warnings(model: str) -> Iterator[str]:
     )
     yield "The first time: speed slider at 30 percent, hand on the emergency stop."
     yield "Nothing guards the motion but the arm's own safety system: while it runs, ftdrive can only listen."
+
+
+def _speeds(plan: Plan) -> str:
+    fastest_deg_s = degrees(max(step.speed_rad_s for step in plan.steps))
+    tip_m_s = plan.description["speeds"]["tip_m_s"]
+    limit = "are NOT LIMITED" if tip_m_s is None else f"up to {1e3 * tip_m_s:.0f} mm/s"
+    return f"joints up to {fastest_deg_s:.0f} deg/s, the tips of the tool {limit}"
 
 
 def _joints(q_rad: tuple[float, ...]) -> str:

@@ -119,6 +119,7 @@ class Plan:
             check_format(document, PLAN_FORMAT, PlanRefused)
         except PlanRefused as error:
             raise PlanRefused(f"{path}: {error}") from error
+        document.pop("schema_version", None)  # that of `ftdrive plan --json`, which is a plan too
         found = document.pop("sha256", None)
         if found != digest(document):
             raise PlanRefused(f"{path} was changed after it was made: make a new plan with `ftdrive plan`")

@@ -21,7 +21,10 @@ def has_completed(arm_serial: str, plan_sha256: str) -> bool:
     if not path.is_file():
         return False
     wanted = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256}
-    return any(wanted.items() <= _read(line).items() for line in path.read_text(encoding="utf-8").splitlines())
+    return any(
+        wanted.items() <= _read(line).items()
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines()
+    )
 
 
 def remember_completed(arm_serial: str, plan_sha256: str) -> None:

@@ -33,7 +33,7 @@ class Desk:
             for event in self._early:
                 run.append_event(event.to_dict())
             self._early.clear()
-        self.tell(RunOpened(folder=str(run.folder), resume=f"ftdrive calibrate --resume {run.folder}"), sync=True)
+        self.tell(RunOpened(folder=str(run.folder), resume=run.resume_command), sync=True)
 
     def tell(self, event: Event, *, sync: bool = False) -> None:
         """Show and keep an event."""
@@ -58,6 +58,11 @@ class Desk:
         """Ask a question that only yes answers; raises `Declined`."""
         if self.ask(Question(text, assumed="yes" if assumed else None)) != "yes":
             raise Declined(f"not confirmed, nothing moves on: {text}")
+
+    @property
+    def has_keys(self) -> bool:
+        """Whether the person has keys to press."""
+        return self._operator.has_keys
 
     def pressed(self) -> Key | None:
         """Take a key."""

@@ -416,7 +416,8 @@ def _kept(desk: Desk, run: Run) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        words = f"{len(run.stops())} poses are kept in {run.folder}; go on with ftdrive calibrate --resume {run.folder}"
+        words = f"{len(run.stops())} poses are kept in {run.folder}; go on with {run.resume_command}"
+        words += f", or solve them with {run.solve_command}" if run.stops() else ""
         desk.tell(Noted(words=words), sync=True)
         raise
 

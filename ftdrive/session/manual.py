@@ -98,7 +98,7 @@ def collect_manually(
 
     Keys: keep ends it once the light is green; stop ends it at once; redo takes the newest pose again, where the arm
     stands or is moved to next; skip leaves out where it stands; pause, and pause again. A key is heard within the time
-    of an average.
+    of an average. Where the operator has no keys, it ends with the first good pose that finds the light green.
 
     Parameters
     ----------
@@ -164,11 +164,16 @@ class _Collection:
         """Whether the program comes to its first pose on its way; one that is started again does."""
         self._fault: str | None = None
         self._over = False
+        self._ends_by_itself = not (listen or operator.has_keys)
+        self._enough = False
+        """Whether the light is green and the newest pose casts no doubt."""
 
     def run(self) -> None:
         self._greet()
         for record in self._earlier:
             self._learn(record)
+        if self._ends_by_itself and self._enough:
+            self._note("The poses that are there are enough: it ends with the next one.")
         self._tell_state(State.MOVE)
         while not self._over:
             state = self._arm.state()
@@ -255,8 +260,12 @@ class _Collection:
             return
         stop = self._next_stop()
         number = self._taken[first].pose.number if returned else stop
-        if self._measure(stop, number, settle_s=state.t_device_s - self._still_since_s) and returned:
+        if not self._measure(stop, number, settle_s=state.t_device_s - self._still_since_s):
+            return
+        if returned:
             self._end("The program is back at its first pose")
+        elif self._ends_by_itself and self._enough:
+            self._end("These poses are enough")
 
     def _measure(self, stop: int, number: int, *, settle_s: float) -> bool:
         """Average, again while something is not quiet, and keep the pose; False when the arm moved on."""
@@ -281,7 +290,8 @@ class _Collection:
             if not unrest:
                 break
             last = attempt == self._sampling.attempts
-            advice = "It is kept and marked; press r to take it again." if last else "Let go of tool and cable."
+            again = "; press r to take it again" if self._operator.has_keys else ""
+            advice = f"It is kept and marked{again}." if last else "Let go of tool and cable."
             self._note(f"Pose {stop} is not quiet: {unrest}. {advice}", warning=True)
         self._obey_keys()  # pressed while this one was not yet shown: r means the one before
         if self._over or self._paused or self._dealt_with:
@@ -327,13 +337,16 @@ class _Collection:
         estimated = self._running.add(record)
         self._operator.tell(replace(estimated, hint="") if self._listen else estimated)
         sigmas, force_N = estimated.residual_sigma or 0.0, estimated.residual_force_N or 0.0
-        if estimated.poses >= LEAST_TO_COMPARE and sigmas > SURPRISE_SIGMA and force_N > SURPRISE_N:
+        touched = estimated.poses >= LEAST_TO_COMPARE and sigmas > SURPRISE_SIGMA and force_N > SURPRISE_N
+        if touched:
+            again = " and press r to take the pose again" if self._operator.has_keys else ""
             self._note(
                 f"Pose {record.stop} is {force_N:.1f} N from what the others tell: if something touched the tool, free "
-                "it and press r to take the pose again.",
+                f"it{again}.",
                 warning=True,
             )
-        if estimated.light == "green" != self._light and not self._listen:
+        self._enough = estimated.light == "green" and record.steady and not touched
+        if estimated.light == "green" != self._light and not (self._listen or self._ends_by_itself):
             self._note("These poses are enough: press k to finish, or go on for a better result.")
         self._light = estimated.light
 
@@ -376,6 +389,8 @@ class _Collection:
                 "Move the arm by hand or with the pendant to orientations of the tool as different as you can. At each "
                 f"of them let go of the tool and {self._hold_still()}."
             )
+        if self._ends_by_itself:
+            self._note("It ends by itself, and solves, once the coverage is green; Ctrl-C ends it before.")
 
     def _hold_still(self) -> str:
         seconds = STILL_S + self._sampling.average_s + 3 * LOOK_S

@@ -38,5 +38,9 @@ class Operator(Protocol):
     def ask(self, question: Question) -> str:
         """Return one of the question's answers, waiting as long as it takes; raises `Declined` when there is nobody."""
 
+    @property
+    def has_keys(self) -> bool:
+        """Whether `pressed` can ever tell one: nobody is told to press what is not heard."""
+
     def pressed(self) -> Key | None:
         """Take the oldest key that was pressed and not yet taken; returns at once."""

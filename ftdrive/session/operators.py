@@ -94,6 +94,11 @@ class JsonOperator:
                 return answer
             error = f"'{typed.strip()}' is none of the answers"
 
+    @property
+    def has_keys(self) -> bool:
+        """Tell that there are none."""
+        return False
+
     def pressed(self) -> Key | None:
         """Nothing: a script stops a session with SIGINT."""
         return None
@@ -106,10 +111,17 @@ class JsonOperator:
 
 
 class PlainOperator:
-    """One line for everything worth reading later, without colour and without keys."""
+    """One line for everything worth reading later, without colour and without keys.
 
-    def __init__(self, *, stdin: TextIO | None = None, stderr: TextIO | None = None) -> None:
+    Parameters
+    ----------
+    quiet : bool
+        Tell things only when a question follows, which they may be about.
+    """
+
+    def __init__(self, *, stdin: TextIO | None = None, stderr: TextIO | None = None, quiet: bool = False) -> None:
         self._stdin, self._stderr = stdin or sys.stdin, stderr or sys.stderr
+        self._quiet, self._untold = quiet, list[str]()
         self._lock = Lock()
         self._asked = ""
 
@@ -117,12 +129,18 @@ class PlainOperator:
         """Write the event in words, if it is worth a line."""
         if isinstance(event, Asked) and event.question == self._asked:
             return  # stands there already
-        if words := in_words(event):
+        if not (words := in_words(event)):
+            return
+        if self._quiet:
+            self._untold.append(words + "\n")
+        else:
             self._write(words + "\n")
 
     def ask(self, question: Question) -> str:
         """Answer from stdin; raises `Declined` at its end."""
         self._asked = question.text
+        untold, self._untold = self._untold, []
+        self._write("".join(untold))
         while True:
             self._write(prompt(question))
             try:
@@ -135,6 +153,11 @@ class PlainOperator:
             if (answer := match(question, typed)) is not None:
                 return answer
             self._write(f"'{typed.strip()}' is none of the answers.\n")
+
+    @property
+    def has_keys(self) -> bool:
+        """Tell that there are none."""
+        return False
 
     def pressed(self) -> Key | None:
         """Nothing: Ctrl-C stops a session."""

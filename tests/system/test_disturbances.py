@@ -36,6 +36,7 @@ class Nobody:
 
     happening: Happening
     told: list[Event] = field(default_factory=list)
+    has_keys: bool = False
 
     def tell(self, event: Event) -> None:
         self.told.append(event)

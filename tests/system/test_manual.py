@@ -85,6 +85,8 @@ class Spectator:
 class Person:
     """Lets the mover go on after each pose, and presses k when `enough` were taken."""
 
+    has_keys = True
+
     def __init__(self, taken: Callable[[], None], enough: int | None) -> None:
         self._taken, self._enough = taken, enough
         self.poses = 0

@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from ftdrive.cli import cli, exit_code
+from ftdrive.errors import ConfigError
 from ftdrive.planning.plan import Plan
 
 UR5E = ["plan", "--model", "ur5e", "--tool", "0:200:100"]
@@ -47,7 +48,25 @@ def test_table_is_talk_and_the_file_is_the_plan(tmp_path: Path) -> None:
     for word in ("wrist 3", "ball of 0.35 m", "proven clear", "Predicted"):
         assert word in outcome.stderr
     assert len(Plan.load(path).tour) == 24
-    assert isinstance(run(*UR5E, "--output", str(path)).exception, FileExistsError)
+
+
+@pytest.mark.parametrize("option", ["--output", "--png"])
+@pytest.mark.parametrize(("name", "words"), [("there", "never overwritten"), ("no/there", "create it first")])
+def test_a_file_that_cannot_be_made_is_refused_before_any_work(
+    option: str, name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "there").touch()
+    monkeypatch.setattr("ftdrive.commands.plan.make_plan", lambda *_, **__: pytest.fail("it was planned"))
+    error = run(*UR5E, option, str(tmp_path / name)).exception
+    assert isinstance(error, ConfigError)
+    assert str(tmp_path / name).removesuffix("/there") in str(error)
+    assert words in str(error)
+
+
+@pytest.mark.parametrize("text", ["none", "NONE"])
+def test_no_limit_of_the_tips_however_it_is_written(text: str) -> None:
+    document = json.loads(run(*UR5E, "--minimal", "--tip-speed-limit", text, "--json").stdout)
+    assert document["description"]["speeds"]["tip_m_s"] is None
 
 
 @pytest.mark.parametrize(
@@ -97,7 +116,8 @@ def test_the_table_fits_into_80_columns(arguments: list[str]) -> None:
         (["--quick", "--minimal"], "not both"),
         (["--mounting", "sideways"], "mounting"),
         (["--plane", "0:0:0:1"], "no direction"),
-        (["--tip-speed-limit", "-1"], "above zero"),
+        (["--tip-speed-limit", "-1"], "1 to 250"),
+        (["--tip-speed-limit", "fast"], "'fast': give mm/s, such as 250, or none"),
         (["--posture", "45,-100"], "3 numbers"),
         (["--mass", "0"], "0.001 to 100"),
     ],

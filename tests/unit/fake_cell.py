@@ -211,6 +211,7 @@ class Scripted:
     answers: dict[str, list[str]] = field(default_factory=dict)
     on_event: Callable[[Event], None] = lambda _: None
     keys: list[Key] = field(default_factory=list)
+    has_keys: bool = True
     told: list[Event] = field(default_factory=list)
     asked: list[Question] = field(default_factory=list)
 

@@ -1,8 +1,10 @@
 """`ftdrive calibrate` before it opens anything: which options go together, and which settings count."""
 
 import json
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import pytest
@@ -10,7 +12,7 @@ from click.testing import CliRunner
 
 from calib.errors import CalibError
 from ftdrive.cli import cli, exit_code
-from ftdrive.config import CellConfig
+from ftdrive.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.errors import ConfigError
 from ftdrive.runs import Run
 from ftdrive.session import guided
@@ -114,7 +116,9 @@ def begin(cells: list[Any], tmp_path: Path) -> Begin:
         assert isinstance(call(*arguments), Opened)
         cell, options = cells.pop()
         description = guided._description(cell, {}, options)
-        return str(Run.create(tmp_path / "runs", "calibrate", json.loads(json.dumps(description))).folder)
+        run = Run.create(tmp_path / "runs", "calibrate", json.loads(json.dumps(description)))
+        run.plan_path.touch()
+        return str(run.folder)
 
     return begun
 
@@ -158,6 +162,42 @@ def test_a_resumed_run_keeps_the_tool_it_was_given(begin: Begin, cells: list[Any
     Path("ftdrive.toml").unlink()
     assert isinstance(call("--resume", run, "--tool", "0:70:90"), Opened)
     assert cells.pop()[0].tool.cylinders_mm == ((0, 70, 90),)
+
+
+@pytest.fixture
+def stations(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Sequence[str]]]:
+    """Which emulated cells are started, by sensor and options; none is."""
+    found = list[tuple[str, Sequence[str]]]()
+
+    class Emulated:
+        cell = CellConfig(RobotConfig("127.0.0.1"), SensorConfig("emulated://"))
+        truth: Mapping[str, Any] = MappingProxyType({})
+
+        def __init__(self, sensor: str, options: Sequence[str] = ()) -> None:
+            self.sensor, self.options = sensor, options
+            found.append((sensor, tuple(options)))
+
+        def __enter__(self) -> "Emulated":
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+    monkeypatch.setattr("ftdrive.simulation.Station", Emulated)
+    return found
+
+
+def test_an_emulated_run_goes_on_in_the_same_cell(cells: list[Any], stations: list[Any], tmp_path: Path) -> None:
+    station = {"sensor": "serial", "options": ["--seed", "7"], "truth": {}}
+    config = {"robot": {"host": "127.0.0.1"}, "sensor": {"url": "ati-serial:///dev/pts/9"}, "sampling": {}}
+    run = Run.create(tmp_path, "demo", {"station": station, "config": config})
+    run.plan_path.touch()
+    for words in (shlex.split(run.resume_command)[2:], ["--simulate", "--resume", str(run.folder)]):
+        assert isinstance(call(*words), Opened)
+        assert stations.pop() == ("serial", ("--seed", "7"))
+        assert not cells.pop()[1].real
+    assert isinstance(call("--resume", str(run.folder), "--robot", "10.0.0.9"), Opened)
+    assert stations == []
+    assert cells.pop()[1].real
 
 
 def test_every_error_of_the_solver_has_an_exit_code() -> None:

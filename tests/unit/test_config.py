@@ -137,6 +137,27 @@ def test_a_variable_that_cannot_be_used_is_named(
     assert all(word in str(error.value) for word in words), error.value
 
 
+def test_degrees_of_the_mounting_are_a_number_too() -> None:
+    Path("ftdrive.toml").write_text(GOOD + "[workcell]\nmounting = 45\n")
+    assert load().workcell.mounting == "45"
+
+
+@pytest.mark.parametrize(
+    ("line", "cure"),
+    [
+        ("[site]\ng_m_s2 = '9.81'", "a number: give one such as"),
+        ("[sampling]\nattempts = 1.5", "a whole number: give one such as 1,"),
+        ("[workcell]\nmounting = true", "a text: put it in quotes"),
+        ("[workcell]\nmeasured = 1", "true or false: give one of them"),
+        ("[tool]\ncylinders_mm = [0, 60, 90]", r"such as \[\[0, 60, 90\]\]"),
+    ],
+)
+def test_a_wrong_type_says_what_to_give(line: str, cure: str) -> None:
+    Path("ftdrive.toml").write_text(f"{GOOD}{line}\n")
+    with pytest.raises(ConfigError, match=cure):
+        load()
+
+
 @pytest.mark.parametrize(
     ("said", "record_s"),
     [("", 12), ("average_s = 1\n", 0), ("noise_record_s = 30\n", 30), ("average_s = 1\nnoise_record_s = 30\n", 30)],

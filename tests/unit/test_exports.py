@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from ftdrive.cli import cli, exit_code
-from ftdrive.errors import PlanRefused
+from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.exports import targets_csv, urscript
 from ftdrive.planning.plan import Plan
 
@@ -182,6 +182,23 @@ def test_a_program_that_moves_the_whole_arm_says_so(plan: Plan) -> None:
     assert any(line.startswith("  # ") and "the whole arm moves" in line for line in lines)
 
 
+@pytest.mark.parametrize(("tip_m_s", "words"), [(0.25, "up to 250 mm/s"), (None, "are NOT LIMITED")])
+def test_header_and_question_tell_how_fast_it_is(plan: Plan, tip_m_s: float | None, words: str) -> None:
+    speeds = {**plan.description["speeds"], "tip_m_s": tip_m_s}
+    lines = urscript.program(replace(plan, description={**plan.description, "speeds": speeds}), dwell_s=1.0)
+    told = [line for line in lines.splitlines() if f"joints up to 60 deg/s, the tips of the tool {words}" in line]
+    assert [line.split("(")[0].split(":")[0].strip() for line in told] == ["# Speed", "popup"]
+
+
+def test_a_plan_told_as_json_is_a_plan(tmp_path: Path) -> None:
+    path = tmp_path / "plan.json"
+    told = CliRunner().invoke(cli, ["plan", "--model", "ur5e", "--tool", "0:200:100", "--minimal", "--json"])
+    path.write_text(told.stdout)
+    assert export(path, "--format", "csv").exit_code == 0
+    path.write_text(told.stdout.replace('"limited_by"', '"limited-by"'))
+    assert "changed" in str(export(path, "--format", "csv").exception)
+
+
 @pytest.mark.parametrize("told", [{}, {"measured": False}])
 def test_placeholders_do_not_reach_the_pendant(told: dict[str, bool], plan: Plan, tmp_path: Path) -> None:
     described = {key: value for key, value in plan.description.items() if key != "measured"}
@@ -264,7 +281,8 @@ def test_files_are_new_and_plans_unchanged(path: Path, tmp_path: Path) -> None:
     assert export(path, "--format", "urscript", "-o", str(out)).exit_code == 0
     written = out.read_text()
     again = export(path, "--format", "csv", "-o", str(out))
-    assert isinstance(again.exception, FileExistsError)
+    assert isinstance(again.exception, ConfigError)
+    assert "never overwritten" in str(again.exception)
     assert out.read_text() == written
     edited = tmp_path / "edited.json"
     edited.write_text(path.read_text().replace('"speed_rad_s": 1.0471975511965976', '"speed_rad_s": 3.0'))

@@ -110,6 +110,7 @@ def test_a_script_reads_events_and_answers_questions() -> None:
     assert lines[3]["values"] == {"mass_kg": 1.2}
     assert lines[4]["sigma"] == POSE.sigma.tolist()
     assert operator.pressed() is None
+    assert not operator.has_keys
 
 
 def test_every_event_is_one_line_of_json_and_arrives_at_once() -> None:

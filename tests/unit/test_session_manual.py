@@ -136,8 +136,9 @@ class Cell:
 class Person:
     """Hears everything, presses keys at given times, and q a while after the arm's last dwell."""
 
-    def __init__(self, cell: Cell, keys: dict[float, Key]) -> None:
+    def __init__(self, cell: Cell, keys: dict[float, Key], *, has_keys: bool = True) -> None:
         self.cell = cell
+        self.has_keys = has_keys
         self.keys = keys | {cell.end_s + 20: Key.STOP}
         self.told: list[Event] = []
 
@@ -148,6 +149,9 @@ class Person:
         raise AssertionError(question)
 
     def pressed(self) -> Key | None:
+        if not self.has_keys:
+            assert self.cell.now_s < self.cell.end_s + 20, "it should have ended"
+            return None
         due = min(self.keys)
         return self.keys.pop(due) if self.cell.now_s >= due else None
 
@@ -192,6 +196,7 @@ class Outcome:
         earlier: Sequence[PoseRecord] = (),
         says: Callable[[float], Status] | None = None,
         fit: Fit | None = None,
+        has_keys: bool = True,
         raises: Any = None,
         **cell: Any,
     ) -> None:
@@ -199,7 +204,7 @@ class Outcome:
         self.cell.says = says or self.cell.says
         for name, value in cell.items():
             setattr(self.cell, name, value)
-        self.person = Person(self.cell, keys or {})
+        self.person = Person(self.cell, keys or {}, has_keys=has_keys)
         self.fit = fit or Fit()
         self.kept: list[PoseRecord] = []
 
@@ -299,6 +304,36 @@ def test_stop_ends_it_at_any_time_and_says_what_is_missing() -> None:
     assert isinstance(last, Noted)
     assert last.warning
     assert last.words == "Stopped: 1 pose is kept; the light is amber, a calibration of them may be refused."
+
+
+TILTED = [Rotation.from_euler("xyz", angles, degrees=True) for angles in ((45, 0, 0), (0, 45, 0))]
+
+
+def test_without_keys_it_ends_by_itself_when_the_poses_are_enough() -> None:
+    outcome = Outcome(dwells(*AROUND, *TILTED), has_keys=False)
+    assert outcome.stops == [1, 2, 3, 4, 5, 6]
+    assert "ends by itself" in outcome.person.words()
+    assert "These poses are enough: 6 poses are kept." in outcome.person.words()
+    assert "press" not in outcome.person.words()
+
+
+def test_without_keys_it_does_not_end_with_a_pose_that_is_in_doubt() -> None:
+    def shaken(t: Array) -> Array:
+        return np.outer(np.sin(40 * t), [8, 0, 0, 0, 0, 0])
+
+    poses = dwells(*AROUND, *TILTED)
+    poses[5] = Dwell(AROUND[5], 12.0, wrench=shaken)
+    outcome = Outcome(poses, has_keys=False)
+    assert [record.steady for record in outcome.kept] == [True] * 5 + [False, True]
+    assert "It is kept and marked." in outcome.person.words()
+    assert "press" not in outcome.person.words()
+
+
+def test_a_run_that_is_continued_without_keys_takes_one_pose_more() -> None:
+    first = Outcome(dwells(*AROUND), has_keys=False)
+    outcome = Outcome(dwells(*TILTED), earlier=first.kept, has_keys=False)
+    assert outcome.stops == [7]
+    assert "it ends with the next one" in outcome.person.words()
 
 
 def test_redo_replaces_the_newest_pose_where_the_arm_stands_or_goes() -> None:

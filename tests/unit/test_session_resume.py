@@ -1,6 +1,8 @@
 """Keys, and how a run goes on, on the fake cell: pause, stop, skip, redo, --resume, by hand."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from drivers.errors import DeviceFault
 from drivers.interfaces import DeviceInfo
 from ftdrive.config import ToolConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
+from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.plan import Plan
 from ftdrive.session import machine
 from ftdrive.session.events import (
@@ -252,6 +255,40 @@ def test_a_run_by_hand_goes_on_by_hand(mode: str, lab: Lab) -> None:
         lab.calibrate(resume=run.folder, mode="step")
     with pytest.raises(ConfigError, match="leave out --redo"):
         lab.calibrate(resume=run.folder, redo=(1,))
+
+
+def by_hand(lab: Lab, at_pose: Callable[[int], None] = lambda _: None) -> None:
+    """Let somebody take the arm on after each pose; nobody has keys."""
+    poses, clock_s, state = constant_tour(lab.arm.q), count(step=0.6), lab.arm.state
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, PoseTaken):
+            at_pose(event.stop)
+            lab.arm.q = poses[event.stop]
+
+    lab.arm.state = lambda: replace(state(), t_device_s=next(clock_s))  # type: ignore[method-assign]
+    lab.operator.has_keys, lab.operator.on_event = False, on_event
+
+
+def test_by_hand_and_without_keys_the_session_ends_with_a_calibration(lab: Lab) -> None:
+    by_hand(lab)
+    outcome = lab.calibrate(mode="manual")
+    assert outcome is not None
+    assert 6 <= outcome.result.n_poses < 24
+    assert outcome.run.calibration_path.exists()
+
+
+def test_a_session_that_is_interrupted_says_how_to_solve_what_is_there(lab: Lab) -> None:
+    def at_pose(stop: int) -> None:
+        if stop == 3:
+            raise KeyboardInterrupt
+
+    by_hand(lab, at_pose)
+    with pytest.raises(KeyboardInterrupt):
+        lab.calibrate(mode="manual")
+    words = lab.operator.of(Noted)[-1].words
+    assert words.endswith(f"or solve them with {lab.run().solve_command}")
+    assert lab.run().stops() == [1, 2, 3]
 
 
 def test_a_run_along_a_plan_does_not_go_on_by_hand(lab: Lab) -> None:

@@ -1,0 +1,79 @@
+"""What is told to a person: texts stand as they are, -q leaves them out, errors of the system become sentences."""
+
+import io
+import logging
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from ftdrive.cli import cli, in_a_sentence
+from ftdrive.commands.live import _screen
+from ftdrive.errors import Declined
+from ftdrive.screen import open_operator
+from ftdrive.session import guided
+from ftdrive.session.events import Noted
+from ftdrive.session.operator import Question
+from ftdrive.session.operators import PlainOperator
+from ftdrive.talk import talk
+
+PLAN = ["plan", "--model", "ur5e", "--tool", "0:200:100", "--minimal"]
+HELD = ["calibrate", "--robot", "10.0.0.1", "--sensor", "ati-can://can0"]
+
+
+@pytest.fixture(autouse=True)
+def _put_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(talk, "quiet", False)
+    monkeypatch.setattr(logging, "basicConfig", lambda **_: None)
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, arguments)
+
+
+def test_brackets_and_colons_are_no_markup(monkeypatch: pytest.MonkeyPatch) -> None:
+    def guide(*_: object) -> None:
+        raise Declined("nobody answered 'Free? [yes/no]' in [bold]my [old] runs:cat:")
+
+    monkeypatch.setattr(guided, "calibrate", guide)
+    assert "nobody answered 'Free? [yes/no]' in [bold]my [old] runs:cat:" in run(*HELD).stderr
+
+
+def test_the_live_screen_shows_a_path_as_it_is() -> None:
+    numbers = {"force_N": [1.0, -2.0, 3.0], "torque_Nm": [0.1, 0.2, 0.3]}
+    reading = {"axes": "base", "about": "sensor origin", "verdict": "good", "rate_Hz": 100.0, "lost": 0}
+    reading |= {"raw": numbers, "compensated": numbers, "sigma": numbers}
+    with talk.capture() as shown:
+        talk.print(_screen(reading, "my [old] runs/calibration.json"))
+    assert "my [old] runs/calibration.json, good" in shown.get()
+    assert "[/]" not in shown.get()
+
+
+def test_quiet_leaves_only_errors() -> None:
+    assert "Predicted" in run(*PLAN).stderr
+    quiet = run("-q", *PLAN)
+    assert (quiet.exit_code, quiet.stderr, quiet.stdout) == (0, "", "")
+    assert '"steps"' in run("-q", *PLAN, "--json").stdout
+
+
+def test_quiet_asks_with_all_that_a_question_is_about(monkeypatch: pytest.MonkeyPatch) -> None:
+    stderr = io.StringIO()
+    operator = PlainOperator(stdin=io.StringIO("yes\n"), stderr=stderr, quiet=True)
+    operator.tell(Noted(words="the arm goes there"))
+    assert stderr.getvalue() == ""
+    assert operator.ask(Question("Go?")) == "yes"
+    operator.tell(Noted(words="it went"))
+    assert stderr.getvalue() == "the arm goes there\nGo? [yes/no] yes\n"
+    monkeypatch.setattr(talk, "quiet", True)
+    with open_operator() as chosen:
+        assert isinstance(chosen, PlainOperator)
+        chosen.tell(Noted(words="not told"))
+
+
+def test_errors_of_the_system_name_the_file_and_what_to_look_at(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="No such file") as error:
+        (tmp_path / "gone").read_text()
+    assert in_a_sentence(error.value) == (
+        f"{tmp_path}/gone: No such file or directory: check this path, and who may read and write there"
+    )
+    assert in_a_sentence(FileExistsError("it is there: choose another name")) == "it is there: choose another name"
