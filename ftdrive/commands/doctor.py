@@ -94,10 +94,10 @@ def doctor(
         alive = _examine_sensor(device, address, cell, mass_kg or cell.tool.mass_kg or 1.0, found, blame, stack)
         found += [checks.check_workcell(cell), *checks.check_disk(runs), *permissions]
         if calibration is not None:
-            serials = {"sensor": device.identify().serial} if alive else {}
+            connected = {"sensor": device.identify()} if alive else {}
             if arm is not None:
-                serials["arm"] = arm.identify().serial
-            found.append(diagnosis.check_calibration(calibration, serials))
+                connected["arm"] = arm.identify()
+            found.append(diagnosis.check_calibration(calibration, connected))
         if push:
             R_flange_sensor = None if calibration is None else calibration.R_flange_sensor
             if station is not None and calibration is None:

@@ -157,7 +157,7 @@ def _recorded_looks(run: Run) -> Iterator[Look]:
 
 
 def _refuse_other_devices(calibration: CalibrationResult, found: dict[str, DeviceInfo]) -> None:
-    belongs = belonging(calibration, {role: device.serial for role, device in found.items()})
+    belongs = belonging(calibration, found)
     if belongs.others:
         raise ConfigError(f"{belongs.others[0]}: calibrate this cell")
     for words in belongs.unknown:

@@ -27,7 +27,7 @@ class Slow:
     def __exit__(self, *_: object) -> None: ...
 
     def identify(self) -> SimpleNamespace:
-        return SimpleNamespace(serial="1")
+        return SimpleNamespace(serial="1", model="M")
 
     def state(self) -> SimpleNamespace:
         return SimpleNamespace(R_base_flange=np.eye(3))
