@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, Known, Parameters, solve
 from calib.compare import Compared, compare
+from calib.errors import NotObservable
 from calib.model import predict
 from calib.result import Method
 from calib.yu import SPECIAL_R_flange_base
@@ -56,6 +57,11 @@ def test_a_method_that_was_told_wrong_is_named_as_the_cause() -> None:
     assert result.verdict != "good"
     assert any("with nothing taken as known the forces fit to 0.00" in reason for reason in result.reasons)
     assert not any("taken as known" in reason for reason in solve(tilted(), "lrom").reasons)
+
+
+def test_a_method_that_lacks_the_mass_says_how_to_give_it() -> None:
+    with pytest.raises(NotObservable, match="takes the weight as known: .* \\(--mass-kg\\)"):
+        solve(tilted(), "carlson-cayley")
 
 
 @pytest.mark.parametrize(
