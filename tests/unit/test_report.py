@@ -60,7 +60,7 @@ def test_a_method_that_was_told_wrong_is_named_as_the_cause() -> None:
 
 
 def test_a_method_that_lacks_the_mass_says_how_to_give_it() -> None:
-    with pytest.raises(NotObservable, match="takes the weight as known: .* \\(--mass-kg\\)"):
+    with pytest.raises(NotObservable, match=r"takes the weight as known: .* \(--mass-kg\)"):
         solve(tilted(), "carlson-cayley")
 
 
