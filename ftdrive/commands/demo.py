@@ -47,12 +47,12 @@ def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
         )
     else:
         print_result(outcome.result, truth=truth, drift=outcome.drift, records=outcome.run.records())
-        ftdrive = "uv run ftdrive" if "UV_RUN_RECURSION_DEPTH" in os.environ else "ftdrive"  # as uv run tells
+        uv = "uv run " if "UV_RUN_RECURSION_DEPTH" in os.environ else ""  # which uv run sets
         talk.print(
             "\n Try next:"
-            f"\n   {ftdrive} live --calibration {outcome.run.calibration_path} --simulate"
-            f"\n   {ftdrive} replay {outcome.run.folder}"
-            f"\n   {ftdrive} solve {outcome.run.folder} --method lrom"
+            f"\n   {uv}ftdrive live --calibration {outcome.run.calibration_path} --simulate"
+            f"\n   {uv}ftdrive replay {outcome.run.folder}"
+            f"\n   {uv}ftdrive solve {outcome.run.folder} --method lrom"
             f"\n Saved {outcome.run.calibration_path}"
         )
     stop_unless_accepted(outcome.result)

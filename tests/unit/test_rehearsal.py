@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 from ftdrive import rehearsal
 from ftdrive.commands import demo
+from ftdrive.runs import Run
 from ftdrive.session.events import Event, Noted, RunOpened
 
 STATION: Any = SimpleNamespace(sensor="can", options=(), truth={"mass_kg": 0.5}, cell=None)
@@ -54,7 +55,8 @@ def test_the_demo_names_its_next_commands_as_they_can_be_typed(
     monkeypatch.delenv("UV_RUN_RECURSION_DEPTH", raising=False)
     if environment is not None:
         monkeypatch.setenv("UV_RUN_RECURSION_DEPTH", environment)
-    run = SimpleNamespace(folder=Path("runs/a"), calibration_path=Path("runs/a/calibration.json"), records=list)
+    run = Run(Path("runs/a"))
+    monkeypatch.setattr(Run, "records", lambda _: [])
     outcome = SimpleNamespace(run=run, result=SimpleNamespace(verdict="good"), drift=None)
     monkeypatch.setattr(demo, "Station", lambda *_: nullcontext(STATION))
     monkeypatch.setattr(demo, "rehearse", lambda *_: outcome)
