@@ -407,7 +407,7 @@ def test_the_screen_draws_asks_and_goes_on() -> None:
             asking.join(10)
             assert answers == ["MOVE"]
             eventually(lambda: not termios.tcgetattr(program)[3] & termios.ECHO)
-            eventually(lambda: "ftdrive calibrate" in shown.text.split("\x1b[J")[-1])
+            eventually(lambda: "ftdrive calibrate" in shown.text.partition("\x1b[J")[2])
             erased, drawn_again = shown.text.split("\x1b[J")
             used = len(drawn(view(*MIDDLE))) + 3  # the question twice, and a line about the wrong answer
             assert erased.endswith(f"\x1b[{used}F")
