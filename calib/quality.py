@@ -72,6 +72,7 @@ def judge(
     measured_sigma: Array | None = None,
     farthest_com_m: float = FARTHEST_COM_M,
     up_in_base: ArrayLike = _UP_IN_BASE,
+    unconstrained: Evidence | None = None,
 ) -> Quality:
     """Judge a fit.
 
@@ -90,6 +91,8 @@ def judge(
         How far from the sensor the centre of mass of the tool can be.
     up_in_base : array_like, shape (3,)
         Where up should be, in base: +z for a robot on a table.
+    unconstrained : Evidence, optional
+        The best fit to the same poses with nothing taken as known, where `fit` is another method's.
     """
     rejected: list[str] = []
     usable: list[str] = []
@@ -109,6 +112,8 @@ def judge(
     rejected += explanation + _weight_reasons(fit, weight_N) + _second_solution_reasons(fit)
     _com_reasons(parameters, farthest_com_m, rejected, usable)
     (rejected if largest > REJECTED_SHARE else usable).extend(inexact)
+    if unconstrained is not None and largest > NOISY_SHARE:
+        usable += _contradiction_reasons(fit, unconstrained)
     sensible = not explanation and largest < SENSELESS_SHARE
     if sensible:
         usable += reversed_signs(parameters, fit.covariance, up_in_base)
@@ -291,7 +296,8 @@ def _inside_m(parameters: Parameters, covariance: Array) -> float:
 
 def _weight_reasons(fit: Evidence, weight_N: float) -> list[str]:
     along = fit.parameters.gravity_force_base_N / (weight_N or 1.0)
-    sigma_N = float(np.sqrt(along @ fit.covariance[3:6, 3:6] @ along))
+    variance = float(along @ fit.covariance[3:6, 3:6] @ along)
+    sigma_N = np.sqrt(max(variance, 0.0))  # below 0 is rounding of a weight that is exactly known
     if weight_N > SIGNIFICANT_SIGMAS * sigma_N:
         return []
     return [
@@ -385,6 +391,17 @@ def _shares(
             (f"{what} is {100 * share:.1f} % of {of} ({error:.2g} {unit}), more than {100 * limit:g} %", share)
         )
     return sorted(shares, key=lambda pair: -pair[1]), left_out
+
+
+def _contradiction_reasons(fit: Evidence, unconstrained: Evidence) -> list[str]:
+    used = unconstrained.weights > 0.5
+    return [
+        f"with nothing taken as known the {kind}s fit to {best:.2g} {unit} instead of {ours:.2g} {unit} (method ml): "
+        "check the mass and the level base, if they were taken as known"
+        for kind, unit, columns in (("force", "N", slice(0, 3)), ("torque", "N·m", slice(3, 6)))
+        for ours, best in [(_rms(fit.residuals[used, columns]), _rms(unconstrained.residuals[used, columns]))]
+        if best < COLLAPSE * ours
+    ][:1]
 
 
 def _noise_reason(fit: Evidence, noise_factor: float) -> str:

@@ -101,7 +101,7 @@ def solve(
             best.second_basin_chi2,
         )
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
-    quality = judge(evidence, t_s=dataset.t_s, measured_sigma=measured_sigma)
+    quality = judge(evidence, t_s=dataset.t_s, measured_sigma=measured_sigma, unconstrained=best if estimator else None)
     chi2 = evidence.chi2 if wrench_cov is None else evidence.measured_chi2
     drifted = best.drift if estimator is None else None
     return CalibrationResult(

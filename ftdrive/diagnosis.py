@@ -355,36 +355,43 @@ class Belonging:
     others: tuple[str, ...]
     """It was made with another one."""
     unknown: tuple[str, ...]
-    """Cannot be told, because a serial number is not known."""
+    """Cannot be told: a serial number is not known, and the model is the same."""
 
 
-def belonging(result: CalibrationResult, serials: Mapping[str, str]) -> Belonging:
-    """Compare the devices a calibration was made with and those that are connected, by role."""
+def belonging(result: CalibrationResult, connected: Mapping[str, DeviceInfo]) -> Belonging:
+    """Compare the devices a calibration was made with and those that are connected, by role.
+
+    Serial numbers decide where both sides tell one; elsewhere another model is another device all the same.
+    """
     made_with = result.provenance.get("devices")
     others, unknown = [], []
-    for role, found in serials.items():
-        told = made_with.get(role, {}).get("serial", NOT_REPORTED) if isinstance(made_with, Mapping) else NOT_REPORTED
-        if NOT_REPORTED in {told, found}:
+    for role, device in connected.items():
+        made = made_with.get(role, {}) if isinstance(made_with, Mapping) else {}
+        told, found = made.get("serial", NOT_REPORTED), device.serial
+        if NOT_REPORTED not in {told, found}:
+            if told != found:
+                others.append(f"the calibration was made with the {role} {told}, but the {role} {found} is connected")
+        elif (model := made.get("model", device.model)).casefold() != device.model.casefold():
+            others.append(f"the calibration was made with the {role} {model}, but {device.model} is connected")
+        else:
             why = (
                 "it was made with told no serial number" if told == NOT_REPORTED else "connected tells no serial number"
             )
             unknown.append(f"whether the calibration is of this {role} cannot be checked: the {role} {why}")
-        elif told != found:
-            others.append(f"the calibration was made with the {role} {told}, but the {role} {found} is connected")
     return Belonging(tuple(others), tuple(unknown))
 
 
-def check_calibration(result: CalibrationResult, serials: Mapping[str, str]) -> Check:
+def check_calibration(result: CalibrationResult, connected: Mapping[str, DeviceInfo]) -> Check:
     """See whether a calibration belongs to the devices that are connected, as far as any are."""
     name = "calibration.devices"
-    belongs = belonging(result, serials)
+    belongs = belonging(result, connected)
     if belongs.others:
         return Check(name, "failed", "; ".join(belongs.others), "ftdrive calibrate")
     made = f"verdict {result.verdict}, made at {result.provenance.get('created_utc', 'an unknown time')}"
     if belongs.unknown:
         fix = "add serial=… (its label) to the sensor's address, and calibrate with it once"
         return Check(name, "warning", f"{made}; {'; '.join(belongs.unknown)}", fix)
-    return Check(name, "ok", f"{made}, with these devices" if serials else f"{made}; no device to compare with")
+    return Check(name, "ok", f"{made}, with these devices" if connected else f"{made}; no device to compare with")
 
 
 def check_push(

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult
 from calib.compare import Compared
+from calib.quality import SURE
 from calib.routine import DriftCheck, PoseRecord
 from ftdrive.hints import hints, names_of
 from ftdrive.talk import talk
@@ -19,6 +20,9 @@ from ftdrive.talk import talk
 Array = NDArray[np.float64]
 
 _STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
+_ROUNDED = 1e-9
+"""A standard deviation below this share of the largest one is one of rounding: its value was taken as known."""
+_NO_LIMIT = 10_000
 
 
 def print_result(
@@ -43,18 +47,17 @@ def print_result(
         The calibration file, told in the last line.
     """
     data = result.to_dict()
-    force_N, torque_Nm = result.predicted_error()
     talk.print(
         Text.assemble(
             "\n ",
             (result.verdict.upper(), _STYLE[result.verdict]),
-            f"  {result.n_poses} poses, method {result.method}; compensation error "
-            f"{force_N:.4f} N, {torque_Nm:.5f} N·m rms over all orientations (predicted)",
+            f"  {result.n_poses} poses, method {result.method}; compensation error {error_in_words(result)}",
         )
     )
     for reason in result.reasons:
         talk.print(f"   {reason}")
     errors = {} if truth is None else errors_in_sigma(result, truth)
+    fixed_below = _ROUNDED * float(np.sqrt(np.diag(result.covariance).max()))
     table = Table(box=None, padding=(0, 1))
     for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
         if truth is not None or title not in {"truth", "error / sigma"}:
@@ -62,9 +65,13 @@ def print_result(
     for label, scale, unit, key in _ROWS:
         estimates, sigmas = (_values(source[key], key) * scale for source in (data, data["sigma"]))
         truths = None if truth is None else _values(truth[key], key) * scale
-        digits = int(np.clip(1 - np.floor(np.log10(max(sigmas.min(), 1e-9))), 0, 7))  # two digits of the smallest sigma
+        fixed = sigmas <= fixed_below * scale
+        least = sigmas[~fixed].min(initial=np.inf)
+        # two digits of the smallest sigma
+        digits = 4 if fixed.all() else int(np.clip(1 - np.floor(np.log10(max(least, 1e-9))), 0, 7))
         for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
-            cells = [f"{label} {axis}".strip() + f", {unit}", f"{estimates[i]:.{digits}f}", f"{sigmas[i]:.{digits}f}"]
+            spread = "fixed" if fixed[i] else f"{sigmas[i]:.{digits}f}"
+            cells = [f"{label} {axis}".strip() + f", {unit}", f"{estimates[i]:.{digits}f}", spread]
             if truths is not None:
                 cells.insert(1, f"{truths[i]:.{digits}f}")
                 cells.append(f"{errors[key][i]:+.1f}")
@@ -91,6 +98,22 @@ def print_result(
             talk.print(f" ? {hint}", style="yellow")
     if saved is not None:
         talk.print(f" Saved {saved}")
+
+
+def error_in_words(result: CalibrationResult) -> str:
+    """Say how well a free tool will be compensated, N and N·m, and from what that is known.
+
+    What noise makes uncertain says it all only where the measured noise explains the residuals. Elsewhere it is the
+    larger of that and of the error in predicting each pose from all others.
+    """
+    predicted = result.predicted_error()
+    words = "{:.4f} N, {:.5f} N·m".format(*predicted)
+    if not result.quality or (result.p_value is not None and result.p_value >= SURE):
+        return f"{words} rms over all orientations (predicted)"
+    left_out = result.quality["loo_force_rms_N"], result.quality["loo_torque_rms_Nm"]
+    seen = "{:.4f} N, {:.5f} N·m".format(*np.maximum(predicted, left_out))
+    why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
+    return f"{seen} rms (cross-validated, as {why}; predicted: {words})"
 
 
 def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:
@@ -150,32 +173,39 @@ def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict
 
 
 def print_comparison(compared: Sequence[Compared]) -> None:
-    """Show all methods side by side."""
-    table = Table(box=None, padding=(0, 1))
-    for title in (
-        *("method", "mass kg", "centre of mass mm", "force bias N", "torque bias N·m", "mounting differs"),
-        *("force rms N", "torque rms N·m", "cross-validated N", "N·m"),
-    ):
-        table.add_column(title, justify="left" if title == "method" else "right")
-    for one in compared:
-        if one.parameters is None:
-            continue
-        com_mm, force_N, torque_Nm = (
-            ", ".join(f"{value:.{digits}f}" for value in vector)
-            for vector, digits in (
-                (1e3 * one.parameters.p_sensor_com_m, 1),
-                (one.parameters.force_bias_N, 3),
-                (one.parameters.torque_bias_Nm, 4),
-            )
-        )
-        angle = f"{np.degrees(one.rotation_difference_rad):.3f}°"
-        rms = (one.force_rms_N, one.torque_rms_Nm, one.cv_force_rms_N, one.cv_torque_rms_Nm)
-        cells = ("-" if np.isnan(value) else f"{value:.5f}" for value in rms)
-        table.add_row(one.method, f"{one.mass_kg:.5f}", com_mm, force_N, torque_Nm, angle, *cells)
-    talk.print(table)
+    """Show all methods side by side, no number cut: a narrow terminal gets no vectors, a pipe lines of any length."""
+    table = _comparison(compared, vectors=True)
+    if talk.is_terminal and table.width is not None and table.width > talk.width:
+        table = _comparison(compared, vectors=False)
+    talk.print(table, soft_wrap=True)
     for one in compared:
         if one.reason is not None:
             talk.print(f" {one.method}: {one.reason}")
+
+
+def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:
+    """Make the table, as wide as it needs to be."""
+    table = Table(box=None, padding=(0, 1))
+    for title, shown in (
+        *(("method", True), ("mass\nkg", True)),
+        *(("centre of mass\nmm", vectors), ("force bias\nN", vectors), ("torque bias\nN·m", vectors)),
+        *(("mounting\ndiffers", True), ("residual\nrms N", True), ("residual\nrms N·m", True)),
+        *(("left out\nrms N", True), ("left out\nrms N·m", True)),
+    ):
+        if shown:
+            table.add_column(title, justify="left" if title == "method" else "right", no_wrap=True)
+    for one in compared:
+        if one.parameters is None:
+            continue
+        p = one.parameters
+        three = ((1e3 * p.p_sensor_com_m, 1), (p.force_bias_N, 3), (p.torque_bias_Nm, 4)) if vectors else ()
+        triples = (", ".join(f"{value:.{digits}f}" for value in vector) for vector, digits in three)
+        angle = f"{np.degrees(one.rotation_difference_rad):.3f}°"
+        rms = (one.force_rms_N, one.torque_rms_Nm, one.cv_force_rms_N, one.cv_torque_rms_Nm)
+        cells = ("-" if np.isnan(value) else f"{value:.5f}" for value in rms)
+        table.add_row(one.method, f"{one.mass_kg:.5f}", *triples, angle, *cells)
+    table.width = talk.measure(table, options=talk.options.update(width=_NO_LIMIT)).maximum
+    return table
 
 
 def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:

@@ -239,7 +239,7 @@ def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Te
 
 
 def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
-    """Unfold the cube of the flange axes: how many poses had gravity along each; `*` is the newest."""
+    """Unfold the cube of the flange axes: how many poses had gravity along each."""
     face = None
     if newest is not None:
         axis = int(np.abs(newest).argmax())
@@ -249,8 +249,8 @@ def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
         for k, (name, count) in enumerate(zip(_FACES, counts, strict=True))
     }
     return [
-        "      ┌─────┐",
-        f"      │{cells['+y']}│",
+        "      ┌─────┐  * newest",
+        f"      │{cells['+y']}│  - none yet",
         "┌─────┼─────┼─────┬─────┐",
         f"│{cells['-x']}│{cells['+z']}│{cells['+x']}│{cells['-z']}│",
         "└─────┼─────┼─────┴─────┘",
@@ -295,8 +295,9 @@ def _drift(view: View) -> Text:
 
 
 def _keys(view: View) -> list[Text]:
+    end = "Ctrl-C ends, poses are kept" if view.folder else "Ctrl-C ends"
     if view.keys != "live":
-        return [Text("Enter sends the answer; Ctrl-C ends, poses are kept", "dim")] if view.keys == "asking" else []
+        return [Text(f"Enter sends the answer; {end}", "dim")] if view.keys == "asking" else []
     useful: set[Key] = set()  # before and after the poses nobody listens
     if view.now is not None and view.now.stop is not None:
         useful = set(KEYS) if view.now.stops is None else set(KEYS) - {Key.KEEP}  # by hand there is no last one
@@ -306,7 +307,7 @@ def _keys(view: View) -> list[Text]:
             continue
         line.append(f" {key.value} ", "reverse")
         line.append(f" {word.upper()} asked  " if key in view.waiting else f" {word}  ")
-    line.append("Ctrl-C ends, poses are kept")
+    line.append(end)
     return [line]
 
 

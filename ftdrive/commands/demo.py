@@ -1,5 +1,6 @@
 """`ftdrive demo`: the whole job on an emulated cell, truth beside estimate."""
 
+import os
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -47,11 +48,12 @@ def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
         )
     else:
         print_result(outcome.result, truth=truth, drift=outcome.drift, records=outcome.run.records())
+        uv = "uv run " if "UV_RUN_RECURSION_DEPTH" in os.environ else ""  # which uv run sets
         talk.print(
             "\n Try next:"
-            f"\n   ftdrive live --calibration {quote(str(outcome.run.calibration_path))} --simulate"
-            f"\n   ftdrive replay {quote(str(outcome.run.folder))}"
-            f"\n   {outcome.run.solve_command} --method lrom"
+            f"\n   {uv}ftdrive live --calibration {quote(str(outcome.run.calibration_path))} --simulate"
+            f"\n   {uv}ftdrive replay {quote(str(outcome.run.folder))}"
+            f"\n   {uv}{outcome.run.solve_command} --method lrom"
             f"\n Saved {outcome.run.calibration_path}"
         )
     stop_unless_accepted(outcome.result)

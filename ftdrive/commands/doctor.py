@@ -95,10 +95,10 @@ def doctor(
         told = cell.robot.model if arm is None else arm.identify().model
         found += [checks.check_workcell(cell, told), *checks.check_disk(runs), *permissions]
         if calibration is not None:
-            serials = {"sensor": device.identify().serial} if alive else {}
+            connected = {"sensor": device.identify()} if alive else {}
             if arm is not None:
-                serials["arm"] = arm.identify().serial
-            found.append(diagnosis.check_calibration(calibration, serials))
+                connected["arm"] = arm.identify()
+            found.append(diagnosis.check_calibration(calibration, connected))
         if push:
             R_flange_sensor = None if calibration is None else calibration.R_flange_sensor
             if station is not None and calibration is None:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,6 +23,7 @@ from ftdrive.commands.common import JSON, check_simulate, read_cell, simulate, s
 from ftdrive.config import CellConfig
 from ftdrive.diagnosis import belonging
 from ftdrive.errors import ConfigError
+from ftdrive.keyboard import Keyboard
 from ftdrive.rehearsal import rehearse
 from ftdrive.runs import Run
 from ftdrive.simulation import Station, sensor_name
@@ -102,11 +103,14 @@ def live(
                 if once:
                     break
         else:
+            made = "made for this" if path is None else str(path)
+            stack.enter_context(Keyboard(0) if Keyboard.usable(0) else nullcontext())  # Enter would break the screen
             with Live(console=talk, refresh_per_second=10) as screen:
+                shown = Group()
                 for look in looks:
-                    screen.update(
-                        _screen(_reading(look, calibration, axes), "made for this" if path is None else str(path))
-                    )
+                    shown = _screen(_reading(look, calibration, axes), made)
+                    screen.update(Group(shown, "Ctrl-C ends"))
+                screen.update(Group(shown, "The recording has ended."))
 
 
 def _emulated(
@@ -119,7 +123,7 @@ def _emulated(
         return calibration, stack.enter_context(Station(name, made_by.get("options", ()))).cell
     station = stack.enter_context(Station(sensor_name(sensor)))
     with TemporaryDirectory(prefix="ftdrive-") as runs:
-        result = rehearse(station, Path(runs), "simulated", poses=6).result
+        result = rehearse(station, Path(runs), "simulated", poses=6, kept=False).result
     stop_unless_accepted(result)
     return result, station.cell
 
@@ -158,7 +162,7 @@ def _recorded_looks(run: Run) -> Iterator[Look]:
 
 
 def _refuse_other_devices(calibration: CalibrationResult, found: dict[str, DeviceInfo]) -> None:
-    belongs = belonging(calibration, {role: device.serial for role, device in found.items()})
+    belongs = belonging(calibration, found)
     if belongs.others:
         raise ConfigError(f"{belongs.others[0]}: calibrate this cell")
     for words in belongs.unknown:
@@ -201,8 +205,8 @@ def _line(reading: dict[str, Any]) -> str:
 
 def _screen(reading: dict[str, Any], made: str) -> Group:
     table = Table(box=None)
-    for title in ("", "raw", "contact", "± 1 sigma", ""):
-        table.add_column(title, justify="right")
+    for title, width in (("", 2), ("raw", 9), ("contact", 13), ("± 1 sigma", 9), ("", 20)):
+        table.add_column(title, justify="right", min_width=width, no_wrap=True)  # else they move with every sign
     columns = [np.r_[reading[key]["force_N"], reading[key]["torque_Nm"]] for key in ("raw", "compensated", "sigma")]
     for i, name in enumerate(_NAMES):
         raw, contact, sigma = (column[i] for column in columns)
@@ -217,5 +221,4 @@ def _screen(reading: dict[str, Any], made: str) -> Group:
         ),
         f"{made}, {reading['verdict']}   mean of {_PERIOD_S} s   {reading['rate_Hz']:.0f} Hz, lost {reading['lost']}",
         table,
-        "Ctrl-C ends",
     )

@@ -224,28 +224,44 @@ def test_push_without_mounting_or_without_a_push() -> None:
     assert check.state == "failed"
 
 
+def told(serial: str, model: str = "M") -> DeviceInfo:
+    return DeviceInfo(model, serial, NOT_REPORTED)
+
+
 def test_calibration_of_another_sensor() -> None:
-    provenance = {"devices": {"arm": {"serial": "A"}, "sensor": {"serial": "S"}}, "created_utc": "2026-01-01"}
+    made_with = {"arm": {"serial": "A", "model": "UR5e"}, "sensor": {"serial": "S", "model": "M"}}
+    provenance = {"devices": made_with, "created_utc": "2026-01-01"}
     result = cast(CalibrationResult, SimpleNamespace(provenance=provenance, verdict="good"))
-    assert diagnosis.check_calibration(result, {"arm": "A", "sensor": "S"}).state == "ok"
-    other = diagnosis.check_calibration(result, {"arm": "A", "sensor": "T"})
+    assert diagnosis.check_calibration(result, {"arm": told("A", "UR5e"), "sensor": told("S")}).state == "ok"
+    other = diagnosis.check_calibration(result, {"arm": told("A"), "sensor": told("T")})
     assert other.state == "failed"
     assert other.found == "the calibration was made with the sensor S, but the sensor T is connected"
-    unknown = diagnosis.check_calibration(result, {"arm": "A", "sensor": NOT_REPORTED})
+    unknown = diagnosis.check_calibration(result, {"arm": told("A"), "sensor": told(NOT_REPORTED)})
     assert unknown.state == "warning"
     assert "cannot be checked" in unknown.found
     assert "serial=" in str(unknown.fix)
-    both = diagnosis.check_calibration(result, {"arm": "B", "sensor": NOT_REPORTED})
+    both = diagnosis.check_calibration(result, {"arm": told("B"), "sensor": told(NOT_REPORTED)})
     assert (both.state, both.fix) == ("failed", "ftdrive calibrate")
+
+
+@pytest.mark.parametrize(("made", "connected"), [("S", NOT_REPORTED), (NOT_REPORTED, "S"), (NOT_REPORTED,) * 2])
+def test_a_calibration_of_another_model_is_of_another_sensor_without_serial_numbers(made: str, connected: str) -> None:
+    devices = {"sensor": {"serial": made, "model": "ATI F/T (NETCANOEM, CAN)"}}
+    result = cast(CalibrationResult, SimpleNamespace(provenance={"devices": devices}, verdict="good"))
+    check = diagnosis.check_calibration(result, {"sensor": told(connected, "Bota force/torque sensor")})
+    assert (check.state, check.fix) == ("failed", "ftdrive calibrate")
+    assert "with the sensor ATI F/T (NETCANOEM, CAN), but Bota force/torque sensor is connected" in check.found
+    same = diagnosis.check_calibration(result, {"sensor": told(connected, "ATI F/T (NETCANOEM, CAN)")})
+    assert same.state == "warning"
 
 
 @pytest.mark.parametrize("devices", [{"sensor": {"serial": NOT_REPORTED}}, {"sensor": {}}, {}, None])
 def test_a_calibration_that_does_not_know_its_sensor_cannot_be_checked(devices: object) -> None:
     result = cast(CalibrationResult, SimpleNamespace(provenance={"devices": devices}, verdict="good"))
     for serial in ("FT12345", NOT_REPORTED):
-        (words,) = diagnosis.belonging(result, {"sensor": serial}).unknown
+        (words,) = diagnosis.belonging(result, {"sensor": told(serial)}).unknown
         assert "was made with" in words
-        assert not diagnosis.belonging(result, {"sensor": serial}).others
+        assert not diagnosis.belonging(result, {"sensor": told(serial)}).others
 
 
 ALLOWED = Check("permissions.port", "ok", "may be read and written")

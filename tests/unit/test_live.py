@@ -1,11 +1,17 @@
-"""The live readout with sensors that are slow: noise is only told from enough samples."""
+"""The live readout: enough samples from slow sensors, and a screen that stands still and says when it ends."""
 
+import io
+import re
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from rich.console import Console
 
+from calib import CalibrationResult
 from calib.noise import LEAST_SAMPLES
 from drivers.interfaces import Health
 from ftdrive.commands import live
@@ -27,7 +33,7 @@ class Slow:
     def __exit__(self, *_: object) -> None: ...
 
     def identify(self) -> SimpleNamespace:
-        return SimpleNamespace(serial="1")
+        return SimpleNamespace(serial="1", model="M")
 
     def state(self) -> SimpleNamespace:
         return SimpleNamespace(R_base_flange=np.eye(3))
@@ -64,3 +70,70 @@ def test_a_slow_recording_is_shown_in_pieces_long_enough(monkeypatch: pytest.Mon
     looks = list(live._recorded_looks(run))
     assert [look.mean.mean[0] for look in looks] == [9.5, 29.5, 49.5, 69.5]
     assert looks[0].rate_Hz == pytest.approx(100)
+
+
+@pytest.fixture
+def recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
+    """A recording of three looks with changing signs, and a calibration of nothing; the command's arguments."""
+    calibration: Any = SimpleNamespace(
+        provenance={},
+        verdict="good",
+        compensate=lambda raw, _: raw - 9.5,
+        wrench_covariance=lambda _: np.zeros((6, 6)),
+        R_flange_sensor=np.eye(3),
+    )
+    n = 60
+    wrench = np.add.outer(np.repeat([9.4, -3.0, 12.0], 20), np.linspace(0.0, 1e-3, 6)) + np.arange(n)[:, None] % 2
+    samples = SimpleNamespace(t_host_ns=np.arange(n) * 10_000_000, wrench=wrench, seq=np.arange(n))
+    record = SimpleNamespace(samples=samples, before=SimpleNamespace(R_base_flange=np.eye(3)))
+    monkeypatch.setattr(CalibrationResult, "load", lambda _: calibration)
+    monkeypatch.setattr(live, "Run", lambda _: SimpleNamespace(records=lambda: [record]))
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    file = tmp_path / "calibration.json"
+    file.touch()
+    return ["--calibration", str(file), "--replay", str(tmp_path)]
+
+
+def test_the_end_of_a_recording_is_said(recorded: list[str]) -> None:
+    shown = CliRunner().invoke(live.live, recorded, catch_exceptions=False).stderr
+    assert shown.rstrip().endswith("The recording has ended.")
+    assert "Ctrl-C" not in shown
+
+
+def test_what_is_typed_does_not_break_the_screen(recorded: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    quiet: list[str] = []
+
+    class Keyboard:
+        def __init__(self, fd: int) -> None:
+            assert fd == 0
+
+        usable = staticmethod(lambda _: True)
+
+        def __enter__(self) -> None:
+            quiet.append("echo off")
+
+        def __exit__(self, *_: object) -> None:
+            quiet.append("as before")
+
+    def screen(*_: object) -> str:
+        quiet.append("shown")
+        return "a screen"
+
+    monkeypatch.setattr(live, "_screen", screen)
+    monkeypatch.setattr(live, "Keyboard", Keyboard)
+    CliRunner().invoke(live.live, recorded, catch_exceptions=False)
+    assert quiet == ["echo off", "shown", "shown", "shown", "as before"]
+
+
+def test_columns_stand_still_when_a_sign_changes() -> None:
+    def ends(contact: float) -> list[int]:
+        three = {"force_N": [contact] * 3, "torque_Nm": [contact / 10] * 3}
+        reading = {"axes": "base", "about": "sensor origin", "verdict": "good", "rate_Hz": 1e3, "lost": 0}
+        reading |= {"raw": three, "compensated": three, "sigma": {"force_N": [0.1] * 3, "torque_Nm": [0.1] * 3}}
+        console = Console(width=80, file=io.StringIO(), color_system=None)
+        console.print(live._screen(reading, "made for this"))
+        assert isinstance(console.file, io.StringIO)
+        (line,) = [line for line in console.file.getvalue().splitlines() if line.startswith(" Fx")]
+        return [match.end() for match in re.finditer(r"\S+", line)]
+
+    assert ends(1.5) == ends(-1.5) == ends(-150.0)

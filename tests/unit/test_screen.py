@@ -124,8 +124,8 @@ def test_everything_needed_is_on_a_screen_of_80_by_24() -> None:
         "     residual 0.062 N, 1.4 sigma against the fit before it",
         "─" * 80,
         "estimate                                   ± 1 sigma  gravity by flange axis",
-        "mass kg         1.1870                    ± 0.0011          ┌─────┐",
-        "centre mm        12.30    -4.10    61.80  ± 0.2             │+y 2 │",
+        "mass kg         1.1870                    ± 0.0011          ┌─────┐  * newest",
+        "centre mm        12.30    -4.10    61.80  ± 0.2             │+y 2 │  - none yet",
         "F bias N        -3.210    7.900 -112.040  ± 0.021     ┌─────┼─────┼─────┬─────┐",
         "T bias N·m      0.1200  -0.0800   0.0300  ± 0.001     │-x - │+z - │+x 1 │-z12 │",
         "mounting deg      0.00     0.00    90.00  ± 0.1       └─────┼─────┼─────┴─────┘",
@@ -170,6 +170,7 @@ def test_only_keys_that_do_something_are_offered() -> None:
     assert by_hand == " k  finish   r  redo   s  skip   p  pause   q  stop  Ctrl-C ends, poses are kept"
     before = keys(state=State.PREFLIGHT)
     assert before == "Ctrl-C ends, poses are kept"
+    assert drawn(view(StateChanged(state=State.SAMPLE, stop=3, stops=7), pose(2, 19)))[-1].endswith(" Ctrl-C ends")
 
 
 def test_before_a_run_there_is_no_table_of_nothing() -> None:
@@ -406,7 +407,7 @@ def test_the_screen_draws_asks_and_goes_on() -> None:
             asking.join(10)
             assert answers == ["MOVE"]
             eventually(lambda: not termios.tcgetattr(program)[3] & termios.ECHO)
-            eventually(lambda: "ftdrive calibrate" in shown.text.split("\x1b[J")[-1])
+            eventually(lambda: "ftdrive calibrate" in shown.text.partition("\x1b[J")[2])
             erased, drawn_again = shown.text.split("\x1b[J")
             used = len(drawn(view(*MIDDLE))) + 3  # the question twice, and a line about the wrong answer
             assert erased.endswith(f"\x1b[{used}F")
