@@ -74,13 +74,14 @@ class PoseRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftCheck:
-    """The first pose seen again at the end of the tour."""
+    """The first pose seen again at the end of the tour: from it to its return."""
 
     change: Array
     """(6,) N and N·m."""
     sigma: Array
     """(6,) standard deviation of the change expected from the noise alone."""
     elapsed_s: float
+    """Negative where the first pose was taken anew after the return."""
 
 
 def take_pose(

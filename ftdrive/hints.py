@@ -9,6 +9,7 @@ from calib import CalibrationResult
 from calib.changes import Change, lasting_change
 from calib.quality import out_of_line
 from calib.routine import PoseRecord, drift_check, is_return, turned_rad
+from ftdrive.mismatch import mismatches
 
 Array = NDArray[np.float64]
 
@@ -22,7 +23,9 @@ def names_of(records: Sequence[PoseRecord]) -> tuple[str, ...]:
 
 
 def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[str, ...]:
-    """Explain what stands out, most important first; nothing for a quiet run.
+    """Explain what stands out, most important first, then what the controller should be told otherwise.
+
+    Nothing is said of a quiet run of a level arm that knows its payload.
 
     Parameters
     ----------
@@ -40,7 +43,7 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[str
     change = _lasting_change(result, records)
     if change is not None:
         what, row = change
-        return (what.in_words(names[row]), *_moved(records, names, range(len(records))))
+        return (what.in_words(names[row]), *_moved(records, names, range(len(records))), *mismatches(result))
     words = [*_moved(records, names, range(len(records)))]
     odd = [row for row in out if _steady(records[row])]
     pulled = [row for row in odd if _pulled(result, row)]
@@ -64,7 +67,7 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[str
                 f"{names[0]} reads otherwise at the end, and the poses between do not drift: was it touched then? "
                 "Repeat the last stop"
             )
-    return tuple(words)
+    return (*words, *mismatches(result))
 
 
 def _in_dataset(records: Sequence[PoseRecord]) -> list[PoseRecord]:

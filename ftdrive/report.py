@@ -212,10 +212,14 @@ def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
     """Say how the first pose reads at the end; true where that is more than noise."""
     worst = float(np.max(np.abs(drift.change) / drift.sigma))
     force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
-    words = f"first pose again after {drift.elapsed_s:.0f} s, {force_N:.3f} N, {torque_Nm:.4f} N·m away: "
+    apart_s = abs(drift.elapsed_s)
+    again = f"first pose again after {apart_s:.0f} s"
+    if drift.elapsed_s < 0:  # --redo 1
+        again = f"first pose, taken anew {apart_s:.0f} s after the return to it"
+    words = f"{again}, {force_N:.3f} N, {torque_Nm:.4f} N·m away: "
     if worst < 4:
         return words + "none seen", False
-    minutes = max(drift.elapsed_s, 1.0) / 60
+    minutes = max(apart_s, 1.0) / 60
     in_force = np.max(np.abs(drift.change[:3]) / drift.sigma[:3]) >= 4
     rate = f"{force_N / minutes:.2g} N/min" if in_force else f"{torque_Nm / minutes:.2g} N·m/min"
     return words + rate, True

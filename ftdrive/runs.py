@@ -133,6 +133,17 @@ class Run:
                 file.flush()
                 os.fsync(file.fileno())
 
+    def events(self) -> Iterator[Mapping[str, Any]]:
+        """Read events.ndjson; a line that was broken off, as by a power cut, counts for nothing."""
+        path = self.folder / "events.ndjson"
+        for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+            try:
+                event = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(event, dict):
+                yield event
+
     def header(self) -> Mapping[str, Any]:
         """Read run.json; raises `BadDataset` when it is not one."""
         path = self.folder / "run.json"

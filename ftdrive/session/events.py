@@ -151,6 +151,15 @@ class Estimated(Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Weighed(Event):
+    """The running fit can be trusted: what hangs on the sensor, beside what the controller was told."""
+
+    mass_kg: float
+    """Of what the sensor carries, so without sensor and adapter."""
+    payload_kg: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GuardTripped(Event):
     """A guard has stopped the arm; told after it was stopped."""
 

@@ -20,6 +20,7 @@ from calib.routine import PoseRecord, Sampling, Stage, TourPose, take_pose
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrive.errors import Declined, NotAccepted, PlanRefused
+from ftdrive.mismatch import payload_in_words
 from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
@@ -34,10 +35,12 @@ from ftdrive.session.events import (
     PoseTaken,
     State,
     StateChanged,
+    Weighed,
     Witness,
 )
 from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, by_safety, out_of_sight
 from ftdrive.session.operator import Key, Question
+from ftdrive.session.outcome import cell_of
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.watch import Guards
 
@@ -60,6 +63,10 @@ _LOOK_AGAIN_S: Final = 0.4
 
 class RunningFit(Protocol):
     """What a session needs of `ftdrive.session.running.Running`."""
+
+    @property
+    def weighed_kg(self) -> float | None:
+        """Mass that the sensor carries; None while nobody can know."""
 
     def add(self, record: PoseRecord) -> Estimated:
         """Take a pose in."""
@@ -146,6 +153,7 @@ class Tour:
         self._again = False  # the last one is to be taken again
         self._skipped: set[int] = set()  # indices of postures where the arm should not go
         self._reopened: set[int] = set()
+        self._payload_kg: float | None = None  # as the controller told it when it was compared
         self._witness = Witness(sensor, desk.tell)
 
     # -------------------------------------------------------------------------------------------- the tour
@@ -186,7 +194,20 @@ class Tour:
         self._go(index, stop)
         self._hear()
         self._last = self._take(stop, index)
+        self._compare_payload()
         self._todo.popleft()
+
+    def _compare_payload(self) -> None:
+        """Row 7: say what hangs on the sensor, and where the controller was told otherwise; once for each payload."""
+        mass_kg = self._running.weighed_kg
+        told_kg = None if mass_kg is None else self._arm.status().payload_kg
+        if mass_kg is None or told_kg is None or told_kg == self._payload_kg:
+            return
+        self._payload_kg = told_kg
+        self._desk.tell(Weighed(mass_kg=mass_kg, payload_kg=told_kg))
+        sensor_kg = cell_of(self._run.header()).sensor.mass_kg
+        if words := payload_in_words(told_kg, mass_kg, sensor_kg):
+            self._note(words, warning=True)
 
     def _index(self, stop: int) -> int:
         return (stop - 1) % len(self._nodes)
@@ -276,18 +297,20 @@ class Tour:
         self._note(f"pose {self._last.stop} is taken again")
 
     def _skip(self) -> None:
-        """Drop the pose, and the return to it: the arm does not go there."""
+        """Drop the pose, and the return to it: the arm does not go there. What was to be taken again stays."""
         index = self._index(self._todo[0])
         self._skipped.add(index)
         dropped = [stop for stop in self._todo if self._index(stop) == index]
         self._todo = deque(stop for stop in self._todo if stop not in dropped)
-        if self._last is not None and self._last.stop in dropped:  # was to be taken again
-            self._desk.tell(self._running.add(self._last))
-            self._note(f"pose {self._last.stop} stays as it was taken", warning=True)
-            return
-        names = " and ".join(str(stop) for stop in dropped)
-        way = f"the arm goes on to pose {self._todo[0]}" if self._todo else "it was the last"
-        self._note(f"skipped: pose {names}, {way}; --resume takes what was skipped", warning=True)
+        names = {stop: "the return to pose 1" if stop == self._stops else f"pose {stop}" for stop in dropped}
+        stay = set(dropped).intersection(self._run.stops())
+        for record in self._run.records() if stay else ():
+            if record.stop in stay:
+                self._desk.tell(self._running.add(record))
+                self._note(f"{names[record.stop]} stays as it was taken", warning=True)
+        if left := [name for stop, name in names.items() if stop not in stay]:
+            way = f"the arm goes on to pose {self._todo[0]}" if self._todo else "it was the last"
+            self._note(f"skipped: {' and '.join(left)}, {way}; --resume takes what was skipped", warning=True)
 
     def _take(self, stop: int, index: int) -> PoseRecord:
         step = self._plan.steps[index]

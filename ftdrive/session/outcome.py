@@ -78,5 +78,19 @@ def _prepared(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDatas
         "devices": devices,
         "run": run.folder.name,
         "station": header.get("station"),
+        "setup": _setup(run, header["config"]),
     }
     return dataset, float(header["config"]["site"]["g_m_s2"]), provenance
+
+
+def _setup(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
+    """What `ftdrive.mismatch` compares a result with; the payload is the one that the controller told last."""
+    payload_kg = None
+    for event in run.events():
+        if event.get("event") == "weighed":
+            payload_kg = event["payload_kg"]
+    return {
+        "payload_kg": payload_kg,
+        "sensor_mass_kg": config.get("sensor", {}).get("mass_kg"),
+        "mounting": config.get("workcell", {}).get("mounting"),
+    }

@@ -63,6 +63,14 @@ class Running:
         """What `calib.solve` makes of the poses so far; None as long as they do not determine it."""
         return self._result
 
+    @property
+    def weighed_kg(self) -> float | None:
+        """Mass that the sensor carries; None as long as nobody can know, as in `predict`."""
+        result = self._trusted()
+        if result is None or result.sigma["weight_N"] > TRUSTED_SHARE * result.weight_N:
+            return None
+        return result.mass_kg
+
     def add(self, record: PoseRecord) -> Estimated:
         """Take a pose in, in place of one with the same `stop`, and say where the calibration stands."""
         self._records.pop(record.stop, None)
@@ -102,15 +110,20 @@ class Running:
         That is before six poses, while a quite different mounting of the sensor fits almost as well, and at
         orientations far from those taken. Any thread may ask.
         """
-        result = self._result
-        if result is None or result.n_poses < RECOMMENDED_POSES:
-            return None
-        if result.second_basin_chi2 is not None and result.second_basin_chi2 < ACCEPTED_DELTA_CHI2:
+        result = self._trusted()
+        if result is None:
             return None
         sigma_N = float(np.sqrt(np.trace(result.wrench_covariance(R_base_flange)[:3, :3])))
         if sigma_N > TRUSTED_SHARE * result.weight_N:
             return None
         return -result.compensate(np.zeros(6), R_base_flange)
+
+    def _trusted(self) -> CalibrationResult | None:
+        result = self._result
+        if result is None or result.n_poses < RECOMMENDED_POSES:
+            return None
+        second = result.second_basin_chi2
+        return result if second is None or second >= ACCEPTED_DELTA_CHI2 else None
 
     def _kept(self) -> list[PoseRecord]:
         return [self._records[stop] for stop in sorted(self._records)]

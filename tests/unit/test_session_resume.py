@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from calib.routine import DriftCheck
 from drivers.errors import DeviceFault
 from drivers.interfaces import DeviceInfo
 from ftdrive.config import ToolConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
 from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.plan import Plan
+from ftdrive.report import drift_in_words
 from ftdrive.session import machine
 from ftdrive.session.events import (
     Checked,
@@ -143,6 +145,60 @@ def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> Non
     assert outcome is not None
     assert outcome.result.n_poses == 6
     assert [event.poses for event in lab.operator.of(Estimated)][:5] == [1, 2, 3, 3, 4]
+
+
+def test_skip_of_the_first_pose_while_it_is_taken_again_keeps_it_and_names_the_return(lab: Lab) -> None:
+    lab.operator.answers["Pose 2 of 7"] = ["r"]
+    lab.operator.answers["Pose 1 of 7"] = ["", "s"]
+    outcome = lab.calibrate(mode="step")
+    assert lab.taken() == [1, 2, 3, 4, 5, 6]
+    assert "pose 1 stays as it was taken" in lab.said()
+    assert "skipped: the return to pose 1, the arm goes on to pose 2; --resume takes what was skipped" in lab.said()
+    assert outcome is not None
+    assert outcome.result.n_poses == 6
+    assert outcome.drift is None
+    lab.operator.told.clear()
+    outcome = lab.calibrate(resume=lab.run().folder)
+    assert lab.taken() == [7]
+    assert outcome is not None
+    assert outcome.drift is not None
+
+
+def test_a_pose_of_a_run_that_redo_names_stays_when_it_is_skipped(lab: Lab) -> None:
+    lab.calibrate()
+    lab.operator.told.clear()
+    lab.operator.answers["Pose 3 of 7"] = ["s"]
+    outcome = lab.calibrate(resume=lab.run().folder, redo=(3,), mode="step")
+    assert lab.taken() == []
+    assert "pose 3 stays as it was taken" in lab.said()
+    assert "skipped" not in lab.said()
+    assert [event.poses for event in lab.operator.of(Estimated)][-1] == 6
+    assert outcome is not None
+    assert outcome.result.n_poses == 6
+
+
+def test_a_first_pose_that_is_taken_anew_after_its_return_gives_the_drift_between_the_two(lab: Lab) -> None:
+    lab.calibrate()
+    lab.sensor.push = np.array([0.5, 0, 0, 0, 0, 0])
+    outcome = lab.calibrate(resume=lab.run().folder, redo=(1,))
+    assert lab.taken()[-1] == 1
+    assert outcome is not None
+    assert outcome.result.n_poses == 6
+    drift = outcome.drift
+    assert drift is not None
+    assert -60 < drift.elapsed_s < 0
+    assert drift.change[0] == pytest.approx(-0.5, abs=0.05)  # per time it rises all the same
+    words, bad = drift_in_words(drift)
+    assert bad
+    assert words.startswith(f"first pose, taken anew {-drift.elapsed_s:.0f} s after the return to it, 0.")
+
+
+@pytest.mark.parametrize(("elapsed_s", "when"), [(300.0, "again after 300 s"), (-300.0, "anew 300 s after the return")])
+def test_the_rate_of_a_drift_is_the_same_whichever_was_first(elapsed_s: float, when: str) -> None:
+    words, bad = drift_in_words(DriftCheck(np.array([0.5, 0, 0, 0, 0, 0]), np.full(6, 0.01), elapsed_s))
+    assert bad
+    assert when in words
+    assert words.endswith("away: 0.1 N/min")
 
 
 def test_a_way_past_a_skipped_pose_is_told_and_confirmed_by_a_person(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
