@@ -45,7 +45,7 @@ def cell_file(cell: CellConfig, found: Sequence[str]) -> str:
         _line("mass_kg", tool.mass_kg),
         "",
         "[workcell]",
-        _line("mounting", workcell.mounting, "floor, wall, ceiling, or degrees the base leans about its y"),
+        _line("mounting", workcell.mounting, "floor, wall, ceiling, or degrees the base leans towards its -x: 90 is wall"),
         "# PLACEHOLDERS until measured: mm from the centre of the base, in its axes; what it stands on is known.",
         "# Planes, [nx, ny, nz, mm]: the arm stays where normal times point is mm or more; [-1, 0, 0, -800] is a wall",
         "# 800 mm away towards +x. Boxes, [x, y, z, x, y, z]: two opposite corners of a block.",

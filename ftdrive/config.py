@@ -74,7 +74,7 @@ class WorkcellConfig:
     """What stands around the arm, base axes."""
 
     mounting: str = "floor"
-    """floor, wall, ceiling, or degrees the base leans about its y axis."""
+    """floor, wall, ceiling, or degrees the base leans towards its -x: 90 is wall."""
     planes_mm: Rows = ()
     """(nx, ny, nz, place): the arm stays where normal times point is place or more."""
     boxes_mm: Rows = ()
@@ -392,7 +392,7 @@ def _wrong_mounting(value: str) -> str | None:
         usable = value in {"floor", "wall", "ceiling"} or isfinite(float(value))
     except ValueError:
         usable = False
-    return None if usable else "give floor, wall, ceiling, or degrees about base y"
+    return None if usable else "give floor, wall, ceiling, or degrees the base leans to -x"
 
 
 _THINNEST_MM = 5.0

@@ -34,7 +34,7 @@ _SILENT = "did not answer when this was written"
     help="A cylinder of what is mounted, the sensor too, in mm from the flange face. Repeatable.",
 )
 @click.option("--tool-mass", metavar="KG", help="Of what hangs on the sensor, about.")
-@click.option("--mounting", help="floor, wall, ceiling, or degrees the base leans about its y.")
+@click.option("--mounting", help="floor, wall, ceiling, or degrees the base leans towards its -x: 90 is wall.")
 @click.option("--plane", "planes", multiple=True, metavar="NX:NY:NZ:MM", help="A wall, base axes. Repeatable.")
 @click.option("--box", "boxes", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block, two corners in mm. Repeatable.")
 @click.option("--speed", metavar="DEG/S", help="Of the fastest joint.")

@@ -43,7 +43,7 @@ USUAL_MASS_KG = 1.0
     metavar="Q1,Q2,Q3",
     help="Of the first three joints, degrees.",
 )
-@click.option("--mounting", help="floor, wall, ceiling, or degrees the base leans about its y.")
+@click.option("--mounting", help="floor, wall, ceiling, or degrees the base leans towards its -x: 90 is wall.")
 @click.option(
     "--plane",
     "planes",

@@ -123,7 +123,7 @@ def _scene(scene: dict[str, Any]) -> Iterator[str]:
     """Say what stands around the arm; planes and boxes as `--plane` and `--box` take them."""
     lean_rad = float(scene["lean_rad"])
     names = [name for name, angle in MOUNTINGS.items() if abs(lean_rad - angle) < 1e-9]
-    yield f"mounted: {names[0] if names else f'base leans {degrees(lean_rad):.1f} deg about its y axis'}"
+    yield f"mounted: {names[0] if names else f'base leans {degrees(lean_rad):.1f} deg towards its -x'}"
     for plane in scene["planes"]:  # the first one is what the base is bolted to
         normal = ":".join(f"{value:.6g}" for value in plane["normal"])
         place_mm = 1e3 * float(plane["offset_m"])

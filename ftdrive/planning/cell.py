@@ -33,7 +33,7 @@ class Workcell(Protocol):
 
     @property
     def mounting(self) -> str:
-        """floor, wall, ceiling, or degrees about base y."""
+        """floor, wall, ceiling, or degrees the base leans to -x."""
 
     @property
     def planes_mm(self) -> Sequence[Sequence[float]]:

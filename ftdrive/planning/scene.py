@@ -42,12 +42,12 @@ BASE_PLANE = Plane((0.0, 0.0, 1.0), 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Planes and boxes in base axes. The base is what it is mounted on, turned by `lean_rad` about its y axis."""
+    """Planes and boxes in base axes. The base leans by `lean_rad` from upright towards its -x."""
 
     planes: Sequence[Plane] = field(default=(BASE_PLANE,))
     boxes: Sequence[Box] = ()
     lean_rad: float = 0.0
-    """0 on a floor, pi/2 on a wall, pi under a ceiling."""
+    """0 on a floor, pi/2 on a wall (gravity along -x), pi under a ceiling."""
 
     @property
     def down_base(self) -> Array:
@@ -66,4 +66,4 @@ def lean_of(mounting: str) -> float:
     try:
         return float(np.radians(float(mounting)))
     except ValueError:
-        raise ConfigError(f"mounting is '{mounting}': give {', '.join(MOUNTINGS)} or degrees about base y") from None
+        raise ConfigError(f"mounting is '{mounting}': give {', '.join(MOUNTINGS)} or degrees the base leans to -x") from None
