@@ -111,7 +111,7 @@ def test_a_fault_on_the_way_stops_the_arm_and_resume_goes_on(fault: str, lab: La
     assert outcome is not None
     (trip,) = lab.operator.of(GuardTripped)
     assert trip.hazard == hazard
-    assert lab.arm.opened == 2
+    assert lab.arm.opened == 3  # to look, to take control, and again
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     states = lab.operator.states()
     stop = states.index(State.STOP)
