@@ -25,6 +25,7 @@ def cell_file(cell: CellConfig, found: Sequence[str]) -> str:
         "[robot]",
         _line("host", robot.host),
         _line("model", robot.model, "checked against the controller where it can tell"),
+        _line("serial", robot.serial, "of the arm: where it is said, nothing moves on another"),
         _line("speed_deg_s", robot.speed_deg_s, "of the fastest joint, 60 at most; the first run of a plan is slower"),
         _line("# acceleration_deg_s2", robot.acceleration_deg_s2),
         _line("# tip_speed_mm_s", robot.tip_speed_mm_s, "of the tool's farthest point, 250 at most"),

@@ -184,13 +184,17 @@ def leave_programs_alone(arm: RobotArm) -> None:
 
 
 def check_model(before: Before) -> Checked:
-    """Rows 8 and 9: the flange is where this model has it."""
-    state = before.arm.state()
+    """Rows 8 and 9: it is the arm that is meant, and its flange is where this model has it."""
+    state, info, robot = before.arm.state(), before.arm.identify(), before.cell.robot
+    if robot.serial not in {None, info.serial}:
+        return _failed(
+            "model",
+            f"the arm at {robot.host} has serial {info.serial}, [robot] serial says {robot.serial}: correct one",
+        )
     try:
         ModelGuard(before.limits, before.certifier).judge(state)
     except Tripped as trip:
         return _failed("model", str(trip))
-    info = before.arm.identify()
     return _passed("model", f"{info.model}, serial {info.serial}: the flange is where its joints have it")
 
 
