@@ -121,6 +121,8 @@ class UrArm(RobotArm):
             log.info("%s is opened again: %s", self._host, error)
             self.close()
             return
+        if look.program_state == PROGRAM_STOPPED:
+            self._left_behind = self._starting  # what runs later is not ours
         if not control or self._control is None:
             return
         plays = self._control.alive and not look.program_fault()
