@@ -191,7 +191,7 @@ def test_local_control_is_refused_in_a_dry_run_too(lab: Lab) -> None:
     assert lab.calibrate(dry_run=True) is None
 
 
-@pytest.mark.parametrize(("late_s", "busy_for", "passes"), [(0.03, 10_000, False), (0.03, 1, True), (0.008, 0, True)])
+@pytest.mark.parametrize(("late_s", "busy_for", "passes"), [(0.03, 10_000, False), (0.03, 1, True), (0.008, 10_000, True)])
 def test_an_arm_that_answers_late_is_refused(late_s: float, busy_for: int, passes: bool, lab: Lab) -> None:
     right, left = lab.arm.state, [busy_for]
 
@@ -203,4 +203,4 @@ def test_an_arm_that_answers_late_is_refused(late_s: float, busy_for: int, passe
     lab.arm.state = late  # type: ignore[method-assign]  # this arm only
     found = preflight.check_link(cast("preflight.Before", SimpleNamespace(arm=lab.arm)))
     assert found.passed == passes
-    assert passes or ("answers within 30 ms" in found.words and "20 ms" in found.words)
+    assert passes or "20 ms are usual at most" in found.words
