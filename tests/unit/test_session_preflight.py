@@ -191,7 +191,7 @@ def test_local_control_is_refused_in_a_dry_run_too(lab: Lab) -> None:
     assert lab.calibrate(dry_run=True) is None
 
 
-@pytest.mark.parametrize(("late_s", "busy_for", "passes"), [(0.03, 10_000, False), (0.03, 1, True), (0.008, 10_000, True)])
+@pytest.mark.parametrize(("late_s", "busy_for", "passes"), [(0.03, 9999, False), (0.03, 1, True), (0.008, 9999, True)])
 def test_an_arm_that_answers_late_is_refused(late_s: float, busy_for: int, passes: bool, lab: Lab) -> None:
     right, left = lab.arm.state, [busy_for]
 
