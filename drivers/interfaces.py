@@ -203,7 +203,10 @@ class RobotArm(_Device):
 
     @abstractmethod
     def open(self, *, control: bool = False) -> None:
-        """Connect, read-only unless `control` is asked for. Idempotent. Raises `ConnectError`."""
+        """Connect, read-only unless `control` is asked for. Idempotent. Raises `ConnectError`.
+
+        Taking control ends no program that somebody else has on the controller: that is a `ConnectError`.
+        """
 
     @abstractmethod
     def state(self) -> ArmState:
@@ -221,6 +224,10 @@ class RobotArm(_Device):
 
     def in_remote_control(self) -> bool | None:
         """Whether the controller takes programs from the network; None where there is no such switch."""
+        return None
+
+    def program_told(self) -> str | None:
+        """What the controller calls the program it runs, in its own words; None where it does not tell."""
         return None
 
     @abstractmethod

@@ -41,6 +41,8 @@ class RobotConfig:
     """Of the tool's farthest points; 250 at most, the reduced speed of ISO 10218-1."""
     driver: str = "ur"
     """Of another package, by its entry point: drivers/README."""
+    serial: str | None = None
+    """Of the arm, as its controller tells it; where it is said, nothing moves on another."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -434,6 +436,7 @@ _WRONG: Mapping[str, Callable[[Any], str | None]] = {
     "robot.host": _wrong_text,
     "robot.model": _wrong_model,
     "robot.driver": _wrong_text,
+    "robot.serial": _wrong_text,
     "sensor.url": _wrong_text,
     "sensor.sign": _wrong_sign,
     "sampling.noise_record_s": _wrong_record,

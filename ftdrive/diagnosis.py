@@ -303,7 +303,7 @@ def _check_program(status: ArmStatus) -> Check:
     if status.program == "stopped":
         return Check("robot.program", "ok", "no program runs; other clients that only read cannot be seen")
     what = f"a program is on the controller ({status.program})"
-    return Check("robot.program", "warning", what, "stop it at the pendant: calibrate would end it")
+    return Check("robot.program", "warning", what, "stop it at the pendant: calibrate does not begin beside it")
 
 
 def _check_speed(status: ArmStatus) -> Check:

@@ -34,6 +34,8 @@ _PROGRESS_S: Final = 0.4
 _OURS_EVERY_S: Final = 0.1
 _OURS_S: Final = 0.4
 """A question to our program on the controller, which answers within two control cycles."""
+_OURS_AGAIN_S: Final = 1.0
+"""The same when the arm is opened again, where nothing hurries."""
 _STOP_S: Final = 0.4
 _STOP_SILENT_S: Final = 0.15
 _REACH_S: Final = 1.5
@@ -41,7 +43,7 @@ _REACH_S: Final = 1.5
 been heard of the controller for 0.2 s; and how long the attempt to connect goes on, one retransmission of TCP."""
 _SCRIPT_PORT: Final = 30003
 _RELEASE_S: Final = 1.0
-"""A control process whose parent was killed needs half of that to stop the arm and let the registers go."""
+"""A control process whose parent was killed needs half of that to stop the arm, end its program and let go."""
 _ARRIVED_RAD: Final = 1e-3
 _STANDING_RAD_S: Final = 1e-6
 """Of the set-point, which is exactly zero at rest."""
@@ -84,6 +86,7 @@ class UrArm(RobotArm):
         self._reader: Reader | None = None
         self._control: ControlProcess | None = None
         self._left_behind = False  # a program of ours may be on the controller without us
+        self._starting = False  # one was sent, and nobody has seen it play: it may begin after it was told to stop
         self._goal: list[float] | None = None
         self._stop_requested = threading.Event()
         self._stop_wanted = threading.Event()  # by an attempt in the background
@@ -93,9 +96,11 @@ class UrArm(RobotArm):
     def open(self, *, control: bool = False) -> None:
         """Connect, read-only unless `control` is asked for; what was lost since the last time is opened again.
 
-        Reading disturbs nothing and needs no remote control. Taking control ends the program that runs on the
-        controller, if one does. After a stop of the safety system it works once the operator has cleared it; the
-        interrupted move is gone. Raises `ConnectError`, and the arm is closed then. Within 5 s, all in all.
+        Reading disturbs nothing and needs no remote control. Taking control starts a program on the controller, which
+        zeroes the sensor in an e-Series wrist anew. A program that plays or is paused there is never ended for it, but
+        for one that this object has started itself before. After a stop of the safety system it works once the operator
+        has cleared it; the interrupted move is gone. Raises `ConnectError`, and the arm is closed then. Within 5 s, all
+        in all.
         """
         try:
             self._drop_what_is_lost(control)
@@ -116,9 +121,15 @@ class UrArm(RobotArm):
             log.info("%s is opened again: %s", self._host, error)
             self.close()
             return
-        if control and self._control is not None and (not self._control.alive or look.program_fault()):
-            self._control.kill()
-            self._control = None
+        if look.program_state == PROGRAM_STOPPED:
+            self._left_behind = self._starting  # what runs later is not ours
+        if not control or self._control is None:
+            return
+        plays = self._control.alive and not look.program_fault()
+        if plays and (look.safety_fault() or self._is_ours(self._control, timeout_s=_OURS_AGAIN_S)):
+            return
+        self._control.kill()
+        self._control = None
 
     def _connect(self, control: bool) -> None:
         if self._reader is None:
@@ -147,9 +158,8 @@ class UrArm(RobotArm):
                     f"{self._host} is not in remote control: press Local, Remote Control at the top right of the "
                     f"pendant (enable it first under Settings, System, Remote Control)."
                 )
-            # A program left over would make ur_rtde wait up to 300 s for its end.
-            if reader.look().program_state != PROGRAM_STOPPED:
-                log.warning("ending the program that runs on %s", self._host)
+            if self._left_behind and reader.look().program_state != PROGRAM_STOPPED:
+                log.warning("ending the program of ours that was left on %s", self._host)
                 dashboard.stop()
 
         look_out()
@@ -157,10 +167,12 @@ class UrArm(RobotArm):
         self._claim_nothing_of_others()
         self._stop_wanted.clear()  # an attempt that is still on its way would stop the new program
         ask_dashboard(self._host, prepare, timeout_s=CONNECT_S)
-        self._left_behind = True
+        self._end_nothing_of_others(reader)
+        self._left_behind = self._starting = True
         self._control = ControlProcess(self._host, FREQUENCY_HZ)
         try:
             self._control.wait_until_ready(look_out)
+            self._starting = False
         except (StreamBroken, DeviceTimeout) as error:
             look_out()  # ur_rtde seldom knows the reason
             raise ConnectError(_advice(self._host, str(error))) from error
@@ -182,6 +194,18 @@ class UrArm(RobotArm):
                 raise ConnectError(_taken(self._host, f"{taken[0]} and {len(taken) - 1} more"))
             time.sleep(0.05)
 
+    def _end_nothing_of_others(self, reader: Reader) -> None:
+        """Raise `ConnectError` when a program stays on the controller: ur_rtde would end it, or wait 300 s for it."""
+        deadline = time.monotonic() + _RELEASE_S
+        while reader.look().program_state != PROGRAM_STOPPED:
+            if time.monotonic() > deadline:
+                told = self.program_told()
+                raise ConnectError(
+                    f"a program that this one has not started is on {self._host}{f' ({told})' if told else ''} and is "
+                    f"not ended: stop it at the pendant, then start again."
+                )
+            time.sleep(0.02)
+
     def close(self) -> None:
         """Let the arm go, stopping it and its control script first. Idempotent; within 1.5 s even when all is lost."""
         control, self._control = self._control, None
@@ -191,7 +215,6 @@ class UrArm(RobotArm):
             self._end_program(control, reader)
         if self._left_behind:
             self._stop_program(timeout_s=_STOP_S)
-            self._left_behind = False
         if reader is not None:
             reader.close()
 
@@ -225,7 +248,7 @@ class UrArm(RobotArm):
         if not reader.tells_tcp and self._control is None:
             raise ConnectError(
                 f"the controller {self._host} is too old to tell its active TCP, without which its poses say nothing "
-                f"about the flange: update it, or open the arm with control."
+                f"about the flange: update it, or take control of the arm, as a calibration does."
             )
         return reader.state(lambda: self._in_control().call("tcp_offset"))
 
@@ -234,13 +257,26 @@ class UrArm(RobotArm):
         return self._reading().status()
 
     def in_remote_control(self) -> bool | None:
-        """Ask the dashboard server, which takes some milliseconds; None before PolyScope 5.6, which does not tell.
+        """Ask the dashboard server, which takes some milliseconds.
 
-        Raises `StreamBroken` or `DeviceTimeout`.
+        None before PolyScope 5.6, which does not tell, and at the addresses of URSim, where it does not matter. Raises
+        `StreamBroken` or `DeviceTimeout`.
         """
-        if self._reading().version[:2] < (5, 6):
+        if self._reading().version[:2] < (5, 6) or self._host in _SIMULATORS:
             return None
         return ask_dashboard(self._host, lambda dashboard: dashboard.isInRemoteControl(), timeout_s=CONNECT_S)
+
+    def program_told(self) -> str | None:
+        """Ask the dashboard server for the program's state and name; None where it does not answer.
+
+        A program that a client has sent may come under the name of one that is loaded: not tried on hardware.
+        """
+        try:
+            told = ask_dashboard(self._host, lambda dashboard: dashboard.programState(), timeout_s=CONNECT_S)
+        except DriverError as error:
+            log.info("%s does not tell its program: %s", self._host, error)
+            return None
+        return told.strip() or None
 
     # ------------------------------------------------------------------ moving
 
@@ -425,14 +461,13 @@ class UrArm(RobotArm):
         self._stop_wanted.set()
         try:
             ask_dashboard(self._host, stop, timeout_s=timeout_s, connect_s=_REACH_S)
-            self._left_behind = False
+            self._left_behind = self._starting
         except DriverError as error:
             log.warning("%s could not be told to stop, press the emergency stop if it moves: %s", self._host, error)
 
     def _check_ours(self, control: ControlProcess) -> None:
         """Raise `DeviceFault` when the program that runs is not ours: its registers would say nothing."""
         if not self._is_ours(control, timeout_s=_OURS_S, look_out=self._look_out):
-            self._left_behind = False
             raise self._fault() or DeviceFault(
                 f"the control program on {self._host} does not answer: another program may have been started, or "
                 "controller or computer are too busy; look at the pendant, then open the arm again."
@@ -443,10 +478,14 @@ class UrArm(RobotArm):
     ) -> bool:
         try:
             control.call("tcp_offset", timeout_s=timeout_s, look_out=look_out)
-        except DriverError as error:
-            if isinstance(error, DeviceTimeout) and control.alive:
+        except DeviceTimeout as error:
+            if control.alive:
                 raise  # said by `look_out`: the controller is silent, whosever program it runs
             log.info("%s: the control program does not answer: %s", self._host, error)
+            self._left_behind = False  # another has taken its place, as far as anybody can tell
+            return False
+        except DriverError as error:
+            log.info("%s: the control program cannot be asked: %s", self._host, error)
             return False
         return True
 

@@ -92,6 +92,9 @@ class Dashboard(Protocol):
     def polyscopeVersion(self) -> str:
         """Such as 5.15.0.1261331."""
 
+    def programState(self) -> str:
+        """Such as "PLAYING pick.urp"."""
+
     def isInRemoteControl(self) -> bool:
         """Whether programs sent over the network are accepted (e-Series from 5.6 on)."""
 

@@ -66,4 +66,6 @@ def lean_of(mounting: str) -> float:
     try:
         return float(np.radians(float(mounting)))
     except ValueError:
-        raise ConfigError(f"mounting is '{mounting}': give {', '.join(MOUNTINGS)} or degrees the base leans to -x") from None
+        raise ConfigError(
+            f"mounting is '{mounting}': give {', '.join(MOUNTINGS)} or degrees the base leans to -x"
+        ) from None

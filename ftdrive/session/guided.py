@@ -108,17 +108,22 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
     desk.tell(StateChanged(state=State.IDLE))
     options = _as_begun(options)
     by_hand = options.mode in _BY_HAND
+    plan = None if by_hand else _plan_on_disk(options)
+    device, driver = build_sensor(cell), build_arm(cell)
     if options.resume is not None:
         desk.keep_in(Run(options.resume))
-    with build_sensor(cell) as sensor, closing(build_arm(cell)) as arm, preflight.awake() as kept_awake:
-        arm.open(control=not by_hand)
+    with device as sensor, closing(driver) as arm, preflight.awake() as kept_awake:
+        arm.open()
         desk.tell(StateChanged(state=State.PREFLIGHT))
+        if not by_hand:
+            preflight.leave_programs_alone(arm)
         devices = {"arm": asdict(arm.identify()), "sensor": asdict(sensor.identify())}
         if by_hand:
             run = _by_hand(cell, arm, sensor, desk, options, devices)
         else:
             desk.tell(Noted(words=kept_awake))
-            begun = _Begun(cell, arm, sensor, desk, options, limits or (Limits() if options.real else _EMULATED))
+            limits = limits or (Limits() if options.real else _EMULATED)
+            begun = _Begun(cell, arm, sensor, desk, options, plan, limits)
             if options.dry_run:
                 return None
             run = begun.tour(devices)
@@ -135,6 +140,8 @@ def _as_begun(options: Options) -> Options:
         way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
         raise ConfigError(f"{options.resume} was begun {way} and can only go on like that: leave out --{options.mode}")
     options = replace(options, mode=begun if options.mode == "auto" else options.mode)
+    if options.redo and options.resume is None:
+        raise ConfigError("--redo takes poses of a run again: name the run with --resume RUN")
     if options.mode not in _BY_HAND:
         return options
     no_motion = {
@@ -151,6 +158,17 @@ def _as_begun(options: Options) -> Options:
     return options
 
 
+def _plan_on_disk(options: Options) -> Plan | None:
+    """Load the plan of the run that is resumed, or the one that is named; raises `ConfigError` for poses it has not."""
+    if options.resume is None:
+        return None if options.plan is None else Plan.load(options.plan)
+    plan = Plan.load(Run(options.resume).plan_path)
+    stops = len(plan.steps) + 1
+    if wrong := sorted(stop for stop in options.redo if not 1 <= stop <= stops):
+        raise ConfigError(f"pose {wrong[0]} cannot be taken again: the run has poses 1 to {stops}")
+    return plan
+
+
 class _Begun:
     """A session in front of its tour: planned, checked and shown."""
 
@@ -161,15 +179,19 @@ class _Begun:
         sensor: ForceTorqueSensor,
         desk: Desk,
         options: Options,
+        plan: Plan | None,
         limits: Limits,
     ) -> None:
+        if not options.dry_run and arm.status().tcp_offset is None:
+            arm.open(control=True)  # an old controller tells no poses before
         self._cell, self._arm, self._sensor, self._desk, self._options = cell, arm, sensor, desk, options
         self._limits = limits
+        self._reduced = False  # as a person has said it should be
         info: DeviceInfo = arm.identify()
         self._certifier = certifier_for(cell, info.model)
         self._old = None if options.resume is None else Run(options.resume)
         self._speeds = speeds_of(cell)
-        self._plan = self._planned()
+        self._plan = plan or self._planned()
         document = self._plan.to_dict()
         self._key = (info.serial, str(document["sha256"]))
         self._known = not options.real or has_completed(*self._key)
@@ -200,16 +222,17 @@ class _Begun:
         self._way = way_of(q, self._before.approach)
         self._show()
         self._check(preflight.CHECKS)
+        if options.dry_run:
+            desk.tell(Noted(words="the controller's own safety limits are not asked for: only a program on it could"))
+        else:
+            arm.open(control=True)
+            self._check(preflight.IN_CONTROL)
         self._sampling, self._noise = self._chosen_sampling()
         self._show_prospect(q)
 
     def _planned(self) -> Plan:
-        """The plan of the run that is resumed, or of a file, or one made where the arm stands."""
+        """Make a plan where the arm stands."""
         options, cell = self._options, self._cell
-        if self._old is not None:
-            return Plan.load(self._old.plan_path)
-        if options.plan is not None:
-            return Plan.load(options.plan)
         q = np.round(self._arm.state().q_rad / _GRID_RAD) * _GRID_RAD
         with suppress(ConfigError):  # the planner says what to do about it
             q[3:5] = constant_tour(q)[0, 3:5]  # wherever the wrist was left; joint 6 tells how the cable is wound
@@ -221,14 +244,9 @@ class _Begun:
         """Stops to take, and records that stand."""
         stops = range(1, len(self._plan.steps) + 2)
         if self._old is None:
-            if self._options.redo:
-                raise ConfigError("--redo takes poses of a run again: name the run with --resume RUN")
             return list(stops), []
         _require_same_devices(self._old, self._arm, self._sensor)
-        redo = set(self._options.redo)
-        if wrong := sorted(redo - set(stops)):
-            raise ConfigError(f"pose {wrong[0]} cannot be taken again: the run has poses 1 to {len(stops)}")
-        kept = [record for record in self._old.records() if record.stop not in redo]
+        kept = [record for record in self._old.records() if record.stop not in self._options.redo]
         have = {record.stop for record in kept}
         return [stop for stop in stops if stop not in have], kept
 
@@ -322,7 +340,7 @@ class _Begun:
         """Ask, move, keep."""
         desk, plan, cell = self._desk, self._driven, self._cell
         if self._options.questions and self._todo:
-            self._ask()
+            self._ask(assumed=self._known and not arm_moves(self._way))  # nobody has seen a way of the arm
         run = self._run(devices)
         quiet = self._before.quiet.wrench
         window = int(len(quiet) * min(1.0, self._sampling.average_s / preflight.LISTEN_S))
@@ -367,12 +385,22 @@ class _Begun:
             remember_completed(*self._key)
         return run
 
-    def _recheck(self) -> None:
-        self._before = replace(self._before, quiet=self._listen(preflight.LISTEN_S))
+    def _recheck(self, hazard: int | None) -> None:
+        """Do the checks again after a stop by a row of the hazard table, and ask again where that row says so."""
+        q = self._arm.state().q_rad
+        stays = approach_to(self._certifier, q, q, SLOW)  # the way on is judged by itself, once it is known where to
+        quiet = self._listen(preflight.LISTEN_S)
+        self._before = replace(self._before, quiet=quiet, approach=stays, known=True, resumed=True)
+        self._way = way_of(q, stays)
         self._check(preflight.AGAIN)
+        if not self._options.questions:
+            return
+        if hazard == 11:  # an emergency or safeguard stop: all of the preflight again
+            self._ask(assumed=False)
+        else:
+            self._ask_reduced(assumed=False)
 
-    def _ask(self) -> None:
-        assumed = self._known and not arm_moves(self._way)  # nobody has seen this way
+    def _ask(self, *, assumed: bool) -> None:
         room = "" if self._plan.arm_rests else ", and the room of the whole arm, which moves too,"
         if arm_moves(self._way):
             room = f", and the room of the whole arm, which moves on its way there too ({turns_in_words(self._way)}),"
@@ -383,8 +411,14 @@ class _Begun:
             "Is the emergency stop in reach, and tested?",
         ):
             self._desk.require(text, assumed=assumed)
-        if self._arm.status().safety_mode == "reduced":
+        self._ask_reduced(assumed=assumed)
+
+    def _ask_reduced(self, *, assumed: bool) -> None:
+        """Ask whether reduced mode is meant, once as long as it lasts."""
+        reduced = self._arm.status().safety_mode == "reduced"
+        if reduced and not self._reduced:
             self._desk.require("The controller is in reduced mode. Is that as it should be?", assumed=assumed)
+        self._reduced = reduced
 
     def _run(self, devices: Mapping[str, Any]) -> Run:
         if self._old is not None:

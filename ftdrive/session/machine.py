@@ -114,7 +114,8 @@ class Tour:
     contact, load
         The two guards that the tour itself feeds.
     recheck : callable
-        Looks at the devices once more after a stop, and raises when they are not ready.
+        Does the checks once more after a stop, and asks what the row of the hazard table that stopped it, or None,
+        wants asked again; raises when it may not go on.
     quiet_std : array, shape (6,)
         Of the resting sensor's samples.
     """
@@ -134,7 +135,7 @@ class Tour:
         load: RangeGuard,
         sampling: Sampling,
         pace: Pace,
-        recheck: Callable[[], None],
+        recheck: Callable[[int | None], None],
         quiet_std: Array,
     ) -> None:
         self._arm, self._sensor, self._certifier = arm, sensor, certifier
@@ -495,8 +496,8 @@ class Tour:
             if answer == "quit":
                 raise end
             try:
-                self._recover()
-            except (Tripped, DriverError, NotAccepted) as again:
+                self._recover(None if trip is None else trip.hazard)
+            except (Tripped, DriverError, NotAccepted, Declined) as again:
                 self._desk.tell(Noted(words=f"not yet: {again}", warning=True))
                 continue
             if answer == "skip":
@@ -539,14 +540,14 @@ class Tour:
             return False
         self._reopened.add(stop)
         try:
-            self._recover()
+            self._recover(trip.hazard)
         except (Tripped, DriverError, NotAccepted) as error:
             log.info("the sensor does not come back: %s", error)
             return False
         self._desk.tell(Noted(words=f"{trip}; it is back, pose {stop} begins anew", warning=True))
         return True
 
-    def _recover(self) -> None:
+    def _recover(self, hazard: int | None) -> None:
         """Open again what was lost, and look at everything once more. A safety stop is for the operator to clear."""
         self._arm.open(control=True)
         try:
@@ -557,7 +558,7 @@ class Tour:
             self._sensor.open()
             self._contact.forget()
             self._witness = Witness(self._sensor, self._desk.tell)
-        self._recheck()
+        self._recheck(hazard)
         self._guards.begin()
         q = self._arm.state().q_rad
         with self._guards.watching(q, q, moving=False):  # is what tripped them gone?

@@ -19,7 +19,7 @@ from calib.noise import LEAST_SAMPLES
 from drivers.errors import DriverError
 from drivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
 from ftdrive.config import CellConfig
-from ftdrive.errors import PlanRefused
+from ftdrive.errors import NotAccepted, PlanRefused
 from ftdrive.planning.approach import Approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.nodes import WRIST_6_RAD
@@ -32,7 +32,12 @@ Array = NDArray[np.float64]
 LISTEN_S: Final = 2.0
 _RATE: Final = 0.1
 _LINK_S: Final = 0.5
-_LATENCY_S: Final = 0.1
+_LINK_TRIES: Final = 3
+_LATENCY_S, _GAP_S = 0.02, 0.1
+"""Of a usual answer, and of nine in ten. 8 ms of it are the wait for the next sample; on a healthy link to an emulated
+arm it is 8 ms, and up to 16 ms with three times more to do than the computer has cores for."""
+_ENDS_S: Final = 1.5
+"""What a session that was killed has left on the controller ends by itself within 0.5 s."""
 _FREE_BYTES: Final = 200_000_000
 _EDGE_RAD: Final = float(np.radians(5))
 """Each question takes the controller some 10 ms. Between two points no part is more than 1 mm off their chord."""
@@ -152,14 +157,44 @@ def check_safety(before: Before) -> Checked:
     return _passed("safety", f"safety mode {status.safety_mode}, program {status.program}")
 
 
+def check_remote(before: Before) -> Checked:
+    """Row 21: the controller takes programs from here."""
+    try:
+        remote = before.arm.in_remote_control()
+    except DriverError as error:
+        return _failed("remote", str(error))
+    if remote is None:
+        return _passed("remote", "this controller does not tell whether it takes programs from the network")
+    if remote:
+        return _passed("remote", "the controller is in remote control")
+    cure = "press Local, Remote Control at the top right of the pendant"
+    return _failed("remote", f"the controller is in local control: {cure}")
+
+
+def leave_programs_alone(arm: RobotArm) -> None:
+    """Row 21: raise `NotAccepted` where a program is, and stays, on the controller: no session ends one to begin."""
+    deadline = time.monotonic() + _ENDS_S
+    while (program := arm.status().program) != "stopped":
+        if time.monotonic() > deadline:
+            raise NotAccepted(
+                f"a program is on the controller ({arm.program_told() or program}) and is not ended by this one: stop "
+                "it at the pendant, then start again; nothing was touched"
+            )
+        time.sleep(0.02)
+
+
 def check_model(before: Before) -> Checked:
-    """Rows 8 and 9: the flange is where this model has it."""
-    state = before.arm.state()
+    """Rows 8 and 9: it is the arm that is meant, and its flange is where this model has it."""
+    state, info, robot = before.arm.state(), before.arm.identify(), before.cell.robot
+    if robot.serial not in {None, info.serial}:
+        return _failed(
+            "model",
+            f"the arm at {robot.host} has serial {info.serial}, [robot] serial says {robot.serial}: correct one",
+        )
     try:
         ModelGuard(before.limits, before.certifier).judge(state)
     except Tripped as trip:
         return _failed("model", str(trip))
-    info = before.arm.identify()
     return _passed("model", f"{info.model}, serial {info.serial}: the flange is where its joints have it")
 
 
@@ -244,18 +279,22 @@ def check_load(before: Before) -> Checked:
 
 
 def check_link(before: Before) -> Checked:
-    """Row 16: states of the arm come without gaps."""
-    took_s, end_s = list[float](), time.monotonic() + _LINK_S
-    try:
-        while (started_s := time.monotonic()) < end_s:
-            before.arm.state()
-            took_s.append(time.monotonic() - started_s)
-    except DriverError as error:
-        return _failed("link", str(error))
-    words = f"the arm answers within {1e3 * np.median(took_s):.0f} ms, once {1e3 * max(took_s):.0f} ms"
-    if np.quantile(took_s, 0.9) > _LATENCY_S:
-        return _failed("link", f"{words}: use a cable, and give this computer and network less to do")
-    return _passed("link", words)
+    """Row 16: states of the arm come soon and without gaps, in one of three half seconds."""
+    words = ""
+    for _ in range(_LINK_TRIES):  # a computer that is busy for a moment is no bad link
+        took_s, end_s = list[float](), time.monotonic() + _LINK_S
+        try:
+            while (started_s := time.monotonic()) < end_s:
+                before.arm.state()
+                took_s.append(time.monotonic() - started_s)
+        except DriverError as error:
+            return _failed("link", str(error))
+        usual_s = float(np.median(took_s))
+        words = f"the arm answers within {1e3 * usual_s:.0f} ms, once {1e3 * max(took_s):.0f} ms"
+        if usual_s < _LATENCY_S and np.quantile(took_s, 0.9) < _GAP_S:
+            return _passed("link", words)
+    limit = f"{1e3 * _LATENCY_S:.0f} ms are usual at most"
+    return _failed("link", f"{words} ({limit}): use a cable, and give this computer and network less to do")
 
 
 def check_disk(before: Before) -> Checked:
@@ -274,6 +313,7 @@ def check_disk(before: Before) -> Checked:
 
 CHECKS: Final[Sequence[Check]] = (
     check_safety,
+    check_remote,
     check_model,
     check_payload,
     check_slider,
@@ -284,13 +324,15 @@ CHECKS: Final[Sequence[Check]] = (
     check_plan,
     check_approach,
     check_cable,
-    check_safety_limits,
     check_disk,
 )
-"""In the order in which they are told."""
+"""In the order in which they are told. None of them takes control of the arm."""
 
-AGAIN: Final[Sequence[Check]] = (check_safety, check_model, check_payload, check_link, check_sensor, check_disk)
-"""What is looked at once more before a stopped session goes on."""
+IN_CONTROL: Final[Sequence[Check]] = (check_safety_limits,)
+"""What only a program on the controller can answer, asked when all else is well."""
+
+AGAIN: Final[Sequence[Check]] = (*(check for check in CHECKS if check is not check_approach), *IN_CONTROL)
+"""What is looked at once more before a stopped session goes on: all, but that the way on is judged by itself."""
 
 
 def edges(q_rad: Array, step_rad: float) -> Array:

@@ -315,8 +315,8 @@ BEFOREHAND: Final[Sequence[Beforehand]] = (
     Beforehand("7", "payload 0 in the controller", 7, "payload", ("--payload", "0")),
     Beforehand("8", "a turned TCP, not told", 0, options=("--tcp", "0,0,0.2,0.3,0,0", "--no-tcp-offset")),
     Beforehand("9", "another model", 3, "UR10e", change=_of_model("UR10e")),
-    Beforehand("10", "protective stop", 3, "protective", do={"do": "protective-stop"}),
-    Beforehand("11", "emergency stop", 3, "emergency", do={"do": "emergency-stop"}),
+    Beforehand("10", "protective stop", 7, "protective", do={"do": "protective-stop"}),
+    Beforehand("11", "emergency stop", 5, "emergency", do={"do": "emergency-stop"}),
     Beforehand(
         "13",
         "a tool of 14 kg, 300 mm",
@@ -329,7 +329,8 @@ BEFOREHAND: Final[Sequence[Beforehand]] = (
     Beforehand("15", "sensor silent", 3, "no answer", do={"do": "sensor-faults", "stall": True}),
     Beforehand("15", "sensor stuck", 5, "frozen", do={"do": "freeze-sensor"}),
     Beforehand("16", "controller silent", 3, "did not answer", do={"do": "silence-arm"}),
-    Beforehand("21", "local control", 3, "remote", do={"do": "remote-control", "on": False}),
+    Beforehand("21", "program of another client", 7, "stop it at the", do={"do": "foreign-program", "seconds": 60}),
+    Beforehand("21", "local control", 7, "remote", do={"do": "remote-control", "on": False}),
     Beforehand(
         "25",
         "a plan for another tool",

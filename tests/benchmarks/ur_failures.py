@@ -158,6 +158,8 @@ def application(number: signal.Signals, *, child_too: bool = False, at_once: boo
                 return Row(nan, nan, "stopped by the next start", usable(arm))
             stood = stands(station, begin, q0 + (-STEP_RAD if q0 > 0.5 else STEP_RAD))
             os.kill(process.pid, signal.SIGKILL)
+            if child_too:
+                station.do("dashboard-stop")  # the operator: no start ends a program it does not know
             return Row(nan, *stood, usable(arm))
         finally:
             for pid in pids:
@@ -188,6 +190,20 @@ def second_client() -> Row:
         return Row(nan, refused_s, "it is refused", usable(arm))
 
 
+def program_of_others() -> Row:
+    """Begin beside a program of somebody else; tell when that is refused."""
+    with closing(Station()) as station, closing(new_arm(station.host)) as arm:
+        station.do("foreign-program", seconds=1000)
+        station.wait_for(lambda state: state["runtime_state"] == "PLAYING")
+        begin = time.monotonic()
+        with suppress(ConnectError):
+            arm.open(control=True)
+            raise AssertionError("a program of somebody else was ended")
+        refused_s = time.monotonic() - begin
+        station.do("dashboard-stop")
+        return Row(nan, refused_s, "it is refused", usable(arm))
+
+
 def of_the_cell(do: Act) -> Do:
     return lambda station, _: do(station)
 
@@ -205,13 +221,13 @@ def rows() -> dict[str, Callable[[], Row]]:
         "closed in a freeze": closed_while_frozen,
         "controller killed, restarted": controller_restarted,
         "second client": second_client,
+        "program of others at a start": program_of_others,
         "child killed": partial(befall, signal_child(signal.SIGKILL), nothing),
         "child hangs": partial(befall, signal_child(signal.SIGSTOP), nothing),
         "we: kill -9": partial(application, signal.SIGKILL),
         "we: kill -9, next start at once": partial(application, signal.SIGKILL, at_once=True),
         "we: suspended": partial(application, signal.SIGSTOP),
         "we and child: kill -9": partial(application, signal.SIGKILL, child_too=True),
-        "we and child: kill -9, next start at once": partial(application, signal.SIGKILL, child_too=True, at_once=True),
     }
 
 

@@ -107,6 +107,14 @@ def test_without_the_typed_word_nothing_moves(
         assert not ftdrive.poses()
 
 
+def test_a_wrong_option_is_told_before_anybody_is_called(ftdrive: CommandLine) -> None:
+    outcome = ftdrive.run(
+        "calibrate", "--robot", "127.213.7.9", "--sensor", "ati-serial:///dev/no-such-port", "--redo", "3"
+    )
+    assert outcome.returncode == 2, outcome.stderr
+    assert "name the run with --resume" in outcome.stderr
+
+
 def test_nobody_there(ftdrive: CommandLine) -> None:
     outcome = ftdrive.run("calibrate", "--robot", "127.213.7.9", "--sensor", "ati-serial:///dev/no-such-port")
     assert outcome.returncode == 3

@@ -77,6 +77,40 @@ def moves_of(station: Station) -> int:
     return sum(event["what"] == "moves" for event in station.control(do="state", since=0)["events"])
 
 
+def programs_of(station: Station) -> list[str]:
+    """What happened to programs, and was asked for it."""
+    diary = station.control(do="state", since=0)["events"]
+    asked = [
+        event["what"] for event in diary if event["by"] == "dashboard" and event["what"] in {"stop", "play", "pause"}
+    ]
+    return asked + [event["what"] for event in diary if event["by"] in {"program", "script port"}]
+
+
+@pytest.mark.parametrize("dry", [True, False], ids=["dry-run", "calibrate"])
+def test_a_program_of_somebody_else_and_its_move_go_on(
+    dry: bool, station: Station, config: Path, ftdrive: CommandLine
+) -> None:
+    q_rad = station.control(do="state")["q_rad"]
+    goal = [*q_rad[:5], q_rad[5] - 3.0]
+    station.control(do="foreign-program", q_rad=goal, speed_rad_s=0.01)
+    deadline = time.monotonic() + 5
+    while not (before := station.control(do="state"))["moving"]:
+        assert time.monotonic() < deadline
+    programs = programs_of(station)
+    options = ("--dry-run",) if dry else ()
+    outcome = ftdrive.run("calibrate", "--config", config, *options, typed=QUESTIONS + FIRST_MOTION)
+    assert outcome.returncode == 7, outcome.stderr
+    said = " ".join(outcome.stderr.split())
+    assert "a program is on the controller (PLAYING" in said
+    assert "stop it at the pendant, then start again" in said
+    assert "Is the tool free" not in said
+    after = station.control(do="state")
+    assert (after["program"], after["runtime_state"], after["moving"]) == ("other", "PLAYING", True)
+    assert after["q_rad"][5] < before["q_rad"][5]
+    assert programs_of(station) == programs
+    assert not (ftdrive.folder / "runs").exists()
+
+
 def test_a_dry_run_shows_everything_and_moves_nothing(station: Station, config: Path, ftdrive: CommandLine) -> None:
     path = ftdrive.folder / "tour.json"
     outcome = ftdrive.run("calibrate", "--config", config, "--dry-run", "--output", path)
@@ -85,9 +119,16 @@ def test_a_dry_run_shows_everything_and_moves_nothing(station: Station, config: 
     again = ftdrive.run("calibrate", "--config", config, "--dry-run", "--output", path)
     assert again.returncode == 2
     assert "never overwritten" in again.stderr
-    for words in ("24 moves proven clear", "the controller accepts", "ball of 0.3", "wrist 3", "nothing has moved"):
+    for words in (
+        "24 moves proven clear",
+        "safety limits are not asked",
+        "ball of 0.3",
+        "wrist 3",
+        "nothing has moved",
+    ):
         assert words in outcome.stderr
     assert moves_of(station) == 0
+    assert programs_of(station) == []
     assert not (ftdrive.folder / "runs").exists()
 
 

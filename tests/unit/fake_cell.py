@@ -49,6 +49,10 @@ class FakeArm(RobotArm):
         self.stops = 0
         self.opened = 0
         self.control = False
+        self.program = "stopped"
+        """Of somebody else, as long as nobody has taken control."""
+        self.remote: bool | None = True
+        self.asked_limits = 0
         self.at_move: dict[int, Callable[[], None]] = {}
         self.forbidden: Array | None = None
         self.halted = threading.Event()
@@ -57,10 +61,11 @@ class FakeArm(RobotArm):
 
     def open(self, *, control: bool = False) -> None:
         self.opened += 1
-        self.control = control
+        self.control |= control
+        assert not control or self.program == "stopped", "a program of somebody else was ended"
 
     def close(self) -> None:
-        pass
+        self.control = False
 
     def identify(self) -> DeviceInfo:
         return DeviceInfo("UR5e", "A1", "5.15")
@@ -75,7 +80,10 @@ class FakeArm(RobotArm):
         return ArmState(time.monotonic_ns(), 0.0, q, np.zeros(6), at.R_base_flange[0], at.flange_m[0])
 
     def status(self) -> ArmStatus:
-        return self._status
+        return self._status if self.control else replace(self._status, program=self.program)
+
+    def in_remote_control(self) -> bool | None:
+        return self.remote
 
     def set_status(self, **different: Any) -> None:
         self._status = replace(STATUS, **different)
@@ -90,6 +98,8 @@ class FakeArm(RobotArm):
         self.set_status()
 
     def within_safety_limits(self, q_rad: Sequence[float]) -> bool:
+        assert self.control
+        self.asked_limits += 1
         return self.forbidden is None or not np.allclose(q_rad, self.forbidden)
 
     def move_to(

@@ -81,7 +81,7 @@ def test_a_ready_arm() -> None:
     [
         ({"fault": "protective stop: clear it"}, "robot.safety", "failed", "clear it"),
         ({"safety_mode": "reduced"}, "robot.safety", "warning", "normal mode"),
-        ({"program": "playing"}, "robot.program", "warning", "would end it"),
+        ({"program": "playing"}, "robot.program", "warning", "does not begin beside it"),
         ({"payload_kg": 0.0}, "robot.payload", "warning", "at the pendant"),
         ({"p_flange_payload_m": (0.0, 0.0, 0.0)}, "robot.payload", "warning", "centre of gravity at the pendant"),
         ({"speed_slider": 0.04}, "robot.speed", "failed", "at the pendant"),

@@ -1,14 +1,16 @@
 """What is checked before anything moves, on the fake cell: each finding is refused with its words."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from drivers.errors import StreamBroken
-from drivers.interfaces import ArmState
+from drivers.interfaces import ArmState, ArmStatus
 from ftdrive.config import ToolConfig, WorkcellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.session import preflight
@@ -84,6 +86,13 @@ def test_another_model_or_tcp_is_refused(lab: Lab) -> None:
     refuse(lab, "check the model and the active TCP")
 
 
+def test_another_arm_than_the_one_that_is_meant_is_refused(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, serial="A1"))
+    assert lab.calibrate(dry_run=True) is None
+    lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, serial="B2"))
+    refuse(lab, r"the arm at fake has serial A1, \[robot\] serial says B2")
+
+
 def test_a_stuck_sensor_is_refused(lab: Lab) -> None:
     lab.sensor.stuck = True
     refuse(lab, "did not change")
@@ -119,3 +128,79 @@ def test_a_plan_for_another_tool_is_refused(lab: Lab) -> None:
     with pytest.raises(NotAccepted, match="another tool"):
         lab.calibrate(plan=plan)
     assert lab.arm.moves == []
+
+
+@pytest.mark.parametrize("dry_run", [True, False])
+@pytest.mark.parametrize("program", ["playing", "paused"])
+def test_a_program_of_somebody_else_is_refused_before_anything_is_done(
+    program: str, dry_run: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(preflight, "_ENDS_S", 0.1)
+    monkeypatch.setattr(lab.arm, "program_told", lambda: "PLAYING pick.urp")
+    lab.arm.program = program
+    words = r"a program is on the controller \(PLAYING pick\.urp\) .* stop it at the pendant, then start again"
+    with pytest.raises(NotAccepted, match=words):
+        lab.calibrate(dry_run=dry_run)
+    assert (lab.arm.opened, lab.arm.moves, lab.operator.asked) == (1, [], [])
+
+
+def test_what_a_killed_session_left_behind_is_waited_for(lab: Lab) -> None:
+    left = iter(["playing", "playing", "stopping", "stopped"])
+    lab.arm.program = "playing"
+    looked = lab.arm.status
+
+    def status() -> ArmStatus:
+        lab.arm.program = next(left, "stopped")
+        return looked()
+
+    lab.arm.status = status  # type: ignore[method-assign]  # this arm only
+    assert lab.calibrate(dry_run=True) is None
+    assert next(left, None) is None
+
+
+def test_a_dry_run_takes_no_control_and_says_what_it_left_out(lab: Lab) -> None:
+    assert lab.calibrate(dry_run=True) is None
+    assert (lab.arm.opened, lab.arm.asked_limits) == (1, 0)
+    assert "safety limits are not asked for" in lab.said()
+
+
+def test_control_is_taken_when_all_else_is_well(lab: Lab) -> None:
+    lab.arm.set_status(payload_kg=0.0)
+    refuse(lab, "nothing hangs")
+    assert (lab.arm.opened, lab.arm.asked_limits) == (1, 0)
+
+
+def test_an_old_controller_is_controlled_from_the_start_for_it_tells_no_poses_before(lab: Lab) -> None:
+    lab.arm.set_status(tcp_offset=None)
+    right = lab.arm.state
+
+    def state() -> ArmState:
+        assert lab.arm.control
+        return right()
+
+    lab.arm.state = state  # type: ignore[method-assign]  # this arm only
+    lab.calibrate()
+    assert lab.stops()[-1] == 7
+
+
+def test_local_control_is_refused_in_a_dry_run_too(lab: Lab) -> None:
+    lab.arm.remote = False
+    with pytest.raises(NotAccepted, match="remote: the controller is in local control: press Local"):
+        lab.calibrate(dry_run=True)
+    lab.arm.remote = None
+    assert lab.calibrate(dry_run=True) is None
+
+
+@pytest.mark.parametrize(("late_s", "busy_for", "passes"), [(0.03, 9999, False), (0.03, 1, True), (0.008, 9999, True)])
+def test_an_arm_that_answers_late_is_refused(late_s: float, busy_for: int, passes: bool, lab: Lab) -> None:
+    right, left = lab.arm.state, [busy_for]
+
+    def late() -> ArmState:
+        left[0] -= 1
+        time.sleep(late_s if left[0] >= 0 else 0.0)
+        return right()
+
+    lab.arm.state = late  # type: ignore[method-assign]  # this arm only
+    found = preflight.check_link(cast("preflight.Before", SimpleNamespace(arm=lab.arm)))
+    assert found.passed == passes
+    assert passes or "20 ms are usual at most" in found.words

@@ -17,7 +17,7 @@ from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
 from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.plan import Plan
 from ftdrive.report import drift_in_words
-from ftdrive.session import machine
+from ftdrive.session import guided, machine
 from ftdrive.session.events import (
     Checked,
     Estimated,
@@ -358,6 +358,33 @@ def test_by_hand_nothing_is_planned_or_moved(option: dict[str, Any], lab: Lab) -
     with pytest.raises(ConfigError, match="leave out --" + next(iter(option)).replace("_", "-")):
         lab.calibrate(mode="manual", **option)
     assert not (lab.folder / "runs").exists()
+
+
+def test_options_that_cannot_be_used_are_told_before_anything_opens(lab: Lab) -> None:
+    lab.calibrate()
+    opened, run = lab.arm.opened, lab.run()
+    with pytest.raises(ConfigError, match="name the run with --resume"):
+        lab.calibrate(redo=(3,))
+    with pytest.raises(ConfigError, match="pose 8 cannot be taken again: the run has poses 1 to 7"):
+        lab.calibrate(resume=run.folder, redo=(7, 8))
+    damaged = lab.folder / "damaged.json"
+    damaged.write_text(run.plan_path.read_text().replace('"clearance_m"', '"clearance"', 1))
+    with pytest.raises(PlanRefused):
+        lab.calibrate(plan=damaged)
+    assert lab.arm.opened == opened
+
+
+def test_a_cell_that_cannot_be_built_is_told_before_its_sensor_opens(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: object) -> None:
+        raise ConfigError("[robot] driver")
+
+    def opened() -> None:
+        raise AssertionError("opened")
+
+    monkeypatch.setattr(guided, "build_arm", refuse)
+    monkeypatch.setattr(lab.sensor, "open", opened)
+    with pytest.raises(ConfigError, match="driver"):
+        lab.calibrate()
 
 
 def test_a_run_of_another_sensor_is_not_gone_on_with(lab: Lab) -> None:

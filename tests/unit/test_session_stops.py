@@ -14,6 +14,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.runs import Run
 from ftdrive.session import guided
 from ftdrive.session.events import (
+    Checked,
     Event,
     GuardTripped,
     Noted,
@@ -111,7 +112,7 @@ def test_a_fault_on_the_way_stops_the_arm_and_resume_goes_on(fault: str, lab: La
     assert outcome is not None
     (trip,) = lab.operator.of(GuardTripped)
     assert trip.hazard == hazard
-    assert lab.arm.opened == 2
+    assert lab.arm.opened == 3  # to look, to take control, and again
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     states = lab.operator.states()
     stop = states.index(State.STOP)
@@ -328,3 +329,101 @@ def test_saturated_samples_discard_the_pose(lab: Lab, monkeypatch: pytest.Monkey
         lab.calibrate()
     assert lab.operator.of(GuardTripped)[0].hazard == 13
     assert lab.stops() == [1, 2, 3]
+
+
+QUESTIONS = ("Is the tool free", "Is the ball of", "Is the emergency stop in reach")
+
+
+def hold_and_resume(lab: Lab, fault: Callable[[], None], mend: Callable[[], None]) -> None:
+    """Let something stop the arm in its fourth move, and be mended when a person is asked."""
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, StateChanged) and event.state is State.HOLD:
+            lab.operator.asked.clear()
+            lab.operator.told.clear()
+            lab.arm.asked_limits = 0
+            mend()
+
+    lab.arm.at_move[4] = fault
+    lab.operator.on_event = on_event
+    lab.operator.answers.setdefault("Type resume", ["resume"])
+    lab.calibrate()
+
+
+@pytest.mark.parametrize("mode", ["robot emergency stop", "safeguard stop", "protective stop"])
+def test_after_an_emergency_stop_the_whole_preflight_is_done_again_questions_too(mode: str, lab: Lab) -> None:
+    hold_and_resume(lab, lambda: lab.arm.set_status(fault="a stop", safety_mode=mode), lab.arm.set_status)
+    names = [event.name for event in lab.operator.of(Checked)]
+    assert names == [
+        *("safety", "remote", "model", "payload", "slider", "link", "sensor", "load", "workcell", "plan", "cable"),
+        *("disk", "limits"),
+    ]
+    asked = [question for question in lab.operator.asked if question.text.startswith(QUESTIONS)]
+    assert len(asked) == (0 if mode == "protective stop" else 3)
+    assert all(question.assumed is None for question in asked)
+
+
+def test_the_controller_is_asked_for_every_pose_once_more_but_not_for_the_ways_between(lab: Lab) -> None:
+    asked: list[int] = []
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, Checked) and event.name == "limits":
+            asked.append(lab.arm.asked_limits)
+        if isinstance(event, StateChanged) and event.state is State.HOLD:
+            lab.arm.asked_limits = 0
+            lab.arm.set_status()
+
+    lab.operator.on_event = on_event
+    lab.arm.at_move[4] = lambda: lab.arm.set_status(fault="a stop", safety_mode="protective stop")
+    lab.operator.answers["Type resume"] = ["resume"]
+    lab.calibrate()
+    first, again = asked
+    assert first > 50
+    assert again == 7
+
+
+def test_what_became_wrong_while_the_arm_stood_is_found_before_it_goes_on(lab: Lab) -> None:
+    def mend() -> None:
+        lab.sensor.push = np.zeros(6)
+        lab.arm.remote = False  # and meanwhile somebody took the arm to the pendant
+
+    def told(event: Event) -> None:
+        if isinstance(event, Noted) and event.words.startswith("not yet"):
+            lab.arm.remote = True
+        held(event)
+
+    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    lab.arm.at_move[4] = lambda: setattr(lab.sensor, "push", np.array([150.0, 0, 0, 0, 0, 0]))
+
+    def held(event: Event) -> None:
+        if isinstance(event, StateChanged) and event.state is State.HOLD:
+            mend()
+
+    lab.operator.on_event = told
+    lab.calibrate()
+    (refused,) = [event.words for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
+    assert "remote: the controller is in local control" in refused
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_a_question_that_is_not_answered_with_yes_leads_back_to_the_hold(lab: Lab) -> None:
+    lab.operator.answers["Is the emergency stop in reach"] = ["yes", "no", "yes"]
+    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    hold_and_resume(
+        lab, lambda: lab.arm.set_status(fault="a stop", safety_mode="robot emergency stop"), lab.arm.set_status
+    )
+    (refused,) = [event.words for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
+    assert "not confirmed" in refused
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+
+
+@pytest.mark.parametrize("stays", [True, False])
+def test_reduced_mode_that_stays_is_confirmed_before_the_arm_goes_on(stays: bool, lab: Lab) -> None:
+    hold_and_resume(
+        lab,
+        lambda: lab.arm.set_status(safety_mode="reduced"),
+        lambda: None if stays else lab.arm.set_status(),
+    )
+    asked = [question for question in lab.operator.asked if "in reduced mode" in question.text]
+    assert len(asked) == stays
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]

@@ -24,8 +24,11 @@ slider at zero          `DeviceTimeout`   stopped, still ours            `test_a
 our process killed      -                 stopped by the child           `test_ur_arm.py`
 the child killed, hung  `StreamBroken`,   stopped through the dashboard  `test_ur_arm.py`
                         `DeviceTimeout`
-both killed             -                 finishes its move; the next    `test_both_processes_killed`
-                                          start stops it
+both killed             -                 finishes its move; its         `test_both_processes_killed`
+                                          program is for the operator
+                                          to stop
+program of others       `ConnectError`    goes on: nothing of theirs     `test_a_program_of_somebody_else_is_never…`,
+at a start              of the opening    is touched                     `test_a_program_that_took_the_place_of_ours…`
 our process suspended   `DeviceTimeout`   stopped by the child           `test_suspended_in_a_move`
 both suspended          as the arm is     finishes its move              `test_both_processes_suspended`
 suspended while idle    -                 stands                         `test_nothing_old_is_believed`
@@ -451,6 +454,38 @@ def test_a_program_of_somebody_else_is_not_stopped_by_leaving(station: Station, 
     station.do("dashboard-stop")
 
 
+@pytest.mark.parametrize("paused", [False, True], ids=["playing", "paused"])
+def test_a_program_of_somebody_else_is_never_ended_for_a_start(station: Station, paused: bool) -> None:
+    q = station.do("state")["q_rad"]
+    q[5] += -STEP_RAD if q[5] > 0.5 else STEP_RAD
+    station.do("foreign-program", q_rad=q, speed_rad_s=0.5 / TIME_SCALE)
+    station.wait_for(lambda state: state["moving"])
+    if paused:
+        station.dashboard("pause")
+        station.wait_for(lambda state: state["runtime_state"] == "PAUSED")
+    before = len(station.do("state")["events"])
+    said = refused(station)
+    assert re.search(r"not started is on .* \((PLAYING|PAUSED) .*\) and is not ended: stop it at the pendant", said)
+    state = station.do("state", since=before)
+    assert not [event for event in state["events"] if event["by"] in ("script port", "program")]
+    assert not [event for event in state["events"] if event["by"] == "dashboard" and event["what"] == "stop"]
+    assert state["program"] == "other"
+    station.do("dashboard-stop")
+
+
+def test_a_program_that_took_the_place_of_ours_is_not_ended_when_the_arm_is_opened_again(
+    station: Station, arm: UrArm
+) -> None:
+    station.do("foreign-program", seconds=1000)
+    station.wait_for(lambda state: state["program"] == "other" and state["runtime_state"] == "PLAYING")
+    with pytest.raises(ConnectError, match="stop it at the pendant"):
+        arm.open(control=True)
+    assert station.do("state")["program"] == "other"
+    assert station.do("state")["runtime_state"] == "PLAYING"
+    station.do("dashboard-stop")
+    moves_again(arm)
+
+
 # ---------------------------------------------------------------------- sentences
 
 
@@ -579,10 +614,13 @@ def test_both_processes_killed(station: Station, application: Application) -> No
     os.kill(application.child, signal.SIGKILL)
     application.process.kill()
     assert station.do("state")["moving"]  # nobody is left to stop it
+    said = refused(station)  # nobody can tell it from a program of somebody else
+    assert "is not ended: stop it at the pendant, then start again" in said
+    station.wait_for(lambda state: not state["moving"], within_s=3)
+    assert station.do("state")["runtime_state"] == "PLAYING"
+    station.do("dashboard-stop")
     arm = new_arm(station.host)
-    t0 = time.monotonic()
     moves_again(arm)
-    assert time.monotonic() - t0 < RESUMED_S
     arm.close()
 
 
