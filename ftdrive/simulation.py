@@ -31,8 +31,8 @@ SENSORS = {
 """Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm."""
 EMULATED = "emulated://"
 
-PAYLOAD_KG, PAYLOAD_COG_M = 1.5, "0,0,0.06"
-"""What its controller is told about the tool, as somebody should have."""
+_PAYLOAD_COG_M = "0,0,0.06"
+"""What its controller is told about the tool, as somebody should have; it knows the mass."""
 _CONNECTIONS_END_S = 3.0
 TOOL_MM = (0.0, 200.0, 100.0)
 
@@ -55,8 +55,7 @@ class Station:
 
     def __enter__(self) -> Self:
         command = [sys.executable, "-P", "-m", "mocks", "station", "--sensor", self.sensor]
-        command += ["--time-scale", str(TIME_SCALE), "--payload", str(PAYLOAD_KG)]
-        command += ["--payload-cog", PAYLOAD_COG_M, *self.options]
+        command += ["--time-scale", str(TIME_SCALE), "--payload-cog", _PAYLOAD_COG_M, *self.options]
         # A session of its own: Ctrl-C in the terminal is for us, not for the emulated cell.
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True

@@ -63,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--no-tcp-offset", action="store_true", help="answer NOT_FOUND to the RTDE output tcp_offset")
     add("--serial-number", default="20225500001")
     add("--tcp", type=_vector(6), default=[0.0] * 6, metavar="x,y,z,rx,ry,rz", help="active TCP, m and rad")
-    add("--payload", type=float, default=0.0, metavar="kg", help="payload set in the controller")
+    add("--payload", type=float, metavar="kg", help="payload set in the controller (default: the tool's true mass)")
     add("--payload-cog", type=_vector(3), default=[0.0] * 3, metavar="x,y,z", help="its centre in the flange, m")
     add("--start-q-deg", type=_vector(6), metavar="q1,…,q6", help="start posture (default near the tour's first pose)")
     add("--joint-limit-deg", type=_positive, default=360.0)

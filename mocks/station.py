@@ -106,7 +106,7 @@ class Station:
                 polyscope=options.polyscope,
                 serial_number=options.serial_number,
                 tcp=vector6(options.tcp),
-                payload_kg=options.payload,
+                payload_kg=self.world.truth.mass_kg if options.payload is None else options.payload,
                 payload_cog_m=vector3(options.payload_cog),
                 joint_limit_rad=math.radians(options.joint_limit_deg),
                 plane=options.plane,

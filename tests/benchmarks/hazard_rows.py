@@ -16,9 +16,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from ftdrive.config import CellConfig, ToolConfig, WorkcellConfig
-from ftdrive.simulation import PAYLOAD_KG, Station
+from ftdrive.simulation import Station
 
 Json = dict[str, Any]
+
+PAYLOAD_KG = 1.5
+"""What the controllers of all rows are told, where a row does not say otherwise."""
 
 UNSEEN: Final[Mapping[str, str]] = {
     "1 cable, gently": "nothing stops the arm below the contact limit; the report names poses (test_disturbances.py)",

@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftdrive.config import FORMAT, CellConfig
 from ftdrive.simulation import Station
-from tests.benchmarks.hazard_rows import Beforehand, Child, Fault, Json, Scene
+from tests.benchmarks.hazard_rows import PAYLOAD_KG, Beforehand, Child, Fault, Json, Scene
 
 Array = NDArray[np.float64]
 
-REAL_TIME: Final = ("--time-scale", "1", "--seed", "11")
+REAL_TIME: Final = ("--time-scale", "1", "--seed", "11", "--payload", str(PAYLOAD_KG))
 QUIET: Final = ("--noise", "0.005,0.0002")
 """A tenth of the usual. Without any, the sensor would be taken for a stuck one."""
 DEEP_S: Final = 0.6

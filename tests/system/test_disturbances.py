@@ -27,8 +27,8 @@ POSES = 12
 PUSH = [1.5, 1.0, 0.0, 0.0, 0.0, 0.0]
 """N in base axes: far below what stops the arm."""
 CONTACT = 14
-SETUP = 2
-"""Hints that every run of this cell ends with: its controller was told another payload, and its base leans."""
+LEANS = 1
+"""Every run of this cell ends with the hint that its base leans."""
 NOTHING = [0.0] * 6
 
 
@@ -129,7 +129,7 @@ def test_pushes_and_a_tap_while_poses_are_averaged(
     assert outcome.result.rejected_poses == (pushed,)
     assert f"? {first} reads otherwise at the end, and the poses between do not drift: was it touched then?" in text
     assert "warm up" not in text
-    assert text.count(" ? ") == 2 + SETUP
+    assert text.count(" ? ") == 2 + LEANS
     assert_near(outcome, dict(station.truth))
 
 
@@ -170,7 +170,7 @@ def test_a_sensor_that_drifts_by_half_a_newton(
     text = words_of(outcome)
     assert "N/min" in text
     assert "the sensor drifts: let it warm up" in text
-    assert text.count(" ? ") == 1 + SETUP
+    assert text.count(" ? ") == 1 + LEANS
     found = outcome.result.drift
     assert found is not None
     assert found.change[2] == pytest.approx(drifted_N[-1] - drifted_N[0], abs=4 * found.sigma[2])

@@ -59,7 +59,7 @@ def test_a_healthy_cell(ftdrive: CommandLine) -> None:
     assert answer["push"]["base"]["force_N"] == pytest.approx([15, 0, 0], abs=0.2)
     assert np.linalg.norm(answer["push"]["sensor"]["force_N"]) == pytest.approx(15, abs=0.2)
     assert not any(ftdrive.folder.iterdir())  # it only looked
-    assert checks["robot.payload"]["found"] == "payload 1.50 kg at (0, 0, 60) mm from the flange"
+    assert checks["robot.payload"]["found"] == "payload 0.50 kg at (0, 0, 60) mm from the flange"
     assert re.fullmatch(r"127\.[0-9.]+ answers in [0-9]+\.[0-9] ms", checks["robot.reachable"]["found"])
 
 
