@@ -35,7 +35,9 @@ _LINK_S: Final = 0.5
 _LINK_TRIES: Final = 3
 _LATENCY_S, _GAP_S = 0.02, 0.1
 """Of a usual answer, and of nine in ten. 8 ms of it are the wait for the next sample; on a healthy link to an emulated
-arm it is 8 ms, and up to 16 ms with three times more to do than the computer has cores for."""
+arm it is 8 ms, and up to 16 ms with more to do than the computer has cores for."""
+_ASKING_S: Final = 0.04
+"""On top of it where a controller tells its TCP only to a program, which is asked twice: 24 ms on a healthy link."""
 _ENDS_S: Final = 1.5
 """What a session that was killed has left on the controller ends by itself within 0.5 s."""
 _FREE_BYTES: Final = 200_000_000
@@ -280,7 +282,9 @@ def check_load(before: Before) -> Checked:
 
 def check_link(before: Before) -> Checked:
     """Row 16: states of the arm come soon and without gaps, in one of three half seconds."""
-    words = ""
+    words, limit_s = "", _LATENCY_S
+    if before.arm.status().tcp_offset is None:
+        limit_s += _ASKING_S
     for _ in range(_LINK_TRIES):  # a computer that is busy for a moment is no bad link
         took_s, end_s = list[float](), time.monotonic() + _LINK_S
         try:
@@ -291,9 +295,9 @@ def check_link(before: Before) -> Checked:
             return _failed("link", str(error))
         usual_s = float(np.median(took_s))
         words = f"the arm answers within {1e3 * usual_s:.0f} ms, once {1e3 * max(took_s):.0f} ms"
-        if usual_s < _LATENCY_S and np.quantile(took_s, 0.9) < _GAP_S:
+        if usual_s < limit_s and np.quantile(took_s, 0.9) < _GAP_S:
             return _passed("link", words)
-    limit = f"{1e3 * _LATENCY_S:.0f} ms are usual at most"
+    limit = f"{1e3 * limit_s:.0f} ms are usual at most"
     return _failed("link", f"{words} ({limit}): use a cable, and give this computer and network less to do")
 
 
