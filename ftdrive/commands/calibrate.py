@@ -42,7 +42,7 @@ _EXCLUDE_ONE_ANOTHER = (
 )
 @click.option("--manual", is_flag=True, help="No motion at all: you move the arm, ftdrive tells where to.")
 @click.option("--listen", is_flag=True, help="No motion at all: a program on the pendant moves the arm.")
-@click.option("--dry-run", is_flag=True, help="Plan, show and check everything; nothing moves.")
+@click.option("--dry-run", is_flag=True, help="Plan, show, check all that can be seen without control; nothing moves.")
 @click.option("--output", type=NewFile(), help="Save the plan as a new JSON file.")
 @click.option("--png", type=NewFile(), help="Save stick figures (needs ftdrive[viz]).")
 @click.option("--view", is_flag=True, help="Show the plan in the browser first, until you answer (needs ftdrive[viz]).")

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.design import predicted_sigma, special
+from calib.design import predicted_sigma
 from ftdrive.config import CellConfig
 from ftdrive.planning.approach import Approach
 from ftdrive.planning.certify import Certifier
@@ -96,11 +96,10 @@ def prediction(plan: Plan, certifier: Certifier, mass_kg: float | None, average_
     force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (sigma[:3], sigma[3:]))
     guess = replace(guess_of(certifier, mass_kg or USUAL_KG), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
     found = predicted_sigma(np.array([step.R_base_flange for step in plan.steps]), guess)
-    all_24 = predicted_sigma(special(range(1, 25)), guess)
     assumed = "" if mass_kg else " (assumed: [tool] mass_kg is not told)"
     return (
         f"this sensor's averages of {average_s:g} s are good to {force_N:.2g} N, {torque_Nm:.2g} N·m; predicted from "
         f"that for {guess.mass_kg:g} kg{assumed}, one sigma: mass {1e3 * float(found.sigma['mass_kg']):.2g} g, force "
         f"bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
-        f"{found.torque_rms_Nm:.2g} N·m, {found.force_rms_N / all_24.force_rms_N:.2f} times that of all 24 poses"
+        f"{found.torque_rms_Nm:.2g} N·m"
     )
