@@ -156,7 +156,7 @@ def _title(view: View, now_s: float, width: int) -> Text:
     left = view.last.stops - kept if view.last else 0
     if len(times_s) > 2 and left > 0:
         usual_s = median(b - a for a, b in pairwise(times_s))  # a stop with questions is not usual
-        rest_s = max(usual_s * left - (now_s - times_s[-1]), 0.0)
+        rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)  # nothing goes on in a hold
         right += f", about {_minutes(rest_s)} left"
     name = "ftdrive calibrate"
     return Text.assemble((name, "bold"), " " * max(width - len(name) - len(right), 2), right)

@@ -541,7 +541,7 @@ class Tour:
         self._reopened.add(stop)
         try:
             self._recover(trip.hazard)
-        except (Tripped, DriverError, NotAccepted) as error:
+        except (Tripped, DriverError, NotAccepted, Declined) as error:
             log.info("the sensor does not come back: %s", error)
             return False
         self._desk.tell(Noted(words=f"{trip}; it is back, pose {stop} begins anew", warning=True))

@@ -269,7 +269,8 @@ def check_load(before: Before) -> Checked:
     """Row 13: twice the tool's weight fits into the sensor's range."""
     mass_kg = before.cell.tool.mass_kg
     if before.sensor_range is None or mass_kg is None:
-        return _passed("load", "the sensor itself tells when it is overloaded")
+        what = "the tool's mass" if mass_kg is None else "the sensor's range"
+        return _passed("load", f"not compared: {what} is not known; a sensor that tells an overload stops the arm")
     weight_N = mass_kg * G_M_S2
     lever_m = max(part.to_m for part in before.certifier.arm.tool)
     share = max(
@@ -351,9 +352,10 @@ def edges(q_rad: Array, step_rad: float) -> Array:
 @contextmanager
 def awake() -> Iterator[str]:
     """Row 18: keep the computer from going to sleep where systemd can; yields what was done, in words."""
+    asleep = "this computer is not kept awake: see that it does not go to sleep"
     tool = shutil.which("systemd-inhibit") if sys.platform == "linux" else None
     if tool is None:
-        yield "this computer is not kept awake: see that it does not go to sleep"
+        yield asleep
         return
     command = [tool, "--what=sleep:idle", "--who=ftdrive", "--why=an arm is under way", "--mode=block", "cat"]
     # `cat` ends with our end of its stdin, so the inhibition cannot outlive us.
@@ -367,7 +369,7 @@ def awake() -> Iterator[str]:
     try:
         with suppress(subprocess.TimeoutExpired):  # it only ends by itself when nobody grants the wish
             process.wait(timeout=0.3)
-        yield "this computer is kept awake" if process.returncode is None else "this computer cannot be kept awake"
+        yield "this computer is kept awake" if process.returncode is None else asleep
     finally:
         if process.stdin is not None:
             process.stdin.close()

@@ -114,11 +114,15 @@ def drawn(found: View, *, width: int = 80, height: int = 24, now_s: float = 9.0)
     return [line.rstrip() for line in file.getvalue().splitlines()]
 
 
+def test_a_long_hold_brings_the_end_no_nearer() -> None:
+    assert drawn(view(*MIDDLE), now_s=5000.0)[0].endswith("6 kept, about 18 s left")
+
+
 def test_everything_needed_is_on_a_screen_of_80_by_24() -> None:
     lines = drawn(view(*MIDDLE, Noted(words="R12 was repeated", warning=True)))
     assert len(lines) <= 23
     assert lines == [
-        "ftdrive calibrate                                        6 kept, about 16 s left",
+        "ftdrive calibrate                                        6 kept, about 18 s left",
         "pose 7/25 R05  SETTLE  1 s",
         "R14: settled 0.9 s, 2000 samples, sigma 0.031 N 0.0012 N·m",
         "     residual 0.062 N, 1.4 sigma against the fit before it",
