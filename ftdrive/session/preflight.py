@@ -20,6 +20,7 @@ from drivers.errors import DriverError
 from drivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
 from ftdrive.config import CellConfig
 from ftdrive.errors import NotAccepted, PlanRefused
+from ftdrive.mismatch import PAYLOAD_KG, PAYLOAD_SHARE
 from ftdrive.planning.approach import Approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.nodes import WRIST_6_RAD
@@ -46,7 +47,6 @@ _EDGE_RAD: Final = float(np.radians(5))
 _ROUNDED_RAD: Final = float(np.radians(1))
 """A plan is made for where the arm stands, rounded."""
 _LOAD: Final = 0.8
-_PAYLOAD_KG, _PAYLOAD_SHARE = 0.5, 0.3
 _PAYLOAD_M: Final = 0.1
 """How far outside of the described tool the centre of the payload may be."""
 
@@ -216,7 +216,7 @@ def check_payload(before: Before) -> Checked:
     if parts[0] is None:
         return _passed("payload", f"the controller carries {told:.2f} kg; nothing in [tool] to compare it with")
     expected = sum(part for part in parts if part is not None)
-    if abs(told - expected) > max(_PAYLOAD_KG, _PAYLOAD_SHARE * expected):
+    if abs(told - expected) > max(PAYLOAD_KG, PAYLOAD_SHARE * expected):
         return _failed(
             "payload",
             f"the controller carries {told:.2f} kg, sensor and tool are {expected:.2f} kg: correct one of the two",
