@@ -67,7 +67,7 @@ def init(
     The arm is only read and nothing moves. A file that is there already is never overwritten. What must be measured has
     no default, and `measured = false` in the file stays until you change it.
     """
-    from calib.files import write_new
+    from calib.files import require_new, write_new
     from drivers.ur.kinematics import model_named
     from ftdrive.cellfile import cell_file
     from ftdrive.config import FILE, CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, settings
@@ -81,6 +81,7 @@ def init(
         raise FileExistsError(
             f"{path} exists already and is never overwritten: edit it, or choose another with --output"
         )
+    require_new(path)  # before the questions: their answers would be lost
     said = settings()
     with ExitStack() as stack:
         if simulate:

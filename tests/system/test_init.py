@@ -141,6 +141,13 @@ def test_a_robot_that_does_not_answer_is_exit_code_3(station: Station) -> None:
     assert not Path("ftdrive.toml").exists()
 
 
+def test_a_folder_that_is_not_there_is_told_before_anything_is_asked(tmp_path: Path) -> None:
+    path = tmp_path / "nowhere" / "cell.toml"
+    error = run("--robot", "127.99.99.9", "--sensor", "ati-can://can0", *TOOL, "--yes", "--output", str(path)).exception
+    assert isinstance(error, FileNotFoundError)
+    assert "create it first" in str(error)
+
+
 def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
     answers = ["127.99.99.9", station.cell.robot.host, "ati-nonsense://x", station.endpoints["serial"]["port"]]
     answers += ["high", "3300", "33", "", ""]
