@@ -126,14 +126,14 @@ def test_somebody_guides_the_arm_and_lets_go(station: Answering) -> None:
         station.do("hand-guide", on=False)
     assert state["runtime_state"] == "STOPPED"
     assert state["q_rad"][:3] == before["q_rad"][:3]
-    station.until(lambda s: not s["moving"])
+    station.until(lambda s: s["steady"])
 
 
 def test_somebody_starts_a_program_on_the_pendant(station: Answering) -> None:
     assert station.do("pendant-program", rest_s=0.05)["accepted"]
     station.until(lambda s: s["program"] == "turns" and s["moving"])
     station.do("dashboard-stop")
-    station.until(lambda s: not s["moving"] and s["runtime_state"] == "STOPPED")
+    station.until(lambda s: s["steady"] and s["runtime_state"] == "STOPPED")
 
 
 def test_a_pushed_joint_and_a_changed_payload(station: Answering) -> None:
