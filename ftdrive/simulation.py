@@ -30,6 +30,11 @@ SENSORS = {
 }
 """Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm."""
 EMULATED = "emulated://"
+MOVED_BY: Mapping[str, tuple[Mapping[str, Any], str]] = {
+    "manual": ({"do": "hand-guide"}, "somebody guides its arm by hand from orientation to orientation"),
+    "listen": ({"do": "pendant-program"}, "somebody starts a program on its pendant, which turns the wrist"),
+}
+"""Who moves the emulated arm where a session does not, by its mode: what the cell is asked for, and words for it."""
 
 _PAYLOAD_COG_M = "0,0,0.06"
 """What its controller is told about the tool, as somebody should have; it knows the mass."""

@@ -12,6 +12,7 @@ from ftdrive.commands.common import NewFile, rows, runs, stop_unless_accepted, w
 
 if TYPE_CHECKING:
     from ftdrive.config import CellConfig
+    from ftdrive.session.guided import Mode
     from ftdrive.session.outcome import Outcome
 
 _OF_A_PLAN = ("--quick", "--minimal", "--output", "--png", "--view")
@@ -96,7 +97,7 @@ def calibrate(
     from ftdrive.screen import open_operator
     from ftdrive.session.guided import Options
     from ftdrive.session.guided import calibrate as guide
-    from ftdrive.simulation import Station, sensor_name
+    from ftdrive.simulation import MOVED_BY, Station, sensor_name
     from ftdrive.talk import talk
 
     given = {
@@ -116,15 +117,21 @@ def calibrate(
         "--tool": tool,
     }
     _refuse_contradictions([option for option, value in given.items() if value])
+    mode: Mode = "step" if step else "manual" if manual else "listen" if listen else "auto"
     with ExitStack() as stack:
         description: dict[str, Any] = {}
-        made_by = {} if resume is None else Run(resume).header_to_resume().get("station") or {}
+        begun = {} if resume is None else Run(resume).header_to_resume()
+        made_by = begun.get("station") or {}
         simulate = simulate or bool(made_by and not (config or robot or tool))  # a run goes on where it was begun
         if simulate:
             name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
             station = stack.enter_context(Station(name, made_by.get("options", ())))
             cell = station.cell
             description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
+            if mover := MOVED_BY.get(begun.get("mode", mode) if mode == "auto" else mode):
+                request, words = mover
+                station.control(**request)
+                talk.print(f"The cell is emulated: {words}.")
         else:
             said = Said(str(config.absolute()) if config else None, robot, sensor, tool)
             description = {"said": said.to_dict()}
@@ -132,7 +139,7 @@ def calibrate(
         options = Options(
             runs,
             poses=6 if minimal else 12 if quick else 24,
-            mode="step" if step else "manual" if manual else "listen" if listen else "auto",
+            mode=mode,
             dry_run=dry_run,
             fast=fast,
             output=output,

@@ -50,6 +50,7 @@ from ftdrive.session.watch import Guards
 from ftdrive.wiring import build_arm, build_sensor
 
 Array = NDArray[np.float64]
+Mode = Literal["auto", "step", "manual", "listen"]
 
 _GRID_RAD: Final = float(np.radians(0.1))
 """Plans are made where joints 1 to 3 stand, to this grid: the same place gives the same plan, and hash, again."""
@@ -69,7 +70,7 @@ class Options:
     runs: Path
     name: str = "calibrate"
     poses: int = 24
-    mode: Literal["auto", "step", "manual", "listen"] = "auto"
+    mode: Mode = "auto"
     """A run that is resumed keeps to its own where nothing else is said."""
     dry_run: bool = False
     fast: bool = False

@@ -6,6 +6,7 @@ from typing import Any
 
 from mocks.kinematics import ZERO6, vector3, vector6
 from mocks.ur import dashboard
+from mocks.ur.hand import REST_S, guided_by_hand, pendant_program
 from mocks.ur.modes import PERMITTED, RobotMode, SafetyMode
 from mocks.ur.robot import Robot
 from mocks.ur.script import Upload
@@ -44,6 +45,8 @@ class Operator:
             "foreign-program": self._foreign_program,
             "close-popup": lambda _request: self._pendant("close-popup", "close popup"),
             "hand-move": self._hand_move,
+            "hand-guide": self._hand_guide,
+            "pendant-program": self._pendant_program,
             "push-joint": self._push_joint,
             "slider": self._slider,
             "speed-scaling": self._speed_scaling,
@@ -146,6 +149,15 @@ class Operator:
         self._robot.note("operator", "hand-move", q_rad=list(q))
         return {"done": "hand-move"}
 
+    def _hand_guide(self, request: Request) -> dict[str, Any]:
+        self._robot.hand = guided_by_hand(self._robot, _rest_s(request)) if _on(request) else None
+        self._robot.note("operator", "hand-guide", on=_on(request))
+        return {"done": "hand-guide"}
+
+    def _pendant_program(self, request: Request) -> dict[str, Any]:
+        accepted = self._robot.upload(pendant_program(self._robot, _rest_s(request)), by="operator")
+        return {"done": "pendant-program", "accepted": accepted}
+
     # -- other clients, and the controller's own trouble --------------------------------------------------------------
 
     def _dashboard_stop(self, _request: Request) -> dict[str, Any]:
@@ -216,3 +228,10 @@ def _fraction(request: Request) -> float:
     if not 0.0 <= fraction <= 1.0:
         raise ValueError(f"fraction {fraction} is not between 0 and 1")
     return fraction
+
+
+def _rest_s(request: Request) -> float:
+    rest_s = float(request.get("rest_s", REST_S))
+    if not 0.0 < rest_s < math.inf:
+        raise ValueError(f"rest_s {rest_s} is no positive time")
+    return rest_s

@@ -5,7 +5,7 @@ in it (clock, motion, settling, the waiting times of the controller). The watchd
 and so does the clock when the arm's own sensor is the station's: every sensor samples in real time.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -125,6 +125,8 @@ class Robot:
         self.output_doubles = [0.0] * 48
         self.events: list[Event] = []
         """What happened, newest last: commands taken and refused, program, safety, the arm starting and stopping."""
+        self.hand: Iterator[None] | None = None
+        """Somebody who guides the arm; moves on once per control cycle."""
         self._remote_control = True
         self._reduced = False
         self._program: ControlScript | Program | None = None
@@ -159,6 +161,8 @@ class Robot:
         self._later = [(when, action) for when, action in self._later if when > self._physical_s]
         for action in due:
             action()
+        if self.hand is not None:
+            next(self.hand, None)
         if self.runtime == Runtime.PLAYING and self._program is not None:
             try:
                 if not self._program.step():
@@ -297,6 +301,11 @@ class Robot:
         self._start(Program(self, self.loaded_program, ""))
         return True
 
+    @property
+    def hand_obstacle(self) -> str | None:
+        """Why nobody can move the arm by hand now; None when somebody can."""
+        return "a program plays" if self.runtime == Runtime.PLAYING else self.obstacle
+
     def hand_move(self, q: Vector6, speed_rad_s: float) -> None:
         """Somebody moves the arm by hand, as in freedrive: no program plays, and the set-point goes with the joints.
 
@@ -305,9 +314,8 @@ class Robot:
         ValueError
             When a program plays or the arm has no power.
         """
-        obstacle = "a program plays" if self.runtime == Runtime.PLAYING else self.obstacle
-        if obstacle:
-            raise ValueError(f"nobody can move the arm by hand: {obstacle}")
+        if self.hand_obstacle:
+            raise ValueError(f"nobody can move the arm by hand: {self.hand_obstacle}")
         self.arm.start(HandMove(self.arm.dh, q, speed_rad_s, HAND_ACCELERATION_RAD_S2), "hand")
 
     # -- safety and power ---------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """Somebody else moves the emulated arm while the session only looks: over real wires, to a result within its sigmas."""
 
+import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -8,11 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from calib import solve
 from calib.routine import PoseRecord, TourPose, dataset_from, drift_check
-from drivers.errors import StreamBroken
+from drivers.errors import DriverError, StreamBroken
 from drivers.interfaces import ArmState, RobotArm
+from ftdrive import simulation
+from ftdrive.cli import cli
 from ftdrive.planning.constant_tour import NUMBERS, constant_tour
 from ftdrive.report import errors_in_sigma
 from ftdrive.runs import Run
@@ -180,3 +184,21 @@ def test_a_lost_sensor_ends_it_with_the_poses_on_disk(station: Station, tmp_path
     with pytest.raises(StreamBroken):
         watch(station, run, listen=True, commit=commit)
     assert len(run.records()) == 2
+
+
+@pytest.mark.parametrize("mode", ["manual", "listen"])
+def test_somebody_in_the_emulated_cell_brings_it_to_its_end(
+    mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request, words = simulation.MOVED_BY[mode]
+    monkeypatch.setattr(simulation, "MOVED_BY", {mode: ({**request, "rest_s": 1.2}, words)})  # in a hurry
+    arguments = ["calibrate", "--simulate", f"--{mode}", "--runs", str(tmp_path), "--json"]
+    outcome = CliRunner().invoke(cli, arguments)
+    if isinstance(outcome.exception, DriverError):  # where much else runs, an emulated sensor may get no time for 0.3 s
+        outcome = CliRunner().invoke(cli, arguments)
+    assert outcome.exit_code == 0, (outcome.output, outcome.exception)
+    assert words in outcome.stderr
+    told = json.loads(outcome.stdout.splitlines()[-1])
+    assert told["verdict"] != "rejected"
+    truth = json.loads((Path(told["run"]) / "run.json").read_text())["station"]["truth"]
+    assert told["mass_kg"] == pytest.approx(truth["mass_kg"], rel=0.01)

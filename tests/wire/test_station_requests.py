@@ -93,6 +93,8 @@ def test_cables_drift_and_payload(station: Answering) -> None:
         ("sensor-faults", {"dropp": 1}, "unknown fault dropp"),
         ("hand-move", {"q_rad": [0] * 5}, "hand-move"),
         ("hand-move", {"q_rad": [0] * 6, "speed_rad_s": 0}, "positive speed"),
+        ("hand-guide", {"rest_s": 0}, "rest_s 0"),
+        ("pendant-program", {"rest_s": "long"}, "long"),
         ("push-joint", {"joint": 0, "off_deg": 1}, "joint 0"),
         ("set-payload", {"payload_kg": -1}, "payload -1"),
         ("set-payload", {"payload_kg": 1, "payload_cog_m": [0, 0]}, "not enough values"),
@@ -113,6 +115,25 @@ def test_a_hand_moves_the_arm(station: Answering) -> None:
     assert station.do("hand_move", q_rad=goal, speed_rad_s=0.5) == {"done": "hand-move"}
     assert station.until(lambda s: s["moving"])["runtime_state"] == "STOPPED"
     station.until(lambda s: not s["moving"] and s["q_rad"] == pytest.approx(goal, abs=1e-6))
+
+
+def test_somebody_guides_the_arm_and_lets_go(station: Answering) -> None:
+    before = station.do("state")
+    try:
+        assert station.do("hand-guide", rest_s=0.05) == {"done": "hand-guide"}
+        state = station.until(lambda s: s["moving"] and abs(s["q_rad"][4] - before["q_rad"][4]) > 0.3)
+    finally:
+        station.do("hand-guide", on=False)
+    assert state["runtime_state"] == "STOPPED"
+    assert state["q_rad"][:3] == before["q_rad"][:3]
+    station.until(lambda s: s["steady"])
+
+
+def test_somebody_starts_a_program_on_the_pendant(station: Answering) -> None:
+    assert station.do("pendant-program", rest_s=0.05)["accepted"]
+    station.until(lambda s: s["program"] == "turns" and s["moving"])
+    station.do("dashboard-stop")
+    station.until(lambda s: s["steady"] and s["runtime_state"] == "STOPPED")
 
 
 def test_a_pushed_joint_and_a_changed_payload(station: Answering) -> None:

@@ -1,0 +1,120 @@
+"""The emulated person who guides the arm, and their program on the pendant: where the wrist goes, how fast, how long it
+rests, and what both put up with.
+"""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mocks.kinematics import MODELS, Array, Vector6, forward, vector6
+from mocks.ur.hand import IN_A_PROGRAM, SPEED_RAD_S, guided_by_hand, orientations, pendant_program
+from mocks.ur.modes import Runtime
+from mocks.ur.robot import Robot, RobotSettings
+from mocks.ur.script import Upload
+from mocks.world import Truth, World
+
+UR5E = MODELS["UR5e"]
+HOME = vector6(np.radians([45, -100, 60, -50, 70, 0]))
+"""Joint 5 20° off the right angle; there the axes of the flange are along those of joints 4 and 5, and one vertical."""
+ALL = 24
+SCALE = 20.0
+REST_S = 0.2
+
+
+def new_robot() -> Robot:
+    return Robot(World(Truth.drawn(0), UR5E, HOME, 0), RobotSettings(time_scale=SCALE))
+
+
+def run(robot: Robot, seconds: float) -> None:
+    for _ in range(round(seconds * robot.frequency_hz)):
+        robot.tick()
+
+
+def rests(robot: Robot, count: int) -> list[tuple[Vector6, float]]:
+    """Where the arm rests next, and how long (s, real time) until it moves again."""
+    found: list[tuple[Vector6, float]] = []
+    stood = 0
+    for _ in range(100 * robot.frequency_hz):
+        robot.tick()
+        if robot.arm.at_rest:
+            stood += 1
+        elif stood:
+            found.append((robot.arm.actual_q, stood * robot.period_s))
+            stood = 0
+        if len(found) == count:
+            return found
+    raise AssertionError(f"only {len(found)} rests")
+
+
+def flange(q: Vector6) -> Array:
+    """Its orientation in base."""
+    return forward(UR5E, q)[:3, :3]
+
+
+def test_a_hand_turns_the_wrist_to_all_turns_of_a_cube_and_begins_again() -> None:
+    robot = new_robot()
+    robot.hand = guided_by_hand(robot, REST_S)
+    found = rests(robot, ALL + 2)
+    np.testing.assert_allclose([q for q, _ in found[ALL:]], [q for q, _ in found[:2]], atol=0.02)
+    found = found[:ALL]
+    assert all(q[:3] == HOME[:3] for q, _ in found)
+    assert all(REST_S <= rest_s < REST_S + 0.05 for _, rest_s in found)
+    turns = np.array([flange(found[0][0]).T @ flange(q) for q, _ in found])
+    np.testing.assert_allclose(np.abs(turns).max(axis=2), 1.0, atol=0.001)  # axes go to axes
+    assert len({tuple(turn.round().astype(int).ravel()) for turn in turns}) == ALL
+    down = np.array([-flange(q)[2] for q, _ in found[:6]])
+    np.testing.assert_allclose(np.abs(down).max(axis=1), 1.0, atol=0.001)
+    assert len({tuple(row) for row in down.round().astype(int).tolist()}) == 6  # soon it has pulled along every axis
+
+
+def test_a_hand_moves_smoothly_whatever_the_slider_says() -> None:
+    robot = new_robot()
+    robot.arm.speed_fraction = 0.1
+    robot.hand = guided_by_hand(robot, REST_S)
+    speeds: list[float] = []
+    for _ in range(1500):
+        robot.tick()
+        speeds.append(max(map(abs, robot.arm.qd)))
+    assert max(speeds) == pytest.approx(SPEED_RAD_S)
+    assert max(abs(b - a) for a, b in pairwise(speeds)) < 2.0 * SCALE * robot.period_s
+
+
+def test_the_joints_stay_within_a_turn() -> None:
+    q = vector6([*HOME[:5], math.radians(350)])
+    assert all(abs(angle) <= 2 * math.pi for posture in orientations(q) for angle in posture)
+    assert orientations(q)[0] == pytest.approx([*q[:4], math.pi / 2, q[5]])
+
+
+def test_a_hand_waits_for_a_program_and_for_power() -> None:
+    robot = new_robot()
+    robot.upload(Upload("other", "def other():\n  sleep(20)\nend\n", secondary=False))
+    run(robot, 0.1)
+    assert robot.runtime == Runtime.PLAYING
+    robot.hand = guided_by_hand(robot, REST_S)
+    run(robot, 0.8)
+    assert robot.arm.q == HOME
+    run(robot, 1.0)
+    assert robot.arm.q != HOME
+    robot.emergency_stop(True)
+    run(robot, 0.3)
+    stopped_at = robot.arm.q
+    run(robot, 1.0)
+    assert robot.arm.q == stopped_at
+    robot.emergency_stop(False)
+    robot.brake_release()
+    run(robot, 1.0)
+    assert robot.arm.q != stopped_at
+
+
+def test_a_program_on_the_pendant_goes_there_once_and_back() -> None:
+    robot = new_robot()
+    assert robot.upload(pendant_program(robot, REST_S))
+    _, *found = rests(robot, IN_A_PROGRAM + 1)  # before its start too
+    assert robot.runtime == Runtime.PLAYING
+    expected = orientations(HOME)[:IN_A_PROGRAM]
+    np.testing.assert_allclose([q for q, _ in found], expected, atol=0.02)
+    assert all(rest_s == pytest.approx(REST_S, abs=0.02) for _, rest_s in found)
+    run(robot, 1.0)
+    assert (robot.runtime, robot.arm.q) == (Runtime.STOPPED, expected[0])
