@@ -44,6 +44,12 @@ def test_every_command_and_option_is_in_the_readme() -> None:
     look(cli, "ftdrive")
 
 
+def test_no_merge_was_left_half_done() -> None:
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("[!.]*/**/*.md")]
+    assert len(pages) > 5
+    assert [page for page in pages if re.search(r"^(<{7}|>{7}) ", page.read_text(encoding="utf-8"), re.MULTILINE)] == []
+
+
 def test_every_dependency_is_bounded_and_has_its_reason() -> None:
     lines = (ROOT / "pyproject.toml").read_text(encoding="utf-8").splitlines()
     required = [line.strip().strip('",') for line in lines if line.startswith('  "') and ">=" in line]
