@@ -255,7 +255,7 @@ class _PageServer(ThreadingTCPServer):
     def answer(self, request: bytes) -> bytes:
         left = self._left.get(asked_for(request))
         if not left:
-            self._diverge(f"the driver asked {asked_for(request).decode(errors='replace')}, which nobody asked then")
+            self._diverge(f"the driver asked {asked_for(request).decode(errors='replace')}, which was not asked in the recording")
             return b""
         page = left.pop(0) if len(left) > 1 else left[0]
         self.ended.wait(page.took_s)

@@ -18,6 +18,7 @@ from click.testing import CliRunner, Result
 
 from drivers.errors import ConnectError, ProtocolError
 from drivers.interfaces import DeviceInfo, FtSamples
+from drivers.netft import NetFtSensor
 from drivers.registry import sensor_from_url
 from drivers.transcript import BadTranscript, Page, Passage, Transcript, Writer
 from drivers.transcript_player import Player
@@ -110,7 +111,7 @@ def test_nobody_there_is_told_by_the_driver_and_in_the_file(tmp_path: Path) -> N
             with pytest.raises(ConnectError, match=cause):
                 look(url + more, 1.0)
         with pytest.raises(ConnectError, match=r"[Nn]ame"):
-            look("ati-netft://no-such-host.invalid?onrobot=1", 1.0)
+            NetFtSensor("no such host", onrobot=True).open()
     writer.end(error="ConnectError")
     lines = [json.loads(line) for line in (tmp_path / "gone.jsonl").read_text().splitlines()]
     (page,) = [line for line in lines if line.get("event") == "page"]
@@ -151,10 +152,12 @@ def test_every_datagram_of_the_device_stays_one_and_others_do_not_pass(tmp_path:
 
 @pytest.mark.parametrize(("port", "host"), [(80, b"no-such-host"), (8080, b"no-such-host:8080")])
 def test_the_device_is_called_by_its_own_name(port: int, host: bytes, tmp_path: Path) -> None:
-    with _PageRelay(Writer(tmp_path / "a.jsonl", HEADER), "no-such-host", port) as relay:
+    writer = Writer(tmp_path / "a.jsonl", HEADER)
+    with _PageRelay(writer, "no-such-host", port) as relay:
         here = f"127.0.0.1:{relay.server_address[1]}".encode()
         request = b"GET /%b HTTP/1.1\r\nHost: %b\r\nAccept: */*\r\n\r\n"
         assert relay.for_the_device(request % (here, here)) == request % (here, host)
+    writer.discard()
 
 
 def made_up(*passages: tuple[float, bool, bytes], pages: tuple[Page, ...] = ()) -> Transcript:
@@ -229,7 +232,7 @@ def test_pages_are_answered_in_their_order_and_the_last_one_again() -> None:
         assert [ask(path) for path in ("/a", "/a", "/b", "/a", "/mute")] == [b"1", b"2", b"other", b"2", b""]
         assert player.divergence is None
         assert ask("/c") == b""
-        assert player.divergence == "the driver asked GET /c, which nobody asked then"
+        assert player.divergence == "the driver asked GET /c, which was not asked in the recording"
         assert ask("/b") == b"other"
 
 
@@ -310,7 +313,7 @@ def test_a_driver_that_asks_something_else_is_told_what(recorded: list[str], tmp
     elsewhere = b"/elsewhere.xml HTTP/1.1".hex()
     outcome = play([line.replace(b"/netftcalapi.xml".hex(), elsewhere) for line in recorded], tmp_path)
     assert isinstance(outcome.exception, ProtocolError)
-    assert "asked GET /netftcalapi.xml?index=0, which nobody asked then" in str(outcome.exception)
+    assert "asked GET /netftcalapi.xml?index=0, which was not asked in the recording" in str(outcome.exception)
 
 
 @pytest.mark.parametrize(
