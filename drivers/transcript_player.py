@@ -253,9 +253,10 @@ class _PageServer(ThreadingTCPServer):
             self._left.setdefault(asked_for(page.request), []).append(page)
 
     def answer(self, request: bytes) -> bytes:
-        left = self._left.get(asked_for(request))
+        asked = asked_for(request)
+        left = self._left.get(asked)
         if not left:
-            self._diverge(f"the driver asked {asked_for(request).decode(errors='replace')}, which was not asked in the recording")
+            self._diverge(f"the driver asked {asked.decode(errors='replace')}, which was not asked in the recording")
             return b""
         page = left.pop(0) if len(left) > 1 else left[0]
         self.ended.wait(page.took_s)

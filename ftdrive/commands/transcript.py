@@ -34,7 +34,7 @@ _TAIL_S = 0.3
 def transcript() -> None:
     """Record the bytes on a sensor's wire, or play them to the driver: a bug report becomes a test.
 
-    Sensors on a serial port, on a CAN bus, or on Ethernet through pynetft. The sensor of the arm itself is not recorded.
+    Sensors on a serial port, on a CAN bus, or on Ethernet if they are Net F/T. The arm's own sensor is not recorded.
     """
 
 
@@ -74,7 +74,7 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
     address = SensorAddress.of(url)
     if address.scheme == "ur-ft":
         raise ConfigError(
-            f"{sensor} is read over RTDE, which is not recorded: capture TCP port 30004 of the arm with Wireshark instead"
+            f"{sensor} is read over RTDE, which is not recorded: capture TCP port 30004 of the arm with Wireshark"
         )
     if address.serial_port is None and address.scheme != "ati-netft" and not address.scheme.endswith("-can"):
         raise ConfigError(
