@@ -74,18 +74,15 @@ def relayed(writer: Writer) -> Iterator[None]:
 
 
 class _DatagramRelay:
-    """Hands datagrams on, both ways, between whoever writes to `port` on this computer and a sensor."""
+    """Hands datagrams on, both ways, between whoever writes to `port` on this computer and a sensor.
+
+    Each socket of the driver has one towards the device, so that nothing comes that an earlier one has asked for.
+    """
 
     def __init__(self, writer: Writer, host: str, port: int) -> None:
         self._writer = writer
-        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        self._far = socket.socket(family, kind)
-        self._far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _ROOM)
-        try:
-            self._far.connect(address)  # so that nobody else's datagrams come
-        except OSError:
-            self._far.close()
-            raise
+        self._device = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        self._far = self._connect()
         self._near = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._near.bind((_LOOPBACK, 0))
         self.port: int = self._near.getsockname()[1]
@@ -103,10 +100,24 @@ class _DatagramRelay:
         self._near.close()
         self._far.close()
 
+    def _connect(self) -> socket.socket:
+        family, kind, _, _, address = self._device
+        far = socket.socket(family, kind)
+        far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _ROOM)
+        try:
+            far.connect(address)  # so that nobody else's datagrams come
+        except OSError:
+            far.close()
+            raise
+        return far
+
     def _run(self) -> None:
         at_once = 0
-        while not self._ended.is_set():
+        while True:
+            is_ended = self._ended.is_set()
             readable, _, _ = select.select([self._near, self._far], [], [], 0)
+            if is_ended and self._near not in readable:  # the driver's last request is not left behind
+                return
             at_once += 1
             if not readable:
                 at_once = 0
@@ -116,14 +127,17 @@ class _DatagramRelay:
                 time.sleep(0.001)
             try:
                 if self._near in readable:
-                    data, self._driver = self._near.recvfrom(65536)
+                    data, driver = self._near.recvfrom(65536)
                     self._writer.sent(data)
+                    if driver != self._driver:
+                        far = self._connect()
+                        self._far.close()
+                        self._far, self._driver = far, driver
                     self._far.send(data)
                 if self._far in readable:
                     data = self._far.recv(65536)
-                    if self._driver is not None:  # else it is left from before, and nobody has asked for it
-                        self._writer.received_datagram(data)
-                        self._near.sendto(data, self._driver)
+                    self._writer.received_datagram(data)
+                    self._near.sendto(data, self._driver)
             except OSError as error:  # nobody listens at the device, or no longer here: for the driver that is silence
                 self._writer.event("unreachable", error=str(error))
 

@@ -126,9 +126,8 @@ def test_frames_of_a_can_interface_are_played_by_an_slcan_adapter(tmp_path: Path
     assert player.divergence is None
     assert again == identity
     recorded = {row.tobytes() for row in wrench}
-    assert (
-        sum(row.tobytes() in recorded for row in played) > 0.7 * len(played) > 20
-    )  # asked for as fast as the computer goes
+    assert len(played) > 0.25 * len(wrench)
+    assert sum(row.tobytes() in recorded for row in played) > 0.7 * len(played)
 
 
 @pytest.mark.parametrize(

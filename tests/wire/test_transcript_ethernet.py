@@ -150,6 +150,47 @@ def test_every_datagram_of_the_device_stays_one_and_others_do_not_pass(tmp_path:
     )
 
 
+def test_who_asks_from_a_new_socket_gets_nothing_that_an_old_one_asked_for(tmp_path: Path) -> None:
+    writer = Writer(tmp_path / "a.jsonl", HEADER)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as before,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as driver,
+    ):
+        device.bind(("127.0.0.1", 0))
+        with _DatagramRelay(writer, *device.getsockname()) as relay:
+            writer.event("open", datagrams=True)
+            for end in (device, driver):
+                end.settimeout(5)
+            places = []
+            for end in (before, driver):
+                end.sendto(START, ("127.0.0.1", relay.port))
+                places.append(device.recvfrom(100)[1])
+            for data, place in zip((b"old", b"new"), places, strict=True):
+                device.sendto(data, place)
+            assert driver.recv(100) == b"new"
+    writer.end()
+    assert [p.data for p in Transcript.load(tmp_path / "a.jsonl").passages] == [START, START, b"new"]
+
+
+def test_the_last_request_reaches_the_device(tmp_path: Path) -> None:
+    """Else it would stream on to nobody."""
+    writer = Writer(tmp_path / "a.jsonl", HEADER)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as driver,
+    ):
+        device.bind(("127.0.0.1", 0))
+        relay = _DatagramRelay(writer, *device.getsockname())
+        driver.sendto(STOP, ("127.0.0.1", relay.port))
+        relay._ended.set()  # before the relay has had its turn
+        with relay:
+            pass
+        device.setblocking(False)
+        assert device.recv(100) == STOP
+    writer.discard()
+
+
 @pytest.mark.parametrize(("port", "host"), [(80, b"no-such-host"), (8080, b"no-such-host:8080")])
 def test_the_device_is_called_by_its_own_name(port: int, host: bytes, tmp_path: Path) -> None:
     writer = Writer(tmp_path / "a.jsonl", HEADER)
