@@ -14,7 +14,9 @@ import numpy as np
 from drivers.errors import ConnectError, DeviceTimeout, ProtocolError
 from drivers.interfaces import ForceTorqueSensor
 from drivers.registry import BadUrl, sensor_from_url
-from drivers.transcript import INTERRUPTED, BadTranscript, Player, Transcript, Writer, recording
+from drivers.transcript import INTERRUPTED, BadTranscript, Transcript, Writer
+from drivers.transcript_player import Player
+from drivers.transcript_taps import recording
 from ftdrive.checks import SensorAddress
 from ftdrive.commands.common import EMULATED_SENSOR, JSON, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
@@ -32,7 +34,7 @@ _TAIL_S = 0.3
 def transcript() -> None:
     """Record the bytes on a sensor's wire, or play them to the driver: a bug report becomes a test.
 
-    Sensors on a serial port or a CAN bus. Ethernet is not recorded.
+    Sensors on a serial port, on a CAN bus, or on Ethernet if they are Net F/T. The arm's own sensor is not recorded.
     """
 
 
@@ -70,8 +72,15 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
     """Record, and name the file if it is kept; returns the address that a driver was given, and what it saw."""
     url = sensor_url(sensor)
     address = SensorAddress.of(url)
-    if address.serial_port is None and not address.scheme.endswith("-can"):
-        raise ConfigError(f"{sensor} is not on a serial port or a CAN bus: only what passes one can be recorded")
+    if address.scheme == "ur-ft":
+        raise ConfigError(
+            f"{sensor} is read over RTDE, which is not recorded: capture TCP port 30004 of the arm with Wireshark"
+        )
+    if address.serial_port is None and address.scheme != "ati-netft" and not address.scheme.endswith("-can"):
+        raise ConfigError(
+            f"{sensor} is neither on a serial port or a CAN bus nor an ati-netft: only these can be recorded; capture "
+            "others with Wireshark"
+        )
     device = _sensor(url)
     header = {
         "url": url,
@@ -98,7 +107,9 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
             if kept:
                 talk.print(f" Saved {path}")
     if not writer.has_port:
-        raise ConfigError(f"the driver of {sensor} uses neither pyserial nor python-can: only these can be recorded")
+        raise ConfigError(
+            f"the driver of {sensor} uses neither pyserial nor python-can nor pynetft: only these can be recorded"
+        )
     return url, seen
 
 

@@ -127,6 +127,7 @@ TRANSCRIPT = "\n".join(
     for line in (
         {"format": FORMAT, "url": "bota:///dev/ttyUSB0?sinc=64", "duration_s": 1.5},
         {"t_ns": 1, "event": "open", "baudrate": 460800},
+        {"t_ns": 9, "event": "page", "request": "474554202f", "reply": "4f4b", "took_s": 0.5},
         {"t_ns": 20, "dir": "tx", "hex": "430d"},
         {"t_ns": 31, "dir": "rx", "hex": "aa0042"},
         {"t_ns": 99, "event": "end", "error": None},

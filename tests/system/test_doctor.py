@@ -256,6 +256,7 @@ def test_transcript_of_a_sensor_that_is_gone(ftdrive: CommandLine) -> None:
     last = (ftdrive.folder / "gone.jsonl").read_text().splitlines()[-1]
     assert "the port does not open" in json.loads(last)["error"]
     assert ftdrive.run("transcript", "play", ftdrive.folder / "gone.jsonl").returncode == 6
-    refused = ftdrive.run("transcript", "record", "--sensor", "ati-netft://192.168.1.1", "-o", "net.jsonl")
+    arm = "ur-ft://192.168.1.1?counts_per_N=1&counts_per_Nm=1"
+    refused = ftdrive.run("transcript", "record", "--sensor", arm, "-o", "net.jsonl")
     assert refused.returncode == 2
-    assert "not on a serial port" in refused.stderr
+    assert "with Wireshark" in refused.stderr

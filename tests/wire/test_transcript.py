@@ -24,7 +24,9 @@ from drivers._serial import SerialPort
 from drivers.errors import ConnectError
 from drivers.interfaces import DeviceInfo, ForceTorqueSensor
 from drivers.registry import sensor_from_url
-from drivers.transcript import BadTranscript, Passage, Player, Transcript, Writer, recording
+from drivers.transcript import BadTranscript, Passage, Transcript, Writer
+from drivers.transcript_player import Player
+from drivers.transcript_taps import recording
 from mocks.ati_can import AtiCanNode
 from mocks.ati_serial import AtiSerialBox
 from mocks.bota import BotaBox

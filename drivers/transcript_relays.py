@@ -1,0 +1,201 @@
+"""How a transcript is taken of a sensor on Ethernet: by relays between the driver and the device.
+
+pynetft opens its sockets where Python does not see them. So it is sent to two ports of this computer, and so are the
+questions over HTTP that the driver asks itself. A relay hands on every datagram as it is, and of a question all but
+the name of the host, which it puts right.
+"""
+
+import contextlib
+import http.client
+import select
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from socketserver import BaseRequestHandler, ThreadingTCPServer
+from typing import Any, Final, Self
+
+import pynetft
+
+from drivers.transcript import Writer
+
+_CLIENT_CLASS: Final = "Client"
+_CONNECTION_CLASS: Final = "HTTPConnection"
+_LOOPBACK: Final = "127.0.0.1"
+_LOOK_S: Final = 0.05
+"""How often a relay looks whether the recording has ended."""
+_HTTP_S: Final = 2.0
+_ROOM: Final = 4 << 20
+"""Bytes of datagrams that may wait for a relay; the system may grant less."""
+_AT_ONCE: Final = 64
+"""Datagrams for pynetft in a row: its socket has room for about 250."""
+
+
+@contextlib.contextmanager
+def relayed(writer: Writer) -> Iterator[None]:
+    """Put relays in front of what pynetft and HTTP clients ask in the `with` block."""
+    plain, plain_connection = pynetft.Client, http.client.HTTPConnection
+    with contextlib.ExitStack() as relays:
+
+        @cache
+        def pages_of(host: str, port: int) -> int:
+            return relays.enter_context(_PageRelay(writer, host, port)).server_address[1]
+
+        @cache
+        def stream_of(host: str, port: int) -> int:
+            relay = relays.enter_context(_DatagramRelay(writer, host, port))
+            writer.event("open", port=f"{host}:{port}", datagrams=True)
+            return relay.port
+
+        class RelayedClient(pynetft.Client):
+            def __init__(self, config: pynetft.Config, **options: Any) -> None:
+                try:
+                    rdt_port = stream_of(config.sensor_host, config.rdt_port)
+                except OSError as error:
+                    raise pynetft.NetFTError(str(error)) from error
+                http_port = pages_of(config.sensor_host, config.http_port)
+                here = replace(config, sensor_host=_LOOPBACK, rdt_port=rdt_port, http_port=http_port)
+                super().__init__(here, **options)
+
+        class RelayedConnection(http.client.HTTPConnection):
+            def __init__(self, *arguments: Any, **options: Any) -> None:
+                super().__init__(*arguments, **options)
+                self.host, self.port = _LOOPBACK, pages_of(self.host, self.port)
+
+        setattr(pynetft, _CLIENT_CLASS, RelayedClient)
+        setattr(http.client, _CONNECTION_CLASS, RelayedConnection)
+        try:
+            yield
+        finally:
+            setattr(pynetft, _CLIENT_CLASS, plain)
+            setattr(http.client, _CONNECTION_CLASS, plain_connection)
+
+
+class _DatagramRelay:
+    """Hands datagrams on, both ways, between whoever writes to `port` on this computer and a sensor.
+
+    Each socket of the driver has one towards the device, so that nothing comes that an earlier one has asked for.
+    """
+
+    def __init__(self, writer: Writer, host: str, port: int) -> None:
+        self._writer = writer
+        self._device = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        self._far = self._connect()
+        self._near = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._near.bind((_LOOPBACK, 0))
+        self.port: int = self._near.getsockname()[1]
+        self._driver: Any = None
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"datagrams of {host}")
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._near.close()
+        self._far.close()
+
+    def _connect(self) -> socket.socket:
+        family, kind, _, _, address = self._device
+        far = socket.socket(family, kind)
+        far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _ROOM)
+        try:
+            far.connect(address)  # so that nobody else's datagrams come
+        except OSError:
+            far.close()
+            raise
+        return far
+
+    def _run(self) -> None:
+        at_once = 0
+        while True:
+            is_ended = self._ended.is_set()
+            readable, _, _ = select.select([self._near, self._far], [], [], 0)
+            if is_ended and self._near not in readable:  # the driver's last request is not left behind
+                return
+            at_once += 1
+            if not readable:
+                at_once = 0
+                readable, _, _ = select.select([self._near, self._far], [], [], _LOOK_S)
+            elif at_once == _AT_ONCE:  # after a pause of this computer
+                at_once = 0
+                time.sleep(0.001)
+            try:
+                if self._near in readable:
+                    data, driver = self._near.recvfrom(65536)
+                    self._writer.sent(data)
+                    if driver != self._driver:
+                        far = self._connect()
+                        self._far.close()
+                        self._far, self._driver = far, driver
+                    self._far.send(data)
+                if self._far in readable:
+                    data = self._far.recv(65536)
+                    self._writer.received_datagram(data)
+                    self._near.sendto(data, self._driver)
+            except OSError as error:  # nobody listens at the device, or no longer here: for the driver that is silence
+                self._writer.event("unreachable", error=str(error))
+
+
+class _PageRelay(ThreadingTCPServer):
+    """Hands questions over HTTP on to a sensor, one a connection, and its answers back."""
+
+    def __init__(self, writer: Writer, host: str, port: int) -> None:
+        super().__init__((_LOOPBACK, 0), _PageExchange)
+        self.writer = writer
+        self.device = host, port
+        self.ended = threading.Event()
+        self._thread = threading.Thread(target=self.serve_forever, args=(_LOOK_S,), name=f"pages of {host}")
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.ended.set()
+        self.shutdown()
+        self._thread.join()
+        self.server_close()  # waits for exchanges under way
+
+    def for_the_device(self, request: bytes) -> bytes:
+        """Put the host right to which the client thinks it is talking."""
+        host, port = self.device
+        here = f"\r\nHost: {_LOOPBACK}:{self.server_address[1]}\r\n"
+        there = f"\r\nHost: {host}\r\n" if port == http.client.HTTP_PORT else f"\r\nHost: {host}:{port}\r\n"
+        return request.replace(here.encode(), there.encode())
+
+
+class _PageExchange(BaseRequestHandler):
+    server: _PageRelay
+
+    def handle(self) -> None:
+        driver: socket.socket = self.request
+        request = reply = b""
+        error = None
+        began = time.monotonic()
+        try:
+            driver.settimeout(_HTTP_S)
+            request = self.server.for_the_device(driver.recv(65536))
+            with socket.create_connection(self.server.device, timeout=_HTTP_S) as device:
+                device.sendall(request)
+                while not self.server.ended.is_set():
+                    readable, _, _ = select.select([driver, device], [], [], _LOOK_S)
+                    if device in readable:
+                        if not (data := device.recv(65536)):
+                            break
+                        reply += data
+                        driver.sendall(data)
+                    if driver in readable:
+                        if not (data := driver.recv(65536)):
+                            break
+                        request += data
+                        device.sendall(data)
+        except OSError as exc:
+            error = str(exc)
+        took_s = round(time.monotonic() - began, 6)
+        self.server.writer.event("page", request=request.hex(), reply=reply.hex(), took_s=took_s, error=error)

@@ -1,0 +1,112 @@
+"""Where the bytes of a transcript are taken: inside pyserial and python-can, and in front of pynetft."""
+
+import contextlib
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
+from importlib import import_module
+from typing import Any, Final, cast
+
+import can
+import serial
+
+from drivers._parity import marks_asked_for
+from drivers.transcript import Writer
+
+_PORT_CLASS: Final = "Serial"
+_BUS_CLASS: Final = "Bus"
+
+
+@contextlib.contextmanager
+def recording(writer: Writer) -> Iterator[None]:
+    """Write down what passes through the serial ports, CAN buses and pynetft clients opened in the `with` block.
+
+    They have the driver's own settings: the device sees no difference.
+    """
+    with _ports_and_buses(writer), _ethernet(writer):
+        yield
+
+
+def _ethernet(writer: Writer) -> AbstractContextManager[None]:
+    """Record pynetft; nothing where it is not installed, for then nobody uses it."""
+    try:
+        relays = import_module("drivers.transcript_relays")
+    except ImportError:
+        return nullcontext()
+    return cast(AbstractContextManager[None], relays.relayed(writer))
+
+
+@contextlib.contextmanager
+def _ports_and_buses(writer: Writer) -> Iterator[None]:
+    plain, plain_bus = serial.Serial, can.Bus
+    opened: list[serial.Serial] = []
+
+    class RecordedPort(serial.Serial):
+        _told = False
+
+        def open(self) -> None:
+            super().open()
+            self._told = False
+            opened.append(self)
+
+        def _tell(self) -> None:
+            """Note how the port is set: at its first use, for who opens it sets the marks after pyserial is done."""
+            if not self._told:
+                self._told = True
+                settings = {key: getattr(self, key) for key in ("baudrate", "bytesize", "parity", "stopbits")}
+                marks = marks_asked_for(self)
+                writer.event("open", port=self.port, **settings, parity_marks=marks)
+
+        def read(self, size: int = 1, /) -> bytes:
+            self._tell()
+            data: bytes = super().read(size)
+            writer.received(data)
+            return data
+
+        def write(self, data: Any, /) -> int | None:
+            self._tell()
+            writer.sent(bytes(data))
+            written: int | None = super().write(data)
+            return written
+
+        def reset_input_buffer(self) -> None:
+            self._tell()
+            if waiting := self.in_waiting:  # they were on the wire although the driver does not want them
+                writer.received(super().read(waiting))
+            super().reset_input_buffer()
+
+    def recorded_bus(channel: str, **options: Any) -> can.BusABC:
+        before = len(opened)
+        bus = plain_bus(channel, **options)
+        if len(opened) > before:  # it is on a recorded port, like slcan
+            return bus
+        writer.event("open", port=channel, frames=True)
+        receive, send = bus.recv, bus.send
+
+        def recv(timeout: float | None = None) -> can.Message | None:
+            if (message := receive(timeout)) is not None:
+                writer.received(_slcan_line(message))
+            return message
+
+        def recorded_send(message: can.Message, timeout: float | None = None) -> None:
+            writer.sent(_slcan_line(message))
+            send(message, timeout)
+
+        vars(bus).update(recv=recv, send=recorded_send)
+        return bus
+
+    setattr(serial, _PORT_CLASS, RecordedPort)
+    setattr(can, _BUS_CLASS, recorded_bus)
+    try:
+        yield
+    finally:
+        setattr(serial, _PORT_CLASS, plain)
+        setattr(can, _BUS_CLASS, plain_bus)
+
+
+def _slcan_line(frame: can.Message) -> bytes:
+    """Write a frame as an slcan adapter does; nothing for one that it cannot carry."""
+    if frame.is_error_frame or frame.is_fd:
+        return b""
+    kind, data = ("r", "") if frame.is_remote_frame else ("t", frame.data.hex().upper())
+    head = f"{kind.upper()}{frame.arbitration_id:08X}" if frame.is_extended_id else f"{kind}{frame.arbitration_id:03X}"
+    return f"{head}{frame.dlc}{data}\r".encode()
