@@ -18,7 +18,7 @@ import threading
 import time
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -152,8 +152,7 @@ class Run:
         try:
             header = read_object(path, BadDataset)
             check_format(header, RUN_FORMAT, BadDataset)
-            for name in header.keys() & {"config", "devices"}:
-                _require_objects(name, header[name])
+            _require_kinds(header)
             if "config" in header:
                 header["config"] = recorded(header["config"])
         except (BadDataset, ConfigError) as error:
@@ -203,9 +202,47 @@ class Run:
         return sorted(int(name) for name in names if name.isdecimal())
 
 
-def _require_objects(name: str, found: Any) -> None:
-    if not isinstance(found, dict) or not all(isinstance(one, dict) for one in found.values()):
-        raise BadDataset(f"'{name}' is {found!r}, the file is damaged: {_RESTORE}")
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_object(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+_Kind = tuple[str, Callable[[Any], bool]]
+_MODES = ("auto", "step", "manual", "listen")
+_TEXT: _Kind = "a text", _is_text
+_TEXT_OR_NULL: _Kind = "a text or null", lambda value: value is None or _is_text(value)
+_TEXTS: _Kind = "a list of texts", lambda value: isinstance(value, list) and all(map(_is_text, value))
+_OBJECT: _Kind = "an object", _is_object
+_OBJECTS: _Kind = "an object of objects", lambda value: _is_object(value) and all(map(_is_object, value.values()))
+_KINDS: Mapping[str, _Kind] = {
+    "config": _OBJECTS,
+    "devices": _OBJECTS,
+    "devices.arm.serial": _TEXT,
+    "devices.sensor.serial": _TEXT,
+    "mode": (f"one of {', '.join(_MODES)}", lambda value: value in _MODES),
+    "said": _OBJECT,
+    "said.config": _TEXT_OR_NULL,
+    "said.robot": _TEXT_OR_NULL,
+    "said.sensor": _TEXT_OR_NULL,
+    "said.tool": _TEXTS,
+    "station": _OBJECT,
+    "station.sensor": _TEXT,
+    "station.options": _TEXTS,
+}
+"""What the fields of run.json that somebody reads must be, where they are there; those of config: `recorded`."""
+
+
+def _require_kinds(header: Mapping[str, Any]) -> None:
+    for place, (words, fits) in _KINDS.items():
+        *above, name = place.split(".")
+        found = header
+        for one in above:
+            found = found.get(one, {})
+        if name in found and not fits(found[name]):
+            raise BadDataset(f"'{place}' is {found[name]!r} and not {words}, the file is damaged: {_RESTORE}")
 
 
 class _Whole(dict[str, Any]):

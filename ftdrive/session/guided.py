@@ -45,6 +45,7 @@ from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Operator
 from ftdrive.session.outcome import Outcome, solve_and_save
 from ftdrive.session.prospect import USUAL_KG, at_most, moves_s, prediction, slower, speeds_of
+from ftdrive.session.recovery import Recovery
 from ftdrive.session.running import Running
 from ftdrive.session.watch import Guards
 from ftdrive.wiring import build_arm, build_sensor
@@ -350,7 +351,9 @@ class _Begun:
         heaviest_kg = cell.tool.mass_kg or _HEAVIEST_KG.get(name, _HEAVIEST_OF_ALL_KG)
         reach_m = max(float(np.hypot(part.to_m, part.reach_m)) for part in self._certifier.arm.tool)
         load = RangeGuard(self._limits, self._before.sensor_range)
-        contact = ContactGuard(self._limits, heaviest_kg, reach_m, plan.acceleration_rad_s2, quiet_std)
+        contact = ContactGuard(
+            self._limits, heaviest_kg, reach_m, plan.acceleration_rad_s2, quiet_std, self._running.predict
+        )
         rows: Sequence[Guard] = (
             SafetyGuard(),
             PathGuard(self._limits),
@@ -375,19 +378,18 @@ class _Begun:
                 desk,
                 self._running,
                 guards,
-                contact=contact,
+                recovery=Recovery(self._arm, self._sensor, desk, guards, contact, self._recheck),
                 load=load,
                 sampling=self._sampling,
                 pace=self._pace,
-                recheck=self._recheck,
                 quiet_std=quiet_std,
             ).run(self._todo)
         if self._pace.slow and run.stops() == list(range(1, len(plan.steps) + 2)):
             remember_completed(*self._key)
         return run
 
-    def _recheck(self, hazard: int | None) -> None:
-        """Do the checks again after a stop by a row of the hazard table, and ask again where that row says so."""
+    def _recheck(self, asks: bool) -> None:
+        """Do the checks again after a stop; with `asks`, all of the preflight: the questions again too."""
         q = self._arm.state().q_rad
         stays = approach_to(self._certifier, q, q, SLOW)  # the way on is judged by itself, once it is known where to
         quiet = self._listen(preflight.LISTEN_S)
@@ -396,7 +398,7 @@ class _Begun:
         self._check(preflight.AGAIN)
         if not self._options.questions:
             return
-        if hazard == 11:  # an emergency or safeguard stop: all of the preflight again
+        if asks:
             self._ask(assumed=False)
         else:
             self._ask_reduced(assumed=False)

@@ -7,7 +7,7 @@ that is planned from where the arm stands, shown and confirmed.
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final, Protocol
@@ -36,12 +36,12 @@ from ftdrive.session.events import (
     State,
     StateChanged,
     Weighed,
-    Witness,
 )
-from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, by_safety, out_of_sight
+from ftdrive.session.guards import RangeGuard, Tripped
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.outcome import cell_of
 from ftdrive.session.preflight import forbidden
+from ftdrive.session.recovery import Recovery
 from ftdrive.session.watch import Guards
 
 log = logging.getLogger(__name__)
@@ -58,7 +58,6 @@ _PATIENCE: Final = 20.0
 _NEAR_RAD: Final = float(np.radians(10))
 """A way that comes so close to a skipped posture passes it."""
 _FIRST_WORD: Final = "MOVE"
-_LOOK_AGAIN_S: Final = 0.4
 
 
 class RunningFit(Protocol):
@@ -79,7 +78,7 @@ class RunningFit(Protocol):
 
 
 class Stopped(Exception):
-    """A person had the arm stop, to pause or to end, or sent it back and has to say how it goes on."""
+    """A person had the arm stop, to pause or to end, sent it back or said no, and has to say how it goes on."""
 
     def __init__(self, words: str, *, for_good: bool = False) -> None:
         super().__init__(words)
@@ -111,11 +110,8 @@ class Tour:
 
     Parameters
     ----------
-    contact, load
-        The two guards that the tour itself feeds.
-    recheck : callable
-        Does the checks once more after a stop, and asks what the row of the hazard table that stopped it, or None,
-        wants asked again; raises when it may not go on.
+    load
+        The guard that also judges every sample of a pose.
     quiet_std : array, shape (6,)
         Of the resting sensor's samples.
     """
@@ -131,17 +127,16 @@ class Tour:
         running: RunningFit,
         guards: Guards,
         *,
-        contact: ContactGuard,
+        recovery: Recovery,
         load: RangeGuard,
         sampling: Sampling,
         pace: Pace,
-        recheck: Callable[[int | None], None],
         quiet_std: Array,
     ) -> None:
         self._arm, self._sensor, self._certifier = arm, sensor, certifier
         self._plan, self._run, self._desk, self._running, self._guards = plan, run, desk, running, guards
-        self._contact, self._load, self._sampling, self._pace = contact, load, sampling, pace
-        self._recheck, self._quiet_std = recheck, quiet_std
+        self._recovery, self._load, self._sampling, self._pace = recovery, load, sampling, pace
+        self._quiet_std = quiet_std
         self._nodes = np.array([step.q_rad for step in plan.steps])
         self._stops = len(self._nodes) + 1
         self._todo: deque[int] = deque()
@@ -155,7 +150,6 @@ class Tour:
         self._skipped: set[int] = set()  # indices of postures where the arm should not go
         self._reopened: set[int] = set()
         self._payload_kg: float | None = None  # as the controller told it when it was compared
-        self._witness = Witness(sensor, desk.tell)
 
     # -------------------------------------------------------------------------------------------- the tour
 
@@ -169,7 +163,6 @@ class Tour:
         Tripped, DriverError, OSError
             What stopped the arm, when a person then ended it.
         """
-        self._contact.predict = self._running.predict
         self._todo = deque(todo)
         self._guards.begin()
         while self._todo:
@@ -179,7 +172,7 @@ class Tour:
                 self._turn(turned.key)
             except (Tripped, DriverError, OSError, Stopped, TooFewSamples, NotAccepted) as error:
                 self._hold(error)
-        self._witness.tell_news()
+        self._recovery.tell_news()
         self._tell(State.CLOSE)
 
     def _next(self) -> None:
@@ -353,7 +346,7 @@ class Tour:
             ),
             sync=True,
         )
-        self._witness.tell_news()
+        self._recovery.tell_news()
         self._desk.tell(self._running.add(record))
         return record
 
@@ -429,7 +422,8 @@ class Tour:
             return
         trusted = self._pace.trusted and not by_person
         if self._moved:
-            self._desk.require(text, assumed=trusted)
+            if self._desk.ask(Question(text, assumed="yes" if trusted else None)) != "yes":
+                raise Stopped(f"not confirmed: {text}")
             return
         assumed = _FIRST_WORD if trusted else None
         question = Question(f"{text} Hand on the emergency stop. Type {_FIRST_WORD}", (_FIRST_WORD,), assumed)
@@ -440,6 +434,7 @@ class Tour:
     def _move(self, start: Array, goal: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         if not self._moved:
             self._confirm("The arm begins the tour.")
+        self._recovery.require_answers()
         if self._pace.slow:
             speed_rad_s, acceleration_rad_s2 = (
                 min(speed_rad_s, SLOW.joint_rad_s),
@@ -469,7 +464,7 @@ class Tour:
         if isinstance(error, Stopped) and error.for_good:
             self._tell(State.STOP, words=str(error))
             raise Declined(str(error))
-        trip = self._cause(error)
+        trip = self._recovery.cause(error, moving=self._at is None)
         if trip is not None and self._mended(trip):
             return
         stop, back = self._todo[0], self._left_behind()
@@ -478,7 +473,7 @@ class Tour:
         if trip is not None and trip is not self._guards.tripped(wait_s=0.0):
             self._desk.tell(GuardTripped(hazard=trip.hazard, words=words))
         self._tell(State.STOP, words=words)
-        self._witness.tell_news()
+        self._recovery.tell_news()
         self._tell(State.HOLD, words=words)
         by_person = isinstance(error, Stopped)
         end = Declined(words) if by_person else error if trip is None else trip.error
@@ -496,7 +491,7 @@ class Tour:
             if answer == "quit":
                 raise end
             try:
-                self._recover(None if trip is None else trip.hazard)
+                self._recovery.make_sure()
             except (Tripped, DriverError, NotAccepted, Declined) as again:
                 self._desk.tell(Noted(words=f"not yet: {again}", warning=True))
                 continue
@@ -511,28 +506,6 @@ class Tour:
         gone = {self._index(self._todo[0]), *self._skipped}
         return None if self._at is not None or self._stood_at in gone else self._stood_at
 
-    def _cause(self, error: Exception) -> Tripped | None:
-        """What a guard has to say about it, or the row of the table that the error belongs to."""
-        if isinstance(error, Tripped):
-            return error
-        if isinstance(error, OSError) and not isinstance(error, DriverError):
-            return Tripped(26, error)
-        if not isinstance(error, DriverError):
-            return None
-        if (trip := self._guards.tripped(wait_s=0.3)) is not None:
-            return trip
-        try:
-            self._sensor.check()
-        except DriverError:
-            return Tripped(15, error)
-        try:
-            status = self._arm.status()
-        except DriverError:
-            return out_of_sight(error, moving=self._at is None)
-        if status.fault is not None:
-            return by_safety(status, str(error))
-        return Tripped(21, error) if isinstance(error, DeviceFault) else Tripped(16, error)
-
     def _mended(self, trip: Tripped) -> bool:
         """Open a sensor that failed while the arm stood at a pose, once for each pose; the pose begins anew."""
         stop = self._todo[0]
@@ -540,29 +513,12 @@ class Tour:
             return False
         self._reopened.add(stop)
         try:
-            self._recover(trip.hazard)
+            self._recovery.make_sure()
         except (Tripped, DriverError, NotAccepted, Declined) as error:
             log.info("the sensor does not come back: %s", error)
             return False
         self._desk.tell(Noted(words=f"{trip}; it is back, pose {stop} begins anew", warning=True))
         return True
-
-    def _recover(self, hazard: int | None) -> None:
-        """Open again what was lost, and look at everything once more. A safety stop is for the operator to clear."""
-        self._arm.open(control=True)
-        try:
-            self._sensor.check()
-        except DriverError:
-            self._witness.tell_news()
-            self._sensor.close()
-            self._sensor.open()
-            self._contact.forget()
-            self._witness = Witness(self._sensor, self._desk.tell)
-        self._recheck(hazard)
-        self._guards.begin()
-        q = self._arm.state().q_rad
-        with self._guards.watching(q, q, moving=False):  # is what tripped them gone?
-            time.sleep(_LOOK_AGAIN_S)
 
     # -------------------------------------------------------------------------------------------- telling
 

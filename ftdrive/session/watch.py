@@ -25,13 +25,15 @@ Array = NDArray[np.float64]
 PERIOD_S: Final = 0.01
 _LATE_S: Final = 0.02
 """So much of the time between two looks counts as silence: when this process gets no time, nothing else is late."""
+_ASIDE_S: Final = 0.05
+"""Between two looks for a stop of the safety system, while nothing else is watched."""
 _HUNG_S: Final = 1.0
 _TELL_S: Final = 0.2
 """A stop that takes longer is told meanwhile. An arm that answers brakes from 60 deg/s in 0.26 s."""
 
 
 class Guards:
-    """The thread. Watches from `begin` on, whenever a `watching` block is open.
+    """The thread. Watches from `begin` on, whenever a `watching` block is open; for row 11 it looks all the time.
 
     Parameters
     ----------
@@ -55,6 +57,9 @@ class Guards:
         self._end = threading.Event()
         self._told = threading.Event()
         self._tripped: Tripped | None = None
+        self.safety_stop: Tripped | None = None
+        """The last emergency or safeguard stop that was seen, whatever the arm did; one for each, never forgotten."""
+        self._stopped_by_safety = False
         self._begun = False
         self._last: tuple[float, ArmState] | None = None
         self._looked_s = 0.0
@@ -89,6 +94,26 @@ class Guards:
             self._wake.clear()
         self.check()
 
+    def look_aside(self) -> None:
+        """Row 11 while the arm stands: who has pressed it may have let go again when a person says how it goes on.
+
+        It is not told from here: a question may stand on the screen.
+        """
+        try:
+            status = self._arm.status()
+        except DriverError:  # it is opened again, which says so, or the next motion does
+            return
+        trip = None if status.fault is None else by_safety(status, f"the arm stopped: {status.fault}")
+        if trip is None or trip.hazard != 11:
+            self._stopped_by_safety = False
+        elif not self._stopped_by_safety:
+            self.keep(trip)
+
+    def keep(self, trip: Tripped) -> None:
+        """Remember it as `safety_stop` when it is one."""
+        if trip.hazard == 11:
+            self.safety_stop, self._stopped_by_safety = trip, True
+
     def check(self) -> None:
         """Raise what has tripped. Called in the loops that wait for the arm."""
         if self._tripped is not None:
@@ -109,7 +134,11 @@ class Guards:
         while not self._end.is_set():
             watch = self._watch
             if watch is None or self._tripped is not None:
-                self._wake.wait(0.2)
+                try:
+                    self.look_aside()
+                except Exception:
+                    log.exception("a look for a stop of the safety system failed")
+                self._wake.wait(_ASIDE_S)
                 if self._tripped is not None:
                     self._end.wait(0.02)
                 continue
@@ -156,6 +185,7 @@ class Guards:
 
     def _stop(self, trip: Tripped) -> None:
         self._tripped = trip
+        self.keep(trip)
         stopping = threading.Thread(target=self._stop_arm, name="guards stop", daemon=True)
         stopping.start()
         stopping.join(_TELL_S)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from calib.errors import CalibError
+from calib.errors import BadDataset, CalibError
 from ftdrive.cli import cli, exit_code
 from ftdrive.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.errors import ConfigError
@@ -198,6 +198,21 @@ def test_an_emulated_run_goes_on_in_the_same_cell(cells: list[Any], stations: li
     assert isinstance(call("--resume", str(run.folder), "--robot", "10.0.0.9"), Opened)
     assert stations == []
     assert cells.pop()[1].real
+
+
+@pytest.mark.parametrize("more", [(), ("--redo", "3"), ("--dry-run",), ("--simulate",)])
+@pytest.mark.parametrize("wrong", [{"said": 5}, {"said": {"tool": "0:60:90"}}, {"mode": 5}, {"station": ["can"]}])
+def test_a_run_with_a_field_of_the_wrong_type_is_refused_in_one_sentence(
+    wrong: Mapping[str, Any], more: Sequence[str], begin: Begin, cells: list[Any], stations: list[Any]
+) -> None:
+    Path("ftdrive.toml").write_text(CELL)
+    folder = Path(begin())
+    header = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(header | wrong))
+    outcome = CliRunner().invoke(cli, ["calibrate", "--resume", str(folder), *more])
+    assert isinstance(outcome.exception, BadDataset)
+    assert str(outcome.exception).startswith(f"{folder / 'run.json'}: '{next(iter(wrong))}")
+    assert cells == stations == []
 
 
 def test_every_error_of_the_solver_has_an_exit_code() -> None:

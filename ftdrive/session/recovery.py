@@ -1,0 +1,105 @@
+"""From a stop back to where the arm may move again: what has stopped it, and whether that is mended."""
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from drivers.errors import DeviceFault, DriverError
+from drivers.interfaces import ForceTorqueSensor, RobotArm
+from ftdrive.session.desk import Desk
+from ftdrive.session.events import GuardTripped, Witness
+from ftdrive.session.guards import ContactGuard, Tripped, by_safety, out_of_sight
+from ftdrive.session.watch import Guards
+
+_LOOK_AGAIN_S: Final = 0.4
+
+
+class Recovery:
+    """Opens again what was lost, looks at everything once more, and sees that the questions come again after row 11.
+
+    Parameters
+    ----------
+    contact
+        Takes the zero of a sensor that was opened again as it is.
+    recheck : callable
+        Does the checks once more, and asks the questions of the beginning again where it is told so; raises when the
+        arm may not go on.
+    """
+
+    def __init__(
+        self,
+        arm: RobotArm,
+        sensor: ForceTorqueSensor,
+        desk: Desk,
+        guards: Guards,
+        contact: ContactGuard,
+        recheck: Callable[[bool], None],
+    ) -> None:
+        self._arm, self._sensor, self._desk, self._guards = arm, sensor, desk, guards
+        self._contact, self._recheck = contact, recheck
+        self._witness = Witness(sensor, desk.tell)
+        self._told: Tripped | None = None  # last, as what the arm is held for
+        self._answered: Tripped | None = None  # last stop of row 11 after which the questions were answered
+
+    def tell_news(self) -> None:
+        """Tell what the sensor went through."""
+        self._witness.tell_news()
+
+    def cause(self, error: Exception, *, moving: bool) -> Tripped | None:
+        """What a guard has to say about it, or the row of the table that the error belongs to."""
+        self._told = self._row_of(error, moving=moving)
+        if self._told is not None:
+            self._guards.keep(self._told)
+        return self._told
+
+    def require_answers(self) -> None:
+        """Raise a stop of row 11, however short, after which the questions were not answered: no motion goes on."""
+        self._guards.look_aside()
+        stop = self._guards.safety_stop
+        if stop is not None and stop is not self._answered:
+            raise stop
+
+    def make_sure(self) -> None:
+        """Raise unless all is well again. A stop of the safety system is for the operator to clear."""
+        self._guards.look_aside()
+        self._arm.open(control=True)
+        try:
+            self._sensor.check()
+        except DriverError:
+            self._witness.tell_news()
+            self._sensor.close()
+            self._sensor.open()
+            self._contact.forget()
+            self._witness = Witness(self._sensor, self._desk.tell)
+        stop = self._guards.safety_stop
+        if stop is not None and stop not in {self._answered, self._told}:  # pressed while the arm was held already
+            self._told = stop
+            self._desk.tell(GuardTripped(hazard=stop.hazard, words=str(stop)))
+        self._recheck(stop is not self._answered)
+        self._answered = stop
+        self._guards.begin()
+        q = self._arm.state().q_rad
+        with self._guards.watching(q, q, moving=False):  # is what tripped them gone?
+            time.sleep(_LOOK_AGAIN_S)
+        self.require_answers()
+
+    def _row_of(self, error: Exception, *, moving: bool) -> Tripped | None:
+        if isinstance(error, Tripped):
+            return error
+        if isinstance(error, OSError) and not isinstance(error, DriverError):
+            return Tripped(26, error)
+        if not isinstance(error, DriverError):
+            return None
+        if (trip := self._guards.tripped(wait_s=0.3)) is not None:
+            return trip
+        try:
+            self._sensor.check()
+        except DriverError:
+            return Tripped(15, error)
+        try:
+            status = self._arm.status()
+        except DriverError:
+            return out_of_sight(error, moving=moving)
+        if status.fault is not None:
+            return by_safety(status, str(error))
+        return Tripped(21, error) if isinstance(error, DeviceFault) else Tripped(16, error)
