@@ -16,6 +16,7 @@ from calib.compare import compare
 from calib.errors import CalibError
 from calib.ml import STANDARD_GRAVITY_M_S2, Drift
 from calib.result import Method
+from calib.routine import drift_check
 from ftdrive.cli import exit_code
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
@@ -27,6 +28,7 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.hints import hints
 from ftdrive.rehearsal import rehearsed_run
 from ftdrive.report import print_comparison, print_result
 from ftdrive.runs import Run, versions
@@ -122,10 +124,12 @@ def _solve_each(
                 _show_all(source, dataset, {**options, "g_m_s2": g_m_s2}, as_json)
                 continue
             result = _solve(dataset, method, {**options, "g_m_s2": g_m_s2, "provenance": provenance})
+            records = Run(source).records() if source.is_dir() else []  # a run tells more than its dataset
             if as_json:
-                write_json({"source": str(source), **result.to_dict()})
+                told = list(hints(result, records)) if records else []
+                write_json({"source": str(source), "hints": told, **result.to_dict()})
             else:
-                print_result(result)
+                print_result(result, drift=drift_check(records), records=records)
             if not force:
                 stop_unless_accepted(result)
             if output is not None:
