@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import click
 
-from ftdrive.commands.common import JSON, MODEL, check_simulate, rows, simulate, write_json
+from ftdrive.commands.common import JSON, MODEL, NewFile, check_simulate, rows, simulate, write_json
 
 T = TypeVar("T")
 
@@ -38,9 +38,7 @@ _SILENT = "did not answer when this was written"
 @click.option("--plane", "planes", multiple=True, metavar="NX:NY:NZ:MM", help="A wall, base axes. Repeatable.")
 @click.option("--box", "boxes", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block, two corners in mm. Repeatable.")
 @click.option("--speed", metavar="DEG/S", help="Of the fastest joint.")
-@click.option(
-    "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="A new file.  [default: ftdrive.toml]"
-)
+@click.option("-o", "--output", type=NewFile(), default="ftdrive.toml", show_default=True, help="A new file.")
 @simulate("Robot and sensor are emulated, --sensor emulated://NAME is which; they end with this command.")
 @click.option("--yes", is_flag=True, help="Ask nothing: take what is given here, and defaults where there are any.")
 @JSON
@@ -57,7 +55,7 @@ def init(
     planes: tuple[str, ...],
     boxes: tuple[str, ...],
     speed: str | None,
-    output: Path | None,
+    output: Path,
     simulate: bool,
     yes: bool,
     as_json: bool,
@@ -67,21 +65,15 @@ def init(
     The arm is only read and nothing moves. A file that is there already is never overwritten. What must be measured has
     no default, and `measured = false` in the file stays until you change it.
     """
-    from calib.files import require_new, write_new
+    from calib.files import write_new
     from drivers.ur.kinematics import model_named
     from ftdrive.cellfile import cell_file
-    from ftdrive.config import FILE, CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, settings
+    from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, settings
     from ftdrive.planning.arm_model import SHAPES
     from ftdrive.planning.cell import require_possible
     from ftdrive.simulation import Station, sensor_name
 
     check_simulate(simulate, real={"--robot": robot})
-    path = output or Path(FILE)
-    if path.exists():
-        raise FileExistsError(
-            f"{path} exists already and is never overwritten: edit it, or choose another with --output"
-        )
-    require_new(path)  # before the questions: their answers would be lost
     said = settings()
     with ExitStack() as stack:
         if simulate:
@@ -145,15 +137,15 @@ def init(
         ToolConfig(name, cylinders, tool_kg),
         workcell,
     )
-    write_new(path, cell_file(cell, [f"Robot: {robot_told}.", f"Sensor: {sensor_told}."]))
+    write_new(output, cell_file(cell, [f"Robot: {robot_told}.", f"Sensor: {sensor_told}."]))
     if as_json:
-        told = {"file": str(path), "robot": robot_told, "sensor": sensor_told}
+        told = {"file": str(output), "robot": robot_told, "sensor": sensor_told}
         write_json({"schema_version": 1, **told, "config": asdict(cell)})
     if simulate:
-        _say(f"Wrote {path}, to look at only: the emulated robot and sensor in it have ended with this command.")
+        _say(f"Wrote {output}, to look at only: the emulated robot and sensor in it have ended with this command.")
         _say("Next: ftdrive doctor --simulate, then ftdrive plan --simulate")
     else:
-        _say(f"Wrote {path}. Measure tool, planes and boxes, then set measured = true in it: nothing moves before.")
+        _say(f"Wrote {output}. Measure tool, planes and boxes, then set measured = true in it: nothing moves before.")
         _say("Next: ftdrive doctor, then ftdrive plan")
 
 
