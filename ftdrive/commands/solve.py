@@ -23,6 +23,7 @@ from ftdrive.commands.common import (
     JSON,
     NewFile,
     check_simulate,
+    numbers,
     simulate,
     stop_unless_accepted,
     write_json,
@@ -70,8 +71,12 @@ _NAMES = "\b\nMETHOD is one of\n" + fill(
     show_default=True,
     help="How the bias may move during the poses; the order of rows stands in for missing times.",
 )
-@click.option("--mass-kg", type=float, help="Known mass of what hangs on the sensor.")
-@click.option("--level-deg", type=float, help="The base is level within this many degrees (one sigma).")
+@click.option(
+    "--mass-kg", metavar="KG", type=click.FloatRange(0, min_open=True), help="Known mass of what hangs on the sensor."
+)
+@click.option(
+    "--level-deg", metavar="DEG", type=click.FloatRange(0, 180), help="The base is level within so much (one sigma)."
+)
 @click.option("--mounting-deg", metavar="RX,RY,RZ", help="Known rotation vector of the sensor in the flange.")
 @click.option("--output", "-o", type=NewFile(), help="Save the calibration here.")
 @click.option("--force", is_flag=True, help="Save even a rejected result; it stays marked as rejected.")
@@ -174,11 +179,8 @@ def _known(mass_kg: float | None, level_deg: float | None, mounting_deg: str | N
         return None
     R_flange_sensor = None
     if mounting_deg is not None:
-        try:
-            rotation_vector = [float(angle) for angle in mounting_deg.split(",")]
-            R_flange_sensor = Rotation.from_rotvec(rotation_vector, degrees=True).as_matrix()
-        except ValueError as error:
-            raise ConfigError(f"--mounting-deg takes three numbers such as 0,0,45, not {mounting_deg!r}") from error
+        rotation_vector = numbers("--mounting-deg", mounting_deg, ",", (3,))
+        R_flange_sensor = Rotation.from_rotvec(rotation_vector, degrees=True).as_matrix()
     try:
         return Known(
             R_flange_sensor=R_flange_sensor,

@@ -3,8 +3,10 @@
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, get_args
 
+import click
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -16,6 +18,7 @@ from calib.model import predict
 from calib.result import Method
 from calib.yu import SPECIAL_R_flange_base
 from ftdrive.commands.solve import solve as solve_command
+from ftdrive.errors import ConfigError
 from ftdrive.hints import hints
 from ftdrive.report import error_in_words, print_comparison, print_result
 from ftdrive.talk import talk
@@ -120,6 +123,23 @@ def test_lines_of_the_report_go_on_under_their_text(
     below = [re.match(r" (residuals:|worst:| {7,}) ?\S", line) for line in lines[residuals:]]
     assert len(below) > 2
     assert all(below)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--level-deg", "-1", "-1.0 is not in the range 0<=x<=180"),
+        ("--mounting-deg", "nan,0,0", "--mounting-deg is 'nan,0,0': give 3 numbers"),
+        ("--mass-kg", "0", "0.0 is not in the range x>0"),
+    ],
+)
+def test_a_known_value_that_cannot_be_is_told_as_it_was_given(
+    option: str, value: str, words: str, tmp_path: Path
+) -> None:
+    tilted().save(tmp_path / "data.json")
+    with pytest.raises((click.UsageError, ConfigError)) as error:
+        solve_command.main([str(tmp_path / "data.json"), option, value], standalone_mode=False)
+    assert words in str(error.value)
 
 
 @pytest.mark.parametrize("as_json", [False, True])
