@@ -196,7 +196,7 @@ def print_comparison(compared: Sequence[Compared]) -> None:
     talk.print(table, soft_wrap=True)
     for one in compared:
         if one.reason is not None:
-            talk.print(hanging(f" {one.method}: ", one.reason))
+            talk.print(hanging(f" {one.method}: ", one.reason.removeprefix(f"{one.method} ")))
 
 
 def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:

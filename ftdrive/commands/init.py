@@ -82,7 +82,9 @@ def init(
         ask = Questions(yes)
         host, model, robot_told = _robot(ask, robot, said["robot.host"].value, model)
         if model is not None and model_named(model, controller_major=0) not in SHAPES:
-            _say(f"  ! the shape of the {model} is not measured, so no motion can be planned: use calibrate --manual")
+            _say(
+                f"the shape of the {model} is not measured, so no motion can be planned: use calibrate --manual", "  ! "
+            )
         url, sensor_told = _sensor(ask, sensor, said["sensor.url"].value)
     height_mm = ask.number("Sensor height above the flange, mm (measure it)", "sensor.height_mm", "--height", height)
     sensor_kg = ask.number(
@@ -181,7 +183,7 @@ class Questions:
             try:
                 return read(answer)
             except ConfigError as error:
-                _say(f"  ✘ {error}")
+                _say(str(error), "  ✘ ")
 
     def text(self, words: str, key: str, flag: str, given: str | None, usual: str | None = None) -> str:
         """Ask for a text."""
@@ -261,7 +263,7 @@ def _robot(ask: Questions, given: str | None, usual: str | None, model: str | No
         except DriverError as error:
             if not ask.somebody_answers:
                 raise
-            _say(f"  ✘ {error}")
+            _say(str(error), "  ✘ ")
             other = ask.text("Another address, or Enter to keep it", "robot.host", "--robot", None, host)
             if other == host and model is not None:
                 return host, model, _SILENT
@@ -269,7 +271,7 @@ def _robot(ask: Questions, given: str | None, usual: str | None, model: str | No
                 model = ask.text("Model of the arm, such as ur5e", "robot.model", "--model", None)
             host = other
             continue
-        _say(f"  ✔ {told}")
+        _say(told, "  ✔ ")
         return host, found, told
 
 
@@ -299,16 +301,16 @@ def _sensor(ask: Questions, given: str | None, usual: str | None) -> tuple[str, 
         except (DriverError, ConfigError) as error:
             if not ask.somebody_answers:
                 raise
-            _say(f"  ✘ {error}")
+            _say(str(error), "  ✘ ")
             failed = url if isinstance(error, DriverError) and not is_place(url) else None
             keep = ", or Enter to keep it" if failed else ""
             text = ask.text(f"Another address{keep}", "sensor.url", "--sensor", None, failed)
             continue
-        _say(f"  ✔ {url}: {told}")
+        _say(f"{url}: {told}", "  ✔ ")
         return url, told
 
 
-def _say(text: str) -> None:
-    from ftdrive.talk import talk
+def _say(words: str, head: str = "") -> None:
+    from ftdrive.talk import hanging, talk
 
-    talk.print(text, markup=False)
+    talk.print(hanging(head, words))
