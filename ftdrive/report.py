@@ -61,7 +61,7 @@ def print_result(
     table = Table(box=None, padding=(0, 1))
     for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
         if truth is not None or title not in {"truth", "error / sigma"}:
-            table.add_column(title, justify="right" if title else "left", no_wrap=True)
+            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may be folded
     for label, scale, unit, key in _ROWS:
         estimates, sigmas = (_values(source[key], key) * scale for source in (data, data["sigma"]))
         truths = None if truth is None else _values(truth[key], key) * scale

@@ -221,7 +221,7 @@ def _screen(reading: dict[str, Any], made: str) -> Group:
     return Group(
         Text.assemble(
             (f"{reading['axes']} axes, about the {reading['about']}", "bold"),
-            "   raw → bias and weight of the tool taken away",
+            "   contact: raw less bias and weight of tool",
         ),
         f"{made}, {reading['verdict']}   mean of {_PERIOD_S} s   {reading['rate_Hz']:.0f} Hz, lost {reading['lost']}",
         table,

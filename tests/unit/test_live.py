@@ -148,6 +148,16 @@ def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
     assert min(min(one["force_N"]) for one in shown) > 0.5 * headline[0] / np.sqrt(3)
 
 
+@pytest.mark.parametrize("axes", ["sensor", "flange", "base"])
+def test_what_stands_above_the_numbers_fits_into_80_columns(axes: str) -> None:
+    three = {"force_N": [1.0] * 3, "torque_Nm": [0.1] * 3}
+    reading = {"axes": axes, "about": "sensor origin", "verdict": "good", "rate_Hz": 1e3, "lost": 0}
+    console = Console(width=80, file=io.StringIO(), color_system=None)
+    console.print(live._screen(reading | {"raw": three, "compensated": three, "sigma": three}, "made for this"))
+    assert isinstance(console.file, io.StringIO)
+    assert "± 1 sigma" in console.file.getvalue().splitlines()[2]
+
+
 def test_columns_stand_still_when_a_sign_changes() -> None:
     def ends(contact: float) -> list[int]:
         three = {"force_N": [contact] * 3, "torque_Nm": [contact / 10] * 3}

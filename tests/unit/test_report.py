@@ -106,7 +106,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
         monkeypatch.setattr(talk, name, value)
 
 
-@pytest.mark.parametrize("width", [50, 80])
+@pytest.mark.parametrize("width", [44, 80])
 def test_lines_of_the_report_go_on_under_their_text(
     width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -120,6 +120,7 @@ def test_lines_of_the_report_go_on_under_their_text(
     assert lines[start + 1].startswith(" " * len(" REJECTED  "))
     assert all(line.startswith("   ") for line in lines[start + 1 : end])
     residuals = next(i for i, line in enumerate(lines) if line.startswith(" residuals:"))
+    assert "…" not in "".join(lines)
     below = [re.match(r" (residuals:|worst:| {7,}) ?\S", line) for line in lines[residuals:]]
     assert len(below) > 2
     assert all(below)
