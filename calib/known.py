@@ -51,6 +51,43 @@ class Known:
             if not 0 <= getattr(self, name) < np.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected 0 (exactly known) or more")
 
+    def contradictions(self, found: Parameters, covariance: Array, g_m_s2: float, sigmas: float) -> list[str]:
+        """Say what of this is off by more than so many standard deviations, with what the data say instead.
+
+        Parameters
+        ----------
+        found : Parameters
+            Of a fit with nothing taken as known.
+        covariance : array, shape (15, 15)
+            Of it.
+        g_m_s2 : float
+        sigmas : float
+        """
+        words = []
+        if self.mass_kg is not None:
+            weight_N = float(np.linalg.norm(found.gravity_force_base_N))
+            along = found.gravity_force_base_N / (weight_N or 1.0)
+            mass_kg, sigma_kg = weight_N / g_m_s2, float(np.sqrt(along @ covariance[3:6, 3:6] @ along)) / g_m_s2
+            if abs(mass_kg - self.mass_kg) > sigmas * np.hypot(sigma_kg, self.mass_tolerance_kg):
+                words.append(f"mass {self.mass_kg:g} kg, they say {_with_sigma(mass_kg, sigma_kg)} kg")
+        if self.gravity_direction_base is not None:
+            direction = np.asarray(self.gravity_direction_base)
+            turn = _turn(direction, _unit(found.gravity_force_base_N))
+            across = np.cross(_unit(turn), direction)
+            sigma = float(np.sqrt(across @ covariance[3:6, 3:6] @ across / np.sum(found.gravity_force_base_N**2)))
+            if np.linalg.norm(turn) > sigmas * np.hypot(sigma, self.direction_tolerance_rad):
+                words.append(f"the direction of gravity in base, they say {_angle(turn, sigma)} off that")
+        if self.R_flange_sensor is not None:
+            turn = Rotation.from_matrix(found.R_flange_sensor @ np.asarray(self.R_flange_sensor).T).as_rotvec()
+            if self.yaw_only:
+                z = np.array([0.0, 0.0, 1.0])
+                turn = _turn(z, Rotation.from_rotvec(turn).apply(z))
+            axis = _unit(turn)
+            sigma = float(np.sqrt(axis @ covariance[:3, :3] @ axis))
+            if np.linalg.norm(turn) > sigmas * np.hypot(sigma, self.R_tolerance_rad):
+                words.append(f"the mounting of the sensor, they say {_angle(turn, sigma)} off that")
+        return words
+
 
 class Constraints:
     """A `Known` as the solver needs it: free directions, and pseudo-measurements in units of their tolerance."""
@@ -154,6 +191,15 @@ def _turn(a: Array, b: Array) -> Array:
     if sine < 1e-12:
         return np.asarray(axis if a @ b > 0 else np.pi * _across(a)[0])
     return np.asarray(axis * (angle / sine))
+
+
+def _angle(turn_rad: Array, sigma_rad: float) -> str:
+    return f"{_with_sigma(float(np.degrees(np.linalg.norm(turn_rad))), float(np.degrees(sigma_rad)))}°"
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    digits = int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 6))
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
 
 
 def _unit(v: Array) -> Array:

@@ -1,5 +1,6 @@
 """What a fit is worth, in plain words: how well it predicts, whether it is plausible, and what looks reversed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
@@ -73,6 +74,7 @@ def judge(
     farthest_com_m: float = FARTHEST_COM_M,
     up_in_base: ArrayLike = _UP_IN_BASE,
     unconstrained: Evidence | None = None,
+    contradicted: Sequence[str] = (),
 ) -> Quality:
     """Judge a fit.
 
@@ -92,7 +94,9 @@ def judge(
     up_in_base : array_like, shape (3,)
         Where up should be, in base: +z for a robot on a table.
     unconstrained : Evidence, optional
-        The best fit to the same poses with nothing taken as known, where `fit` is another method's.
+        The best fit to the same poses with nothing taken as known, where `fit` is another.
+    contradicted : sequence of str
+        What was taken as known and that fit contradicts, as `Known.contradictions` has it.
     """
     rejected: list[str] = []
     usable: list[str] = []
@@ -112,7 +116,7 @@ def judge(
     rejected += explanation + _weight_reasons(fit, weight_N) + _second_solution_reasons(fit)
     _com_reasons(parameters, farthest_com_m, rejected, usable)
     (rejected if largest > REJECTED_SHARE else usable).extend(inexact)
-    if unconstrained is not None and largest > NOISY_SHARE:
+    if unconstrained is not None and largest > NOISY_SHARE and not contradicted:
         usable += _contradiction_reasons(fit, unconstrained)
     sensible = not explanation and largest < SENSELESS_SHARE
     if sensible:
@@ -148,6 +152,10 @@ def judge(
         notes += _plausibility_notes(parameters, fit.covariance, up_in_base, farthest_com_m)
     if chi2_p is None:
         notes.append("the noise was not measured but estimated from the residuals: chi2 says nothing about the fit")
+    if contradicted and (chi2_p is None or chi2_p < SURE):
+        known = "; ".join(contradicted)
+        cause = f"what was given as known does not agree with the data: {known}: correct it, or leave it out"
+        (rejected or usable or notes).insert(0, cause)  # before what it causes
     return Quality(
         verdict="rejected" if rejected else "usable" if usable else "good",
         reasons=(*rejected, *usable, *notes),

@@ -16,7 +16,7 @@ from calib.ml import RANK_TOLERANCE, STANDARD_GRAVITY_M_S2, Drift, Fit, fit
 from calib.model import PARAMETER_NAMES, Array, Parameters, predict
 from calib.pooling import pooled_covariance
 from calib.published import LEVEL_BASE, PUBLISHED, Estimator, published
-from calib.quality import judge
+from calib.quality import SIGNIFICANT_SIGMAS, judge
 from calib.result import CalibrationResult, DriftResult, Method
 
 SIMULATIONS = 400
@@ -101,7 +101,19 @@ def solve(
             best.second_basin_chi2,
         )
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
-    quality = judge(evidence, t_s=dataset.t_s, measured_sigma=measured_sigma, unconstrained=best if estimator else None)
+    unconstrained = best if estimator else None if known is None else _unconstrained(dataset, wrench_cov, drift)
+    contradicted: list[str] = []
+    if known is not None and unconstrained is not None:
+        contradicted = known.contradictions(
+            unconstrained.parameters, unconstrained.covariance, g_m_s2, SIGNIFICANT_SIGMAS
+        )
+    quality = judge(
+        evidence,
+        t_s=dataset.t_s,
+        measured_sigma=measured_sigma,
+        unconstrained=unconstrained,
+        contradicted=contradicted,
+    )
     chi2 = evidence.chi2 if wrench_cov is None else evidence.measured_chi2
     drifted = best.drift if estimator is None else None
     return CalibrationResult(
@@ -139,6 +151,17 @@ def _constrained(method: Method, known: Known | None) -> Known | None:
     if method == "yaw-only":
         return replace(known or Known(), yaw_only=True)
     return known
+
+
+def _unconstrained(dataset: CalibrationDataset, wrench_cov: Array | None, drift: Drift) -> Fit | None:
+    """Fit with nothing taken as known; None where the poses do not determine everything."""
+    try:
+        require_orientations(dataset.R_base_flange, 4)
+        found = fit(dataset.R_base_flange, dataset.wrench, wrench_cov, t_s=dataset.t_s, drift=drift)
+        _require_determined(dataset.R_base_flange, found, None)
+    except NotObservable:
+        return None
+    return found
 
 
 def estimator_of(method: Method, R_base_flange: Array, known: Known | None, g_m_s2: float) -> Estimator:

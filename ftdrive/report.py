@@ -15,7 +15,7 @@ from calib.compare import Compared
 from calib.quality import SURE
 from calib.routine import DriftCheck, PoseRecord
 from ftdrive.hints import hints, names_of
-from ftdrive.talk import talk
+from ftdrive.talk import hanging, talk
 
 Array = NDArray[np.float64]
 
@@ -47,21 +47,21 @@ def print_result(
         The calibration file, told in the last line.
     """
     data = result.to_dict()
+    talk.print()
     talk.print(
-        Text.assemble(
-            "\n ",
-            (result.verdict.upper(), _STYLE[result.verdict]),
-            f"  {result.n_poses} poses, method {result.method}; compensation error {error_in_words(result)}",
+        hanging(
+            Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  "),
+            f"{result.n_poses} poses, method {result.method}; compensation error {error_in_words(result)}",
         )
     )
     for reason in result.reasons:
-        talk.print(f"   {reason}")
+        talk.print(hanging("   ", reason))
     errors = {} if truth is None else errors_in_sigma(result, truth)
     fixed_below = _ROUNDED * float(np.sqrt(np.diag(result.covariance).max()))
     table = Table(box=None, padding=(0, 1))
     for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
         if truth is not None or title not in {"truth", "error / sigma"}:
-            table.add_column(title, justify="right" if title else "left", no_wrap=True)
+            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may be folded
     for label, scale, unit, key in _ROWS:
         estimates, sigmas = (_values(source[key], key) * scale for source in (data, data["sigma"]))
         truths = None if truth is None else _values(truth[key], key) * scale
@@ -79,41 +79,57 @@ def print_result(
     talk.print(table)
     residual = data["residual"]
     talk.print(
-        f" residuals: force {residual['force_rms_N']:.4f} N rms, {residual['force_max_N']:.4f} max; "
-        f"torque {residual['torque_rms_Nm']:.5f} N·m rms, {residual['torque_max_Nm']:.5f} max"
+        hanging(
+            " residuals: ",
+            f"force {residual['force_rms_N']:.4f} N rms, {residual['force_max_N']:.4f} max; "
+            f"torque {residual['torque_rms_Nm']:.5f} N·m rms, {residual['torque_max_Nm']:.5f} max",
+        )
     )
     if (poses := poses_in_words(result, names_of(records))) is not None:
-        talk.print(f" {poses}")
+        talk.print(hanging(" worst: ", poses))
     if drift is not None:
         words, bad = drift_in_words(drift)
-        talk.print(f" drift: {words}", style="yellow" if bad else None)
+        talk.print(hanging(" drift: ", words), style="yellow" if bad else None)
     if result.drift is not None:
         change, sigma = result.drift.change, result.drift.sigma
-        talk.print(
-            f" drift in the fit: {np.linalg.norm(change[:3]):.3f} ± {np.max(sigma[:3]):.3f} N, "
+        words = (
+            f"{np.linalg.norm(change[:3]):.3f} ± {np.max(sigma[:3]):.3f} N, "
             f"{np.linalg.norm(change[3:]):.4f} ± {np.max(sigma[3:]):.4f} N·m from the first pose to the last"
         )
+        talk.print(hanging(" drift in the fit: ", words))
     if records:
         for hint in hints(result, records):
-            talk.print(f" ? {hint}", style="yellow")
+            talk.print(hanging(" ? ", hint), style="yellow")
     if saved is not None:
         talk.print(f" Saved {saved}")
 
 
 def error_in_words(result: CalibrationResult) -> str:
-    """Say how well a free tool will be compensated, N and N·m, and from what that is known.
+    """Say how well a free tool will be compensated, N and N·m, and from what that is known."""
+    words = "{:.4f} N, {:.5f} N·m".format(*result.predicted_error())
+    if _noise_explains(result):
+        return f"{words} rms over all orientations (predicted)"
+    seen = "{:.4f} N, {:.5f} N·m".format(*likely_error(result))
+    why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
+    return f"{seen} rms (cross-validated, as {why}; predicted: {words})"
+
+
+def likely_error(result: CalibrationResult) -> Array:
+    """Root mean square error (2,) of compensating a free tool over all orientations, N and N·m.
 
     What noise makes uncertain says it all only where the measured noise explains the residuals. Elsewhere it is the
     larger of that and of the error in predicting each pose from all others.
     """
-    predicted = result.predicted_error()
-    words = "{:.4f} N, {:.5f} N·m".format(*predicted)
-    if not result.quality or (result.p_value is not None and result.p_value >= SURE):
-        return f"{words} rms over all orientations (predicted)"
-    left_out = result.quality["loo_force_rms_N"], result.quality["loo_torque_rms_Nm"]
-    seen = "{:.4f} N, {:.5f} N·m".format(*np.maximum(predicted, left_out))
-    why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
-    return f"{seen} rms (cross-validated, as {why}; predicted: {words})"
+    predicted = np.array(result.predicted_error())
+    if _noise_explains(result):
+        return predicted
+    left_out = [result.quality["loo_force_rms_N"], result.quality["loo_torque_rms_Nm"]]
+    return np.asarray(np.maximum(predicted, left_out))
+
+
+def _noise_explains(result: CalibrationResult) -> bool:
+    """Tell whether nothing speaks against the noise model: files of the first version hold nothing that could."""
+    return not result.quality or (result.p_value is not None and result.p_value >= SURE)
 
 
 def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:
@@ -131,7 +147,7 @@ def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str 
     row = int(quality["worst_pose"])
     worst = names[row - 1] if names else f"pose {row}"
     return (
-        f"worst: {worst}, {quality['residual_sigma'][row - 1]:.1f} sigma; each pose predicted by the others: "
+        f"{worst}, {quality['residual_sigma'][row - 1]:.1f} sigma; each pose predicted by the others: "
         f"{quality['loo_force_rms_N']:.4f} N, {quality['loo_torque_rms_Nm']:.5f} N·m rms"
     )
 
@@ -180,7 +196,7 @@ def print_comparison(compared: Sequence[Compared]) -> None:
     talk.print(table, soft_wrap=True)
     for one in compared:
         if one.reason is not None:
-            talk.print(f" {one.method}: {one.reason}")
+            talk.print(hanging(f" {one.method}: ", one.reason.removeprefix(f"{one.method} ")))
 
 
 def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:

@@ -6,9 +6,26 @@ import textwrap
 from typing import TextIO
 
 from rich.console import Console
+from rich.text import Text
 
 talk = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
 """A terminal gets whole words, a file whole lines. Brackets and colons stand as they are: paths have them too."""
+
+_NARROWEST = 20
+"""Columns behind a head: with fewer, lines begin at the left."""
+
+
+def hanging(head: str | Text, words: str, console: Console = talk) -> Text:
+    """Put words behind a head; on a terminal too narrow for them the next lines begin under the first word."""
+    first = Text.assemble(head)
+    text = Text(words)
+    width = console.width - first.cell_len
+    if console.soft_wrap or width < _NARROWEST:
+        return first + text
+    lines = text.wrap(console, width)
+    for line in lines:
+        line.rstrip()
+    return first + Text("\n" + " " * first.cell_len).join(lines)
 
 
 def in_whole_words(text: str, file: TextIO) -> str:

@@ -50,7 +50,7 @@ class NewFile(click.Path):
         try:
             require_new(path)
         except OSError as error:
-            raise ConfigError(str(error)) from error
+            raise ConfigError(f"{max(param.opts, key=len) if param else '--output'}: {error}") from error
         return path
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
@@ -15,6 +15,7 @@ from ftdrive.checks import Check, can_details, can_interfaces, check_serial_port
 from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.simulation import Station
+from ftdrive.talk import hanging
 
 _PLACES = """\b
 A PLACE is
@@ -105,17 +106,17 @@ def _print(found: dict[str, Any]) -> None:
     data = Console(highlight=False, emoji=False, soft_wrap=not sys.stdout.isatty())
     for port in found["serial"]:
         words = [port["by_id"] or port["port"], port["description"], port["usb"]]
-        data.print(" serial  " + escape("   ".join(word for word in words if word)))
+        data.print(hanging(" serial  ", "   ".join(word for word in words if word), data))
         for finding in port["findings"]:
-            data.print(f"         [yellow]![/] {escape(finding['found'])}")
-            data.print(f"           fix: {escape(finding['fix'] or '-')}")
+            data.print(hanging(Text.assemble(" " * 9, ("!", "yellow"), " "), finding["found"], data))
+            data.print(hanging(f"{'':11}fix: ", finding["fix"] or "-", data))
     for interface in found["can"]:
         words = [str(value) for value in interface.values()]
-        data.print(" can     " + escape("   ".join(words)))
+        data.print(hanging(" can     ", "   ".join(words), data))
     for kind, name in (("serial", "serial ports"), ("can", "CAN interfaces of the kernel")):
         if not found[kind]:
             data.print(f" no {name}")
     for answer in found.get("answers", ()):
         what = answer["what"] if answer["error"] is None else f"{answer['what']}: {answer['error']}"
         words = [answer["port"], what, answer["url"]]
-        data.print(" probed  " + escape("   ".join(word for word in words if word)))
+        data.print(hanging(" probed  ", "   ".join(word for word in words if word), data))

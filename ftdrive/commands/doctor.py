@@ -14,7 +14,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from calib import CalibrationResult
 from drivers.errors import DriverError
@@ -28,7 +28,7 @@ from ftdrive.commands.common import JSON, MODEL, check_simulate, read_cell, runs
 from ftdrive.config import CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.simulation import Station, sensor_name, sensor_url
-from ftdrive.talk import talk
+from ftdrive.talk import hanging, talk
 from ftdrive.wiring import build_arm, build_sensor
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ _PUSH_WINDOW_S = 0.2
 _SIMULATED_PUSH_N = 15.0
 _SCRIPT_PORT = 30003
 _NOT_UR = Check("robot.programs", "skipped", "not applicable: only a UR has dashboard, RTDE registers and port 30003")
-_MARK = {"ok": "[green]✔[/]", "warning": "[yellow]![/]", "failed": "[red]✘[/]", "skipped": "-"}
+_MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "red"), "skipped": ("-", "")}
 
 
 @click.command()
@@ -271,9 +271,10 @@ def _print(found: list[Check]) -> None:
     subject = ""
     for check in found:
         first, _, _ = check.name.partition(".")
-        data.print(f" {'' if first == subject else first:<12}{_MARK[check.state]} {escape(check.found)}")
+        head = Text.assemble(f" {'' if first == subject else first:<12}", _MARK[check.state], " ")
+        data.print(hanging(head, check.found, data))
         if check.fix is not None and check.state in {"warning", "failed"}:
-            data.print(f"{'':15}fix: {escape(check.fix)}")
+            data.print(hanging(f"{'':15}fix: ", check.fix, data))
         subject = first
     worst = checks.verdict(found)
     talk.print({"ok": " All is well.", "warning": " Usable; see what is marked !", "failed": " Not ready."}[worst])

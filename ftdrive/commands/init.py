@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import click
 
-from ftdrive.commands.common import JSON, MODEL, check_simulate, rows, simulate, write_json
+from ftdrive.commands.common import JSON, MODEL, NewFile, check_simulate, rows, simulate, write_json
 
 T = TypeVar("T")
 
@@ -38,9 +38,7 @@ _SILENT = "did not answer when this was written"
 @click.option("--plane", "planes", multiple=True, metavar="NX:NY:NZ:MM", help="A wall, base axes. Repeatable.")
 @click.option("--box", "boxes", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block, two corners in mm. Repeatable.")
 @click.option("--speed", metavar="DEG/S", help="Of the fastest joint.")
-@click.option(
-    "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="A new file.  [default: ftdrive.toml]"
-)
+@click.option("-o", "--output", type=NewFile(), default="ftdrive.toml", show_default=True, help="A new file.")
 @simulate("Robot and sensor are emulated, --sensor emulated://NAME is which; they end with this command.")
 @click.option("--yes", is_flag=True, help="Ask nothing: take what is given here, and defaults where there are any.")
 @JSON
@@ -57,7 +55,7 @@ def init(
     planes: tuple[str, ...],
     boxes: tuple[str, ...],
     speed: str | None,
-    output: Path | None,
+    output: Path,
     simulate: bool,
     yes: bool,
     as_json: bool,
@@ -67,21 +65,15 @@ def init(
     The arm is only read and nothing moves. A file that is there already is never overwritten. What must be measured has
     no default, and `measured = false` in the file stays until you change it.
     """
-    from calib.files import require_new, write_new
+    from calib.files import write_new
     from drivers.ur.kinematics import model_named
     from ftdrive.cellfile import cell_file
-    from ftdrive.config import FILE, CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, settings
+    from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, settings
     from ftdrive.planning.arm_model import SHAPES
     from ftdrive.planning.cell import require_possible
     from ftdrive.simulation import Station, sensor_name
 
     check_simulate(simulate, real={"--robot": robot})
-    path = output or Path(FILE)
-    if path.exists():
-        raise FileExistsError(
-            f"{path} exists already and is never overwritten: edit it, or choose another with --output"
-        )
-    require_new(path)  # before the questions: their answers would be lost
     said = settings()
     with ExitStack() as stack:
         if simulate:
@@ -90,7 +82,9 @@ def init(
         ask = Questions(yes)
         host, model, robot_told = _robot(ask, robot, said["robot.host"].value, model)
         if model is not None and model_named(model, controller_major=0) not in SHAPES:
-            _say(f"  ! the shape of the {model} is not measured, so no motion can be planned: use calibrate --manual")
+            _say(
+                f"the shape of the {model} is not measured, so no motion can be planned: use calibrate --manual", "  ! "
+            )
         url, sensor_told = _sensor(ask, sensor, said["sensor.url"].value)
     height_mm = ask.number("Sensor height above the flange, mm (measure it)", "sensor.height_mm", "--height", height)
     sensor_kg = ask.number(
@@ -145,15 +139,15 @@ def init(
         ToolConfig(name, cylinders, tool_kg),
         workcell,
     )
-    write_new(path, cell_file(cell, [f"Robot: {robot_told}.", f"Sensor: {sensor_told}."]))
+    write_new(output, cell_file(cell, [f"Robot: {robot_told}.", f"Sensor: {sensor_told}."]))
     if as_json:
-        told = {"file": str(path), "robot": robot_told, "sensor": sensor_told}
+        told = {"file": str(output), "robot": robot_told, "sensor": sensor_told}
         write_json({"schema_version": 1, **told, "config": asdict(cell)})
     if simulate:
-        _say(f"Wrote {path}, to look at only: the emulated robot and sensor in it have ended with this command.")
+        _say(f"Wrote {output}, to look at only: the emulated robot and sensor in it have ended with this command.")
         _say("Next: ftdrive doctor --simulate, then ftdrive plan --simulate")
     else:
-        _say(f"Wrote {path}. Measure tool, planes and boxes, then set measured = true in it: nothing moves before.")
+        _say(f"Wrote {output}. Measure tool, planes and boxes, then set measured = true in it: nothing moves before.")
         _say("Next: ftdrive doctor, then ftdrive plan")
 
 
@@ -189,7 +183,7 @@ class Questions:
             try:
                 return read(answer)
             except ConfigError as error:
-                _say(f"  ✘ {error}")
+                _say(str(error), "  ✘ ")
 
     def text(self, words: str, key: str, flag: str, given: str | None, usual: str | None = None) -> str:
         """Ask for a text."""
@@ -269,7 +263,7 @@ def _robot(ask: Questions, given: str | None, usual: str | None, model: str | No
         except DriverError as error:
             if not ask.somebody_answers:
                 raise
-            _say(f"  ✘ {error}")
+            _say(str(error), "  ✘ ")
             other = ask.text("Another address, or Enter to keep it", "robot.host", "--robot", None, host)
             if other == host and model is not None:
                 return host, model, _SILENT
@@ -277,7 +271,7 @@ def _robot(ask: Questions, given: str | None, usual: str | None, model: str | No
                 model = ask.text("Model of the arm, such as ur5e", "robot.model", "--model", None)
             host = other
             continue
-        _say(f"  ✔ {told}")
+        _say(told, "  ✔ ")
         return host, found, told
 
 
@@ -307,16 +301,16 @@ def _sensor(ask: Questions, given: str | None, usual: str | None) -> tuple[str, 
         except (DriverError, ConfigError) as error:
             if not ask.somebody_answers:
                 raise
-            _say(f"  ✘ {error}")
+            _say(str(error), "  ✘ ")
             failed = url if isinstance(error, DriverError) and not is_place(url) else None
             keep = ", or Enter to keep it" if failed else ""
             text = ask.text(f"Another address{keep}", "sensor.url", "--sensor", None, failed)
             continue
-        _say(f"  ✔ {url}: {told}")
+        _say(f"{url}: {told}", "  ✔ ")
         return url, told
 
 
-def _say(text: str) -> None:
-    from ftdrive.talk import talk
+def _say(words: str, head: str = "") -> None:
+    from ftdrive.talk import hanging, talk
 
-    talk.print(text, markup=False)
+    talk.print(hanging(head, words))

@@ -25,6 +25,7 @@ from ftdrive.diagnosis import belonging
 from ftdrive.errors import ConfigError
 from ftdrive.keyboard import Keyboard
 from ftdrive.rehearsal import rehearse
+from ftdrive.report import likely_error
 from ftdrive.runs import Run
 from ftdrive.simulation import Station, sensor_name
 from ftdrive.talk import talk
@@ -173,6 +174,9 @@ def _reading(look: Look, calibration: CalibrationResult, axes: Axes) -> dict[str
     raw = look.mean.mean
     contact = calibration.compensate(raw, look.R_base_flange)
     covariance = look.mean.covariance + calibration.wrench_covariance(look.R_base_flange)
+    # What noise does not explain, as the report says it, may be along any axis.
+    beyond = likely_error(calibration) ** 2 - np.square(calibration.predicted_error())
+    covariance += np.diag(np.repeat(beyond / 3, 3))
     R_axes_sensor = {
         "sensor": np.eye(3),
         "flange": calibration.R_flange_sensor,
@@ -217,7 +221,7 @@ def _screen(reading: dict[str, Any], made: str) -> Group:
     return Group(
         Text.assemble(
             (f"{reading['axes']} axes, about the {reading['about']}", "bold"),
-            "   raw → bias and weight of the tool taken away",
+            "   contact: raw less bias and weight of tool",
         ),
         f"{made}, {reading['verdict']}   mean of {_PERIOD_S} s   {reading['rate_Hz']:.0f} Hz, lost {reading['lost']}",
         table,

@@ -16,17 +16,20 @@ from calib.compare import compare
 from calib.errors import CalibError
 from calib.ml import STANDARD_GRAVITY_M_S2, Drift
 from calib.result import Method
+from calib.routine import drift_check
 from ftdrive.cli import exit_code
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
     JSON,
     NewFile,
     check_simulate,
+    numbers,
     simulate,
     stop_unless_accepted,
     write_json,
 )
 from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.hints import hints
 from ftdrive.rehearsal import rehearsed_run
 from ftdrive.report import print_comparison, print_result
 from ftdrive.runs import Run, versions
@@ -68,8 +71,12 @@ _NAMES = "\b\nMETHOD is one of\n" + fill(
     show_default=True,
     help="How the bias may move during the poses; the order of rows stands in for missing times.",
 )
-@click.option("--mass-kg", type=float, help="Known mass of what hangs on the sensor.")
-@click.option("--level-deg", type=float, help="The base is level within this many degrees (one sigma).")
+@click.option(
+    "--mass-kg", metavar="KG", type=click.FloatRange(0, min_open=True), help="Known mass of what hangs on the sensor."
+)
+@click.option(
+    "--level-deg", metavar="DEG", type=click.FloatRange(0, 180), help="The base is level within so much (one sigma)."
+)
 @click.option("--mounting-deg", metavar="RX,RY,RZ", help="Known rotation vector of the sensor in the flange.")
 @click.option("--output", "-o", type=NewFile(), help="Save the calibration here.")
 @click.option("--force", is_flag=True, help="Save even a rejected result; it stays marked as rejected.")
@@ -122,10 +129,12 @@ def _solve_each(
                 _show_all(source, dataset, {**options, "g_m_s2": g_m_s2}, as_json)
                 continue
             result = _solve(dataset, method, {**options, "g_m_s2": g_m_s2, "provenance": provenance})
+            records = Run(source).records() if source.is_dir() else []  # a run tells more than its dataset
             if as_json:
-                write_json({"source": str(source), **result.to_dict()})
+                told = list(hints(result, records)) if records else []
+                write_json({"source": str(source), "hints": told, **result.to_dict()})
             else:
-                print_result(result)
+                print_result(result, drift=drift_check(records), records=records)
             if not force:
                 stop_unless_accepted(result)
             if output is not None:
@@ -170,11 +179,8 @@ def _known(mass_kg: float | None, level_deg: float | None, mounting_deg: str | N
         return None
     R_flange_sensor = None
     if mounting_deg is not None:
-        try:
-            rotation_vector = [float(angle) for angle in mounting_deg.split(",")]
-            R_flange_sensor = Rotation.from_rotvec(rotation_vector, degrees=True).as_matrix()
-        except ValueError as error:
-            raise ConfigError(f"--mounting-deg takes three numbers such as 0,0,45, not {mounting_deg!r}") from error
+        rotation_vector = numbers("--mounting-deg", mounting_deg, ",", (3,))
+        R_flange_sensor = Rotation.from_rotvec(rotation_vector, degrees=True).as_matrix()
     try:
         return Known(
             R_flange_sensor=R_flange_sensor,

@@ -18,7 +18,7 @@ from drivers.transcript import INTERRUPTED, BadTranscript, Transcript, Writer
 from drivers.transcript_player import Player
 from drivers.transcript_taps import recording
 from ftdrive.checks import SensorAddress
-from ftdrive.commands.common import EMULATED_SENSOR, JSON, check_simulate, simulate, write_json
+from ftdrive.commands.common import EMULATED_SENSOR, JSON, NewFile, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs import versions
 from ftdrive.simulation import EMULATED, sensor_name, sensor_url
@@ -41,9 +41,7 @@ def transcript() -> None:
 @transcript.command()
 @click.option("--sensor", metavar="URL", help="Such as ati-serial:///dev/serial/by-id/NAME.")
 @simulate("An emulated sensor, on RS-485 from ATI unless --sensor emulated://NAME names another.")
-@click.option(
-    "-o", "--output", "path", required=True, type=click.Path(dir_okay=False, path_type=Path), help="A new file."
-)
+@click.option("-o", "--output", "path", required=True, type=NewFile(), help="A new file.")
 @click.option(
     "--duration", "duration_s", type=click.FloatRange(0.1, 600), default=5.0, show_default=True, help="Seconds."
 )

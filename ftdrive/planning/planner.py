@@ -208,7 +208,7 @@ def plan_box(
     """
     stands = checked_joints(q_rad)
     if not 0 <= half_size_m <= 1:
-        raise ConfigError(f"the box is {half_size_m:g} m to each side: give 0 to 1")
+        raise ConfigError(f"the box is {1e3 * half_size_m:g} mm to each side: give 0 to 1000")
     centre = certifier.arm.frames(stands).flange_m[0] if centre_m is None else np.asarray(centre_m, dtype=np.float64)
     found = _box(certifier, stands, _numbers(poses), centre, half_size_m, speeds)
     if found is None:

@@ -245,8 +245,8 @@ def test_the_transcript_of_a_simulated_play_is_not_said_to_be_saved(ftdrive: Com
     assert played.returncode == 0, played.stderr
     assert "Saved" not in played.stderr
     refused = ftdrive.run("transcript", "record", "--simulate", "-o", "nope/sensor.jsonl", "--duration", "0.1")
-    assert refused.returncode == 6
-    assert "nope/sensor.jsonl cannot be written" in refused.stderr
+    assert refused.returncode == 2
+    assert "the folder nope does not exist" in refused.stderr
     assert "Saved" not in refused.stderr
 
 

@@ -21,6 +21,7 @@ from click.testing import CliRunner, Result
 from drivers.errors import ConnectError
 from ftdrive.cli import cli, exit_code
 from ftdrive.config import load
+from ftdrive.errors import ConfigError
 from ftdrive.simulation import Station
 
 COLUMNS = 80
@@ -115,8 +116,8 @@ def test_what_was_not_asked_is_left_to_the_users_file(addresses: list[str], monk
 def test_an_existing_file_is_never_overwritten() -> None:
     Path("ftdrive.toml").write_text("mine")
     outcome = run("--yes")
-    assert isinstance(outcome.exception, FileExistsError)
-    assert "never overwritten" in str(outcome.exception)
+    assert isinstance(outcome.exception, ConfigError)
+    assert "--output: ftdrive.toml exists already and is never overwritten" in str(outcome.exception)
     assert Path("ftdrive.toml").read_text() == "mine"
 
 
@@ -144,7 +145,7 @@ def test_a_robot_that_does_not_answer_is_exit_code_3(station: Station) -> None:
 def test_a_folder_that_is_not_there_is_told_before_anything_is_asked(tmp_path: Path) -> None:
     path = tmp_path / "nowhere" / "cell.toml"
     error = run("--robot", "127.99.99.9", "--sensor", "ati-can://can0", *TOOL, "--yes", "--output", str(path)).exception
-    assert isinstance(error, FileNotFoundError)
+    assert isinstance(error, ConfigError)
     assert "create it first" in str(error)
 
 

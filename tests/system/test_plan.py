@@ -119,6 +119,8 @@ def test_the_table_fits_into_80_columns(arguments: list[str]) -> None:
         (["--tip-speed-limit", "-1"], "1 to 250"),
         (["--tip-speed-limit", "fast"], "'fast': give mm/s, such as 250, or none"),
         (["--posture", "45,-100"], "3 numbers"),
+        (["--free-box", "-3"], "the box is -3 mm to each side: give 0 to 1000"),
+        (["--free-box", "nan"], "the box is nan mm"),
         (["--mass", "0"], "0.001 to 100"),
     ],
 )

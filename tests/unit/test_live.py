@@ -11,10 +11,13 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from calib import CalibrationResult
-from calib.noise import LEAST_SAMPLES
+from calib import CalibrationDataset, CalibrationResult, Known, Parameters, solve
+from calib.model import predict
+from calib.noise import LEAST_SAMPLES, PoseMean
+from calib.yu import SPECIAL_R_flange_base
 from drivers.interfaces import Health
 from ftdrive.commands import live
+from ftdrive.report import likely_error
 
 
 class Slow:
@@ -80,6 +83,8 @@ def recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
         verdict="good",
         compensate=lambda raw, _: raw - 9.5,
         wrench_covariance=lambda _: np.zeros((6, 6)),
+        predicted_error=lambda: (0.0, 0.0),
+        quality={},
         R_flange_sensor=np.eye(3),
     )
     n = 60
@@ -123,6 +128,34 @@ def test_what_is_typed_does_not_break_the_screen(recorded: list[str], monkeypatc
     monkeypatch.setattr(live, "Keyboard", Keyboard)
     CliRunner().invoke(live.live, recorded, catch_exceptions=False)
     assert quiet == ["echo off", "shown", "shown", "shown", "as before"]
+
+
+def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
+    truth = Parameters(np.eye(3), np.array([0.1, -0.2, -5.0]), np.zeros(3), np.array([0.0, 0.0, 0.05]), np.zeros(3))
+    R = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+    off = np.random.default_rng(1).normal(size=(24, 6)) * np.repeat([0.02, 0.001], 3)  # ten times the measured noise
+    cov = np.tile(np.diag(np.repeat([2e-3, 1e-4], 3) ** 2), (24, 1, 1))
+    known = Known(mass_kg=0.6)  # too much
+    calibration = solve(
+        CalibrationDataset(R, predict(truth, R) + off, cov, np.zeros(24, np.int64), np.full(24, np.nan)), known=known
+    )
+    headline = likely_error(calibration)
+    assert (headline > 1.1 * np.array(calibration.predicted_error())).all()
+    mean = PoseMean(np.zeros(6), np.zeros((6, 6)), 20)
+    shown = [live._reading(live.Look(mean, one, 1e3, 0), calibration, "base")["sigma"] for one in R]
+    rms = [float(np.sqrt(np.mean([np.sum(np.square(one[key])) for one in shown]))) for key in ("force_N", "torque_Nm")]
+    np.testing.assert_allclose(rms, headline)
+    assert min(min(one["force_N"]) for one in shown) > 0.5 * headline[0] / np.sqrt(3)
+
+
+@pytest.mark.parametrize("axes", ["sensor", "flange", "base"])
+def test_what_stands_above_the_numbers_fits_into_80_columns(axes: str) -> None:
+    three = {"force_N": [1.0] * 3, "torque_Nm": [0.1] * 3}
+    reading = {"axes": axes, "about": "sensor origin", "verdict": "good", "rate_Hz": 1e3, "lost": 0}
+    console = Console(width=80, file=io.StringIO(), color_system=None)
+    console.print(live._screen(reading | {"raw": three, "compensated": three, "sigma": three}, "made for this"))
+    assert isinstance(console.file, io.StringIO)
+    assert "± 1 sigma" in console.file.getvalue().splitlines()[2]
 
 
 def test_columns_stand_still_when_a_sign_changes() -> None:

@@ -1,7 +1,12 @@
 """The report of a solve: a headline that its own residuals do not refute, and tables without a cut number."""
 
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, get_args
 
+import click
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -12,8 +17,12 @@ from calib.errors import NotObservable
 from calib.model import predict
 from calib.result import Method
 from calib.yu import SPECIAL_R_flange_base
+from ftdrive.commands.solve import solve as solve_command
+from ftdrive.errors import ConfigError
+from ftdrive.hints import hints
 from ftdrive.report import error_in_words, print_comparison, print_result
 from ftdrive.talk import talk
+from tests.unit.fake_cell import Lab
 
 SIGMA = np.repeat([2e-3, 1e-4], 3)
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
@@ -57,6 +66,102 @@ def test_a_method_that_was_told_wrong_is_named_as_the_cause() -> None:
     assert result.verdict != "good"
     assert any("with nothing taken as known the forces fit to 0.00" in reason for reason in result.reasons)
     assert not any("taken as known" in reason for reason in solve(tilted(), "lrom").reasons)
+
+
+LEVEL = Known(gravity_direction_base=(0, 0, -1), mass_kg=0.5)
+
+
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize(
+    ("known", "words"),
+    [
+        (Known(mass_kg=0.61), r"data: mass 0\.61 kg, they say 0\.4999\d* ± 0\.0000\d+ kg: correct it"),
+        (LEVEL, r"data: the direction of gravity in base, they say 1\.89\d* ± 0\.00\d+° off that: correct"),
+        (Known(R_flange_sensor=np.eye(3)), r"data: the mounting of the sensor, they say (79\.99|80\.00)\d* ± "),
+    ],
+)
+def test_what_was_given_wrongly_is_named_with_what_the_data_say(known: Known, words: str, measured: bool) -> None:
+    result = solve(tilted(measured=measured), known=known)
+    assert re.search(words, result.reasons[0])
+
+
+def test_what_was_given_and_may_be_true_is_not_blamed() -> None:
+    right = Known(TILTED.R_flange_sensor, 0.0, False, TILTED.gravity_force_base_N, 0.0, 0.49998, 1e-4)
+    loose = Known(gravity_direction_base=(0, 0, -1), direction_tolerance_rad=0.03, mass_kg=0.51, mass_tolerance_kg=0.01)
+    flat = Known(yaw_only=True)
+    for known in (right, loose, flat):
+        assert not any("given as known" in reason for reason in solve(tilted(), known=known).reasons)
+
+
+def test_too_few_poses_to_do_without_what_is_known_blame_nothing() -> None:
+    R = Rotation.from_rotvec([[0, 0, 0], [1.5, 0, 0.3], [0, 1.5, 0.7]]).as_matrix()
+    few = CalibrationDataset(R, predict(TILTED, R), None, np.zeros(3, np.int64), np.full(3, np.nan))
+    known = Known(TILTED.R_flange_sensor, gravity_direction_base=(0, 0, -1), mass_kg=0.61)
+    assert not any("given as known" in reason for reason in solve(few, known=known).reasons)
+
+
+def terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+    state: Any = {"_force_terminal": True, "_width": width, "_height": 25, "_color_system": None, "soft_wrap": False}
+    for name, value in state.items():
+        monkeypatch.setattr(talk, name, value)
+
+
+@pytest.mark.parametrize("width", [44, 80])
+def test_lines_of_the_report_go_on_under_their_text(
+    width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    terminal(monkeypatch, width)
+    result = solve(tilted(), known=Known(mass_kg=0.61))
+    print_result(result)
+    lines = [line.rstrip() for line in capsys.readouterr().err.splitlines()]
+    assert max(map(len, lines)) <= width
+    start = next(i for i, line in enumerate(lines) if line.startswith(" REJECTED"))
+    end = next(i for i, line in enumerate(lines) if "estimate" in line)
+    assert lines[start + 1].startswith(" " * len(" REJECTED  "))
+    assert all(line.startswith("   ") for line in lines[start + 1 : end])
+    residuals = next(i for i, line in enumerate(lines) if line.startswith(" residuals:"))
+    assert "…" not in "".join(lines)
+    below = [re.match(r" (residuals:|worst:| {7,}) ?\S", line) for line in lines[residuals:]]
+    assert len(below) > 2
+    assert all(below)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--level-deg", "-1", "-1.0 is not in the range 0<=x<=180"),
+        ("--mounting-deg", "nan,0,0", "--mounting-deg is 'nan,0,0': give 3 numbers"),
+        ("--mass-kg", "0", "0.0 is not in the range x>0"),
+    ],
+)
+def test_a_known_value_that_cannot_be_is_told_as_it_was_given(
+    option: str, value: str, words: str, tmp_path: Path
+) -> None:
+    tilted().save(tmp_path / "data.json")
+    with pytest.raises((click.UsageError, ConfigError)) as error:
+        solve_command.main([str(tmp_path / "data.json"), option, value], standalone_mode=False)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_solve_says_of_a_run_what_calibrate_says(as_json: bool, lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
+    lab.arm.set_status(payload_kg=2.5)
+    lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting="3"))
+    outcome = lab.calibrate()
+    assert outcome is not None
+    records = outcome.run.records()
+    told = hints(outcome.result, records)
+    assert any("the base leans" in one for one in told)
+    assert any("2.50 kg" in one for one in told)
+    capsys.readouterr()
+    print_result(outcome.result, drift=outcome.drift, records=records)
+    by_calibrate = capsys.readouterr().err
+    solve_command.main([str(outcome.run.folder), *["--json"][:as_json]], standalone_mode=False)
+    by_solve = capsys.readouterr()
+    if as_json:
+        assert json.loads(by_solve.out)["hints"] == list(told)
+    else:
+        assert by_solve.err == by_calibrate
 
 
 def test_a_method_that_lacks_the_mass_says_how_to_give_it() -> None:
@@ -133,9 +238,7 @@ def test_a_narrow_terminal_gets_no_vectors_and_nothing_is_cut(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    terminal: Any = {"_force_terminal": True, "_width": width, "_height": 25, "_color_system": None}
-    for name, value in terminal.items():
-        monkeypatch.setattr(talk, name, value)
+    terminal(monkeypatch, width)
     lines = shown(compared, capsys)
     assert "…" not in "".join(lines)
     assert [line.split()[0] for line in lines[2:]] == list(get_args(Method))

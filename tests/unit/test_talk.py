@@ -2,12 +2,17 @@
 
 import io
 import logging
+import re
+import sys
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
+from rich.console import Console
 
+from ftdrive.checks import Check
 from ftdrive.cli import cli, in_a_sentence
+from ftdrive.commands.doctor import _print
 from ftdrive.commands.live import _screen
 from ftdrive.errors import Declined
 from ftdrive.screen import open_operator
@@ -15,7 +20,7 @@ from ftdrive.session import guided
 from ftdrive.session.events import Noted
 from ftdrive.session.operator import Question
 from ftdrive.session.operators import PlainOperator
-from ftdrive.talk import talk
+from ftdrive.talk import hanging, talk
 
 PLAN = ["plan", "--model", "ur5e", "--tool", "0:200:100", "--minimal"]
 HELD = ["calibrate", "--robot", "10.0.0.1", "--sensor", "ati-can://can0"]
@@ -47,6 +52,35 @@ def test_the_live_screen_shows_a_path_as_it_is() -> None:
         talk.print(_screen(reading, "my [old] runs/calibration.json"))
     assert "my [old] runs/calibration.json, good" in shown.get()
     assert "[/]" not in shown.get()
+
+
+@pytest.mark.parametrize("width", [40, 80])
+def test_what_is_longer_than_the_terminal_goes_on_under_its_first_word(width: int) -> None:
+    console = Console(width=width, file=io.StringIO(), color_system=None)
+    words = " ".join(f"word{k}" for k in range(30))
+    console.print(hanging("  head: ", words, console))
+    assert isinstance(console.file, io.StringIO)
+    first, *others = console.file.getvalue().splitlines()
+    assert first.startswith("  head: word0 ")
+    assert others
+    assert all(re.match(r" {8}word\d", line) and len(line) <= width for line in others)
+    assert " ".join([first.removeprefix("  head: ").strip(), *map(str.strip, others)]) == words
+    assert hanging("head: ", words, Console(width=width, soft_wrap=True)).plain == f"head: {words}"  # a file
+
+
+def test_findings_of_doctor_and_their_cures_are_indented(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TERM", "dumb")  # 80 columns, no colour
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    _print([Check("robot.payload", "failed", "found [1] " * 20, "mend it " * 20)])
+    first, *others = (line.rstrip() for line in capsys.readouterr().out.splitlines())
+    assert first.startswith(" robot       ✘ found [1]")
+    cure = next(k for k, line in enumerate(others) if line.startswith(" " * 15 + "fix: mend"))
+    assert cure > 0
+    assert all(re.match(r" {15}\S", line) for line in others[:cure])
+    assert all(re.match(r" {20}\S", line) for line in others[cure + 1 :])
+    assert others[cure + 1 :]
 
 
 def test_quiet_leaves_only_errors() -> None:

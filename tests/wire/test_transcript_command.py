@@ -53,6 +53,17 @@ def test_a_recording_may_be_longer_than_what_one_collect_holds(url: str, monkeyp
     assert seen["mean_torque_Nm"] == pytest.approx(WRENCH[3:], abs=0.02)
 
 
+@pytest.mark.parametrize(("name", "words"), [("there", "never overwritten"), ("no/there", "create it first")])
+def test_a_file_that_cannot_be_made_is_refused_before_the_sensor_is_opened(
+    name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "there").touch()
+    monkeypatch.setattr(transcript, "_record", lambda *_, **__: pytest.fail("it was recorded"))
+    error = run("record", "--sensor", "bota-serial:///dev/none", "-o", str(tmp_path / name)).exception
+    assert isinstance(error, ConfigError)
+    assert words in str(error)
+
+
 @pytest.fixture
 def recorded(url: str, tmp_path: Path) -> list[str]:
     path = tmp_path / "whole.jsonl"
