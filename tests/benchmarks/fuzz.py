@@ -163,7 +163,7 @@ def targets() -> list[Target]:
         Target("ati.codec.decode_counts_per_unit", ati.decode_counts_per_unit, bytes.fromhex("000F4240000F4240")),
         Target("ati.codec.decode_unit_codes", ati.decode_unit_codes, b"\x02\x03"),
         Target("ati.codec.decode_firmware", ati.decode_firmware, b"\x03\x08\x00\x01"),
-        Target("ati.modbus.check_reply", reply_to(registers), modbus.frame(modbus.READ_HOLDING, b"\x02\0\0")),
+        Target("ati.modbus.check_reply", reply_to(registers), modbus.frame(0x03, b"\x02\0\0")),
         Target("ati.modbus.decode_calibration_block", modbus.decode_calibration_block, calibration),
         Target("ati.modbus.decode_records", keep, record * 8),
         Target("robotous.codec.decode_sample", robotous.decode_sample, sample),
