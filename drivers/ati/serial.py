@@ -16,10 +16,10 @@ import numpy as np
 
 from drivers._modbus import ask
 from drivers._serial import SerialPort
+from drivers._status import describe_status
 from drivers._stream import StreamingSensor, scale_facts
 from drivers.ati import modbus
 from drivers.ati.calibration import Calibration, saturated_gauges, units
-from drivers.ati.codec import describe_status
 from drivers.errors import UNUSABLE, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 

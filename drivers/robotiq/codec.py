@@ -14,6 +14,7 @@ from functools import partial
 
 from drivers import _modbus
 from drivers._crc import crc16_modbus
+from drivers._frames import Deframer
 from drivers.errors import ProtocolError
 from drivers.interfaces import NOT_REPORTED
 
@@ -57,6 +58,11 @@ def is_frame(data: bytes) -> bool:
         and data.startswith(HEADER)
         and crc16_modbus(data[:-2]) == int.from_bytes(data[-2:], "little")
     )
+
+
+def deframer() -> Deframer:
+    """Something that finds frames in a stream of bytes."""
+    return Deframer(HEADER, FRAME_SIZE, is_frame)
 
 
 def decode_frame(data: bytes) -> tuple[int, ...]:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from drivers._frames import Deframer
 from drivers._modbus import ask
 from drivers._serial import SerialPort
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
@@ -66,7 +65,7 @@ class RobotiqFt300(StreamingSensor):
         except codec.Refused:
             firmware = NOT_REPORTED
         self._ask(codec.write_register(codec.STREAM, codec.START_STREAM))
-        self._frames = Deframer(codec.HEADER, codec.FRAME_SIZE, codec.is_frame)
+        self._frames = codec.deframer()
         self._nominal_Hz = codec.NOMINAL_RATE_Hz
         self._hint_since_ns, self._hint_frames, self._hinted = 0, 0, False
         return DeviceInfo(

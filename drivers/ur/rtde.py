@@ -22,7 +22,7 @@ from itertools import accumulate, pairwise
 from types import MappingProxyType
 from typing import Final
 
-from drivers._stream import awake_s
+from drivers._clock import awake_s
 from drivers.errors import ConnectError, DeviceTimeout, DriverError, ProtocolError, StreamBroken
 
 log = logging.getLogger(__name__)

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import cast
 
 from drivers._crc import crc16_modbus, crc16_x25
-from drivers._frames import Deframer
 from drivers.ati import codec as ati
 from drivers.ati import modbus
 from drivers.bota import codec as bota
@@ -138,9 +137,9 @@ def targets() -> list[Target]:
     ati_row = halves(8, 8, 8)
     ati_pair = halves(8, 6)
     words = halves(2, 2, 2, 2)
-    robotous_stream = Deframer(bytes([robotous.START_OF_FRAME]), robotous.FRAME_SIZE, robotous.is_frame)
-    robotiq_stream = Deframer(robotiq.HEADER, robotiq.FRAME_SIZE, robotiq.is_frame)
-    bota_stream = Deframer(bota.HEADER, bota.FRAME_SIZE, bota.is_frame)
+    robotous_stream = robotous.deframer()
+    robotiq_stream = robotiq.deframer()
+    bota_stream = bota.deframer()
     sample = bytes([robotous.Command.START, *range(15)])
     record = bytes.fromhex("0064012C01F4FF38FE70FDA850")
     registers = modbus.read_registers(modbus.STATUS, 1)
