@@ -68,9 +68,9 @@ _SAYS: Mapping[str, str] = MappingProxyType(
 )
 
 
-def who(info: DeviceInfo) -> str:
-    """Name a device in words."""
-    return f"{info.model}, serial {info.serial}, firmware {info.firmware}"
+def who(info: DeviceInfo, firmware: str = "firmware") -> str:
+    """Name a device in words; `firmware` is what its firmware is called."""
+    return f"{info.model}, serial {info.serial}, {firmware} {info.firmware}"
 
 
 def check_identity(info: DeviceInfo) -> list[Check]:
@@ -263,7 +263,7 @@ def check_unreachable(error: DriverError, host: str) -> Check:
 
 def check_arm(info: DeviceInfo) -> Check:
     """Say who an arm is, and whether its PolyScope, such as "5.15.0.1261331", can be controlled."""
-    name, found = "robot.identity", f"{info.model}, serial {info.serial}, PolyScope {info.firmware}"
+    name, found = "robot.identity", who(info, "PolyScope")
     major, _, rest = info.firmware.partition(".")
     minor = rest.partition(".")[0]
     if minor.isdecimal() and int(minor) < _OLDEST_MINOR:

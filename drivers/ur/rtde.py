@@ -28,6 +28,7 @@ from drivers.errors import ConnectError, DeviceTimeout, DriverError, ProtocolErr
 log = logging.getLogger(__name__)
 
 PORT: Final = 30004
+SCRIPT_PORT: Final = 30003
 
 REQUEST_PROTOCOL_VERSION: Final = ord("V")
 GET_CONTROLLER_VERSION: Final = ord("v")
@@ -266,6 +267,17 @@ def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float) -> 
     except OSError as error:
         raise StreamBroken(f"{host}:{PORT} was lost ({error}): check the robot and the cable.") from error
     return [name for name, kind in zip(names, recipe.types, strict=False) if kind == "IN_USE"]
+
+
+def find_script_port(host: str, *, timeout_s: float) -> None:
+    """See whether the controller takes programs, sending none. Raises `ConnectError`."""
+    try:
+        socket.create_connection((host, SCRIPT_PORT), timeout=timeout_s).close()
+    except OSError as error:
+        raise ConnectError(
+            f"{host}:{SCRIPT_PORT}, which takes programs, cannot be reached ({error}): enable the real-time client "
+            f"interface under Settings, Security, Services, and look for a firewall between."
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)
