@@ -249,7 +249,7 @@ class UrArm(RobotArm):
         """Ask the dashboard server, which takes some milliseconds.
 
         None before PolyScope 5.6, which does not tell, and at the addresses of URSim, where it does not matter. Raises
-        `StreamBroken` or `DeviceTimeout`.
+        `NoDashboard`.
         """
         if self._reading().version[:2] < (5, 6) or self._host in _SIMULATORS:
             return None

@@ -23,7 +23,7 @@ from types import MappingProxyType
 from typing import Final
 
 from drivers._clock import awake_s
-from drivers.errors import ConnectError, DeviceTimeout, DriverError, ProtocolError, StreamBroken
+from drivers.errors import ConnectError, DeviceTimeout, DriverError, ProtocolError, StreamBroken, Unreachable
 
 log = logging.getLogger(__name__)
 
@@ -177,8 +177,10 @@ class Subscription:
 
     Raises
     ------
+    Unreachable
+        Nobody there.
     ConnectError
-        Nobody there, no RTDE, or outputs of other types.
+        No RTDE, or outputs of other types.
     """
 
     def __init__(self, host: str, outputs: Mapping[str, str], frequency_Hz: float, *, timeout_s: float) -> None:
@@ -190,7 +192,7 @@ class Subscription:
         try:
             self._connection = _Connection(socket.create_connection((host, PORT), timeout=timeout_s))
         except OSError as error:
-            raise ConnectError(
+            raise Unreachable(
                 f"{where} cannot be reached ({error}): check the address and the cable, that the robot controller is "
                 f"switched on, and that no firewall stands between."
             ) from error
