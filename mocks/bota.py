@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mocks.faults import Faults
-from mocks.sensor import Measure, SerialSensor
+from mocks.stream import Measure, SerialSensor
 
 HEADER = b"\xaa"
 LONGEST_COMMAND = len(b"f,4096,0,0,0")

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from mocks.ati_gauges import Scale
 from mocks.faults import Faults, FaultyWire
-from mocks.sensor import Measure, Pacer
+from mocks.stream import Measure, Pacer
 
 RDT_PORT = 49152
 REQUEST = struct.Struct(">HHI")
