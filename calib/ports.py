@@ -1,6 +1,6 @@
 """What the calibration routine asks of the outside world: a driver, a recording or a fake of this shape fits."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 
 
 class WrenchSamples(Protocol):
-    """n samples of a force/torque sensor, as measured; see `Recording` for the meaning of the columns."""
+    """n samples of a force/torque sensor, as measured: before any bias, tare, filter or compensation."""
 
     @property
     def t_host_ns(self) -> NDArray[np.int64]:
@@ -40,7 +40,7 @@ class WrenchSamples(Protocol):
 class Sensor(Protocol):
     """A source of wrenches."""
 
-    def collect(self, duration_s: float) -> WrenchSamples:
+    def collect(self, duration_s: float, /) -> WrenchSamples:
         """Every sample of the next `duration_s` seconds, or an exception."""
 
     def check(self) -> None:
@@ -64,21 +64,10 @@ class ArmReading(Protocol):
 
 
 class Arm(Protocol):
-    """Something that takes the sensor to an orientation."""
+    """An arm that stands at a pose, or comes to rest there."""
 
     def state(self) -> ArmReading:
         """Read a fresh state, or raise."""
-
-    def move_to(
-        self,
-        q_rad: Sequence[float],
-        *,
-        timeout_s: float,
-        guard: Callable[[], None],
-        speed_rad_s: float | None = None,
-        acceleration_rad_s2: float | None = None,
-    ) -> None:
-        """Move the joints to `q_rad` (6,); return on arrival, or stop the arm and raise."""
 
     def wait_until_still(self, *, timeout_s: float, guard: Callable[[], None]) -> None:
         """Return when the arm has come to rest, or raise."""

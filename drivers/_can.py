@@ -10,8 +10,7 @@ from typing import Any
 import can
 from can.interfaces.slcan import slcanBus
 
-from drivers._serial import refusal
-from drivers._stream import LINK_ERRORS
+from drivers._serial import LINK_ERRORS, refusal
 from drivers.errors import ConnectError, StreamBroken
 
 if sys.platform != "win32":

@@ -3,7 +3,6 @@
 import copy
 import logging
 import math
-import sys
 import threading
 import time
 from abc import abstractmethod
@@ -13,17 +12,10 @@ from typing import Literal
 
 import numpy as np
 
+from drivers._clock import awake_s
 from drivers._plausible import DeviceClock, Liveness, Rate
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
-
-if sys.platform == "win32":
-    LINK_ERRORS: tuple[type[Exception], ...] = (OSError,)
-else:
-    import termios
-
-    LINK_ERRORS = (OSError, termios.error)
-    """What a vanished serial port raises; `termios.error` is not an `OSError`."""
 
 log = logging.getLogger(__name__)
 
@@ -55,13 +47,6 @@ for something new, and how long to try for one."""
 _RECOVER_S = 10.0
 _RETRY_S = 0.2
 _EVENTS = 1000
-
-
-def awake_s() -> float:
-    """Seconds of a clock that goes on while the computer sleeps, where there is one."""
-    if sys.platform == "linux":
-        return time.clock_gettime(time.CLOCK_BOOTTIME)
-    return time.monotonic()
 
 
 class StreamingSensor(ForceTorqueSensor):

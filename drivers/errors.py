@@ -1,13 +1,16 @@
 """What can go wrong with a device.
 
 DriverError
-├── ConnectError     the device could not be opened, or is not what it should be
-│   └── PortInUse    another program has its port
-├── StreamBroken     the connection was lost after it had worked
-├── DeviceTimeout    nothing arrived in time (also a TimeoutError)
-├── ProtocolError    bytes arrived that the document does not allow
-└── DeviceFault      the device itself reports a fault: sensor status, protective or emergency stop
-    └── Frozen       a sensor says the same again and again
+├── ConnectError      the device could not be opened, or is not what it should be
+│   ├── PortInUse     another program has its port
+│   ├── Unreachable   nobody answers at its address
+│   ├── ModelUnknown  an arm does not tell which model it is, and nobody else has
+│   └── NoDashboard   the dashboard server of an arm does not answer, or refuses
+├── StreamBroken      the connection was lost after it had worked
+├── DeviceTimeout     nothing arrived in time (also a TimeoutError)
+├── ProtocolError     bytes arrived that the document does not allow
+└── DeviceFault       the device itself reports a fault: sensor status, protective or emergency stop
+    └── Frozen        a sensor says the same again and again
 
 Every message says what happened, with the value, and what to do next: a sensor's after "; ", an arm's, which is a
 sentence, after its last colon.
@@ -29,6 +32,18 @@ class ConnectError(DriverError):
 
 class PortInUse(ConnectError):
     """Another program has the port of the device."""
+
+
+class Unreachable(ConnectError):
+    """Nobody answers at the address of the device."""
+
+
+class ModelUnknown(ConnectError):
+    """An arm does not tell which model it is, and nobody else has."""
+
+
+class NoDashboard(ConnectError):
+    """The dashboard server of an arm does not answer, or refuses."""
 
 
 class StreamBroken(DriverError):

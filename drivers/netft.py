@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 import pynetft
 
+from drivers._status import describe_status
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM, units
 from drivers.errors import UNUSABLE, ConnectError, DeviceFault, ProtocolError, StreamBroken
@@ -114,12 +115,6 @@ ONROBOT_BITS: Mapping[int, str] = MappingProxyType(
         15: "converter error",
     }
 )
-
-
-def describe_status(status: int, bits: Mapping[int, str]) -> str:
-    """Put a status word in words, e.g. ``0x80020000 (bit 17: …, bit 31: any error)``."""
-    words = [f"bit {n}: {bits.get(n, 'reserved')}" for n in range(32) if status >> n & 1]
-    return f"0x{status:08X} ({', '.join(words) or 'ok'})"
 
 
 def text_in(page: bytes, element: str) -> str:
@@ -332,11 +327,11 @@ class NetFtSensor(StreamingSensor):
         if status not in {0, MONITOR_LATCHED}:
             raise self._fault(status)
         if status and not self._warned:
-            log.warning("%s: status %s; measuring goes on", self.name, describe_status(status, self._bits))
+            log.warning("%s: status %s; measuring goes on", self.name, describe_status(status, self._bits, 32))
             self._warned = True
 
     def _fault(self, status: int) -> DeviceFault:
-        return DeviceFault(f"{self.name}: status {describe_status(status, self._bits)}; {UNUSABLE}")
+        return DeviceFault(f"{self.name}: status {describe_status(status, self._bits, 32)}; {UNUSABLE}")
 
     def _read_page(self, path: str) -> bytes:
         """Ask for what pynetft does not: serial number of the calibration in use, rate, range."""

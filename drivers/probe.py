@@ -81,8 +81,8 @@ def _hear(path: str, known: _Known, request: bytes | None, duration_s: float) ->
     return data
 
 
-def _frames(header: bytes, size: int, is_frame: Callable[[bytes], bool]) -> Callable[[bytes], bool]:
-    return lambda data: len(Deframer(header, size, is_frame).feed(data)) >= _ENOUGH_FRAMES
+def _frames(deframer: Callable[[], Deframer]) -> Callable[[bytes], bool]:
+    return lambda data: len(deframer().feed(data)) >= _ENOUGH_FRAMES
 
 
 def _ati_streams(data: bytes) -> bool:
@@ -114,40 +114,22 @@ def _robotiq_reply(data: bytes) -> str:
 
 
 def _robotous_reply(data: bytes) -> str:
-    for _, frame in _robotous_frames().feed(data):
+    for _, frame in robotous.deframer().feed(data):
         field = frame[1:-2]
         if field[0] == robotous.Command.MODEL:
             return f"Robotous {robotous.decode_text(field)}"
     raise ProtocolError("no reply of a Robotous sensor")
 
 
-def _robotous_frames() -> Deframer:
-    return Deframer(bytes([robotous.START_OF_FRAME]), robotous.FRAME_SIZE, robotous.is_frame)
-
-
 def _nothing(_: bytes) -> str:
     raise ProtocolError("it is not asked")
 
 
-_robotous_streams = _frames(bytes([robotous.START_OF_FRAME]), robotous.FRAME_SIZE, robotous.is_frame)
+_robotous_streams = _frames(robotous.deframer)
 
 _KNOWN = (
-    _Known(
-        "bota://{port}",
-        460_800,
-        False,
-        _frames(bota.HEADER, bota.FRAME_SIZE, bota.is_frame),
-        None,
-        _nothing,
-    ),
-    _Known(
-        "robotiq-ft300://{port}",
-        19_200,
-        False,
-        _frames(robotiq.HEADER, robotiq.FRAME_SIZE, robotiq.is_frame),
-        _ROBOTIQ_REQUEST,
-        _robotiq_reply,
-    ),
+    _Known("bota://{port}", 460_800, False, _frames(bota.deframer), None, _nothing),
+    _Known("robotiq-ft300://{port}", 19_200, False, _frames(robotiq.deframer), _ROBOTIQ_REQUEST, _robotiq_reply),
     _Known("robotous-serial://{port}", 115_200, False, _robotous_streams, _ROBOTOUS_REQUEST, _robotous_reply),
     _Known(
         "robotous-serial://{port}?baud=921600",

@@ -20,9 +20,12 @@ from drivers.errors import (
     DeviceFault,
     DeviceTimeout,
     DriverError,
+    ModelUnknown,
+    NoDashboard,
     PortInUse,
     ProtocolError,
     StreamBroken,
+    Unreachable,
 )
 from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
 from drivers.ur.kinematics import MODELS
@@ -68,9 +71,9 @@ _SAYS: Mapping[str, str] = MappingProxyType(
 )
 
 
-def who(info: DeviceInfo) -> str:
-    """Name a device in words."""
-    return f"{info.model}, serial {info.serial}, firmware {info.firmware}"
+def who(info: DeviceInfo, firmware: str = "firmware") -> str:
+    """Name a device in words; `firmware` is what its firmware is called."""
+    return f"{info.model}, serial {info.serial}, {firmware} {info.firmware}"
 
 
 def check_identity(info: DeviceInfo) -> list[Check]:
@@ -242,7 +245,7 @@ def check_noise(wrench: Array, duration_s: float, average_s: float, mass_kg: flo
 def check_unreachable(error: DriverError, host: str) -> Check:
     """Say why an arm could not be opened, and what to do about just that."""
     found, cure = found_and_cure(error, f"ping {host}")
-    if "cannot be reached" in found:
+    if isinstance(error, Unreachable):
         if isinstance(error.__cause__, ConnectionRefusedError):
             cure = (
                 f"{host} is there and takes no RTDE: enable RTDE at the pendant under {_SERVICES}, if it is the robot"
@@ -253,9 +256,9 @@ def check_unreachable(error: DriverError, host: str) -> Check:
             )
         else:
             cure = f"ping {host}"
-    elif "name the model" in cure:
+    elif isinstance(error, ModelUnknown):
         cure = f'write model = "ur5e" under [robot] in ftdrive.toml, or give --model; it is one of {", ".join(MODELS)}'
-    elif "the dashboard server of" in found:
+    elif isinstance(error, NoDashboard):
         found = str(error).rstrip(".")  # what it says is no cure
         cure = f"enable the dashboard server at the pendant under {_SERVICES}; restart the controller if it is"
     return Check("robot.reachable", "failed", found, cure)
@@ -263,7 +266,7 @@ def check_unreachable(error: DriverError, host: str) -> Check:
 
 def check_arm(info: DeviceInfo) -> Check:
     """Say who an arm is, and whether its PolyScope, such as "5.15.0.1261331", can be controlled."""
-    name, found = "robot.identity", f"{info.model}, serial {info.serial}, PolyScope {info.firmware}"
+    name, found = "robot.identity", who(info, "PolyScope")
     major, _, rest = info.firmware.partition(".")
     minor = rest.partition(".")[0]
     if minor.isdecimal() and int(minor) < _OLDEST_MINOR:

@@ -2,17 +2,13 @@
 
 from contextlib import closing
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from serial.tools import list_ports
 
 from drivers.errors import ConnectError
 from drivers.probe import Answer, probe
 from drivers.probe_can import probe_can
-from drivers.registry import Options
-from drivers.ur.kinematics import model_named
-from drivers.ur.library import ask_dashboard
-from drivers.ur.reading import CONNECT_S, Reader
+from drivers.registry import Options, split_url
 from ftdrive.checks import (
     Check,
     can_details,
@@ -22,8 +18,9 @@ from ftdrive.checks import (
     name_by_id,
 )
 from ftdrive.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.diagnosis import who
 from ftdrive.errors import ConfigError
-from ftdrive.wiring import build_sensor
+from ftdrive.wiring import build_arm, build_sensor
 
 _LOOK_S = 0.5
 _CAN = ("socketcan", "slcan")
@@ -32,13 +29,11 @@ _SLCAN = "slcan:///dev/ttyACM0?bitrate=250000"
 
 def look_at_robot(host: str, model: str | None) -> tuple[str, str]:
     """Model of the arm at an address, and in words what it says of itself; raises `DriverError`."""
-    with closing(Reader(host, None if model is None else model_named(model, 0))) as reader:
-        info, version = reader.info, reader.version
-    told = f"{info.model}, serial {info.serial}, PolyScope {info.firmware}"
-    if version[:2] >= (5, 6):  # older ones do not tell
-        remote = ask_dashboard(host, lambda dashboard: dashboard.isInRemoteControl(), timeout_s=CONNECT_S)
-        told += f", remote control {'ON' if remote else 'OFF'}"
-    return info.model, told
+    with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig("")))) as arm:
+        arm.open()
+        info, remote = arm.identify(), arm.in_remote_control()
+    told = who(info, "PolyScope")
+    return info.model, told if remote is None else f"{told}, remote control {'ON' if remote else 'OFF'}"
 
 
 def look_at_sensor(url: str) -> str:
@@ -46,7 +41,7 @@ def look_at_sensor(url: str) -> str:
     with build_sensor(CellConfig(RobotConfig(""), SensorConfig(url))) as sensor:
         info = sensor.identify()
         rate_Hz = len(sensor.collect(_LOOK_S).t_host_ns) / _LOOK_S
-    return f"{info.model}, serial {info.serial}, firmware {info.firmware}, {rate_Hz:.0f} Hz"
+    return f"{who(info)}, {rate_Hz:.0f} Hz"
 
 
 def is_place(text: str) -> bool:
@@ -94,8 +89,8 @@ def ask(place: str) -> list[Answer]:
 
 def _ask_can(url: str) -> list[Answer]:
     try:
-        parts = urlsplit(url)
-        interface, channel, options = parts.scheme, parts.netloc + parts.path, Options(url, parts.query)
+        parts = split_url(url)
+        interface, channel, options = parts.scheme, parts.address, Options(url, parts.query)
         if interface not in _CAN or not channel:
             raise ConfigError(f"{url} is no place to ask: give a serial port, can0, or {_SLCAN}")
         bitrate = options.integer("bitrate", 0, 0, 1_000_000) or None

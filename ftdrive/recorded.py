@@ -1,11 +1,11 @@
 """A recorded run played back to the routine, in place of an arm and a sensor."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from calib.ports import ArmReading, WrenchSamples
-from calib.routine import PoseRecord
+from calib.routine import Array, PoseRecord
 
 
 class RecordedRun:
@@ -16,21 +16,13 @@ class RecordedRun:
         self._stop = -1
         self._collected = False
 
-    def move_to(
-        self,
-        q_rad: Sequence[float],
-        *,
-        timeout_s: float,
-        guard: Callable[[], None],
-        speed_rad_s: float | None = None,
-        acceleration_rad_s2: float | None = None,
-    ) -> None:
-        """Go on to the next recorded stop."""
+    def go_on_to(self, q_rad: Array) -> None:
+        """Go on to the next recorded stop, which must be at these joint angles (6,)."""
         self._stop += 1
         if not np.array_equal(q_rad, self._records[self._stop].pose.q_rad):
             raise ValueError(f"stop {self._stop + 1} of the recording went elsewhere than the routine now asks")
 
-    def wait_until_still(self, *, timeout_s: float, guard: Callable[[], None]) -> None:
+    def wait_until_still(self, **_: object) -> None:
         """Begin a look at the pose."""
         self._collected = False
 
@@ -39,7 +31,7 @@ class RecordedRun:
         record = self._records[self._stop]
         return record.after if self._collected else record.before
 
-    def collect(self, duration_s: float) -> WrenchSamples:
+    def collect(self, _duration_s: float, /) -> WrenchSamples:
         """Give the samples of this stop."""
         self._collected = True
         return self._records[self._stop].samples

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from mocks.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
 from mocks.faults import Faults
-from mocks.sensor import CanSensor, Measure
 from mocks.slcan import CanFrame
+from mocks.stream import CanSensor, Measure
 
 EMPTY_SLOT_STATUS = 0x8040  # bad active calibration, any error
 NO_ARGUMENT, ONE_ARGUMENT = (0, 1), (1,)  # accepted data lengths; a superfluous byte is tolerated

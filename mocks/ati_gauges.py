@@ -18,18 +18,42 @@ GAUGE_MIN, GAUGE_MAX = -32768, 32767
 WIRE_ORDER = np.array([0, 2, 4, 1, 3, 5])  # both interfaces send the even gauges first
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scale:
+    """What the counts of an ATI interface mean.
+
+    Parameters
+    ----------
+    counts_per_force, counts_per_torque
+        Counts per force unit and per torque unit.
+    force_unit, torque_unit
+        ATI unit codes 1 to 6, the keys of `UNIT_N` and `UNIT_NM`.
+    """
+
+    counts_per_force: int = 1_000_000
+    counts_per_torque: int = 1_000_000
+    force_unit: int = 2
+    torque_unit: int = 3
+
+    @cached_property
+    def units_SI(self) -> NDArray[np.float64]:
+        """(6,) force unit in newtons (three) and torque unit in newton metres (three)."""
+        return np.repeat([UNIT_N[self.force_unit], UNIT_NM[self.torque_unit]], 3)
+
+    @cached_property
+    def counts_per_SI(self) -> NDArray[np.float64]:
+        """(6,) counts per newton (three) and per newton metre (three)."""
+        return np.repeat([self.counts_per_force, self.counts_per_torque], 3) / self.units_SI
+
+
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(Scale):
     """What an ATI interface stores about one transducer.
 
     Parameters
     ----------
     matrix
         (6, 6) runtime matrix, rows Fx Fy Fz Tx Ty Tz, columns gauge 0 to 5: counts per gauge count.
-    counts_per_force, counts_per_torque
-        Counts per force unit and per torque unit.
-    force_unit, torque_unit
-        ATI unit codes 1 to 6, the keys of `UNIT_N` and `UNIT_NM`.
     gauge_gains, gauge_offsets
         (6,) analogue settings at which the matrix holds, u16; the NETCANOEM keeps them to itself.
     serial, part_number, date
@@ -39,23 +63,12 @@ class Calibration:
     """
 
     matrix: NDArray[np.float64]
-    counts_per_force: int = 1_000_000
-    counts_per_torque: int = 1_000_000
-    force_unit: int = 2
-    torque_unit: int = 3
     gauge_gains: Sequence[int] = (543, 555, 569, 579, 565, 567)
     gauge_offsets: Sequence[int] = (0x8000,) * 6
     serial: str = "FT12345"
     part_number: str = "SI-130-10"
     date: str = "2020-01-0100:00:00Z"
     max_rating: Sequence[float] = (130.0, 130.0, 400.0, 10.0, 10.0, 10.0)
-
-    @cached_property
-    def counts_per_SI(self) -> NDArray[np.float64]:
-        """(6,) counts per newton (three) and per newton metre (three)."""
-        force = self.counts_per_force / UNIT_N[self.force_unit]
-        torque = self.counts_per_torque / UNIT_NM[self.torque_unit]
-        return np.array([force] * 3 + [torque] * 3)
 
     @cached_property
     def gauges_per_SI(self) -> NDArray[np.float64]:

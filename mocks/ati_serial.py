@@ -28,7 +28,7 @@ from mocks.modbus import (
     written_registers,
 )
 from mocks.pty import PtyDevice
-from mocks.sensor import Measure
+from mocks.stream import Measure
 
 ADDRESS = 0x0A
 STREAM_HZ = 7000.0

@@ -17,14 +17,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from mocks.faults import Faults
-from mocks.sensor import Measure, SerialSensor
+from mocks.stream import Measure, SerialSensor
 
 HEADER = b"\xaa"
-FRAME_BYTES = 37
 LONGEST_COMMAND = len(b"f,4096,0,0,0")
 SINC_UNIT_S = 19.53125e-6
 SINC_LENGTHS = range(51, 4097)
-BAUD_RATES = (9_600, 57_600, 115_200, 230_400, 460_800)
 BANNER = b"Bota Systems AG\r\nSensONE\r\nApp Init\r\n"
 OVERRANGE, RAW_OUTPUT = 0x0002, 0x0008
 CAPACITY = (500.0, 500.0, 1200.0, 15.0, 15.0, 12.0)

@@ -27,9 +27,9 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from mocks.ati_gauges import UNIT_N, UNIT_NM
+from mocks.ati_gauges import Scale
 from mocks.faults import Faults, FaultyWire
-from mocks.sensor import Measure, Pacer
+from mocks.stream import Measure, Pacer
 
 RDT_PORT = 49152
 REQUEST = struct.Struct(">HHI")
@@ -62,36 +62,21 @@ class Endpoint(TypedDict):
     http_port: int
 
 
-@dataclass(frozen=True)
-class Calibration:
+@dataclass(frozen=True, eq=False)
+class Calibration(Scale):
     """What the box tells over HTTP about its transducer.
 
     Parameters
     ----------
-    counts_per_force, counts_per_torque
-        Counts per force unit and per torque unit.
-    force_unit, torque_unit
-        ATI unit codes 1 to 6.
     serial, part_number
         Of the transducer.
     rating
         (6,) in N and N·m; readings are clipped there.
     """
 
-    counts_per_force: int = 1_000_000
-    counts_per_torque: int = 1_000_000
-    force_unit: int = 2
-    torque_unit: int = 3
     serial: str = "FT12345"
     part_number: str = "SI-130-10"
     rating: Sequence[float] = (130.0, 130.0, 400.0, 10.0, 10.0, 10.0)
-
-    @property
-    def counts_per_SI(self) -> NDArray[np.float64]:
-        """(6,) counts per newton (three) and per newton metre (three)."""
-        force = self.counts_per_force / UNIT_N[self.force_unit]
-        torque = self.counts_per_torque / UNIT_NM[self.torque_unit]
-        return np.array([force] * 3 + [torque] * 3)
 
 
 def rdt_records(first: int, ft: NDArray[np.int64], status: NDArray[np.int64], counts: NDArray[np.float64]) -> bytes:
@@ -370,7 +355,6 @@ class NetFtBox:
 
     def _calibration(self) -> dict[str, object]:
         calibration = self.calibration
-        units = [UNIT_N[calibration.force_unit]] * 3 + [UNIT_NM[calibration.torque_unit]] * 3
         return {
             "calsn": calibration.serial,
             "calpn": calibration.part_number,
@@ -378,7 +362,7 @@ class NetFtBox:
             "caltu": calibration.torque_unit,
             "calcpf": calibration.counts_per_force,
             "calcpt": calibration.counts_per_torque,
-            "calmr": ";".join(f"{rating / unit:g}" for rating, unit in zip(calibration.rating, units, strict=True)),
+            "calmr": ";".join(f"{rating:g}" for rating in calibration.rating / calibration.units_SI),
         }
 
 

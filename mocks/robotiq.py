@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mocks import modbus
 from mocks.faults import Faults
-from mocks.sensor import Measure, SerialSensor
+from mocks.stream import Measure, SerialSensor
 
 ADDRESS = 0x09
 STREAM_HZ = 100.0

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mocks.faults import Faults
-from mocks.sensor import CanSensor, Measure, Pacer, SerialSensor
 from mocks.slcan import CanFrame
+from mocks.stream import CanSensor, Measure, Pacer, SerialSensor
 
 COMMAND_BYTES, RESPONSE_BYTES = 8, 16
 START_OF_PACKET, END_OF_PACKET = 0x55, 0xAA

@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import Any, Protocol
 
 from mocks.faults import Faults
-from mocks.sensor import Measure
+from mocks.stream import Measure
 
 
 class SensorEmulator(Protocol):

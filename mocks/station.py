@@ -173,8 +173,6 @@ class Station:
                 "serial_number": self._options.serial_number,
             },
             "sensors": sensors,
-            "can": sensors.get("can"),
-            "serial": sensors.get("serial"),
             "truth": self.world.truth.to_json(),
         }
 

@@ -15,8 +15,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # The configuration of whoever runs the tests, and the plans they have run, are none of their business.
-os.environ["XDG_CONFIG_HOME"] = str(Path(__file__).parent / "no-such-folder")
 _state = TemporaryDirectory(prefix="ftdrive-state-")
+os.environ["XDG_CONFIG_HOME"] = _state.name + "/config"
 os.environ["XDG_STATE_HOME"] = _state.name
 for _name in [name for name in os.environ if name.startswith("FTDRIVE_") and name != "FTDRIVE_REAL_DATA"]:
     del os.environ[_name]

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal, Self
 import numpy as np
 
 from drivers._can import CanBus
+from drivers._status import describe_status
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.ati import codec
 from drivers.ati.calibration import (
@@ -221,13 +222,13 @@ class AtiCanSensor(StreamingSensor):
         """Raise on what makes a reading unusable, log the rest of a status word once."""
         status = reading.status
         if status & codec.CRITICAL:
-            raise DeviceFault(f"{self.name}: status {codec.describe_status(status)}; {UNUSABLE}")
+            raise DeviceFault(f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}; {UNUSABLE}")
         if self._polls and status & ~self._seen_status & codec.WATCHDOG_RESET:
             raise StreamBroken(
                 f"{self.name}: the sensor has reset itself and may be back at calibration slot 0; open it again"
             )
         if new := status & ~self._seen_status:
-            log.warning("%s: status %s; measuring goes on", self.name, codec.describe_status(new))
+            log.warning("%s: status %s; measuring goes on", self.name, describe_status(new, codec.STATUS_BITS))
             self._seen_status |= new
         if gauges := saturated_gauges(reading.gauges[np.newaxis]):
             names = ", ".join(f"G{g}" for g in gauges)

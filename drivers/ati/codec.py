@@ -83,12 +83,6 @@ class Firmware(NamedTuple):
     build: int
 
 
-def describe_status(status: int, bits: Mapping[int, str] = STATUS_BITS) -> str:
-    """Put a status word in words, e.g. ``0x0040 (bit 6: no valid calibration in the active slot)``."""
-    words = [f"bit {n}: {bits.get(n, 'reserved')}" for n in range(16) if status >> n & 1]
-    return f"0x{status:04X} ({', '.join(words) or 'ok'})"
-
-
 def decode_gauges(first: bytes, second: bytes) -> GaugeReading:
     """Decode the two halves of a reading: status, G0, G2, G4 and G1, G3, G5."""
     status, g0, g2, g4 = _unpack(">Hhhh", first, "first half of a gauge reading")

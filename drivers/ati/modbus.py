@@ -9,12 +9,13 @@ A decoder returns a value or raises `ProtocolError`, never anything else. Regist
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers._crc import crc16_modbus
+from drivers import _modbus
 from drivers.ati.codec import decode_text
 from drivers.errors import ProtocolError
 from drivers.interfaces import Array
@@ -22,7 +23,6 @@ from drivers.interfaces import Array
 ADDRESS = 10
 """The slave address, fixed by ATI."""
 
-READ_HOLDING, WRITE_MULTIPLE = 0x03, 0x10
 START_STREAM, STORAGE = 0x46, 0x6A
 
 GAINS, OFFSETS, STATUS = 0x0000, 0x0006, 0x001D
@@ -58,74 +58,27 @@ ANY_ERROR = 0x8000
 CRITICAL = 0x3EFE
 """All but watchdog reset, configuration, CAN and the summary bit."""
 
-_EXCEPTIONS = {1: "illegal function", 2: "illegal register", 3: "illegal value", 4: "device failure or locked"}
-
-
-class Refused(ProtocolError):
-    """The device understood a request and refused it; asking again does not help."""
-
-
-def frame(function: int, payload: bytes) -> bytes:
-    """Build a frame to or from the sensor."""
-    body = bytes([ADDRESS, function]) + payload
-    return body + crc16_modbus(body).to_bytes(2, "little")
-
+frame = partial(_modbus.frame, ADDRESS)
+read_registers = partial(_modbus.read_registers, ADDRESS)
+"""At most 64 at once are known to work."""
+write_registers = partial(_modbus.write_registers, ADDRESS)
+reply_size = _modbus.reply_size
 
 UNLOCK = frame(STORAGE, b"\xaa")
 LOCK = frame(STORAGE, b"\x18")
 START = frame(START_STREAM, b"\x55")
 
 
-def read_registers(register: int, count: int) -> bytes:
-    """Request `count` holding registers (at most 64 are known to work)."""
-    return frame(READ_HOLDING, struct.pack(">HH", register, count))
-
-
-def write_registers(register: int, values: Sequence[int]) -> bytes:
-    """Request to write holding registers."""
-    n = len(values)
-    return frame(WRITE_MULTIPLE, struct.pack(f">HHB{n}H", register, n, 2 * n, *values))
-
-
-def reply_size(request: bytes) -> int:
-    """Length in bytes of the success reply to `request`; a refusal (Modbus exception) has 5."""
-    match request[1]:
-        case 0x03:
-            return 5 + 2 * int.from_bytes(request[4:6], "big")
-        case 0x10:
-            return 8
-        case _:
-            return 5
-
-
 def check_reply(request: bytes, reply: bytes) -> bytes:
-    """Check a whole reply against its request and return its payload, without address, function and CRC.
-
-    Raises
-    ------
-    ProtocolError
-        Damaged, not the reply to this request, or a refusal (`Refused`).
-    """
-    text = reply.hex(" ")
-    if len(reply) < 5 or crc16_modbus(reply[:-2]) != int.from_bytes(reply[-2:], "little"):
-        raise ProtocolError(f"reply is damaged ({text or 'empty'})")
+    """Check a whole reply against its request and return the registers it carries; see `drivers._modbus`."""
+    payload = _modbus.check_reply(request, reply)
     function = request[1]
-    if reply[0] == ADDRESS and reply[1] == function | 0x80 and len(reply) == 5:
-        reason = _EXCEPTIONS.get(reply[2], "unknown reason")
-        raise Refused(f"the sensor refused function 0x{function:02X}: {reply[2]} ({reason})")
-    if reply[0] != ADDRESS or reply[1] != function or len(reply) != reply_size(request):
-        raise ProtocolError(f"reply {text} does not belong to request {request.hex(' ')}")
-    payload = reply[2:-2]
-    if function == READ_HOLDING:
-        if payload[0] != len(payload) - 1:
-            raise ProtocolError(f"reply announces {payload[0]} bytes and carries {len(payload) - 1}")
-        return payload[1:]
-    if function == WRITE_MULTIPLE:
-        if payload != request[2:6]:
-            raise ProtocolError(f"reply {text} confirms other registers than request {request.hex(' ')}")
-        return b""
+    if function not in {START_STREAM, STORAGE}:
+        return payload
     if payload != b"\x01":
-        raise Refused(f"the sensor refused command 0x{function:02X} 0x{request[2]:02X} (answer 0x{payload.hex()})")
+        raise _modbus.Refused(
+            f"the sensor refused command 0x{function:02X} 0x{request[2]:02X} (answer 0x{payload.hex()})"
+        )
     return b""
 
 

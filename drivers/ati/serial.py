@@ -7,19 +7,19 @@ Modbus RTU for set-up, then a bare stream of 13-byte records at 7 kHz which only
 outlives the program that started it. Gauge gains and offsets are volatile and are written at every start.
 """
 
-import contextlib
 import logging
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from drivers._modbus import exchange
+from drivers._modbus import ask
 from drivers._serial import SerialPort
+from drivers._status import describe_status
 from drivers._stream import StreamingSensor, scale_facts
 from drivers.ati import modbus
 from drivers.ati.calibration import Calibration, saturated_gauges, units
-from drivers.ati.codec import describe_status
 from drivers.errors import UNUSABLE, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 
@@ -33,7 +33,6 @@ _READ_S = 0.02
 """The port's only time-out, also the silence after which a stopped stream is believed to have stopped."""
 _REPLY_S = 0.1
 _SILENCE_S = 0.2
-_ATTEMPTS = 3
 _BATCH_BYTES = 32 * modbus.RECORD_SIZE
 """4.6 ms of stream, less where bytes are FF and come doubled: few wake-ups, and far less than a port buffers."""
 _MAX_RESTARTS = 3
@@ -197,28 +196,14 @@ class AtiSerialSensor(StreamingSensor):
 
     def _stop_stream(self) -> int:
         """Jam, wait for silence and prove it by reading the status word, which is returned."""
-        for _ in range(_ATTEMPTS - 1):
-            self._jam()
-            with contextlib.suppress(DeviceTimeout, ProtocolError):
-                return self._read_status()
         self._jam()
         try:
-            return self._read_status()
+            return int.from_bytes(self._ask(modbus.read_registers(modbus.STATUS, 1), self._jam), "big")
         except (DeviceTimeout, ProtocolError) as exc:
             raise DeviceTimeout(f"{exc}; is it this sensor, and is the termination right?") from exc
 
-    def _read_status(self) -> int:
-        return int.from_bytes(self._exchange(modbus.read_registers(modbus.STATUS, 1)), "big")
-
     def _start_stream(self) -> None:
-        for attempt in range(1, _ATTEMPTS + 1):
-            try:
-                self._exchange(modbus.START)
-                break
-            except (DeviceTimeout, ProtocolError) as exc:
-                if attempt == _ATTEMPTS or isinstance(exc, modbus.Refused):
-                    raise
-                self._jam()  # perhaps only the reply was lost
+        self._ask(modbus.START, self._jam)  # perhaps it streams, and only the reply was lost
         self._buffer.clear()
         self._damaged.clear()
 
@@ -240,21 +225,10 @@ class AtiSerialSensor(StreamingSensor):
         while self._port.read(_BATCH_BYTES) and time.monotonic() < deadline:
             pass
 
-    def _ask(self, request: bytes) -> bytes:
-        """Exchange with retries; not for the start of the stream."""
-        for _ in range(_ATTEMPTS - 1):
-            try:
-                return self._exchange(request)
-            except modbus.Refused:
-                raise
-            except (DeviceTimeout, ProtocolError):
-                self._port.read(_BATCH_BYTES)  # a late reply passes
-        return self._exchange(request)
-
-    def _exchange(self, request: bytes) -> bytes:
-        """Send a request and return the payload of its reply."""
-        size = modbus.reply_size(request)
-        return exchange(self._port, self.name, request, size, modbus.check_reply, _REPLY_S)
+    def _ask(self, request: bytes, before_again: Callable[[], object] | None = None) -> bytes:
+        """Exchange with retries; unless told otherwise, a late reply passes between them."""
+        again = before_again or (lambda: self._port.read(_BATCH_BYTES))
+        return ask(self._port, self.name, request, modbus.check_reply, _REPLY_S, again)
 
     def _judge_status(self, status: int) -> None:
         """Raise on what makes the data unusable, log the rest of a status word once."""

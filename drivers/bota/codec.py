@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from drivers._crc import crc16_x25
+from drivers._frames import Deframer
 from drivers.errors import ProtocolError
 
 HEADER = b"\xaa"
@@ -47,6 +48,11 @@ def is_frame(data: bytes) -> bool:
     )
 
 
+def deframer() -> Deframer:
+    """Something that finds frames in a stream of bytes."""
+    return Deframer(HEADER, FRAME_SIZE, is_frame)
+
+
 def decode_frame(data: bytes) -> Frame:
     """Decode a whole frame."""
     if not is_frame(data):
@@ -65,9 +71,3 @@ def filter_command(sinc: int) -> bytes:
 def success(command: bytes) -> bytes:
     """Tell how the sensor confirms a command."""
     return b"r,0," + command[:1] + b",0"
-
-
-def describe_status(status: int) -> str:
-    """Put a status word in words, e.g. ``0x0002 (bit 1: overrange)``."""
-    words = [f"bit {n}: {STATUS_BITS.get(n, 'reserved')}" for n in range(16) if status >> n & 1]
-    return f"0x{status:04X} ({', '.join(words) or 'ok'})"

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from drivers._frames import Deframer
 from drivers._serial import SerialPort
+from drivers._status import describe_status
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.bota import codec
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
@@ -69,7 +69,7 @@ class BotaSensor(StreamingSensor):
         self._seen_status = 0
         if self._sinc is not None:
             self._configure(self._sinc)
-        self._frames = Deframer(codec.HEADER, codec.FRAME_SIZE, codec.is_frame)
+        self._frames = codec.deframer()
         first = self._first_frames()
         times = [frame.t_us for frame in first]
         self._period_us = median((b - a) % _CLOCK for a, b in pairwise(times))
@@ -161,14 +161,11 @@ class BotaSensor(StreamingSensor):
 
     def _judge(self, status: int) -> None:
         """Raise on what makes a sample unusable, log the rest of a status word once."""
+        told = f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}"
         if status & codec.RAW:
-            raise DeviceFault(
-                f"{self.name}: status {codec.describe_status(status)}: these are no newtons; ?sinc=512 configures it"
-            )
+            raise DeviceFault(f"{told}: these are no newtons; ?sinc=512 configures it")
         if status & (codec.OVERRANGE | codec.INVALID):
-            raise DeviceFault(
-                f"{self.name}: status {codec.describe_status(status)}; take the load off, check the cable"
-            )
+            raise DeviceFault(f"{told}; take the load off, check the cable")
         if new := status & ~self._seen_status:
-            log.warning("%s: status %s; measuring goes on", self.name, codec.describe_status(new))
+            log.warning("%s: status %s; measuring goes on", self.name, describe_status(new, codec.STATUS_BITS))
             self._seen_status |= new

@@ -10,13 +10,15 @@ little-endian.
 
 import struct
 from collections.abc import Sequence
+from functools import partial
 
+from drivers import _modbus
 from drivers._crc import crc16_modbus
+from drivers._frames import Deframer
 from drivers.errors import ProtocolError
 from drivers.interfaces import NOT_REPORTED
 
 ADDRESS = 9
-READ_HOLDING, WRITE_MULTIPLE = 0x03, 0x10
 
 STREAM, FIRMWARE, SERIAL = 410, 500, 510
 START_STREAM = 0x0200
@@ -33,42 +35,34 @@ RANGE = (300.0, 300.0, 300.0, 30.0, 30.0, 30.0)
 """N and N·m, either way."""
 
 
-class Refused(ProtocolError):
-    """The sensor understood a request and refused it."""
-
-
-def read_registers(register: int, count: int) -> bytes:
-    """Request `count` holding registers."""
-    return _frame(READ_HOLDING, struct.pack(">HH", register, count))
+Refused = _modbus.Refused
+read_registers = partial(_modbus.read_registers, ADDRESS)
+reply_size = _modbus.reply_size
 
 
 def write_register(register: int, value: int) -> bytes:
     """Request to write one holding register."""
-    return _frame(WRITE_MULTIPLE, struct.pack(">HHBH", register, 1, 2, value))
-
-
-def reply_size(request: bytes) -> int:
-    """Length in bytes of the success reply to a request; a refusal has 5."""
-    return 5 + 2 * int.from_bytes(request[4:6], "big") if request[1] == READ_HOLDING else 8
+    return _modbus.write_registers(ADDRESS, register, [value])
 
 
 def check_reply(request: bytes, reply: bytes) -> tuple[int, ...]:
     """Check a whole reply against its request and return the registers it carries; none for a write."""
-    text = reply.hex(" ")
-    if len(reply) < 5 or _crc(reply[:-2]) != reply[-2:]:
-        raise ProtocolError(f"reply is damaged ({text or 'empty'})")
-    if len(reply) == 5 and reply[0] == ADDRESS and reply[1] == request[1] | 0x80:
-        raise Refused(f"the sensor refused function 0x{request[1]:02X} with Modbus exception {reply[2]}")
-    is_read = request[1] == READ_HOLDING
-    head = bytes([ADDRESS, READ_HOLDING, len(reply) - 5]) if is_read else request[:6]
-    if len(reply) != reply_size(request) or not reply.startswith(head):
-        raise ProtocolError(f"reply {text} does not belong to request {request.hex(' ')}")
-    return struct.unpack(f">{(len(reply) - 5) // 2}H", reply[3:-2]) if is_read else ()
+    payload = _modbus.check_reply(request, reply)
+    return struct.unpack(f">{len(payload) // 2}H", payload)
 
 
 def is_frame(data: bytes) -> bool:
     """Tell whether bytes are a whole stream frame: length, header and checksum."""
-    return len(data) == FRAME_SIZE and data.startswith(HEADER) and _crc(data[:-2]) == data[-2:]
+    return (
+        len(data) == FRAME_SIZE
+        and data.startswith(HEADER)
+        and crc16_modbus(data[:-2]) == int.from_bytes(data[-2:], "little")
+    )
+
+
+def deframer() -> Deframer:
+    """Something that finds frames in a stream of bytes."""
+    return Deframer(HEADER, FRAME_SIZE, is_frame)
 
 
 def decode_frame(data: bytes) -> tuple[int, ...]:
@@ -103,12 +97,3 @@ def _words(registers: Sequence[int], count: int) -> Sequence[int]:
 def _letters(*codes: int) -> str:
     """Text of character codes; none where one of them is not printable."""
     return bytes(codes).decode("ascii") if all(0x20 < code < 0x7F for code in codes) else ""
-
-
-def _frame(function: int, payload: bytes) -> bytes:
-    body = bytes([ADDRESS, function]) + payload
-    return body + _crc(body)
-
-
-def _crc(data: bytes) -> bytes:
-    return crc16_modbus(data).to_bytes(2, "little")

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from drivers._frames import Deframer
-from drivers._modbus import exchange
+from drivers._modbus import ask
 from drivers._serial import SerialPort
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
-from drivers.errors import DeviceFault, DeviceTimeout, ProtocolError
+from drivers.errors import DeviceFault
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 from drivers.robotiq import codec
 
@@ -29,7 +28,6 @@ log = logging.getLogger(__name__)
 _BAUD = 19_200
 _REPLY_S = 0.2
 _STOP_S = 1.0
-_ATTEMPTS = 3
 _LATENT_RATE_Hz = (55.0, 70.0)
 """Around 62.5 Hz, one answer in each 16 ms of an FTDI adapter's latency timer."""
 
@@ -67,7 +65,7 @@ class RobotiqFt300(StreamingSensor):
         except codec.Refused:
             firmware = NOT_REPORTED
         self._ask(codec.write_register(codec.STREAM, codec.START_STREAM))
-        self._frames = Deframer(codec.HEADER, codec.FRAME_SIZE, codec.is_frame)
+        self._frames = codec.deframer()
         self._nominal_Hz = codec.NOMINAL_RATE_Hz
         self._hint_since_ns, self._hint_frames, self._hinted = 0, 0, False
         return DeviceInfo(
@@ -114,18 +112,7 @@ class RobotiqFt300(StreamingSensor):
 
     def _ask(self, request: bytes) -> tuple[int, ...]:
         """Exchange with retries, each after another stop: a stream may run that we did not start."""
-        for _ in range(_ATTEMPTS - 1):
-            try:
-                return self._exchange(request)
-            except codec.Refused:
-                raise
-            except (DeviceTimeout, ProtocolError):
-                self._stop_stream()
-        return self._exchange(request)
-
-    def _exchange(self, request: bytes) -> tuple[int, ...]:
-        size = codec.reply_size(request)
-        return exchange(self._port, self.name, request, size, codec.check_reply, _REPLY_S)
+        return ask(self._port, self.name, request, codec.check_reply, _REPLY_S, self._stop_stream)
 
     def _watch_rate(self, t_host_ns: int, frames: int) -> None:
         """Once a second compare the rate with what a slow USB adapter makes of it."""

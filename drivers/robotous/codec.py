@@ -16,6 +16,7 @@ from enum import IntEnum
 from types import MappingProxyType
 from typing import NamedTuple
 
+from drivers._frames import Deframer
 from drivers.errors import ProtocolError
 
 COMMAND_SIZE, REPLY_SIZE = 8, 16
@@ -76,6 +77,11 @@ def encode_frame(field: bytes) -> bytes:
 def is_frame(data: bytes) -> bool:
     """Tell whether bytes are a whole frame of the sensor: length, both marks and the sum."""
     return len(data) == FRAME_SIZE and data == encode_frame(data[1:-2])
+
+
+def deframer() -> Deframer:
+    """Something that finds frames in a stream of bytes."""
+    return Deframer(bytes([START_OF_FRAME]), FRAME_SIZE, is_frame)
 
 
 def decode_text(field: bytes) -> str:

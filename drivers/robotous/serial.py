@@ -6,7 +6,6 @@ Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7: 8N1
 import time
 from typing import TYPE_CHECKING, Self
 
-from drivers._frames import Deframer
 from drivers._serial import SerialPort
 from drivers.robotous import codec
 from drivers.robotous.codec import Command, Field
@@ -28,7 +27,7 @@ class SerialLink:
         # 1 kHz needs 921600 baud (manual); below, a frame of 19 bytes takes 190 bits
         self.fastest_Hz = 1000 if baud == 921_600 else min(500, baud // 190)
         self._port = SerialPort(self.name, path, baud)
-        self._frames = _new_deframer()
+        self._frames = codec.deframer()
 
     @property
     def damaged(self) -> int:
@@ -42,7 +41,7 @@ class SerialLink:
 
     def open(self) -> None:
         """Open the port."""
-        self._frames = _new_deframer()
+        self._frames = codec.deframer()
         self._port.open()
 
     def send(self, field: bytes) -> None:
@@ -72,7 +71,3 @@ class RobotousSerial(RobotousSensor):
         """Build from ``robotous-serial:///dev/serial/by-id/…?baud=921600&rate=1000``."""
         link = SerialLink(address, baud=options.integer("baud", 115_200, BAUDS[0], BAUDS[-1]))
         return cls(link, rate_Hz=options.integer("rate", 0, 0, 1000) or None, sign=sign)
-
-
-def _new_deframer() -> Deframer:
-    return Deframer(bytes([codec.START_OF_FRAME]), codec.FRAME_SIZE, codec.is_frame)

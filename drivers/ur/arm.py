@@ -10,7 +10,6 @@ Checked on hardware: no.
 
 import logging
 import math
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +24,7 @@ from drivers.ur.control_child import DECELERATION_RAD_S2, UNWATCHED_S
 from drivers.ur.kinematics import MODELS, model_named
 from drivers.ur.library import FREQUENCY_HZ, Dashboard, ask_dashboard
 from drivers.ur.reading import CONNECT_S, PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Look, Reader
-from drivers.ur.rtde import CONTROL_REGISTERS, registers_in_use
+from drivers.ur.rtde import CONTROL_REGISTERS, find_script_port, registers_in_use
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +40,6 @@ _STOP_SILENT_S: Final = 0.15
 _REACH_S: Final = 1.5
 """The dashboard server stops the arm in 0.02 s. How long a caller waits for that, at most; the same when nothing has
 been heard of the controller for 0.2 s; and how long the attempt to connect goes on, one retransmission of TCP."""
-_SCRIPT_PORT: Final = 30003
 _RELEASE_S: Final = 1.0
 """A control process whose parent was killed needs half of that to stop the arm, end its program and let go."""
 _ARRIVED_RAD: Final = 1e-3
@@ -163,7 +161,7 @@ class UrArm(RobotArm):
                 dashboard.stop()
 
         look_out()
-        self._find_script_port()
+        find_script_port(self._host, timeout_s=CONNECT_S)
         self._claim_nothing_of_others()
         self._stop_wanted.clear()  # an attempt that is still on its way would stop the new program
         ask_dashboard(self._host, prepare, timeout_s=CONNECT_S)
@@ -176,15 +174,6 @@ class UrArm(RobotArm):
         except (StreamBroken, DeviceTimeout) as error:
             look_out()  # ur_rtde seldom knows the reason
             raise ConnectError(_advice(self._host, str(error))) from error
-
-    def _find_script_port(self) -> None:
-        try:
-            socket.create_connection((self._host, _SCRIPT_PORT), timeout=CONNECT_S).close()
-        except OSError as error:
-            raise ConnectError(
-                f"{self._host}:{_SCRIPT_PORT}, which takes programs, cannot be reached ({error}): enable the real-time "
-                f"client interface under Settings, Security, Services, and look for a firewall between."
-            ) from error
 
     def _claim_nothing_of_others(self) -> None:
         """Raise `ConnectError` when somebody else has the registers, before anything of theirs is stopped."""
@@ -260,7 +249,7 @@ class UrArm(RobotArm):
         """Ask the dashboard server, which takes some milliseconds.
 
         None before PolyScope 5.6, which does not tell, and at the addresses of URSim, where it does not matter. Raises
-        `StreamBroken` or `DeviceTimeout`.
+        `NoDashboard`.
         """
         if self._reading().version[:2] < (5, 6) or self._host in _SIMULATORS:
             return None

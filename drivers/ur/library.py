@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from importlib import import_module
 from typing import Final, Protocol, TypeVar, cast
 
-from drivers.errors import ConnectError, DeviceTimeout, StreamBroken
+from drivers.errors import ConnectError, NoDashboard
 
 T = TypeVar("T")
 
@@ -116,7 +116,7 @@ def connect_receive(host: str) -> Receive:
 
 
 def ask_dashboard(host: str, ask: Callable[[Dashboard], T], *, timeout_s: float, connect_s: float | None = None) -> T:
-    """Connect to the dashboard server, ask, disconnect. Raises `StreamBroken` or `DeviceTimeout`.
+    """Connect to the dashboard server, ask, disconnect. Raises `NoDashboard`.
 
     What is not done within `timeout_s` goes on in a thread: for `connect_s`, which is `timeout_s` where not given, it
     tries to connect, then it waits 2.5 s for the banner.
@@ -133,9 +133,9 @@ def ask_dashboard(host: str, ask: Callable[[Dashboard], T], *, timeout_s: float,
     try:
         return _in_background(session).result(timeout_s)
     except RuntimeError as error:
-        raise StreamBroken(f"the dashboard server of {host} says: {error}") from error
+        raise NoDashboard(f"the dashboard server of {host} says: {error}") from error
     except TimeoutError as error:
-        raise DeviceTimeout(f"the dashboard server of {host} did not answer within {timeout_s:.1f} s") from error
+        raise NoDashboard(f"the dashboard server of {host} did not answer within {timeout_s:.1f} s") from error
 
 
 def retire(receive: Receive) -> None:

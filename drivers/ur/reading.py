@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ModelUnknown, NoDashboard, StreamBroken
 from drivers.interfaces import NOT_REPORTED, ArmState, ArmStatus, DeviceInfo
 from drivers.ur.kinematics import MODELS, Pose, forward, model_named
 from drivers.ur.library import Dashboard, Receive, ask_dashboard, connect_receive, require, retire
@@ -158,11 +158,11 @@ class Reader:
 
         try:
             told, serial, polyscope = ask_dashboard(self._host, ask, timeout_s=CONNECT_S)
-        except (StreamBroken, DeviceTimeout) as error:
-            raise ConnectError(f"{error}: enable it under Settings, Security, Services.") from error
+        except NoDashboard as error:
+            raise NoDashboard(f"{error}: enable it under Settings, Security, Services.") from error
         says = model_named(told, major)
         if model is None and says is None:
-            raise ConnectError(
+            raise ModelUnknown(
                 f"{self._host} says {told!r} to the question for its model, which is no known one (CB3 before "
                 f"3.12 and e-Series before 5.6 do not tell it): name the model of the arm."
             )

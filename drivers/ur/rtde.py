@@ -22,12 +22,13 @@ from itertools import accumulate, pairwise
 from types import MappingProxyType
 from typing import Final
 
-from drivers._stream import awake_s
-from drivers.errors import ConnectError, DeviceTimeout, DriverError, ProtocolError, StreamBroken
+from drivers._clock import awake_s
+from drivers.errors import ConnectError, DeviceTimeout, DriverError, ProtocolError, StreamBroken, Unreachable
 
 log = logging.getLogger(__name__)
 
 PORT: Final = 30004
+SCRIPT_PORT: Final = 30003
 
 REQUEST_PROTOCOL_VERSION: Final = ord("V")
 GET_CONTROLLER_VERSION: Final = ord("v")
@@ -176,8 +177,10 @@ class Subscription:
 
     Raises
     ------
+    Unreachable
+        Nobody there.
     ConnectError
-        Nobody there, no RTDE, or outputs of other types.
+        No RTDE, or outputs of other types.
     """
 
     def __init__(self, host: str, outputs: Mapping[str, str], frequency_Hz: float, *, timeout_s: float) -> None:
@@ -189,7 +192,7 @@ class Subscription:
         try:
             self._connection = _Connection(socket.create_connection((host, PORT), timeout=timeout_s))
         except OSError as error:
-            raise ConnectError(
+            raise Unreachable(
                 f"{where} cannot be reached ({error}): check the address and the cable, that the robot controller is "
                 f"switched on, and that no firewall stands between."
             ) from error
@@ -266,6 +269,17 @@ def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float) -> 
     except OSError as error:
         raise StreamBroken(f"{host}:{PORT} was lost ({error}): check the robot and the cable.") from error
     return [name for name, kind in zip(names, recipe.types, strict=False) if kind == "IN_USE"]
+
+
+def find_script_port(host: str, *, timeout_s: float) -> None:
+    """See whether the controller takes programs, sending none. Raises `ConnectError`."""
+    try:
+        socket.create_connection((host, SCRIPT_PORT), timeout=timeout_s).close()
+    except OSError as error:
+        raise ConnectError(
+            f"{host}:{SCRIPT_PORT}, which takes programs, cannot be reached ({error}): enable the real-time client "
+            f"interface under Settings, Security, Services, and look for a firewall between."
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)

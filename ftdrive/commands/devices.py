@@ -93,7 +93,7 @@ def _answers(place: str, failures: list[Exception]) -> list[dict[str, Any]]:
 
 def _emulated(failures: list[Exception]) -> dict[str, Any]:
     with Station("both") as station:
-        serial, can = station.endpoints["serial"], station.endpoints["can"]
+        serial, can = station.endpoints["sensors"]["serial"], station.endpoints["sensors"]["can"]
         places = (serial["port"], f"slcan://{can['channel']}?bitrate={can['bitrate']}")
         return {
             "serial": [_serial_port(ListPortInfo(path)) for path in (serial["port"], can["channel"])],

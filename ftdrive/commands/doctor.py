@@ -1,6 +1,5 @@
 """`ftdrive doctor`: is the cell connected, quiet and permitted? Nothing moves."""
 
-import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -21,7 +20,7 @@ from drivers.errors import DriverError
 from drivers.interfaces import ArmStatus, ForceTorqueSensor, RobotArm
 from drivers.ur.library import Dashboard, ask_dashboard
 from drivers.ur.reading import CONNECT_S
-from drivers.ur.rtde import CONTROL_REGISTERS, registers_in_use
+from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
 from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
 from ftdrive.commands.common import JSON, MODEL, check_simulate, read_cell, runs, simulate, write_json
@@ -40,7 +39,6 @@ _LOOK_S = 2.0
 _PUSH_S = 3.0
 _PUSH_WINDOW_S = 0.2
 _SIMULATED_PUSH_N = 15.0
-_SCRIPT_PORT = 30003
 _NOT_UR = Check("robot.programs", "skipped", "not applicable: only a UR has dashboard, RTDE registers and port 30003")
 _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "red"), "skipped": ("-", "")}
 
@@ -158,17 +156,11 @@ def _registers(host: str) -> Check:
 
 
 def _script_port(host: str) -> Check:
-    """See whether the controller takes programs, without sending one."""
-    name = "robot.programs"
     try:
-        socket.create_connection((host, _SCRIPT_PORT), timeout=CONNECT_S).close()
-    except OSError as error:
-        fix = (
-            "enable the real-time client interface at the pendant under Settings, Security, Services; look for a "
-            f"firewall that stops port {_SCRIPT_PORT}"
-        )
-        return Check(name, "failed", f"port {_SCRIPT_PORT}, which takes programs, cannot be reached ({error})", fix)
-    return Check(name, "ok", f"port {_SCRIPT_PORT}, which takes programs, is open")
+        find_script_port(host, timeout_s=CONNECT_S)
+    except DriverError as error:
+        return Check("robot.programs", "failed", *diagnosis.found_and_cure(error, f"ping {host}"))
+    return Check("robot.programs", "ok", f"port {SCRIPT_PORT}, which takes programs, is open")
 
 
 def _flange(arm: RobotArm, status: ArmStatus) -> Check:

@@ -46,7 +46,7 @@ def _repeat(run: Run, as_json: bool) -> None:
     records: list[PoseRecord] = []
     sampling = sampling_of(run.header())
     for kept in run.records():
-        recorded.move_to(kept.pose.q_rad.tolist(), timeout_s=0.0, guard=recorded.check)
+        recorded.go_on_to(kept.pose.q_rad)
         again = take_pose(recorded, recorded, kept.stop, kept.pose, sampling)
         records.append(replace(again, clock_offset_ns=kept.clock_offset_ns))
         talk.print(f"{kept.stop:2d}  R{kept.pose.number:02d}  {len(kept.samples.t_host_ns)} samples")

@@ -52,7 +52,6 @@ class Operator:
             "speed-scaling": self._speed_scaling,
             "remote-control": self._remote_control,
             "set-tcp": self._set_tcp,
-            "tcp": self._set_tcp,
             "set-payload": self._set_payload,
             "freeze": self._freeze,
             "silent": self._silent,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from inspect import isgenerator, signature
 from typing import TYPE_CHECKING, Any, cast
 
-from mocks.ur.library import FUNCTIONS, Pose, ScriptError, is_number
+from mocks.ur.library import FUNCTIONS, Pose, ScriptError, is_number, shown
 from mocks.ur.syntax import (
     Assignment,
     Call,
@@ -80,6 +80,9 @@ class Thread:
         self.name = name
         self.steps = _nothing()
         self.done = False
+
+    def __str__(self) -> str:
+        return self.name
 
 
 @dataclass
@@ -369,12 +372,3 @@ class Program:
             raise ScriptError(f"{name}: {error}") from None
         result = function(self, *args, **named)
         return (yield from cast("Run", result)) if isgenerator(result) else result
-
-
-def shown(value: Value) -> str:
-    """Write a value as the controller does in a message."""
-    if isinstance(value, list):
-        return ("p" if isinstance(value, Pose) else "") + "[" + ", ".join(map(shown, value)) + "]"
-    if isinstance(value, Thread):
-        return value.name
-    return "nothing" if value is None else str(value)

@@ -7,6 +7,7 @@ import selectors
 import socket
 import struct
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 from mocks.ur import dashboard, rtde
@@ -21,17 +22,19 @@ CATCH_UP_CYCLES = 250  # a longer stall of this process is not made good
 Select = selectors.BaseSelector
 
 
-class Client:
+class Client(ABC):
     """One TCP connection: bytes in, bytes out, never blocking."""
 
     kind = ""
+    banner = b""
+    """What the port says first."""
 
     def __init__(self, server: "UrServer", connection: socket.socket) -> None:
         self.server = server
         self.robot = server.robot
         self.open = True
         self.greeted = False
-        """Whether `on_open` has run."""
+        """Whether the banner was sent."""
         self._socket = connection
         self._in = bytearray()
         self._out = bytearray()
@@ -45,9 +48,6 @@ class Client:
     def lagging(self) -> bool:
         """Whether the client has not yet read what was sent before."""
         return bool(self._out)
-
-    def on_open(self) -> None:
-        """Say what the port says first."""
 
     def on_ready(self) -> None:
         """Read what is there and act on it."""
@@ -63,9 +63,9 @@ class Client:
         self._in += data
         self.on_bytes(self._in)
 
+    @abstractmethod
     def on_bytes(self, buffer: bytearray) -> None:
         """Consume what is complete at the start of `buffer`."""
-        raise NotImplementedError
 
     def send(self, data: bytes) -> None:
         """Send now what the socket takes, keep the rest."""
@@ -117,6 +117,7 @@ class DashboardClient(Client):
     """Port 29999: a banner, then one line for each line."""
 
     kind = "dashboard"
+    banner = dashboard.BANNER.encode() + b"\n"
 
     def __init__(self, server: "UrServer", connection: socket.socket) -> None:
         super().__init__(server, connection)
@@ -127,10 +128,6 @@ class DashboardClient(Client):
     def trusted(self) -> bool:
         """Whether the pendant was in remote control ever since this client connected; else it can only ask."""
         return self._opened_remote and self._switches == self.robot.remote_switches
-
-    def on_open(self) -> None:
-        """Send the banner."""
-        self.send(dashboard.BANNER.encode() + b"\n")
 
     def on_bytes(self, buffer: bytearray) -> None:
         """Answer every complete line."""
@@ -312,7 +309,7 @@ class UrServer:
         self._selector.register(client, selectors.EVENT_READ, client.on_ready)
         if not client.greeted:
             client.greeted = True
-            client.on_open()
+            client.send(client.banner)
 
     def forget(self, client: Client) -> None:
         """A client hung up: its input variables are free again."""

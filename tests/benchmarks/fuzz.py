@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import cast
 
 from drivers._crc import crc16_modbus, crc16_x25
-from drivers._frames import Deframer
 from drivers.ati import codec as ati
 from drivers.ati import modbus
 from drivers.bota import codec as bota
@@ -139,9 +138,9 @@ def targets() -> list[Target]:
     ati_row = halves(8, 8, 8)
     ati_pair = halves(8, 6)
     words = halves(2, 2, 2, 2)
-    robotous_stream = Deframer(bytes([robotous.START_OF_FRAME]), robotous.FRAME_SIZE, robotous.is_frame)
-    robotiq_stream = Deframer(robotiq.HEADER, robotiq.FRAME_SIZE, robotiq.is_frame)
-    bota_stream = Deframer(bota.HEADER, bota.FRAME_SIZE, bota.is_frame)
+    robotous_stream = robotous.deframer()
+    robotiq_stream = robotiq.deframer()
+    bota_stream = bota.deframer()
     sample = bytes([robotous.Command.START, *range(15)])
     record = bytes.fromhex("0064012C01F4FF38FE70FDA850")
     registers = modbus.read_registers(modbus.STATUS, 1)
@@ -164,7 +163,7 @@ def targets() -> list[Target]:
         Target("ati.codec.decode_counts_per_unit", ati.decode_counts_per_unit, bytes.fromhex("000F4240000F4240")),
         Target("ati.codec.decode_unit_codes", ati.decode_unit_codes, b"\x02\x03"),
         Target("ati.codec.decode_firmware", ati.decode_firmware, b"\x03\x08\x00\x01"),
-        Target("ati.modbus.check_reply", reply_to(registers), modbus.frame(modbus.READ_HOLDING, b"\x02\0\0")),
+        Target("ati.modbus.check_reply", reply_to(registers), modbus.frame(0x03, b"\x02\0\0")),
         Target("ati.modbus.decode_calibration_block", modbus.decode_calibration_block, calibration),
         Target("ati.modbus.decode_records", keep, record * 8),
         Target("robotous.codec.decode_sample", robotous.decode_sample, sample),

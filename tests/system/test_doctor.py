@@ -187,7 +187,7 @@ def test_devices_of_this_computer_and_of_an_emulated_cell(station: Station, ftdr
 
 def test_devices_asks_serial_port_and_can_bus_where_it_is_told_to(ftdrive: CommandLine) -> None:
     with Station("both", ["--time-scale", "1"]) as station:
-        port, can = station.endpoints["serial"]["port"], station.endpoints["can"]
+        port, can = station.endpoints["sensors"]["serial"]["port"], station.endpoints["sensors"]["can"]
         bus = f"slcan://{can['channel']}?bitrate={can['bitrate']}"
         url = f"ati-can://{can['channel']}?interface=slcan&bitrate={can['bitrate']}"
         serial_answer, can_answer = ftdrive.json("devices", "--probe", port, "--probe", bus)["answers"]

@@ -34,9 +34,13 @@ def station() -> Iterator[Station]:
         yield station
 
 
+def serial_port(station: Station) -> str:
+    return str(station.endpoints["sensors"]["serial"]["port"])
+
+
 @pytest.fixture
 def addresses(station: Station) -> list[str]:
-    return ["--robot", station.cell.robot.host, "--sensor", f"ati-serial://{station.endpoints['serial']['port']}"]
+    return ["--robot", station.cell.robot.host, "--sensor", f"ati-serial://{serial_port(station)}"]
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +53,7 @@ def run(*arguments: str, typed: str = "") -> Result:
 
 
 def test_a_script_needs_no_questions(station: Station) -> None:
-    addresses = ["--robot", station.cell.robot.host, "--sensor", station.endpoints["serial"]["port"]]
+    addresses = ["--robot", station.cell.robot.host, "--sensor", serial_port(station)]
     more = [
         "--sensor-mass",
         "0.255",
@@ -67,7 +71,7 @@ def test_a_script_needs_no_questions(station: Station) -> None:
     assert outcome.stdout == ""
     cell = load()
     assert (cell.robot.host, cell.robot.model, cell.robot.speed_deg_s) == (station.cell.robot.host, "UR5e", 45)
-    assert cell.sensor.url == f"ati-serial://{station.endpoints['serial']['port']}"  # the port was asked what is there
+    assert cell.sensor.url == f"ati-serial://{serial_port(station)}"  # the port was asked what is there
     assert (cell.sensor.height_mm, cell.sensor.mass_kg) == (33, 0.255)
     assert cell.tool.cylinders_mm == ((0, 33, 80), (33, 200, 100, 0, 5))
     assert (cell.tool.name, cell.tool.mass_kg, cell.workcell.mounting) == ("gripper", 1.2, "12.5")
@@ -83,7 +87,7 @@ def test_an_arm_that_cannot_be_planned_for_is_said_to_be_one() -> None:
 
 
 def test_a_bus_is_asked_what_is_there(station: Station) -> None:
-    can = station.endpoints["can"]
+    can = station.endpoints["sensors"]["can"]
     bus = f"slcan://{can['channel']}?bitrate={can['bitrate']}"
     outcome = run("--robot", station.cell.robot.host, "--sensor", bus, *TOOL, "--yes")
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)
@@ -150,7 +154,7 @@ def test_a_folder_that_is_not_there_is_told_before_anything_is_asked(tmp_path: P
 
 
 def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
-    answers = ["127.99.99.9", station.cell.robot.host, "ati-nonsense://x", station.endpoints["serial"]["port"]]
+    answers = ["127.99.99.9", station.cell.robot.host, "ati-nonsense://x", serial_port(station)]
     answers += ["high", "3300", "33", "", ""]
     answers += ["0:x:33", "0:0.2:0.1", "0:20:80", "", "20:33:80", "33:20:100", "33:200:100", "", "", ""]
     answers += ["1:0:0:800", "-1:0:0:-800", "", "-50:-50:0:50:50:400", "300:300:0:500:500:400", "", ""]
@@ -209,7 +213,7 @@ def test_in_a_terminal(station: Station) -> None:
     screen, decoder = "", codecs.getincrementaldecoder("utf-8")()  # a read may end within a letter
     talk = [
         (r"Robot address: ", station.cell.robot.host),
-        (r"Sensor(, a number| address).*: ", station.endpoints["serial"]["port"]),
+        (r"Sensor(, a number| address).*: ", serial_port(station)),
         (r"measure it\): ", "33"),
         (r"Sensor and adapter, kg .*: ", "0.255"),
         (r"Name of the tool \[tool\]: ", ""),
@@ -239,6 +243,6 @@ def test_in_a_terminal(station: Station) -> None:
     assert "remote control ON" in screen
     assert re.search(r"✔ ati-serial://\S+: ATI", screen)
     assert load().sensor.height_mm == 33
-    addresses = (station.cell.robot.host, station.endpoints["serial"]["port"])
+    addresses = (station.cell.robot.host, serial_port(station))
     long = [line for line in screen.splitlines() if len(line) > COLUMNS and not any(a in line for a in addresses)]
     assert not long  # a terminal would break it within a word

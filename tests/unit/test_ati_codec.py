@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers._status import describe_status
 from drivers.ati import codec
 from drivers.errors import ProtocolError
 
@@ -64,8 +65,8 @@ def test_identity_and_units() -> None:
 
 
 def test_status_in_words() -> None:
-    assert codec.describe_status(0) == "0x0000 (ok)"
-    assert codec.describe_status(0x8040) == (
+    assert describe_status(0, codec.STATUS_BITS) == "0x0000 (ok)"
+    assert describe_status(0x8040, codec.STATUS_BITS) == (
         "0x8040 (bit 6: no valid calibration in the active slot, bit 15: any error)"
     )
     critical = {bit for bit in range(16) if codec.CRITICAL >> bit & 1}

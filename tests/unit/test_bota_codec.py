@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers._crc import crc16_x25
+from drivers._status import describe_status
 from drivers.bota import codec
 from drivers.errors import ProtocolError
 
@@ -62,5 +63,5 @@ def test_commands_and_their_confirmations() -> None:
 
 
 def test_status_in_words() -> None:
-    assert codec.describe_status(0) == "0x0000 (ok)"
-    assert codec.describe_status(6) == "0x0006 (bit 1: overrange, bit 2: invalid measurement)"
+    assert describe_status(0, codec.STATUS_BITS) == "0x0000 (ok)"
+    assert describe_status(6, codec.STATUS_BITS) == "0x0006 (bit 1: overrange, bit 2: invalid measurement)"

@@ -18,9 +18,11 @@ from drivers.errors import (
     DeviceTimeout,
     DriverError,
     Frozen,
+    NoDashboard,
     PortInUse,
     ProtocolError,
     StreamBroken,
+    Unreachable,
 )
 from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
 from ftdrive import diagnosis
@@ -395,7 +397,7 @@ def test_a_polyscope_that_cannot_be_controlled(firmware: str, state: str) -> Non
     ],
 )
 def test_an_arm_that_is_not_reached(cause: OSError, cure: str) -> None:
-    error = ConnectError(f"ur5:30004 cannot be reached ({cause}): check the address and the cable.")
+    error = Unreachable(f"ur5:30004 cannot be reached ({cause}): check the address and the cable.")
     error.__cause__ = cause
     check = diagnosis.check_unreachable(error, "ur5")
     assert (check.name, check.state) == ("robot.reachable", "failed")
@@ -403,7 +405,7 @@ def test_an_arm_that_is_not_reached(cause: OSError, cure: str) -> None:
 
 
 def test_what_a_dashboard_server_says_is_not_lost() -> None:
-    error = StreamBroken("the dashboard server of ur5 says: Timeout connecting to UR dashboard server.")
+    error = NoDashboard("the dashboard server of ur5 says: Timeout connecting to UR dashboard server.")
     check = diagnosis.check_unreachable(error, "ur5")
     assert check.found == "the dashboard server of ur5 says: Timeout connecting to UR dashboard server"
     assert "enable the dashboard server" in str(check.fix)

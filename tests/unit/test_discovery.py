@@ -68,6 +68,13 @@ def test_an_adapter_on_a_serial_port(
     assert asked == [(tty + serial_speed, {"interface": "slcan", "bitrate": bitrate, "base": base})]
 
 
+def test_an_adapter_whose_name_is_written_like_in_any_address(asked: list[Any], tmp_path: Path) -> None:
+    port = tmp_path / "my port"
+    port.symlink_to("/dev/null")
+    ask(f"slcan://{tmp_path}/my%20port?bitrate=250000")
+    assert [channel for channel, _ in asked] == [str(port)]
+
+
 def test_a_port_without_more_is_a_serial_sensor(asked: list[Any], tmp_path: Path) -> None:
     assert ask("/dev/null") == []
     assert asked == ["/dev/null"]

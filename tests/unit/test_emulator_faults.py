@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mocks.faults import Faults, FaultyWire
-from mocks.sensor import MAX_BACKLOG_S, Pacer
 from mocks.slcan import CanFrame
+from mocks.stream import MAX_BACKLOG_S, Pacer
 
 LATER = 1e6  # seconds: whatever is on its way has arrived
 

@@ -12,6 +12,7 @@ from typing import Self
 import numpy as np
 import pytest
 
+from drivers._status import describe_status
 from drivers.errors import ConnectError, DeviceFault, StreamBroken
 from drivers.interfaces import Fact
 from drivers.netft import (
@@ -19,7 +20,6 @@ from drivers.netft import (
     NET_FT_BITS,
     ONROBOT_BITS,
     NetFtSensor,
-    describe_status,
     numbers_in,
     range_in,
     text_in,
@@ -256,7 +256,7 @@ def test_rate_and_range_are_the_devices() -> None:
 
 
 def test_status_in_words() -> None:
-    assert describe_status(0, NET_FT_BITS) == "0x00000000 (ok)"
-    assert describe_status(0x80020000, NET_FT_BITS).startswith("0x80020000 (bit 17: transducer saturated")
-    assert "bit 30: force or torque out of range" in describe_status(0x40000000, AXIA_BITS)
-    assert describe_status(0x10, ONROBOT_BITS) == "0x00000010 (bit 4: overload Fx)"
+    assert describe_status(0, NET_FT_BITS, 32) == "0x00000000 (ok)"
+    assert describe_status(0x80020000, NET_FT_BITS, 32).startswith("0x80020000 (bit 17: transducer saturated")
+    assert "bit 30: force or torque out of range" in describe_status(0x40000000, AXIA_BITS, 32)
+    assert describe_status(0x10, ONROBOT_BITS, 32) == "0x00000010 (bit 4: overload Fx)"

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mocks.robotous import Model, RobotousCanNode, RobotousSensor, RobotousSerialBox, fields, packet, sample_field
-from mocks.sensor import Pacer
+from mocks.stream import Pacer
 
 WRENCH = np.array([10, -5, 20, 1, -0.5, 0.05])
 SAMPLE = "0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000"

@@ -54,9 +54,6 @@ class Cell:
         R = Rotation.from_euler("xz", [self.q[4], self.q[5] + turn]).as_matrix()
         return Reading(len(self.log), self.q, R)
 
-    def move_to(self, *_: object, **__: object) -> None:
-        raise AssertionError("whoever moves the arm, it is not the routine")
-
     def wait_until_still(self, *, timeout_s: float, guard: Callable[[], None]) -> None:
         assert timeout_s > 0
         guard()

@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers import _stream
+from drivers._clock import awake_s
 from drivers._stream import NOTHING, StreamingSensor
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, Frozen, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, FtSamples
@@ -416,7 +417,6 @@ def test_how_many_identical_samples_are_enough_depends_on_the_rate(nominal_Hz: f
 
 def test_what_has_piled_up_while_the_computer_slept_is_never_delivered(monkeypatch: pytest.MonkeyPatch) -> None:
     asleep_s = [0.0]
-    awake_s = _stream.awake_s
     monkeypatch.setattr(_stream, "awake_s", lambda: awake_s() + asleep_s[0])
     with FakeSensor(stale_after_s=0.3) as sensor:
         told: list[Exception] = []

@@ -522,8 +522,7 @@ def test_the_first_line_tells_where_and_what(station: Station) -> None:
     assert hello["format"] == "mocks.station/1"
     assert hello["arm"]["model"] == "UR5e"
     assert hello["arm"]["host"].startswith("127.")
-    assert hello["can"] is None
-    assert hello["serial"] is None
+    assert hello["sensors"] == {}
     truth = hello["truth"]
     assert truth["weight_N"] == pytest.approx(truth["mass_kg"] * truth["g_m_s2"])
     assert math.hypot(*truth["gravity_force_base_N"]) == pytest.approx(truth["weight_N"])
@@ -627,7 +626,7 @@ def test_dashboard_lines_end_with_a_bare_line_feed(station: Station) -> None:
 def test_sensors_share_the_station() -> None:
     cell = Station("--sensor", "both")
     try:
-        can, serial = cell.hello["can"], cell.hello["serial"]
+        can, serial = cell.hello["sensors"]["can"], cell.hello["sensors"]["serial"]
         assert {key: can[key] for key in ("interface", "bitrate", "base")} == {
             "interface": "slcan",
             "bitrate": 250_000,
