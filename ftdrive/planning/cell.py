@@ -1,66 +1,18 @@
 """From a cell as its configuration describes it, in millimetres, to what judges moves in it."""
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 
 from drivers.ur.kinematics import MODELS, model_named
+from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError
 from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier, Margins
 from ftdrive.planning.scene import BASE_PLANE, Box, Plane, Scene, lean_of
 
 
-class Sensor(Protocol):
-    """Between flange and tool."""
-
-    @property
-    def height_mm(self) -> float | None:
-        """Of its origin above the flange face."""
-
-
-class Tool(Protocol):
-    """What the flange carries."""
-
-    @property
-    def cylinders_mm(self) -> Sequence[Sequence[float]]:
-        """From, to, diameter, and x, y where the axis stands aside."""
-
-
-class Workcell(Protocol):
-    """What stands around the arm."""
-
-    @property
-    def mounting(self) -> str:
-        """floor, wall, ceiling, or degrees the base leans to -x."""
-
-    @property
-    def planes_mm(self) -> Sequence[Sequence[float]]:
-        """Normal in base axes, and the least offset along it. The mounting surface is known without."""
-
-    @property
-    def boxes_mm(self) -> Sequence[Sequence[float]]:
-        """Two corners in base axes."""
-
-
-class Cell(Protocol):
-    """The parts of a cell's configuration that a plan depends on."""
-
-    @property
-    def sensor(self) -> Sensor:
-        """Between flange and tool."""
-
-    @property
-    def tool(self) -> Tool:
-        """What the flange carries."""
-
-    @property
-    def workcell(self) -> Workcell:
-        """What stands around the arm."""
-
-
-def certifier_for(cell: Cell, model: str) -> Certifier:
+def certifier_for(cell: CellConfig, model: str) -> Certifier:
     """Describe arm, tool and surroundings of a cell to the certifier.
 
     Whether somebody has measured them is not asked here.
@@ -83,7 +35,7 @@ def certifier_for(cell: Cell, model: str) -> Certifier:
     return certifier
 
 
-def require_possible(cell: Cell, model: str | None) -> None:
+def require_possible(cell: CellConfig, model: str | None) -> None:
     """Refuse what no cell looks like: a tool shorter than its sensor, a plane or box with the arm itself inside.
 
     Judged is the shoulder, which no motion takes away: of what is refused here nothing could be proven clear. What is

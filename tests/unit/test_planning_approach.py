@@ -1,12 +1,12 @@
 """The way to the first pose, and the cell it is judged in."""
 
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from drivers.ur.kinematics import Array
+from ftdrive.config import CellConfig, RobotConfig, Rows, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.arm_model import ArmModel, Cylinder
 from ftdrive.planning.cell import certifier_for
@@ -100,14 +100,12 @@ def test_an_arm_that_stands_too_near_to_something_is_told_what() -> None:
         plan_approach(certifier, USUAL_POSTURE_RAD, away, SLOW)
 
 
-def cell(**changes: object) -> SimpleNamespace:
-    tool = {"cylinders_mm": ((0, 200, 100), (20, 60, 30, 70, -10))}
-    workcell = {"mounting": "wall", "planes_mm": ((0, -2, 0, -800),), "boxes_mm": ((400, 0, 300, 300, -600, 0),)}
-    return SimpleNamespace(
-        sensor=SimpleNamespace(height_mm=None),
-        tool=SimpleNamespace(**{k: changes.get(k, v) for k, v in tool.items()}),
-        workcell=SimpleNamespace(**{k: changes.get(k, v) for k, v in workcell.items()}),
-    )
+TOOL_MM: Rows = ((0, 200, 100), (20, 60, 30, 70, -10))
+AROUND = WorkcellConfig("wall", ((0, -2, 0, -800),), ((400, 0, 300, 300, -600, 0),))
+
+
+def cell(tool: Rows = TOOL_MM, workcell: WorkcellConfig = AROUND) -> CellConfig:
+    return CellConfig(RobotConfig(""), SensorConfig(""), ToolConfig(cylinders_mm=tool), workcell)
 
 
 def test_a_cell_in_millimetres_becomes_what_judges_moves() -> None:
@@ -120,16 +118,16 @@ def test_a_cell_in_millimetres_becomes_what_judges_moves() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("changed", "words"),
     [
-        ({"cylinders_mm": ()}, "tool is empty"),
-        ({"cylinders_mm": ((0, 200),)}, "3 or 5 numbers"),
-        ({"planes_mm": ((0, 0, 0, 5),)}, "no direction"),
-        ({"boxes_mm": ((0, 0, 0, float("nan"), 1, 1),)}, "6 numbers"),
-        ({"boxes_mm": ((0, 0, 0, 0, 1, 1),)}, "is empty"),
-        ({"mounting": "desk"}, "mounting is 'desk'"),
+        (cell(tool=()), "tool is empty"),
+        (cell(tool=((0, 200),)), "3 or 5 numbers"),
+        (cell(workcell=WorkcellConfig(planes_mm=((0, 0, 0, 5),))), "no direction"),
+        (cell(workcell=WorkcellConfig(boxes_mm=((0, 0, 0, float("nan"), 1, 1),))), "6 numbers"),
+        (cell(workcell=WorkcellConfig(boxes_mm=((0, 0, 0, 0, 1, 1),))), "is empty"),
+        (cell(workcell=WorkcellConfig("desk")), "mounting is 'desk'"),
     ],
 )
-def test_a_cell_that_cannot_be_is_refused(changes: dict[str, object], words: str) -> None:
+def test_a_cell_that_cannot_be_is_refused(changed: CellConfig, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        certifier_for(cell(**changes), "ur5e")
+        certifier_for(changed, "ur5e")
