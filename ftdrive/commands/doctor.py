@@ -25,7 +25,7 @@ from drivers.ur.rtde import CONTROL_REGISTERS, registers_in_use
 from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
 from ftdrive.commands.common import JSON, MODEL, check_simulate, read_cell, runs, simulate, write_json
-from ftdrive.config import CellConfig
+from ftdrive.config import USUAL_KG, CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.simulation import Station, sensor_name, sensor_url
 from ftdrive.talk import talk
@@ -91,7 +91,7 @@ def doctor(
         arm = _examine_robot(cell, found, stack)
         permissions = checks.check_permissions(address)
         blame = partial(diagnosis.check_sensor_error, address=address, permissions=permissions)
-        alive = _examine_sensor(device, address, cell, mass_kg or cell.tool.mass_kg or 1.0, found, blame, stack)
+        alive = _examine_sensor(device, address, cell, mass_kg or cell.tool.mass_kg or USUAL_KG, found, blame, stack)
         told = cell.robot.model if arm is None else arm.identify().model
         found += [checks.check_workcell(cell, told), *checks.check_disk(runs), *permissions]
         if calibration is not None:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.design import SUBSET_6, T12, Guess, special
 from drivers.ur.kinematics import Array
+from ftdrive.config import USUAL_KG
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning import constant_tour
 from ftdrive.planning.approach import Approach, plan_approach
@@ -46,10 +47,10 @@ Found = tuple[Sequence[int], Array]
 """Numbers of the orientations and joint vectors (n, 6), in the order of travel."""
 
 
-def guess_of(certifier: Certifier, mass_kg: float = 1.0) -> Guess:
+def guess_of(certifier: Certifier, mass_kg: float | None = None) -> Guess:
     """Expect a tool of this mass, its centre half way down, noise of an averaged pose, and gravity as mounted."""
     length_m = max(part.to_m for part in certifier.arm.tool)
-    return Guess(mass_kg, 0.05, 0.003, (0.0, 0.0, length_m / 2), tilt_beta_rad=certifier.scene.lean_rad)
+    return Guess(mass_kg or USUAL_KG, 0.05, 0.003, (0.0, 0.0, length_m / 2), tilt_beta_rad=certifier.scene.lean_rad)
 
 
 def plan_tour(

@@ -16,10 +16,10 @@ from drivers.errors import DriverError
 from drivers.interfaces import DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
 from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
-from ftdrive.planning.cell import certifier_for
+from ftdrive.planning.cell import certifier_for, plan_for, speeds_of
 from ftdrive.planning.constant_tour import constant_tour
+from ftdrive.planning.motion import slower
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import guess_of, plan_tour
 from ftdrive.planning.scene import Scene, lean_of
 from ftdrive.planning.words import arm_moves, point_in_words, turns_in_words, way_in_words, way_of
 from ftdrive.runs import Run
@@ -44,7 +44,7 @@ from ftdrive.session.machine import SLOW, Pace, RunningFit, Tour, approach_to
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Operator
 from ftdrive.session.outcome import Outcome, solve_and_save
-from ftdrive.session.prospect import USUAL_KG, at_most, moves_s, prediction, slower, speeds_of
+from ftdrive.session.prospect import at_most, moves_s, prediction
 from ftdrive.session.running import Running
 from ftdrive.session.watch import Guards
 from ftdrive.wiring import build_arm, build_sensor
@@ -190,12 +190,11 @@ class _Begun:
         info: DeviceInfo = arm.identify()
         self._certifier = certifier_for(cell, info.model)
         self._old = None if options.resume is None else Run(options.resume)
-        self._speeds = speeds_of(cell)
         self._plan = plan or self._planned()
         document = self._plan.to_dict()
         self._key = (info.serial, str(document["sha256"]))
         self._known = not options.real or has_completed(*self._key)
-        speeds = slower(self._speeds, SLOW) if self._pace.slow else self._speeds
+        speeds = slower(speeds_of(cell), SLOW) if self._pace.slow else speeds_of(cell)
         self._driven = at_most(self._plan, self._certifier, speeds)
         q = arm.state().q_rad
         self._todo, self._taken = self._what_is_left()
@@ -232,13 +231,10 @@ class _Begun:
 
     def _planned(self) -> Plan:
         """Make a plan where the arm stands."""
-        options, cell = self._options, self._cell
         q = np.round(self._arm.state().q_rad / _GRID_RAD) * _GRID_RAD
         with suppress(ConfigError):  # the planner says what to do about it
             q[3:5] = constant_tour(q)[0, 3:5]  # wherever the wrist was left; joint 6 tells how the cable is wound
-        guess = guess_of(self._certifier, cell.tool.mass_kg or USUAL_KG)
-        made = plan_tour(self._certifier, q, options.poses, speeds=self._speeds, guess=guess)
-        return made.marked(measured=cell.workcell.measured)
+        return plan_for(self._cell, self._certifier, q, self._options.poses)
 
     def _what_is_left(self) -> tuple[list[int], list[PoseRecord]]:
         """Stops to take, and records that stand."""
