@@ -15,7 +15,6 @@ from drivers.ur.kinematics import Array
 from ftdrive.config import USUAL_KG
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning import constant_tour
-from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.chosen import Chosen, chosen_tour
 from ftdrive.planning.free_box import box_tour
@@ -25,17 +24,6 @@ from ftdrive.planning.nodes import WRIST_6_RAD, wrist_nodes
 from ftdrive.planning.plan import Plan, make_plan
 from ftdrive.planning.postures import with_room
 from ftdrive.planning.tours import clear_tour
-
-__all__ = [
-    "NUMBERS",
-    "USUAL_POSTURE_RAD",
-    "Approach",
-    "guess_of",
-    "plan_approach",
-    "plan_box",
-    "plan_cone",
-    "plan_tour",
-]
 
 USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 """Where all models have room for the constant tour with usual tools; the wrist is at its first pose."""

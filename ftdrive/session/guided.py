@@ -16,12 +16,13 @@ from drivers.errors import DriverError
 from drivers.interfaces import DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
 from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
+from ftdrive.planning.approach import arm_moves, plan_approach
 from ftdrive.planning.cell import certifier_for, plan_for, speeds_of
 from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.motion import slower
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.scene import Scene, lean_of
-from ftdrive.planning.words import arm_moves, point_in_words, turns_in_words, way_in_words, way_of
+from ftdrive.planning.words import point_in_words, turns_in_words, way_in_words
 from ftdrive.runs import Run
 from ftdrive.session import preflight
 from ftdrive.session.completed import has_completed, remember_completed
@@ -40,7 +41,7 @@ from ftdrive.session.guards import (
     StallGuard,
     Tripped,
 )
-from ftdrive.session.machine import SLOW, Pace, RunningFit, Tour, approach_to
+from ftdrive.session.machine import SLOW, Pace, RunningFit, Tour
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Operator
 from ftdrive.session.outcome import Outcome, solve_and_save
@@ -210,7 +211,7 @@ class _Begun:
             sensor=sensor,
             certifier=self._certifier,
             plan=self._plan,
-            approach=approach_to(self._certifier, q, goal, SLOW),
+            approach=plan_approach(self._certifier, q, goal, SLOW),
             runs=options.runs,
             known=self._known,
             quiet=self._listen(preflight.LISTEN_S),
@@ -218,7 +219,7 @@ class _Begun:
             limits=limits,
             sensor_range=_range_of(sensor),
         )
-        self._way = way_of(q, self._before.approach)
+        self._way = self._before.approach.way_rad
         self._show()
         self._check(preflight.CHECKS)
         if options.dry_run:
@@ -384,10 +385,10 @@ class _Begun:
     def _recheck(self, hazard: int | None) -> None:
         """Do the checks again after a stop by a row of the hazard table, and ask again where that row says so."""
         q = self._arm.state().q_rad
-        stays = approach_to(self._certifier, q, q, SLOW)  # the way on is judged by itself, once it is known where to
+        stays = plan_approach(self._certifier, q, q, SLOW)  # the way on is judged by itself, once it is known where to
         quiet = self._listen(preflight.LISTEN_S)
         self._before = replace(self._before, quiet=quiet, approach=stays, known=True, resumed=True)
-        self._way = way_of(q, stays)
+        self._way = stays.way_rad
         self._check(preflight.AGAIN)
         if not self._options.questions:
             return
