@@ -17,13 +17,12 @@ from ftdrive.errors import PlanRefused
 from ftdrive.planning.certify import Certificate, Certifier
 from ftdrive.planning.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
+from ftdrive.planning.nodes import ELBOW_RAD
 
 NEAR_RAD = float(np.radians(30))
-"""From here a person is asked to let the program take over."""
+"""A person jogs every joint so near to the first pose where the way is not proven, then lets a program take over."""
 ROOM_RAD = np.radians([120.0, 90.0, 100.0, 120.0, 120.0, 0.0])
 """How far via-poses may lie beyond what start and end span. Joint 6 needs no detour."""
-ELBOW_RAD = float(np.radians(165))
-"""The elbow cannot fold further, and the shapes do not know it."""
 AT_RAD = 1e-3
 """An arm so near to the first pose stands there."""
 STILL_RAD = float(np.radians(0.5))

@@ -94,7 +94,7 @@ def plan_tour(
     for centre_m in _box_centres(certifier, stands):
         if (found := _box(certifier, stands, numbers, centre_m, BOX_HALF_SIZE_M, speeds)) is not None:
             return made("box", [nowhere, _box_words(centre_m, BOX_HALF_SIZE_M)], found)
-    chosen = chosen_tour(certifier, stands, poses, np.pi, certifier.scene.down_base, speeds, guess)
+    chosen = chosen_tour(certifier, stands, poses, np.pi, speeds, guess)
     if chosen is not None:
         why = ["Not all of the orientations are in reach: the poses that tell most among those that are.", nowhere]
         return made("reachable", [*why, *_chosen_words(chosen)], (chosen.numbers, chosen.q_rad))
@@ -110,11 +110,10 @@ def plan_cone(
     poses: int = 24,
     *,
     half_angle_rad: float,
-    axis_base: ArrayLike | None = None,
     speeds: Speeds,
     guess: Guess,
 ) -> Plan:
-    """Plan a tour of chosen poses that keeps the tool axis in a cone.
+    """Plan a tour of chosen poses that keeps the tool axis in a cone about straight down.
 
     Parameters
     ----------
@@ -124,9 +123,7 @@ def plan_cone(
     poses : int
         6 or more.
     half_angle_rad : float
-        Between the tool axis (flange z) and the axis of the cone.
-    axis_base : array_like, shape (3,), optional
-        Of the cone, in base; straight down if not given.
+        Between the tool axis (flange z) and straight down.
     speeds : Speeds
     guess : Guess
 
@@ -141,15 +138,12 @@ def plan_cone(
         There is no tour whose moves are all proven clear.
     """
     stands = checked_joints(q_rad)
-    axis = certifier.scene.down_base if axis_base is None else np.asarray(axis_base, dtype=np.float64)
     if not (0 < half_angle_rad <= np.pi and poses >= FEWEST_CHOSEN):
         raise ConfigError(
             f"a cone of {np.degrees(half_angle_rad):g} degrees with {poses} poses cannot be planned: give above 0 to "
             f"180 degrees, and {FEWEST_CHOSEN} poses or more"
         )
-    if axis.shape != (3,) or not np.linalg.norm(axis) > 0:
-        raise ConfigError(f"the axis of the cone is {axis.tolist()}: give a direction in base axes, such as 0, 0, -1")
-    chosen = chosen_tour(certifier, stands, poses, half_angle_rad, axis, speeds, guess)
+    chosen = chosen_tour(certifier, stands, poses, half_angle_rad, speeds, guess)
     if chosen is None:
         raise PlanRefused(
             f"{poses} poses with the tool within {np.degrees(half_angle_rad):.0f} degrees of the axis of the cone are "

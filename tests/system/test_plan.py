@@ -47,7 +47,7 @@ def test_table_is_talk_and_the_file_is_the_plan(tmp_path: Path) -> None:
     assert outcome.stdout == ""
     for word in ("wrist 3", "ball of 0.35 m", "proven clear", "Predicted"):
         assert word in outcome.stderr
-    assert len(Plan.load(path).tour) == 24
+    assert len(Plan.load(path).steps) == 24
 
 
 @pytest.mark.parametrize("option", ["--output", "--png"])
