@@ -24,7 +24,7 @@ from drivers.ur.reading import CONNECT_S
 from drivers.ur.rtde import CONTROL_REGISTERS, registers_in_use
 from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
-from ftdrive.commands.common import JSON, MODEL, check_simulate, read_cell, runs, simulate, write_json
+from ftdrive.commands.common import CELL, JSON, MODEL, check_simulate, read_cell, runs, simulate, write_json
 from ftdrive.config import USUAL_KG, CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.simulation import Station, sensor_name, sensor_url
@@ -46,9 +46,7 @@ _MARK = {"ok": "[green]✔[/]", "warning": "[yellow]![/]", "failed": "[red]✘[/
 
 
 @click.command()
-@click.option("--config", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="The cell, in TOML.")
-@click.option("--robot", metavar="HOST", help="Address of the controller.")
-@click.option("--sensor", metavar="URL", help="Such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0.")
+@CELL
 @MODEL
 @simulate()
 @click.option(
