@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from calib.errors import CalibError
-
 JSON: TypeAlias = Any
 """What `json` can write: numbers, strings, None, and lists and dicts of them."""
 
@@ -61,7 +59,7 @@ def _refuse_existing(path: Path) -> None:
         raise FileExistsError(f"{path} exists already and is never overwritten: choose another name")
 
 
-def read_object(path: Path, error: type[CalibError]) -> dict[str, Any]:
+def read_object(path: Path, error: type[Exception]) -> dict[str, Any]:
     """Read a JSON file that holds one object; raise `error`, one sentence without the file's name, when it does not."""
     try:
         text = path.read_text(encoding="utf-8")
@@ -78,7 +76,7 @@ def read_object(path: Path, error: type[CalibError]) -> dict[str, Any]:
     return document
 
 
-def check_format(document: Mapping[str, object], expected: str, error: type[CalibError]) -> None:
+def check_format(document: Mapping[str, object], expected: str, error: type[Exception]) -> None:
     """Check the field `format`, for example 'ftdrive.dataset/1'; raise `error` when it is another one."""
     found = document.get("format")
     kind, _, version = expected.partition("/")

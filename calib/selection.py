@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from calib.design import (
     Guess,
-    Prediction,
     TOOL_DOWN_R_base_flange,
     force_rows,
     information,
@@ -34,7 +33,6 @@ WEIGHT_OF_PLANE = 0.3
 FEWEST = 4
 """Poses that can determine all parameters."""
 LEAST_GAP = 0.05
-RECOMMENDED_POSES = 6
 MOST_SWEEPS = 20
 LEAST_GAIN = 1e-6
 CLEARLY_WIDER = 1.1
@@ -171,32 +169,6 @@ def next_pose(
     ranked = np.argsort(-worth, kind="stable")
     variance = np.maximum(np.sum(C * force) - force_gain[ranked], 0.0)
     return ranked, np.asarray(guess.sigma_force_N * np.sqrt(variance))
-
-
-def enough(
-    prediction: Prediction,
-    force_rms_N: float,
-    torque_rms_Nm: float = float("inf"),
-    *,
-    least_gap: float = LEAST_GAP,
-) -> bool:
-    """Say whether the poses behind a prediction will do: errors as wanted, one clear solution, six poses or more.
-
-    Parameters
-    ----------
-    prediction : Prediction
-        Of the poses taken.
-    force_rms_N, torque_rms_Nm : float
-        Wanted errors of compensation, root mean square over all orientations.
-    least_gap : float
-        0.05 is out of reach within about 40° of straight down: ask for 0.02 there, for less in narrower cones.
-    """
-    return (
-        prediction.n_poses >= RECOMMENDED_POSES
-        and prediction.second_basin_gap >= least_gap
-        and prediction.force_rms_N <= force_rms_N
-        and prediction.torque_rms_Nm <= torque_rms_Nm
-    )
 
 
 def order(R_base_flange: Array, guess: Guess) -> Indices:

@@ -84,25 +84,6 @@ def lrom(R_base_flange: Array, wrench: Array) -> Parameters:
     return _remaining_steps(R_base_flange, wrench, lrom_gravity_force(A, wrench[:, :3]))
 
 
-def mixed(R_special: Array, wrench_special: Array, R_base_flange: Array, wrench: Array) -> Parameters:
-    """Take the gravity force from the 24 special orientations and everything else from any poses (Table III, case 8).
-
-    Parameters
-    ----------
-    R_special, wrench_special : array, shape (24, 3, 3) and (24, 6)
-        As for `srom`.
-    R_base_flange, wrench : array, shape (n, 3, 3) and (n, 6)
-        Three poses or more; they may include the special ones.
-
-    Raises
-    ------
-    NotObservable
-        Orientations of the 24 are missing or repeated.
-    """
-    gravity_force_base_N = srom(R_special, wrench_special).gravity_force_base_N
-    return _remaining_steps(R_base_flange, wrench, gravity_force_base_N)
-
-
 def _remaining_steps(R_base_flange: Array, wrench: Array, gravity_force_base_N: Array) -> Parameters:
     A, force_N, torque_Nm = np.swapaxes(R_base_flange, 1, 2), wrench[:, :3], wrench[:, 3:]
     R, force_bias_N = rotation_and_force_bias(A, force_N, gravity_force_base_N)

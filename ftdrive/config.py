@@ -25,6 +25,9 @@ PREFIX = "FTDRIVE_"
 
 Rows = tuple[tuple[float, ...], ...]
 
+USUAL_KG = 1.0
+"""What a tool is expected to weigh that nobody has weighed."""
+
 
 @dataclass(frozen=True, slots=True)
 class RobotConfig:

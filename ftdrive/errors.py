@@ -1,7 +1,5 @@
 """What can go wrong in the application itself."""
 
-from calib.errors import CalibError
-
 
 class ConfigError(Exception):
     """The configuration or the combination of options cannot be used."""
@@ -11,7 +9,7 @@ class NotAccepted(Exception):
     """The result is not good enough to be kept, or differs from what it must equal."""
 
 
-class PlanRefused(NotAccepted, CalibError):
+class PlanRefused(NotAccepted):
     """No motion is proven clear, or a plan was made for something else than what is there now."""
 
 

@@ -43,8 +43,8 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[str
     change = _lasting_change(result, records)
     if change is not None:
         what, row = change
-        return (what.in_words(names[row]), *_moved(records, names, range(len(records))), *mismatches(result))
-    words = [*_moved(records, names, range(len(records)))]
+        return (what.in_words(names[row]), *_moved(records, names), *mismatches(result))
+    words = _moved(records, names)
     odd = [row for row in out if _steady(records[row])]
     pulled = [row for row in odd if _pulled(result, row)]
     for row in odd:
@@ -78,17 +78,14 @@ def _steady(record: PoseRecord) -> bool:
     return record.steady and turned_rad(record.before, record.after) < _STILL_RAD
 
 
-def _moved(records: Sequence[PoseRecord], names: Sequence[str], rows: Sequence[int]) -> list[str]:
+def _moved(records: Sequence[PoseRecord], names: Sequence[str]) -> list[str]:
     words = []
-    for row in rows:
-        record = records[row]
+    for record, name in zip(records, names, strict=True):
         turned_deg = np.degrees(turned_rad(record.before, record.after))
         if turned_deg >= np.degrees(_STILL_RAD):
-            words.append(f"{names[row]} turned by {turned_deg:.2f}° while it was averaged: repeat it")
+            words.append(f"{name} turned by {turned_deg:.2f}° while it was averaged: repeat it")
         elif not record.steady:
-            words.append(
-                f"{names[row]} was not steady while it was averaged: something swung or was touched, repeat it"
-            )
+            words.append(f"{name} was not steady while it was averaged: something swung or was touched, repeat it")
     return words
 
 

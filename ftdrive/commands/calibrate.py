@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import NewFile, rows, runs, stop_unless_accepted, write_json
+from ftdrive.commands.common import CELL, NewFile, rows, runs, stop_unless_accepted, write_json
 
 if TYPE_CHECKING:
     from ftdrive.config import CellConfig
@@ -25,9 +25,7 @@ _EXCLUDE_ONE_ANOTHER = (
 
 
 @click.command()
-@click.option("--config", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="The cell, in TOML.")
-@click.option("--robot", metavar="HOST", help="Address of the controller.")
-@click.option("--sensor", metavar="URL", help="Such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0.")
+@CELL
 @click.option(
     "--tool",
     multiple=True,

@@ -35,6 +35,13 @@ CONFIG = click.option(
 )
 
 
+def CELL(command: F) -> F:
+    """Add the options --config, --robot and --sensor, which say what `read_cell` reads."""
+    sensor_help = "Such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0."
+    command = click.option("--sensor", metavar="URL", help=sensor_help)(command)
+    return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller.")(command))
+
+
 class NewFile(click.Path):
     """A file that a command makes: refused before any work where one is there already, or where its folder is not."""
 

@@ -23,8 +23,8 @@ from drivers.ur.reading import CONNECT_S
 from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
 from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
-from ftdrive.commands.common import JSON, MODEL, check_simulate, read_cell, runs, simulate, write_json
-from ftdrive.config import CellConfig
+from ftdrive.commands.common import CELL, JSON, MODEL, check_simulate, read_cell, runs, simulate, write_json
+from ftdrive.config import USUAL_KG, CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.simulation import Station, sensor_name, sensor_url
 from ftdrive.talk import hanging, talk
@@ -44,9 +44,7 @@ _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "
 
 
 @click.command()
-@click.option("--config", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="The cell, in TOML.")
-@click.option("--robot", metavar="HOST", help="Address of the controller.")
-@click.option("--sensor", metavar="URL", help="Such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0.")
+@CELL
 @MODEL
 @simulate()
 @click.option(
@@ -89,7 +87,7 @@ def doctor(
         arm = _examine_robot(cell, found, stack)
         permissions = checks.check_permissions(address)
         blame = partial(diagnosis.check_sensor_error, address=address, permissions=permissions)
-        alive = _examine_sensor(device, address, cell, mass_kg or cell.tool.mass_kg or 1.0, found, blame, stack)
+        alive = _examine_sensor(device, address, cell, mass_kg or cell.tool.mass_kg or USUAL_KG, found, blame, stack)
         told = cell.robot.model if arm is None else arm.identify().model
         found += [checks.check_workcell(cell, told), *checks.check_disk(runs), *permissions]
         if calibration is not None:

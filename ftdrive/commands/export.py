@@ -69,9 +69,10 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
 
 
 def _emulated() -> "Plan":
-    from ftdrive.commands.plan import make_plan
+    from ftdrive.planning.cell import certifier_for, plan_for
+    from ftdrive.planning.planner import USUAL_POSTURE_RAD
     from ftdrive.simulation import Station
 
     with Station() as station:
-        made, _ = make_plan(station.cell)
-    return made
+        cell = station.cell
+    return plan_for(cell, certifier_for(cell, cell.robot.model), USUAL_POSTURE_RAD)

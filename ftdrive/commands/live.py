@@ -19,7 +19,7 @@ from rich.text import Text
 from calib import CalibrationResult
 from calib.noise import LEAST_SAMPLES, PoseMean, mean_and_covariance
 from drivers.interfaces import DeviceInfo
-from ftdrive.commands.common import JSON, check_simulate, read_cell, simulate, stop_unless_accepted, write_json
+from ftdrive.commands.common import CELL, JSON, check_simulate, read_cell, simulate, stop_unless_accepted, write_json
 from ftdrive.config import CellConfig
 from ftdrive.diagnosis import belonging
 from ftdrive.errors import ConfigError
@@ -55,9 +55,7 @@ class Look:
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help="FILE; with --simulate one is made first where none is given.",
 )
-@click.option("--config", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="The cell, in TOML.")
-@click.option("--robot", metavar="HOST", help="Address of the controller.")
-@click.option("--sensor", metavar="URL", help="Such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0.")
+@CELL
 @simulate("An emulated cell: that which the calibration is of, or that of --sensor emulated://NAME.")
 @click.option("--replay", type=click.Path(exists=True, file_okay=False, path_type=Path), help="A recorded run.")
 @click.option(

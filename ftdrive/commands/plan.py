@@ -1,6 +1,5 @@
 """`ftdrive plan`: where an arm would go and how clear it stays, without an arm."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,12 +9,10 @@ import click
 from ftdrive.commands.common import CONFIG, JSON, NewFile, check_simulate, numbers, rows, simulate, write_json
 
 if TYPE_CHECKING:
-    from ftdrive.config import CellConfig
     from ftdrive.planning.certify import Certifier
     from ftdrive.planning.plan import Plan
 
 USUAL_POSTURE_DEG = (45, -100, 60)
-USUAL_MASS_KG = 1.0
 
 
 @click.command()
@@ -84,8 +81,12 @@ def plan(
     Arm, tool and surroundings come from the configuration where there is one; what is given here takes its place. Real
     cables, fixtures and people are not in the model: look at the ball before anything moves.
     """
+    import numpy as np
+
     from ftdrive.config import cell_of, settings
     from ftdrive.errors import ConfigError
+    from ftdrive.planning.cell import certifier_for, plan_for
+    from ftdrive.planning.planner import USUAL_POSTURE_RAD
     from ftdrive.simulation import Station
     from ftdrive.talk import talk
 
@@ -118,9 +119,12 @@ def plan(
         cell = replace(cell, workcell=replace(cell.workcell, measured=True))
     if not cell.workcell.measured:
         talk.print(f"Placeholders are in {', '.join(sorted(described))} (measured = false): a plan for the eye only.")
-    made, certifier = make_plan(
+    certifier = certifier_for(cell, cell.robot.model)
+    q_rad = np.array([*np.radians(numbers("--posture", posture, ",", (3,))), *USUAL_POSTURE_RAD[3:]])
+    made = plan_for(
         cell,
-        numbers("--posture", posture, ",", (3,)),
+        certifier,
+        q_rad,
         6 if minimal else 12 if quick else 24,
         cone_deg=cone_deg,
         box_mm=box_mm,
@@ -140,51 +144,6 @@ def plan(
         talk.print(plan_in_words(made))
     if view:
         _look(made, certifier)
-
-
-def make_plan(
-    cell: "CellConfig",
-    posture_deg: Sequence[float] = USUAL_POSTURE_DEG,
-    poses: int = 24,
-    *,
-    cone_deg: float | None = None,
-    box_mm: float | None = None,
-    tip_unlimited: bool = False,
-) -> "tuple[Plan, Certifier]":
-    """Plan for a cell, from a posture of its first three joints; also what has proven it clear.
-
-    Raises `ConfigError` where arm or tool are not named, and `PlanRefused`.
-    """
-    import numpy as np
-
-    from ftdrive.errors import ConfigError, PlanRefused
-    from ftdrive.planning.cell import certifier_for
-    from ftdrive.planning.motion import Speeds
-    from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
-
-    if cell.robot.model is None:
-        raise ConfigError("which arm? Give --model, or [robot] model in ftdrive.toml")
-    if not cell.tool.cylinders_mm:
-        raise ConfigError("what is mounted? Give --tool FROM:TO:DIAMETER, or [tool] cylinders_mm in ftdrive.toml")
-    q_rad = USUAL_POSTURE_RAD.copy()
-    q_rad[:3] = np.radians(posture_deg)
-    certifier = certifier_for(cell, cell.robot.model)
-    speeds = Speeds(
-        float(np.radians(cell.robot.speed_deg_s)),
-        float(np.radians(cell.robot.acceleration_deg_s2)),
-        None if tip_unlimited else cell.robot.tip_speed_mm_s / 1e3,
-    )
-    guess = guess_of(certifier, USUAL_MASS_KG if cell.tool.mass_kg is None else cell.tool.mass_kg)
-    if cone_deg is not None:
-        cone_rad = float(np.radians(cone_deg))
-        made = plan_cone(certifier, q_rad, poses, half_angle_rad=cone_rad, speeds=speeds, guess=guess)
-    elif box_mm is not None:
-        made = plan_box(certifier, q_rad, poses, half_size_m=box_mm / 1e3, speeds=speeds, guess=guess)
-    else:
-        made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess)
-    if not made.certified:
-        raise PlanRefused("a move of the plan could not be proven clear")
-    return made.marked(measured=cell.workcell.measured), certifier
 
 
 def _look(made: "Plan", certifier: "Certifier") -> None:

@@ -9,12 +9,11 @@ from math import degrees, radians
 from typing import Any
 
 from ftdrive.exports.common import plain, require_usable
+from ftdrive.planning.approach import NEAR_RAD
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.scene import MOUNTINGS
 from ftdrive.planning.words import point_in_words, room_in_words
 
-NEAR_RAD = radians(30)
-"""The way to the first pose is not part of a plan: no joint may be farther from it than this at the start."""
 APPROACH_RAD_S, APPROACH_RAD_S2 = radians(10), radians(20)
 
 

@@ -17,13 +17,16 @@ from ftdrive.errors import PlanRefused
 from ftdrive.planning.certify import Certificate, Certifier
 from ftdrive.planning.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
+from ftdrive.planning.nodes import ELBOW_RAD
 
 NEAR_RAD = float(np.radians(30))
-"""From here a person is asked to let the program take over."""
+"""A person jogs every joint so near to the first pose where the way is not proven, then lets a program take over."""
 ROOM_RAD = np.radians([120.0, 90.0, 100.0, 120.0, 120.0, 0.0])
 """How far via-poses may lie beyond what start and end span. Joint 6 needs no detour."""
-ELBOW_RAD = float(np.radians(165))
-"""The elbow cannot fold further, and the shapes do not know it."""
+AT_RAD = 1e-3
+"""An arm so near to the first pose stands there."""
+STILL_RAD = float(np.radians(0.5))
+"""A joint that turns less does not count as moving: no part of any arm moves by 20 mm."""
 NODES = 240
 NEIGHBOURS = 16
 ROUNDS = 80
@@ -32,14 +35,12 @@ ROUNDS = 80
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """k moves, one after the other; the last ends at the first pose."""
+    """k moves, one after the other; the last ends at the first pose. None where the arm stands there already."""
 
-    q_rad: Array
-    """(k, 6) where each move ends."""
+    way_rad: Array
+    """(k + 1, 6) from where the arm stands to the first pose; (0, 6) without a move."""
     speed_rad_s: Array
     """(k,) of the leading joint of each move."""
-    move_duration_s: Array
-    """(k,)"""
     certified: bool
     """Every move is proven clear. Always so when made by `plan_approach`."""
     clearance_m: float
@@ -48,14 +49,15 @@ class Approach:
     """The two bodies that come closest to their margin."""
 
     @property
-    def duration_s(self) -> float:
-        """Of all moves."""
-        return float(self.move_duration_s.sum())
+    def q_rad(self) -> Array:
+        """(k, 6) where each move ends."""
+        return self.way_rad[1:]
 
-    @property
-    def straight(self) -> bool:
-        """Whether there is no via-pose."""
-        return len(self.q_rad) == 1
+
+def arm_moves(way_rad: ArrayLike) -> bool:
+    """Tell whether base, shoulder or elbow turn along a way (n, 6)."""
+    way = np.asarray(way_rad)
+    return len(way) > 0 and bool(np.ptp(way[:, :3], axis=0).max() >= STILL_RAD)
 
 
 def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, speeds: Speeds) -> Approach:
@@ -79,6 +81,8 @@ def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, sp
     PlanRefused
         No way was proven clear: where to jog the arm is said.
     """
+    if np.abs(np.subtract(q_now, q_first)).max() < AT_RAD:
+        return Approach(np.zeros((0, 6)), np.zeros(0), certified=True, clearance_m=np.inf, limited_by="")
     now, first = checked_joints(q_now), checked_joints(q_first)
     if certifier.certify(now, first, tight=False).clear[0]:
         return _approach(certifier, now, first[None], speeds)
@@ -94,15 +98,12 @@ def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, sp
 
 
 def _approach(certifier: Certifier, now: Array, path: Array, speeds: Speeds) -> Approach:
-    start = np.vstack([now, path[:-1]])
-    certificate = certifier.certify(start, path)
-    speed = speed_of_leading_joint(certifier.arm, start, path, speeds)
-    turn = np.abs(path - start).max(axis=1)
+    way = np.vstack([now, path])
+    certificate = certifier.certify(way[:-1], path)
     nearest = int(np.argmin(certificate.clearance_m))
     return Approach(
-        path,
-        speed,
-        move_duration_s(turn, speed, speeds.joint_rad_s2),
+        way,
+        speed_of_leading_joint(certifier.arm, way[:-1], path, speeds),
         bool(certificate.clear.all()),
         float(certificate.clearance_m[nearest]),
         certificate.limited_by[nearest],

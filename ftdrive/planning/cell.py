@@ -1,66 +1,62 @@
-"""From a cell as its configuration describes it, in millimetres, to what judges moves in it."""
+"""From a cell as its configuration describes it, in millimetres and degrees, to what judges moves in it, and a plan."""
 
 from collections.abc import Sequence
-from typing import Protocol
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drivers.ur.kinematics import MODELS, model_named
-from ftdrive.errors import ConfigError
+from ftdrive.config import CellConfig
+from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier, Margins
+from ftdrive.planning.motion import Speeds, slower
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import guess_of, plan_box, plan_cone, plan_tour
 from ftdrive.planning.scene import BASE_PLANE, Box, Plane, Scene, lean_of
 
-
-class Sensor(Protocol):
-    """Between flange and tool."""
-
-    @property
-    def height_mm(self) -> float | None:
-        """Of its origin above the flange face."""
+FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
+"""Nothing goes faster, whatever a plan, or the configuration of an old run, says."""
 
 
-class Tool(Protocol):
-    """What the flange carries."""
-
-    @property
-    def cylinders_mm(self) -> Sequence[Sequence[float]]:
-        """From, to, diameter, and x, y where the axis stands aside."""
-
-
-class Workcell(Protocol):
-    """What stands around the arm."""
-
-    @property
-    def mounting(self) -> str:
-        """floor, wall, ceiling, or degrees the base leans to -x."""
-
-    @property
-    def planes_mm(self) -> Sequence[Sequence[float]]:
-        """Normal in base axes, and the least offset along it. The mounting surface is known without."""
-
-    @property
-    def boxes_mm(self) -> Sequence[Sequence[float]]:
-        """Two corners in base axes."""
+def speeds_of(cell: CellConfig) -> Speeds:
+    """Give the speeds in force in a cell."""
+    robot = cell.robot
+    joint_rad_s, joint_rad_s2 = np.radians([robot.speed_deg_s, robot.acceleration_deg_s2])
+    return slower(Speeds(float(joint_rad_s), float(joint_rad_s2), robot.tip_speed_mm_s / 1e3), FASTEST)
 
 
-class Cell(Protocol):
-    """The parts of a cell's configuration that a plan depends on."""
+def plan_for(
+    cell: CellConfig,
+    certifier: Certifier,
+    q_rad: ArrayLike,
+    poses: int = 24,
+    *,
+    cone_deg: float | None = None,
+    box_mm: float | None = None,
+    tip_unlimited: bool = False,
+) -> Plan:
+    """Plan for a cell, with what `certifier_for` gives for it, where the arm stands at `q_rad` (6,).
 
-    @property
-    def sensor(self) -> Sensor:
-        """Between flange and tool."""
+    Raises as `plan_cone` with `cone_deg`, `plan_box` with `box_mm`, else `plan_tour`.
+    """
+    speeds, guess = speeds_of(cell), guess_of(certifier, cell.tool.mass_kg)
+    if tip_unlimited:
+        speeds = replace(speeds, tip_m_s=None)
+    if cone_deg is not None:
+        half_angle_rad = float(np.radians(cone_deg))
+        made = plan_cone(certifier, q_rad, poses, half_angle_rad=half_angle_rad, speeds=speeds, guess=guess)
+    elif box_mm is not None:
+        made = plan_box(certifier, q_rad, poses, half_size_m=box_mm / 1e3, speeds=speeds, guess=guess)
+    else:
+        made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess)
+    if not made.certified:
+        raise PlanRefused("a move of the plan could not be proven clear")
+    return made.marked(measured=cell.workcell.measured)
 
-    @property
-    def tool(self) -> Tool:
-        """What the flange carries."""
 
-    @property
-    def workcell(self) -> Workcell:
-        """What stands around the arm."""
-
-
-def certifier_for(cell: Cell, model: str) -> Certifier:
+def certifier_for(cell: CellConfig, model: str | None) -> Certifier:
     """Describe arm, tool and surroundings of a cell to the certifier.
 
     Whether somebody has measured them is not asked here.
@@ -68,14 +64,18 @@ def certifier_for(cell: Cell, model: str) -> Certifier:
     Parameters
     ----------
     cell : CellConfig
-    model : str
+    model : str or None
         Of the arm, as the controller or the configuration tells it.
 
     Raises
     ------
     ConfigError
-        The tool is empty, a shape is impossible, the arm has no measured shape, or see `require_possible`.
+        Arm or tool are not named, a shape is impossible, the arm has no measured shape, or see `require_possible`.
     """
+    if model is None:
+        raise ConfigError("which arm? Give --model, or [robot] model in ftdrive.toml")
+    if not cell.tool.cylinders_mm:
+        raise ConfigError("what is mounted? Give --tool FROM:TO:DIAMETER, or [tool] cylinders_mm in ftdrive.toml")
     planes = (BASE_PLANE, *map(plane_from_mm, cell.workcell.planes_mm))
     scene = Scene(planes, tuple(map(box_from_mm, cell.workcell.boxes_mm)), lean_of(cell.workcell.mounting))
     certifier = Certifier(ArmModel(model, [cylinder_from_mm(values) for values in cell.tool.cylinders_mm]), scene)
@@ -83,7 +83,7 @@ def certifier_for(cell: Cell, model: str) -> Certifier:
     return certifier
 
 
-def require_possible(cell: Cell, model: str | None) -> None:
+def require_possible(cell: CellConfig, model: str | None) -> None:
     """Refuse what no cell looks like: a tool shorter than its sensor, a plane or box with the arm itself inside.
 
     Judged is the shoulder, which no motion takes away: of what is refused here nothing could be proven clear. What is

@@ -54,7 +54,6 @@ def chosen_tour(
     q_rad: ArrayLike,
     poses: int,
     half_angle_rad: float,
-    axis_base: ArrayLike,
     speeds: Speeds,
     guess: Guess,
 ) -> Chosen | None:
@@ -68,9 +67,7 @@ def chosen_tour(
     poses : int
         4 or more.
     half_angle_rad : float
-        Between the tool axis (flange z) and the axis of the cone; pi for any orientation.
-    axis_base : array_like, shape (3,)
-        Of the cone; of any length.
+        Between the tool axis (flange z) and straight down; pi for any orientation.
     speeds : Speeds
     guess : Guess
 
@@ -83,7 +80,7 @@ def chosen_tour(
     lumps = certifier.arm.travel_m[:, 5].any()
     spins, directions = (SPINS_OF_A_LUMP, DIRECTIONS_OF_A_LUMP) if lumps else (SPINS, DIRECTIONS)
     candidates = cone_candidates(half_angle_rad, spins, directions)
-    candidates = _from_down(axis_base) @ candidates
+    candidates = _from_down(certifier.scene.down_base) @ candidates
     ideal = predicted_sigma(candidates[choose(candidates, poses, guess)], guess).force_rms_N
     best = _at(certifier, stands, candidates, spins, poses, speeds, guess, ideal)
     if best is None or best.force_rms_N > NEARLY * ideal:
@@ -136,10 +133,8 @@ def _others(certifier: Certifier, stands: Array, candidates: Array) -> Array:
     return np.asarray(postures[np.argsort(-free.sum(axis=1), kind="stable")][:OTHER_POSTURES])
 
 
-def _from_down(axis_base: ArrayLike) -> Array:
-    """Turn (3, 3) of straight down onto a direction, the shortest one."""
-    axis = np.asarray(axis_base, dtype=np.float64)
-    axis = axis / np.linalg.norm(axis)
+def _from_down(axis: Array) -> Array:
+    """Turn (3, 3) of base -z onto a unit vector, the shortest one."""
     down = np.array([0.0, 0.0, -1.0])
     normal = np.cross(down, axis)
     sine = float(np.linalg.norm(normal))

@@ -25,6 +25,15 @@ class Speeds:
         return cls(float(np.radians(30)), float(np.radians(40)))
 
 
+def slower(one: Speeds, other: Speeds) -> Speeds:
+    """Give the smaller of each limit."""
+    return Speeds(
+        min(one.joint_rad_s, other.joint_rad_s),
+        min(one.joint_rad_s2, other.joint_rad_s2),
+        min(one.tip_m_s or np.inf, other.tip_m_s or np.inf),
+    )
+
+
 def move_duration_s(turn_rad: Array, speed_rad_s: Array | float, acceleration_rad_s2: float) -> Array:
     """Duration of moves by the angle of their leading joint, with speed ramped up and down."""
     ramp = np.square(speed_rad_s) / acceleration_rad_s2

@@ -1,6 +1,7 @@
 """Stick figures of a plan."""
 
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
+from calib.files import write_new
 from drivers.ur.kinematics import Array
 from ftdrive.errors import ConfigError
 from ftdrive.planning.arm_model import ArmModel, Cylinder
@@ -44,14 +46,14 @@ def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) 
     Raises
     ------
     ConfigError
-        The file is there already, or matplotlib is not.
+        There is no matplotlib.
+    OSError
+        As `write_new`.
     """
     try:
         from matplotlib.figure import Figure
     except ImportError:
         raise ConfigError("a picture needs matplotlib: install ftdrive with its extra viz, `ftdrive[viz]`") from None
-    if path.exists():
-        raise ConfigError(f"{path} exists already and is never overwritten: choose another name")
     arm, scene = certifier.arm, certifier.scene
     poses = arm.frames([step.q_rad for step in plan.steps])
     before = np.reshape(np.asarray(way_rad, dtype=np.float64), (-1, 6))[:-1]
@@ -77,7 +79,9 @@ def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) 
         axes.set_xlabel(f"base {'xyz'[across]} [m]")
         axes.set_ylabel(f"base {'xyz'[up]} [m]")
     figure.suptitle(title_of(plan, certifier, on_its_way=len(before) > 0))
-    figure.savefig(path, format="png", dpi=110)
+    picture = BytesIO()
+    figure.savefig(picture, format="png", dpi=110)
+    write_new(path, picture.getvalue())
 
 
 def title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:

@@ -11,7 +11,6 @@ import numpy as np
 
 from calib.design import Guess, Prediction, predicted_sigma, special
 from calib.files import check_format, read_object, write_new
-from calib.routine import TourPose
 from drivers.ur.kinematics import Array
 from ftdrive.errors import PlanRefused
 from ftdrive.planning.certify import Certificate, Certifier
@@ -59,11 +58,6 @@ class Plan:
     predicted: Mapping[str, Any]
     description: Mapping[str, Any]
     """Model, tool, scene and speeds in words and numbers; whether a person has `measured` them, see `marked`."""
-
-    @property
-    def tour(self) -> tuple[TourPose, ...]:
-        """The poses as the routine takes them."""
-        return tuple(TourPose(step.number, np.array(step.q_rad)) for step in self.steps)
 
     @property
     def certified(self) -> bool:

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.design import SUBSET_6, T12, Guess, special
 from drivers.ur.kinematics import Array
+from ftdrive.config import USUAL_KG
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning import constant_tour
-from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.chosen import Chosen, chosen_tour
 from ftdrive.planning.free_box import box_tour
@@ -24,17 +24,6 @@ from ftdrive.planning.nodes import WRIST_6_RAD, wrist_nodes
 from ftdrive.planning.plan import Plan, make_plan
 from ftdrive.planning.postures import with_room
 from ftdrive.planning.tours import clear_tour
-
-__all__ = [
-    "NUMBERS",
-    "USUAL_POSTURE_RAD",
-    "Approach",
-    "guess_of",
-    "plan_approach",
-    "plan_box",
-    "plan_cone",
-    "plan_tour",
-]
 
 USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 """Where all models have room for the constant tour with usual tools; the wrist is at its first pose."""
@@ -46,10 +35,10 @@ Found = tuple[Sequence[int], Array]
 """Numbers of the orientations and joint vectors (n, 6), in the order of travel."""
 
 
-def guess_of(certifier: Certifier, mass_kg: float = 1.0) -> Guess:
+def guess_of(certifier: Certifier, mass_kg: float | None = None) -> Guess:
     """Expect a tool of this mass, its centre half way down, noise of an averaged pose, and gravity as mounted."""
     length_m = max(part.to_m for part in certifier.arm.tool)
-    return Guess(mass_kg, 0.05, 0.003, (0.0, 0.0, length_m / 2), tilt_beta_rad=certifier.scene.lean_rad)
+    return Guess(mass_kg or USUAL_KG, 0.05, 0.003, (0.0, 0.0, length_m / 2), tilt_beta_rad=certifier.scene.lean_rad)
 
 
 def plan_tour(
@@ -105,7 +94,7 @@ def plan_tour(
     for centre_m in _box_centres(certifier, stands):
         if (found := _box(certifier, stands, numbers, centre_m, BOX_HALF_SIZE_M, speeds)) is not None:
             return made("box", [nowhere, _box_words(centre_m, BOX_HALF_SIZE_M)], found)
-    chosen = chosen_tour(certifier, stands, poses, np.pi, certifier.scene.down_base, speeds, guess)
+    chosen = chosen_tour(certifier, stands, poses, np.pi, speeds, guess)
     if chosen is not None:
         why = ["Not all of the orientations are in reach: the poses that tell most among those that are.", nowhere]
         return made("reachable", [*why, *_chosen_words(chosen)], (chosen.numbers, chosen.q_rad))
@@ -121,11 +110,10 @@ def plan_cone(
     poses: int = 24,
     *,
     half_angle_rad: float,
-    axis_base: ArrayLike | None = None,
     speeds: Speeds,
     guess: Guess,
 ) -> Plan:
-    """Plan a tour of chosen poses that keeps the tool axis in a cone.
+    """Plan a tour of chosen poses that keeps the tool axis in a cone about straight down.
 
     Parameters
     ----------
@@ -135,9 +123,7 @@ def plan_cone(
     poses : int
         6 or more.
     half_angle_rad : float
-        Between the tool axis (flange z) and the axis of the cone.
-    axis_base : array_like, shape (3,), optional
-        Of the cone, in base; straight down if not given.
+        Between the tool axis (flange z) and straight down.
     speeds : Speeds
     guess : Guess
 
@@ -152,15 +138,12 @@ def plan_cone(
         There is no tour whose moves are all proven clear.
     """
     stands = checked_joints(q_rad)
-    axis = certifier.scene.down_base if axis_base is None else np.asarray(axis_base, dtype=np.float64)
     if not (0 < half_angle_rad <= np.pi and poses >= FEWEST_CHOSEN):
         raise ConfigError(
             f"a cone of {np.degrees(half_angle_rad):g} degrees with {poses} poses cannot be planned: give above 0 to "
             f"180 degrees, and {FEWEST_CHOSEN} poses or more"
         )
-    if axis.shape != (3,) or not np.linalg.norm(axis) > 0:
-        raise ConfigError(f"the axis of the cone is {axis.tolist()}: give a direction in base axes, such as 0, 0, -1")
-    chosen = chosen_tour(certifier, stands, poses, half_angle_rad, axis, speeds, guess)
+    chosen = chosen_tour(certifier, stands, poses, half_angle_rad, speeds, guess)
     if chosen is None:
         raise PlanRefused(
             f"{poses} poses with the tool within {np.degrees(half_angle_rad):.0f} degrees of the axis of the cone are "

@@ -4,12 +4,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drivers.ur.kinematics import Array
-from ftdrive.planning.approach import Approach
+from ftdrive.planning.approach import STILL_RAD, arm_moves
 from ftdrive.planning.plan import Plan
 
 JOINTS = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
-STILL_RAD = float(np.radians(0.5))
-"""A joint that turns less is not named: no part of any arm moves by 20 mm."""
 
 
 def plan_in_words(plan: Plan) -> str:
@@ -36,11 +34,6 @@ def point_in_words(plan: Plan) -> str:
     return f"x {x}, y {y}, z {z} m in base"
 
 
-def way_of(q_rad: ArrayLike, approach: Approach) -> Array:
-    """Joint vectors (k + 1, 6) from where the arm stands to the first pose; none where it stands there already."""
-    return np.vstack([q_rad, approach.q_rad]) if len(approach.q_rad) else np.zeros((0, 6))
-
-
 def way_in_words(way_rad: ArrayLike, clearance_m: float) -> str:
     """Say how many moves an approach has, which joints turn over which range, and whether all of the arm needs room."""
     count = len(np.asarray(way_rad)) - 1
@@ -56,12 +49,6 @@ def turns_in_words(way_rad: ArrayLike) -> str:
         f"{name} {turn:.0f}°" for name, turn in zip(JOINTS, ranges_deg, strict=True) if turn >= np.degrees(STILL_RAD)
     ]
     return ", ".join(turns) or "no joint by half a degree"
-
-
-def arm_moves(way_rad: ArrayLike) -> bool:
-    """Tell whether base, shoulder or elbow turn along a way (n, 6)."""
-    way = np.asarray(way_rad)
-    return len(way) > 0 and bool(np.ptp(way[:, :3], axis=0).max() >= STILL_RAD)
 
 
 def _table(plan: Plan) -> list[str]:

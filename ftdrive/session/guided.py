@@ -16,12 +16,13 @@ from drivers.errors import DriverError
 from drivers.interfaces import DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
 from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
-from ftdrive.planning.cell import certifier_for
+from ftdrive.planning.approach import arm_moves, plan_approach
+from ftdrive.planning.cell import certifier_for, plan_for, speeds_of
 from ftdrive.planning.constant_tour import constant_tour
+from ftdrive.planning.motion import slower
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import guess_of, plan_tour
 from ftdrive.planning.scene import Scene, lean_of
-from ftdrive.planning.words import arm_moves, point_in_words, turns_in_words, way_in_words, way_of
+from ftdrive.planning.words import point_in_words, turns_in_words, way_in_words
 from ftdrive.runs import Run
 from ftdrive.session import preflight
 from ftdrive.session.completed import has_completed, remember_completed
@@ -40,11 +41,11 @@ from ftdrive.session.guards import (
     StallGuard,
     Tripped,
 )
-from ftdrive.session.machine import SLOW, Pace, RunningFit, Tour, approach_to
+from ftdrive.session.machine import SLOW, Pace, RunningFit, Tour
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Operator
 from ftdrive.session.outcome import Outcome, solve_and_save
-from ftdrive.session.prospect import USUAL_KG, at_most, moves_s, prediction, slower, speeds_of
+from ftdrive.session.prospect import at_most, moves_s, prediction
 from ftdrive.session.recovery import Recovery
 from ftdrive.session.running import Running
 from ftdrive.session.watch import Guards
@@ -192,12 +193,11 @@ class _Begun:
         info: DeviceInfo = arm.identify()
         self._certifier = certifier_for(cell, info.model)
         self._old = None if options.resume is None else Run(options.resume)
-        self._speeds = speeds_of(cell)
         self._plan = plan or self._planned()
         document = self._plan.to_dict()
         self._key = (info.serial, str(document["sha256"]))
         self._known = not options.real or has_completed(*self._key)
-        speeds = slower(self._speeds, SLOW) if self._pace.slow else self._speeds
+        speeds = slower(speeds_of(cell), SLOW) if self._pace.slow else speeds_of(cell)
         self._driven = at_most(self._plan, self._certifier, speeds)
         q = arm.state().q_rad
         self._todo, self._taken = self._what_is_left()
@@ -213,7 +213,7 @@ class _Begun:
             sensor=sensor,
             certifier=self._certifier,
             plan=self._plan,
-            approach=approach_to(self._certifier, q, goal, SLOW),
+            approach=plan_approach(self._certifier, q, goal, SLOW),
             runs=options.runs,
             known=self._known,
             quiet=self._listen(preflight.LISTEN_S),
@@ -221,7 +221,7 @@ class _Begun:
             limits=limits,
             sensor_range=_range_of(sensor),
         )
-        self._way = way_of(q, self._before.approach)
+        self._way = self._before.approach.way_rad
         self._show()
         self._check(preflight.CHECKS)
         if options.dry_run:
@@ -234,13 +234,10 @@ class _Begun:
 
     def _planned(self) -> Plan:
         """Make a plan where the arm stands."""
-        options, cell = self._options, self._cell
         q = np.round(self._arm.state().q_rad / _GRID_RAD) * _GRID_RAD
         with suppress(ConfigError):  # the planner says what to do about it
             q[3:5] = constant_tour(q)[0, 3:5]  # wherever the wrist was left; joint 6 tells how the cable is wound
-        guess = guess_of(self._certifier, cell.tool.mass_kg or USUAL_KG)
-        made = plan_tour(self._certifier, q, options.poses, speeds=self._speeds, guess=guess)
-        return made.marked(measured=cell.workcell.measured)
+        return plan_for(self._cell, self._certifier, q, self._options.poses)
 
     def _what_is_left(self) -> tuple[list[int], list[PoseRecord]]:
         """Stops to take, and records that stand."""
@@ -391,10 +388,10 @@ class _Begun:
     def _recheck(self, asks: bool) -> None:
         """Do the checks again after a stop; with `asks`, all of the preflight: the questions again too."""
         q = self._arm.state().q_rad
-        stays = approach_to(self._certifier, q, q, SLOW)  # the way on is judged by itself, once it is known where to
+        stays = plan_approach(self._certifier, q, q, SLOW)  # the way on is judged by itself, once it is known where to
         quiet = self._listen(preflight.LISTEN_S)
         self._before = replace(self._before, quiet=quiet, approach=stays, known=True, resumed=True)
-        self._way = way_of(q, stays)
+        self._way = stays.way_rad
         self._check(preflight.AGAIN)
         if not self._options.questions:
             return

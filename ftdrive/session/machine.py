@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,11 @@ from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrive.errors import Declined, NotAccepted, PlanRefused
 from ftdrive.mismatch import payload_in_words
-from ftdrive.planning.approach import Approach, plan_approach
+from ftdrive.planning.approach import arm_moves, plan_approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.words import arm_moves, way_in_words, way_of
+from ftdrive.planning.words import way_in_words
 from ftdrive.runs import Run
 from ftdrive.session.desk import Desk
 from ftdrive.session.events import (
@@ -384,10 +384,10 @@ class Tour:
         return self._plan.steps[at if (index - at) % n == 1 else index].speed_rad_s
 
     def _approach(self, q: Array, index: int, stop: int, *, back: bool = False) -> None:
-        approach = approach_to(self._certifier, q, self._nodes[index], SLOW)
+        approach = plan_approach(self._certifier, q, self._nodes[index], SLOW)
         if not len(approach.q_rad):
             return
-        way = way_of(q, approach)
+        way = approach.way_rad
         if words := forbidden(self._arm, way):
             raise PlanRefused(words)
         passed = self._passed(way, index)
@@ -528,11 +528,3 @@ class Tour:
 
     def _note(self, words: str, *, warning: bool = False) -> None:
         self._desk.tell(Noted(words=words, warning=warning))
-
-
-def approach_to(certifier: Certifier, q_rad: Array, goal_rad: Array, speeds: Speeds) -> Approach:
-    """Plan an approach; one that is already there has no moves."""
-    if np.abs(q_rad - goal_rad).max() < 1e-3:
-        none: Any = np.zeros(0)
-        return Approach(np.zeros((0, 6)), none, none, certified=True, clearance_m=np.inf, limited_by="")
-    return plan_approach(certifier, q_rad, goal_rad, speeds)

@@ -3,13 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.design import predicted_sigma
-from ftdrive.config import CellConfig
 from ftdrive.planning.approach import Approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
@@ -18,27 +16,6 @@ from ftdrive.planning.planner import guess_of
 from ftdrive.session.machine import APPROACH_RAD_S, SLOW
 
 Array = NDArray[np.float64]
-
-USUAL_KG: Final = 1.0
-"""What a tool is expected to weigh that nobody has weighed."""
-FASTEST: Final = Speeds(joint_rad_s2=float(np.radians(300)))
-"""Nothing goes faster, whatever a plan, or the configuration of an old run, says."""
-
-
-def speeds_of(cell: CellConfig) -> Speeds:
-    """Give the speeds in force in a cell."""
-    robot = cell.robot
-    joint_rad_s, joint_rad_s2 = np.radians([robot.speed_deg_s, robot.acceleration_deg_s2])
-    return slower(Speeds(float(joint_rad_s), float(joint_rad_s2), robot.tip_speed_mm_s / 1e3), FASTEST)
-
-
-def slower(one: Speeds, other: Speeds) -> Speeds:
-    """Give the smaller of each limit."""
-    return Speeds(
-        min(one.joint_rad_s, other.joint_rad_s),
-        min(one.joint_rad_s2, other.joint_rad_s2),
-        min(one.tip_m_s or np.inf, other.tip_m_s or np.inf),
-    )
 
 
 def at_most(plan: Plan, certifier: Certifier, speeds: Speeds) -> Plan:
@@ -94,7 +71,7 @@ def prediction(plan: Plan, certifier: Certifier, mass_kg: float | None, average_
         Standard deviation of such an average, as measured, N and N·m.
     """
     force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (sigma[:3], sigma[3:]))
-    guess = replace(guess_of(certifier, mass_kg or USUAL_KG), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
+    guess = replace(guess_of(certifier, mass_kg), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
     found = predicted_sigma(np.array([step.R_base_flange for step in plan.steps]), guess)
     assumed = "" if mass_kg else " (assumed: [tool] mass_kg is not told)"
     return (

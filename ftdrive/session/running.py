@@ -20,6 +20,7 @@ from calib.identifiability import (
 from calib.routine import PoseRecord, dataset_from, is_return
 from calib.selection import next_pose
 from calib.yu import weight_and_tilt
+from ftdrive.config import USUAL_KG
 from ftdrive.session.events import Estimated
 
 Array = NDArray[np.float64]
@@ -31,7 +32,6 @@ AMBER = {"cond9": 8.0, "cond_u1": 25.0}
 TRUSTED_SHARE = 0.05
 """`Running.predict` is silent where it is less sure of the force than this share of the weight."""
 
-_NOMINAL_KG = 1.0
 _ALIGNED = np.sin(np.radians(22.5))
 """An axis counts as pointing down, among others, from this share of gravity on."""
 
@@ -154,7 +154,7 @@ class Running:
         return result.gravity_force_base_N / result.weight_N
 
     def _guess(self) -> Guess:
-        """Give the tool as estimated, or 1 kg, with the noise of the poses as measured."""
+        """Give the tool as estimated, or a usual one, with the noise of the poses as measured."""
         variance = np.mean([np.diag(record.mean.covariance) for record in self._records.values()], axis=0)
         _, alpha, beta = weight_and_tilt(self._down())
         noise = {
@@ -166,7 +166,7 @@ class Running:
         }
         result = self._result
         if result is None or result.mass_kg == 0:
-            return Guess(_NOMINAL_KG, **noise)
+            return Guess(USUAL_KG, **noise)
         return Guess(
             result.mass_kg, p_sensor_com_m=result.p_sensor_com_m, R_flange_sensor=result.R_flange_sensor, **noise
         )

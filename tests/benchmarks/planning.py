@@ -16,13 +16,14 @@ import numpy as np
 from calib.design import special
 from drivers.ur.kinematics import Array
 from ftdrive.errors import PlanRefused
+from ftdrive.planning.approach import plan_approach
 from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.kinematics import inverse
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_approach, plan_box, plan_cone, plan_tour
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
 from ftdrive.planning.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.shapes import Bodies
 

@@ -47,7 +47,7 @@ def test_table_is_talk_and_the_file_is_the_plan(tmp_path: Path) -> None:
     assert outcome.stdout == ""
     for word in ("wrist 3", "ball of 0.35 m", "proven clear", "Predicted"):
         assert word in outcome.stderr
-    assert len(Plan.load(path).tour) == 24
+    assert len(Plan.load(path).steps) == 24
 
 
 @pytest.mark.parametrize("option", ["--output", "--png"])
@@ -56,7 +56,7 @@ def test_a_file_that_cannot_be_made_is_refused_before_any_work(
     option: str, name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "there").touch()
-    monkeypatch.setattr("ftdrive.commands.plan.make_plan", lambda *_, **__: pytest.fail("it was planned"))
+    monkeypatch.setattr("ftdrive.planning.cell.plan_for", lambda *_, **__: pytest.fail("it was planned"))
     error = run(*UR5E, option, str(tmp_path / name)).exception
     assert isinstance(error, ConfigError)
     assert str(tmp_path / name).removesuffix("/there") in str(error)

@@ -26,7 +26,7 @@ from calib.design import (
 )
 from calib.errors import NotObservable
 from calib.model import Array, jacobian, predict
-from calib.selection import Criterion, choose, cone_candidates, enough, next_pose, order
+from calib.selection import Criterion, choose, cone_candidates, next_pose, order
 from ftdrive.planning.constant_tour import NUMBERS
 
 ALL = special(range(1, 25))
@@ -399,18 +399,6 @@ def test_published_greedy_against_random() -> None:
         ranked, rms = next_pose(R, candidates, guess)
         R = np.concatenate([R, candidates[ranked[:1]]])
     assert_allclose(rms[0], 0.0788, rtol=0.03)
-
-
-def test_enough() -> None:
-    prediction = predicted_sigma(optimised(8), GUESS)
-    force, torque = prediction.force_rms_N, prediction.torque_rms_Nm
-    assert enough(prediction, 1.01 * force, 1.01 * torque)
-    assert enough(prediction, 1.01 * force)
-    assert not enough(prediction, 0.99 * force)
-    assert not enough(prediction, 1.01 * force, 0.99 * torque)
-    assert not enough(prediction, 1.01 * force, least_gap=0.95)
-    assert not enough(predicted_sigma(optimised(8)[:5], GUESS), 10.0)
-    assert not enough(predicted_sigma(special(AMBIGUOUS_6), GUESS), 10.0)
 
 
 def test_order_keeps_a_wandering_bias_apart() -> None:

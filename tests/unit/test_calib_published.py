@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from calib import NotObservable, Parameters
 from calib.model import predict
 from calib.published import LEVEL_BASE, PUBLISHED, published
-from calib.yu import SPECIAL_R_flange_base, mixed
+from calib.yu import SPECIAL_R_flange_base
 
 TRUTH = Parameters(
     Rotation.from_euler("zyx", [70, 15, 13], degrees=True).as_matrix(),
@@ -42,16 +42,3 @@ def test_methods_that_know_gravity_are_wrong_on_a_tilted_base_unless_told() -> N
 def test_cayley_asks_for_the_mass() -> None:
     with pytest.raises(NotObservable, match="mass"):
         published("carlson-cayley", R_BASE_FLANGE)
-
-
-def test_mixed_case_takes_gravity_from_the_special_poses_and_the_rest_from_any() -> None:
-    few = R_BASE_FLANGE[24:]
-    exact = mixed(SPECIAL, predict(TRUTH, SPECIAL), few, predict(TRUTH, few))
-    np.testing.assert_allclose(TRUTH.difference(exact), 0, atol=1e-11)
-    # A change of bias between the two recordings is seen by the second one only: gravity comes from the first.
-    moved = Parameters(
-        TRUTH.R_flange_sensor, TRUTH.gravity_force_base_N, np.array([9.0, 9.0, 9.0]), TRUTH.p_sensor_com_m, np.zeros(3)
-    )
-    np.testing.assert_allclose(
-        moved.difference(mixed(SPECIAL, predict(TRUTH, SPECIAL), few, predict(moved, few))), 0, atol=1e-11
-    )

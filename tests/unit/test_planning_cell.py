@@ -1,13 +1,13 @@
 """Cells that cannot be: what is told to whom described one, and that nothing possible is refused."""
 
 from collections.abc import Sequence
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ftdrive.config import CellConfig, RobotConfig, Rows, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import ConfigError
 from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.cell import box_from_mm, certifier_for, plane_from_mm, require_possible
@@ -18,14 +18,9 @@ Row = Sequence[float]
 SHOULDER = 1
 
 
-def cell(
-    planes: Sequence[Row] = (), boxes: Sequence[Row] = (), tool: Sequence[Row] = ((0, 60, 90),), height: float = 33
-) -> SimpleNamespace:
-    return SimpleNamespace(
-        sensor=SimpleNamespace(height_mm=height),
-        tool=SimpleNamespace(cylinders_mm=tool),
-        workcell=SimpleNamespace(mounting="floor", planes_mm=planes, boxes_mm=boxes),
-    )
+def cell(planes: Sequence[Row] = (), boxes: Sequence[Row] = (), tool: Rows = ((0, 60, 90),)) -> CellConfig:
+    workcell = WorkcellConfig(planes_mm=tuple(map(tuple, planes)), boxes_mm=tuple(map(tuple, boxes)))
+    return CellConfig(RobotConfig(""), SensorConfig("", height_mm=33), ToolConfig(cylinders_mm=tool), workcell)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from ftdrive.errors import ConfigError
 from ftdrive.planning.arm_model import ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds
@@ -76,5 +75,5 @@ def test_tool_surroundings_and_the_way_are_drawn(plan: Plan, tmp_path: Path, mon
     assert np.subtract(areas[2], areas[0]).tolist() == [1, 2, 2]  # the box, and the wall from its edge
     assert np.subtract(lines[3], lines[0]).tolist() == [1, 1, 1]
     assert [figure.axes[2].get_xlim()[1] > 0.8 for figure in saved] == [False, False, True, False]  # the wall is seen
-    with pytest.raises(ConfigError, match="never overwritten"):
+    with pytest.raises(FileExistsError, match="never overwritten"):
         draw(plan, certifier_of(), tmp_path / "0.png")

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ftdrive.planning.approach import arm_moves
 from ftdrive.planning.arm_model import ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
 from ftdrive.planning.scene import Scene
-from ftdrive.planning.words import arm_moves, plan_in_words, room_in_words, turns_in_words, way_in_words
+from ftdrive.planning.words import plan_in_words, room_in_words, turns_in_words, way_in_words
 
 
 @pytest.fixture(scope="module")

@@ -6,13 +6,14 @@ import pytest
 from ftdrive.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.planning.approach import plan_approach
 from ftdrive.planning.arm_model import ArmModel, Cylinder
+from ftdrive.planning.cell import speeds_of
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
 from ftdrive.planning.scene import BASE_PLANE, Scene
 from ftdrive.session.machine import APPROACH_RAD_S, SLOW
-from ftdrive.session.prospect import at_most, moves_s, speeds_of
+from ftdrive.session.prospect import at_most, moves_s
 
 
 @pytest.fixture(scope="module")
