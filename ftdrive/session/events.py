@@ -113,7 +113,7 @@ class PoseTaken(Event):
     stops: int
     number: int
     gravity_flange: Array
-    """(3,) unit vector down, in the flange frame, for a level base."""
+    """(3,) unit vector down, in the flange frame, as the base is mounted."""
     mean: Array
     """(6,) N and N·m, as measured."""
     sigma: Array

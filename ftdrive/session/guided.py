@@ -475,10 +475,20 @@ def _by_hand(
         run = Run(options.resume)
         _require_same_devices(run, arm, sensor)
         earlier = run.records()
-    running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_of(cell))
-    listen = options.mode == "listen"
+    down_base, listen = down_of(cell), options.mode == "listen"
+    running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base)
     with _kept(desk, run):
-        collect_manually(arm, sensor, cell.sampling, desk, running, run.commit, listen=listen, earlier=earlier)
+        collect_manually(
+            arm,
+            sensor,
+            cell.sampling,
+            desk,
+            running,
+            run.commit,
+            down_base=down_base,
+            listen=listen,
+            earlier=earlier,
+        )
     return run
 
 

@@ -91,6 +91,7 @@ def collect_manually(
     running: Fit,
     commit: Callable[[PoseRecord], None],
     *,
+    down_base: Array,
     listen: bool,
     earlier: Sequence[PoseRecord] = (),
 ) -> None:
@@ -108,6 +109,8 @@ def collect_manually(
         Is given each pose; judges whether they are enough, and says what would help.
     commit : callable
         Takes each record and returns when it is safe on disk; one with the `stop` of an earlier one replaces it.
+    down_base : array, shape (3,)
+        Unit vector down in base, as it is mounted.
     listen : bool
         A program moves the arm: no advice on where to move it. Poses are taken from its start to its end, or until it
         comes back to its first pose when there are enough. That return is committed too and serves
@@ -127,7 +130,7 @@ def collect_manually(
     Exception
         Whatever the arm or the sensor raises; the poses committed so far stand.
     """
-    _Collection(arm, sensor, sampling, operator, running, commit, listen, earlier).run()
+    _Collection(arm, sensor, sampling, operator, running, commit, down_base, listen, earlier).run()
 
 
 class _Collection:
@@ -139,13 +142,14 @@ class _Collection:
         operator: Operator,
         running: Fit,
         commit: Callable[[PoseRecord], None],
+        down_base: Array,
         listen: bool,
         earlier: Sequence[PoseRecord],
     ) -> None:
         self._arm, self._sensor, self._sampling = arm, sensor, sampling
         self._witness = Witness(sensor, operator.tell)
         self._operator, self._running, self._commit = operator, running, commit
-        self._listen = listen
+        self._down_base, self._listen = down_base, listen
         self._earlier = earlier
         self._taken: dict[int, PoseRecord] = {}
         self._level: Array | None = None
@@ -310,7 +314,7 @@ class _Collection:
                 stop=record.stop,
                 stops=max(record.stop, len(self._taken)),
                 number=record.pose.number,
-                gravity_flange=-record.before.R_base_flange[2],
+                gravity_flange=record.before.R_base_flange.T @ self._down_base,
                 mean=record.mean.mean,
                 sigma=np.sqrt(np.diag(record.mean.covariance)),
                 samples=len(record.samples.wrench),

@@ -151,7 +151,16 @@ def watch(station: Station, run: Run, *, listen: bool, commit: Callable[[PoseRec
         person = Person(mover.measured, None if listen else len(tour))
         with mover:
             arm = Spectator(ours, mover)
-            collect_manually(arm, sensor, cell.sampling, person, Fit(), commit or run.commit, listen=listen)
+            collect_manually(
+                arm,
+                sensor,
+                cell.sampling,
+                person,
+                Fit(),
+                commit or run.commit,
+                down_base=np.array([0.0, 0.0, -1.0]),
+                listen=listen,
+            )
             assert mover.plays  # it was we who found the end
 
 

@@ -26,6 +26,7 @@ NOISE = np.repeat([0.05, 0.002], 3)
 BIAS = np.array([3.0, -2.0, 1.0, 0.1, -0.2, 0.3])
 COM_M = np.array([0.0, 0.01, 0.06])
 AVERAGE_S = 2.0
+FLOOR = np.array([0.0, 0.0, -1.0])
 
 UP, DOWN, LEFT, RIGHT, FRONT, BACK = (
     Rotation.from_euler("xyz", angles, degrees=True)
@@ -211,7 +212,15 @@ class Outcome:
         def collect() -> None:
             sampling = Sampling(average_s=AVERAGE_S, attempts=3)
             collect_manually(
-                self.cell, self.cell, sampling, self.person, self.fit, self._commit, listen=listen, earlier=earlier
+                self.cell,
+                self.cell,
+                sampling,
+                self.person,
+                self.fit,
+                self._commit,
+                down_base=FLOOR,
+                listen=listen,
+                earlier=earlier,
             )
 
         if raises is None:
@@ -523,5 +532,7 @@ def test_a_disk_that_is_full_ends_it() -> None:
         raise OSError("No space left on device")
 
     with pytest.raises(OSError, match="No space"):
-        collect_manually(cell, cell, Sampling(average_s=AVERAGE_S), person, Fit(), commit, listen=False)
+        collect_manually(
+            cell, cell, Sampling(average_s=AVERAGE_S), person, Fit(), commit, down_base=FLOOR, listen=False
+        )
     assert not any(isinstance(event, PoseTaken) for event in person.told)
