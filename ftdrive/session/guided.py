@@ -383,6 +383,7 @@ class _Begun:
                 sampling=self._sampling,
                 pace=self._pace,
                 quiet_std=quiet_std,
+                sensor_kg=cell.sensor.mass_kg,
             ).run(self._todo)
         if self._pace.slow and run.stops() == list(range(1, len(plan.steps) + 2)):
             remember_completed(*self._key)

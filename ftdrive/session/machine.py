@@ -39,7 +39,6 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.guards import RangeGuard, Tripped
 from ftdrive.session.operator import Key, Question
-from ftdrive.session.outcome import cell_of
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.recovery import Recovery
 from ftdrive.session.watch import Guards
@@ -114,6 +113,8 @@ class Tour:
         The guard that also judges every sample of a pose.
     quiet_std : array, shape (6,)
         Of the resting sensor's samples.
+    sensor_kg
+        Mass of sensor and adapter; None where it is not known.
     """
 
     def __init__(
@@ -132,11 +133,12 @@ class Tour:
         sampling: Sampling,
         pace: Pace,
         quiet_std: Array,
+        sensor_kg: float | None,
     ) -> None:
         self._arm, self._sensor, self._certifier = arm, sensor, certifier
         self._plan, self._run, self._desk, self._running, self._guards = plan, run, desk, running, guards
         self._recovery, self._load, self._sampling, self._pace = recovery, load, sampling, pace
-        self._quiet_std = quiet_std
+        self._quiet_std, self._sensor_kg = quiet_std, sensor_kg
         self._nodes = np.array([step.q_rad for step in plan.steps])
         self._stops = len(self._nodes) + 1
         self._todo: deque[int] = deque()
@@ -199,8 +201,7 @@ class Tour:
             return
         self._payload_kg = told_kg
         self._desk.tell(Weighed(mass_kg=mass_kg, payload_kg=told_kg))
-        sensor_kg = cell_of(self._run.header()).sensor.mass_kg
-        if words := payload_in_words(told_kg, mass_kg, sensor_kg):
+        if words := payload_in_words(told_kg, mass_kg, self._sensor_kg):
             self._note(words, warning=True)
 
     def _index(self, stop: int) -> int:
