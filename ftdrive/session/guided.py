@@ -262,7 +262,7 @@ class _Begun:
         self._sensor.open()
         return self._sensor.collect(duration_s)
 
-    def _check(self, checks: Sequence[preflight.Check]) -> None:
+    def _check(self, checks: Sequence[preflight.Row]) -> None:
         failed = []
         for check in checks:
             found = check(self._before)
