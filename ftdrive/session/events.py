@@ -4,11 +4,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.interfaces import ForceTorqueSensor
 from ftdrive.planning.plan import Plan
 
 Array = NDArray[np.float64]
@@ -179,23 +180,10 @@ class Asked(Event):
     """Who answered: whoever was asked, or nobody but the option, which takes what the question assumes."""
 
 
-class _Health(Protocol):
-    @property
-    def events(self) -> tuple[tuple[int, str], ...]:
-        """(`t_host_ns`, what happened)."""
-
-
-class Streaming(Protocol):
-    """A sensor that keeps what its stream has been through; see `drivers.interfaces.Health`."""
-
-    def health(self) -> _Health:
-        """Tell it, since the sensor was opened."""
-
-
 class Witness:
     """Tells what a sensor has been through, each thing once: interruptions, connections that came back."""
 
-    def __init__(self, sensor: Streaming, tell: Callable[[Event], None]) -> None:
+    def __init__(self, sensor: ForceTorqueSensor, tell: Callable[[Event], None]) -> None:
         self._sensor, self._tell = sensor, tell
         self._told = 0
 

@@ -40,7 +40,7 @@ from ftdrive.session.guards import (
     StallGuard,
     Tripped,
 )
-from ftdrive.session.machine import SLOW, Pace, RunningFit, Tour, approach_to
+from ftdrive.session.machine import SLOW, Pace, Tour, approach_to
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Operator
 from ftdrive.session.outcome import Outcome, solve_and_save
@@ -202,7 +202,7 @@ class _Begun:
         q = arm.state().q_rad
         self._todo, self._taken = self._what_is_left()
         down_base = self._certifier.scene.down_base
-        self._running: RunningFit = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base, advise=False)
+        self._running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base, advise=False)
         for record in self._taken:
             desk.tell(self._running.add(record))
         first = self._todo[0] - 1 if self._todo else 0
@@ -484,7 +484,7 @@ def _by_hand(
             sensor,
             cell.sampling,
             desk,
-            running,
+            running.add,
             run.commit,
             down_base=down_base,
             listen=listen,

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,6 @@ from ftdrive.planning.words import arm_moves, way_in_words, way_of
 from ftdrive.runs import Run
 from ftdrive.session.desk import Desk
 from ftdrive.session.events import (
-    Estimated,
     GuardTripped,
     Noted,
     PoseTaken,
@@ -41,6 +40,7 @@ from ftdrive.session.guards import RangeGuard, Tripped
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.recovery import Recovery
+from ftdrive.session.running import Running
 from ftdrive.session.watch import Guards
 
 log = logging.getLogger(__name__)
@@ -57,23 +57,6 @@ _PATIENCE: Final = 20.0
 _NEAR_RAD: Final = float(np.radians(10))
 """A way that comes so close to a skipped posture passes it."""
 _FIRST_WORD: Final = "MOVE"
-
-
-class RunningFit(Protocol):
-    """What a session needs of `ftdrive.session.running.Running`."""
-
-    @property
-    def weighed_kg(self) -> float | None:
-        """Mass that the sensor carries; None while nobody can know."""
-
-    def add(self, record: PoseRecord) -> Estimated:
-        """Take a pose in."""
-
-    def remove(self, stop: int) -> None:
-        """Leave a pose out."""
-
-    def predict(self, R_base_flange: Array) -> Array | None:
-        """Wrench of a free tool; None while nobody can know."""
 
 
 class Stopped(Exception):
@@ -125,7 +108,7 @@ class Tour:
         plan: Plan,
         run: Run,
         desk: Desk,
-        running: RunningFit,
+        running: Running,
         guards: Guards,
         *,
         recovery: Recovery,
