@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.routine import PoseRecord
 from drivers.interfaces import ForceTorqueSensor
 from ftdrive.planning.plan import Plan
 
@@ -124,6 +125,25 @@ class PoseTaken(Event):
     average_s: float
     attempts: int
     steady: bool
+
+    @classmethod
+    def of(
+        cls, record: PoseRecord, down_base: Array, *, stops: int, settle_s: float, average_s: float, attempts: int
+    ) -> "PoseTaken":
+        """Tell a record that is on disk; `down_base` (3,) is the unit vector down in base, as it is mounted."""
+        return cls(
+            stop=record.stop,
+            stops=stops,
+            number=record.pose.number,
+            gravity_flange=record.before.R_base_flange.T @ down_base,
+            mean=record.mean.mean,
+            sigma=np.sqrt(np.diag(record.mean.covariance)),
+            samples=len(record.samples.t_host_ns),
+            settle_s=settle_s,
+            average_s=average_s,
+            attempts=attempts,
+            steady=record.steady,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

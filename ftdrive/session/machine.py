@@ -315,18 +315,13 @@ class Tour:
         self._load.judge(record.samples.wrench)
         self._run.commit(record)
         self._desk.tell(
-            PoseTaken(
-                stop=stop,
+            PoseTaken.of(
+                record,
+                self._certifier.scene.down_base,
                 stops=self._stops,
-                number=step.number,
-                gravity_flange=record.before.R_base_flange.T @ self._certifier.scene.down_base,
-                mean=record.mean.mean,
-                sigma=np.sqrt(np.diag(record.mean.covariance)),
-                samples=len(record.samples.t_host_ns),
                 settle_s=settled_s,
                 average_s=self._sampling.average_s,
                 attempts=attempts,
-                steady=record.steady,
             ),
             sync=True,
         )

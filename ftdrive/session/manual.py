@@ -12,9 +12,8 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from calib.errors import TooFewSamples
-from calib.noise import CHANNELS, LEAST_SAMPLES, is_stationary, restless_channels
-from calib.routine import PoseRecord, Sampling, TourPose, turned_rad
+from calib.noise import CHANNELS, is_stationary, restless_channels
+from calib.routine import MOVED_RAD, PoseRecord, Sampling, TourPose, require_enough, turned_rad
 from drivers.errors import DeviceTimeout, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, ForceTorqueSensor, FtSamples
 from ftdrive.session.events import (
@@ -31,8 +30,6 @@ from ftdrive.session.operator import Key, Operator
 STILL_S: Final = 1.0
 """On the controller's clock. (Its own `is_steady` is of no use here: in freedrive it is always false.)"""
 STILL_RAD_S: Final = 0.002
-CREPT_RAD: Final = radians(0.05)
-"""An arm that has turned this much has not stood still, however slowly it did."""
 LEFT_RAD: Final = radians(1)
 """Closer than this to where it was, the arm was nudged, not moved."""
 REPEAT_RAD: Final = radians(10)
@@ -215,7 +212,7 @@ class _Collection:
                 return False
             self._dealt_with = False
             self._tell_state(State.SETTLE)
-        elif still and turned_rad(self._rests_at, state) < CREPT_RAD:
+        elif still and turned_rad(self._rests_at, state) < MOVED_RAD:
             return not self._dealt_with and state.t_device_s - self._still_since_s >= STILL_S
         elif self._dealt_with:
             return False
@@ -256,16 +253,12 @@ class _Collection:
                 return False
             samples = found
             after = self._arm.state()
-            if turned_rad(before, after) >= CREPT_RAD or np.abs(after.qd_rad_s).max() >= STILL_RAD_S:
+            if turned_rad(before, after) >= MOVED_RAD or np.abs(after.qd_rad_s).max() >= STILL_RAD_S:
                 self._still_since_s = after.t_device_s
                 self._note(f"The arm moved while pose {stop} was measured: {self._hold_still()}.", warning=True)
                 self._tell_state(State.SETTLE)
                 return False
-            if len(samples.wrench) < LEAST_SAMPLES:
-                raise TooFewSamples(
-                    f"the sensor gave {len(samples.wrench)} samples in {self._sampling.average_s} s, at least "
-                    f"{LEAST_SAMPLES} are needed: check its rate, or average longer"
-                )
+            require_enough(samples, self._sampling.average_s)
             unrest = self._unrest(samples)
             if not unrest:
                 break
@@ -286,18 +279,13 @@ class _Collection:
         self._commit(record)
         self._redo = None
         self._operator.tell(
-            PoseTaken(
-                stop=record.stop,
+            PoseTaken.of(
+                record,
+                self._down_base,
                 stops=max(record.stop, len(self._taken)),
-                number=record.pose.number,
-                gravity_flange=record.before.R_base_flange.T @ self._down_base,
-                mean=record.mean.mean,
-                sigma=np.sqrt(np.diag(record.mean.covariance)),
-                samples=len(record.samples.wrench),
                 settle_s=settle_s,
                 average_s=self._sampling.average_s,
                 attempts=attempts,
-                steady=record.steady,
             )
         )
         self._learn(record)
