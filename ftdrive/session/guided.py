@@ -47,7 +47,7 @@ from ftdrive.session.outcome import Outcome, solve_and_save
 from ftdrive.session.prospect import USUAL_KG, at_most, moves_s, prediction, slower, speeds_of
 from ftdrive.session.recovery import Recovery
 from ftdrive.session.running import Running
-from ftdrive.session.watch import Guards
+from ftdrive.session.watch import Watcher
 from ftdrive.wiring import build_arm, build_sensor
 
 Array = NDArray[np.float64]
@@ -368,7 +368,7 @@ class _Begun:
         def on_trip(trip: Tripped) -> None:
             desk.tell(GuardTripped(hazard=trip.hazard, words=str(trip)))
 
-        with _kept(desk, run), Guards(self._arm, self._sensor, rows, on_trip) as guards:
+        with _kept(desk, run), Watcher(self._arm, self._sensor, rows, on_trip) as watcher:
             Tour(
                 self._arm,
                 self._sensor,
@@ -377,8 +377,8 @@ class _Begun:
                 run,
                 desk,
                 self._running,
-                guards,
-                recovery=Recovery(self._arm, self._sensor, desk, guards, contact, self._recheck),
+                watcher,
+                recovery=Recovery(self._arm, self._sensor, desk, watcher, contact, self._recheck),
                 load=load,
                 sampling=self._sampling,
                 pace=self._pace,

@@ -41,7 +41,7 @@ from ftdrive.session.operator import Key, Question
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.recovery import Recovery
 from ftdrive.session.running import Running
-from ftdrive.session.watch import Guards
+from ftdrive.session.watch import Watcher
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ class Tour:
         run: Run,
         desk: Desk,
         running: Running,
-        guards: Guards,
+        watcher: Watcher,
         *,
         recovery: Recovery,
         load: RangeGuard,
@@ -119,7 +119,7 @@ class Tour:
         sensor_kg: float | None,
     ) -> None:
         self._arm, self._sensor, self._certifier = arm, sensor, certifier
-        self._plan, self._run, self._desk, self._running, self._guards = plan, run, desk, running, guards
+        self._plan, self._run, self._desk, self._running, self._watcher = plan, run, desk, running, watcher
         self._recovery, self._load, self._sampling, self._pace = recovery, load, sampling, pace
         self._quiet_std, self._sensor_kg = quiet_std, sensor_kg
         self._nodes = np.array([step.q_rad for step in plan.steps])
@@ -149,7 +149,7 @@ class Tour:
             What stopped the arm, when a person then ended it.
         """
         self._todo = deque(todo)
-        self._guards.begin()
+        self._watcher.begin()
         while self._todo:
             try:
                 self._next()
@@ -301,7 +301,7 @@ class Tour:
                 settled_s, attempts = time.monotonic() - began_s, attempts + 1
             self._tell(State.SETTLE if stage == "settle" else State.SAMPLE, stop)
 
-        with self._guards.watching(pose.q_rad, pose.q_rad, moving=False):
+        with self._watcher.watching(pose.q_rad, pose.q_rad, moving=False):
             record = take_pose(
                 self._arm,
                 self._sensor,
@@ -422,7 +422,7 @@ class Tour:
         turn = np.abs(goal - start).max()
         duration_s = float(move_duration_s(turn, speed_rad_s, acceleration_rad_s2))
         self._at = None
-        with self._guards.watching(start, goal, moving=True):
+        with self._watcher.watching(start, goal, moving=True):
             self._arm.move_to(
                 goal.tolist(),
                 timeout_s=_PATIENCE * (duration_s + 1.5),
@@ -432,7 +432,7 @@ class Tour:
             )
 
     def _between_looks(self) -> None:
-        self._guards.check()
+        self._watcher.check()
         self._hear()
 
     # -------------------------------------------------------------------------------------------- stop and hold
@@ -449,7 +449,7 @@ class Tour:
         stop, back = self._todo[0], self._left_behind()
         self._at = None
         words = str(error if trip is None else trip).rstrip(".")
-        if trip is not None and trip is not self._guards.tripped(wait_s=0.0):
+        if trip is not None and trip is not self._watcher.tripped(wait_s=0.0):
             self._desk.tell(GuardTripped(hazard=trip.hazard, words=words))
         self._tell(State.STOP, words=words)
         self._recovery.tell_news()
