@@ -124,8 +124,19 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
             run = _by_hand(cell, arm, sensor, desk, options, devices)
         else:
             desk.tell(Noted(words=kept_awake))
-            limits = limits or (Limits() if options.real else _EMULATED)
-            begun = _Begun(cell, arm, sensor, desk, options, plan, limits)
+            if not options.dry_run and arm.status().tcp_offset is None:
+                arm.open(control=True)  # an old controller tells no poses before
+            begun = _Begun(cell, arm, sensor, desk, options, plan, limits or (Limits() if options.real else _EMULATED))
+            begun.look()
+            begun.check(preflight.CHECKS)
+            if options.dry_run:
+                desk.tell(
+                    Noted(words="the controller's own safety limits are not asked for: only a program on it could")
+                )
+            else:
+                arm.open(control=True)
+                begun.check(preflight.IN_CONTROL)
+            begun.predict()
             if options.dry_run:
                 return None
             run = begun.tour(devices)
@@ -172,7 +183,7 @@ def _plan_on_disk(options: Options) -> Plan | None:
 
 
 class _Begun:
-    """A session in front of its tour: planned, checked and shown."""
+    """A session along a plan: it looks, checks, predicts, then tours. It never takes control: `calibrate` does."""
 
     def __init__(
         self,
@@ -184,8 +195,6 @@ class _Begun:
         plan: Plan | None,
         limits: Limits,
     ) -> None:
-        if not options.dry_run and arm.status().tcp_offset is None:
-            arm.open(control=True)  # an old controller tells no poses before
         self._cell, self._arm, self._sensor, self._desk, self._options = cell, arm, sensor, desk, options
         self._limits = limits
         self._reduced = False  # as a person has said it should be
@@ -199,12 +208,16 @@ class _Begun:
         self._known = not options.real or has_completed(*self._key)
         speeds = slower(self._speeds, SLOW) if self._pace.slow else self._speeds
         self._driven = at_most(self._plan, self._certifier, speeds)
-        q = arm.state().q_rad
-        self._todo, self._taken = self._what_is_left()
         down_base = self._certifier.scene.down_base
         self._running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base, advise=False)
+
+    def look(self) -> None:
+        """See what is left to take, how the arm gets there and what the resting sensor says; show it."""
+        cell, arm, sensor, options, limits = self._cell, self._arm, self._sensor, self._options, self._limits
+        q = self._stands_rad = arm.state().q_rad
+        self._todo, self._taken = self._what_is_left()
         for record in self._taken:
-            desk.tell(self._running.add(record))
+            self._desk.tell(self._running.add(record))
         first = self._todo[0] - 1 if self._todo else 0
         goal = np.array(self._plan.steps[first % len(self._plan.steps)].q_rad)
         self._before = preflight.Before(
@@ -223,14 +236,6 @@ class _Begun:
         )
         self._way = way_of(q, self._before.approach)
         self._show()
-        self._check(preflight.CHECKS)
-        if options.dry_run:
-            desk.tell(Noted(words="the controller's own safety limits are not asked for: only a program on it could"))
-        else:
-            arm.open(control=True)
-            self._check(preflight.IN_CONTROL)
-        self._sampling, self._noise = self._chosen_sampling()
-        self._show_prospect(q)
 
     def _planned(self) -> Plan:
         """Make a plan where the arm stands."""
@@ -262,7 +267,8 @@ class _Begun:
         self._sensor.open()
         return self._sensor.collect(duration_s)
 
-    def _check(self, checks: Sequence[preflight.Row]) -> None:
+    def check(self, checks: Sequence[preflight.Row]) -> None:
+        """Tell what each finds; raise `NotAccepted` when one failed."""
         failed = []
         for check in checks:
             found = check(self._before)
@@ -312,14 +318,15 @@ class _Begun:
                 open_in_browser(url)
                 self._desk.require(f"The plan is shown at {url} until you answer. Go on?", assumed=False)
 
-    def _show_prospect(self, q_rad: Array) -> None:
-        """Tell what the plan is worth with this sensor's noise, and how long it takes."""
+    def predict(self) -> None:
+        """Choose how long to average; tell what the plan is worth with this sensor's noise, and how long it takes."""
+        self._sampling, noise = self._chosen_sampling()
         mass_kg, average_s = self._cell.tool.mass_kg, self._sampling.average_s
-        self._desk.tell(Noted(words=prediction(self._plan, self._certifier, mass_kg, average_s, self._noise)))
+        self._desk.tell(Noted(words=prediction(self._plan, self._certifier, mass_kg, average_s, noise)))
         if self._options.fast and self._pace.slow:
             self._desk.tell(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
         fastest_rad_s = max(step.speed_rad_s for step in self._driven.steps)
-        total_s = moves_s(self._driven, self._todo, q_rad, self._before.approach)
+        total_s = moves_s(self._driven, self._todo, self._stands_rad, self._before.approach)
         total_s += len(self._todo) * (average_s + 0.6)
         self._desk.tell(
             Noted(
@@ -396,7 +403,7 @@ class _Begun:
         quiet = self._listen(preflight.LISTEN_S)
         self._before = replace(self._before, quiet=quiet, approach=stays, known=True, resumed=True)
         self._way = way_of(q, stays)
-        self._check(preflight.AGAIN)
+        self.check(preflight.AGAIN)
         if not self._options.questions:
             return
         if asks:
