@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 Stage = Literal["settle", "sample"]
 
-_MOVED_RAD = np.radians(0.05)
+MOVED_RAD = float(np.radians(0.05))
 """The flange may turn this much while a pose is averaged: a tenth of the noise of a good sensor at 1 kg."""
 
 
@@ -126,19 +126,23 @@ def take_pose(
         samples = sensor.collect(sampling.average_s)
         after = arm.state()
         guard()
-        enough = len(samples.wrench) >= LEAST_SAMPLES
-        steady = enough and turned_rad(before, after) < _MOVED_RAD
+        steady = len(samples.wrench) >= LEAST_SAMPLES and turned_rad(before, after) < MOVED_RAD
         if steady:
             wrench = samples.wrench
             steady = is_stationary(wrench) if quiet_std is None else is_quiet(wrench, quiet_std)
         if steady:
             break
-    if not enough:
-        raise TooFewSamples(
-            f"the sensor gave {len(samples.wrench)} samples in {sampling.average_s} s, at least {LEAST_SAMPLES} "
-            "are needed: check its rate, or average longer"
-        )
+    require_enough(samples, sampling.average_s)
     return PoseRecord(stop, pose, before, after, samples, steady)
+
+
+def require_enough(samples: WrenchSamples, average_s: float) -> None:
+    """Raise `TooFewSamples` where this many of them are no average."""
+    if len(samples.wrench) < LEAST_SAMPLES:
+        raise TooFewSamples(
+            f"the sensor gave {len(samples.wrench)} samples in {average_s} s, at least {LEAST_SAMPLES} are needed: "
+            "check its rate, or average longer"
+        )
 
 
 def turned_rad(before: ArmReading, after: ArmReading) -> float:

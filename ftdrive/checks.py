@@ -12,6 +12,7 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, Literal
 from urllib.parse import parse_qsl, urlencode
 
@@ -28,7 +29,10 @@ _CAN_INTERFACE = "280"
 """ARPHRD_CAN, in /sys/class/net/*/type."""
 _ON_SERIAL = ("ati-serial", "bota", "robotiq-ft300", "robotous-serial")
 _ON_ETHERNET = ("ati-netft", "ur-ft")
-_FREE_BYTES = 1_000_000_000
+_LEAST_BYTES, _FEW_BYTES = 200_000_000, 1_000_000_000
+
+RATE_TOLERANCE = 0.1
+"""A sensor that is further from its rate is not set, or not connected, as it should be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,18 +106,23 @@ class SensorAddress:
         return int(self.options.get("bitrate", "250000"), 0)
 
 
-def check_disk(folder: Path) -> list[Check]:
-    """See whether runs can be written into a folder, which need not exist yet."""
-    there = folder.absolute()
+def check_disk(folder: Path) -> Check:
+    """See whether runs can be written into a folder, which need not exist yet, and whether there is room for them."""
+    name, there = "disk.runs", folder.absolute()
     while not there.exists():
         there = there.parent
-    if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
-        return [Check("disk.runs", "failed", f"{there} may not be written", "give --runs DIR, a folder of yours")]
-    free = shutil.disk_usage(there).free
-    found = f"{free / 1e9:.1f} GB free in {there}"
-    if free < _FREE_BYTES:
-        return [Check("disk.runs", "warning", found, "make room, or give --runs DIR on another disk")]
-    return [Check("disk.runs", "ok", found)]
+    try:
+        with TemporaryFile(dir=there) as file:
+            file.write(b"ftdrive")
+            file.flush()
+        free = shutil.disk_usage(there).free
+    except OSError as error:
+        return Check(
+            name, "failed", f"nothing can be written in {there} ({error})", "give --runs DIR, a folder of yours"
+        )
+    state: State = "failed" if free < _LEAST_BYTES else "warning" if free < _FEW_BYTES else "ok"
+    fix = None if state == "ok" else "make room, or give --runs DIR on another disk"
+    return Check(name, state, f"{free / 1e9:.1f} GB free in {there}", fix)
 
 
 def check_workcell(cell: CellConfig, model: str | None) -> Check:

@@ -340,13 +340,20 @@ def recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any
     """
     return {
         section: {
-            item.name: _typed(f"[{section}] {item.name} = {values[item.name]!r}", item, values[item.name])
+            item.name: _as_kept(
+                item, _typed(f"[{section}] {item.name} = {values[item.name]!r}", item, values[item.name])
+            )
             for item in fields(_SECTIONS[section])
             if item.name in values
         }
         for section, values in config.items()
         if section in _SECTIONS
     }
+
+
+def recorded_cell(config: Mapping[str, Mapping[str, Any]]) -> CellConfig:
+    """Put the cell of a run together from what `recorded` returns."""
+    return CellConfig(**{name: kind(**config[name]) for name, kind in _SECTIONS.items()})
 
 
 def _typed(said: str, item: Field[Any], value: Any) -> Any:
@@ -356,12 +363,17 @@ def _typed(said: str, item: Field[Any], value: Any) -> Any:
     return value
 
 
+def _as_kept(item: Field[Any], value: Any) -> Any:
+    if value is not None and item.type in {float, float | None}:
+        return float(value)
+    return tuple(tuple(map(float, row)) for row in value) if item.type == Rows else value
+
+
 def checked(place: str, key: str, value: Any) -> Any:
     """Return the value of a key such as "robot.host" as its section takes it, or raise `ConfigError`."""
     said = f"{place}: [{key.replace('.', '] ')} = {value!r}"
     if key == "workcell.mounting" and _number(value):  # degrees
         value = str(value)
-    kind = _KEYS[key].type
     _typed(said, _KEYS[key], value)
     if key in _RANGES:
         low, high = _RANGES[key]
@@ -369,9 +381,7 @@ def checked(place: str, key: str, value: Any) -> Any:
             raise ConfigError(f"{said} is out of range: give {low:g} to {high:g}")
     if cure := _WRONG.get(key, lambda _: None)(value):
         raise ConfigError(f"{said} cannot be used: {cure}")
-    if kind is float or kind == float | None:
-        return float(value)
-    return tuple(tuple(map(float, row)) for row in value) if kind == Rows else value
+    return _as_kept(_KEYS[key], value)
 
 
 def _wrong_text(value: str) -> str | None:

@@ -29,7 +29,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
 from drivers.ur.kinematics import MODELS
-from ftdrive.checks import Check, SensorAddress, State, latency_command
+from ftdrive.checks import RATE_TOLERANCE, Check, SensorAddress, State, latency_command
 
 Array = NDArray[np.float64]
 
@@ -167,7 +167,7 @@ def _check_rate(rate_Hz: float, nominal_Hz: float, address: SensorAddress) -> Ch
     if math.isnan(nominal_Hz):
         return Check("sensor.rate", "ok", f"{rate_Hz:.0f} Hz (as fast as it answers, or as it is set)")
     found, share = f"{rate_Hz:.1f} Hz (nominal {nominal_Hz:g})", rate_Hz / nominal_Hz
-    if 0.95 < share < 1.1:
+    if 1 - RATE_TOLERANCE / 2 < share < 1 + RATE_TOLERANCE:
         return Check("sensor.rate", "ok", found)
     port = address.serial_port
     fix = "close other programs, and try another USB port or cable"
@@ -177,7 +177,7 @@ def _check_rate(rate_Hz: float, nominal_Hz: float, address: SensorAddress) -> Ch
         fix = _BETTER_NETWORK
     elif port is not None and (tty := port.resolve().name).startswith("ttyUSB"):
         fix = latency_command(tty)
-    return Check("sensor.rate", "warning" if 0.5 < share < 1.5 else "failed", found, fix)
+    return Check("sensor.rate", "failed" if abs(share - 1) > RATE_TOLERANCE else "warning", found, fix)
 
 
 def _check_lost(health: Health, address: SensorAddress) -> Check:
@@ -289,15 +289,16 @@ def check_registers(taken: Sequence[str]) -> Check:
 
 def check_status(status: ArmStatus) -> list[Check]:
     """Judge what the controller says of itself: may the arm move, does a program run, how fast, with what payload."""
-    return [_check_safety(status), _check_program(status), _check_speed(status), _check_payload(status)]
+    return [check_safety(status), _check_program(status), _check_speed(status), check_payload(status)]
 
 
-def _check_safety(status: ArmStatus) -> Check:
+def check_safety(status: ArmStatus) -> Check:
+    """Judge whether the safety system lets the arm move."""
     if status.fault is not None:
         state, _, cure = status.fault.partition(": ")
         return Check("robot.safety", "failed", state, cure)
     if status.safety_mode != "normal":
-        fix = "see the pendant for what puts it there; a calibration needs the normal mode"
+        fix = "see the pendant for what puts it there; calibrate asks whether that is as it should be"
         return Check("robot.safety", "warning", f"safety mode {status.safety_mode}", fix)
     return Check("robot.safety", "ok", "powered, brakes released, no stop")
 
@@ -317,13 +318,16 @@ def _check_speed(status: ArmStatus) -> Check:
     return Check("robot.speed", "ok", found)
 
 
-def _check_payload(status: ArmStatus) -> Check:
+def check_payload(status: ArmStatus) -> Check:
+    """Judge what the controller was told to carry, whatever the tool is."""
     name = "robot.payload"
-    if status.payload_kg is None or status.p_flange_payload_m is None:
+    if status.payload_kg is None:
         return Check(name, "skipped", "not applicable: this controller does not tell its payload")
-    if not status.payload_kg:
+    if status.payload_kg <= 0:
         fix = "set mass and centre of mass of all that hangs on the flange at the pendant; else the arm may stop itself"
-        return Check(name, "warning", "the controller was told of no payload", fix)
+        return Check(name, "failed", "the controller was told of no payload", fix)
+    if status.p_flange_payload_m is None:
+        return Check(name, "ok", f"payload {status.payload_kg:.2f} kg, its centre is not told")
     if not any(status.p_flange_payload_m):
         found = f"payload {status.payload_kg:.2f} kg, its centre in the middle of the flange face, where nothing hangs"
         return Check(name, "warning", found, "set the centre of gravity at the pendant: Installation, Payload")
@@ -335,7 +339,9 @@ def check_remote(remote: bool | None) -> Check:
     """Judge whether the controller takes programs from the network; None where it does not tell."""
     name = "robot.remote"
     if remote is None:
-        return Check(name, "skipped", "not applicable: this controller has no remote control to switch")
+        return Check(
+            name, "skipped", "not applicable: this controller does not tell whether it takes programs from the network"
+        )
     if remote:
         return Check(name, "ok", "remote control on")
     return Check(name, "failed", "local control", "press Local, Remote Control at the top right of the pendant")

@@ -8,12 +8,11 @@ from numpy.typing import NDArray
 from calib import CalibrationResult
 from calib.changes import Change, lasting_change
 from calib.quality import out_of_line
-from calib.routine import PoseRecord, drift_check, is_return, turned_rad
+from calib.routine import MOVED_RAD, PoseRecord, drift_check, is_return, turned_rad
 from ftdrive.mismatch import mismatches
 
 Array = NDArray[np.float64]
 
-_STILL_RAD = np.radians(0.05)
 _SIGNIFICANT = 4.0
 
 
@@ -75,15 +74,15 @@ def _in_dataset(records: Sequence[PoseRecord]) -> list[PoseRecord]:
 
 
 def _steady(record: PoseRecord) -> bool:
-    return record.steady and turned_rad(record.before, record.after) < _STILL_RAD
+    return record.steady and turned_rad(record.before, record.after) < MOVED_RAD
 
 
 def _moved(records: Sequence[PoseRecord], names: Sequence[str]) -> list[str]:
     words = []
     for record, name in zip(records, names, strict=True):
-        turned_deg = np.degrees(turned_rad(record.before, record.after))
-        if turned_deg >= np.degrees(_STILL_RAD):
-            words.append(f"{name} turned by {turned_deg:.2f}° while it was averaged: repeat it")
+        turn_rad = turned_rad(record.before, record.after)
+        if turn_rad >= MOVED_RAD:
+            words.append(f"{name} turned by {np.degrees(turn_rad):.2f}° while it was averaged: repeat it")
         elif not record.steady:
             words.append(f"{name} was not steady while it was averaged: something swung or was touched, repeat it")
     return words

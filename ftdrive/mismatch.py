@@ -99,8 +99,9 @@ def lean_in_words(gravity_force_base_N: Array, covariance: Array, mounting: str)
     sigma_deg = float(np.degrees(np.sqrt(low @ covariance @ low) / along_N))
     if lean_deg < max(LEAN_DEG, _SIGNIFICANT * sigma_deg):
         return ""
+    side = " and ".join(axes_along(low))
     return (
-        f"the base leans {lean_deg:.2f}° ± {sigma_deg:.2f}° towards its {_axes_of(low)}, that side is too low; counted "
+        f"the base leans {lean_deg:.2f}° ± {sigma_deg:.2f}° towards its {side}, that side is too low; counted "
         f"from {assumed}, and PolyScope is taken to be set so too: level the base, or set its mounting in PolyScope"
     )
 
@@ -109,10 +110,10 @@ def _named(mounting: str) -> str:
     return mounting if mounting.isalpha() else f"{float(mounting):g}°"
 
 
-def _axes_of(direction: Array) -> str:
-    """Name the axes that a unit vector (3,) is along, or between."""
-    return " and ".join(
+def axes_along(direction: Array) -> list[str]:
+    """Name the axes that a unit vector (3,) is along, or between, such as "-x"."""
+    return [
         f"{'-' if part < 0 else '+'}{axis}"
         for axis, part in zip("xyz", direction.tolist(), strict=True)
         if abs(part) > _ALIGNED
-    )
+    ]

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from calib.errors import BadDataset
 from calib.files import check_format, read_object, write_new
 from calib.routine import PoseRecord, TourPose
+from drivers.interfaces import FtSamples
 from ftdrive import __version__
 from ftdrive.config import recorded
 from ftdrive.errors import ConfigError
@@ -43,20 +44,9 @@ _RESTORE = "take it from a copy"
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """What numpy raises for a file with wrong bytes in it."""
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
+"""Of a recording, named as in `FtSamples`."""
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Samples:
-    """Samples read back from a recording; the columns are those of `calib.ports.WrenchSamples`."""
-
-    t_host_ns: NDArray[np.int64]
-    t_device_s: Array
-    seq: NDArray[np.int64]
-    counts: NDArray[np.int32]
-    wrench: Array
-    status: NDArray[np.uint32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,7 +288,7 @@ def _record(data: Mapping[str, Any]) -> PoseRecord:
         pose=TourPose(int(data["number"]), data["q_target_rad"]),
         before=before,
         after=after,
-        samples=Samples(*(data[name] for name in _SAMPLE_COLUMNS)),
+        samples=FtSamples(*(data[name] for name in _SAMPLE_COLUMNS)),
         steady=bool(data["steady"]),
         clock_offset_ns=int(data.get("clock_offset_ns", 0)),
     )

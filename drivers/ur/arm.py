@@ -486,9 +486,10 @@ class UrArm(RobotArm):
         return self._control
 
     def _reading(self) -> Reader:
-        if self._reader is None:
+        reader = self._reader  # once: another thread may close the arm between two looks
+        if reader is None:
             raise ConnectError(f"the arm at {self._host} is not open: open it first.")
-        return self._reader
+        return reader
 
 
 def _check_speed(speed_rad_s: float, acceleration_rad_s2: float) -> None:

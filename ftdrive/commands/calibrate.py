@@ -213,9 +213,8 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
     Tool and surroundings are those that files and environment describe now: when they are not those of the plan, it is
     refused. Where nothing describes them any more, the run's own record counts.
     """
-    from ftdrive.config import Setting, cell_of
+    from ftdrive.config import Setting, cell_of, recorded_cell
     from ftdrive.runs import Run
-    from ftdrive.session import cell_of as cell_of_run
     from ftdrive.talk import talk
 
     header = Run(folder).header()
@@ -228,7 +227,7 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
         said.sensor or begun["sensor"],
         said.tool or tuple(begun["tool"]),
     )
-    found, before = said.settings(), cell_of_run(header)
+    found, before = said.settings(), recorded_cell(header["config"])
     nobody = {"default", "not set", "--tool"}
     origins = {one.origin for key, one in found.items() if key.startswith(("tool.", "workcell."))} - nobody
     if origins:

@@ -89,7 +89,7 @@ def doctor(
         blame = partial(diagnosis.check_sensor_error, address=address, permissions=permissions)
         alive = _examine_sensor(device, address, cell, mass_kg or cell.tool.mass_kg or USUAL_KG, found, blame, stack)
         told = cell.robot.model if arm is None else arm.identify().model
-        found += [checks.check_workcell(cell, told), *checks.check_disk(runs), *permissions]
+        found += [checks.check_workcell(cell, told), checks.check_disk(runs), *permissions]
         if calibration is not None:
             connected = {"sensor": device.identify()} if alive else {}
             if arm is not None:

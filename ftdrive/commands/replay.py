@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from calib import CalibrationResult
-from calib.routine import PoseRecord, take_pose
+from calib.routine import PoseRecord, Sampling, take_pose
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
     JSON,
@@ -20,7 +20,7 @@ from ftdrive.recorded import RecordedRun
 from ftdrive.rehearsal import rehearsed_run
 from ftdrive.report import print_result
 from ftdrive.runs import Run
-from ftdrive.session import sampling_of, solve_records
+from ftdrive.session import solve_records
 from ftdrive.talk import talk
 
 
@@ -44,7 +44,7 @@ def replay(folder: Path | None, simulate: bool, sensor: str | None, as_json: boo
 def _repeat(run: Run, as_json: bool) -> None:
     recorded = RecordedRun(run.records())
     records: list[PoseRecord] = []
-    sampling = sampling_of(run.header())
+    sampling = Sampling(**run.header()["config"]["sampling"])
     for kept in run.records():
         recorded.go_on_to(kept.pose.q_rad)
         again = take_pose(recorded, recorded, kept.stop, kept.pose, sampling)

@@ -4,11 +4,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.routine import PoseRecord
+from drivers.interfaces import ForceTorqueSensor
 from ftdrive.planning.plan import Plan
 
 Array = NDArray[np.float64]
@@ -113,7 +115,7 @@ class PoseTaken(Event):
     stops: int
     number: int
     gravity_flange: Array
-    """(3,) unit vector down, in the flange frame, for a level base."""
+    """(3,) unit vector down, in the flange frame, as the base is mounted."""
     mean: Array
     """(6,) N and N·m, as measured."""
     sigma: Array
@@ -123,6 +125,25 @@ class PoseTaken(Event):
     average_s: float
     attempts: int
     steady: bool
+
+    @classmethod
+    def of(
+        cls, record: PoseRecord, down_base: Array, *, stops: int, settle_s: float, average_s: float, attempts: int
+    ) -> "PoseTaken":
+        """Tell a record that is on disk; `down_base` (3,) is the unit vector down in base, as it is mounted."""
+        return cls(
+            stop=record.stop,
+            stops=stops,
+            number=record.pose.number,
+            gravity_flange=record.before.R_base_flange.T @ down_base,
+            mean=record.mean.mean,
+            sigma=np.sqrt(np.diag(record.mean.covariance)),
+            samples=len(record.samples.t_host_ns),
+            settle_s=settle_s,
+            average_s=average_s,
+            attempts=attempts,
+            steady=record.steady,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -179,23 +200,10 @@ class Asked(Event):
     """Who answered: whoever was asked, or nobody but the option, which takes what the question assumes."""
 
 
-class _Health(Protocol):
-    @property
-    def events(self) -> tuple[tuple[int, str], ...]:
-        """(`t_host_ns`, what happened)."""
-
-
-class Streaming(Protocol):
-    """A sensor that keeps what its stream has been through; see `drivers.interfaces.Health`."""
-
-    def health(self) -> _Health:
-        """Tell it, since the sensor was opened."""
-
-
 class Witness:
     """Tells what a sensor has been through, each thing once: interruptions, connections that came back."""
 
-    def __init__(self, sensor: Streaming, tell: Callable[[Event], None]) -> None:
+    def __init__(self, sensor: ForceTorqueSensor, tell: Callable[[Event], None]) -> None:
         self._sensor, self._tell = sensor, tell
         self._told = 0
 

@@ -59,8 +59,8 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Watch:
-    """What the arm is doing, as far as the session knows."""
+class Motion:
+    """What the arm should be doing: a straight move in joint space, or to stand."""
 
     start_rad: Array
     goal_rad: Array
@@ -75,7 +75,7 @@ class Seen:
     """Of the guards' own clock."""
     dt_s: float
     """Since the look before, counted as the guards count silence."""
-    watch: Watch
+    motion: Motion
     state: ArmState
     status: ArmStatus
     wrench: Array
@@ -106,18 +106,18 @@ class PathGuard(Guard):
 
     def look(self, seen: Seen) -> None:
         """Compare with the nearest point of the line."""
-        watch, q = seen.watch, seen.state.q_rad
-        turn = watch.goal_rad - watch.start_rad
+        motion, q = seen.motion, seen.state.q_rad
+        turn = motion.goal_rad - motion.start_rad
         length2 = float(turn @ turn)
-        share = 0.0 if length2 == 0 else float(np.clip((q - watch.start_rad) @ turn / length2, 0, 1))
-        off = np.abs(q - watch.start_rad - share * turn)
-        resting = (np.abs(turn) < 1e-3) & ((np.arange(6) < 3) | (not watch.moving))
+        share = 0.0 if length2 == 0 else float(np.clip((q - motion.start_rad) @ turn / length2, 0, 1))
+        off = np.abs(q - motion.start_rad - share * turn)
+        resting = (np.abs(turn) < 1e-3) & ((np.arange(6) < 3) | (not motion.moving))
         allowed = np.where(resting, self.limits.frozen_rad, self.limits.tracking_rad)
         if not (off > allowed).any():
             return
         joint = int(np.argmax(off / allowed))
         words = f"joint {joint + 1} is {np.degrees(off[joint]):.1f}° from where it should be"
-        if watch.moving:
+        if motion.moving:
             raise Tripped(
                 2,
                 DeviceFault(
@@ -141,9 +141,9 @@ class StallGuard(Guard):
 
     def look(self, seen: Seen) -> None:
         """Count the time without progress."""
-        goal = seen.watch.goal_rad
+        goal = seen.motion.goal_rad
         left = float(np.abs(goal - seen.state.q_rad).max())
-        if goal is not self._goal_rad or not seen.watch.moving or left < self._nearest_rad - 1e-4:
+        if goal is not self._goal_rad or not seen.motion.moving or left < self._nearest_rad - 1e-4:
             self._goal_rad, self._nearest_rad, self._still_s = goal, left, 0.0
             return
         self._still_s += seen.dt_s
@@ -273,7 +273,7 @@ class SensorGuard(Guard):
             self._silent_s += seen.dt_s
         else:
             self._sample, self._silent_s = seen.sample, 0.0
-        allowed = self.limits.sensor_age_moving_s if seen.watch.moving else self.limits.sensor_age_holding_s
+        allowed = self.limits.sensor_age_moving_s if seen.motion.moving else self.limits.sensor_age_holding_s
         if self._silent_s > allowed:
             raise Tripped(
                 15,
@@ -375,7 +375,7 @@ class ContactGuard(Guard):
         gain = 1 - np.exp(-2 * np.pi * self.limits.low_pass_Hz * max(seen.dt_s, 1e-3))
         self._residual = self._residual + gain * (residual - self._residual)
         turn = max(self._turns_rad_s)
-        inertia_m_s2 = self.lever_m * (self.acceleration_rad_s2 + turn**2) if seen.watch.moving else 0.0
+        inertia_m_s2 = self.lever_m * (self.acceleration_rad_s2 + turn**2) if seen.motion.moving else 0.0
         allowance_N = self.heaviest_kg * (inertia_m_s2 + G_M_S2 * min(turn * self.limits.skew_s, 2.0))
         five = self.limits.contact_sigmas * self.quiet_std
         limit_N = max(self.limits.contact_N, float(np.linalg.norm(five[:3]))) + allowance_N

@@ -41,14 +41,14 @@ from ftdrive.session.guards import (
     StallGuard,
     Tripped,
 )
-from ftdrive.session.machine import SLOW, Pace, RunningFit, Tour
+from ftdrive.session.machine import SLOW, Pace, Tour
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Operator
 from ftdrive.session.outcome import Outcome, solve_and_save
 from ftdrive.session.prospect import at_most, moves_s, prediction
 from ftdrive.session.recovery import Recovery
 from ftdrive.session.running import Running
-from ftdrive.session.watch import Guards
+from ftdrive.session.watch import Watcher
 from ftdrive.wiring import build_arm, build_sensor
 
 Array = NDArray[np.float64]
@@ -125,8 +125,19 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
             run = _by_hand(cell, arm, sensor, desk, options, devices)
         else:
             desk.tell(Noted(words=kept_awake))
-            limits = limits or (Limits() if options.real else _EMULATED)
-            begun = _Begun(cell, arm, sensor, desk, options, plan, limits)
+            if not options.dry_run and arm.status().tcp_offset is None:
+                arm.open(control=True)  # an old controller tells no poses before
+            begun = _Begun(cell, arm, sensor, desk, options, plan, limits or (Limits() if options.real else _EMULATED))
+            begun.look()
+            begun.check(preflight.CHECKS)
+            if options.dry_run:
+                desk.tell(
+                    Noted(words="the controller's own safety limits are not asked for: only a program on it could")
+                )
+            else:
+                arm.open(control=True)
+                begun.check(preflight.IN_CONTROL)
+            begun.predict()
             if options.dry_run:
                 return None
             run = begun.tour(devices)
@@ -173,7 +184,7 @@ def _plan_on_disk(options: Options) -> Plan | None:
 
 
 class _Begun:
-    """A session in front of its tour: planned, checked and shown."""
+    """A session along a plan: it looks, checks, predicts, then tours. It never takes control: `calibrate` does."""
 
     def __init__(
         self,
@@ -185,8 +196,6 @@ class _Begun:
         plan: Plan | None,
         limits: Limits,
     ) -> None:
-        if not options.dry_run and arm.status().tcp_offset is None:
-            arm.open(control=True)  # an old controller tells no poses before
         self._cell, self._arm, self._sensor, self._desk, self._options = cell, arm, sensor, desk, options
         self._limits = limits
         self._reduced = False  # as a person has said it should be
@@ -199,12 +208,16 @@ class _Begun:
         self._known = not options.real or has_completed(*self._key)
         speeds = slower(speeds_of(cell), SLOW) if self._pace.slow else speeds_of(cell)
         self._driven = at_most(self._plan, self._certifier, speeds)
-        q = arm.state().q_rad
-        self._todo, self._taken = self._what_is_left()
         down_base = self._certifier.scene.down_base
-        self._running: RunningFit = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base, advise=False)
+        self._running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base, advise=False)
+
+    def look(self) -> None:
+        """See what is left to take, how the arm gets there and what the resting sensor says; show it."""
+        cell, arm, sensor, options, limits = self._cell, self._arm, self._sensor, self._options, self._limits
+        q = self._stands_rad = arm.state().q_rad
+        self._todo, self._taken = self._what_is_left()
         for record in self._taken:
-            desk.tell(self._running.add(record))
+            self._desk.tell(self._running.add(record))
         first = self._todo[0] - 1 if self._todo else 0
         goal = np.array(self._plan.steps[first % len(self._plan.steps)].q_rad)
         self._before = preflight.Before(
@@ -223,14 +236,6 @@ class _Begun:
         )
         self._way = self._before.approach.way_rad
         self._show()
-        self._check(preflight.CHECKS)
-        if options.dry_run:
-            desk.tell(Noted(words="the controller's own safety limits are not asked for: only a program on it could"))
-        else:
-            arm.open(control=True)
-            self._check(preflight.IN_CONTROL)
-        self._sampling, self._noise = self._chosen_sampling()
-        self._show_prospect(q)
 
     def _planned(self) -> Plan:
         """Make a plan where the arm stands."""
@@ -259,7 +264,8 @@ class _Begun:
         self._sensor.open()
         return self._sensor.collect(duration_s)
 
-    def _check(self, checks: Sequence[preflight.Check]) -> None:
+    def check(self, checks: Sequence[preflight.Row]) -> None:
+        """Tell what each finds; raise `NotAccepted` when one failed."""
         failed = []
         for check in checks:
             found = check(self._before)
@@ -309,14 +315,15 @@ class _Begun:
                 open_in_browser(url)
                 self._desk.require(f"The plan is shown at {url} until you answer. Go on?", assumed=False)
 
-    def _show_prospect(self, q_rad: Array) -> None:
-        """Tell what the plan is worth with this sensor's noise, and how long it takes."""
+    def predict(self) -> None:
+        """Choose how long to average; tell what the plan is worth with this sensor's noise, and how long it takes."""
+        self._sampling, noise = self._chosen_sampling()
         mass_kg, average_s = self._cell.tool.mass_kg, self._sampling.average_s
-        self._desk.tell(Noted(words=prediction(self._plan, self._certifier, mass_kg, average_s, self._noise)))
+        self._desk.tell(Noted(words=prediction(self._plan, self._certifier, mass_kg, average_s, noise)))
         if self._options.fast and self._pace.slow:
             self._desk.tell(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
         fastest_rad_s = max(step.speed_rad_s for step in self._driven.steps)
-        total_s = moves_s(self._driven, self._todo, q_rad, self._before.approach)
+        total_s = moves_s(self._driven, self._todo, self._stands_rad, self._before.approach)
         total_s += len(self._todo) * (average_s + 0.6)
         self._desk.tell(
             Noted(
@@ -365,7 +372,7 @@ class _Begun:
         def on_trip(trip: Tripped) -> None:
             desk.tell(GuardTripped(hazard=trip.hazard, words=str(trip)))
 
-        with _kept(desk, run), Guards(self._arm, self._sensor, rows, on_trip) as guards:
+        with _kept(desk, run), Watcher(self._arm, self._sensor, rows, on_trip) as watcher:
             Tour(
                 self._arm,
                 self._sensor,
@@ -374,12 +381,13 @@ class _Begun:
                 run,
                 desk,
                 self._running,
-                guards,
-                recovery=Recovery(self._arm, self._sensor, desk, guards, contact, self._recheck),
+                watcher,
+                recovery=Recovery(self._arm, self._sensor, desk, watcher, contact, self._recheck),
                 load=load,
                 sampling=self._sampling,
                 pace=self._pace,
                 quiet_std=quiet_std,
+                sensor_kg=cell.sensor.mass_kg,
             ).run(self._todo)
         if self._pace.slow and run.stops() == list(range(1, len(plan.steps) + 2)):
             remember_completed(*self._key)
@@ -392,7 +400,7 @@ class _Begun:
         quiet = self._listen(preflight.LISTEN_S)
         self._before = replace(self._before, quiet=quiet, approach=stays, known=True, resumed=True)
         self._way = stays.way_rad
-        self._check(preflight.AGAIN)
+        self.check(preflight.AGAIN)
         if not self._options.questions:
             return
         if asks:
@@ -472,10 +480,20 @@ def _by_hand(
         run = Run(options.resume)
         _require_same_devices(run, arm, sensor)
         earlier = run.records()
-    running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_of(cell))
-    listen = options.mode == "listen"
+    down_base, listen = down_of(cell), options.mode == "listen"
+    running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base)
     with _kept(desk, run):
-        collect_manually(arm, sensor, cell.sampling, desk, running, run.commit, listen=listen, earlier=earlier)
+        collect_manually(
+            arm,
+            sensor,
+            cell.sampling,
+            desk,
+            running.add,
+            run.commit,
+            down_base=down_base,
+            listen=listen,
+            earlier=earlier,
+        )
     return run
 
 

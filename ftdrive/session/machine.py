@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,6 @@ from ftdrive.planning.words import way_in_words
 from ftdrive.runs import Run
 from ftdrive.session.desk import Desk
 from ftdrive.session.events import (
-    Estimated,
     GuardTripped,
     Noted,
     PoseTaken,
@@ -39,10 +38,10 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.guards import RangeGuard, Tripped
 from ftdrive.session.operator import Key, Question
-from ftdrive.session.outcome import cell_of
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.recovery import Recovery
-from ftdrive.session.watch import Guards
+from ftdrive.session.running import Running
+from ftdrive.session.watch import Watcher
 
 log = logging.getLogger(__name__)
 
@@ -58,23 +57,6 @@ _PATIENCE: Final = 20.0
 _NEAR_RAD: Final = float(np.radians(10))
 """A way that comes so close to a skipped posture passes it."""
 _FIRST_WORD: Final = "MOVE"
-
-
-class RunningFit(Protocol):
-    """What a session needs of `ftdrive.session.running.Running`."""
-
-    @property
-    def weighed_kg(self) -> float | None:
-        """Mass that the sensor carries; None while nobody can know."""
-
-    def add(self, record: PoseRecord) -> Estimated:
-        """Take a pose in."""
-
-    def remove(self, stop: int) -> None:
-        """Leave a pose out."""
-
-    def predict(self, R_base_flange: Array) -> Array | None:
-        """Wrench of a free tool; None while nobody can know."""
 
 
 class Stopped(Exception):
@@ -114,6 +96,8 @@ class Tour:
         The guard that also judges every sample of a pose.
     quiet_std : array, shape (6,)
         Of the resting sensor's samples.
+    sensor_kg
+        Mass of sensor and adapter; None where it is not known.
     """
 
     def __init__(
@@ -124,19 +108,20 @@ class Tour:
         plan: Plan,
         run: Run,
         desk: Desk,
-        running: RunningFit,
-        guards: Guards,
+        running: Running,
+        watcher: Watcher,
         *,
         recovery: Recovery,
         load: RangeGuard,
         sampling: Sampling,
         pace: Pace,
         quiet_std: Array,
+        sensor_kg: float | None,
     ) -> None:
         self._arm, self._sensor, self._certifier = arm, sensor, certifier
-        self._plan, self._run, self._desk, self._running, self._guards = plan, run, desk, running, guards
+        self._plan, self._run, self._desk, self._running, self._watcher = plan, run, desk, running, watcher
         self._recovery, self._load, self._sampling, self._pace = recovery, load, sampling, pace
-        self._quiet_std = quiet_std
+        self._quiet_std, self._sensor_kg = quiet_std, sensor_kg
         self._nodes = np.array([step.q_rad for step in plan.steps])
         self._stops = len(self._nodes) + 1
         self._todo: deque[int] = deque()
@@ -164,7 +149,7 @@ class Tour:
             What stopped the arm, when a person then ended it.
         """
         self._todo = deque(todo)
-        self._guards.begin()
+        self._watcher.begin()
         while self._todo:
             try:
                 self._next()
@@ -199,8 +184,7 @@ class Tour:
             return
         self._payload_kg = told_kg
         self._desk.tell(Weighed(mass_kg=mass_kg, payload_kg=told_kg))
-        sensor_kg = cell_of(self._run.header()).sensor.mass_kg
-        if words := payload_in_words(told_kg, mass_kg, sensor_kg):
+        if words := payload_in_words(told_kg, mass_kg, self._sensor_kg):
             self._note(words, warning=True)
 
     def _index(self, stop: int) -> int:
@@ -317,7 +301,7 @@ class Tour:
                 settled_s, attempts = time.monotonic() - began_s, attempts + 1
             self._tell(State.SETTLE if stage == "settle" else State.SAMPLE, stop)
 
-        with self._guards.watching(pose.q_rad, pose.q_rad, moving=False):
+        with self._watcher.watching(pose.q_rad, pose.q_rad, moving=False):
             record = take_pose(
                 self._arm,
                 self._sensor,
@@ -331,18 +315,13 @@ class Tour:
         self._load.judge(record.samples.wrench)
         self._run.commit(record)
         self._desk.tell(
-            PoseTaken(
-                stop=stop,
+            PoseTaken.of(
+                record,
+                self._certifier.scene.down_base,
                 stops=self._stops,
-                number=step.number,
-                gravity_flange=record.before.R_base_flange.T @ self._certifier.scene.down_base,
-                mean=record.mean.mean,
-                sigma=np.sqrt(np.diag(record.mean.covariance)),
-                samples=len(record.samples.t_host_ns),
                 settle_s=settled_s,
                 average_s=self._sampling.average_s,
                 attempts=attempts,
-                steady=record.steady,
             ),
             sync=True,
         )
@@ -443,7 +422,7 @@ class Tour:
         turn = np.abs(goal - start).max()
         duration_s = float(move_duration_s(turn, speed_rad_s, acceleration_rad_s2))
         self._at = None
-        with self._guards.watching(start, goal, moving=True):
+        with self._watcher.watching(start, goal, moving=True):
             self._arm.move_to(
                 goal.tolist(),
                 timeout_s=_PATIENCE * (duration_s + 1.5),
@@ -453,7 +432,7 @@ class Tour:
             )
 
     def _between_looks(self) -> None:
-        self._guards.check()
+        self._watcher.check()
         self._hear()
 
     # -------------------------------------------------------------------------------------------- stop and hold
@@ -470,7 +449,7 @@ class Tour:
         stop, back = self._todo[0], self._left_behind()
         self._at = None
         words = str(error if trip is None else trip).rstrip(".")
-        if trip is not None and trip is not self._guards.tripped(wait_s=0.0):
+        if trip is not None and trip is not self._watcher.tripped(wait_s=0.0):
             self._desk.tell(GuardTripped(hazard=trip.hazard, words=words))
         self._tell(State.STOP, words=words)
         self._recovery.tell_news()

@@ -12,12 +12,10 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from calib.errors import TooFewSamples
-from calib.noise import CHANNELS, LEAST_SAMPLES, is_stationary, restless_channels
-from calib.ports import Sensor, WrenchSamples
-from calib.routine import PoseRecord, Sampling, TourPose, turned_rad
+from calib.noise import CHANNELS, is_stationary, restless_channels
+from calib.routine import MOVED_RAD, PoseRecord, Sampling, TourPose, require_enough, turned_rad
 from drivers.errors import DeviceTimeout, StreamBroken
-from drivers.interfaces import ArmState
+from drivers.interfaces import ArmState, ArmStatus, ForceTorqueSensor, FtSamples
 from ftdrive.session.events import (
     Array,
     Estimated,
@@ -25,7 +23,6 @@ from ftdrive.session.events import (
     PoseTaken,
     State,
     StateChanged,
-    Streaming,
     Witness,
 )
 from ftdrive.session.operator import Key, Operator
@@ -33,8 +30,6 @@ from ftdrive.session.operator import Key, Operator
 STILL_S: Final = 1.0
 """On the controller's clock. (Its own `is_steady` is of no use here: in freedrive it is always false.)"""
 STILL_RAD_S: Final = 0.002
-CREPT_RAD: Final = radians(0.05)
-"""An arm that has turned this much has not stood still, however slowly it did."""
 LEFT_RAD: Final = radians(1)
 """Closer than this to where it was, the arm was nudged, not moved."""
 REPEAT_RAD: Final = radians(10)
@@ -50,47 +45,25 @@ LEAST_TO_COMPARE: Final = 6
 """Poses with this one."""
 
 
-class Status(Protocol):
-    """What a controller says of itself; see `drivers.interfaces.ArmStatus`."""
-
-    @property
-    def program(self) -> str:
-        """Such as "playing", "paused" or "stopped"."""
-
-    @property
-    def fault(self) -> str | None:
-        """Why the arm may not move, and what to do."""
-
-
 class WatchedArm(Protocol):
-    """An arm to look at."""
+    """An arm to look at: nothing here could command it."""
 
     def state(self) -> ArmState:
         """Read a fresh state, or raise."""
 
-    def status(self) -> Status:
+    def status(self) -> ArmStatus:
         """Tell the controller's modes, or raise."""
-
-
-class WatchedSensor(Sensor, Streaming, Protocol):
-    """A sensor that is measured, and tells what its stream went through."""
-
-
-class Fit(Protocol):
-    """The running fit; see `ftdrive.session.running`."""
-
-    def add(self, record: PoseRecord) -> Estimated:
-        """Take a pose in, in place of one with the same stop."""
 
 
 def collect_manually(
     arm: WatchedArm,
-    sensor: WatchedSensor,
+    sensor: ForceTorqueSensor,
     sampling: Sampling,
     operator: Operator,
-    running: Fit,
+    estimate: Callable[[PoseRecord], Estimated],
     commit: Callable[[PoseRecord], None],
     *,
+    down_base: Array,
     listen: bool,
     earlier: Sequence[PoseRecord] = (),
 ) -> None:
@@ -104,16 +77,19 @@ def collect_manually(
     ----------
     arm, sensor
         Open; the arm for reading. A sensor with `recover` is waited for when its stream was interrupted.
-    running : Fit
-        Is given each pose; judges whether they are enough, and says what would help.
+    estimate : callable
+        Is given each pose, in place of one with the same stop; judges whether they are enough, and says what would
+        help. `Running.add` of `ftdrive.session.running`.
     commit : callable
         Takes each record and returns when it is safe on disk; one with the `stop` of an earlier one replaces it.
+    down_base : array, shape (3,)
+        Unit vector down in base, as it is mounted.
     listen : bool
         A program moves the arm: no advice on where to move it. Poses are taken from its start to its end, or until it
         comes back to its first pose when there are enough. That return is committed too and serves
         `calib.routine.drift_check`. A program that passes its first pose before is followed to its end.
     earlier : sequence of PoseRecord
-        Poses of the run that is continued; `running` is given them too.
+        Poses of the run that is continued; `estimate` is given them too.
 
     Notes
     -----
@@ -127,25 +103,26 @@ def collect_manually(
     Exception
         Whatever the arm or the sensor raises; the poses committed so far stand.
     """
-    _Collection(arm, sensor, sampling, operator, running, commit, listen, earlier).run()
+    _Collection(arm, sensor, sampling, operator, estimate, commit, down_base, listen, earlier).run()
 
 
 class _Collection:
     def __init__(
         self,
         arm: WatchedArm,
-        sensor: WatchedSensor,
+        sensor: ForceTorqueSensor,
         sampling: Sampling,
         operator: Operator,
-        running: Fit,
+        estimate: Callable[[PoseRecord], Estimated],
         commit: Callable[[PoseRecord], None],
+        down_base: Array,
         listen: bool,
         earlier: Sequence[PoseRecord],
     ) -> None:
         self._arm, self._sensor, self._sampling = arm, sensor, sampling
         self._witness = Witness(sensor, operator.tell)
-        self._operator, self._running, self._commit = operator, running, commit
-        self._listen = listen
+        self._operator, self._estimate, self._commit = operator, estimate, commit
+        self._down_base, self._listen = down_base, listen
         self._earlier = earlier
         self._taken: dict[int, PoseRecord] = {}
         self._level: Array | None = None
@@ -186,7 +163,7 @@ class _Collection:
             elif self._program == "stopped" and self._dealt_with and self._rests_at is not None:
                 self._end("The program has ended")
 
-    def _collect(self, duration_s: float) -> WrenchSamples | None:
+    def _collect(self, duration_s: float) -> FtSamples | None:
         """Samples of the time to come; None when they were interrupted and the driver has the sensor back."""
         try:
             samples = self._sensor.collect(duration_s)
@@ -235,7 +212,7 @@ class _Collection:
                 return False
             self._dealt_with = False
             self._tell_state(State.SETTLE)
-        elif still and turned_rad(self._rests_at, state) < CREPT_RAD:
+        elif still and turned_rad(self._rests_at, state) < MOVED_RAD:
             return not self._dealt_with and state.t_device_s - self._still_since_s >= STILL_S
         elif self._dealt_with:
             return False
@@ -276,16 +253,12 @@ class _Collection:
                 return False
             samples = found
             after = self._arm.state()
-            if turned_rad(before, after) >= CREPT_RAD or np.abs(after.qd_rad_s).max() >= STILL_RAD_S:
+            if turned_rad(before, after) >= MOVED_RAD or np.abs(after.qd_rad_s).max() >= STILL_RAD_S:
                 self._still_since_s = after.t_device_s
                 self._note(f"The arm moved while pose {stop} was measured: {self._hold_still()}.", warning=True)
                 self._tell_state(State.SETTLE)
                 return False
-            if len(samples.wrench) < LEAST_SAMPLES:
-                raise TooFewSamples(
-                    f"the sensor gave {len(samples.wrench)} samples in {self._sampling.average_s} s, at least "
-                    f"{LEAST_SAMPLES} are needed: check its rate, or average longer"
-                )
+            require_enough(samples, self._sampling.average_s)
             unrest = self._unrest(samples)
             if not unrest:
                 break
@@ -306,18 +279,13 @@ class _Collection:
         self._commit(record)
         self._redo = None
         self._operator.tell(
-            PoseTaken(
-                stop=record.stop,
+            PoseTaken.of(
+                record,
+                self._down_base,
                 stops=max(record.stop, len(self._taken)),
-                number=record.pose.number,
-                gravity_flange=-record.before.R_base_flange[2],
-                mean=record.mean.mean,
-                sigma=np.sqrt(np.diag(record.mean.covariance)),
-                samples=len(record.samples.wrench),
                 settle_s=settle_s,
                 average_s=self._sampling.average_s,
                 attempts=attempts,
-                steady=record.steady,
             )
         )
         self._learn(record)
@@ -334,7 +302,7 @@ class _Collection:
         if record.steady:  # the quietest tell how much the sensor scatters when left alone
             std = record.samples.wrench.std(axis=0, ddof=1)
             self._level = std if self._level is None else np.minimum(self._level, std)
-        estimated = self._running.add(record)
+        estimated = self._estimate(record)
         self._operator.tell(replace(estimated, hint="") if self._listen else estimated)
         sigmas, force_N = estimated.residual_sigma or 0.0, estimated.residual_force_N or 0.0
         touched = estimated.poses >= LEAST_TO_COMPARE and sigmas > SURPRISE_SIGMA and force_N > SURPRISE_N
@@ -350,7 +318,7 @@ class _Collection:
             self._note("These poses are enough: press k to finish, or go on for a better result.")
         self._light = estimated.light
 
-    def _unrest(self, samples: WrenchSamples) -> str:
+    def _unrest(self, samples: FtSamples) -> str:
         """Say what is not quiet; empty when all is."""
         if self._level is not None:
             for c in np.flatnonzero(restless_channels(samples.wrench, self._level)):

@@ -7,8 +7,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from calib import CalibrationDataset, CalibrationResult, solve
-from calib.routine import DriftCheck, PoseRecord, Sampling, dataset_from, drift_check
-from ftdrive.config import CellConfig, RobotConfig, SensorConfig, SiteConfig, ToolConfig, WorkcellConfig
+from calib.routine import DriftCheck, PoseRecord, dataset_from, drift_check
 from ftdrive.runs import Run, versions
 
 
@@ -41,30 +40,6 @@ def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     dataset, g_m_s2, provenance = _prepared(run, records)
     result = solve(dataset, g_m_s2=g_m_s2, provenance=provenance)
     return Outcome(run, dataset, result, drift_check(records))
-
-
-def cell_of(header: Mapping[str, Any]) -> CellConfig:
-    """Read the cell back from a run's header."""
-    kinds: dict[str, Any] = {
-        "robot": RobotConfig,
-        "sensor": SensorConfig,
-        "tool": ToolConfig,
-        "workcell": WorkcellConfig,
-        "site": SiteConfig,
-    }
-    sections = {name: kind(**_tuples(header["config"].get(name, {}))) for name, kind in kinds.items()}
-    return CellConfig(**sections, sampling=sampling_of(header))
-
-
-def sampling_of(header: Mapping[str, Any]) -> Sampling:
-    """Read how long a run looked at each pose; older runs also said how long a move may take."""
-    values = dict(header["config"]["sampling"])
-    values.pop("move_timeout_s", None)
-    return Sampling(**values)
-
-
-def _tuples(section: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: tuple(map(tuple, value)) if isinstance(value, list) else value for key, value in section.items()}
 
 
 def _prepared(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, float, dict[str, Any]]:

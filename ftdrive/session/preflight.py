@@ -6,10 +6,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Final
 
 import numpy as np
@@ -18,6 +17,8 @@ from numpy.typing import NDArray
 from calib.noise import LEAST_SAMPLES
 from drivers.errors import DriverError
 from drivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
+from ftdrive import checks, diagnosis
+from ftdrive.checks import RATE_TOLERANCE, Check
 from ftdrive.config import CellConfig
 from ftdrive.errors import NotAccepted, PlanRefused
 from ftdrive.mismatch import PAYLOAD_KG, PAYLOAD_SHARE
@@ -31,7 +32,6 @@ from ftdrive.session.guards import AXES, G_M_S2, Limits, ModelGuard, Tripped
 Array = NDArray[np.float64]
 
 LISTEN_S: Final = 2.0
-_RATE: Final = 0.1
 _LINK_S: Final = 0.5
 _LINK_TRIES: Final = 3
 _LATENCY_S, _GAP_S = 0.02, 0.1
@@ -41,7 +41,6 @@ _ASKING_S: Final = 0.04
 """On top of it where a controller tells its TCP only to a program, which is asked twice: 24 ms on a healthy link."""
 _ENDS_S: Final = 1.5
 """What a session that was killed has left on the controller ends by itself within 0.5 s."""
-_FREE_BYTES: Final = 200_000_000
 _EDGE_RAD: Final = float(np.radians(5))
 """Each question takes the controller some 10 ms. Between two points no part is more than 1 mm off their chord."""
 _ROUNDED_RAD: Final = float(np.radians(1))
@@ -72,21 +71,14 @@ class Before:
     sensor_range: Array | None = None
 
 
-Check = Callable[[Before], Checked]
+Row = Callable[[Before], Checked]
+"""Of the hazard table."""
 
 
 def check_workcell(before: Before) -> Checked:
-    """Row 3: planes and boxes are as a person measured them."""
-    work = before.cell.workcell
-    if not work.measured:
-        return _failed(
-            "workcell",
-            "nobody has measured tool, planes and boxes: measure them, then set measured = true in [workcell]",
-        )
-    return _passed(
-        "workcell",
-        f"measured; planes: {len(work.planes_mm)}, boxes: {len(work.boxes_mm)}, and the surface the arm is mounted on",
-    )
+    """Row 3: tool, planes and boxes are described, can be, and are as a person measured them."""
+    check = checks.check_workcell(before.cell, before.certifier.arm.name)
+    return replace(_told("workcell", check), passed=check.state == "ok")
 
 
 def check_plan(before: Before) -> Checked:
@@ -153,24 +145,15 @@ def forbidden(arm: RobotArm, q_rad: Array, step_rad: float = _EDGE_RAD) -> str:
 
 def check_safety(before: Before) -> Checked:
     """Rows 10, 11 and 12: the safety system lets the arm move."""
-    status = before.arm.status()
-    if status.fault is not None:
-        return _failed("safety", status.fault)
-    return _passed("safety", f"safety mode {status.safety_mode}, program {status.program}")
+    return _told("safety", diagnosis.check_safety(before.arm.status()))
 
 
 def check_remote(before: Before) -> Checked:
     """Row 21: the controller takes programs from here."""
     try:
-        remote = before.arm.in_remote_control()
+        return _told("remote", diagnosis.check_remote(before.arm.in_remote_control()))
     except DriverError as error:
         return _failed("remote", str(error))
-    if remote is None:
-        return _passed("remote", "this controller does not tell whether it takes programs from the network")
-    if remote:
-        return _passed("remote", "the controller is in remote control")
-    cure = "press Local, Remote Control at the top right of the pendant"
-    return _failed("remote", f"the controller is in local control: {cure}")
 
 
 def leave_programs_alone(arm: RobotArm) -> None:
@@ -202,14 +185,12 @@ def check_model(before: Before) -> Checked:
 
 def check_payload(before: Before) -> Checked:
     """Row 7: the controller knows about what it carries."""
-    told = before.arm.status().payload_kg
+    status = before.arm.status()
+    told = status.payload_kg
     if told is None:
         return _passed("payload", "this controller does not tell its payload: compare it at the pendant")
-    if told <= 0:
-        return _failed(
-            "payload",
-            "the controller believes that nothing hangs on the flange: set payload and its centre at the pendant",
-        )
+    if (check := diagnosis.check_payload(status)).state == "failed":
+        return _told("payload", check)
     if words := _misplaced(before):
         return _failed("payload", words)
     parts = (before.cell.tool.mass_kg, before.cell.sensor.mass_kg)
@@ -256,7 +237,7 @@ def check_sensor(before: Before) -> Checked:
         return _failed("sensor", "the sensor says something that is no number: check its cable and supply")
     span_s = float(before.quiet.t_host_ns[-1] - before.quiet.t_host_ns[0]) / 1e9
     rate_Hz = (len(wrench) - 1) / max(span_s, 1e-3)
-    if np.isfinite(nominal) and abs(rate_Hz / nominal - 1) > _RATE:
+    if np.isfinite(nominal) and abs(rate_Hz / nominal - 1) > RATE_TOLERANCE:
         return _failed("sensor", f"{rate_Hz:.0f} Hz instead of {nominal:.0f}: see `ftdrive doctor`")
     dead = [AXES[i] for i in np.flatnonzero(np.ptp(wrench, axis=0) == 0)]
     if dead:
@@ -304,19 +285,10 @@ def check_link(before: Before) -> Checked:
 
 def check_disk(before: Before) -> Checked:
     """Row 26: poses can be written, and there is room for them."""
-    folder = next(path for path in (before.runs.absolute(), *before.runs.absolute().parents) if path.is_dir())
-    try:
-        with TemporaryFile(dir=folder) as file:
-            file.write(b"ftdrive")
-            file.flush()
-        free = shutil.disk_usage(folder).free
-    except OSError as error:
-        return _failed("disk", f"nothing can be written in {folder} ({error}): choose another folder with --runs")
-    words = f"{free / 1e9:.1f} GB free in {folder}"
-    return _passed("disk", words) if free > _FREE_BYTES else _failed("disk", f"{words}: make room first")
+    return _told("disk", checks.check_disk(before.runs))
 
 
-CHECKS: Final[Sequence[Check]] = (
+CHECKS: Final[Sequence[Row]] = (
     check_safety,
     check_remote,
     check_model,
@@ -333,10 +305,10 @@ CHECKS: Final[Sequence[Check]] = (
 )
 """In the order in which they are told. None of them takes control of the arm."""
 
-IN_CONTROL: Final[Sequence[Check]] = (check_safety_limits,)
+IN_CONTROL: Final[Sequence[Row]] = (check_safety_limits,)
 """What only a program on the controller can answer, asked when all else is well."""
 
-AGAIN: Final[Sequence[Check]] = (*(check for check in CHECKS if check is not check_approach), *IN_CONTROL)
+AGAIN: Final[Sequence[Row]] = (*(check for check in CHECKS if check is not check_approach), *IN_CONTROL)
 """What is looked at once more before a stopped session goes on: all, but that the way on is judged by itself."""
 
 
@@ -378,6 +350,12 @@ def awake() -> Iterator[str]:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+def _told(name: str, check: Check) -> Checked:
+    """What `doctor` says of the same thing; a warning does not forbid to go on."""
+    words = check.found if check.fix is None else f"{check.found}: {check.fix}"
+    return Checked(name=name, passed=check.state != "failed", words=words)
 
 
 def _passed(name: str, words: str) -> Checked:

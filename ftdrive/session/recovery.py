@@ -9,7 +9,7 @@ from drivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrive.session.desk import Desk
 from ftdrive.session.events import GuardTripped, Witness
 from ftdrive.session.guards import ContactGuard, Tripped, by_safety, out_of_sight
-from ftdrive.session.watch import Guards
+from ftdrive.session.watch import Watcher
 
 _LOOK_AGAIN_S: Final = 0.4
 
@@ -31,11 +31,11 @@ class Recovery:
         arm: RobotArm,
         sensor: ForceTorqueSensor,
         desk: Desk,
-        guards: Guards,
+        watcher: Watcher,
         contact: ContactGuard,
         recheck: Callable[[bool], None],
     ) -> None:
-        self._arm, self._sensor, self._desk, self._guards = arm, sensor, desk, guards
+        self._arm, self._sensor, self._desk, self._watcher = arm, sensor, desk, watcher
         self._contact, self._recheck = contact, recheck
         self._witness = Witness(sensor, desk.tell)
         self._told: Tripped | None = None  # last, as what the arm is held for
@@ -49,19 +49,19 @@ class Recovery:
         """What a guard has to say about it, or the row of the table that the error belongs to."""
         self._told = self._row_of(error, moving=moving)
         if self._told is not None:
-            self._guards.keep(self._told)
+            self._watcher.keep(self._told)
         return self._told
 
     def require_answers(self) -> None:
         """Raise a stop of row 11, however short, after which the questions were not answered: no motion goes on."""
-        self._guards.look_aside()
-        stop = self._guards.safety_stop
+        self._watcher.look_aside()
+        stop = self._watcher.safety_stop
         if stop is not None and stop is not self._answered:
             raise stop
 
     def make_sure(self) -> None:
         """Raise unless all is well again. A stop of the safety system is for the operator to clear."""
-        self._guards.look_aside()
+        self._watcher.look_aside()
         self._arm.open(control=True)
         try:
             self._sensor.check()
@@ -71,15 +71,15 @@ class Recovery:
             self._sensor.open()
             self._contact.forget()
             self._witness = Witness(self._sensor, self._desk.tell)
-        stop = self._guards.safety_stop
+        stop = self._watcher.safety_stop
         if stop is not None and stop not in {self._answered, self._told}:  # pressed while the arm was held already
             self._told = stop
             self._desk.tell(GuardTripped(hazard=stop.hazard, words=str(stop)))
         self._recheck(stop is not self._answered)
         self._answered = stop
-        self._guards.begin()
+        self._watcher.begin()
         q = self._arm.state().q_rad
-        with self._guards.watching(q, q, moving=False):  # is what tripped them gone?
+        with self._watcher.watching(q, q, moving=False):  # is what tripped them gone?
             time.sleep(_LOOK_AGAIN_S)
         self.require_answers()
 
@@ -90,7 +90,7 @@ class Recovery:
             return Tripped(26, error)
         if not isinstance(error, DriverError):
             return None
-        if (trip := self._guards.tripped(wait_s=0.3)) is not None:
+        if (trip := self._watcher.tripped(wait_s=0.3)) is not None:
             return trip
         try:
             self._sensor.check()

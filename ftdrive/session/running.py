@@ -21,6 +21,7 @@ from calib.routine import PoseRecord, dataset_from, is_return
 from calib.selection import next_pose
 from calib.yu import weight_and_tilt
 from ftdrive.config import USUAL_KG
+from ftdrive.mismatch import axes_along
 from ftdrive.session.events import Estimated
 
 Array = NDArray[np.float64]
@@ -31,9 +32,6 @@ AMBER = {"cond9": 8.0, "cond_u1": 25.0}
 """As within 30 to 45 degrees."""
 TRUSTED_SHARE = 0.05
 """`Running.predict` is silent where it is less sure of the force than this share of the weight."""
-
-_ALIGNED = np.sin(np.radians(22.5))
-"""An axis counts as pointing down, among others, from this share of gravity on."""
 
 
 class Running:
@@ -223,11 +221,7 @@ def _motions(last: Array, down_base: Array) -> tuple[list[str], Array]:
 
 
 def _pointing_down(gravity_flange: Array) -> str:
-    axes = [
-        f"{'-' if part < 0 else '+'}{axis}"
-        for axis, part in zip("xyz", gravity_flange.tolist(), strict=True)
-        if abs(part) > _ALIGNED
-    ]
+    axes = axes_along(gravity_flange)
     if len(axes) == 1:
         return f"the tool's {axes[0]} axis"
     return f"the middle of the tool's {', '.join(axes[:-1])} and {axes[-1]} axes"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calib.routine import turned_rad
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ArmState, ForceTorqueSensor, RobotArm
-from ftdrive.session.guards import Guard, Seen, Tripped, Watch, by_safety, out_of_sight
+from ftdrive.session.guards import Guard, Motion, Seen, Tripped, by_safety, out_of_sight
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ _TELL_S: Final = 0.2
 """A stop that takes longer is told meanwhile. An arm that answers brakes from 60 deg/s in 0.26 s."""
 
 
-class Guards:
+class Watcher:
     """The thread. Watches from `begin` on, whenever a `watching` block is open; for row 11 it looks all the time.
 
     Parameters
@@ -52,7 +52,7 @@ class Guards:
         on_trip: Callable[[Tripped], None],
     ) -> None:
         self._arm, self._sensor, self._guards, self._on_trip = arm, sensor, tuple(guards), on_trip
-        self._watch: Watch | None = None
+        self._motion: Motion | None = None
         self._wake = threading.Event()
         self._end = threading.Event()
         self._told = threading.Event()
@@ -65,7 +65,7 @@ class Guards:
         self._looked_s = 0.0
         self._thread = threading.Thread(target=self._run, name="guards", daemon=True)
 
-    def __enter__(self) -> "Guards":
+    def __enter__(self) -> "Watcher":
         self._thread.start()
         return self
 
@@ -85,12 +85,12 @@ class Guards:
         """Watch while the block runs. What trips is raised at its end, and by `check`."""
         self._last = None
         self._looked_s = time.monotonic()
-        self._watch = Watch(np.asarray(start_rad), np.asarray(goal_rad), moving)
+        self._motion = Motion(np.asarray(start_rad), np.asarray(goal_rad), moving)
         self._wake.set()
         try:
             yield
         finally:
-            self._watch = None
+            self._motion = None
             self._wake.clear()
         self.check()
 
@@ -118,7 +118,7 @@ class Guards:
         """Raise what has tripped. Called in the loops that wait for the arm."""
         if self._tripped is not None:
             raise self._tripped
-        if self._watch is not None and time.monotonic() - self._looked_s > _HUNG_S:
+        if self._motion is not None and time.monotonic() - self._looked_s > _HUNG_S:
             raise Tripped(18, DeviceFault("the guards have not looked for a second: give this computer less to do"))
 
     def tripped(self, *, wait_s: float) -> Tripped | None:
@@ -132,8 +132,8 @@ class Guards:
 
     def _run(self) -> None:
         while not self._end.is_set():
-            watch = self._watch
-            if watch is None or self._tripped is not None:
+            motion = self._motion
+            if motion is None or self._tripped is not None:
                 try:
                     self.look_aside()
                 except Exception:
@@ -144,17 +144,17 @@ class Guards:
                 continue
             started_s = time.monotonic()
             try:
-                self._look(watch)
+                self._look(motion)
             except Tripped as trip:
                 self._stop(trip)
             except DriverError as error:
-                self._stop(out_of_sight(error, moving=watch.moving))
+                self._stop(out_of_sight(error, moving=motion.moving))
             except Exception as error:
                 log.exception("a guard failed")
                 self._stop(Tripped(18, DeviceFault(f"a guard failed ({error!r}): report this, and do not go on")))
             self._end.wait(max(0.0, started_s + PERIOD_S - time.monotonic()))
 
-    def _look(self, watch: Watch) -> None:
+    def _look(self, motion: Motion) -> None:
         status = self._arm.status()
         try:
             state = self._arm.state()
@@ -166,7 +166,7 @@ class Guards:
             sample = self._sensor.latest(timeout_s=0.0)
         except DriverError as error:
             raise Tripped(15, error) from error
-        if watch is not self._watch:  # the block has ended meanwhile: what was seen may belong to the next one
+        if motion is not self._motion:  # the block has ended meanwhile: what was seen may belong to the next one
             return
         now_s = time.monotonic()
         dt_s = min(now_s - self._looked_s, _LATE_S)
@@ -175,7 +175,7 @@ class Guards:
             then_s, before = self._last
             turn_rad_s = turned_rad(before, state) / max(now_s - then_s, 1e-3)
         self._last, self._looked_s = (now_s, state), now_s
-        seen = Seen(now_s, dt_s, watch, state, status, sample.wrench[-1], int(sample.seq[-1]), turn_rad_s)
+        seen = Seen(now_s, dt_s, motion, state, status, sample.wrench[-1], int(sample.seq[-1]), turn_rad_s)
         if not self._begun:
             for guard in self._guards:
                 guard.begin(seen)

@@ -4,7 +4,7 @@ import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from calib import solve
 from calib.routine import PoseRecord, TourPose, dataset_from, drift_check
 from drivers.errors import DriverError, StreamBroken
-from drivers.interfaces import ArmState, RobotArm
+from drivers.interfaces import ArmState, ArmStatus, RobotArm
 from ftdrive import simulation
 from ftdrive.cli import cli
 from ftdrive.planning.constant_tour import NUMBERS, constant_tour
@@ -30,14 +30,6 @@ pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platfo
 
 QUICK = (2, 4, 5, 7, 10, 12, 13, 15, 18, 20, 21, 23)
 """Of the paper's 24 orientations, as well conditioned as all of them."""
-
-
-@dataclass(frozen=True)
-class Program:
-    """What the controller says of it."""
-
-    program: str
-    fault: str | None = None
 
 
 class Mover:
@@ -82,8 +74,8 @@ class Spectator:
     def state(self) -> ArmState:
         return self._arm.state()
 
-    def status(self) -> Program:
-        return Program("playing" if self._mover.plays else "stopped")
+    def status(self) -> ArmStatus:
+        return replace(self._arm.status(), program="playing" if self._mover.plays else "stopped")
 
 
 class Person:
@@ -151,7 +143,16 @@ def watch(station: Station, run: Run, *, listen: bool, commit: Callable[[PoseRec
         person = Person(mover.measured, None if listen else len(tour))
         with mover:
             arm = Spectator(ours, mover)
-            collect_manually(arm, sensor, cell.sampling, person, Fit(), commit or run.commit, listen=listen)
+            collect_manually(
+                arm,
+                sensor,
+                cell.sampling,
+                person,
+                Fit().add,
+                commit or run.commit,
+                down_base=np.array([0.0, 0.0, -1.0]),
+                listen=listen,
+            )
             assert mover.plays  # it was we who found the end
 
 

@@ -220,13 +220,20 @@ def test_a_network_sensor_has_no_port() -> None:
 
 
 def test_disk_that_can_be_written_and_one_that_cannot(tmp_path: Path) -> None:
-    (fine,) = checks.check_disk(tmp_path / "not/yet/there")
+    fine = checks.check_disk(tmp_path / "not/yet/there")
     assert fine.state in {"ok", "warning"}
     assert str(tmp_path) in fine.found
     (tmp_path / "file").touch()
-    (bad,) = checks.check_disk(tmp_path / "file" / "runs")
+    bad = checks.check_disk(tmp_path / "file" / "runs")
     assert bad.state == "failed"
     assert "--runs" in str(bad.fix)
+
+
+@pytest.mark.parametrize(("free", "state"), [(1e8, "failed"), (5e8, "warning"), (5e9, "ok")])
+def test_a_disk_with_little_room(free: float, state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
+    found = checks.check_disk(tmp_path)
+    assert (found.state, found.fix is None) == (state, state == "ok")
 
 
 def test_the_verdict_is_the_worst_state() -> None:

@@ -181,6 +181,16 @@ def test_the_mass_of_the_sensor_counts(payload_kg: float, sensor_kg: float | Non
     assert any("payload" in one for one in hints(outcome.result, outcome.run.records())) is told_off
 
 
+def test_a_run_goes_on_with_the_mass_of_the_sensor_as_it_is_known_now(lab: Lab) -> None:
+    lab.arm.set_status(payload_kg=2.8)
+    lab.calibrate()
+    assert "PolyScope" in lab.said()
+    lab.operator.told.clear()
+    lab.cell = replace(lab.cell, sensor=SensorConfig("fake://", mass_kg=1.6))
+    lab.calibrate(resume=lab.run().folder, redo=(4,))
+    assert "PolyScope" not in lab.said()
+
+
 def test_a_controller_that_does_not_tell_its_payload_is_not_compared(lab: Lab) -> None:
     lab.arm.set_status(payload_kg=None)
     lab.calibrate()

@@ -11,7 +11,8 @@ import pytest
 
 from calib.errors import BadDataset
 from calib.routine import PoseRecord, TourPose
-from ftdrive.runs import Reading, Run, Samples
+from drivers.interfaces import FtSamples
+from ftdrive.runs import Reading, Run
 
 CONFIG = {"robot": {"host": "10.0.0.2"}, "sensor": {"url": "ati-can://can0"}, "tool": {"mass_kg": None, "later": 1}}
 
@@ -22,7 +23,7 @@ def run(tmp_path: Path) -> Run:
     run = Run.create(tmp_path, "calibrate", {"mode": "auto", "config": CONFIG, "devices": {"arm": {"serial": "1"}}})
     reading = Reading(0, np.zeros(6), np.eye(3))
     n = 20
-    samples = Samples(
+    samples = FtSamples(
         np.arange(n),
         np.full(n, np.nan),
         np.arange(n),

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,12 @@ from calib.errors import TooFewSamples
 from calib.model import Array
 from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
 from drivers.errors import StreamBroken
-from drivers.interfaces import ArmState, FtSamples, Health
+from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
 from ftdrive.session import manual
 from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Key, Question
+from tests.unit.fake_cell import STATUS
 
 RATE_HZ = 200
 MOVE_S = 1.5
@@ -26,6 +27,7 @@ NOISE = np.repeat([0.05, 0.002], 3)
 BIAS = np.array([3.0, -2.0, 1.0, 0.1, -0.2, 0.3])
 COM_M = np.array([0.0, 0.01, 0.06])
 AVERAGE_S = 2.0
+FLOOR = np.array([0.0, 0.0, -1.0])
 
 UP, DOWN, LEFT, RIGHT, FRONT, BACK = (
     Rotation.from_euler("xyz", angles, degrees=True)
@@ -45,13 +47,11 @@ class Dwell:
     """What else acts on the sensor, by the time in the dwell."""
 
 
-@dataclass(frozen=True)
-class Status:
-    program: str = "playing"
-    fault: str | None = None
+def status(program: str = "playing", fault: str | None = None) -> ArmStatus:
+    return replace(STATUS, program=program, fault=fault)
 
 
-class Cell:
+class Cell(ForceTorqueSensor):
     """An arm that somebody moves from dwell to dwell, and its sensor; both make time pass."""
 
     def __init__(self, dwells: Sequence[Dwell]) -> None:
@@ -59,7 +59,7 @@ class Cell:
         self.now_s = 0.0
         self.rng = np.random.default_rng(1)
         self.rate_Hz = RATE_HZ
-        self.says: Callable[[float], Status] = lambda _: Status()
+        self.says: Callable[[float], ArmStatus] = lambda _: status()
         self.fails: dict[str, float] = {}
         self.recover = False
         self.unplugged_s = np.inf
@@ -97,8 +97,18 @@ class Cell:
             p_base_flange_m=np.zeros(3),
         )
 
-    def status(self) -> Status:
+    def status(self) -> ArmStatus:
         return self.says(self.now_s)
+
+    def open(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def identify(self) -> DeviceInfo:
+        raise AssertionError
+
+    def latest(self, *, timeout_s: float) -> FtSamples:
+        raise AssertionError(timeout_s)
 
     def collect(self, duration_s: float) -> FtSamples:
         t = self.now_s + np.arange(max(1, round(duration_s * self.rate_Hz))) / self.rate_Hz
@@ -194,7 +204,7 @@ class Outcome:
         listen: bool = False,
         keys: dict[float, Key] | None = None,
         earlier: Sequence[PoseRecord] = (),
-        says: Callable[[float], Status] | None = None,
+        says: Callable[[float], ArmStatus] | None = None,
         fit: Fit | None = None,
         has_keys: bool = True,
         raises: Any = None,
@@ -211,7 +221,15 @@ class Outcome:
         def collect() -> None:
             sampling = Sampling(average_s=AVERAGE_S, attempts=3)
             collect_manually(
-                self.cell, self.cell, sampling, self.person, self.fit, self._commit, listen=listen, earlier=earlier
+                self.cell,
+                self.cell,
+                sampling,
+                self.person,
+                self.fit.add,
+                self._commit,
+                down_base=FLOOR,
+                listen=listen,
+                earlier=earlier,
             )
 
         if raises is None:
@@ -431,8 +449,8 @@ def test_a_pose_that_the_others_contradict_is_asked_about(residual: tuple[float,
 
 
 def test_nothing_is_measured_while_the_controller_reports_a_fault() -> None:
-    def says(t: float) -> Status:
-        return Status("stopped", "protective stop: clear it at the pendant" if 4.5 < t < 10.9 else None)
+    def says(t: float) -> ArmStatus:
+        return status("stopped", "protective stop: clear it at the pendant" if 4.5 < t < 10.9 else None)
 
     outcome = Outcome(dwells(UP, DOWN, LEFT), says=says)
     assert [r.before.R_base_flange[2, 2].round(3) for r in outcome.kept] == [1.0, 0.0]
@@ -471,7 +489,7 @@ def test_a_program_that_passes_its_first_pose_is_followed_to_its_end() -> None:
     outcome = Outcome(
         dwells(UP, DOWN, UP, LEFT, RIGHT, FRONT, BACK, UP, Rotation.from_euler("x", 50, degrees=True)),
         listen=True,
-        says=lambda t: Status("playing" if t < ends_s else "stopped"),
+        says=lambda t: status("playing" if t < ends_s else "stopped"),
     )
     assert outcome.stops == [1, 2, 3, 4, 5, 6, 7]
     assert [record.pose.number for record in outcome.kept] == [1, 2, 3, 4, 5, 6, 7]
@@ -479,9 +497,9 @@ def test_a_program_that_passes_its_first_pose_is_followed_to_its_end() -> None:
 
 
 def test_only_standstills_of_the_running_program_count_and_the_last_though_it_has_ended() -> None:
-    def says(t: float) -> Status:
+    def says(t: float) -> ArmStatus:
         moments = [(5, "stopped"), (11, "playing"), (15.4, "paused"), (22, "playing"), (1e9, "stopped")]
-        return Status(next(program for until, program in moments if t < until))
+        return status(next(program for until, program in moments if t < until))
 
     outcome = Outcome(dwells(UP, DOWN, LEFT, RIGHT, FRONT), listen=True, says=says)
     rest = [record.before.R_base_flange.round(6).tolist() for record in outcome.kept]
@@ -490,7 +508,7 @@ def test_only_standstills_of_the_running_program_count_and_the_last_though_it_ha
 
 
 def test_a_program_that_ends_where_it_has_been_ends_it() -> None:
-    outcome = Outcome(dwells(UP, DOWN, UP), listen=True, says=lambda t: Status("playing" if t < 10 else "stopped"))
+    outcome = Outcome(dwells(UP, DOWN, UP), listen=True, says=lambda t: status("playing" if t < 10 else "stopped"))
     assert outcome.stops == [1, 2]
     assert "This is pose 1 again, 0° from it: it is left out.\nThe program has ended" in outcome.person.words()
     assert outcome.cell.now_s < 13
@@ -523,5 +541,7 @@ def test_a_disk_that_is_full_ends_it() -> None:
         raise OSError("No space left on device")
 
     with pytest.raises(OSError, match="No space"):
-        collect_manually(cell, cell, Sampling(average_s=AVERAGE_S), person, Fit(), commit, listen=False)
+        collect_manually(
+            cell, cell, Sampling(average_s=AVERAGE_S), person, Fit().add, commit, down_base=FLOOR, listen=False
+        )
     assert not any(isinstance(event, PoseTaken) for event in person.told)

@@ -11,6 +11,7 @@ import pytest
 
 from drivers.errors import StreamBroken
 from drivers.interfaces import ArmState, ArmStatus
+from ftdrive import checks
 from ftdrive.config import ToolConfig, WorkcellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.session import preflight
@@ -37,7 +38,7 @@ def test_a_workcell_nobody_measured_is_refused(lab: Lab) -> None:
     ("different", "words"),
     [
         ({"fault": "protective stop: clear it", "safety_mode": "protective stop"}, "protective stop"),
-        ({"payload_kg": 0.0}, "nothing hangs"),
+        ({"payload_kg": 0.0}, "told of no payload"),
         (
             {"p_flange_payload_m": (0.0, 0.0, -0.15)},
             r"centre at \(0, 0, -150\) mm from the flange, where the tool is not",
@@ -115,7 +116,7 @@ def test_a_folder_that_cannot_be_written_is_refused(lab: Lab, monkeypatch: pytes
     def full(**_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(preflight, "TemporaryFile", full)
+    monkeypatch.setattr(checks, "TemporaryFile", full)
     refuse(lab, "No space left")
 
 
@@ -166,7 +167,7 @@ def test_a_dry_run_takes_no_control_and_says_what_it_left_out(lab: Lab) -> None:
 
 def test_control_is_taken_when_all_else_is_well(lab: Lab) -> None:
     lab.arm.set_status(payload_kg=0.0)
-    refuse(lab, "nothing hangs")
+    refuse(lab, "told of no payload")
     assert (lab.arm.opened, lab.arm.asked_limits) == (1, 0)
 
 
@@ -185,7 +186,7 @@ def test_an_old_controller_is_controlled_from_the_start_for_it_tells_no_poses_be
 
 def test_local_control_is_refused_in_a_dry_run_too(lab: Lab) -> None:
     lab.arm.remote = False
-    with pytest.raises(NotAccepted, match="remote: the controller is in local control: press Local"):
+    with pytest.raises(NotAccepted, match="remote: local control: press Local"):
         lab.calibrate(dry_run=True)
     lab.arm.remote = None
     assert lab.calibrate(dry_run=True) is None

@@ -30,6 +30,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Key
+from ftdrive.session.running import faces
 from tests.unit.fake_cell import Lab
 
 
@@ -332,6 +333,20 @@ def test_by_hand_and_without_keys_the_session_ends_with_a_calibration(lab: Lab) 
     assert outcome is not None
     assert 6 <= outcome.result.n_poses < 24
     assert outcome.run.calibration_path.exists()
+
+
+def test_by_hand_on_a_wall_a_pose_is_shown_on_the_face_where_it_counts(lab: Lab) -> None:
+    def at_pose(stop: int) -> None:
+        if stop == 4:  # from here on the fit would tell how the base leans
+            raise KeyboardInterrupt
+
+    lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting="wall"))
+    by_hand(lab, at_pose)
+    with pytest.raises(KeyboardInterrupt):
+        lab.calibrate(mode="manual")
+    shown = np.array([event.gravity_flange for event in lab.operator.of(PoseTaken)])
+    counted = [event.faces for event in lab.operator.of(Estimated)]
+    assert counted == [faces(shown[:poses]) for poses in (1, 2, 3)]
 
 
 def test_a_session_that_is_interrupted_says_how_to_solve_what_is_there(lab: Lab) -> None:

@@ -402,7 +402,7 @@ def test_what_became_wrong_while_the_arm_stood_is_found_before_it_goes_on(lab: L
     lab.operator.on_event = told
     lab.calibrate()
     (refused,) = [event.words for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
-    assert "remote: the controller is in local control" in refused
+    assert "remote: local control" in refused
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
 
 
