@@ -39,7 +39,8 @@ SURE = 1e-3
 COLLAPSE = 0.4
 """An explanation is one if the residual drops to this share."""
 
-_UP_IN_BASE = np.array([0.0, 0.0, 1.0])
+UP_IN_BASE = np.array([0.0, 0.0, 1.0])
+"""Of a robot on a table."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +73,7 @@ def judge(
     t_s: Array | None = None,
     measured_sigma: Array | None = None,
     farthest_com_m: float = FARTHEST_COM_M,
-    up_in_base: ArrayLike = _UP_IN_BASE,
+    up_in_base: ArrayLike = UP_IN_BASE,
     unconstrained: Evidence | None = None,
     contradicted: Sequence[str] = (),
 ) -> Quality:
@@ -112,7 +113,7 @@ def judge(
     largest = shares[0][1]
 
     inexact = [words for words, share in shares if share > USABLE_SHARE]
-    explanation = disagreeing_axes(fit.R_base_flange[used], fit.wrench[used]) if inexact else []
+    explanation = disagreeing_axes(fit.R_base_flange[used], fit.wrench[used], up_in_base) if inexact else []
     rejected += explanation + _weight_reasons(fit, weight_N) + _second_solution_reasons(fit)
     _com_reasons(parameters, farthest_com_m, rejected, usable)
     (rejected if largest > REJECTED_SHARE else usable).extend(inexact)
@@ -207,7 +208,7 @@ def expected_error(parameters: Parameters, covariance: Array) -> tuple[float, fl
     return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
 
 
-def disagreeing_axes(R_base_flange: Array, wrench: Array) -> list[str]:
+def disagreeing_axes(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[str]:
     """Find out whether inverted orientations, or torque axes that disagree with the force axes, explain a bad fit.
 
     Forces are fitted alone, then torques to them by linear least squares, as read and with axes reversed. Reversing all
@@ -217,6 +218,8 @@ def disagreeing_axes(R_base_flange: Array, wrench: Array) -> list[str]:
     ----------
     R_base_flange : array, shape (n, 3, 3)
     wrench : array, shape (n, 6)
+    up_in_base : array_like, shape (3,)
+        Where up should be.
     """
     n, force_N, torque_Nm = len(wrench), wrench[:, :3], wrench[:, 3:]
     if n < RECOMMENDED_POSES:
@@ -243,7 +246,7 @@ def disagreeing_axes(R_base_flange: Array, wrench: Array) -> list[str]:
     (rms, signs), as_read = min(fits, key=lambda fit: fit[0]), fits[0][0]
     if rms < COLLAPSE * as_read:
         axes = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
-        up = F_b @ _UP_IN_BASE > 0
+        up = F_b @ np.asarray(up_in_base) > 0
         other = f" (or force {axes})" if up == (np.prod(signs) < 0) else ""
         found.append(
             f"force and torque axes disagree, with torque {axes} reversed{other} the torque residual drops from "
@@ -252,7 +255,7 @@ def disagreeing_axes(R_base_flange: Array, wrench: Array) -> list[str]:
     return found
 
 
-def reversed_signs(parameters: Parameters, covariance: Array, up_in_base: ArrayLike = _UP_IN_BASE) -> list[str]:
+def reversed_signs(parameters: Parameters, covariance: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[str]:
     """Say what a weight that pulls upwards means."""
     angle_deg = _tilt_deg(parameters, up_in_base)
     if angle_deg < REVERSED_TILT_DEG:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calib.dataset import CalibrationDataset
 from calib.descent import column_scale
@@ -16,7 +17,7 @@ from calib.ml import RANK_TOLERANCE, STANDARD_GRAVITY_M_S2, Drift, Fit, fit
 from calib.model import PARAMETER_NAMES, Array, Parameters, predict
 from calib.pooling import pooled_covariance
 from calib.published import LEVEL_BASE, PUBLISHED, Estimator, published
-from calib.quality import SIGNIFICANT_SIGMAS, judge
+from calib.quality import SIGNIFICANT_SIGMAS, UP_IN_BASE, judge
 from calib.result import CalibrationResult, DriftResult, Method
 
 SIMULATIONS = 400
@@ -32,6 +33,7 @@ def solve(
     drift: Drift = "auto",
     known: Known | None = None,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
+    up_in_base: ArrayLike = UP_IN_BASE,
     provenance: Mapping[str, Any] | None = None,
 ) -> CalibrationResult:
     """Calibrate.
@@ -51,6 +53,8 @@ def solve(
         for gravity.
     g_m_s2 : float
         Gravity, by which the weight is divided to give the mass.
+    up_in_base : array_like, shape (3,)
+        Where up should be, in base: +z for a robot on a table. The fit does not use it; its judgement does.
     provenance : mapping, optional
         Kept with the result, beside the hash of the dataset. Must be writable as JSON.
 
@@ -111,6 +115,7 @@ def solve(
         evidence,
         t_s=dataset.t_s,
         measured_sigma=measured_sigma,
+        up_in_base=up_in_base,
         unconstrained=unconstrained,
         contradicted=contradicted,
     )

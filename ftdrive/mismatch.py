@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import CalibrationResult
-from ftdrive.planning.scene import Scene, lean_of
+from ftdrive.planning.scene import down_of
 
 Array = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def lean_in_words(gravity_force_base_N: Array, covariance: Array, mounting: str)
     mounting : str
         As in [workcell]: assumed to be set in the controller too.
     """
-    down = Scene(lean_rad=lean_of(mounting)).down_base
+    down = down_of(mounting)
     along_N = float(gravity_force_base_N @ down)
     aside_N = gravity_force_base_N - along_N * down
     size_N = float(np.linalg.norm(aside_N))

@@ -124,11 +124,11 @@ def _solve_each(
     first_failure: CalibError | NotAccepted | None = None
     for source in sources:
         try:
-            dataset, g_m_s2, provenance = _read(source, orientation)
+            dataset, circumstances = _read(source, orientation)
             if method == "all":
-                _show_all(source, dataset, {**options, "g_m_s2": g_m_s2}, as_json)
+                _show_all(source, dataset, {**options, "g_m_s2": circumstances["g_m_s2"]}, as_json)
                 continue
-            result = _solve(dataset, method, {**options, "g_m_s2": g_m_s2, "provenance": provenance})
+            result = _solve(dataset, method, {**options, **circumstances})
             records = Run(source).records() if source.is_dir() else []  # a run tells more than its dataset
             if as_json:
                 told = list(hints(result, records)) if records else []
@@ -151,11 +151,12 @@ def _solve_each(
         raise SystemExit(exit_code(first_failure))
 
 
-def _read(source: Path, orientation: Orientation) -> tuple[CalibrationDataset, float, dict[str, Any]]:
+def _read(source: Path, orientation: Orientation) -> tuple[CalibrationDataset, dict[str, Any]]:
     if source.is_dir():
         return dataset_of(Run(source))
     dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
-    return dataset, STANDARD_GRAVITY_M_S2, {"source": source.name, "versions": versions()}
+    provenance = {"source": source.name, "versions": versions()}
+    return dataset, {"g_m_s2": STANDARD_GRAVITY_M_S2, "provenance": provenance}
 
 
 def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) -> CalibrationResult:

@@ -59,6 +59,11 @@ class Scene:
         return asdict(self)
 
 
+def down_of(mounting: str) -> Array:
+    """Direction of gravity in base (3,), as mounted."""
+    return Scene(lean_rad=lean_of(mounting)).down_base
+
+
 def lean_of(mounting: str) -> float:
     """Read a mounting: floor, wall, ceiling, or an angle in degrees."""
     if mounting in MOUNTINGS:

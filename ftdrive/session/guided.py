@@ -21,7 +21,7 @@ from ftdrive.planning.cell import certifier_for, plan_for, speeds_of
 from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.motion import slower
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.scene import Scene, lean_of
+from ftdrive.planning.scene import down_of
 from ftdrive.planning.words import point_in_words, turns_in_words, way_in_words
 from ftdrive.runs import Run
 from ftdrive.session import preflight
@@ -480,7 +480,7 @@ def _by_hand(
         run = Run(options.resume)
         _require_same_devices(run, arm, sensor)
         earlier = run.records()
-    down_base, listen = down_of(cell), options.mode == "listen"
+    down_base, listen = down_of(cell.workcell.mounting), options.mode == "listen"
     running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base)
     with _kept(desk, run):
         collect_manually(
@@ -495,11 +495,6 @@ def _by_hand(
             earlier=earlier,
         )
     return run
-
-
-def down_of(cell: CellConfig) -> Array:
-    """Direction of gravity in base (3,), as mounted."""
-    return Scene(lean_rad=lean_of(cell.workcell.mounting)).down_base
 
 
 def _description(cell: CellConfig, devices: Mapping[str, Any], options: Options) -> dict[str, Any]:

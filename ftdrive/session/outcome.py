@@ -8,6 +8,7 @@ from typing import Any
 
 from calib import CalibrationDataset, CalibrationResult, solve
 from calib.routine import DriftCheck, PoseRecord, dataset_from, drift_check
+from ftdrive.planning.scene import down_of
 from ftdrive.runs import Run, versions
 
 
@@ -30,21 +31,21 @@ def solve_and_save(run: Run) -> Outcome:
     return outcome
 
 
-def dataset_of(run: Run) -> tuple[CalibrationDataset, float, dict[str, Any]]:
-    """Read a run as a dataset, with the local gravity it was made at and where a result of it comes from."""
+def dataset_of(run: Run) -> tuple[CalibrationDataset, dict[str, Any]]:
+    """Read a run as a dataset, with what else `solve` takes: gravity and up where it was made, and its provenance."""
     return _prepared(run, run.records())
 
 
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     """Solve records of a run, as they are on disk or as a replay gives them."""
-    dataset, g_m_s2, provenance = _prepared(run, records)
-    result = solve(dataset, g_m_s2=g_m_s2, provenance=provenance)
+    dataset, circumstances = _prepared(run, records)
+    result = solve(dataset, **circumstances)
     return Outcome(run, dataset, result, drift_check(records))
 
 
-def _prepared(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, float, dict[str, Any]]:
+def _prepared(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any]]:
     header = run.header()
-    devices = header.get("devices", {})
+    config, devices = header["config"], header.get("devices", {})
     dataset = dataset_from(records, {"run": run.folder.name, "devices": devices})
     provenance = {
         "created_utc": datetime.now(UTC).isoformat(),
@@ -53,9 +54,13 @@ def _prepared(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDatas
         "devices": devices,
         "run": run.folder.name,
         "station": header.get("station"),
-        "setup": _setup(run, header["config"]),
+        "setup": _setup(run, config),
     }
-    return dataset, float(header["config"]["site"]["g_m_s2"]), provenance
+    return dataset, {
+        "g_m_s2": float(config["site"]["g_m_s2"]),
+        "up_in_base": -down_of(config.get("workcell", {}).get("mounting", "floor")),
+        "provenance": provenance,
+    }
 
 
 def _setup(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:

@@ -141,7 +141,7 @@ class Running:
 
     def _solved(self) -> CalibrationResult | None:
         try:
-            return solve(dataset_from(self._kept(), {}), g_m_s2=self._g_m_s2)
+            return solve(dataset_from(self._kept(), {}), g_m_s2=self._g_m_s2, up_in_base=-self._down_base)
         except NotObservable:
             return None
 
