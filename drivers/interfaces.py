@@ -217,9 +217,10 @@ class RobotArm(_Device):
 
     @abstractmethod
     def status(self) -> ArmStatus:
-        """Tell the controller's modes and settings. Quick; from any thread, also while `move_to` runs in another.
+        """Tell the controller's modes and settings. Quick; from any thread, whatever else the arm does in another.
 
-        Never older than the last tenth of a second; raises `DeviceTimeout` or `StreamBroken` instead.
+        Never older than the last tenth of a second; raises `DeviceTimeout` or `StreamBroken` instead, `ConnectError`
+        while it is not open.
         """
 
     def in_remote_control(self) -> bool | None:

@@ -345,9 +345,6 @@ class _Begun:
     def tour(self, devices: Mapping[str, Any]) -> Run:
         """Ask, move, keep."""
         desk, plan, cell = self._desk, self._driven, self._cell
-        if self._options.questions and self._todo:
-            self._ask(assumed=self._known and not arm_moves(self._way))  # nobody has seen a way of the arm
-        run = self._run(devices)
         quiet = self._before.quiet.wrench
         window = int(len(quiet) * min(1.0, self._sampling.average_s / preflight.LISTEN_S))
         quiet_std = noise_level(quiet, max(LEAST_SAMPLES, window))
@@ -372,8 +369,11 @@ class _Begun:
         def on_trip(trip: Tripped) -> None:
             desk.tell(GuardTripped(hazard=trip.hazard, words=str(trip)))
 
-        with _kept(desk, run), Watcher(self._arm, self._sensor, rows, on_trip) as watcher:
-            Tour(
+        with Watcher(self._arm, self._sensor, rows, on_trip) as watcher:  # an emergency stop at a question counts too
+            if self._options.questions and self._todo:
+                self._ask(assumed=self._known and not arm_moves(self._way))  # nobody has seen a way of the arm
+            run = self._run(devices)
+            tour = Tour(
                 self._arm,
                 self._sensor,
                 self._certifier,
@@ -388,7 +388,9 @@ class _Begun:
                 pace=self._pace,
                 quiet_std=quiet_std,
                 sensor_kg=cell.sensor.mass_kg,
-            ).run(self._todo)
+            )
+            with _kept(desk, run):
+                tour.run(self._todo)
         if self._pace.slow and run.stops() == list(range(1, len(plan.steps) + 2)):
             remember_completed(*self._key)
         return run

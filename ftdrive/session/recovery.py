@@ -7,7 +7,7 @@ from typing import Final
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrive.session.desk import Desk
-from ftdrive.session.events import GuardTripped, Witness
+from ftdrive.session.events import GuardTripped, Noted, Witness
 from ftdrive.session.guards import ContactGuard, Tripped, by_safety, out_of_sight
 from ftdrive.session.watch import Watcher
 
@@ -47,6 +47,7 @@ class Recovery:
 
     def cause(self, error: Exception, *, moving: bool) -> Tripped | None:
         """What a guard has to say about it, or the row of the table that the error belongs to."""
+        self._watcher.unseen = False
         self._told = self._row_of(error, moving=moving)
         if self._told is not None:
             self._watcher.keep(self._told)
@@ -62,6 +63,7 @@ class Recovery:
     def make_sure(self) -> None:
         """Raise unless all is well again. A stop of the safety system is for the operator to clear."""
         self._watcher.look_aside()
+        unseen = self._watcher.unseen  # before it is opened anew, when it tells nothing for a moment
         self._arm.open(control=True)
         try:
             self._sensor.check()
@@ -75,7 +77,10 @@ class Recovery:
         if stop is not None and stop not in {self._answered, self._told}:  # pressed while the arm was held already
             self._told = stop
             self._desk.tell(GuardTripped(hazard=stop.hazard, words=str(stop)))
-        self._recheck(stop is not self._answered)
+        elif unseen:
+            words = "the arm was out of sight: nobody knows whether its emergency stop was pressed meanwhile"
+            self._desk.tell(Noted(words=words, warning=True))
+        self._recheck(unseen or stop is not self._answered)
         self._answered = stop
         self._watcher.begin()
         q = self._arm.state().q_rad

@@ -59,7 +59,10 @@ class Watcher:
         self._tripped: Tripped | None = None
         self.safety_stop: Tripped | None = None
         """The last emergency or safeguard stop that was seen, whatever the arm did; one for each, never forgotten."""
+        self.unseen = False
+        """Whether there was a time when the arm did not tell whether it is stopped by safety; reset by who asks."""
         self._stopped_by_safety = False
+        self._judging = threading.RLock()
         self._begun = False
         self._last: tuple[float, ArmState] | None = None
         self._looked_s = 0.0
@@ -99,19 +102,24 @@ class Watcher:
 
         It is not told from here: a question may stand on the screen.
         """
-        try:
-            status = self._arm.status()
-        except DriverError:  # it is opened again, which says so, or the next motion does
-            return
-        trip = None if status.fault is None else by_safety(status, f"the arm stopped: {status.fault}")
-        if trip is None or trip.hazard != 11:
-            self._stopped_by_safety = False
-        elif not self._stopped_by_safety:
-            self.keep(trip)
+        with self._judging:
+            try:
+                status = self._arm.status()
+            except Exception as error:  # whatever the arm of another package raises: it is opened again, and says so
+                log.debug("the arm does not tell how it is: %r", error)
+                self.unseen = True
+                return
+            trip = None if status.fault is None else by_safety(status, f"the arm stopped: {status.fault}")
+            if trip is None or trip.hazard != 11:
+                self._stopped_by_safety = False
+            elif not self._stopped_by_safety:
+                self.keep(trip)
 
     def keep(self, trip: Tripped) -> None:
         """Remember it as `safety_stop` when it is one."""
-        if trip.hazard == 11:
+        with self._judging:
+            if trip.hazard != 11:
+                return
             self.safety_stop, self._stopped_by_safety = trip, True
 
     def check(self) -> None:
@@ -134,10 +142,7 @@ class Watcher:
         while not self._end.is_set():
             motion = self._motion
             if motion is None or self._tripped is not None:
-                try:
-                    self.look_aside()
-                except Exception:
-                    log.exception("a look for a stop of the safety system failed")
+                self.look_aside()
                 self._wake.wait(_ASIDE_S)
                 if self._tripped is not None:
                     self._end.wait(0.02)

@@ -5,6 +5,8 @@ from collections.abc import Callable
 
 import pytest
 
+from drivers.errors import ConnectError
+from drivers.interfaces import ArmStatus
 from ftdrive.errors import Declined
 from ftdrive.session.events import GuardTripped, Noted, State, StateChanged
 from ftdrive.session.operator import Key, Question
@@ -199,5 +201,42 @@ def test_an_emergency_stop_between_two_steps_holds_the_arm_where_it_stands(lab: 
     assert moves == [3]
     assert holds(lab) == ["the arm stopped: a stop"]
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [11]
+    assert questions(lab) == 2
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_who_resumes_an_arm_that_nobody_could_see_is_asked_again(lab: Lab) -> None:
+    pause_on_the_way(lab, 4)
+    lab.operator.answers["Type resume"] = ["resume"]
+
+    def out_of_sight() -> None:
+        looks, status = [0], lab.arm.status
+
+        def unseen() -> ArmStatus:
+            looks[0] += 1
+            raise ConnectError("the arm is not open")
+
+        lab.arm.status = unseen  # type: ignore[method-assign]
+        deadline = time.monotonic() + 5
+        while not looks[0]:
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        lab.arm.status = status  # type: ignore[method-assign]
+
+    when_asked(lab, "Type resume", once(out_of_sight))
+    assert lab.calibrate() is not None
+    assert questions(lab) == 2
+    assert [event for event in lab.operator.of(Noted) if "out of sight" in event.words]
+    assert lab.operator.of(GuardTripped) == []
+
+
+@pytest.mark.parametrize("words", QUESTIONS)
+def test_an_emergency_stop_at_the_first_questions_brings_them_again(words: str, lab: Lab) -> None:
+    lab.operator.answers["Type resume"] = ["resume"]
+    when_asked(lab, words, once(lambda: press_and_release(lab)))
+    held_at: list[int] = []
+    when_asked(lab, "Type resume", lambda: held_at.append(len(lab.arm.moves)))
+    assert lab.calibrate() is not None
+    assert held_at == [0]
     assert questions(lab) == 2
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
