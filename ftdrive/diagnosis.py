@@ -1,4 +1,4 @@
-"""What `doctor` says of the devices, as functions of what was seen; nothing here opens one."""
+"""What `doctor` and `calibrate` say of the devices, as functions of what was seen; nothing here opens one."""
 
 import math
 import re
@@ -259,7 +259,6 @@ def check_unreachable(error: DriverError, host: str) -> Check:
     elif isinstance(error, ModelUnknown):
         cure = f'write model = "ur5e" under [robot] in ftdrive.toml, or give --model; it is one of {", ".join(MODELS)}'
     elif isinstance(error, NoDashboard):
-        found = str(error).rstrip(".")  # what it says is no cure
         cure = f"enable the dashboard server at the pendant under {_SERVICES}; restart the controller if it is"
     return Check("robot.reachable", "failed", found, cure)
 

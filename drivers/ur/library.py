@@ -14,11 +14,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from importlib import import_module
 from typing import Final, Protocol, TypeVar, cast
 
-from drivers.errors import ConnectError, NoDashboard
+from drivers.errors import ConnectError, DriverError, NoDashboard
 
 T = TypeVar("T")
 
 FREQUENCY_HZ: Final = 125.0
+_NO_DASHBOARD: Final = "enable it under Settings, Security, Services, or restart the controller."
 """A quarter of the CPU that 500 Hz costs, and a fault is still seen within 10 ms."""
 
 _VARIABLES: Final = [  # only names ur_rtde can parse: it would read everything after an unknown one at the wrong place
@@ -133,9 +134,12 @@ def ask_dashboard(host: str, ask: Callable[[Dashboard], T], *, timeout_s: float,
     try:
         return _in_background(session).result(timeout_s)
     except RuntimeError as error:
-        raise NoDashboard(f"the dashboard server of {host} says: {error}") from error
+        raise NoDashboard(f"the dashboard server of {host} says: {str(error).rstrip('.')}: {_NO_DASHBOARD}") from error
+    except DriverError:  # of what was asked; one of them is a TimeoutError too
+        raise
     except TimeoutError as error:
-        raise NoDashboard(f"the dashboard server of {host} did not answer within {timeout_s:.1f} s") from error
+        words = f"the dashboard server of {host} did not answer within {timeout_s:.1f} s"
+        raise NoDashboard(f"{words}: {_NO_DASHBOARD}") from error
 
 
 def retire(receive: Receive) -> None:

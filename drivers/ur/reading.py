@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ModelUnknown, NoDashboard, StreamBroken
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ModelUnknown, StreamBroken
 from drivers.interfaces import NOT_REPORTED, ArmState, ArmStatus, DeviceInfo
 from drivers.ur.kinematics import MODELS, Pose, forward, model_named
 from drivers.ur.library import Dashboard, Receive, ask_dashboard, connect_receive, require, retire
@@ -156,10 +156,7 @@ class Reader:
                 serial = NOT_REPORTED
             return told, serial, dashboard.polyscopeVersion().strip()
 
-        try:
-            told, serial, polyscope = ask_dashboard(self._host, ask, timeout_s=CONNECT_S)
-        except NoDashboard as error:
-            raise NoDashboard(f"{error}: enable it under Settings, Security, Services.") from error
+        told, serial, polyscope = ask_dashboard(self._host, ask, timeout_s=CONNECT_S)
         says = model_named(told, major)
         if model is None and says is None:
             raise ModelUnknown(
