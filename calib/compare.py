@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calib.dataset import CalibrationDataset
 from calib.errors import BadDataset, NotObservable
@@ -14,6 +14,7 @@ from calib.known import Known
 from calib.ml import STANDARD_GRAVITY_M_S2, Drift
 from calib.model import Array, Parameters, angle_between, predict
 from calib.published import PUBLISHED
+from calib.quality import UP_IN_BASE
 from calib.result import Method
 from calib.solver import estimator_of, solve
 
@@ -63,13 +64,14 @@ def compare(
     drift: Drift = "auto",
     known: Known | None = None,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
+    up_in_base: ArrayLike = UP_IN_BASE,
 ) -> list[Compared]:
     """Run all methods; those that cannot run on these data say why.
 
     Parameters
     ----------
     dataset : CalibrationDataset
-    drift, known, g_m_s2
+    drift, known, g_m_s2, up_in_base
         As for `solve`. The published methods that take gravity as known find it in `known`, or assume a level base.
 
     Raises
@@ -82,7 +84,7 @@ def compare(
     for method in get_args(Method):
         try:
             if method in PUBLISHED:
-                found = _published(dataset, method, known, g_m_s2)
+                found = _published(dataset, method, known, g_m_s2, up_in_base)
             else:
                 found = _fitted(dataset, method, drift, known, g_m_s2)
         except (NotObservable, BadDataset) as error:
@@ -104,14 +106,14 @@ def _fitted(
 
 
 def _published(
-    dataset: CalibrationDataset, method: Method, known: Known | None, g_m_s2: float
+    dataset: CalibrationDataset, method: Method, known: Known | None, g_m_s2: float, up_in_base: ArrayLike
 ) -> tuple[Parameters, float, float]:
     R_base_flange, wrench = dataset.R_base_flange, dataset.wrench
-    parameters = estimator_of(method, R_base_flange, known, g_m_s2)(wrench)
+    parameters = estimator_of(method, R_base_flange, known, g_m_s2, up_in_base)(wrench)
     left_out = np.empty_like(wrench)
     try:
         for out in _folds(len(wrench)):
-            without = estimator_of(method, R_base_flange[~out], known, g_m_s2)(wrench[~out])
+            without = estimator_of(method, R_base_flange[~out], known, g_m_s2, up_in_base)(wrench[~out])
             left_out[out] = wrench[out] - predict(without, R_base_flange[out])
     except NotObservable:
         return parameters, np.nan, np.nan

@@ -16,7 +16,7 @@ from calib.known import Known
 from calib.ml import RANK_TOLERANCE, STANDARD_GRAVITY_M_S2, Drift, Fit, fit
 from calib.model import PARAMETER_NAMES, Array, Parameters, predict
 from calib.pooling import pooled_covariance
-from calib.published import LEVEL_BASE, PUBLISHED, Estimator, published
+from calib.published import PUBLISHED, Estimator, published
 from calib.quality import SIGNIFICANT_SIGMAS, UP_IN_BASE, judge
 from calib.result import CalibrationResult, DriftResult, Method
 
@@ -54,7 +54,8 @@ def solve(
     g_m_s2 : float
         Gravity, by which the weight is divided to give the mass.
     up_in_base : array_like, shape (3,)
-        Where up should be, in base: +z for a robot on a table. The fit does not use it; its judgement does.
+        Where up should be, in base: +z for a robot on a table. For the judgement, and for those published methods that
+        take gravity as known.
     provenance : mapping, optional
         Kept with the result, beside the hash of the dataset. Must be writable as JSON.
 
@@ -75,7 +76,7 @@ def solve(
     if np.ptp(dataset.wrench[:, :3], axis=0).max() == 0:
         raise NotObservable("the force is exactly the same in all poses: the sensor is stuck, or nothing hangs on it.")
 
-    estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2) if method in PUBLISHED else None
+    estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, up_in_base) if method in PUBLISHED else None
     wrench_cov = dataset.wrench_cov
     if wrench_cov is not None:
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
@@ -169,9 +170,12 @@ def _unconstrained(dataset: CalibrationDataset, wrench_cov: Array | None, drift:
     return found
 
 
-def estimator_of(method: Method, R_base_flange: Array, known: Known | None, g_m_s2: float) -> Estimator:
+def estimator_of(
+    method: Method, R_base_flange: Array, known: Known | None, g_m_s2: float, up_in_base: ArrayLike
+) -> Estimator:
     """Prepare a published method; gravity is taken from `known` where the method needs it. Raises `NotObservable`."""
-    direction = LEVEL_BASE if known is None or known.gravity_direction_base is None else known.gravity_direction_base
+    level = -np.asarray(up_in_base, dtype=np.float64)
+    direction = level if known is None or known.gravity_direction_base is None else known.gravity_direction_base
     weight_N = None if known is None or known.mass_kg is None else known.mass_kg * g_m_s2
     return published(method, R_base_flange, gravity_direction_base=np.asarray(direction), weight_N=weight_N)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from textwrap import fill
 from typing import Any, Literal
@@ -15,6 +16,7 @@ from calib import solve as solve_dataset
 from calib.compare import compare
 from calib.errors import CalibError
 from calib.ml import STANDARD_GRAVITY_M_S2, Drift
+from calib.quality import UP_IN_BASE
 from calib.result import Method
 from calib.routine import drift_check
 from ftdrive.cli import exit_code
@@ -124,11 +126,15 @@ def _solve_each(
     first_failure: CalibError | NotAccepted | None = None
     for source in sources:
         try:
-            dataset, circumstances = _read(source, orientation)
+            dataset, circumstances, provenance = _read(source, orientation)
+            known = options["known"]
+            if known is not None and known.gravity_direction_base is not None:  # level as the arm is mounted there
+                known = replace(known, gravity_direction_base=-circumstances["up_in_base"])
+            here = {**options, **circumstances, "known": known}
             if method == "all":
-                _show_all(source, dataset, {**options, "g_m_s2": circumstances["g_m_s2"]}, as_json)
+                _show_all(source, dataset, here, as_json)
                 continue
-            result = _solve(dataset, method, {**options, **circumstances})
+            result = _solve(dataset, method, {**here, "provenance": provenance})
             records = Run(source).records() if source.is_dir() else []  # a run tells more than its dataset
             if as_json:
                 told = list(hints(result, records)) if records else []
@@ -151,12 +157,12 @@ def _solve_each(
         raise SystemExit(exit_code(first_failure))
 
 
-def _read(source: Path, orientation: Orientation) -> tuple[CalibrationDataset, dict[str, Any]]:
+def _read(source: Path, orientation: Orientation) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
     if source.is_dir():
         return dataset_of(Run(source))
     dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
-    provenance = {"source": source.name, "versions": versions()}
-    return dataset, {"g_m_s2": STANDARD_GRAVITY_M_S2, "provenance": provenance}
+    circumstances = {"g_m_s2": STANDARD_GRAVITY_M_S2, "up_in_base": UP_IN_BASE}
+    return dataset, circumstances, {"source": source.name, "versions": versions()}
 
 
 def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) -> CalibrationResult:
@@ -185,7 +191,7 @@ def _known(mass_kg: float | None, level_deg: float | None, mounting_deg: str | N
     try:
         return Known(
             R_flange_sensor=R_flange_sensor,
-            gravity_direction_base=None if level_deg is None else (0.0, 0.0, -1.0),
+            gravity_direction_base=None if level_deg is None else -UP_IN_BASE,
             direction_tolerance_rad=0.0 if level_deg is None else float(np.radians(level_deg)),
             mass_kg=mass_kg,
         )

@@ -31,19 +31,19 @@ def solve_and_save(run: Run) -> Outcome:
     return outcome
 
 
-def dataset_of(run: Run) -> tuple[CalibrationDataset, dict[str, Any]]:
-    """Read a run as a dataset, with what else `solve` takes: gravity and up where it was made, and its provenance."""
+def dataset_of(run: Run) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
+    """Read a run as a dataset, with gravity and up where it was made, as `solve` takes them, and the provenance."""
     return _prepared(run, run.records())
 
 
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     """Solve records of a run, as they are on disk or as a replay gives them."""
-    dataset, circumstances = _prepared(run, records)
-    result = solve(dataset, **circumstances)
+    dataset, circumstances, provenance = _prepared(run, records)
+    result = solve(dataset, **circumstances, provenance=provenance)
     return Outcome(run, dataset, result, drift_check(records))
 
 
-def _prepared(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any]]:
+def _prepared(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
     header = run.header()
     config, devices = header["config"], header.get("devices", {})
     dataset = dataset_from(records, {"run": run.folder.name, "devices": devices})
@@ -56,11 +56,9 @@ def _prepared(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDatas
         "station": header.get("station"),
         "setup": _setup(run, config),
     }
-    return dataset, {
-        "g_m_s2": float(config["site"]["g_m_s2"]),
-        "up_in_base": -down_of(config.get("workcell", {}).get("mounting", "floor")),
-        "provenance": provenance,
-    }
+    mounting = config.get("workcell", {}).get("mounting", "floor")
+    circumstances = {"g_m_s2": float(config["site"]["g_m_s2"]), "up_in_base": -down_of(mounting)}
+    return dataset, circumstances, provenance
 
 
 def _setup(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:

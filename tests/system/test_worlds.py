@@ -34,6 +34,8 @@ def test_odd_cells_are_recovered_within_their_sigmas(
     with Station(sensor, ["--seed", "7", *options]) as station:
         answer = ftdrive.json("calibrate", "--config", write_config(station.cell), typed="yes\nyes\nyes\nMOVE\nyes\n")
         truth = station.truth
+        told = ftdrive.json("solve", answer["run"], "--level-deg", "5")  # level as it is mounted
+    assert not any("was given as known" in reason for reason in told["reasons"]), told["reasons"]
     result = CalibrationResult.load(tmp_path / answer["run"] / "calibration.json")
     assert not any("upwards" in reason or "gravity is" in reason for reason in result.reasons), result.reasons
     for key, errors in errors_in_sigma(result, truth).items():

@@ -2,7 +2,7 @@
 
 import os
 import re
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,10 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, CalibrationResult, NotObservable, Parameters, read_csv, solve
+from calib.compare import compare
+from calib.errors import BadDataset
 from calib.known import Known
-from calib.ml import fit
+from calib.ml import STANDARD_GRAVITY_M_S2, fit
 from calib.model import Array, jacobian, predict
 from calib.result import Method
 from calib.yu import SPECIAL_R_flange_base
@@ -329,6 +331,19 @@ def test_nothing_on_the_sensor_is_never_a_calibration() -> None:
         verdict, reasons = verdict_of(rng.normal(size=(12, 6)) * SIGMA + [1, 2, 3, 0, 0, 0], R, white(12))
         assert verdict in ("rejected", "refused")
         assert "hang something heavier on the sensor" in reasons
+
+
+def test_what_is_known_to_be_down_depends_on_the_mounting() -> None:
+    truth = replace(TRUTH, gravity_force_base_N=np.array([0, 0, 20.0]))  # under a ceiling
+    poses = dataset(R24, predict(truth, R24), white(24))
+    known = Known(mass_kg=20 / STANDARD_GRAVITY_M_S2)
+    result = solve(poses, "carlson-cayley", known=known, up_in_base=(0, 0, -1))
+    assert np.abs(result.residuals).max() < 1e-6
+    assert result.verdict == "good"
+    with pytest.raises(BadDataset, match="point against the given gravity"):
+        solve(poses, "carlson-cayley", known=known)
+    (compared,) = [one for one in compare(poses, known=known, up_in_base=(0, 0, -1)) if one.method == "carlson-cayley"]
+    assert compared.force_rms_N < 1e-6
 
 
 def test_poses_of_one_tilt_are_refused_because_up_and_down_look_alike() -> None:
