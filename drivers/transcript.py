@@ -6,6 +6,7 @@ come, with `time.monotonic_ns()` as `t_ns`:
 {"t_ns", "event": "open", "port", "baudrate", "bytesize", "parity", "stopbits", "parity_marks"}   a serial port
 {"t_ns", "event": "open", "port", "frames": true}                                                 a CAN interface
 {"t_ns", "event": "open", "port", "datagrams": true}                                              UDP
+{"t_ns", "event": "unreachable", "error"}   why a datagram did not get through, which the driver does not see
 {"t_ns", "event": "page", "request", "reply", "took_s", "error"}   one question over HTTP, headers and all, in hex
 {"t_ns", "dir": "tx", "hex"}    one write of the driver
 {"t_ns", "dir": "rx", "hex"}    one datagram, or what the driver read within 2 ms, stamped with its first byte

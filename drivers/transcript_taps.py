@@ -30,7 +30,9 @@ def _ethernet(writer: Writer) -> AbstractContextManager[None]:
     """Record pynetft; nothing where it is not installed, for then nobody uses it."""
     try:
         relays = import_module("drivers.transcript_relays")
-    except ImportError:
+    except ModuleNotFoundError as error:
+        if error.name != "pynetft":
+            raise
         return nullcontext()
     return cast(AbstractContextManager[None], relays.relayed(writer))
 
