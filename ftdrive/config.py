@@ -353,7 +353,7 @@ def recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any
 
 def recorded_cell(config: Mapping[str, Mapping[str, Any]]) -> CellConfig:
     """Put the cell of a run together from what `recorded` returns."""
-    return CellConfig(**{name: kind(**config[name]) for name, kind in _SECTIONS.items()})
+    return CellConfig(**{name: kind(**config.get(name, {})) for name, kind in _SECTIONS.items()})
 
 
 def _typed(said: str, item: Field[Any], value: Any) -> Any:

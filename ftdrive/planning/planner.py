@@ -146,11 +146,11 @@ def plan_cone(
     chosen = chosen_tour(certifier, stands, poses, half_angle_rad, speeds, guess)
     if chosen is None:
         raise PlanRefused(
-            f"{poses} poses with the tool within {np.degrees(half_angle_rad):.0f} degrees of the axis of the cone are "
-            "not in reach of the wrist, not different enough to estimate everything, or no tour of them is proven "
+            f"{poses} poses with the tool within {np.degrees(half_angle_rad):.0f} degrees of straight down are not "
+            "in reach of the wrist, not different enough to estimate everything, or no tour of them is proven "
             "clear: widen the cone, or stand elsewhere"
         )
-    why = [f"The tool axis stays within {np.degrees(half_angle_rad):.0f} degrees of the axis of the cone."]
+    why = [f"The tool axis stays within {np.degrees(half_angle_rad):.0f} degrees of straight down."]
     return make_plan("cone", [*why, *_chosen_words(chosen)], certifier, chosen.numbers, chosen.q_rad, speeds, guess)
 
 

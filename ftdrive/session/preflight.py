@@ -354,7 +354,7 @@ def awake() -> Iterator[str]:
 
 def _told(name: str, check: Check) -> Checked:
     """What `doctor` says of the same thing; a warning does not forbid to go on."""
-    words = check.found if check.fix is None else f"{check.found}: {check.fix}"
+    words = f"{check.found}: {check.fix}" if check.fix else check.found
     return Checked(name=name, passed=check.state != "failed", words=words)
 
 
