@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final
 
 from drivers.errors import DeviceFault, DriverError
@@ -63,8 +64,13 @@ class Recovery:
     def make_sure(self) -> None:
         """Raise unless all is well again. A stop of the safety system is for the operator to clear."""
         self._watcher.look_aside()
-        unseen = self._watcher.unseen  # before it is opened anew, when it tells nothing for a moment
-        self._arm.open(control=True)
+        unseen = self._watcher.unseen
+        try:
+            self._arm.open(control=True)
+        except DriverError:
+            with suppress(DriverError):
+                self._arm.open()  # so that it is seen when somebody presses the emergency stop meanwhile
+            raise
         try:
             self._sensor.check()
         except DriverError:

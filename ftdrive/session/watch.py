@@ -27,6 +27,8 @@ _LATE_S: Final = 0.02
 """So much of the time between two looks counts as silence: when this process gets no time, nothing else is late."""
 _ASIDE_S: Final = 0.05
 """Between two looks for a stop of the safety system, while nothing else is watched."""
+_BLIND_S: Final = 1.0
+"""Nobody presses a stop, releases it and has the arm ready again in less."""
 _HUNG_S: Final = 1.0
 _TELL_S: Final = 0.2
 """A stop that takes longer is told meanwhile. An arm that answers brakes from 60 deg/s in 0.26 s."""
@@ -60,7 +62,8 @@ class Watcher:
         self.safety_stop: Tripped | None = None
         """The last emergency or safeguard stop that was seen, whatever the arm did; one for each, never forgotten."""
         self.unseen = False
-        """Whether there was a time when the arm did not tell whether it is stopped by safety; reset by who asks."""
+        """Whether the arm told nothing for so long that a stop may have come and gone; reset by who asks."""
+        self._blind_since_s: float | None = None
         self._stopped_by_safety = False
         self._judging = threading.RLock()
         self._begun = False
@@ -107,8 +110,11 @@ class Watcher:
                 status = self._arm.status()
             except Exception as error:  # whatever the arm of another package raises: it is opened again, and says so
                 log.debug("the arm does not tell how it is: %r", error)
-                self.unseen = True
+                now_s = time.monotonic()
+                self._blind_since_s = self._blind_since_s or now_s
+                self.unseen |= now_s - self._blind_since_s > _BLIND_S
                 return
+            self._blind_since_s = None
             trip = None if status.fault is None else by_safety(status, f"the arm stopped: {status.fault}")
             if trip is None or trip.hazard != 11:
                 self._stopped_by_safety = False
