@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import can
+import serial
 from can.interfaces.slcan import slcanBus
 
 from drivers._serial import LINK_ERRORS, refusal
@@ -111,13 +112,14 @@ class CanBus:
                 os.close(lock)
 
     def send(self, identifier: int, data: bytes) -> None:
-        """Send one data frame. Raises `StreamBroken`."""
+        """Send one data frame; one that a busy adapter does not take in time is lost. Raises `StreamBroken`."""
         if self._bus is None:
             raise StreamBroken(f"{self._owner}: closed")
         try:
             self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=_SEND_S)
         except BUS_ERRORS as exc:
-            raise self._broken(exc) from exc
+            if not isinstance(exc.__cause__, serial.SerialTimeoutException):  # it also comes of a computer that stalls
+                raise self._broken(exc) from exc
 
     def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
         """Wait for the next data frame of the device as (identifier, data). Raises `StreamBroken`."""
