@@ -8,22 +8,18 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from socketserver import BaseRequestHandler, ThreadingTCPServer
+from socketserver import BaseRequestHandler
 from typing import Any, Final
 
 from drivers._parity import leave_marks_to_far_side, marks_asked_for
 from drivers.transcript import Page, Passage, Transcript, asked_for
+from drivers.transcript_ports import AT_ONCE, HTTP_S, LOOK_S, LOOPBACK, PageServer
 
 if sys.platform != "win32":
     import tty
 
 _EARLY_S: Final = 0.05
 """A driver may ask this much earlier than it did; what the device had sent before is then sent at once."""
-_AT_ONCE: Final = 64
-"""Passages, where the player is late: a driver's socket has room for about 250 datagrams."""
-_LOOPBACK: Final = "127.0.0.1"
-_LOOK_S: Final = 0.05
-_HTTP_S: Final = 2.0
 
 
 class Player:
@@ -72,7 +68,7 @@ class Player:
             return
         self._t = time.monotonic()
         while not self._ended.is_set():
-            wait_s = min(_LOOK_S, max(0.0, self._play()))
+            wait_s = min(LOOK_S, max(0.0, self._play()))
             readable, _, _ = select.select([self._far], [], [], wait_s)
             if readable:
                 data = self._far.read()
@@ -85,9 +81,9 @@ class Player:
         """Send what is due; return the seconds until something else may be."""
         if self._far.is_full:
             self._far.send(b"")
-        for _ in range(_AT_ONCE):
+        for _ in range(AT_ONCE):
             if self._next == len(self._passages) or self.divergence or self._passages[self._next].sent:
-                return 0.001 if self._far.is_full else _LOOK_S
+                return 0.001 if self._far.is_full else LOOK_S
             passage = self._passages[self._next]
             wait_s = self._due_in_s(passage)
             if wait_s > 0:
@@ -210,21 +206,16 @@ class _Ethernet:
         self._pages = pages
         self._diverge = diverge
         self._driver: Any = None
+        self._opened = contextlib.ExitStack()
 
     def open(self) -> str:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind((_LOOPBACK, 0))
-        self._server = _PageServer(self._pages, self._diverge)
-        self._thread = threading.Thread(target=self._server.serve_forever, args=(_LOOK_S,), name="player of pages")
-        self._thread.start()
-        return f"{_LOOPBACK}?rdt_port={self._socket.getsockname()[1]}&http_port={self._server.server_address[1]}"
+        self._socket = self._opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        self._socket.bind((LOOPBACK, 0))
+        answers = self._opened.enter_context(_PageAnswers(self._pages, self._diverge))
+        return f"{LOOPBACK}?rdt_port={self._socket.getsockname()[1]}&http_port={answers.port}"
 
     def close(self) -> None:
-        self._server.ended.set()
-        self._server.shutdown()
-        self._thread.join()
-        self._server.server_close()  # waits for answers under way
-        self._socket.close()
+        self._opened.close()
 
     def wait_for_driver(self, _: threading.Event) -> bool:
         return True
@@ -241,12 +232,11 @@ class _Ethernet:
             self._socket.sendto(data, self._driver)
 
 
-class _PageServer(ThreadingTCPServer):
-    """Answers with the recorded bytes after the recorded time, one question a connection."""
+class _PageAnswers(PageServer):
+    """Answers with the recorded bytes after the recorded time."""
 
     def __init__(self, pages: tuple[Page, ...], diverge: Callable[[str], None]) -> None:
-        super().__init__((_LOOPBACK, 0), _PageAnswer)
-        self.ended = threading.Event()
+        super().__init__("player of pages", _PageAnswer)
         self._diverge = diverge
         self._left: dict[bytes, list[Page]] = {}
         for page in pages:
@@ -264,10 +254,10 @@ class _PageServer(ThreadingTCPServer):
 
 
 class _PageAnswer(BaseRequestHandler):
-    server: _PageServer
+    server: _PageAnswers
 
     def handle(self) -> None:
         driver: socket.socket = self.request
-        driver.settimeout(_HTTP_S)
+        driver.settimeout(HTTP_S)
         with contextlib.suppress(OSError):  # a driver that has hung up wants no answer
             driver.sendall(self.server.answer(driver.recv(65536)))

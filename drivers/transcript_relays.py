@@ -14,23 +14,18 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
-from socketserver import BaseRequestHandler, ThreadingTCPServer
+from socketserver import BaseRequestHandler
 from typing import Any, Final, Self
 
 import pynetft
 
 from drivers.transcript import Writer
+from drivers.transcript_ports import AT_ONCE, HTTP_S, LOOK_S, LOOPBACK, PageServer
 
 _CLIENT_CLASS: Final = "Client"
 _CONNECTION_CLASS: Final = "HTTPConnection"
-_LOOPBACK: Final = "127.0.0.1"
-_LOOK_S: Final = 0.05
-"""How often a relay looks whether the recording has ended."""
-_HTTP_S: Final = 2.0
 _ROOM: Final = 4 << 20
 """Bytes of datagrams that may wait for a relay; the system may grant less."""
-_AT_ONCE: Final = 64
-"""Datagrams for pynetft in a row: its socket has room for about 250."""
 
 
 @contextlib.contextmanager
@@ -41,7 +36,7 @@ def relayed(writer: Writer) -> Iterator[None]:
 
         @cache
         def pages_of(host: str, port: int) -> int:
-            return relays.enter_context(_PageRelay(writer, host, port)).server_address[1]
+            return relays.enter_context(_PageRelay(writer, host, port)).port
 
         @cache
         def stream_of(host: str, port: int) -> int:
@@ -56,13 +51,13 @@ def relayed(writer: Writer) -> Iterator[None]:
                 except OSError as error:
                     raise pynetft.NetFTError(str(error)) from error
                 http_port = pages_of(config.sensor_host, config.http_port)
-                here = replace(config, sensor_host=_LOOPBACK, rdt_port=rdt_port, http_port=http_port)
+                here = replace(config, sensor_host=LOOPBACK, rdt_port=rdt_port, http_port=http_port)
                 super().__init__(here, **options)
 
         class RelayedConnection(http.client.HTTPConnection):
             def __init__(self, *arguments: Any, **options: Any) -> None:
                 super().__init__(*arguments, **options)
-                self.host, self.port = _LOOPBACK, pages_of(self.host, self.port)
+                self.host, self.port = LOOPBACK, pages_of(self.host, self.port)
 
         setattr(pynetft, _CLIENT_CLASS, RelayedClient)
         setattr(http.client, _CONNECTION_CLASS, RelayedConnection)
@@ -84,7 +79,7 @@ class _DatagramRelay:
         self._device = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         self._far = self._connect()
         self._near = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._near.bind((_LOOPBACK, 0))
+        self._near.bind((LOOPBACK, 0))
         self.port: int = self._near.getsockname()[1]
         self._driver: Any = None
         self._ended = threading.Event()
@@ -121,8 +116,8 @@ class _DatagramRelay:
             at_once += 1
             if not readable:
                 at_once = 0
-                readable, _, _ = select.select([self._near, self._far], [], [], _LOOK_S)
-            elif at_once == _AT_ONCE:  # after a pause of this computer
+                readable, _, _ = select.select([self._near, self._far], [], [], LOOK_S)
+            elif at_once == AT_ONCE:  # after a pause of this computer
                 at_once = 0
                 time.sleep(0.001)
             try:
@@ -142,30 +137,18 @@ class _DatagramRelay:
                 self._writer.event("unreachable", error=str(error))
 
 
-class _PageRelay(ThreadingTCPServer):
-    """Hands questions over HTTP on to a sensor, one a connection, and its answers back."""
+class _PageRelay(PageServer):
+    """Hands questions over HTTP on to a sensor, and its answers back."""
 
     def __init__(self, writer: Writer, host: str, port: int) -> None:
-        super().__init__((_LOOPBACK, 0), _PageExchange)
+        super().__init__(f"pages of {host}", _PageExchange)
         self.writer = writer
         self.device = host, port
-        self.ended = threading.Event()
-        self._thread = threading.Thread(target=self.serve_forever, args=(_LOOK_S,), name=f"pages of {host}")
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.ended.set()
-        self.shutdown()
-        self._thread.join()
-        self.server_close()  # waits for exchanges under way
 
     def for_the_device(self, request: bytes) -> bytes:
         """Put the host right to which the client thinks it is talking."""
         host, port = self.device
-        here = f"\r\nHost: {_LOOPBACK}:{self.server_address[1]}\r\n"
+        here = f"\r\nHost: {LOOPBACK}:{self.port}\r\n"
         there = f"\r\nHost: {host}\r\n" if port == http.client.HTTP_PORT else f"\r\nHost: {host}:{port}\r\n"
         return request.replace(here.encode(), there.encode())
 
@@ -179,12 +162,12 @@ class _PageExchange(BaseRequestHandler):
         error = None
         began = time.monotonic()
         try:
-            driver.settimeout(_HTTP_S)
+            driver.settimeout(HTTP_S)
             request = self.server.for_the_device(driver.recv(65536))
-            with socket.create_connection(self.server.device, timeout=_HTTP_S) as device:
+            with socket.create_connection(self.server.device, timeout=HTTP_S) as device:
                 device.sendall(request)
                 while not self.server.ended.is_set():
-                    readable, _, _ = select.select([driver, device], [], [], _LOOK_S)
+                    readable, _, _ = select.select([driver, device], [], [], LOOK_S)
                     if device in readable:
                         if not (data := device.recv(65536)):
                             break

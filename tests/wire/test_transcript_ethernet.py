@@ -7,6 +7,7 @@ import socket
 import struct
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
@@ -121,28 +122,31 @@ def test_nobody_there_is_told_by_the_driver_and_in_the_file(tmp_path: Path) -> N
     assert [line["datagrams"] for line in lines if line.get("event") == "open"] == [True]
 
 
+@contextmanager
+def ends(count: int) -> Iterator[list[socket.socket]]:
+    """UDP sockets; the first has a port of this computer."""
+    with ExitStack() as opened:
+        sockets = [opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(count)]
+        for end in sockets:
+            end.settimeout(5)
+        sockets[0].bind(("127.0.0.1", 0))
+        yield sockets
+
+
 ODD = (b"first", b"", b"x", bytes(1400), b"last")
 
 
 def test_every_datagram_of_the_device_stays_one_and_others_do_not_pass(tmp_path: Path) -> None:
     writer = Writer(tmp_path / "a.jsonl", HEADER)
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as driver,
-    ):
-        device.bind(("127.0.0.1", 0))
-        with _DatagramRelay(writer, *device.getsockname()) as relay:
-            writer.event("open", datagrams=True)
-            for end in (device, driver):
-                end.settimeout(5)
-            driver.sendto(START, ("127.0.0.1", relay.port))
-            request, far = device.recvfrom(100)
-            assert request == START
-            stranger.sendto(b"not from the device", far)
-            for data in ODD:
-                device.sendto(data, far)
-            assert tuple(driver.recv(2000) for _ in ODD) == ODD
+    with ends(3) as (device, stranger, driver), _DatagramRelay(writer, *device.getsockname()) as relay:
+        writer.event("open", datagrams=True)
+        driver.sendto(START, ("127.0.0.1", relay.port))
+        request, far = device.recvfrom(100)
+        assert request == START
+        stranger.sendto(b"not from the device", far)
+        for data in ODD:
+            device.sendto(data, far)
+        assert tuple(driver.recv(2000) for _ in ODD) == ODD
     writer.end()
     assert tuple((p.sent, p.data) for p in Transcript.load(tmp_path / "a.jsonl").passages) == (
         (True, START),
@@ -152,23 +156,15 @@ def test_every_datagram_of_the_device_stays_one_and_others_do_not_pass(tmp_path:
 
 def test_who_asks_from_a_new_socket_gets_nothing_that_an_old_one_asked_for(tmp_path: Path) -> None:
     writer = Writer(tmp_path / "a.jsonl", HEADER)
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as before,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as driver,
-    ):
-        device.bind(("127.0.0.1", 0))
-        with _DatagramRelay(writer, *device.getsockname()) as relay:
-            writer.event("open", datagrams=True)
-            for end in (device, driver):
-                end.settimeout(5)
-            places = []
-            for end in (before, driver):
-                end.sendto(START, ("127.0.0.1", relay.port))
-                places.append(device.recvfrom(100)[1])
-            for data, place in zip((b"old", b"new"), places, strict=True):
-                device.sendto(data, place)
-            assert driver.recv(100) == b"new"
+    with ends(3) as (device, before, driver), _DatagramRelay(writer, *device.getsockname()) as relay:
+        writer.event("open", datagrams=True)
+        places = []
+        for end in (before, driver):
+            end.sendto(START, ("127.0.0.1", relay.port))
+            places.append(device.recvfrom(100)[1])
+        for data, place in zip((b"old", b"new"), places, strict=True):
+            device.sendto(data, place)
+        assert driver.recv(100) == b"new"
     writer.end()
     assert [p.data for p in Transcript.load(tmp_path / "a.jsonl").passages] == [START, START, b"new"]
 
@@ -176,11 +172,7 @@ def test_who_asks_from_a_new_socket_gets_nothing_that_an_old_one_asked_for(tmp_p
 def test_the_last_request_reaches_the_device(tmp_path: Path) -> None:
     """Else it would stream on to nobody."""
     writer = Writer(tmp_path / "a.jsonl", HEADER)
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as device,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as driver,
-    ):
-        device.bind(("127.0.0.1", 0))
+    with ends(2) as (device, driver):
         relay = _DatagramRelay(writer, *device.getsockname())
         driver.sendto(STOP, ("127.0.0.1", relay.port))
         relay._ended.set()  # before the relay has had its turn
@@ -195,7 +187,7 @@ def test_the_last_request_reaches_the_device(tmp_path: Path) -> None:
 def test_the_device_is_called_by_its_own_name(port: int, host: bytes, tmp_path: Path) -> None:
     writer = Writer(tmp_path / "a.jsonl", HEADER)
     with _PageRelay(writer, "no-such-host", port) as relay:
-        here = f"127.0.0.1:{relay.server_address[1]}".encode()
+        here = f"127.0.0.1:{relay.port}".encode()
         request = b"GET /%b HTTP/1.1\r\nHost: %b\r\nAccept: */*\r\n\r\n"
         assert relay.for_the_device(request % (here, here)) == request % (here, host)
     writer.discard()
