@@ -21,7 +21,6 @@ from drivers.errors import (
     DeviceTimeout,
     DriverError,
     ModelUnknown,
-    NoDashboard,
     PortInUse,
     ProtocolError,
     StreamBroken,
@@ -258,8 +257,6 @@ def check_unreachable(error: DriverError, host: str) -> Check:
             cure = f"ping {host}"
     elif isinstance(error, ModelUnknown):
         cure = f'write model = "ur5e" under [robot] in ftdrive.toml, or give --model; it is one of {", ".join(MODELS)}'
-    elif isinstance(error, NoDashboard):
-        cure = f"enable the dashboard server at the pendant under {_SERVICES}; restart the controller if it is"
     return Check("robot.reachable", "failed", found, cure)
 
 

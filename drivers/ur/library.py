@@ -19,8 +19,10 @@ from drivers.errors import ConnectError, DriverError, NoDashboard
 T = TypeVar("T")
 
 FREQUENCY_HZ: Final = 125.0
-_NO_DASHBOARD: Final = "enable it under Settings, Security, Services, or restart the controller."
 """A quarter of the CPU that 500 Hz costs, and a fault is still seen within 10 ms."""
+_NO_DASHBOARD: Final = (
+    "enable the dashboard server at the pendant under Settings, Security, Services; restart the controller if it is."
+)
 
 _VARIABLES: Final = [  # only names ur_rtde can parse: it would read everything after an unknown one at the wrong place
     "timestamp",

@@ -406,7 +406,9 @@ def test_an_arm_that_is_not_reached(cause: OSError, cure: str) -> None:
 
 
 def test_what_a_dashboard_server_says_is_not_lost() -> None:
-    error = NoDashboard("the dashboard server of ur5 says: Timeout connecting to UR dashboard server: restart it.")
+    error = NoDashboard(
+        "the dashboard server of ur5 says: Timeout connecting to UR dashboard server: enable the dashboard server."
+    )
     check = diagnosis.check_unreachable(error, "ur5")
     assert check.found == "the dashboard server of ur5 says: Timeout connecting to UR dashboard server"
     assert "enable the dashboard server" in str(check.fix)
