@@ -161,10 +161,10 @@ class BotaSensor(StreamingSensor):
 
     def _judge(self, status: int) -> None:
         """Raise on what makes a sample unusable, log the rest of a status word once."""
-        told = f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}"
-        if status & codec.RAW:
-            raise DeviceFault(f"{told}: these are no newtons; ?sinc=512 configures it")
-        if status & (codec.OVERRANGE | codec.INVALID):
+        if status & (codec.RAW | codec.OVERRANGE | codec.INVALID):
+            told = f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}"
+            if status & codec.RAW:
+                raise DeviceFault(f"{told}: these are no newtons; ?sinc=512 configures it")
             raise DeviceFault(f"{told}; take the load off, check the cable")
         if new := status & ~self._seen_status:
             log.warning("%s: status %s; measuring goes on", self.name, describe_status(new, codec.STATUS_BITS))
