@@ -24,7 +24,7 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from itertools import count, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,8 @@ _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status
 """Of a recording, named as in `FtSamples`."""
 
 Array = NDArray[np.float64]
+Mode = Literal["auto", "step", "manual", "listen"]
+"""How a session goes on from pose to pose."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,7 +203,6 @@ def _is_object(value: Any) -> bool:
 
 
 _Kind = tuple[str, Callable[[Any], bool]]
-_MODES = ("auto", "step", "manual", "listen")
 _TEXT: _Kind = "a text", _is_text
 _TEXT_OR_NULL: _Kind = "a text or null", lambda value: value is None or _is_text(value)
 _TEXTS: _Kind = "a list of texts", lambda value: isinstance(value, list) and all(map(_is_text, value))
@@ -212,7 +213,7 @@ _KINDS: Mapping[str, _Kind] = {
     "devices": _OBJECTS,
     "devices.arm.serial": _TEXT,
     "devices.sensor.serial": _TEXT,
-    "mode": (f"one of {', '.join(_MODES)}", lambda value: value in _MODES),
+    "mode": (f"one of {', '.join(get_args(Mode))}", lambda value: value in get_args(Mode)),
     "said": _OBJECT,
     "said.config": _TEXT_OR_NULL,
     "said.robot": _TEXT_OR_NULL,

@@ -12,7 +12,7 @@ from ftdrive.commands.common import CELL, NewFile, rows, runs, stop_unless_accep
 
 if TYPE_CHECKING:
     from ftdrive.config import CellConfig
-    from ftdrive.session.guided import Mode
+    from ftdrive.runs import Mode
     from ftdrive.session.outcome import Outcome
 
 _OF_A_PLAN = ("--quick", "--minimal", "--output", "--png", "--view")
@@ -93,7 +93,7 @@ def calibrate(
     from ftdrive.report import print_result
     from ftdrive.runs import Run
     from ftdrive.screen import open_operator
-    from ftdrive.session.guided import Options
+    from ftdrive.session.guided import Options, as_begun
     from ftdrive.session.guided import calibrate as guide
     from ftdrive.simulation import MOVED_BY, Station, sensor_name
     from ftdrive.talk import talk
@@ -118,18 +118,13 @@ def calibrate(
     mode: Mode = "step" if step else "manual" if manual else "listen" if listen else "auto"
     with ExitStack() as stack:
         description: dict[str, Any] = {}
-        begun = {} if resume is None else Run(resume).header_to_resume()
-        made_by = begun.get("station") or {}
+        made_by = {} if resume is None else Run(resume).header_to_resume().get("station") or {}
         simulate = simulate or bool(made_by and not (config or robot or tool))  # a run goes on where it was begun
         if simulate:
             name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
             station = stack.enter_context(Station(name, made_by.get("options", ())))
             cell = station.cell
             description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
-            if mover := MOVED_BY.get(begun.get("mode", mode) if mode == "auto" else mode):
-                request, words = mover
-                station.control(**request)
-                talk.print(f"The cell is emulated: {words}.")
         else:
             said = Said(str(config.absolute()) if config else None, robot, sensor, tool)
             description = {"said": said.to_dict()}
@@ -150,6 +145,10 @@ def calibrate(
             yes=yes,
             description=description,
         )
+        if simulate and (mover := MOVED_BY.get(as_begun(options).mode)):
+            request, words = mover
+            station.control(**request)
+            talk.print(f"The cell is emulated: {words}.")
         try:
             with open_operator(as_json=as_json) as operator:
                 outcome = guide(cell, operator, options)

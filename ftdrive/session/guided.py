@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from ftdrive.planning.motion import slower
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.scene import down_of
 from ftdrive.planning.words import point_in_words, turns_in_words, way_in_words
-from ftdrive.runs import Run
+from ftdrive.runs import Mode, Run
 from ftdrive.session import preflight
 from ftdrive.session.completed import has_completed, remember_completed
 from ftdrive.session.desk import Desk
@@ -52,7 +52,6 @@ from ftdrive.session.watch import Watcher
 from ftdrive.wiring import build_arm, build_sensor
 
 Array = NDArray[np.float64]
-Mode = Literal["auto", "step", "manual", "listen"]
 
 _GRID_RAD: Final = float(np.radians(0.1))
 """Plans are made where joints 1 to 3 stand, to this grid: the same place gives the same plan, and hash, again."""
@@ -109,7 +108,7 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
     """
     desk = Desk(operator, yes=options.yes)
     desk.tell(StateChanged(state=State.IDLE))
-    options = _as_begun(options)
+    options = as_begun(options)
     by_hand = options.mode in _BY_HAND
     plan = None if by_hand else _plan_on_disk(options)
     device, driver = build_sensor(cell), build_arm(cell)
@@ -147,7 +146,7 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
     return solve_and_save(run)
 
 
-def _as_begun(options: Options) -> Options:
+def as_begun(options: Options) -> Options:
     """Give a run that is resumed the mode it was begun in; raises `ConfigError` for options that do not go together."""
     begun = options.mode if options.resume is None else Run(options.resume).header().get("mode", "auto")
     if options.mode != "auto" and (begun in _BY_HAND) != (options.mode in _BY_HAND):

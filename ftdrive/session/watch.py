@@ -123,10 +123,9 @@ class Watcher:
 
     def keep(self, trip: Tripped) -> None:
         """Remember it as `safety_stop` when it is one."""
-        with self._judging:
-            if trip.hazard != 11:
-                return
-            self.safety_stop, self._stopped_by_safety = trip, True
+        if trip.hazard == 11:
+            with self._judging:
+                self.safety_stop, self._stopped_by_safety = trip, True
 
     def check(self) -> None:
         """Raise what has tripped. Called in the loops that wait for the arm."""
