@@ -54,6 +54,8 @@ class FakeArm(RobotArm):
         self.remote: bool | None = True
         self.asked_limits = 0
         self.at_move: dict[int, Callable[[], None]] = {}
+        self.at_look: Callable[[], None] = lambda: None
+        """Whenever somebody asks for the status."""
         self.forbidden: Array | None = None
         self.halted = threading.Event()
         self.gone: DriverError | None = None
@@ -80,6 +82,7 @@ class FakeArm(RobotArm):
         return ArmState(time.monotonic_ns(), 0.0, q, np.zeros(6), at.R_base_flange[0], at.flange_m[0])
 
     def status(self) -> ArmStatus:
+        self.at_look()
         return self._status if self.control else replace(self._status, program=self.program)
 
     def in_remote_control(self) -> bool | None:
@@ -220,6 +223,8 @@ class Scripted:
 
     answers: dict[str, list[str]] = field(default_factory=dict)
     on_event: Callable[[Event], None] = lambda _: None
+    at_question: list[tuple[str, Callable[[], None]]] = field(default_factory=list)
+    """What happens while a question with these words waits for its answer."""
     keys: list[Key] = field(default_factory=list)
     has_keys: bool = True
     told: list[Event] = field(default_factory=list)
@@ -230,6 +235,9 @@ class Scripted:
         self.on_event(event)
 
     def ask(self, question: Question) -> str:
+        for words, happen in self.at_question:
+            if words in question.text:
+                happen()
         self.asked.append(question)
         for word, answers in self.answers.items():
             if word in question.text and answers:

@@ -6,10 +6,9 @@ from collections.abc import Callable
 import pytest
 
 from drivers.errors import ConnectError
-from drivers.interfaces import ArmStatus
 from ftdrive.errors import Declined
 from ftdrive.session.events import GuardTripped, Noted, State, StateChanged
-from ftdrive.session.operator import Key, Question
+from ftdrive.session.operator import Key
 from tests.unit.fake_cell import Lab
 
 QUESTIONS = ("Is the tool free", "Is the ball of", "Is the emergency stop in reach")
@@ -17,35 +16,27 @@ QUESTIONS = ("Is the tool free", "Is the ball of", "Is the emergency stop in rea
 
 def when_asked(lab: Lab, words: str, do: Callable[[], None]) -> None:
     """Let something happen each time a question with these words waits for its answer."""
-    ask = lab.operator.ask
-
-    def asked(question: Question) -> str:
-        if words in question.text:
-            do()
-        return ask(question)
-
-    lab.operator.ask = asked  # type: ignore[method-assign]
+    lab.operator.at_question.append((words, do))
 
 
 def press_and_release(lab: Lab, mode: str = "robot emergency stop") -> None:
     """Press the emergency stop until two looks at the arm have told of it, then release it and wait for two more."""
-    looks, status = [0], lab.arm.status
+    looks = [0]
 
-    def counted() -> object:
+    def count() -> None:
         looks[0] += 1
-        return status()
 
     def wait() -> None:
         looks[0], deadline = 0, time.monotonic() + 5
         while looks[0] < 2 and time.monotonic() < deadline:
             time.sleep(0.005)
 
-    lab.arm.status = counted  # type: ignore[assignment, method-assign]
+    lab.arm.at_look = count
     lab.arm.set_status(fault="a stop", safety_mode=mode)
     wait()
     lab.arm.set_status()
     wait()
-    lab.arm.status = status  # type: ignore[method-assign]
+    lab.arm.at_look = lambda: None
 
 
 def once(do: Callable[[], None]) -> Callable[[], None]:
@@ -211,18 +202,18 @@ def test_who_resumes_an_arm_that_nobody_could_see_is_asked_again(lab: Lab, monke
     lab.operator.answers["Type resume"] = ["resume"]
 
     def out_of_sight() -> None:
-        looks, status = [0], lab.arm.status
+        looks = [0]
 
-        def unseen() -> ArmStatus:
+        def unseen() -> None:
             looks[0] += 1
             raise ConnectError("the arm is not open")
 
-        lab.arm.status = unseen  # type: ignore[method-assign]
+        lab.arm.at_look = unseen
         deadline = time.monotonic() + 5
         while looks[0] < 2:
             assert time.monotonic() < deadline
             time.sleep(0.005)
-        lab.arm.status = status  # type: ignore[method-assign]
+        lab.arm.at_look = lambda: None
 
     when_asked(lab, "Type resume", once(out_of_sight))
     assert lab.calibrate() is not None
