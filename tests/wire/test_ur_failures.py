@@ -543,7 +543,7 @@ def test_an_arm_that_is_not_ready(station: Station, mode: int, cure: str) -> Non
     ("what", "says"),
     [
         ("rtde", "cannot be reached .*check the address and the cable"),
-        ("dashboard", "dashboard server.*enable it under Settings, Security, Services"),
+        ("dashboard", "dashboard server.*enable the dashboard server at the pendant under Settings, Security, Services"),
         ("script", "30003.*enable the real-time client interface under Settings, Security, Services"),
     ],
 )
