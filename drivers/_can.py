@@ -64,8 +64,8 @@ class CanBus:
                 tty = os.path.realpath(tty)
             if not os.access(tty, os.R_OK | os.W_OK):
                 raise ConnectError(
-                    f"{self._owner}: there is no {self._channel} that may be read and written; is the adapter plugged "
-                    "in, and are you in the group of its port?"
+                    f"{self._owner}: there is no {self._channel} that may be read and written",
+                    "is the adapter plugged in, and are you in the group of its port?",
                 )
             if tty.startswith("/dev/pts/"):
                 options["sleep_after_open"] = 0.0
@@ -88,7 +88,7 @@ class CanBus:
             elif self._interface == "socketcan":
                 up = f"sudo ip link set {self._channel} up type can bitrate {self._bitrate}"
                 cure = f"is the adapter plugged in, and '{up}' done?"
-            raise refusal(self._owner, tty, exc, f"the bus does not open ({exc}); {cure}") from exc
+            raise refusal(self._owner, tty, exc, f"the bus does not open ({exc})", cure) from exc
 
     def _take(self, tty: str) -> None:
         """Take a serial port for this process alone, before python-can speaks to the adapter: it would not ask."""
@@ -153,4 +153,4 @@ class CanBus:
             pass
 
     def _broken(self, exc: Exception) -> StreamBroken:
-        return StreamBroken(f"{self._owner}: the CAN interface is gone ({exc}); plug it in and open it again")
+        return StreamBroken(f"{self._owner}: the CAN interface is gone ({exc})", "plug it in and open it again")

@@ -125,10 +125,10 @@ def _exchange(port: SerialPort, name: str, request: bytes, check: Callable[[byte
             wanted = reply_size(request)
         if len(reply) < wanted and time.monotonic() > deadline:
             raise DeviceTimeout(
-                f"{name}: no reply within {timeout_s} s ({len(reply)} of {wanted} bytes); check supply and wiring"
+                f"{name}: no reply within {timeout_s} s ({len(reply)} of {wanted} bytes)", "check supply and wiring"
             )
     try:
         return check(request, reply)
     except ProtocolError as exc:
         cure = "is it the sensor that its address names? Check its wiring, power it off and on"
-        raise type(exc)(f"{name}: {exc}; {cure}") from exc
+        raise type(exc)(f"{name}: {exc.found}", cure) from exc

@@ -37,7 +37,7 @@ class Liveness:
         """Raise on a wrench that is not finite, and on one that has not changed for too long."""
         wrench, t_host_ns = samples.wrench, samples.t_host_ns
         if not np.isfinite(wrench).all():
-            raise ProtocolError(f"{self._name}: the sensor sends a wrench that is not finite; power it off and on")
+            raise ProtocolError(f"{self._name}: the sensor sends a wrench that is not finite", "power it off and on")
         last = wrench[-1]
         other = np.flatnonzero((wrench != last).any(axis=1))
         if len(other) or not np.array_equal(last, self._last):
@@ -52,7 +52,8 @@ class Liveness:
         if self._same_rows >= enough and same_s >= _FROZEN_S:
             raise Frozen(
                 f"{self._name}: frozen, {self._same_rows} identical samples in {same_s:.2f} s, and a sensor that "
-                "measures has noise; power it off and on"
+                "measures has noise",
+                "power it off and on",
             )
 
 
@@ -85,12 +86,12 @@ class DeviceClock:
         back_s = -float(np.diff(t_device_s, prepend=before_s).min())
         if back_s > 0:
             raise StreamBroken(
-                f"{self._name}: the device's clock jumped back by {back_s:.3f} s to {newest_s:.3f} s: it has "
-                "restarted; open it again"
+                f"{self._name}: the device's clock jumped back by {back_s:.3f} s to {newest_s:.3f} s: it has restarted",
+                "open it again",
             )
         if step_s > _CLOCK_JUMP_S:
             raise StreamBroken(
-                f"{self._name}: the device's clock jumped ahead by {step_s:.3f} s to {newest_s:.3f} s; open it again"
+                f"{self._name}: the device's clock jumped ahead by {step_s:.3f} s to {newest_s:.3f} s", "open it again"
             )
         return self._lead_s - leads_s
 

@@ -22,12 +22,12 @@ else:
 _WRITE_S = 0.2
 
 
-def refusal(owner: str, path: str, error: Exception, otherwise: str) -> ConnectError:
+def refusal(owner: str, path: str, error: Exception, found: str, cure: str) -> ConnectError:
     """Say that another program has a port, where the error of opening it tells so; else what is given."""
     if isinstance(error, OSError) and error.errno in {errno.EAGAIN, errno.EBUSY}:
-        cure = f"end it, `fuser -v {shlex.quote(path)}` names it"
-        return PortInUse(f"{owner}: the port is in use by another program; {cure}")
-    return ConnectError(f"{owner}: {otherwise}")
+        holder = f"`fuser -v {shlex.quote(path)}` names it"
+        return PortInUse(f"{owner}: the port is in use by another program", f"end it, {holder}")
+    return ConnectError(f"{owner}: {found}", cure)
 
 
 class SerialPort:
@@ -74,8 +74,8 @@ class SerialPort:
             self._marks = Unmarker() if self._even_parity and ask_for_marks(self._port) else None
         except (ValueError, *LINK_ERRORS) as exc:
             self.close()
-            otherwise = f"the port does not open ({exc}); is it plugged in, free, and are you in its group?"
-            raise refusal(self._owner, self._path, exc, otherwise) from exc
+            cure = "is it plugged in, free, and are you in its group?"
+            raise refusal(self._owner, self._path, exc, f"the port does not open ({exc})", cure) from exc
         with contextlib.suppress(ValueError, NotImplementedError, *LINK_ERRORS):
             self._port.set_low_latency_mode(True)  # a courtesy of some adapters: 1 ms instead of 16 ms
 
@@ -135,4 +135,4 @@ class SerialPort:
         return self._port
 
     def _broken(self, exc: Exception) -> StreamBroken:
-        return StreamBroken(f"{self._owner}: the port is gone ({exc}); plug it in and open it again")
+        return StreamBroken(f"{self._owner}: the port is gone ({exc})", "plug it in and open it again")

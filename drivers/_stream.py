@@ -146,7 +146,7 @@ class StreamingSensor(ForceTorqueSensor):
         except BaseException as exc:
             self._let_go()
             if isinstance(exc, DriverError) and not isinstance(exc, ConnectError | DeviceFault):
-                raise ConnectError(self._named(exc)) from exc
+                raise self._not_opened(exc) from exc
             raise
         self._opened_ns = time.monotonic_ns()
         self._thread = threading.Thread(target=self._run, name=f"reader of {self.name}", daemon=True)
@@ -172,7 +172,7 @@ class StreamingSensor(ForceTorqueSensor):
     def identify(self) -> DeviceInfo:
         """Tell who the device is, as read by the last successful `open`."""
         if self._info is None:
-            raise ConnectError(f"{self.name}: not identified yet; open it first")
+            raise ConnectError(f"{self.name}: not identified yet", "open it first")
         return self._info
 
     def collect(self, duration_s: float) -> FtSamples:
@@ -194,13 +194,14 @@ class StreamingSensor(ForceTorqueSensor):
                     self._news.wait(max(0.0, self._stale_after_s - self._age_s()) + 1e-3)
                     self._check()
                     if self._reconnects != reconnects:
-                        raise StreamBroken(f"{self.name}: the stream was interrupted and came back; collect again")
+                        raise StreamBroken(f"{self.name}: the stream was interrupted and came back", "collect again")
                     if self._pauses != pauses:
-                        raise DeviceTimeout(f"{self.name}: {self._pause}; collect again")
+                        raise DeviceTimeout(f"{self.name}: {self._pause}", "collect again")
                     if self._received - before > self._max_collect_samples:
                         raise StreamBroken(
                             f"{self.name}: more than {self._max_collect_samples} samples in one collect of "
-                            f"{duration_s} s; collect in shorter pieces"
+                            f"{duration_s} s",
+                            "collect in shorter pieces",
                         )
             finally:
                 # by identity: blocks hold arrays, which do not compare
@@ -260,8 +261,8 @@ class StreamingSensor(ForceTorqueSensor):
         facts = info.facts | told | self.configured | {"sign": Fact(self._sign, "configured")}
         if told and facts["serial"].value != info.serial:
             raise ConnectError(
-                f"{self.name}: serial number {info.serial} answers, {facts['serial'].value} is configured; check the "
-                "address, or its option serial"
+                f"{self.name}: serial number {info.serial} answers, {facts['serial'].value} is configured",
+                "check the address, or its option serial",
             )
         serial = str(facts["serial"].value) if "serial" in facts else info.serial
         return replace(info, serial=serial, facts=facts)
@@ -295,7 +296,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._is_late = False
 
     def _run(self) -> None:
-        cause: Exception | None = None
+        cause: DriverError | None = None
         while self._is_mine():
             try:
                 if cause is not None:
@@ -303,18 +304,18 @@ class StreamingSensor(ForceTorqueSensor):
                     cause = None
                 self._pump()
             except Exception as exc:
-                recoverable = isinstance(exc, StreamBroken | DeviceTimeout) and self.recover and cause is None
+                again = self.recover and cause is None
+                cause = exc if again and isinstance(exc, StreamBroken | DeviceTimeout) else None
                 with self._news:
                     if not self._is_mine():
                         return
-                    self._failure, self._has_ended = exc, not recoverable
-                    if recoverable:
+                    self._failure, self._has_ended = exc, cause is None
+                    if cause is not None:
                         self._failure = StreamBroken(f"{self.name}: interrupted, connecting again ({exc})")
-                    self._note(str(exc) if recoverable else f"ended: {exc}")
+                    self._note(f"ended: {exc}" if cause is None else str(exc))
                     self._news.notify_all()
-                if not recoverable:
+                if cause is None:
                     return
-                cause = exc
 
     def _pump(self) -> None:
         """Read and publish until `close`."""
@@ -351,7 +352,7 @@ class StreamingSensor(ForceTorqueSensor):
             self._liveness.forget()
             self._rate.forget()
 
-    def _reconnect(self, cause: Exception) -> None:
+    def _reconnect(self, cause: DriverError) -> None:
         """Connect again to the same device; the first sample that comes then ends the failure."""
         deadline = time.monotonic() + _RECOVER_S
         self._earlier_lost += self._lost
@@ -368,13 +369,14 @@ class StreamingSensor(ForceTorqueSensor):
                 if not self._is_mine():
                     return
                 if time.monotonic() > deadline:
-                    raise StreamBroken(f"{cause}; not back within {_RECOVER_S:g} s ({exc})") from exc
+                    found = f"{cause.found}, not back within {_RECOVER_S:g} s ({exc})"
+                    raise StreamBroken(found, cause.cure) from exc
             time.sleep(_RETRY_S)
         if not self._is_mine():
             self._let_go()
             return
         if info != self._info:
-            raise ConnectError(f"{self.name}: {info} answers where {self._info} was; open it again if that is meant")
+            raise ConnectError(f"{self.name}: {info} answers where {self._info} was", "open it again if that is meant")
         with self._news:
             self._start_watching()
             self._newest_ns, self._heard_s = time.monotonic_ns(), awake_s()  # silence is judged anew
@@ -449,9 +451,10 @@ class StreamingSensor(ForceTorqueSensor):
         self._earlier_lost += int((~fresh).sum())
         return _rows(block, fresh)
 
-    def _named(self, error: DriverError) -> str:
+    def _not_opened(self, error: DriverError) -> ConnectError:
         """Put the device's name before what a codec says, which knows none."""
-        return str(error) if str(error).startswith(self.name) else f"{self.name}: {error}"
+        found = error.found if error.found.startswith(self.name) else f"{self.name}: {error.found}"
+        return ConnectError(found, error.cure)
 
     def _let_go(self) -> None:
         try:
@@ -461,12 +464,14 @@ class StreamingSensor(ForceTorqueSensor):
 
     def _await_first_sample(self) -> None:
         with self._news:
-            arrived = self._news.wait_for(lambda: self._received or self._failure, _FIRST_SAMPLE_S)
-            if isinstance(self._failure, DeviceFault):
-                self._raise_failure()
-            if not self._received or not arrived:
-                reason = self._failure or f"connected, but no sample came within {_FIRST_SAMPLE_S} s; try again"
-                raise ConnectError(f"{self.name}: {reason}") from self._failure
+            self._news.wait_for(lambda: self._received or self._failure, _FIRST_SAMPLE_S)
+            failure = self._failure
+            if self._received and not isinstance(failure, DeviceFault):
+                return
+            if isinstance(failure, DriverError) and not isinstance(failure, DeviceFault):
+                raise self._not_opened(failure) from failure
+            self._raise_failure()
+            raise ConnectError(f"{self.name}: connected, but no sample came within {_FIRST_SAMPLE_S} s", "try again")
 
     def _age_s(self) -> float:
         return awake_s() - self._heard_s
@@ -479,7 +484,7 @@ class StreamingSensor(ForceTorqueSensor):
         hint = self._why_silent()
         if self._was_away(awake_s() - self._turn_s) or not self._is_back:
             hint = "nobody read, for this program or computer was suspended or too busy: try again"
-        return DeviceTimeout(f"{self.name}: silent for {age_s:.3f} s (allowed: {self._stale_after_s:g} s); {hint}")
+        return DeviceTimeout(f"{self.name}: silent for {age_s:.3f} s (allowed: {self._stale_after_s:g} s)", hint)
 
     def _why_silent(self) -> str:
         """Say what to do about a silence; a subclass may know more."""
@@ -489,7 +494,7 @@ class StreamingSensor(ForceTorqueSensor):
         if self._failure is not None:
             raise copy.copy(self._failure) from self._failure
         if self._thread is None:
-            raise StreamBroken(f"{self.name}: not open; call open() first")
+            raise StreamBroken(f"{self.name}: not open", "call open() first")
 
     def _check(self) -> None:
         self._raise_failure()

@@ -12,8 +12,8 @@ DriverError
 └── DeviceFault       the device itself reports a fault: sensor status, protective or emergency stop
     └── Frozen        a sensor says the same again and again
 
-Every message says what happened, with the value, and what to do next: a sensor's after "; ", an arm's, which is a
-sentence, after its last colon.
+Every error says in `found` what happened, with the value, and in `cure` what to do next, where the driver knows it; its
+text is "found; cure", without capital and full stop. One that is raised anew as another kind keeps its cure.
 """
 
 from typing import Final
@@ -23,7 +23,20 @@ UNUSABLE: Final = "its data must not be used: check load, supply and cable, then
 
 
 class DriverError(Exception):
-    """Base of all device errors."""
+    """Base of all device errors.
+
+    Parameters
+    ----------
+    found
+        What happened, with the value.
+    cure
+        What to do next; empty where the driver does not know.
+    """
+
+    def __init__(self, found: str, cure: str = "") -> None:
+        super().__init__(f"{found}; {cure}" if cure else found)  # one argument: two would be those of an `OSError`
+        self.found = found
+        self.cure = cure
 
 
 class ConnectError(DriverError):

@@ -13,6 +13,8 @@ from typing import Final, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import DeviceFault
+
 Array = NDArray[np.float64]
 
 Guard = Callable[[], None]
@@ -136,8 +138,8 @@ class ArmStatus:
     """Such as "normal", "reduced", "protective stop"."""
     program: str
     """"stopped", "playing", "paused", or on the way to one of them; ours plays too while the arm is controlled."""
-    fault: str | None
-    """Why the arm may not move, and what the operator has to do; None when nothing forbids it."""
+    fault: DeviceFault | None
+    """Why the arm may not move, and what the operator has to do; None when nothing forbids it. Told, not raised."""
     speed_slider: float
     """0 to 1, as set at the pendant or by a program."""
     speed_scaling: float

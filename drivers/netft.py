@@ -217,8 +217,8 @@ class NetFtSensor(StreamingSensor):
         scale = told.calibration
         if scale.force_unit.value not in FORCE_UNITS_N or scale.torque_unit.value not in TORQUE_UNITS_NM:
             raise ConnectError(
-                f"{self.name}: it measures in {scale.force_unit.value} and {scale.torque_unit.value}; "
-                "choose N and Nm on its configuration page"
+                f"{self.name}: it measures in {scale.force_unit.value} and {scale.torque_unit.value}",
+                "choose N and Nm on its configuration page",
             )
         counts_per_N = scale.counts_per_force_unit / FORCE_UNITS_N[scale.force_unit.value]
         counts_per_Nm = scale.counts_per_torque_unit / TORQUE_UNITS_NM[scale.torque_unit.value]
@@ -288,7 +288,7 @@ class NetFtSensor(StreamingSensor):
             arrived = client.wait_for_first_sample(_SILENCE_S)
             health = client.health()
             if health.sensor_configuration is None:
-                raise ConnectError(f"{self.name}: the sensor told no scale; open it again")
+                raise ConnectError(f"{self.name}: the sensor told no scale", "open it again")
             is_axia = "Axia" in health.sensor_configuration.product_name
             self._bits = ONROBOT_BITS if self._onrobot else AXIA_BITS if is_axia else NET_FT_BITS
             self._judge(health.last_status)
@@ -296,8 +296,8 @@ class NetFtSensor(StreamingSensor):
                 return health.sensor_configuration
             client.stop()
         raise ConnectError(
-            f"{self.name}: no sample after {_STARTS} requests; check supply and cable; is RDT enabled on its "
-            "communications page?"
+            f"{self.name}: no sample after {_STARTS} requests",
+            "check supply and cable; is RDT enabled on its communications page?",
         )
 
     def _fetch(self) -> list[pynetft.Sample]:
@@ -318,7 +318,7 @@ class NetFtSensor(StreamingSensor):
         if not samples and (health := client.health()).state is not pynetft.ClientState.STREAMING:
             self._judge(health.last_status)
             raise StreamBroken(
-                f"{self.name}: the stream has ended ({health.last_error}); check cable and supply, then open it again"
+                f"{self.name}: the stream has ended ({health.last_error})", "check cable and supply, then open it again"
             )
         return samples
 
@@ -331,7 +331,7 @@ class NetFtSensor(StreamingSensor):
             self._warned = True
 
     def _fault(self, status: int) -> DeviceFault:
-        return DeviceFault(f"{self.name}: status {describe_status(status, self._bits, 32)}; {UNUSABLE}")
+        return DeviceFault(f"{self.name}: status {describe_status(status, self._bits, 32)}", UNUSABLE)
 
     def _read_page(self, path: str) -> bytes:
         """Ask for what pynetft does not: serial number of the calibration in use, rate, range."""
@@ -343,4 +343,6 @@ class NetFtSensor(StreamingSensor):
             raise self._untold(exc) from exc
 
     def _untold(self, exc: Exception) -> ConnectError:
-        return ConnectError(f"{self.name}: it does not tell its configuration ({exc}); check address, cable and supply")
+        return ConnectError(
+            f"{self.name}: it does not tell its configuration ({exc})", "check address, cable and supply"
+        )

@@ -75,7 +75,7 @@ def _hear(path: str, known: _Known, request: bytes | None, duration_s: float) ->
         while time.monotonic() < end:
             data += port.read(4096)
     except StreamBroken as exc:
-        raise ConnectError(str(exc)) from exc
+        raise ConnectError(exc.found, exc.cure) from exc
     finally:
         port.close()
     return data

@@ -69,7 +69,7 @@ def probe_can(channel: str, *, interface: str, bitrate: int | None, base: int = 
         heard = _hear(bus)
         return [answer for sensor in known if (answer := _look(sensor, heard, bus))]
     except StreamBroken as exc:
-        raise ConnectError(str(exc)) from exc
+        raise ConnectError(exc.found, exc.cure) from exc
     finally:
         bus.close()
 

@@ -1,7 +1,6 @@
 """What `doctor` and `calibrate` say of the devices, as functions of what was seen; nothing here opens one."""
 
 import math
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -38,23 +37,6 @@ _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs o
 _SLOWEST_SLIDER = 0.05
 _OLDEST_MINOR = 4
 """Of PolyScope 3 and 5: ur_rtde cannot control older ones."""
-
-
-def found_and_cure(error: Exception, otherwise: str) -> tuple[str, str]:
-    """Split what a driver says into what happened and what to do.
-
-    An arm's driver ends with a full stop, and what to do stands after its last colon; a sensor's says it after the
-    first semicolon that is not in brackets.
-    """
-    words = str(error)
-    if words.endswith("."):
-        found, colon, cure = words.rstrip(".").rpartition(": ")
-        return (found, cure) if colon else (cure, otherwise)
-    for semicolon in re.finditer("; ", words):
-        found, cure = words[: semicolon.start()], words[semicolon.end() :]
-        if found.count("(") == found.count(")"):
-            return found, cure
-    return words, otherwise
 
 
 # ---------------------------------------------------------------------------------------------------------- the sensor
@@ -118,17 +100,17 @@ def _check_sign(fact: Fact | None) -> Check:
 def check_sensor_error(name: str, error: DriverError, address: SensorAddress, permissions: Sequence[Check]) -> Check:
     """Say what to do about the error of a sensor's driver.
 
-    That is what its message says; for a sensor that was not reached, what mends the way to it, if anything is wrong
+    That is what it says itself; for a sensor that was not reached, what mends the way to it, if anything is wrong
     there; and only where neither is known, what usually helps against errors of this kind.
     """
     kind = error.__cause__ if isinstance(error, ConnectError) and isinstance(error.__cause__, DriverError) else error
-    found, own = found_and_cure(error, "")
+    own = error.cure
     way = next((check.fix for check in permissions if check.state == "failed"), None)
     if way is not None and not isinstance(kind, PortInUse | DeviceFault) and (_not_reached(kind) or not own):
         own = way
     elif own and isinstance(kind, DeviceTimeout):
         own = f"{own}; see whom the address reaches: {_ask_who(address)}"
-    return Check(name, "failed", found, own or _usual_cure(kind, address))
+    return Check(name, "failed", error.found, own or _usual_cure(kind, address))
 
 
 def _not_reached(error: BaseException) -> bool:
@@ -243,7 +225,7 @@ def check_noise(wrench: Array, duration_s: float, average_s: float, mass_kg: flo
 
 def check_unreachable(error: DriverError, host: str) -> Check:
     """Say why an arm could not be opened, and what to do about just that."""
-    found, cure = found_and_cure(error, f"ping {host}")
+    cure = error.cure or f"ping {host}"
     if isinstance(error, Unreachable):
         if isinstance(error.__cause__, ConnectionRefusedError):
             cure = (
@@ -257,7 +239,7 @@ def check_unreachable(error: DriverError, host: str) -> Check:
             cure = f"ping {host}"
     elif isinstance(error, ModelUnknown):
         cure = f'write model = "ur5e" under [robot] in ftdrive.toml, or give --model; it is one of {", ".join(MODELS)}'
-    return Check("robot.reachable", "failed", found, cure)
+    return Check("robot.reachable", "failed", error.found, cure)
 
 
 def check_arm(info: DeviceInfo) -> Check:
@@ -291,8 +273,7 @@ def check_status(status: ArmStatus) -> list[Check]:
 def check_safety(status: ArmStatus) -> Check:
     """Judge whether the safety system lets the arm move."""
     if status.fault is not None:
-        state, _, cure = status.fault.partition(": ")
-        return Check("robot.safety", "failed", state, cure)
+        return Check("robot.safety", "failed", status.fault.found, status.fault.cure)
     if status.safety_mode != "normal":
         fix = "see the pendant for what puts it there; calibrate asks whether that is as it should be"
         return Check("robot.safety", "warning", f"safety mode {status.safety_mode}", fix)

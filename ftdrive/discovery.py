@@ -112,7 +112,7 @@ def _ask_can(url: str) -> list[Answer]:
 def _must_pass(checks: list[Check]) -> None:
     for check in checks:
         if check.state == "failed":
-            raise ConnectError(f"{check.found}: {check.fix}")
+            raise ConnectError(check.found, check.fix or "")
 
 
 def places() -> list[str]:

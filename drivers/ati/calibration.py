@@ -47,7 +47,7 @@ def unit_names(unit_codes: tuple[int, int]) -> tuple[str, str]:
     """Name the units of force and torque. Raises `ProtocolError` for unknown codes."""
     force, torque = unit_codes
     if not (1 <= force <= len(_FORCES) and 1 <= torque <= len(_TORQUES)):
-        raise ProtocolError(f"unit codes are {force} (force) and {torque} (torque); codes 1 to 6 are known")
+        raise ProtocolError(f"unit codes are {force} (force) and {torque} (torque), known are 1 to 6")
     return _FORCES[force - 1], _TORQUES[torque - 1]
 
 

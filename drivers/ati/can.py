@@ -128,7 +128,7 @@ class AtiCanSensor(StreamingSensor):
             counts, unit_codes, source = self._read_scale(firmware)
             self._calibration = Calibration.from_vendor(matrix, counts, unit_codes)
         except ProtocolError as exc:
-            raise ProtocolError(f"{self.name}: calibration slot {self._slot}: {exc}; {_ANOTHER_SLOT}") from exc
+            raise ProtocolError(f"{self.name}: calibration slot {self._slot}: {exc.found}", _ANOTHER_SLOT) from exc
         self._judge(codec.decode_gauges(*self._ask(Op.GAUGES)))
         return DeviceInfo(
             model="ATI F/T (NETCANOEM, CAN)",
@@ -182,14 +182,14 @@ class AtiCanSensor(StreamingSensor):
         echo = codec.decode_slot(*self._ask(Op.SELECT_SLOT, self._slot))
         if echo != self._slot:
             raise ConnectError(
-                f"{self.name}: asked for calibration slot {self._slot}, the sensor answered {echo}; end other programs "
-                f"that use it, or {_ANOTHER_SLOT}"
+                f"{self.name}: asked for calibration slot {self._slot}, the sensor answered {echo}",
+                f"end other programs that use it, or {_ANOTHER_SLOT}",
             )
 
     def _read_matrix(self) -> Array:
         matrix = np.array([codec.decode_matrix_row(*self._ask(Op.MATRIX_ROW, axis)) for axis in range(6)])
         if not matrix.any():
-            raise DeviceFault(f"{self.name}: calibration slot {self._slot} is empty; {_ANOTHER_SLOT}")
+            raise DeviceFault(f"{self.name}: calibration slot {self._slot} is empty", _ANOTHER_SLOT)
         return matrix
 
     def _read_scale(
@@ -214,7 +214,8 @@ class AtiCanSensor(StreamingSensor):
         if configured != (counts, unit_codes):
             raise ConnectError(
                 f"{self.name}: the sensor tells {_scale_text(counts, unit_codes)}, configured are "
-                f"{_scale_text(*configured)}; check slot, or units and counts in its address"
+                f"{_scale_text(*configured)}",
+                "check slot, or units and counts in its address",
             )
         return counts, unit_codes, "device"
 
@@ -222,17 +223,19 @@ class AtiCanSensor(StreamingSensor):
         """Raise on what makes a reading unusable, log the rest of a status word once."""
         status = reading.status
         if status & codec.CRITICAL:
-            raise DeviceFault(f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}; {UNUSABLE}")
+            raise DeviceFault(f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}", UNUSABLE)
         if self._polls and status & ~self._seen_status & codec.WATCHDOG_RESET:
             raise StreamBroken(
-                f"{self.name}: the sensor has reset itself and may be back at calibration slot 0; open it again"
+                f"{self.name}: the sensor has reset itself and may be back at calibration slot 0", "open it again"
             )
         if new := status & ~self._seen_status:
             log.warning("%s: status %s; measuring goes on", self.name, describe_status(new, codec.STATUS_BITS))
             self._seen_status |= new
         if gauges := saturated_gauges(reading.gauges[np.newaxis]):
             names = ", ".join(f"G{g}" for g in gauges)
-            raise DeviceFault(f"{self.name}: gauge {names} at the end of its range; take the load off, check the cable")
+            raise DeviceFault(
+                f"{self.name}: gauge {names} at the end of its range", "take the load off, check the cable"
+            )
 
     def _ask(self, op: Op, *args: int) -> list[bytes]:
         """Exchange with retries, for the start-up sequence."""
@@ -240,8 +243,8 @@ class AtiCanSensor(StreamingSensor):
             with contextlib.suppress(DeviceTimeout, ProtocolError):
                 return self._exchange(op, bytes(args), _TRANSACTION_S)
         raise DeviceTimeout(
-            f"{self.name}: no answer to {op.name} after {_ATTEMPTS} attempts of {_TRANSACTION_S} s; check bit rate, "
-            "base identifier, supply and termination"
+            f"{self.name}: no answer to {op.name} after {_ATTEMPTS} attempts of {_TRANSACTION_S} s",
+            "check bit rate, base identifier, supply and termination",
         )
 
     def _exchange(self, op: Op, data: bytes, timeout_s: float) -> list[bytes]:

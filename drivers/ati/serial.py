@@ -90,8 +90,8 @@ class AtiSerialSensor(StreamingSensor):
             self._calibration = Calibration.from_vendor(block.matrix, block.counts_per_unit, block.unit_codes)
         except ProtocolError as exc:
             raise ProtocolError(
-                f"{self.name}: calibration slot {self._calibration_index}: {exc}; choose another, calibration=1 to 16 "
-                "in its address"
+                f"{self.name}: calibration slot {self._calibration_index}: {exc.found}",
+                "choose another, calibration=1 to 16 in its address",
             ) from exc
         self._ask(modbus.UNLOCK)
         try:
@@ -153,7 +153,9 @@ class AtiSerialSensor(StreamingSensor):
             self._look_at_status(t_host_ns)
         if saturated := saturated_gauges(gauges):
             names = ", ".join(f"G{g}" for g in saturated)
-            raise DeviceFault(f"{self.name}: gauge {names} at the end of its range; take the load off, check the cable")
+            raise DeviceFault(
+                f"{self.name}: gauge {names} at the end of its range", "take the load off, check the cable"
+            )
         n = len(gauges)
         return FtSamples(
             t_host_ns=np.full(n, t_host_ns, np.int64),
@@ -179,7 +181,8 @@ class AtiSerialSensor(StreamingSensor):
             if self._restarts > _MAX_RESTARTS:
                 raise ProtocolError(
                     f"{self.name}: records carry the error bit, but the status is {text}, {self._restarts} times in a "
-                    "row; check parity and wiring, power it off and on"
+                    "row",
+                    "check parity and wiring, power it off and on",
                 )
             log.warning("%s: a record with its error bit set, but the status is %s; going on", self.name, text)
         self._start_stream()
@@ -200,7 +203,7 @@ class AtiSerialSensor(StreamingSensor):
         try:
             return int.from_bytes(self._ask(modbus.read_registers(modbus.STATUS, 1), self._jam), "big")
         except (DeviceTimeout, ProtocolError) as exc:
-            raise DeviceTimeout(f"{exc}; is it this sensor, and is the termination right?") from exc
+            raise DeviceTimeout(exc.found, f"{exc.cure}; is it this sensor, and is the termination right?") from exc
 
     def _start_stream(self) -> None:
         self._ask(modbus.START, self._jam)  # perhaps it streams, and only the reply was lost
@@ -211,7 +214,7 @@ class AtiSerialSensor(StreamingSensor):
         self._restarts += 1
         if self._restarts > _MAX_RESTARTS:
             raise ProtocolError(
-                f"{self.name}: no intact record after {_MAX_RESTARTS} restarts of the stream; check parity and wiring"
+                f"{self.name}: no intact record after {_MAX_RESTARTS} restarts of the stream", "check parity and wiring"
             )
         log.warning("%s: stream out of step, restarting it", self.name)
         self._judge_status(self._stop_stream())
@@ -235,8 +238,8 @@ class AtiSerialSensor(StreamingSensor):
         new, self._status = status & ~self._status, status
         text = describe_status(status, modbus.STATUS_BITS)
         if status & modbus.CRITICAL:
-            raise DeviceFault(f"{self.name}: status {text}; {UNUSABLE}")
+            raise DeviceFault(f"{self.name}: status {text}", UNUSABLE)
         if self._seq and new & modbus.WATCHDOG_RESET:
-            raise StreamBroken(f"{self.name}: the sensor has reset itself and lost its gains; open it again")
+            raise StreamBroken(f"{self.name}: the sensor has reset itself and lost its gains", "open it again")
         if new:
             log.warning("%s: status %s; measuring goes on", self.name, text)

@@ -59,7 +59,7 @@ def decode_frame(data: bytes) -> Frame:
         raise ProtocolError(f"these bytes are no frame: {data.hex(' ')}")
     status, *wrench, t_us, temperature_C = _PAYLOAD.unpack_from(data, 1)
     if not all(map(math.isfinite, wrench)):
-        raise ProtocolError(f"the sensor sends {wrench}, which is no wrench; power it off and on")
+        raise ProtocolError(f"the sensor sends {wrench}, which is no wrench", "power it off and on")
     return Frame(status, tuple(wrench), t_us, temperature_C)
 
 

@@ -74,7 +74,7 @@ class BotaSensor(StreamingSensor):
         times = [frame.t_us for frame in first]
         self._period_us = median((b - a) % _CLOCK for a, b in pairwise(times))
         if not self._period_us:
-            raise ConnectError(f"{self.name}: the sensor's clock stands still at {times[-1]} µs; power it off and on")
+            raise ConnectError(f"{self.name}: the sensor's clock stands still at {times[-1]} µs", "power it off and on")
         self._nominal_Hz = 1e6 / self._period_us
         self._t_us = times[-1]
         self._seq = 0
@@ -128,8 +128,8 @@ class BotaSensor(StreamingSensor):
                 if codec.success(command) in answer:
                     return
         raise DeviceTimeout(
-            f"{self.name}: '{command.decode()}' was not confirmed within {_ATTEMPTS} times {_REPLY_S} s; "
-            "check supply and wiring, power it off and on"
+            f"{self.name}: '{command.decode()}' was not confirmed within {_ATTEMPTS} times {_REPLY_S} s",
+            "check supply and wiring, power it off and on",
         )
 
     def _first_frames(self) -> list[codec.Frame]:
@@ -138,8 +138,9 @@ class BotaSensor(StreamingSensor):
         while len(frames) < _FIRST_FRAMES:
             if time.monotonic() > deadline:
                 raise ConnectError(
-                    f"{self.name}: {len(frames)} intact frames within {_FIRST_FRAMES_S} s; check supply and wiring; a "
-                    "sensor that was left in set-up, in text mode or at another rate is put right by ?sinc=512"
+                    f"{self.name}: {len(frames)} intact frames within {_FIRST_FRAMES_S} s",
+                    "check supply and wiring; a sensor that was left in set-up, in text mode or at another rate is "
+                    "put right by ?sinc=512",
                 )
             frames += [codec.decode_frame(frame) for _, frame in self._frames.feed(self._port.read_all(1))]
         return frames
@@ -149,7 +150,7 @@ class BotaSensor(StreamingSensor):
         step_us = (t_us - self._t_us) % _CLOCK
         if step_us > _CLOCK // 2:
             raise StreamBroken(
-                f"{self.name}: the sensor's clock went back to {t_us} µs: it has restarted; open it again"
+                f"{self.name}: the sensor's clock went back to {t_us} µs: it has restarted", "open it again"
             )
         self._t_us += step_us
         if not step_us:
@@ -164,8 +165,8 @@ class BotaSensor(StreamingSensor):
         if status & (codec.RAW | codec.OVERRANGE | codec.INVALID):
             told = f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}"
             if status & codec.RAW:
-                raise DeviceFault(f"{told}: these are no newtons; ?sinc=512 configures it")
-            raise DeviceFault(f"{told}; take the load off, check the cable")
+                raise DeviceFault(f"{told}: these are no newtons", "?sinc=512 configures it")
+            raise DeviceFault(told, "take the load off, check the cable")
         if new := status & ~self._seen_status:
             log.warning("%s: status %s; measuring goes on", self.name, describe_status(new, codec.STATUS_BITS))
             self._seen_status |= new

@@ -83,7 +83,7 @@ class RobotiqFt300(StreamingSensor):
             return NOTHING
         counts = np.array([codec.decode_frame(frame) for _, frame in frames], np.int32)
         if (np.abs(counts + 0.5) > 32767).any():
-            raise DeviceFault(f"{self.name}: a value is at the end of its range; take the load off, check the cable")
+            raise DeviceFault(f"{self.name}: a value is at the end of its range", "take the load off, check the cable")
         self._watch_rate(t_host_ns, len(frames))
         n = len(frames)
         return FtSamples(

@@ -89,7 +89,9 @@ def decode_text(field: bytes) -> str:
     _expect_size(field)
     text = field[1:].split(b"\0")[0].strip()
     if not text or not all(0x20 <= byte < 0x7F for byte in text):
-        raise ProtocolError(f"the reply to command 0x{field[0]:02X} is no text: {field.hex(' ')}; power it off and on")
+        raise ProtocolError(
+            f"the reply to command 0x{field[0]:02X} is no text: {field.hex(' ')}", "power it off and on"
+        )
     return text.decode("ascii")
 
 
@@ -99,7 +101,7 @@ def decode_rate(field: bytes) -> int:
     for rate_Hz, code in RATE_CODES.items():
         if field[1] in {code, 0} and (field[1] or rate_Hz == 200):
             return rate_Hz
-    raise ProtocolError(f"the sensor tells output rate code {field[1]}, known are 0 to 8; power it off and on")
+    raise ProtocolError(f"the sensor tells output rate code {field[1]}, known are 0 to 8", "power it off and on")
 
 
 def check_set(field: bytes) -> None:
@@ -108,7 +110,7 @@ def check_set(field: bytes) -> None:
     if field[1] != 1:
         reason = _FAILURES.get(field[2], "unknown reason")
         cure = "leave rate out of its address, or power it off and on"
-        raise ProtocolError(f"the sensor refused command 0x{field[0]:02X}: {field[2]} ({reason}); {cure}")
+        raise ProtocolError(f"the sensor refused command 0x{field[0]:02X}: {field[2]} ({reason})", cure)
 
 
 def decode_sample(field: bytes) -> Sample:
@@ -131,7 +133,7 @@ def counts_per_unit(model: str) -> tuple[int, int]:
     if match is None or match[1] not in _COUNTS_PER_NM:
         known = ", ".join(f"RFT{number}" for number in _COUNTS_PER_NM)
         cure = "add its scale, from its manual, to drivers/robotous/codec.py"
-        raise ProtocolError(f"the scale of model '{model}' is not known, only those of {known}; {cure}")
+        raise ProtocolError(f"the scale of model '{model}' is not known, only those of {known}", cure)
     return COUNTS_PER_N, _COUNTS_PER_NM[match[1]]
 
 

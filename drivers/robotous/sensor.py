@@ -112,7 +112,7 @@ class RobotousSensor(StreamingSensor):
         overload = np.array([sample.overload for sample in samples], np.uint32)
         if axes := codec.overloaded_axes(int(np.bitwise_or.reduce(overload))):
             raise DeviceFault(
-                f"{self.name}: overload of {', '.join(axes)}; take the load off, then check the zero of the sensor"
+                f"{self.name}: overload of {', '.join(axes)}", "take the load off, then check the zero of the sensor"
             )
         counts = np.array([sample.counts for sample in samples], np.int32)
         return FtSamples(
@@ -146,6 +146,6 @@ class RobotousSensor(StreamingSensor):
                     if field.data[0] == command:
                         return field.data
         raise DeviceTimeout(
-            f"{self.name}: no answer to {command.name} after {_ATTEMPTS} attempts of {_REPLY_S} s; check supply, "
-            "wiring, bit rate and, on CAN, that the identifiers are the factory's"
+            f"{self.name}: no answer to {command.name} after {_ATTEMPTS} attempts of {_REPLY_S} s",
+            "check supply, wiring, bit rate and, on CAN, that the identifiers are the factory's",
         )

@@ -105,7 +105,7 @@ class UrArm(RobotArm):
             self._connect(control)
         except (StreamBroken, DeviceTimeout, DeviceFault) as error:
             self.close()
-            raise ConnectError(f"cannot open the arm at {self._host}: {error}") from error
+            raise ConnectError(f"cannot open the arm at {self._host}: {error.found}", error.cure) from error
         except BaseException:
             self.close()
             raise
@@ -141,20 +141,21 @@ class UrArm(RobotArm):
         major, minor = reader.version[:2]
         if minor < 4:
             raise ConnectError(
-                f"{self._host} runs PolyScope {major}.{minor}, which ur_rtde cannot control: update it to {major}.4 or "
-                f"later."
+                f"{self._host} runs PolyScope {major}.{minor}, which ur_rtde cannot control",
+                f"update it to {major}.4 or later",
             )
 
         def look_out() -> None:
             if fault := reader.look().safety_fault():
-                raise ConnectError(f"the arm at {self._host} cannot move: {fault}.")
+                raise ConnectError(f"the arm at {self._host} cannot move: {fault.found}", fault.cure)
 
         def prepare(dashboard: Dashboard) -> None:
             asks = major == 5 and minor > 5 and self._host not in _SIMULATORS
             if asks and not dashboard.isInRemoteControl():
                 raise ConnectError(
-                    f"{self._host} is not in remote control: press Local, Remote Control at the top right of the "
-                    f"pendant (enable it first under Settings, System, Remote Control)."
+                    f"{self._host} is not in remote control",
+                    "press Local, Remote Control at the top right of the pendant (enable it first under Settings, "
+                    "System, Remote Control)",
                 )
             if self._left_behind and reader.look().program_state != PROGRAM_STOPPED:
                 log.warning("ending the program of ours that was left on %s", self._host)
@@ -173,14 +174,14 @@ class UrArm(RobotArm):
             self._starting = False
         except (StreamBroken, DeviceTimeout) as error:
             look_out()  # ur_rtde seldom knows the reason
-            raise ConnectError(_advice(self._host, str(error))) from error
+            raise _refusal(self._host, error.found) from error
 
     def _claim_nothing_of_others(self) -> None:
         """Raise `ConnectError` when somebody else has the registers, before anything of theirs is stopped."""
         deadline = time.monotonic() + _RELEASE_S
         while taken := registers_in_use(self._host, CONTROL_REGISTERS, timeout_s=CONNECT_S):
             if time.monotonic() > deadline:
-                raise ConnectError(_taken(self._host, f"{taken[0]} and {len(taken) - 1} more"))
+                raise _taken(self._host, f"{taken[0]} and {len(taken) - 1} more")
             time.sleep(0.05)
 
     def _end_nothing_of_others(self, reader: Reader) -> None:
@@ -191,7 +192,8 @@ class UrArm(RobotArm):
                 told = self.program_told()
                 raise ConnectError(
                     f"a program that this one has not started is on {self._host}{f' ({told})' if told else ''} and is "
-                    f"not ended: stop it at the pendant, then start again."
+                    "not ended",
+                    "stop it at the pendant, then start again",
                 )
             time.sleep(0.02)
 
@@ -237,7 +239,8 @@ class UrArm(RobotArm):
         if not reader.tells_tcp and self._control is None:
             raise ConnectError(
                 f"the controller {self._host} is too old to tell its active TCP, without which its poses say nothing "
-                f"about the flange: update it, or take control of the arm, as a calibration does."
+                "about the flange",
+                "update it, or take control of the arm, as a calibration does",
             )
         return reader.state(lambda: self._in_control().call("tcp_offset"))
 
@@ -315,16 +318,16 @@ class UrArm(RobotArm):
         self._moves_at_rad_s = speed
         with self._stopping_on_error():
             if not control.call("move", q, speed, acceleration, look_out=self._look_out):
-                raise self._fault() or DeviceFault(f"the controller did not accept the move to {_degrees(q)}.")
+                raise self._fault() or DeviceFault(f"the controller did not accept the move to {_degrees(q)}")
             checked = time.monotonic()
             for look in self._watch(timeout_s, guard, f"the move to {_degrees(q)} has not ended"):
                 if self._stop_requested.is_set():
-                    raise DeviceFault("the arm was told to stop before it had arrived.")
+                    raise DeviceFault("the arm was told to stop before it had arrived")
                 ended, unwatched = control.call("progress", timeout_s=_PROGRESS_S, look_out=self._look_out)
                 if unwatched:
                     raise DeviceTimeout(
-                        f"nothing was heard from this program for {UNWATCHED_S} s of a move, so the arm was stopped: "
-                        f"keep the computer awake and give it less to do, then move on."
+                        f"nothing was heard from this program for {UNWATCHED_S} s of a move, so the arm was stopped",
+                        "keep the computer awake and give it less to do, then move on",
                     )
                 if not ended:
                     if time.monotonic() - checked > _OURS_EVERY_S:
@@ -335,8 +338,8 @@ class UrArm(RobotArm):
                 end = look if _near(look.target_q_rad, q) else self._reading().look()
                 if not _near(end.target_q_rad, q):
                     raise self._fault() or DeviceFault(
-                        f"the move ended at {_degrees(end.target_q_rad)} instead of {_degrees(q)}: see the pendant "
-                        f"for what ended it."
+                        f"the move ended at {_degrees(end.target_q_rad)} instead of {_degrees(q)}",
+                        "see the pendant for what ended it",
                     )
                 self._goal = q
                 return
@@ -379,8 +382,8 @@ class UrArm(RobotArm):
             yield look
             if time.monotonic() > deadline:
                 raise DeviceTimeout(
-                    f"{what} within {timeout_s:.1f} s; set-points are at {_degrees(look.target_q_rad)}: check the "
-                    f"speed slider, and whether something else moves the arm."
+                    f"{what} within {timeout_s:.1f} s; set-points are at {_degrees(look.target_q_rad)}",
+                    "check the speed slider, and whether something else moves the arm",
                 )
 
     def _look_out(self) -> Look:
@@ -400,7 +403,9 @@ class UrArm(RobotArm):
         while not look.safety_fault() and look.program_fault() and time.monotonic() < deadline:
             look = reader.look()  # the program may end some cycles before its reason is told
         fault = look.safety_fault() or look.program_fault()
-        return DeviceFault(f"the arm at {self._host} stopped: {fault}; then open the arm again.") if fault else None
+        if fault is None:
+            return None
+        return DeviceFault(f"the arm at {self._host} stopped: {fault.found}", f"{fault.cure}, then open the arm again")
 
     @contextmanager
     def _stopping_on_error(self) -> Iterator[None]:
@@ -459,7 +464,8 @@ class UrArm(RobotArm):
         if not self._is_ours(control, timeout_s=_OURS_S, look_out=self._look_out):
             raise self._fault() or DeviceFault(
                 f"the control program on {self._host} does not answer: another program may have been started, or "
-                "controller or computer are too busy; look at the pendant, then open the arm again."
+                "controller or computer are too busy",
+                "look at the pendant, then open the arm again",
             )
 
     def _is_ours(
@@ -480,15 +486,15 @@ class UrArm(RobotArm):
 
     def _in_control(self) -> ControlProcess:
         if self._control is None:
-            raise ConnectError(f"the arm at {self._host} was opened for reading only: open it with control.")
+            raise ConnectError(f"the arm at {self._host} was opened for reading only", "open it with control")
         if not self._control.alive:
-            raise StreamBroken(f"the control of {self._host} has ended: see to the robot, then open the arm again.")
+            raise StreamBroken(f"the control of {self._host} has ended", "see to the robot, then open the arm again")
         return self._control
 
     def _reading(self) -> Reader:
         reader = self._reader  # once: another thread may close the arm between two looks
         if reader is None:
-            raise ConnectError(f"the arm at {self._host} is not open: open it first.")
+            raise ConnectError(f"the arm at {self._host} is not open", "open it first")
         return reader
 
 
@@ -520,20 +526,23 @@ def _degrees(q_rad: Sequence[float]) -> str:
     return "(" + ", ".join(f"{math.degrees(angle):.1f}" for angle in q_rad) + ") degrees"
 
 
-def _advice(host: str, words: str) -> str:
+def _refusal(host: str, words: str) -> ConnectError:
     """Turn ur_rtde's words into what to do."""
     if "already in use" in words:
         return _taken(host, "registers")
     if "remote control" in words:
-        return f"{host} is not in remote control: press Local, Remote Control at the top right of the pendant."
-    return (
-        f"ur_rtde cannot control {host}: {words}. Check at the pendant that no message waits for an answer and that no "
-        f"other program starts by itself."
+        return ConnectError(
+            f"{host} is not in remote control", "press Local, Remote Control at the top right of the pendant"
+        )
+    return ConnectError(
+        f"ur_rtde cannot control {host}: {words}",
+        "check at the pendant that no message waits for an answer and that no other program starts by itself",
     )
 
 
-def _taken(host: str, what: str) -> str:
-    return (
-        f"another client controls {host} and holds its RTDE registers ({what}): end it, or disable EtherNet/IP, "
-        f"PROFINET and other fieldbuses on the controller; after a cut cable wait for half a minute."
+def _taken(host: str, what: str) -> ConnectError:
+    return ConnectError(
+        f"another client controls {host} and holds its RTDE registers ({what})",
+        "end it, or disable EtherNet/IP, PROFINET and other fieldbuses on the controller; after a cut cable wait for "
+        "half a minute",
     )

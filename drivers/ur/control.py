@@ -129,8 +129,8 @@ class ControlProcess:
                     continue
                 self.kill()
                 raise DeviceTimeout(
-                    f"ur_rtde did not answer within {timeout_s:.1f} s and its process was ended: check the robot and "
-                    f"the network, then open the arm again."
+                    f"ur_rtde did not answer within {timeout_s:.1f} s and its process was ended",
+                    "check the robot and the network, then open the arm again",
                 ) from None
             if reply is None:
                 self._replies.put(None)  # for whoever asks next
@@ -138,18 +138,16 @@ class ControlProcess:
             if reply["id"] != to:
                 continue  # the answer to a call that was interrupted
             if "error" in reply:
-                cure = (
-                    ": check the robot and the cable, then open the arm again." if to else ""
-                )  # at the start: `UrArm`
-                raise StreamBroken(f"ur_rtde says: {reply['error']}{cure}")
+                cure = "check the robot and the cable, then open the arm again" if to else ""  # at the start: `UrArm`
+                raise StreamBroken(f"ur_rtde says: {reply['error']}", cure)
             return reply["value"]
 
     def _loss(self) -> StreamBroken:
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(0.2)  # its pipe may close a moment before it is dead
         return StreamBroken(
-            f"the process that controls {self._host} ended (exit code {self._process.returncode}): check the robot, "
-            f"then open the arm again."
+            f"the process that controls {self._host} ended (exit code {self._process.returncode})",
+            "check the robot, then open the arm again",
         )
 
     def _read_replies(self, pipe: IO[str]) -> None:

@@ -21,7 +21,7 @@ T = TypeVar("T")
 FREQUENCY_HZ: Final = 125.0
 """A quarter of the CPU that 500 Hz costs, and a fault is still seen within 10 ms."""
 _NO_DASHBOARD: Final = (
-    "enable the dashboard server at the pendant under Settings, Security, Services; restart the controller if it is."
+    "enable the dashboard server at the pendant under Settings, Security, Services; restart the controller if it is"
 )
 
 _VARIABLES: Final = [  # only names ur_rtde can parse: it would read everything after an unknown one at the wrong place
@@ -114,7 +114,7 @@ def connect_receive(host: str) -> Receive:
         return cast(Receive, _load("rtde_receive").RTDEReceiveInterface(host, FREQUENCY_HZ, _VARIABLES))
     except (RuntimeError, ValueError) as error:
         raise ConnectError(
-            f"ur_rtde cannot read from {host}: {error}. Restart the controller if this stays."
+            f"ur_rtde cannot read from {host}: {error}", "restart the controller if this stays"
         ) from error
 
 
@@ -136,12 +136,13 @@ def ask_dashboard(host: str, ask: Callable[[Dashboard], T], *, timeout_s: float,
     try:
         return _in_background(session).result(timeout_s)
     except RuntimeError as error:
-        raise NoDashboard(f"the dashboard server of {host} says: {str(error).rstrip('.')}: {_NO_DASHBOARD}") from error
+        raise NoDashboard(f"the dashboard server of {host} says: {str(error).rstrip('.')}", _NO_DASHBOARD) from error
     except DriverError:  # of what was asked; one of them is a TimeoutError too
         raise
     except TimeoutError as error:
-        words = f"the dashboard server of {host} did not answer within {timeout_s:.1f} s"
-        raise NoDashboard(f"{words}: {_NO_DASHBOARD}") from error
+        raise NoDashboard(
+            f"the dashboard server of {host} did not answer within {timeout_s:.1f} s", _NO_DASHBOARD
+        ) from error
 
 
 def retire(receive: Receive) -> None:
@@ -172,6 +173,6 @@ def _load(name: str) -> _Module:
     except ImportError as error:
         raise ConnectError(
             f"ur_rtde is not installed for Python {platform.python_version()} on {platform.system()} "
-            f"{platform.machine()} ({error}): install ftdrive with CPython 3.11 or 3.12 on 64-bit x86 Linux, for which "
-            f"ur_rtde has wheels."
+            f"{platform.machine()} ({error})",
+            "install ftdrive with CPython 3.11 or 3.12 on 64-bit x86 Linux, for which ur_rtde has wheels",
         ) from error

@@ -68,12 +68,12 @@ _SAFETY_MODES: Final = {
     11: "undefined",
 }
 _SAFETY: Final = (  # the first that applies says most
-    (0b0_1110_0000, "emergency stop: make the cell safe, release the button, power the arm on at the pendant"),
-    (0b0_0000_0100, "protective stop: find and remove its cause, then clear it at the pendant"),
-    (0b0_0001_0000, "safeguard stop: close the safeguard and reset it"),
-    (0b0_0000_1000, "recovery mode: move the arm back inside its limits at the pendant"),
-    (0b11_0000_0000, "safety violation or fault: read the pendant's log and restart the arm"),
-    (0b100_0000_0000, "stop for a safety reason: read the pendant's log"),
+    (0b0_1110_0000, "emergency stop", "make the cell safe, release the button, power the arm on at the pendant"),
+    (0b0_0000_0100, "protective stop", "find and remove its cause, then clear it at the pendant"),
+    (0b0_0001_0000, "safeguard stop", "close the safeguard and reset it"),
+    (0b0_0000_1000, "recovery mode", "move the arm back inside its limits at the pendant"),
+    (0b11_0000_0000, "safety violation or fault", "read the pendant's log and restart the arm"),
+    (0b100_0000_0000, "stop for a safety reason", "read the pendant's log"),
 )
 
 
@@ -92,26 +92,29 @@ class Look:
     safety_bits: int
     program_state: int
 
-    def safety_fault(self) -> str | None:
+    def safety_fault(self) -> DeviceFault | None:
         """Say why the arm may not move, as far as the arm itself is concerned."""
         return _safety_fault(self.safety_bits, self.robot_mode)
 
-    def program_fault(self) -> str | None:
+    def program_fault(self) -> DeviceFault | None:
         """Say why our program on the controller does not move the arm."""
         if self.program_state == PROGRAM_PLAYING:
             return None
         state = _PROGRAM_STATES.get(self.program_state, "unknown")
-        return f"the control program was ended or paused by somebody else (state {self.program_state}, {state})"
+        return DeviceFault(
+            f"the control program was ended or paused by somebody else (state {self.program_state}, {state})",
+            "leave the arm to this program",
+        )
 
 
-def _safety_fault(safety_bits: int, robot_mode: int) -> str | None:
-    for bits, meaning in _SAFETY:
+def _safety_fault(safety_bits: int, robot_mode: int) -> DeviceFault | None:
+    for bits, meaning, cure in _SAFETY:
         if safety_bits & bits:
-            return f"{meaning} (safety status bits 0x{safety_bits:x})"
+            return DeviceFault(f"{meaning} (safety status bits 0x{safety_bits:x})", cure)
     if robot_mode != ROBOT_RUNNING:
         mode = _ROBOT_MODES.get(robot_mode, "unknown")
         cure = "release its brakes" if robot_mode == ROBOT_IDLE else "power the arm on and release its brakes"
-        return f"robot mode {robot_mode} ({mode}): {cure} at the pendant"
+        return DeviceFault(f"robot mode {robot_mode} ({mode})", f"{cure} at the pendant")
     return None
 
 
@@ -140,12 +143,12 @@ class Reader:
         major = self.version[0]
         if major > 5:
             raise ConnectError(
-                f"{self._host} runs PolyScope X (version {major}), which has no dashboard server to stop the arm "
-                f"with: PolyScope 5 or the CB3 generation is needed."
+                f"{self._host} runs PolyScope X (version {major}), which has no dashboard server to stop the arm with",
+                "PolyScope 5 or the CB3 generation is needed",
             )
 
         if lacking := sorted(self._live.missing - _YOUNGER):
-            raise ConnectError(f"{self._host} does not tell {', '.join(lacking)} over RTDE: update its PolyScope.")
+            raise ConnectError(f"{self._host} does not tell {', '.join(lacking)} over RTDE", "update its PolyScope")
 
         def ask(dashboard: Dashboard) -> tuple[str, str, str]:
             told = dashboard.getRobotModel().strip()
@@ -160,11 +163,12 @@ class Reader:
         says = model_named(told, major)
         if model is None and says is None:
             raise ModelUnknown(
-                f"{self._host} says {told!r} to the question for its model, which is no known one (CB3 before "
-                f"3.12 and e-Series before 5.6 do not tell it): name the model of the arm."
+                f"{self._host} says {told!r} to the question for its model, which is no known one (CB3 before 3.12 "
+                "and e-Series before 5.6 do not tell it)",
+                "name the model of the arm",
             )
         if model is not None and says is not None and MODELS[says] != MODELS[model]:
-            raise ConnectError(f"{self._host} is a {says}, not a {model}: check the address and the model.")
+            raise ConnectError(f"{self._host} is a {says}, not a {model}", "check the address and the model")
         return DeviceInfo(model=model or says or told, serial=serial, firmware=polyscope)
 
     @property
@@ -217,8 +221,8 @@ class Reader:
         while (look := self._newest()).t_device_s < since_s:
             if silent_s > limit_s:
                 raise DeviceTimeout(
-                    f"samples of {self._host} have stayed away for {silent_s:.2f} s: check the robot and the network, "
-                    f"and press the emergency stop if the arm moves."
+                    f"samples of {self._host} have stayed away for {silent_s:.2f} s",
+                    "check the robot and the network, and press the emergency stop if the arm moves",
                 )
             t0 = time.monotonic()
             time.sleep(0.001)
@@ -229,7 +233,7 @@ class Reader:
         receive = self._receive
         if receive is None or not receive.isConnected():
             raise StreamBroken(
-                f"the connection to {self._host} was lost: check the robot and the cable, then open the arm again."
+                f"the connection to {self._host} was lost", "check the robot and the cable, then open the arm again"
             )
         self._live.check()
         for _ in range(100):  # ur_rtde has no snapshot: read again when a new sample came in between
@@ -248,7 +252,7 @@ class Reader:
             )
             if receive.getTimestamp() == t_device_s:
                 return look
-        raise DeviceTimeout(f"no consistent sample of {self._host} could be read: this computer is too busy.")
+        raise DeviceTimeout(f"no consistent sample of {self._host} could be read", "give this computer less to do")
 
     def state(self, ask_tcp: Callable[[], Sequence[float]]) -> ArmState:
         """Read a state; `ask_tcp` tells the TCP offset (6,) where the controller does not. Errors as `UrArm.state`."""
@@ -259,9 +263,9 @@ class Reader:
             if tuple(before) == tuple(after):  # so this TCP was active when the pose was taken
                 break
         else:
-            raise DeviceFault(f"the TCP of {self._host} changes all the time: find out what sets it.")
-        if look.robot_mode not in _MEASURING:
-            raise DeviceFault(f"{self._host} does not measure its joints: {look.safety_fault()}.")
+            raise DeviceFault(f"the TCP of {self._host} changes all the time", "find out what sets it")
+        if look.robot_mode not in _MEASURING and (fault := look.safety_fault()):
+            raise DeviceFault(f"{self._host} does not measure its joints: {fault.found}", fault.cure)
         flange = Pose.from_ur(look.tcp_pose) @ Pose.from_ur(before).inverse()
         self._check_model(look, flange)
         return ArmState(
@@ -287,5 +291,6 @@ class Reader:
             raise DeviceFault(
                 f"the flange is {1e3 * distance_m:.1f} mm and {math.degrees(angle_rad):.2f} degrees from where a "
                 f"{self.info.model} has it with these joint angles: the arm at {self._host} is another model, or its "
-                f"TCP was changed this moment; check both and read again."
+                "TCP was changed this moment",
+                "check both and read again",
             )

@@ -10,6 +10,7 @@ Checked on hardware: no.
 """
 
 import contextlib
+import copy
 import logging
 import socket
 import struct
@@ -76,7 +77,9 @@ def take_package(buffer: bytearray) -> tuple[int, bytes] | None:
         return None
     size, kind = _HEADER.unpack_from(buffer)
     if size < _HEADER.size:
-        raise ProtocolError(f"RTDE package of {size} bytes, at least {_HEADER.size} expected: is this an RTDE server?")
+        raise ProtocolError(
+            f"RTDE package of {size} bytes, at least {_HEADER.size} expected", "is this an RTDE server?"
+        )
     if len(buffer) < size:
         return None
     payload = bytes(buffer[_HEADER.size : size])
@@ -193,22 +196,23 @@ class Subscription:
             self._connection = _Connection(socket.create_connection((host, PORT), timeout=timeout_s))
         except OSError as error:
             raise Unreachable(
-                f"{where} cannot be reached ({error}): check the address and the cable, that the robot controller is "
-                f"switched on, and that no firewall stands between."
+                f"{where} cannot be reached ({error})",
+                "check the address and the cable, that the robot controller is switched on, and that no firewall "
+                "stands between",
             ) from error
         try:
             self._greet(outputs, frequency_Hz, time.monotonic() + timeout_s)
         except TimeoutError as error:
             self.close()
             raise ConnectError(
-                f"{where} accepts the connection but did not answer within {timeout_s:.1f} s: check that this is a "
-                f"robot controller and that it has finished starting."
+                f"{where} accepts the connection but did not answer within {timeout_s:.1f} s",
+                "check that this is a robot controller and that it has finished starting",
             ) from error
         except (OSError, ProtocolError, StreamBroken) as error:
             self.close()
             raise ConnectError(
-                f"{where} does not speak RTDE ({error}): check that this is a robot controller and that RTDE is "
-                f"enabled under Settings, Security, Services."
+                f"{where} does not speak RTDE ({error})",
+                "check that this is a robot controller and that RTDE is enabled under Settings, Security, Services",
             ) from error
 
     def read(self, timeout_s: float | None) -> list[tuple[float, ...]]:
@@ -265,9 +269,9 @@ def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float) -> 
         finally:
             connection.close()
     except TimeoutError as error:
-        raise DeviceTimeout(f"{host}:{PORT} did not answer within {timeout_s:.1f} s: check the robot.") from error
+        raise DeviceTimeout(f"{host}:{PORT} did not answer within {timeout_s:.1f} s", "check the robot") from error
     except OSError as error:
-        raise StreamBroken(f"{host}:{PORT} was lost ({error}): check the robot and the cable.") from error
+        raise StreamBroken(f"{host}:{PORT} was lost ({error})", "check the robot and the cable") from error
     return [name for name, kind in zip(names, recipe.types, strict=False) if kind == "IN_USE"]
 
 
@@ -277,8 +281,8 @@ def find_script_port(host: str, *, timeout_s: float) -> None:
         socket.create_connection((host, SCRIPT_PORT), timeout=timeout_s).close()
     except OSError as error:
         raise ConnectError(
-            f"{host}:{SCRIPT_PORT}, which takes programs, cannot be reached ({error}): enable the real-time client "
-            f"interface under Settings, Security, Services, and look for a firewall between."
+            f"{host}:{SCRIPT_PORT}, which takes programs, cannot be reached ({error})",
+            "enable the real-time client interface under Settings, Security, Services, and look for a firewall between",
         ) from error
 
 
@@ -389,8 +393,8 @@ class LiveReader:
                     self.silent = True
                     stands = "" if self._newest is None else f" at {self._newest.t_device_s:.3f} s"
                     raise DeviceTimeout(
-                        f"the clock of {self._host} has stood still{stands} for {silent_s:.2f} s: check the robot and "
-                        f"the network, and press the emergency stop if the arm moves."
+                        f"the clock of {self._host} has stood still{stands} for {silent_s:.2f} s",
+                        "check the robot and the network, and press the emergency stop if the arm moves",
                     )
                 t0 = time.monotonic()
                 self._changed.wait(0.02)
@@ -400,7 +404,7 @@ class LiveReader:
     def check(self) -> None:
         """Raise what ended the stream, if it has ended."""
         if self._failure:
-            raise type(self._failure)(str(self._failure)) from self._failure
+            raise copy.copy(self._failure) from self._failure
 
     def _run(self, stream: Subscription) -> None:
         """Follow the stream until it ends; what ended it is raised to whoever asks."""
@@ -418,8 +422,8 @@ class LiveReader:
                     self._changed.notify_all()
         except (OSError, StreamBroken) as error:
             failure: DriverError = StreamBroken(
-                f"the RTDE connection to {self._host} was lost ({error}): check the robot and the cable, then open "
-                f"the arm again."
+                f"the RTDE connection to {self._host} was lost ({error})",
+                "check the robot and the cable, then open the arm again",
             )
         except ProtocolError as error:
             failure = error

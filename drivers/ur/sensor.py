@@ -71,8 +71,8 @@ class UrWristSensor(StreamingSensor):
         version = ".".join(map(str, self._stream.version))
         if self._stream.missing:
             raise ConnectError(
-                f"{self.name}: PolyScope {version} does not tell {', '.join(self._stream.missing)}; it needs an "
-                "e-Series arm with PolyScope 5.9 or later"
+                f"{self.name}: PolyScope {version} does not tell {', '.join(self._stream.missing)}",
+                "it needs an e-Series arm with PolyScope 5.9 or later",
             )
         self._seq: int | None = None
         self._nominal_Hz = _RATE_Hz
@@ -93,7 +93,7 @@ class UrWristSensor(StreamingSensor):
             return NOTHING
         except (OSError, StreamBroken) as exc:
             raise StreamBroken(
-                f"{self.name}: the connection was lost ({exc}); check the robot and the cable, then open it again"
+                f"{self.name}: the connection was lost ({exc})", "check the robot and the cable, then open it again"
             ) from exc
         t_host_ns = time.monotonic_ns()
         if not (math.isfinite(t_device_s) and all(map(math.isfinite, raw))):
@@ -102,7 +102,7 @@ class UrWristSensor(StreamingSensor):
         if self._seq is not None:
             if seq <= self._seq:
                 raise StreamBroken(
-                    f"{self.name}: the controller's clock went back to {t_device_s:.3f} s; open it again"
+                    f"{self.name}: the controller's clock went back to {t_device_s:.3f} s", "open it again"
                 )
             self._lost += seq - self._seq - 1
         self._seq = seq

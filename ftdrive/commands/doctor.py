@@ -150,14 +150,14 @@ def _registers(host: str) -> Check:
     try:
         return diagnosis.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=CONNECT_S))
     except DriverError as error:
-        return Check("robot.registers", "failed", *diagnosis.found_and_cure(error, f"ping {host}"))
+        return Check("robot.registers", "failed", error.found, error.cure or f"ping {host}")
 
 
 def _script_port(host: str) -> Check:
     try:
         find_script_port(host, timeout_s=CONNECT_S)
     except DriverError as error:
-        return Check("robot.programs", "failed", *diagnosis.found_and_cure(error, f"ping {host}"))
+        return Check("robot.programs", "failed", error.found, error.cure or f"ping {host}")
     return Check("robot.programs", "ok", f"port {SCRIPT_PORT}, which takes programs, is open")
 
 
@@ -168,7 +168,7 @@ def _flange(arm: RobotArm, status: ArmStatus) -> Check:
     try:
         p_mm = 1e3 * arm.state().p_base_flange_m
     except DriverError as error:
-        return Check(name, "failed", *diagnosis.found_and_cure(error, "check the robot and the network"))
+        return Check(name, "failed", error.found, error.cure or "check the robot and the network")
     where = ", ".join(f"{value:.0f}" for value in p_mm)
     return Check(name, "ok", f"TCP told; the flange is at ({where}) mm in base, where the model has it")
 
@@ -183,7 +183,7 @@ def _clock(arm: RobotArm) -> Check:
             host_ns.append(status.t_host_ns)
             device_s.append(status.t_device_s)
     except DriverError as error:
-        return Check("clock.pace", "failed", *diagnosis.found_and_cure(error, "check the robot and the network"))
+        return Check("clock.pace", "failed", error.found, error.cure or "check the robot and the network")
     return diagnosis.check_clock(host_ns, device_s)
 
 

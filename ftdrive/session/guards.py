@@ -399,11 +399,11 @@ def out_of_sight(error: DriverError, *, moving: bool) -> Tripped:
     """Row 16: nobody sees the arm any more. On its way it may not hear the stop either."""
     if not moving:
         return Tripped(16, error)
-    words = (
-        f"{str(error).rstrip('.')}. It was told to stop, but may not have heard it: then it ends the one move it was "
-        "given, which is proven clear, and goes no further"
+    found = (
+        f"{error.found}; the arm was told to stop, but may not have heard it: then it ends the one move it was given, "
+        "which is proven clear, and goes no further"
     )
-    return Tripped(16, type(error)(words))
+    return Tripped(16, type(error)(found, error.cure))
 
 
 def by_safety(status: ArmStatus, words: str) -> Tripped:

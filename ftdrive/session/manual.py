@@ -192,9 +192,10 @@ class _Collection:
     def _may_measure(self) -> bool:
         """Tell whether a standstill now is one to measure at."""
         status = self._arm.status()
-        if status.fault and status.fault != self._fault:
-            self._note(f"Nothing is measured: {status.fault}.", warning=True)
-        self._fault = status.fault
+        fault = str(status.fault or "")
+        if fault and fault != self._fault:
+            self._note(f"Nothing is measured: {fault}.", warning=True)
+        self._fault = fault
         if self._listen:
             self._program_ran |= status.program == "playing"
             self._program = status.program if self._program_ran else ""

@@ -93,7 +93,7 @@ class FakeArm(RobotArm):
 
     def lose_power(self) -> None:
         """An emergency stop, of which the joints tell before the status does."""
-        self.gone_status = {"fault": "emergency stop: …", "safety_mode": "robot emergency stop"}
+        self.gone_status = {"fault": DeviceFault("emergency stop", "…"), "safety_mode": "robot emergency stop"}
         self.gone = DeviceFault("the joints are not measured")
 
     def power_up(self) -> None:

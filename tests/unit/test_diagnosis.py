@@ -81,7 +81,7 @@ def test_a_ready_arm() -> None:
 @pytest.mark.parametrize(
     ("different", "name", "state", "words"),
     [
-        ({"fault": "protective stop: clear it"}, "robot.safety", "failed", "clear it"),
+        ({"fault": DeviceFault("protective stop", "clear it")}, "robot.safety", "failed", "clear it"),
         ({"safety_mode": "reduced"}, "robot.safety", "warning", "calibrate asks"),
         ({"program": "playing"}, "robot.program", "warning", "does not begin beside it"),
         ({"payload_kg": 0.0}, "robot.payload", "failed", "at the pendant"),
@@ -271,16 +271,16 @@ ALLOWED = Check("permissions.port", "ok", "may be read and written")
 FORBIDDEN = Check("permissions.port", "failed", "may not", "sudo usermod")
 
 
-def wrapped(error: Exception) -> ConnectError:
+def wrapped(error: DriverError) -> ConnectError:
     """As a driver tells what went wrong while it was opened."""
-    outer = ConnectError(str(error))
+    outer = ConnectError(error.found, error.cure)
     outer.__cause__ = error
     return outer
 
 
-def not_opened(words: str) -> ConnectError:
+def not_opened(found: str, cure: str = "") -> ConnectError:
     """As a driver tells that the system refused its port."""
-    outer = ConnectError(words)
+    outer = ConnectError(found, cure)
     outer.__cause__ = OSError(13, "Permission denied")
     return outer
 
@@ -289,36 +289,40 @@ def not_opened(words: str) -> ConnectError:
     ("error", "found", "cure"),
     [
         (
-            ConnectError("sensor: serial number A answers, B is configured; check the address, or its option serial"),
+            ConnectError("sensor: serial number A answers, B is configured", "check the address, or its option serial"),
             "sensor: serial number A answers, B is configured",
             "check the address, or its option serial",
         ),
         (
-            wrapped(ProtocolError("this calibration slot is empty (counts per unit 0 and 0); choose another")),
+            wrapped(ProtocolError("this calibration slot is empty (counts per unit 0 and 0)", "choose another")),
             "this calibration slot is empty (counts per unit 0 and 0)",
             "choose another",
         ),
         (
-            DeviceFault("sensor: status 0x0008 (bit 3: raw): these are no newtons; ?sinc=512 configures it"),
+            DeviceFault("sensor: status 0x0008 (bit 3: raw): these are no newtons", "?sinc=512 configures it"),
             "sensor: status 0x0008 (bit 3: raw): these are no newtons",
             "?sinc=512 configures it",
         ),
         (
-            StreamBroken("sensor: silent for 0.4 s; check cable; try again"),
+            StreamBroken("sensor: silent for 0.4 s", "check cable; try again"),
             "sensor: silent for 0.4 s",
             "check cable; try again",
         ),
         (
-            ProtocolError("sensor: no reply (closed (x; y); z); check wiring"),
+            ProtocolError("sensor: no reply (closed (x; y); z)", "check wiring"),
             "sensor: no reply (closed (x; y); z)",
             "check wiring",
         ),
         (
-            Frozen("sensor: frozen, 50 samples; power it off and on"),
+            Frozen("sensor: frozen, 50 samples", "power it off and on"),
             "sensor: frozen, 50 samples",
             "power it off and on",
         ),
-        (ConnectError("H:30004 cannot be reached (x: y): ask; look."), "H:30004 cannot be reached (x: y)", "ask; look"),
+        (
+            ConnectError("H:30004 does not speak RTDE (x; y)", "ask; look"),
+            "H:30004 does not speak RTDE (x; y)",
+            "ask; look",
+        ),
     ],
 )
 @pytest.mark.parametrize("address", [PORT, BY_NETWORK, BY_PCAN])
@@ -333,7 +337,7 @@ def test_the_cure_that_a_message_names_is_the_one_shown(
     ("address", "ask"), [(PORT, "ftdrive devices --probe "), (BY_NETWORK, "ping ")], ids=["serial port", "network"]
 )
 def test_to_the_cure_of_a_silence_belongs_how_to_see_who_answers(address: SensorAddress, ask: str) -> None:
-    check = diagnosis.check_sensor_error("sensor.stream", DeviceTimeout("silent; check cable"), address, [ALLOWED])
+    check = diagnosis.check_sensor_error("sensor.stream", DeviceTimeout("silent", "check cable"), address, [ALLOWED])
     assert str(check.fix).startswith("check cable; see whom the address reaches: " + ask)
 
 
@@ -341,12 +345,12 @@ def test_to_the_cure_of_a_silence_belongs_how_to_see_who_answers(address: Sensor
     ("error", "address", "permission", "cure"),
     [
         (not_opened("the port does not open"), PORT, FORBIDDEN, "sudo usermod"),
-        (not_opened("the port does not open (13); is it plugged in?"), PORT, FORBIDDEN, "sudo usermod"),
-        (DeviceTimeout("silent for 0.4 s; check cable and supply"), PORT, FORBIDDEN, "sudo usermod"),
-        (StreamBroken("the port is gone (x); plug it in"), PORT, FORBIDDEN, "sudo usermod"),
+        (not_opened("the port does not open (13)", "is it plugged in?"), PORT, FORBIDDEN, "sudo usermod"),
+        (DeviceTimeout("silent for 0.4 s", "check cable and supply"), PORT, FORBIDDEN, "sudo usermod"),
+        (StreamBroken("the port is gone (x)", "plug it in"), PORT, FORBIDDEN, "sudo usermod"),
         (ConnectError("no port that may be read and written"), PORT, FORBIDDEN, "sudo usermod"),
-        (ConnectError("serial number A answers; check the address"), PORT, FORBIDDEN, "check the address"),
-        (wrapped(ProtocolError("slot 3 is empty; choose another")), PORT, FORBIDDEN, "choose another"),
+        (ConnectError("serial number A answers", "check the address"), PORT, FORBIDDEN, "check the address"),
+        (wrapped(ProtocolError("slot 3 is empty", "choose another")), PORT, FORBIDDEN, "choose another"),
         (ConnectError("does not open"), PORT, ALLOWED, "ftdrive devices --probe /dev/ttyUSB7"),
         (DeviceTimeout("silent"), PORT, ALLOWED, "supply and cable, then ftdrive devices --probe /dev/ttyUSB7"),
         (DeviceTimeout("silent"), BY_NETWORK, ALLOWED, "supply and cable, then ping 192.168.1.1"),
@@ -362,23 +366,21 @@ def test_another_cure_is_shown_where_the_way_to_a_sensor_is_wrong_or_its_message
     error: DriverError, address: SensorAddress, permission: Check, cure: str
 ) -> None:
     found = diagnosis.check_sensor_error("sensor.stream", error, address, [permission])
-    assert (found.name, found.state, found.found) == ("sensor.stream", "failed", diagnosis.found_and_cure(error, "")[0])
+    assert (found.name, found.state, found.found) == ("sensor.stream", "failed", error.found)
     assert cure in str(found.fix)
 
 
 def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable() -> None:
-    error = PortInUse("sensor: the port is in use by another program; end it, `fuser -v /dev/ttyUSB7` names it")
+    error = PortInUse("sensor: the port is in use by another program", "end it, `fuser -v /dev/ttyUSB7` names it")
     found = diagnosis.check_sensor_error("sensor.identity", error, PORT, [FORBIDDEN])
     assert found.found == "sensor: the port is in use by another program"
     assert found.fix == "end it, `fuser -v /dev/ttyUSB7` names it"
 
 
-def test_an_arm_whose_sentence_names_no_cure_gets_one() -> None:
-    assert diagnosis.found_and_cure(StreamBroken("H:30004 was lost (x: y): check the robot."), "-") == (
-        "H:30004 was lost (x: y)",
-        "check the robot",
-    )
-    assert diagnosis.found_and_cure(StreamBroken("gone."), "look") == ("gone", "look")
+@pytest.mark.parametrize(("own", "shown"), [("check the robot", "check the robot"), ("", "ping ur5")])
+def test_the_error_of_an_arm_that_names_no_cure_gets_one(own: str, shown: str) -> None:
+    check = diagnosis.check_unreachable(StreamBroken("ur5:30004 was lost (x; y)", own), "ur5")
+    assert (check.found, check.fix) == ("ur5:30004 was lost (x; y)", shown)
 
 
 @pytest.mark.parametrize(("firmware", "state"), [("5.3.1.64192", "failed"), ("5.4.0", "ok"), ("3.15.8", "ok")])
@@ -398,7 +400,7 @@ def test_a_polyscope_that_cannot_be_controlled(firmware: str, state: str) -> Non
     ],
 )
 def test_an_arm_that_is_not_reached(cause: OSError, cure: str) -> None:
-    error = Unreachable(f"ur5:30004 cannot be reached ({cause}): check the address and the cable.")
+    error = Unreachable(f"ur5:30004 cannot be reached ({cause})", "check the address and the cable")
     error.__cause__ = cause
     check = diagnosis.check_unreachable(error, "ur5")
     assert (check.name, check.state) == ("robot.reachable", "failed")
@@ -407,7 +409,7 @@ def test_an_arm_that_is_not_reached(cause: OSError, cure: str) -> None:
 
 def test_what_a_dashboard_server_says_is_not_lost() -> None:
     error = NoDashboard(
-        "the dashboard server of ur5 says: Timeout connecting to UR dashboard server: enable the dashboard server."
+        "the dashboard server of ur5 says: Timeout connecting to UR dashboard server", "enable the dashboard server"
     )
     check = diagnosis.check_unreachable(error, "ur5")
     assert check.found == "the dashboard server of ur5 says: Timeout connecting to UR dashboard server"

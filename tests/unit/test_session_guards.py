@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.errors import DeviceTimeout
+from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.interfaces import ArmState, ArmStatus
 from ftdrive.planning.arm_model import ArmModel, Cylinder
 from ftdrive.planning.certify import Certifier
@@ -127,7 +127,7 @@ def test_settings_changed_on_the_way_are_seen() -> None:
     ("different", "hazard"),
     [
         ({"fault": "protective stop: …", "safety_mode": "protective stop"}, 10),
-        ({"fault": "emergency stop: …", "safety_mode": "robot emergency stop"}, 11),
+        ({"fault": DeviceFault("emergency stop", "…"), "safety_mode": "robot emergency stop"}, 11),
         ({"fault": "safeguard stop: …", "safety_mode": "safeguard stop"}, 11),
         ({"fault": "recovery mode: …", "safety_mode": "recovery"}, 12),
         ({"fault": "robot mode 5 (idle): …", "robot_mode": "idle"}, 12),
@@ -143,20 +143,21 @@ def test_every_stop_and_change_of_the_controller_is_seen_at_once(different: dict
 
 
 def test_a_protective_stop_is_told_with_the_payload_that_may_have_caused_it() -> None:
-    stopped = replace(STATUS, fault="protective stop: …", safety_mode="protective stop")
+    stopped = replace(STATUS, fault=DeviceFault("protective stop", "…"), safety_mode="protective stop")
     assert "payload or centre of mass (it was told 1.50 kg)" in str(Looks(SafetyGuard()).trip(status=stopped))
     untold = str(Looks(SafetyGuard()).trip(status=replace(stopped, payload_kg=None)))
     assert untold.endswith("payload or centre of mass")
-    braked = replace(STATUS, fault="emergency stop: …", safety_mode="robot emergency stop")
+    braked = replace(STATUS, fault=DeviceFault("emergency stop", "…"), safety_mode="robot emergency stop")
     assert "payload" not in str(Looks(SafetyGuard()).trip(status=braked))
 
 
 def test_an_arm_out_of_sight_may_be_ending_its_move() -> None:
-    lost = DeviceTimeout("the clock stands still.")
+    lost = DeviceTimeout("the clock stands still", "check the robot")
     under_way, standing = out_of_sight(lost, moving=True), out_of_sight(lost, moving=False)
     assert (under_way.hazard, standing.hazard) == (16, 16)
     assert isinstance(under_way.error, DeviceTimeout)
-    assert "stands still. It was told to stop, but may not have heard it: then it ends the one move" in str(under_way)
+    assert "stands still; the arm was told to stop, but may not have heard it: then it ends the one" in str(under_way)
+    assert under_way.error.cure == "check the robot"
     assert str(standing) == str(lost)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.errors import ConnectError
+from drivers.errors import ConnectError, DeviceFault
 from ftdrive.errors import Declined
 from ftdrive.session.events import GuardTripped, Noted, State, StateChanged
 from ftdrive.session.operator import Key
@@ -32,7 +32,7 @@ def press_and_release(lab: Lab, mode: str = "robot emergency stop") -> None:
             time.sleep(0.005)
 
     lab.arm.at_look = count
-    lab.arm.set_status(fault="a stop", safety_mode=mode)
+    lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode=mode)
     wait()
     lab.arm.set_status()
     wait()
@@ -154,7 +154,7 @@ def test_the_questions_come_until_they_are_all_answered_with_yes(lab: Lab) -> No
 def test_an_emergency_stop_that_is_still_pressed_is_refused_and_asked_about_once_released(lab: Lab) -> None:
     pause_on_the_way(lab, 4)
     lab.operator.answers["Type resume"] = ["resume", "resume"]
-    pressed_then_not = iter([{"fault": "a stop", "safety_mode": "robot emergency stop"}, {}])
+    pressed_then_not = iter([{"fault": DeviceFault("a stop"), "safety_mode": "robot emergency stop"}, {}])
     when_asked(lab, "Type resume", lambda: lab.arm.set_status(**next(pressed_then_not)))
     assert lab.calibrate() is not None
     (refused,) = [event.words for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
@@ -165,7 +165,7 @@ def test_an_emergency_stop_that_is_still_pressed_is_refused_and_asked_about_once
 
 @pytest.mark.parametrize("words", ["Is the tool free", "the way to pose 4"])
 def test_an_emergency_stop_that_is_pressed_at_a_question_counts_too(words: str, lab: Lab) -> None:
-    lab.arm.at_move[4] = lambda: lab.arm.set_status(fault="a stop", safety_mode="safeguard stop")
+    lab.arm.at_move[4] = lambda: lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode="safeguard stop")
     lab.operator.answers["Type resume"] = ["resume", "resume"]
     when_asked(lab, "Type resume", lab.arm.set_status)
     moves: list[int] = []

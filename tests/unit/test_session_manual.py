@@ -13,7 +13,7 @@ from calib import solve
 from calib.errors import TooFewSamples
 from calib.model import Array
 from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
-from drivers.errors import StreamBroken
+from drivers.errors import DeviceFault, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
 from ftdrive.session import manual
 from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
@@ -47,7 +47,7 @@ class Dwell:
     """What else acts on the sensor, by the time in the dwell."""
 
 
-def status(program: str = "playing", fault: str | None = None) -> ArmStatus:
+def status(program: str = "playing", fault: DeviceFault | None = None) -> ArmStatus:
     return replace(STATUS, program=program, fault=fault)
 
 
@@ -450,11 +450,11 @@ def test_a_pose_that_the_others_contradict_is_asked_about(residual: tuple[float,
 
 def test_nothing_is_measured_while_the_controller_reports_a_fault() -> None:
     def says(t: float) -> ArmStatus:
-        return status("stopped", "protective stop: clear it at the pendant" if 4.5 < t < 10.9 else None)
+        return status("stopped", DeviceFault("protective stop", "clear it at the pendant") if 4.5 < t < 10.9 else None)
 
     outcome = Outcome(dwells(UP, DOWN, LEFT), says=says)
     assert [r.before.R_base_flange[2, 2].round(3) for r in outcome.kept] == [1.0, 0.0]
-    assert outcome.person.words().count("Nothing is measured: protective stop: clear it at the pendant.") == 1
+    assert outcome.person.words().count("Nothing is measured: protective stop; clear it at the pendant.") == 1
 
 
 def test_a_run_is_continued_where_it_was() -> None:

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from drivers.errors import StreamBroken
+from drivers.errors import DeviceFault, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus
 from ftdrive import checks
 from ftdrive.config import ToolConfig, WorkcellConfig
@@ -37,7 +37,7 @@ def test_a_workcell_nobody_measured_is_refused(lab: Lab) -> None:
 @pytest.mark.parametrize(
     ("different", "words"),
     [
-        ({"fault": "protective stop: clear it", "safety_mode": "protective stop"}, "protective stop"),
+        ({"fault": DeviceFault("protective stop", "clear it"), "safety_mode": "protective stop"}, "protective stop"),
         ({"payload_kg": 0.0}, "told of no payload"),
         (
             {"p_flange_payload_m": (0.0, 0.0, -0.15)},

@@ -220,7 +220,9 @@ def test_what_would_help_most_is_not_told_where_the_plan_chooses(lab: Lab) -> No
 
 
 def test_a_hold_tells_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> None:
-    lab.arm.at_move[4] = lambda: lab.arm.set_status(fault="protective stop: …", safety_mode="protective stop")
+    lab.arm.at_move[4] = lambda: lab.arm.set_status(
+        fault=DeviceFault("protective stop", "…"), safety_mode="protective stop"
+    )
     lab.operator.answers["Type resume when it is mended"] = ["quit"]
     with pytest.raises(DeviceFault):
         lab.calibrate()

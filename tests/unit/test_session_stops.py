@@ -40,13 +40,13 @@ FAULTS: dict[str, tuple[int, Callable[[Lab], None], Callable[[Lab], None], type[
     ),
     "a protective stop": (
         10,
-        lambda lab: lab.arm.set_status(fault="protective stop: …", safety_mode="protective stop"),
+        lambda lab: lab.arm.set_status(fault=DeviceFault("protective stop", "…"), safety_mode="protective stop"),
         lambda lab: lab.arm.set_status(),
         DeviceFault,
     ),
     "an emergency stop": (
         11,
-        lambda lab: lab.arm.set_status(fault="emergency stop: …", safety_mode="robot emergency stop"),
+        lambda lab: lab.arm.set_status(fault=DeviceFault("emergency stop", "…"), safety_mode="robot emergency stop"),
         lambda lab: lab.arm.set_status(),
         DeviceFault,
     ),
@@ -125,7 +125,7 @@ def test_a_fault_on_the_way_stops_the_arm_and_resume_goes_on(fault: str, lab: La
 
 def test_a_protective_stop_that_the_driver_tells_names_its_usual_causes_too(lab: Lab) -> None:
     def stop() -> None:
-        lab.arm.set_status(fault="protective stop: …", safety_mode="protective stop")
+        lab.arm.set_status(fault=DeviceFault("protective stop", "…"), safety_mode="protective stop")
         raise DeviceFault("the arm stopped: protective stop")
 
     lab.arm.at_move[4] = stop
@@ -180,7 +180,9 @@ def test_a_push_once_the_tool_is_known(lab: Lab) -> None:
 
 
 def test_resume_before_the_cause_is_mended_is_not_believed(lab: Lab) -> None:
-    lab.arm.at_move[3] = lambda: lab.arm.set_status(fault="protective stop: …", safety_mode="protective stop")
+    lab.arm.at_move[3] = lambda: lab.arm.set_status(
+        fault=DeviceFault("protective stop", "…"), safety_mode="protective stop"
+    )
     lab.operator.answers["Type resume"] = ["resume", "resume", "quit"]
     with pytest.raises(DeviceFault, match="protective stop"):
         lab.calibrate()
@@ -352,7 +354,7 @@ def hold_and_resume(lab: Lab, fault: Callable[[], None], mend: Callable[[], None
 
 @pytest.mark.parametrize("mode", ["robot emergency stop", "safeguard stop", "protective stop"])
 def test_after_an_emergency_stop_the_whole_preflight_is_done_again_questions_too(mode: str, lab: Lab) -> None:
-    hold_and_resume(lab, lambda: lab.arm.set_status(fault="a stop", safety_mode=mode), lab.arm.set_status)
+    hold_and_resume(lab, lambda: lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode=mode), lab.arm.set_status)
     names = [event.name for event in lab.operator.of(Checked)]
     assert names == [
         *("safety", "remote", "model", "payload", "slider", "link", "sensor", "load", "workcell", "plan", "cable"),
@@ -374,7 +376,7 @@ def test_the_controller_is_asked_for_every_pose_once_more_but_not_for_the_ways_b
             lab.arm.set_status()
 
     lab.operator.on_event = on_event
-    lab.arm.at_move[4] = lambda: lab.arm.set_status(fault="a stop", safety_mode="protective stop")
+    lab.arm.at_move[4] = lambda: lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode="protective stop")
     lab.operator.answers["Type resume"] = ["resume"]
     lab.calibrate()
     first, again = asked
@@ -410,7 +412,9 @@ def test_a_question_that_is_not_answered_with_yes_leads_back_to_the_hold(lab: La
     lab.operator.answers["Is the emergency stop in reach"] = ["yes", "no", "yes"]
     lab.operator.answers["Type resume"] = ["resume", "resume"]
     hold_and_resume(
-        lab, lambda: lab.arm.set_status(fault="a stop", safety_mode="robot emergency stop"), lab.arm.set_status
+        lab,
+        lambda: lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode="robot emergency stop"),
+        lab.arm.set_status,
     )
     (refused,) = [event.words for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
     assert "not confirmed" in refused

@@ -588,7 +588,7 @@ class TestRecover:
         reader = sensor._thread
         assert reader
         reader.join(2.0)
-        with pytest.raises(StreamBroken, match=r"gone; not back within 0.3 s \(not plugged in\)"):
+        with pytest.raises(StreamBroken, match=r"gone, not back within 0.3 s \(not plugged in\)"):
             sensor.check()
 
     @pytest.mark.parametrize("error", [DeviceFault("hot"), ProtocolError("odd")])

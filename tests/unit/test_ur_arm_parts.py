@@ -66,20 +66,23 @@ def test_a_new_arm_talks_to_nobody_and_closes() -> None:
         ({"safety_bits": 0x408}, "recovery"),
         ({"safety_bits": 0x600}, "violation or fault"),
         ({"safety_bits": 0x400}, "safety reason"),
-        ({"robot_mode": 3}, r"robot mode 3 \(power off\): power the arm on"),
-        ({"robot_mode": 5}, r"robot mode 5 \(idle\): release its brakes"),
+        ({"robot_mode": 3}, r"robot mode 3 \(power off\); power the arm on"),
+        ({"robot_mode": 5}, r"robot mode 5 \(idle\); release its brakes"),
         ({"robot_mode": 42}, "unknown"),
     ],
 )
 def test_every_safety_stop_has_a_cure(different: dict[str, int], says: str) -> None:
-    assert re.search(says, look(**different).safety_fault() or "")
+    fault = look(**different).safety_fault()
+    assert fault is not None
+    assert re.search(says, str(fault))
+    assert fault.cure
 
 
 @pytest.mark.parametrize("bits", [1, 2, 3])
 def test_normal_and_reduced_mode_are_no_fault(bits: int) -> None:
     assert look(safety_bits=bits).safety_fault() is None
     assert look(safety_bits=bits).program_fault() is None
-    assert "paused" in (look(program_state=4).program_fault() or "")
+    assert "paused" in str(look(program_state=4).program_fault())
 
 
 @pytest.mark.parametrize(
@@ -91,7 +94,7 @@ def test_normal_and_reduced_mode_are_no_fault(bits: int) -> None:
     ],
 )
 def test_the_librarys_words_become_advice(words: str, says: str) -> None:
-    assert re.search(says, arm_module._advice("10.0.0.1", words))
+    assert re.search(says, str(arm_module._refusal("10.0.0.1", words)))
 
 
 def test_without_ur_rtde_the_error_says_where_it_exists(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,7 +123,7 @@ def test_what_the_library_says_comes_with_a_cure(tmp_path: Path, monkeypatch: py
     control = ControlProcess("10.0.0.1", 125.0)
     try:
         control.wait_until_ready(lambda: None)
-        with pytest.raises(StreamBroken, match="was lost: check the robot and the cable, then open the arm again"):
+        with pytest.raises(StreamBroken, match="was lost; check the robot and the cable, then open the arm again"):
             control.call("progress")
     finally:
         control.kill()

@@ -217,7 +217,7 @@ def test_status_is_what_the_controller_says_now(station: Station, new_arm: Calla
     status = arm.status()
     assert status.tcp_offset == pytest.approx(TCP)
     assert status.safety_mode == "protective stop"
-    assert "find and remove its cause" in (status.fault or "")
+    assert "find and remove its cause" in str(status.fault)
     assert arm.in_remote_control() is False
     station.do("freeze")
     time.sleep(0.1)

@@ -136,17 +136,23 @@ class Event:
 
 LOST = (StreamBroken, DeviceTimeout)
 EVENTS = [
-    Event("protective-stop", on("protective-stop"), unlock, DeviceFault, "protective stop: find and remove its cause"),
-    Event("emergency-stop", on("emergency-stop", on=True), release, DeviceFault, "emergency stop: make the cell safe"),
+    Event("protective-stop", on("protective-stop"), unlock, DeviceFault, r"protective stop \(.*\); find and remove"),
+    Event(
+        "emergency-stop",
+        on("emergency-stop", on=True),
+        release,
+        DeviceFault,
+        r"emergency stop \(.*\); make the cell safe",
+    ),
     Event(
         "safeguard",
         on("safeguard", on=True),
         on("safeguard", on=False),
         DeviceFault,
-        "safeguard stop: close the safeguard",
+        r"safeguard stop \(.*\); close the safeguard",
     ),
     Event("power-off", lambda s: s.dashboard("power off"), power_up, DeviceFault, "power the arm on and release"),
-    Event("brakes", on("mode", robot=5), on("mode", robot=7), DeviceFault, r"\(idle\): release its brakes"),
+    Event("brakes", on("mode", robot=5), on("mode", robot=7), DeviceFault, r"\(idle\); release its brakes"),
     Event(
         "program-stop",
         on("dashboard-stop"),
@@ -465,7 +471,7 @@ def test_a_program_of_somebody_else_is_never_ended_for_a_start(station: Station,
         station.wait_for(lambda state: state["runtime_state"] == "PAUSED")
     before = len(station.do("state")["events"])
     said = refused(station)
-    assert re.search(r"not started is on .* \((PLAYING|PAUSED) .*\) and is not ended: stop it at the pendant", said)
+    assert re.search(r"not started is on .* \((PLAYING|PAUSED) .*\) and is not ended; stop it at the pendant", said)
     state = station.do("state", since=before)
     assert not [event for event in state["events"] if event["by"] in ("script port", "program")]
     assert not [event for event in state["events"] if event["by"] == "dashboard" and event["what"] == "stop"]
@@ -543,7 +549,10 @@ def test_an_arm_that_is_not_ready(station: Station, mode: int, cure: str) -> Non
     ("what", "says"),
     [
         ("rtde", "cannot be reached .*check the address and the cable"),
-        ("dashboard", "dashboard server.*enable the dashboard server at the pendant under Settings, Security, Services"),
+        (
+            "dashboard",
+            "dashboard server.*enable the dashboard server at the pendant under Settings, Security, Services",
+        ),
         ("script", "30003.*enable the real-time client interface under Settings, Security, Services"),
     ],
 )
@@ -615,7 +624,7 @@ def test_both_processes_killed(station: Station, application: Application) -> No
     application.process.kill()
     assert station.do("state")["moving"]  # nobody is left to stop it
     said = refused(station)  # nobody can tell it from a program of somebody else
-    assert "is not ended: stop it at the pendant, then start again" in said
+    assert "is not ended; stop it at the pendant, then start again" in said
     station.wait_for(lambda state: not state["moving"], within_s=3)
     assert station.do("state")["runtime_state"] == "PLAYING"
     station.do("dashboard-stop")

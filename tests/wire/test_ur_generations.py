@@ -100,7 +100,7 @@ def test_open_state_move_stop_limits_close(start_station: Callable[..., Station]
 @pytest.mark.parametrize(
     ("polyscope", "control", "says"),
     [
-        ("5.3.0", True, r"PolyScope 5\.3, which ur_rtde cannot control: update it to 5\.4"),
+        ("5.3.0", True, r"PolyScope 5\.3, which ur_rtde cannot control; update it to 5\.4"),
         ("10.7.0", False, "runs PolyScope X .*PolyScope 5 or the CB3 generation is needed"),
     ],
 )

@@ -1,0 +1,30 @@
+"""The errors of the drivers: what is in them, and that nothing of it is lost on the way to whoever tells it."""
+
+import copy
+import pickle
+from collections.abc import Callable
+
+import pytest
+
+from drivers import errors
+from drivers.errors import DeviceTimeout, DriverError
+
+KINDS = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, DriverError)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("cure", ["check supply; try again", ""])
+@pytest.mark.parametrize("via", [copy.copy, copy.deepcopy, lambda error: pickle.loads(pickle.dumps(error))])
+def test_an_error_keeps_its_parts(
+    kind: type[DriverError], cure: str, via: Callable[[DriverError], DriverError]
+) -> None:
+    error = via(kind("silent for 0.4 s (a; b)", cure))
+    assert type(error) is kind
+    assert (error.found, error.cure) == ("silent for 0.4 s (a; b)", cure)
+    assert str(error) == ("silent for 0.4 s (a; b); check supply; try again" if cure else "silent for 0.4 s (a; b)")
+
+
+def test_a_time_out_is_no_error_of_the_system() -> None:
+    error = DeviceTimeout("silent", "check supply")
+    assert isinstance(error, TimeoutError)
+    assert (error.errno, error.strerror, error.filename) == (None, None, None)
