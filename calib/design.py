@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from calib.model import Array, Parameters, jacobian, predict, read_only, skew
+from calib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict, read_only, skew
 from calib.so3 import force_cost, given_rotation, minima
 from calib.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
-STANDARD_GRAVITY_M_S2 = 9.80665
 OBSERVABLE = 1e-9
 """Smallest eigenvalue of the scaled information, as a share of the largest, that still counts."""
 

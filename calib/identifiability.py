@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.errors import NotObservable
-from calib.model import Array, Parameters, angle_between, jacobian, predict
+from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, jacobian, predict
 from calib.so3 import force_cost, minima
 
 LEAST_POSES = 4
@@ -28,7 +28,7 @@ LEVER_M = 0.025
 """Usual ratio of torque noise to force noise."""
 MOST_ADVISED = 5
 
-NOMINAL = Parameters(np.eye(3), np.array([0, 0, -9.80665]), np.zeros(3), np.array([0, 0, 0.08]), np.zeros(3))
+NOMINAL = Parameters(np.eye(3), -STANDARD_GRAVITY_M_S2 * UP_IN_BASE, np.zeros(3), np.array([0, 0, 0.08]), np.zeros(3))
 """Before any data: 1 kg, 80 mm from a sensor on an upright robot. Rank and gap hardly depend on it."""
 
 _SAME_MINIMUM_RAD = np.deg2rad(1.0)

@@ -19,7 +19,7 @@ from calib.descent import MAX_STEPS, Descent, Equations, Minimum, column_scale
 from calib.errors import NotObservable
 from calib.gram import Statistics, features
 from calib.known import Constraints, Known
-from calib.model import Array, Parameters, jacobian, predict
+from calib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict
 from calib.robust import FARTHEST, FEWEST_TO_REJECT_FROM, Kept, agreeing_poses, fewest_kept
 from calib.variance import (
     FORCE,
@@ -54,8 +54,6 @@ LARGE_ROTATION_RAD = np.deg2rad(1.0)  # few kinematics are worse
 WORST_ROTATION_RAD = np.deg2rad(3.0)  # none is
 LARGE_WHITE = 3.0  # times the measured variance
 MEDIAN_DISTANCE = float(chi2_distribution.median(6))
-
-STANDARD_GRAVITY_M_S2 = 9.80665
 
 
 @dataclass(frozen=True, slots=True, eq=False)

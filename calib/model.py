@@ -16,6 +16,10 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
+STANDARD_GRAVITY_M_S2 = 9.80665
+UP_IN_BASE = np.array([0.0, 0.0, 1.0])
+"""Of a robot on a table."""
+
 PARAMETER_NAMES = tuple(
     f"{name}.{axis}"
     for name in ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")

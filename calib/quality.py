@@ -12,7 +12,7 @@ from scipy import stats
 from calib.changes import lasting_change
 from calib.evidence import Evidence, standardized
 from calib.identifiability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
-from calib.model import PARAMETER_NAMES, Array, Parameters, jacobian
+from calib.model import PARAMETER_NAMES, UP_IN_BASE, Array, Parameters, jacobian
 from calib.so3 import force_cost, given_rotation, minima
 from calib.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
@@ -38,9 +38,6 @@ SURE = 1e-3
 """Probability of a false remark."""
 COLLAPSE = 0.4
 """An explanation is one if the residual drops to this share."""
-
-UP_IN_BASE = np.array([0.0, 0.0, 1.0])
-"""Of a robot on a table."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

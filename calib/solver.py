@@ -13,11 +13,11 @@ from calib.errors import NotObservable
 from calib.evidence import Evidence, IndependentFit
 from calib.identifiability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
 from calib.known import Known
-from calib.ml import RANK_TOLERANCE, STANDARD_GRAVITY_M_S2, Drift, Fit, fit
-from calib.model import PARAMETER_NAMES, Array, Parameters, predict
+from calib.ml import RANK_TOLERANCE, Drift, Fit, fit
+from calib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, predict
 from calib.pooling import pooled_covariance
 from calib.published import PUBLISHED, Estimator, published
-from calib.quality import SIGNIFICANT_SIGMAS, UP_IN_BASE, judge
+from calib.quality import SIGNIFICANT_SIGMAS, judge
 from calib.result import CalibrationResult, DriftResult, Method
 
 SIMULATIONS = 400

@@ -15,8 +15,8 @@ from calib import CalibrationDataset, CalibrationResult, NotObservable, Paramete
 from calib.compare import compare
 from calib.errors import BadDataset
 from calib.known import Known
-from calib.ml import STANDARD_GRAVITY_M_S2, fit
-from calib.model import Array, jacobian, predict
+from calib.ml import fit
+from calib.model import STANDARD_GRAVITY_M_S2, Array, jacobian, predict
 from calib.result import Method
 from calib.yu import SPECIAL_R_flange_base
 
