@@ -224,7 +224,8 @@ def disagreeing_axes(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike 
     found = []
     best = minima(force_cost(R_base_flange, force_N, np.ones(n)))[0]
     inverted = minima(force_cost(np.swapaxes(R_base_flange, 1, 2), force_N, np.ones(n)))[0]
-    if inverted.cost < COLLAPSE**2 * best.cost:
+    rounding = 1e-12 * float(np.sum(force_N**2))
+    if inverted.cost + rounding < COLLAPSE**2 * best.cost:
         found.append(
             f"the orientations look inverted, with their transposes the force residual drops from "
             f"{np.sqrt(best.cost / n):.2g} to {np.sqrt(max(inverted.cost, 0) / n):.2g} N: "

@@ -21,6 +21,8 @@ from calib.quality import SIGNIFICANT_SIGMAS, judge
 from calib.result import CalibrationResult, DriftResult, Method
 
 SIMULATIONS = 400
+UNFELT_N = 1e-12
+"""No sensor tells forces apart that differ by less."""
 
 _TOLD = ("carlson-relaxation", "carlson-cayley")
 """Published methods that take the direction of gravity, or the weight, as known."""
@@ -73,8 +75,8 @@ def solve(
         raise ValueError(f"{method} cannot use what is known before: use 'ml'")
     known = _constrained(method, known)
     require_orientations(dataset.R_base_flange, 5 if method == "lrom" else 4 if known is None else 3)
-    if np.ptp(dataset.wrench[:, :3], axis=0).max() == 0:
-        raise NotObservable("the force is exactly the same in all poses: the sensor is stuck, or nothing hangs on it.")
+    if np.ptp(dataset.wrench[:, :3], axis=0).max() < UNFELT_N:
+        raise NotObservable("the force is the same in all poses: the sensor is stuck, or nothing hangs on it.")
 
     estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, up_in_base) if method in PUBLISHED else None
     wrench_cov = dataset.wrench_cov
