@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from calib import so3
 from calib.errors import BadDataset, NotObservable
-from calib.model import skew
+from calib.model import nearest_rotation, skew
 
 Array = NDArray[np.float64]
 
@@ -119,13 +119,6 @@ def force_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method:
         return ForceEquations(A, force_N, np.zeros((3, 3)), np.zeros(3))
     A_mean, f_mean = A.mean(axis=0), force_N.mean(axis=0)
     return ForceEquations(A - A_mean, force_N - f_mean, A_mean, f_mean)
-
-
-def project_to_so3(M: Array) -> Array:
-    """Rotation closest to a (3, 3) matrix in the Frobenius norm (appendix A, eqs. 28-29)."""
-    U, _, Vt = np.linalg.svd(M)
-    U[:, 2] *= np.sign(np.linalg.det(U @ Vt))
-    return np.asarray(U @ Vt)
 
 
 def eigen(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
@@ -325,9 +318,9 @@ def kron_identity(f: Array) -> Array:
 
 
 def _rotation_of_vec(r: Array) -> Array:
-    """Rotation closest to the matrix with columns in r (9,), times a factor of either sign (theorem 1, last line)."""
+    """Rotation closest to the matrix with columns in r (9,), times a factor of either sign (theorem 1, eqs. 28-29)."""
     X = r.reshape(3, 3).T
-    return project_to_so3(X if np.linalg.det(X) > 0 else -X)
+    return nearest_rotation(X if np.linalg.det(X) > 0 else -X)
 
 
 def _fit_vec(eq: ForceEquations, r: Array) -> ForceFit:

@@ -15,12 +15,11 @@ from calib.carlson import (
     ForceEquations,
     ForceFit,
     force_equations,
-    project_to_so3,
     require_weight,
     spanned_dimensions,
 )
 from calib.errors import BadDataset, NotObservable
-from calib.model import skew
+from calib.model import nearest_rotation, skew
 
 
 def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Array, *, bias: bool) -> ForceFit:
@@ -52,7 +51,7 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     eq = force_equations(R_base_flange, force_N, bias=bias, method="the relaxation", min_poses=3)
     a = eq.A @ down
     _require_usable(eq, a, 3)
-    R_sensor_flange = project_to_so3(np.asarray(np.linalg.lstsq(eq.f, a)[0], dtype=np.float64))
+    R_sensor_flange = nearest_rotation(np.asarray(np.linalg.lstsq(eq.f, a)[0], dtype=np.float64))
     weight_N = _weight(eq.f, a, R_sensor_flange)
     return eq.fit(R_sensor_flange.T, weight_N * down)
 
@@ -155,7 +154,7 @@ def similarity(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     eq = force_equations(R_base_flange, force_N, bias=bias, method="the similarity solution", min_poses=2)
     a = eq.A @ down
     _require_usable(eq, a, 2)
-    R_sensor_flange = project_to_so3(eq.f.T @ a)
+    R_sensor_flange = nearest_rotation(eq.f.T @ a)
     weight_N = _weight(eq.f, a, R_sensor_flange)
     return eq.fit(R_sensor_flange.T, weight_N * down)
 
@@ -188,7 +187,7 @@ def _require_pull_downwards(f: Array, a: Array) -> None:
     """No rotation may explain the forces f (n, 3) much better with gravity -a than the best one does with a (n, 3)."""
     residual, reversed_residual = (
         float(np.sum((f - _weight(f, side, R) * side @ R.T) ** 2))
-        for side, R in ((a, project_to_so3(f.T @ a)), (-a, project_to_so3(-f.T @ a)))
+        for side, R in ((a, nearest_rotation(f.T @ a)), (-a, nearest_rotation(-f.T @ a)))
     )
     if residual > 4 * reversed_residual + 1e-12 * float(np.sum(f**2)):
         raise BadDataset(

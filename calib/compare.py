@@ -11,11 +11,10 @@ from calib.dataset import CalibrationDataset
 from calib.errors import BadDataset, NotObservable
 from calib.files import JSON
 from calib.known import Known
-from calib.ml import STANDARD_GRAVITY_M_S2, Drift
-from calib.model import Array, Parameters, angle_between, predict
+from calib.ml import Drift
+from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, predict
 from calib.published import PUBLISHED
-from calib.quality import UP_IN_BASE
-from calib.result import Method
+from calib.result import CalibrationResult, Method
 from calib.solver import estimator_of, solve
 
 _MOST_FOLDS = 50
@@ -79,29 +78,28 @@ def compare(
     NotObservable
         Not even the default method can be used.
     """
-    default = solve(dataset, "ml", drift=drift, known=known, g_m_s2=g_m_s2).R_flange_sensor
+    default = solve(dataset, "ml", drift=drift, known=known, g_m_s2=g_m_s2)
     compared = []
     for method in get_args(Method):
         try:
-            if method in PUBLISHED:
+            if method == "ml":
+                found = _fitted(default)
+            elif method in PUBLISHED:
                 found = _published(dataset, method, known, g_m_s2, up_in_base)
             else:
-                found = _fitted(dataset, method, drift, known, g_m_s2)
+                found = _fitted(solve(dataset, method, drift=drift, known=known, g_m_s2=g_m_s2))
         except (NotObservable, BadDataset) as error:
             compared.append(Compared(method, str(error)))
             continue
         parameters, cv_force, cv_torque = found
         force, torque = _rms(dataset.wrench - predict(parameters, dataset.R_base_flange))
-        angle_rad = float(angle_between(parameters.R_flange_sensor, default))
+        angle_rad = float(angle_between(parameters.R_flange_sensor, default.R_flange_sensor))
         mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / g_m_s2
         compared.append(Compared(method, None, parameters, mass_kg, angle_rad, force, torque, cv_force, cv_torque))
     return compared
 
 
-def _fitted(
-    dataset: CalibrationDataset, method: Method, drift: Drift, known: Known | None, g_m_s2: float
-) -> tuple[Parameters, float, float]:
-    result = solve(dataset, method, drift=drift, known=known, g_m_s2=g_m_s2)
+def _fitted(result: CalibrationResult) -> tuple[Parameters, float, float]:
     return result.parameters, result.quality["loo_force_rms_N"], result.quality["loo_torque_rms_Nm"]
 
 

@@ -15,13 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import BadDataset
 from calib.files import JSON, check_format, read_object, write_new
-from calib.model import Array, nearest_rotation, read_only
+from calib.model import ROUNDING, Array, nearest_rotation, read_only
+from calib.noise import CHANNELS
 
 FORMAT = "ftdrive.dataset/1"
 
-ROUNDING = 2e-3  # rounding to three decimals moves an entry of R^T R by at most 1.8e-3
-WRENCH_COLUMNS = ("fx", "fy", "fz", "tx", "ty", "tz")
-SIGMA_COLUMNS = tuple(f"sigma_{name}" for name in WRENCH_COLUMNS)
+LARGEST = 1e9  # N, N·m or their squares: nothing measures more, and the powers taken of it must not overflow
+LEAST_VARIANCE = 1e-18  # N² or (N·m)²: a sensor of 1 nN; with much less, products of inverses lose all digits
+SIGMA_COLUMNS = tuple(f"sigma_{name}" for name in CHANNELS)
 MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
 VECTOR_COLUMNS = ("rx", "ry", "rz")
 
@@ -172,7 +173,7 @@ def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
     vector = any(c in names for c in VECTOR_COLUMNS) and not any(c in names for c in MATRIX_COLUMNS)
     rotation_columns = VECTOR_COLUMNS if vector else MATRIX_COLUMNS
     sigmas = SIGMA_COLUMNS if any(c in names for c in SIGMA_COLUMNS) else ()
-    wanted = [*rotation_columns, *WRENCH_COLUMNS, *sigmas, *(["t"] if "t" in names else [])]
+    wanted = [*rotation_columns, *CHANNELS, *sigmas, *(["t"] if "t" in names else [])]
     missing = [name for name in wanted if name not in names]
     if missing:
         raise BadDataset(
@@ -240,6 +241,12 @@ def _numbers(name: str, value: object, shape: tuple[int, ...]) -> Array:
     for index in np.argwhere(~np.isfinite(array)):
         entry = "".join(f"[{j}]" for j in index[1:])
         raise BadDataset(f"row {index[0] + 1}: {name}{entry} is {array[tuple(index)]}, not a finite number.")
+    for index in np.argwhere(np.abs(array) > LARGEST):
+        entry = "".join(f"[{j}]" for j in index[1:])
+        raise BadDataset(
+            f"row {index[0] + 1}: {name}{entry} is {array[tuple(index)]:.3g}, more than any sensor measures "
+            f"({LARGEST:g}): check the units."
+        )
     return array
 
 
@@ -270,9 +277,9 @@ def _covariances(cov: Array) -> Array:
 
 def _covariance_problem(C: Array) -> str | None:
     variance = np.diag(C)
-    if variance.min() <= 0:
-        return f"the variance of {WRENCH_COLUMNS[variance.argmin()]} is {variance.min():g}"
-    correlation = C / np.sqrt(np.outer(variance, variance))
+    if variance.min() < LEAST_VARIANCE:
+        return f"the variance of {CHANNELS[variance.argmin()]} is {variance.min():g}, less than any sensor has"
+    correlation = C / np.outer(np.sqrt(variance), np.sqrt(variance))
     asymmetry = np.abs(correlation - correlation.T).max()
     if asymmetry > 1e-9:
         return f"it is not symmetric (by {asymmetry:.2g} of a correlation)"

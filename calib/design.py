@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from calib.model import Array, Parameters, jacobian, predict, read_only, skew
-from calib.so3 import force_cost, given_rotation, minima
+from calib.identifiability import second_minimum
+from calib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict, read_only, skew
+from calib.so3 import given_rotation
 from calib.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
-STANDARD_GRAVITY_M_S2 = 9.80665
 OBSERVABLE = 1e-9
 """Smallest eigenvalue of the scaled information, as a share of the largest, that still counts."""
 
@@ -283,15 +283,13 @@ def second_basin(R_base_flange: Array, guess: Guess) -> tuple[float, Parameters 
     """Give the gap of `second_basin_gap` and the other solution, None where there is not just one; infinite if none."""
     if len(R_base_flange) < 3:
         return 0.0, None  # there is a continuum of solutions
-    wrench = predict(guess.parameters, R_base_flange)
-    force_N, equal = wrench[:, :3], np.ones(len(wrench))
-    found = minima(force_cost(R_base_flange, force_N, equal))
-    if len(found) < 2:
+    other = second_minimum(R_base_flange, guess.parameters)
+    if other is None:
         return float("inf"), None
-    R = found[1].R
-    gravity_N, bias_N = given_rotation(R, R_base_flange, force_N, equal)
+    wrench, R = predict(guess.parameters, R_base_flange), other.R
+    gravity_N, bias_N = given_rotation(R, R_base_flange, wrench[:, :3], np.ones(len(wrench)))
     com_m, torque_bias_Nm = com_and_torque_bias(gravity_N @ R_base_flange @ R.T, wrench[:, 3:])
-    gap = max(found[1].cost, 0.0) / (len(R_base_flange) * guess.weight_N**2)
+    gap = max(other.cost, 0.0) / (len(R_base_flange) * guess.weight_N**2)
     return gap, Parameters(R.T, gravity_N, bias_N, com_m, torque_bias_Nm)
 
 

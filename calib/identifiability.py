@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.errors import NotObservable
-from calib.model import Array, Parameters, angle_between, jacobian, predict
-from calib.so3 import force_cost, minima
+from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, gravity_wrench, jacobian
+from calib.so3 import Minimum, force_cost, minima
 
 LEAST_POSES = 4
 """Three different orientations have 4 or 8 exact solutions, though their Fisher information has full rank."""
@@ -28,7 +28,7 @@ LEVER_M = 0.025
 """Usual ratio of torque noise to force noise."""
 MOST_ADVISED = 5
 
-NOMINAL = Parameters(np.eye(3), np.array([0, 0, -9.80665]), np.zeros(3), np.array([0, 0, 0.08]), np.zeros(3))
+NOMINAL = Parameters(np.eye(3), -STANDARD_GRAVITY_M_S2 * UP_IN_BASE, np.zeros(3), np.array([0, 0, 0.08]), np.zeros(3))
 """Before any data: 1 kg, 80 mm from a sensor on an upright robot. Rank and gap hardly depend on it."""
 
 _SAME_MINIMUM_RAD = np.deg2rad(1.0)
@@ -175,11 +175,17 @@ def second_basin_gap(R_base_flange: Array, parameters: Parameters = NOMINAL) -> 
     Without noise, and from the forces alone: torques rarely decide. With white force noise sigma the wrong solution
     of n poses is worse by n (weight / sigma)² times the gap. Infinite if there is no other minimum.
     """
-    force_N = predict(parameters, R_base_flange)[:, :3] - parameters.force_bias_N
-    found = minima(force_cost(R_base_flange, force_N, np.ones(len(force_N))))
-    others = [m.cost for m in found if angle_between(m.R.T, parameters.R_flange_sensor) > _SAME_MINIMUM_RAD]
+    other = second_minimum(R_base_flange, parameters)
     weight_N2 = float(parameters.gravity_force_base_N @ parameters.gravity_force_base_N)
-    return max(0.0, min(others, default=float("inf")) / (len(force_N) * weight_N2))
+    return float("inf") if other is None else max(0.0, other.cost / (len(R_base_flange) * weight_N2))
+
+
+def second_minimum(R_base_flange: Array, parameters: Parameters) -> Minimum | None:
+    """Give the best solution with another mounting of the sensor, from the exact forces of these parameters."""
+    force_N = gravity_wrench(parameters, R_base_flange)[:, :3]
+    found = minima(force_cost(R_base_flange, force_N, np.ones(len(force_N))))
+    others = (m for m in found if angle_between(m.R.T, parameters.R_flange_sensor) > _SAME_MINIMUM_RAD)
+    return next(others, None)
 
 
 def wrong_basin_probability(delta_chi2: float) -> float:

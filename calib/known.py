@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from calib.model import Array, Parameters, read_only
+from calib.model import Array, Parameters, is_rotation, read_only
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Known:
     def __post_init__(self) -> None:
         if self.R_flange_sensor is not None or self.yaw_only:
             R = read_only(np.eye(3) if self.R_flange_sensor is None else self.R_flange_sensor)
-            if R.shape != (3, 3) or np.abs(R.T @ R - np.eye(3)).max() > 2e-3 or np.linalg.det(R) < 0:
+            if not is_rotation(R):
                 raise ValueError(f"the known R_flange_sensor must be a rotation matrix, not {R.tolist()}")
             object.__setattr__(self, "R_flange_sensor", R)
         if self.gravity_direction_base is not None:

@@ -19,7 +19,7 @@ from calib.descent import MAX_STEPS, Descent, Equations, Minimum, column_scale
 from calib.errors import NotObservable
 from calib.gram import Statistics, features
 from calib.known import Constraints, Known
-from calib.model import Array, Parameters, jacobian, predict
+from calib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict
 from calib.robust import FARTHEST, FEWEST_TO_REJECT_FROM, Kept, agreeing_poses, fewest_kept
 from calib.variance import (
     FORCE,
@@ -54,8 +54,6 @@ LARGE_ROTATION_RAD = np.deg2rad(1.0)  # few kinematics are worse
 WORST_ROTATION_RAD = np.deg2rad(3.0)  # none is
 LARGE_WHITE = 3.0  # times the measured variance
 MEDIAN_DISTANCE = float(chi2_distribution.median(6))
-
-STANDARD_GRAVITY_M_S2 = 9.80665
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,9 +264,11 @@ class _Problem:
         weights = _inverses(self.cov if self.measured else np.broadcast_to(_white(1.0, LEVER_M), self.cov.shape))
         everything = _Explanation(self.descent.minima(weights), np.ones(self.n, bool), self.cov)
         best = everything.minima[0]
-        if self._lacks_rank(best) or self._exact(best.parameters):
-            sigma = _white(*self._least()) if not self.measured else None
-            return self._fit(everything, everything.minima[0].chi2, sigma)
+        if self._lacks_rank(best):
+            return self._fit(everything, best.chi2)
+        if self._exact(best.parameters):
+            exact = self.descent.minima(_inverses(self.cov))
+            return self._fit(replace(everything, minima=exact), exact[0].chi2)
         static_chi2 = best.chi2
         if self.measured and self.n > MANY_POSES and self.drift == "none" and self._fits(everything):
             return self._fit(everything, static_chi2)  # a pose that could do harm among so many would show in chi2
@@ -474,8 +474,10 @@ class _Problem:
         return value
 
     def _start(self, problem: Linearised, components: Sequence[Component]) -> Array:
-        """Give variances to start from: the mean square residual of the group."""
-        scale = [np.mean(problem.r[problem.kept][:, np.array(c.share) > 0] ** 2) for c in components]
+        """Give variances to start from: the mean square residual of the group, or its noise where that is more."""
+        noise = np.diagonal(problem.D, axis1=1, axis2=2)
+        size = np.maximum(problem.r**2, noise)[problem.kept]
+        scale = [np.mean(size[:, np.array(c.share) > 0]) for c in components]
         return np.array([s / (10 * self.n if c.kind == "walk" else 1) for c, s in zip(components, scale, strict=True)])
 
     def _with_all_minima(self, e: _Explanation, everything: _Explanation, weights: Array) -> _Explanation:
@@ -506,7 +508,7 @@ class _Problem:
 
         return equations
 
-    def _fit(self, e: _Explanation, static_chi2: float, sigma: Array | None = None) -> Fit:
+    def _fit(self, e: _Explanation, static_chi2: float) -> Fit:
         best = e.minima[0]
         if not best.settled:
             weight_N = np.linalg.norm(best.parameters.gravity_force_base_N)
@@ -514,9 +516,7 @@ class _Problem:
                 f"the fit has not settled in {MAX_STEPS} steps, at a weight of {weight_N:.2g} N: "
                 "hang something heavier on the sensor, or add poses with other orientations."
             )
-        if sigma is not None:  # exact data
-            noise = Noise(np.broadcast_to(sigma, self.cov.shape))
-        elif not e.components and e.kept.all() and self.drift != "linear":
+        if not e.components and e.kept.all() and self.drift != "linear":
             noise = Noise(self.cov)
         else:
             noise = self._noise(e, best.parameters)

@@ -16,6 +16,11 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
+STANDARD_GRAVITY_M_S2 = 9.80665
+ROUNDING = 2e-3  # rounding to three decimals moves an entry of R^T R by at most 1.8e-3
+UP_IN_BASE = np.array([0.0, 0.0, 1.0])
+"""Of a robot on a table."""
+
 PARAMETER_NAMES = tuple(
     f"{name}.{axis}"
     for name in ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")
@@ -169,6 +174,11 @@ def nearest_rotation(M: Array) -> Array:
     U, _, Vt = np.linalg.svd(M)
     U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     return np.asarray(U @ Vt)
+
+
+def is_rotation(R: Array) -> bool:
+    """Tell whether a matrix is a rotation (3, 3), entries of which may be rounded to three decimals."""
+    return R.shape == (3, 3) and bool(np.abs(R.T @ R - np.eye(3)).max() < ROUNDING and np.linalg.det(R) > 0)
 
 
 def read_only(value: ArrayLike) -> Array:

@@ -14,8 +14,6 @@ from calib.yu import com_and_torque_bias, lrom, special_numbers, srom_numbered
 Estimator = Callable[[Array], Parameters]
 """Takes the mean wrenches (n, 6) of fixed poses, returns the parameters."""
 
-LEVEL_BASE = np.array([0.0, 0.0, -1.0])
-
 _GRAVITY_UNKNOWN: Mapping[str, Callable[..., ForceFit]] = {
     "carlson-eigen": carlson.eigen,
     "carlson-nullspace": carlson.nullspace,
@@ -27,7 +25,7 @@ PUBLISHED = ("srom", "lrom", "carlson-relaxation", "carlson-cayley", *_GRAVITY_U
 
 
 def published(
-    method: str, R_base_flange: Array, *, gravity_direction_base: Array = LEVEL_BASE, weight_N: float | None = None
+    method: str, R_base_flange: Array, *, gravity_direction_base: Array, weight_N: float | None = None
 ) -> Estimator:
     """Prepare a published method for a set of poses.
 
@@ -40,7 +38,7 @@ def published(
         One of `PUBLISHED`.
     R_base_flange : array, shape (n, 3, 3)
     gravity_direction_base : array, shape (3,)
-        For carlson-relaxation and carlson-cayley, which take it as known; a level base where nothing else is said.
+        For carlson-relaxation and carlson-cayley, which take it as known.
     weight_N : float, optional
         For carlson-cayley, which takes it as known too.
 

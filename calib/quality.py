@@ -12,7 +12,7 @@ from scipy import stats
 from calib.changes import lasting_change
 from calib.evidence import Evidence, standardized
 from calib.identifiability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
-from calib.model import PARAMETER_NAMES, Array, Parameters, jacobian
+from calib.model import PARAMETER_NAMES, UP_IN_BASE, Array, Parameters, jacobian
 from calib.so3 import force_cost, given_rotation, minima
 from calib.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
@@ -38,9 +38,6 @@ SURE = 1e-3
 """Probability of a false remark."""
 COLLAPSE = 0.4
 """An explanation is one if the residual drops to this share."""
-
-UP_IN_BASE = np.array([0.0, 0.0, 1.0])
-"""Of a robot on a table."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,7 +224,8 @@ def disagreeing_axes(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike 
     found = []
     best = minima(force_cost(R_base_flange, force_N, np.ones(n)))[0]
     inverted = minima(force_cost(np.swapaxes(R_base_flange, 1, 2), force_N, np.ones(n)))[0]
-    if inverted.cost < COLLAPSE**2 * best.cost:
+    rounding = 1e-12 * float(np.sum(force_N**2))
+    if inverted.cost + rounding < COLLAPSE**2 * best.cost:
         found.append(
             f"the orientations look inverted, with their transposes the force residual drops from "
             f"{np.sqrt(best.cost / n):.2g} to {np.sqrt(max(inverted.cost, 0) / n):.2g} N: "

@@ -14,8 +14,9 @@ from scipy.special import expit
 from calib.compensation import Compensator
 from calib.errors import BadCalibration
 from calib.files import JSON, check_format, read_object, write_new
-from calib.model import PARAMETER_NAMES, Array, Parameters, jacobian, read_only
-from calib.yu import SPECIAL_R_flange_base, weight_and_tilt
+from calib.model import PARAMETER_NAMES, Array, Parameters, is_rotation, jacobian, read_only
+from calib.quality import Verdict, expected_error
+from calib.yu import weight_and_tilt
 
 FORMAT = "ftdrive.calibration/1"
 
@@ -35,7 +36,6 @@ Method = Literal[
     "known-rotation",
     "yaw-only",
 ]
-Verdict = Literal["good", "usable", "rejected"]
 NoiseSource = Literal["measured", "residuals"]
 
 
@@ -97,6 +97,11 @@ class CalibrationResult:
     `correlations` (pairs of parameters above 0.9)."""
 
     def __post_init__(self) -> None:
+        for each in fields(Parameters):
+            if not np.isfinite(value := getattr(self.parameters, each.name)).all():
+                raise ValueError(f"{each.name} must be finite, not {value.tolist()}")
+        if not is_rotation(self.R_flange_sensor):
+            raise ValueError(f"R_flange_sensor must be a rotation matrix, not {self.R_flange_sensor.tolist()}")
         n = len(self.residuals)
         for name, shape in (("covariance", (15, 15)), ("residuals", (n, 6))):
             value = read_only(getattr(self, name))
@@ -238,13 +243,8 @@ class CalibrationResult:
         return np.asarray(J @ self.covariance @ np.swapaxes(J, -1, -2))
 
     def predicted_error(self) -> tuple[float, float]:
-        """Root mean square error of `compensate` over all orientations, N and N·m, as far as noise explains it.
-
-        The error is of second degree in the orientation, so its mean over the 24 rotations of the cube is the mean
-        over all rotations, exactly.
-        """
-        cov = self.wrench_covariance(np.swapaxes(SPECIAL_R_flange_base, 1, 2)).mean(axis=0)
-        return float(np.sqrt(np.trace(cov[:3, :3]))), float(np.sqrt(np.trace(cov[3:, 3:])))
+        """Root mean square error of `compensate` over all orientations, N and N·m, as far as noise explains it."""
+        return expected_error(self.parameters, self.covariance)
 
     def residual_summary(self) -> dict[str, float]:
         """Root mean square and largest norm of the force and torque residuals over the poses."""

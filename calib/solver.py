@@ -13,14 +13,16 @@ from calib.errors import NotObservable
 from calib.evidence import Evidence, IndependentFit
 from calib.identifiability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
 from calib.known import Known
-from calib.ml import RANK_TOLERANCE, STANDARD_GRAVITY_M_S2, Drift, Fit, fit
-from calib.model import PARAMETER_NAMES, Array, Parameters, predict
+from calib.ml import RANK_TOLERANCE, Drift, Fit, fit
+from calib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, predict
 from calib.pooling import pooled_covariance
 from calib.published import PUBLISHED, Estimator, published
-from calib.quality import SIGNIFICANT_SIGMAS, UP_IN_BASE, judge
+from calib.quality import SIGNIFICANT_SIGMAS, judge
 from calib.result import CalibrationResult, DriftResult, Method
 
 SIMULATIONS = 400
+UNFELT_N = 1e-12
+"""No sensor tells forces apart that differ by less."""
 
 _TOLD = ("carlson-relaxation", "carlson-cayley")
 """Published methods that take the direction of gravity, or the weight, as known."""
@@ -73,8 +75,8 @@ def solve(
         raise ValueError(f"{method} cannot use what is known before: use 'ml'")
     known = _constrained(method, known)
     require_orientations(dataset.R_base_flange, 5 if method == "lrom" else 4 if known is None else 3)
-    if np.ptp(dataset.wrench[:, :3], axis=0).max() == 0:
-        raise NotObservable("the force is exactly the same in all poses: the sensor is stuck, or nothing hangs on it.")
+    if np.ptp(dataset.wrench[:, :3], axis=0).max() < UNFELT_N:
+        raise NotObservable("the force is the same in all poses: the sensor is stuck, or nothing hangs on it.")
 
     estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, up_in_base) if method in PUBLISHED else None
     wrench_cov = dataset.wrench_cov

@@ -58,7 +58,7 @@ class Linearised:
     turn: Array
     """(n, 6, 3) derivative by the orientation of each pose."""
     D: Array
-    """(n, 6, 6) measured noise of each pose; zero where nobody measured it."""
+    """(n, 6, 6) measured noise of each pose, or what is surely there when nobody measured it."""
     time: Array
     """(n,) ascending, in mean intervals."""
     kept: NDArray[np.bool_]

@@ -92,9 +92,10 @@ def live(
             if not simulate:
                 cell = read_cell(config, robot, sensor)
             looks = stack.enter_context(_live_looks(cell, calibration))
+        beyond = _beyond_noise(calibration)
         if once or as_json:
             for look in looks:
-                reading = _reading(look, calibration, axes)
+                reading = _reading(look, calibration, beyond, axes)
                 if as_json:
                     write_json(reading)
                 else:
@@ -107,7 +108,7 @@ def live(
             with Live(console=talk, refresh_per_second=10) as screen:
                 shown = Group()
                 for look in looks:
-                    shown = _screen(_reading(look, calibration, axes), made)
+                    shown = _screen(_reading(look, calibration, beyond, axes), made)
                     screen.update(Group(shown, "Ctrl-C ends"))
                 screen.update(Group(shown, "The recording has ended."))
 
@@ -168,13 +169,16 @@ def _refuse_other_devices(calibration: CalibrationResult, found: dict[str, Devic
         talk.print(f" {words}")
 
 
-def _reading(look: Look, calibration: CalibrationResult, axes: Axes) -> dict[str, Any]:
+def _beyond_noise(calibration: CalibrationResult) -> Array:
+    """Variance (6,) that noise does not explain, as the report says it: it may be along any axis."""
+    total = likely_error(calibration) ** 2 - np.square(calibration.predicted_error())
+    return np.repeat(total / 3, 3)
+
+
+def _reading(look: Look, calibration: CalibrationResult, beyond: Array, axes: Axes) -> dict[str, Any]:
     raw = look.mean.mean
     contact = calibration.compensate(raw, look.R_base_flange)
-    covariance = look.mean.covariance + calibration.wrench_covariance(look.R_base_flange)
-    # What noise does not explain, as the report says it, may be along any axis.
-    beyond = likely_error(calibration) ** 2 - np.square(calibration.predicted_error())
-    covariance += np.diag(np.repeat(beyond / 3, 3))
+    covariance = look.mean.covariance + calibration.wrench_covariance(look.R_base_flange) + np.diag(beyond)
     R_axes_sensor = {
         "sensor": np.eye(3),
         "flange": calibration.R_flange_sensor,

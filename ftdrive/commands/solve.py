@@ -15,8 +15,8 @@ from calib import CalibrationDataset, CalibrationResult, Known, read_csv
 from calib import solve as solve_dataset
 from calib.compare import compare
 from calib.errors import CalibError
-from calib.ml import STANDARD_GRAVITY_M_S2, Drift
-from calib.quality import UP_IN_BASE
+from calib.ml import Drift
+from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE
 from calib.result import Method
 from calib.routine import drift_check
 from ftdrive.cli import exit_code

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult, NotObservable, solve
-from calib.design import STANDARD_GRAVITY_M_S2, Guess, Prediction, predicted_sigma
+from calib.design import Guess, Prediction, predicted_sigma
 from calib.identifiability import (
     ACCEPTED_DELTA_CHI2,
     AMBIGUOUS_GAP,
@@ -17,6 +17,7 @@ from calib.identifiability import (
     WEAK_GAP,
     different_orientations,
 )
+from calib.model import STANDARD_GRAVITY_M_S2
 from calib.routine import PoseRecord, dataset_from, is_return
 from calib.selection import next_pose
 from calib.yu import weight_and_tilt

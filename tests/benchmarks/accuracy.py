@@ -28,6 +28,7 @@ from calib.contact import contact_chi2, contact_threshold
 from calib.design import optimised
 from calib.identifiability import AMBIGUOUS_GAP, assess
 from calib.known import Known
+from calib.model import UP_IN_BASE
 from calib.published import published
 from calib.yu import SPECIAL_R_flange_base, lrom, srom
 from tests.benchmarks import carlson_figures, speed
@@ -679,7 +680,7 @@ def _left_out(name: str, R: Array, y: Array, cov: Array | None, time_s: Array, f
         estimate = sim.ten_parameters(*told)
     elif name == "relaxation":
         try:
-            estimate = published("carlson-relaxation", R[kept])(y[kept])
+            estimate = published("carlson-relaxation", R[kept], gravity_direction_base=-UP_IN_BASE)(y[kept])
         except (NotObservable, ValueError):
             return np.full((len(fold), 6), np.inf)
     elif name == "LROM":

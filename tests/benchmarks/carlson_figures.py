@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib import carlson, carlson_known
-from calib.model import skew
+from calib.model import nearest_rotation, skew
 
 Array = NDArray[np.float64]
 
@@ -155,7 +155,7 @@ def algorithm_1_as_printed(R: Array, force_N: Array, gravity: Array | None) -> A
     X = np.eye(3)
     for _ in range(200):
         if gravity is not None:
-            X = carlson.project_to_so3(np.asarray(np.linalg.lstsq(force_N, A @ gravity)[0].T, dtype=np.float64))
+            X = nearest_rotation(np.asarray(np.linalg.lstsq(force_N, A @ gravity)[0].T, dtype=np.float64))
         gravity = np.mean(R @ (force_N @ X.T)[:, :, None], axis=0)[:, 0]
     return X
 
@@ -223,7 +223,7 @@ def total_least_squares(R: Array, force_N: Array, down: Array) -> Array:
         [carlson.kron_identity(force_N), np.tile(-np.eye(3), (n, 1)), (0.3 * 9.82 * down @ R).reshape(-1, 1)]
     )
     null = np.linalg.svd(columns, full_matrices=False)[2][-1]
-    return carlson.project_to_so3((-null[:9] / null[12]).reshape(3, 3).T)
+    return nearest_rotation((-null[:9] / null[12]).reshape(3, 3).T)
 
 
 def report_known_direction(report: Report, quick: bool) -> None:

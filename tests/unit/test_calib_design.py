@@ -20,12 +20,13 @@ from calib.design import (
     efficiency,
     optimised,
     predicted_sigma,
+    second_basin,
     second_basin_gap,
     special,
     whitened_jacobian,
 )
 from calib.errors import NotObservable
-from calib.model import Array, jacobian, predict
+from calib.model import Array, angle_between, jacobian, predict
 from calib.selection import Criterion, choose, cone_candidates, next_pose, order
 from ftdrive.planning.constant_tour import NUMBERS
 
@@ -224,6 +225,15 @@ def test_a_centre_of_mass_near_the_sensor_is_observable() -> None:
 )
 def test_published_gaps(R_base_flange: Array, gap: float, atol: float) -> None:
     assert_allclose(second_basin_gap(R_base_flange, GUESS), gap, atol=atol)
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.3, 0.6])
+def test_the_second_solution_of_an_ambiguous_set_is_not_the_true_one(turn_rad: float) -> None:
+    turned = Rotation.from_rotvec([0, 0, turn_rad]).as_matrix() @ special(AMBIGUOUS_6)
+    gap, other = second_basin(turned, GUESS)
+    assert gap < 1e-9
+    assert other is not None
+    assert angle_between(other.R_flange_sensor, GUESS.parameters.R_flange_sensor) > 0.1
 
 
 def test_the_set_of_six_without_a_gap_is_really_ambiguous() -> None:

@@ -143,6 +143,8 @@ def without(name: str) -> str:
         (without("chi2"), "lacks the field chi2"),
         (json.dumps({**RESULT.to_dict(), "covariance": [[1]]}), "covariance must be"),
         (json.dumps({**RESULT.to_dict(), "force_bias_N": "x"}), "cannot be read"),
+        (json.dumps({**RESULT.to_dict(), "force_bias_N": [0, float("nan"), 0]}), "force_bias_N must be finite"),
+        (json.dumps({**RESULT.to_dict(), "R_flange_sensor": (-np.eye(3)).tolist()}), "must be a rotation matrix"),
     ],
 )
 def test_a_file_that_is_something_else_is_named_in_one_sentence(tmp_path: Path, content: str, words: str) -> None:

@@ -15,8 +15,8 @@ from calib import CalibrationDataset, CalibrationResult, NotObservable, Paramete
 from calib.compare import compare
 from calib.errors import BadDataset
 from calib.known import Known
-from calib.ml import STANDARD_GRAVITY_M_S2, fit
-from calib.model import Array, jacobian, predict
+from calib.ml import fit
+from calib.model import STANDARD_GRAVITY_M_S2, Array, jacobian, predict
 from calib.result import Method
 from calib.yu import SPECIAL_R_flange_base
 
@@ -200,8 +200,35 @@ def test_what_the_poses_cannot_tell_is_refused_in_words(R: Array, method: Method
 
 
 def test_a_sensor_that_feels_nothing_is_refused() -> None:
-    with pytest.raises(NotObservable, match="the force is exactly the same in all poses"):
+    with pytest.raises(NotObservable, match="the force is the same in all poses"):
         solve(dataset(R24, np.tile([1.0, 2, 3, 0, 0, 0], (24, 1))))
+    with pytest.raises(NotObservable, match="the force is the same in all poses"):
+        solve(dataset(R24, 1e-160 * predict(TRUTH, R24)))
+
+
+@pytest.mark.parametrize("n", [4, 8, 24])
+def test_exact_data_are_known_exactly(n: int) -> None:
+    R = Rotation.random(n, rng=3).as_matrix()
+    result = solve(dataset(R, predict(TRUTH, R)))
+    assert result.predicted_error()[0] < 1e-9
+    assert result.p_wrong < 1e-9
+    assert result.verdict == ("good" if n >= 6 else "usable")
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_walk_is_looked_for_where_there_is_nothing_to_see(measured: bool) -> None:
+    R = Rotation.random(8, rng=3).as_matrix()
+    no_lever = replace(TRUTH, p_sensor_com_m=np.zeros(3), torque_bias_Nm=np.zeros(3))
+    rng = np.random.default_rng(4)
+    pushed = predict(no_lever, R) + rng.normal(size=(8, 6)) * SIGMA * [1, 1, 1, 0, 0, 0]  # torques are exactly 0
+    for wrench in (predict(TRUTH, R), pushed):
+        solve(dataset(R, wrench, white(8) if measured else None), drift="random-walk")
+
+
+def test_rounding_is_no_evidence_of_inverted_orientations() -> None:
+    R = spin("x", 0.0)
+    result = solve(dataset(R, predict(TRUTH, R)), known=Known(gravity_direction_base=[0, 0, 1]))
+    assert not any("inverted" in reason for reason in result.reasons)
 
 
 def test_known_mountings_are_methods() -> None:

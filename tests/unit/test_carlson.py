@@ -9,9 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.carlson import ForceFit, eigen, iterative, nullspace, nullspace_all_pairs, polynomial, project_to_so3
+from calib.carlson import ForceFit, eigen, iterative, nullspace, nullspace_all_pairs, polynomial
 from calib.carlson_known import cayley, cayley_rotation, relaxation, similarity
 from calib.errors import BadDataset, NotObservable
+from calib.model import nearest_rotation
 
 Array = NDArray[np.float64]
 Method = Callable[[Array, Array, Array, bool], ForceFit]
@@ -458,7 +459,7 @@ def test_projection_is_the_nearest_rotation() -> None:
     rng = np.random.default_rng(19)
     for _ in range(20):
         M = rng.normal(size=(3, 3))
-        nearest = project_to_so3(M)
+        nearest = nearest_rotation(M)
         assert nearest @ nearest.T == pytest.approx(np.eye(3))
         assert np.linalg.det(nearest) == pytest.approx(1)
         distances = np.linalg.norm(Rotation.random(200, rng=rng).as_matrix() - M, axis=(1, 2))

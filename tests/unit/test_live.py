@@ -142,7 +142,8 @@ def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
     headline = likely_error(calibration)
     assert (headline > 1.1 * np.array(calibration.predicted_error())).all()
     mean = PoseMean(np.zeros(6), np.zeros((6, 6)), 20)
-    shown = [live._reading(live.Look(mean, one, 1e3, 0), calibration, "base")["sigma"] for one in R]
+    beyond = live._beyond_noise(calibration)
+    shown = [live._reading(live.Look(mean, one, 1e3, 0), calibration, beyond, "base")["sigma"] for one in R]
     rms = [float(np.sqrt(np.mean([np.sum(np.square(one[key])) for one in shown]))) for key in ("force_N", "torque_Nm")]
     np.testing.assert_allclose(rms, headline)
     assert min(min(one["force_N"]) for one in shown) > 0.5 * headline[0] / np.sqrt(3)
