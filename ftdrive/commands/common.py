@@ -118,9 +118,10 @@ def read_cell(config: Path | None, robot: str | None, sensor: str | None, *, mod
     return load(config, flags)
 
 
-def stop_unless_accepted(result: "CalibrationResult") -> None:
-    """Raise `NotAccepted` for a rejected result."""
+def stop_unless_accepted(result: "CalibrationResult", *, to_be_saved: bool = False) -> None:
+    """Raise `NotAccepted` for a rejected result, which says so where somebody waits for its file."""
     from ftdrive.errors import NotAccepted
 
     if result.verdict == "rejected":
-        raise NotAccepted("the result is rejected and was not saved: " + "; ".join(result.reasons))
+        unsaved = " and was not saved" if to_be_saved else ""
+        raise NotAccepted(f"the result is rejected{unsaved}: {'; '.join(result.reasons)}")

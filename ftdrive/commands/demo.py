@@ -56,7 +56,7 @@ def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
             f"\n   {uv}{outcome.run.solve_command} --method lrom"
             f"\n Saved {outcome.run.calibration_path}"
         )
-    stop_unless_accepted(outcome.result)
+    stop_unless_accepted(outcome.result, to_be_saved=True)
 
 
 def compensation_error(result: Any, truth: Any) -> dict[str, float]:

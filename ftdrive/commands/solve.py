@@ -142,7 +142,7 @@ def _solve_each(
             else:
                 print_result(result, drift=drift_check(records), records=records)
             if not force:
-                stop_unless_accepted(result)
+                stop_unless_accepted(result, to_be_saved=output is not None)
             if output is not None:
                 result.save(output)
                 talk.print(f" Saved {output}")
