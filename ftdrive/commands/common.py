@@ -42,6 +42,21 @@ def CELL(command: F) -> F:
     return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller.")(command))
 
 
+class Number(click.FloatRange):
+    """A number of a range. `click` takes nan for one of any range."""
+
+    name = "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number."""
+        from math import isfinite
+
+        number: float = super().convert(value, param, ctx)
+        if not isfinite(number):
+            self.fail(f"'{value}' is not a number.", param, ctx)
+        return number
+
+
 class NewFile(click.Path):
     """A file that a command makes: refused before any work where one is there already, or where its folder is not."""
 

@@ -17,7 +17,7 @@ from ftdrive.talk import talk
 
 @click.command()
 @click.option("--sensor", type=click.Choice(list(SENSORS)), default="can", show_default=True, help="Which one.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Draws the truth and the noise.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Draws the truth and the noise.")
 @click.option("--simulate", is_flag=True, expose_value=False, help="As every command has it; a demo always is.")
 @runs()
 @JSON
