@@ -14,6 +14,7 @@ from drivers.ati import modbus
 from drivers.ati.codec import decode_text
 from drivers.bota import codec as bota
 from drivers.errors import ConnectError, ProtocolError, StreamBroken
+from drivers.registry import in_url
 from drivers.robotiq import codec as robotiq
 from drivers.robotous import codec as robotous
 
@@ -54,14 +55,14 @@ def probe(port: str) -> Answer | None:
     """
     for known in _KNOWN:
         if known.streams(_hear(port, known, None, _LISTEN_S)):
-            return Answer(known.url.format(port=port), "it streams")
+            return Answer(known.url.format(port=in_url(port)), "it streams")
     for known in _KNOWN:
         if known.request is not None:
             try:
                 what = known.reply(_hear(port, known, known.request, _REPLY_S))
             except ProtocolError:
                 continue
-            return Answer(known.url.format(port=port), what)
+            return Answer(known.url.format(port=in_url(port)), what)
     return None
 
 

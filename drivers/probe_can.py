@@ -18,6 +18,7 @@ from drivers.ati import codec as ati
 from drivers.ati.codec import Op
 from drivers.errors import ConnectError, ProtocolError, StreamBroken
 from drivers.probe import Answer
+from drivers.registry import in_url
 from drivers.robotous import can as robotous_can
 from drivers.robotous import codec as robotous
 
@@ -159,7 +160,7 @@ def _robotous(channel: str, interface: str) -> _Known:
 
 
 def _url(scheme: str, channel: str, options: Sequence[str]) -> str:
-    return f"{scheme}://{channel}?{'&'.join(filter(None, options))}".rstrip("?")
+    return f"{scheme}://{in_url(channel)}?{'&'.join(filter(None, options))}".rstrip("?")
 
 
 def _ask(bus: CanBus, identifier: int, data: bytes, parts: Mapping[int, int]) -> bytes | None:

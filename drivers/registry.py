@@ -14,7 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from math import isfinite
 from types import MappingProxyType
 from typing import Any, Protocol, cast
-from urllib.parse import parse_qsl, unquote, urlsplit
+from urllib.parse import parse_qsl, quote, unquote, urlsplit
 
 from drivers._stream import StreamingSensor
 from drivers.interfaces import Fact, ForceTorqueSensor, RobotArm
@@ -146,6 +146,11 @@ def split_url(url: str) -> UrlParts:
     except ValueError as exc:
         raise BadUrl(f"{url}: {exc}; write it like {', '.join(_EXAMPLES)}") from exc
     return UrlParts(parts.scheme, unquote(parts.netloc + parts.path), parts.query, parts.fragment)
+
+
+def in_url(address: str) -> str:
+    """Write where a device is so that `split_url` reads it back: a port may have a space or a question mark in it."""
+    return quote(address, safe="/:@")
 
 
 class _FromUrl(Protocol):

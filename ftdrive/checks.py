@@ -16,7 +16,7 @@ from tempfile import TemporaryFile
 from typing import Any, Literal
 from urllib.parse import parse_qsl, urlencode
 
-from drivers.registry import BadUrl, split_url
+from drivers.registry import BadUrl, in_url, split_url
 from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError
 
@@ -95,7 +95,7 @@ class SensorAddress:
             return None if self.serial_port is None else str(self.serial_port)
         base = {key: self.options[key] for key in ("base",) if key in self.options}
         if self.options.get("interface") == "slcan":
-            return f"slcan://{self.address}?{urlencode({'bitrate': self.bitrate} | base)}"
+            return f"slcan://{in_url(self.address)}?{urlencode({'bitrate': self.bitrate} | base)}"
         return f"socketcan://{self.address}?{urlencode(base)}" if self.can_interface and base else self.can_interface
 
     @property

@@ -4,6 +4,7 @@ import importlib
 import logging
 import signal
 import sys
+from errno import ENOSPC
 from io import StringIO
 
 import click
@@ -79,7 +80,7 @@ def exit_code(error: BaseException) -> int | None:
     from calib.errors import BadCalibration, BadDataset, CalibError, TooFewSamples
     from drivers.errors import ConnectError, DeviceFault, DriverError
     from drivers.transcript import BadTranscript
-    from ftdrive.errors import ConfigError, NotAccepted
+    from ftdrive.errors import BadPlan, ConfigError, NotAccepted
 
     codes: list[tuple[type[BaseException], int]] = [
         (ConfigError, 2),
@@ -90,6 +91,7 @@ def exit_code(error: BaseException) -> int | None:
         (BadDataset, 6),
         (BadCalibration, 6),
         (BadTranscript, 6),
+        (BadPlan, 6),
         (CalibError, 7),
         (NotAccepted, 7),
         (OSError, 6),
@@ -101,6 +103,8 @@ def in_a_sentence(error: BaseException) -> str:
     """Say an error; one of the system with its file and what to look at, where it would be a number and two words."""
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}: check this path, and who may read and write there"
+    if isinstance(error, OSError) and error.errno == ENOSPC:
+        return f"{error.strerror}: make room where the output goes"
     return str(error)
 
 
@@ -123,8 +127,6 @@ def main() -> int:
     except (click.Abort, KeyboardInterrupt):
         click.echo("interrupted", err=True)
         return 130
-    except BrokenPipeError:
-        return 0
     except Exception as error:
         code = exit_code(error)
         if code is None:

@@ -236,11 +236,12 @@ def _from_cell(cell: CellConfig) -> dict[str, Setting]:
 
 def _from_file(path: Path) -> dict[str, Setting]:
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not a TOML file: {error}; mend it there") from error
     if (found := document.pop("format", None)) != FORMAT:
-        raise ConfigError(f'{path}: the first line must be format = "{FORMAT}", found {found!r}')
+        instead = "" if found is None else f", found {found!r}"
+        raise ConfigError(f'{path}: the first line must be format = "{FORMAT}"{instead}')
     if unknown := sorted(document.keys() - _SECTIONS.keys()):
         raise ConfigError(f"{path}: unknown section [{unknown[0]}]: the sections are {', '.join(_SECTIONS)}")
     values: dict[str, Setting] = {}
@@ -404,14 +405,22 @@ def _wrong_record(value: float) -> str | None:
 
 def _wrong_mounting(value: str) -> str | None:
     try:
-        usable = value in {"floor", "wall", "ceiling"} or isfinite(float(value))
+        usable = value in {"floor", "wall", "ceiling"} or abs(float(value)) <= 180
     except ValueError:
         usable = False
-    return None if usable else "give floor, wall, ceiling, or degrees the base leans to -x"
+    return None if usable else "give floor, wall, ceiling, or degrees the base leans to -x, -180 to 180"
+
+
+def _wrong_host(value: str) -> str | None:
+    return "give name or IPv4 address alone, such as 192.168.0.10" if "/" in value else _wrong_text(value)
+
+
+def _wrong_height(value: float) -> str | None:
+    return "is it mm? Give the height in mm, such as 33, or 0" if 0 < value < 1 else None
 
 
 _THINNEST_MM = 5.0
-"""A cylinder given in metres or inches is thinner."""
+"""What is given in metres or inches is thinner."""
 
 
 def _wrong_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
@@ -442,16 +451,22 @@ def _wrong_boxes(rows: Sequence[Sequence[float]]) -> str | None:
     for row in rows:
         if len(row) != 6 or any(row[i] == row[i + 3] for i in range(3)):
             return f"{list(row)} is no box: give two opposite corners [x, y, z, x, y, z] in mm"
+        if min(abs(row[i] - row[i + 3]) for i in range(3)) < _THINNEST_MM:
+            return (
+                f"{list(row)} is thinner than {_THINNEST_MM:g} mm, are these mm? Give two opposite corners in mm, "
+                f"{_THINNEST_MM:g} mm apart for what is thinner"
+            )
     return None
 
 
 _WRONG: Mapping[str, Callable[[Any], str | None]] = {
-    "robot.host": _wrong_text,
+    "robot.host": _wrong_host,
     "robot.model": _wrong_model,
     "robot.driver": _wrong_text,
     "robot.serial": _wrong_text,
     "sensor.url": _wrong_text,
     "sensor.sign": _wrong_sign,
+    "sensor.height_mm": _wrong_height,
     "sampling.noise_record_s": _wrong_record,
     "tool.name": _wrong_text,
     "tool.cylinders_mm": _wrong_cylinders,

@@ -34,7 +34,8 @@ Array = NDArray[np.float64]
 _PUSH_N = 2.0
 _SERVICES = "Settings, Security, Services"
 _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs on this computer"
-_SLOWEST_SLIDER = 0.05
+SLOWEST_SLIDER = 0.05
+"""Moves are waited for as long as they last with this one."""
 _OLDEST_MINOR = 4
 """Of PolyScope 3 and 5: ur_rtde cannot control older ones."""
 
@@ -267,7 +268,7 @@ def check_registers(taken: Sequence[str]) -> Check:
 
 def check_status(status: ArmStatus) -> list[Check]:
     """Judge what the controller says of itself: may the arm move, does a program run, how fast, with what payload."""
-    return [check_safety(status), _check_program(status), _check_speed(status), check_payload(status)]
+    return [check_safety(status), _check_program(status), check_speed(status), check_payload(status)]
 
 
 def check_safety(status: ArmStatus) -> Check:
@@ -287,9 +288,10 @@ def _check_program(status: ArmStatus) -> Check:
     return Check("robot.program", "warning", what, "stop it at the pendant: calibrate does not begin beside it")
 
 
-def _check_speed(status: ArmStatus) -> Check:
+def check_speed(status: ArmStatus) -> Check:
+    """Judge whether the speed slider lets the arm move in a reasonable time."""
     found = f"speed slider at {status.speed_slider:.0%}, the controller allows {status.speed_scaling:.0%}"
-    if status.speed_slider < _SLOWEST_SLIDER:
+    if status.speed_slider < SLOWEST_SLIDER:
         fix = "raise the speed slider at the pendant, to 100 % if nothing speaks against it: ftdrive never does"
         return Check("robot.speed", "failed", f"{found}: the arm would hardly move", fix)
     return Check("robot.speed", "ok", found)

@@ -9,6 +9,10 @@ class NotAccepted(Exception):
     """The result is not good enough to be kept, or differs from what it must equal."""
 
 
+class BadPlan(Exception):
+    """A file is no plan."""
+
+
 class PlanRefused(NotAccepted):
     """No motion is proven clear, or a plan was made for something else than what is there now."""
 

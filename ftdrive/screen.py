@@ -39,9 +39,18 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Key, Operator, Question
-from ftdrive.session.operators import JsonOperator, PlainOperator, in_words, match, prompt, read_line, rms_sigma
+from ftdrive.session.operators import (
+    JsonOperator,
+    PlainOperator,
+    head_and_words,
+    in_words,
+    match,
+    prompt,
+    read_line,
+    rms_sigma,
+)
 from ftdrive.session.running import GREEN
-from ftdrive.talk import talk
+from ftdrive.talk import hanging, talk
 
 Array = NDArray[np.float64]
 
@@ -383,9 +392,10 @@ class Screen:
         """Show an event."""
         with self._lock:
             self._view.update(event, self._clock())
-        if _history(event, self._view) and (words := in_words(event)):
+        head, words = head_and_words(event)
+        if words and _history(event, self._view):
             style = "bold red" if isinstance(event, GuardTripped) else ""
-            self._console.print(self._plain(Text(words, style)))
+            self._console.print(hanging(head, self._plain(words), self._console), style=style)
 
     def ask(self, question: Question) -> str:
         """Ask below the frame, which stands still meanwhile."""
@@ -415,7 +425,7 @@ class Screen:
         used = len(self._frame().renderables)
         while True:
             width = self._console.width
-            *lines, last = self._plain(Text(prompt(question).rstrip(), "bold")).wrap(self._console, width)
+            *lines, last = Text(self._plain(prompt(question).rstrip()), "bold").wrap(self._console, width)
             for line in lines:
                 self._console.print(line)
             self._console.print(last, end=" ", soft_wrap=True)
@@ -428,7 +438,7 @@ class Screen:
             if (answer := match(question, typed)) is not None:
                 break
             self._console.print(
-                self._plain(Text(f"'{typed.strip()}' is none of the answers.")), crop=True, no_wrap=True
+                Text(self._plain(f"'{typed.strip()}' is none of the answers.")), crop=True, no_wrap=True
             )
             used += 1
         self._console.file.write(f"\x1b[{used}F\x1b[J")
@@ -441,11 +451,9 @@ class Screen:
             self._view.ascii_only = self._console.options.ascii_only
             return frame(self._view, self._clock(), width=size.width, height=size.height)
 
-    def _plain(self, text: Text) -> Text:
+    def _plain(self, text: str) -> str:
         """Replace what the terminal's encoding lacks."""
-        if self._console.options.ascii_only:
-            text.plain = text.plain.translate(_ASCII)
-        return text
+        return text.translate(_ASCII) if self._console.options.ascii_only else text
 
 
 def _history(event: Event, view: View) -> bool:

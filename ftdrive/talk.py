@@ -28,10 +28,11 @@ def hanging(head: str | Text, words: str, console: Console = talk) -> Text:
     return first + Text("\n" + " " * first.cell_len).join(lines)
 
 
-def in_whole_words(text: str, file: TextIO) -> str:
+def in_whole_words(text: str, file: TextIO, head: str = "") -> str:
     """Break lines between words where they are longer than the terminal is wide; as it is for a file or pipe.
 
-    For what is written without `talk`. A word that is longer by itself, such as a path, stays whole.
+    For what is written without `talk`. A word that is longer by itself, such as a path, stays whole. Where `head` is
+    what the text begins with, its lines go on behind it, as in `hanging`.
     """
     try:
         width = os.get_terminal_size(file.fileno()).columns
@@ -39,7 +40,13 @@ def in_whole_words(text: str, file: TextIO) -> str:
         return text
     if width == 0:  # a terminal that does not know
         return text
-    fold = textwrap.TextWrapper(width, break_long_words=False, break_on_hyphens=False, replace_whitespace=False)
+    fold = textwrap.TextWrapper(
+        width,
+        subsequent_indent=" " * len(head) if width - len(head) >= _NARROWEST else "",
+        break_long_words=False,
+        break_on_hyphens=False,
+        replace_whitespace=False,
+    )
     return "\n".join(
         fold.fill(line) + line[len(line.rstrip()) :]
         for line in text.split("\n")  # a prompt ends with a space

@@ -163,7 +163,7 @@ def calibrate(
     else:
         saved = None if outcome.result.verdict == "rejected" else outcome.run.calibration_path
         print_result(outcome.result, drift=outcome.drift, records=outcome.run.records(), saved=saved)
-    stop_unless_accepted(outcome.result)
+    stop_unless_accepted(outcome.result, to_be_saved=True)
 
 
 def _refuse_contradictions(given: Collection[str]) -> None:

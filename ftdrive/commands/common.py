@@ -42,6 +42,21 @@ def CELL(command: F) -> F:
     return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller.")(command))
 
 
+class Number(click.FloatRange):
+    """A number of a range. `click` takes nan for one of any range."""
+
+    name = "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number."""
+        from math import isfinite
+
+        number: float = super().convert(value, param, ctx)
+        if not isfinite(number):
+            self.fail(f"'{value}' is not a number.", param, ctx)
+        return number
+
+
 class NewFile(click.Path):
     """A file that a command makes: refused before any work where one is there already, or where its folder is not."""
 
@@ -118,9 +133,10 @@ def read_cell(config: Path | None, robot: str | None, sensor: str | None, *, mod
     return load(config, flags)
 
 
-def stop_unless_accepted(result: "CalibrationResult") -> None:
-    """Raise `NotAccepted` for a rejected result."""
+def stop_unless_accepted(result: "CalibrationResult", *, to_be_saved: bool = False) -> None:
+    """Raise `NotAccepted` for a rejected result, which says so where somebody waits for its file."""
     from ftdrive.errors import NotAccepted
 
     if result.verdict == "rejected":
-        raise NotAccepted("the result is rejected and was not saved: " + "; ".join(result.reasons))
+        unsaved = " and was not saved" if to_be_saved else ""
+        raise NotAccepted(f"the result is rejected{unsaved}: {'; '.join(result.reasons)}")

@@ -17,7 +17,7 @@ from ftdrive.talk import talk
 
 @click.command()
 @click.option("--sensor", type=click.Choice(list(SENSORS)), default="can", show_default=True, help="Which one.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Draws the truth and the noise.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Draws the truth and the noise.")
 @click.option("--simulate", is_flag=True, expose_value=False, help="As every command has it; a demo always is.")
 @runs()
 @JSON
@@ -56,7 +56,7 @@ def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
             f"\n   {uv}{outcome.run.solve_command} --method lrom"
             f"\n Saved {outcome.run.calibration_path}"
         )
-    stop_unless_accepted(outcome.result)
+    stop_unless_accepted(outcome.result, to_be_saved=True)
 
 
 def compensation_error(result: Any, truth: Any) -> dict[str, float]:

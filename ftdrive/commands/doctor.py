@@ -23,7 +23,7 @@ from drivers.ur.reading import CONNECT_S
 from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
 from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
-from ftdrive.commands.common import CELL, JSON, MODEL, check_simulate, read_cell, runs, simulate, write_json
+from ftdrive.commands.common import CELL, JSON, MODEL, Number, check_simulate, read_cell, runs, simulate, write_json
 from ftdrive.config import USUAL_KG, CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.simulation import Station, sensor_name, sensor_url
@@ -52,7 +52,7 @@ _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "
 )
 @click.option(
     "--mass-kg",
-    type=click.FloatRange(0, min_open=True),
+    type=Number(0, min_open=True),
     help="Expected, of the tool.  [default: [tool] mass_kg, else 1]",
 )
 @click.option("--push", is_flag=True, help="Find the sign of the sensor: you push the tool along +X of the base.")

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import JSON, NewFile, check_simulate, simulate, write_json
+from ftdrive.commands.common import JSON, NewFile, Number, check_simulate, simulate, write_json
 
 if TYPE_CHECKING:
     from ftdrive.planning.plan import Plan
@@ -31,7 +31,7 @@ def export() -> None:
 @click.option(
     "--dwell",
     "dwell_s",
-    type=click.FloatRange(0, 600),
+    type=Number(0, 600),
     default=4.0,
     show_default=True,
     help="Rest at each pose, seconds (urscript).",

@@ -179,7 +179,13 @@ class Questions:
             return read(given)
         while True:
             shown = in_whole_words(f"{words} [{usual}]: " if usual else f"{words}: ", sys.stderr)
-            answer = click.prompt(shown, default=usual, show_default=False, prompt_suffix="", err=True)
+            try:
+                answer = click.prompt(shown, default=usual, show_default=False, prompt_suffix="", err=True)
+            except click.Abort as abort:
+                click.echo(err=True)  # what is told next begins a line
+                if isinstance(abort.__context__, EOFError):
+                    raise ConfigError(f"nobody answered: give {flag}, or run it in a terminal") from abort
+                raise
             try:
                 return read(answer)
             except ConfigError as error:

@@ -49,8 +49,18 @@ USUAL_POSTURE_DEG = (45, -100, 60)
     help="A wall: the arm stays where normal times place, base axes, is MM or more. The mounting surface is known.",
 )
 @click.option("--box", "boxes", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block, two corners in mm, base axes.")
-@click.option("--tip-speed-limit", metavar="MM/S|none", help="Of the tool's farthest points.  [default: 250]")
-@click.option("--mass", "mass_kg", type=float, help="Of the tool in kg, for the prediction.  [default: 1]")
+@click.option(
+    "--tip-speed-limit",
+    metavar="MM/S|none",
+    help="Of the tool's farthest points.  [default: [robot] tip_speed_mm_s, else 250]",
+)
+@click.option(
+    "--mass",
+    "mass_kg",
+    metavar="KG",
+    type=float,
+    help="Of the tool, for the prediction.  [default: [tool] mass_kg, else 1]",
+)
 @click.option("--output", type=NewFile(), help="Save the plan as a new JSON file.")
 @click.option("--png", type=NewFile(), help="Save stick figures (needs ftdrive[viz]).")
 @click.option("--view", is_flag=True, help="Show it in the browser, in three dimensions (needs ftdrive[viz]).")

@@ -24,6 +24,7 @@ from ftdrive.commands.common import (
     EMULATED_SENSOR,
     JSON,
     NewFile,
+    Number,
     check_simulate,
     numbers,
     simulate,
@@ -73,12 +74,8 @@ _NAMES = "\b\nMETHOD is one of\n" + fill(
     show_default=True,
     help="How the bias may move during the poses; the order of rows stands in for missing times.",
 )
-@click.option(
-    "--mass-kg", metavar="KG", type=click.FloatRange(0, min_open=True), help="Known mass of what hangs on the sensor."
-)
-@click.option(
-    "--level-deg", metavar="DEG", type=click.FloatRange(0, 180), help="The base is level within so much (one sigma)."
-)
+@click.option("--mass-kg", metavar="KG", type=Number(0, min_open=True), help="Known mass of what hangs on the sensor.")
+@click.option("--level-deg", metavar="DEG", type=Number(0, 180), help="The base is level within so much (one sigma).")
 @click.option("--mounting-deg", metavar="RX,RY,RZ", help="Known rotation vector of the sensor in the flange.")
 @click.option("--output", "-o", type=NewFile(), help="Save the calibration here.")
 @click.option("--force", is_flag=True, help="Save even a rejected result; it stays marked as rejected.")
@@ -142,7 +139,7 @@ def _solve_each(
             else:
                 print_result(result, drift=drift_check(records), records=records)
             if not force:
-                stop_unless_accepted(result)
+                stop_unless_accepted(result, to_be_saved=output is not None)
             if output is not None:
                 result.save(output)
                 talk.print(f" Saved {output}")

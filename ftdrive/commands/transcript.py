@@ -18,7 +18,7 @@ from drivers.transcript import INTERRUPTED, BadTranscript, Transcript, Writer
 from drivers.transcript_player import Player
 from drivers.transcript_taps import recording
 from ftdrive.checks import SensorAddress
-from ftdrive.commands.common import EMULATED_SENSOR, JSON, NewFile, check_simulate, simulate, write_json
+from ftdrive.commands.common import EMULATED_SENSOR, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs import versions
 from ftdrive.simulation import EMULATED, sensor_name, sensor_url
@@ -42,9 +42,7 @@ def transcript() -> None:
 @click.option("--sensor", metavar="URL", help="Such as ati-serial:///dev/serial/by-id/NAME.")
 @simulate("An emulated sensor, on RS-485 from ATI unless --sensor emulated://NAME names another.")
 @click.option("-o", "--output", "path", required=True, type=NewFile(), help="A new file.")
-@click.option(
-    "--duration", "duration_s", type=click.FloatRange(0.1, 600), default=5.0, show_default=True, help="Seconds."
-)
+@click.option("--duration", "duration_s", type=Number(0.1, 600), default=5.0, show_default=True, help="Seconds.")
 @JSON
 def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as_json: bool) -> None:
     """Record what the driver and its sensor say to each other, from opening to closing.

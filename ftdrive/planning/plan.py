@@ -12,7 +12,7 @@ import numpy as np
 from calib.design import Guess, Prediction, predicted_sigma, special
 from calib.files import check_format, read_object, write_new
 from drivers.ur.kinematics import Array
-from ftdrive.errors import PlanRefused
+from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.certify import Certificate, Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
 
@@ -107,12 +107,12 @@ class Plan:
 
     @classmethod
     def load(cls, path: Path) -> "Plan":
-        """Read a file; raises `PlanRefused` when it is no plan or was changed since it was made."""
+        """Read a file; raises `BadPlan` for what is no plan, `PlanRefused` for one that was changed."""
         try:
-            document = read_object(path, PlanRefused)
-            check_format(document, PLAN_FORMAT, PlanRefused)
-        except PlanRefused as error:
-            raise PlanRefused(f"{path}: {error}") from error
+            document = read_object(path, BadPlan)
+            check_format(document, PLAN_FORMAT, BadPlan)
+        except BadPlan as error:
+            raise BadPlan(f"{path}: {error}") from error
         document.pop("schema_version", None)  # that of `ftdrive plan --json`, which is a plan too
         found = document.pop("sha256", None)
         if found != digest(document):

@@ -19,6 +19,7 @@ from calib.errors import TooFewSamples
 from calib.routine import PoseRecord, Sampling, Stage, TourPose, take_pose
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ForceTorqueSensor, RobotArm
+from ftdrive.diagnosis import SLOWEST_SLIDER
 from ftdrive.errors import Declined, NotAccepted, PlanRefused
 from ftdrive.mismatch import payload_in_words
 from ftdrive.planning.approach import arm_moves, plan_approach
@@ -52,8 +53,6 @@ BACK_RAD_S: Final = float(np.radians(10))
 """To the pose the arm came from, after it was stopped on its way."""
 SLOW: Final = Speeds.first_run()
 _AT_RAD: Final = float(np.radians(0.5))
-_PATIENCE: Final = 20.0
-"""A slow slider stretches a move; one that stands still is seen by its guard."""
 _NEAR_RAD: Final = float(np.radians(10))
 """A way that comes so close to a skipped posture passes it."""
 _FIRST_WORD: Final = "MOVE"
@@ -425,7 +424,7 @@ class Tour:
         with self._watcher.watching(start, goal, moving=True):
             self._arm.move_to(
                 goal.tolist(),
-                timeout_s=_PATIENCE * (duration_s + 1.5),
+                timeout_s=(duration_s + 1.5) / SLOWEST_SLIDER,  # that the arm stands still is seen by its guard
                 guard=self._between_looks,
                 speed_rad_s=speed_rad_s,
                 acceleration_rad_s2=acceleration_rad_s2,

@@ -295,7 +295,10 @@ class _Collection:
     def _deal_with(self) -> None:
         """Be done with where the arm stands, and say so: the state must not go on as if something were measured."""
         self._dealt_with = True
-        self._tell_state(State.MOVE, "the program goes on" if self._listen else "move on to another orientation")
+        words = "the program goes on" if self._listen else "move on to another orientation"
+        if self._light == "green" and not (self._listen or self._ends_by_itself):
+            words = f"enough: press k to finish, or {words}"
+        self._tell_state(State.MOVE, words)
 
     def _learn(self, record: PoseRecord) -> None:
         """Take in what a pose that is on disk tells, and tell it."""

@@ -121,7 +121,7 @@ class PlainOperator:
 
     def __init__(self, *, stdin: TextIO | None = None, stderr: TextIO | None = None, quiet: bool = False) -> None:
         self._stdin, self._stderr = stdin or sys.stdin, stderr or sys.stderr
-        self._quiet, self._untold = quiet, list[str]()
+        self._quiet, self._untold = quiet, list[tuple[str, str]]()
         self._lock = Lock()
         self._asked = ""
 
@@ -129,18 +129,20 @@ class PlainOperator:
         """Write the event in words, if it is worth a line."""
         if isinstance(event, Asked) and event.question == self._asked:
             return  # stands there already
-        if not (words := in_words(event)):
+        head, words = head_and_words(event)
+        if not words:
             return
         if self._quiet:
-            self._untold.append(words + "\n")
+            self._untold.append((head, words))
         else:
-            self._write(words + "\n")
+            self._write(f"{head}{words}\n", head)
 
     def ask(self, question: Question) -> str:
         """Answer from stdin; raises `Declined` at its end."""
         self._asked = question.text
         untold, self._untold = self._untold, []
-        self._write("".join(untold))
+        for head, words in untold:
+            self._write(f"{head}{words}\n", head)
         while True:
             self._write(prompt(question))
             try:
@@ -163,37 +165,42 @@ class PlainOperator:
         """Nothing: Ctrl-C stops a session."""
         return None
 
-    def _write(self, text: str) -> None:
+    def _write(self, text: str, head: str = "") -> None:
         with self._lock:
-            self._stderr.write(in_whole_words(text, self._stderr))
+            self._stderr.write(in_whole_words(text, self._stderr, head))
             self._stderr.flush()
 
 
 def in_words(event: Event) -> str:
     """Say an event, a plan in many lines, all else in one; nothing for those that only a screen can show."""
+    return "".join(head_and_words(event))
+
+
+def head_and_words(event: Event) -> tuple[str, str]:
+    """Say an event: the mark it begins with, behind which its words go on, and the words."""
     match event:
         case RunOpened():
-            return f"kept in {event.folder}; to continue after a stop: {event.resume}"
+            return "", f"kept in {event.folder}; to continue after a stop: {event.resume}"
         case StateChanged(state=State.HOLD):  # has all that STOP said
-            return f"{event.state.upper()}: {event.words}"
+            return "", f"{event.state.upper()}: {event.words}"
         case StateChanged(state=State.PREFLIGHT | State.APPROACH | State.CLOSE):
-            return f"{event.state}{': ' if event.words else ''}{event.words}"
+            return "", f"{event.state}{': ' if event.words else ''}{event.words}"
         case Checked():
-            return f"{'ok  ' if event.passed else 'FAIL'} {event.name}: {event.words}"
+            return "ok   " if event.passed else "FAIL ", f"{event.name}: {event.words}"
         case Planned():
-            return f"{plan_in_words(event.plan)}\n{event.way_words}"
+            return "", f"{plan_in_words(event.plan)}\n{event.way_words}"
         case Noted():
-            return f"{'! ' if event.warning else ''}{event.words}"
+            return "! " if event.warning else "", event.words
         case PoseTaken():
-            return pose_in_words(event)
+            return "", pose_in_words(event)
         case Estimated():
-            return estimate_in_words(event)
+            return "  ", estimate_in_words(event)
         case GuardTripped():
-            return f"STOPPED by guard {event.hazard}: {event.words}"
+            return "", f"STOPPED by guard {event.hazard}: {event.words}"
         case Asked():
-            return f"{event.question} {event.answer}{' (--yes)' if event.by == '--yes' else ''}"
+            return "", f"{event.question} {event.answer}{' (--yes)' if event.by == '--yes' else ''}"
         case _:
-            return ""
+            return "", ""
 
 
 def pose_in_words(event: PoseTaken) -> str:
@@ -210,7 +217,7 @@ def pose_in_words(event: PoseTaken) -> str:
 
 def estimate_in_words(event: Estimated) -> str:
     """Say where the calibration stands."""
-    words = f"  coverage {event.light}"
+    words = f"coverage {event.light}"
     if "mass_kg" in event.values:
         words += f", mass {event.values['mass_kg']:.4f} ± {event.sigma['mass_kg']:.4f} kg"
     if event.residual_sigma is not None and event.residual_force_N is not None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -77,6 +78,43 @@ def test_a_wrong_option_is_told_in_whole_words(
     told = capfd.readouterr().err
     assert "'carlson-iterative'" in told
     assert max(map(len, told.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("doctor", "--simulate", "--mass-kg", "nan"),
+        ("export", "plan", "--simulate", "--format", "urscript", "--dwell", "nan"),
+        ("solve", "--simulate", "--level-deg", "nan"),
+        ("transcript", "record", "--simulate", "-o", "sensor.jsonl", "--duration", "nan"),
+        ("demo", "--seed", "-1"),
+    ],
+)
+def test_a_number_of_no_use_is_refused_before_any_work(
+    arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    outcome = CliRunner().invoke(cli, arguments)
+    assert outcome.exit_code == 2
+    assert f"Invalid value for '{arguments[-2]}'" in outcome.stderr
+    assert outcome.stdout == ""
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full")
+def test_a_full_disk_and_a_reader_that_is_gone_are_no_crash() -> None:
+    command = [sys.executable, "-m", "ftdrive", "config", "show", "--json"]
+    with Path("/dev/full").open("w") as full:
+        outcome = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (outcome.returncode, outcome.stderr) == (
+        6,
+        "error: No space left on device: make room where the output goes\n",
+    )
+    reader, writer = os.pipe()
+    os.close(reader)
+    outcome = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert (outcome.returncode, outcome.stderr) == (1, "")
 
 
 @pytest.mark.parametrize("command", list(names(cli)))

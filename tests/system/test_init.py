@@ -62,7 +62,7 @@ def test_a_script_needs_no_questions(station: Station) -> None:
         "--plane",
         "-1:0:0:-900",
         "--box",
-        "5:5:0:9:9:9",
+        "500:500:0:900:900:90",
         "--speed",
         "45",
     ]
@@ -76,7 +76,7 @@ def test_a_script_needs_no_questions(station: Station) -> None:
     assert cell.tool.cylinders_mm == ((0, 33, 80), (33, 200, 100, 0, 5))
     assert (cell.tool.name, cell.tool.mass_kg, cell.workcell.mounting) == ("gripper", 1.2, "12.5")
     assert cell.workcell.planes_mm == ((-1, 0, 0, -900),)
-    assert cell.workcell.boxes_mm == ((5, 5, 0, 9, 9, 9),)
+    assert cell.workcell.boxes_mm == ((500, 500, 0, 900, 900, 90),)
 
 
 def test_an_arm_that_cannot_be_planned_for_is_said_to_be_one() -> None:
@@ -180,6 +180,13 @@ def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
     assert cell.workcell.planes_mm == ((-1, 0, 0, -800),)
     assert cell.workcell.boxes_mm == ((300, 300, 0, 500, 500, 400),)
     assert (cell.sensor.height_mm, cell.sensor.mass_kg) == (33, None)
+
+
+def test_a_script_that_answers_too_little_is_told_the_option(station: Station) -> None:
+    error = run("--robot", station.cell.robot.host, "--sensor", station.cell.sensor.url, typed="33\n").exception
+    assert isinstance(error, ConfigError)
+    assert str(error) == "nobody answered: give --sensor-mass, or run it in a terminal"
+    assert not Path("ftdrive.toml").exists()
 
 
 def test_a_person_may_keep_addresses_that_do_not_answer() -> None:

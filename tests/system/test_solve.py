@@ -121,6 +121,8 @@ def test_a_rejected_result_is_saved_only_by_force_and_stays_marked(tmp_path: Pat
     path.write_text("\n".join([HEADER, *noisy]))
     refused = solve(path, "-o", output)
     assert refused.returncode == 7, refused.stderr
+    assert "error: the result is rejected and was not saved: " in refused.stderr
+    assert "error: the result is rejected: " in solve(path).stderr  # nobody asked for a file
     assert not output.exists()
     assert solve(path, "-o", output, "--force").returncode == 0
     assert json.loads(output.read_text())["verdict"] == "rejected"

@@ -123,6 +123,7 @@ def test_the_name_by_id_of_a_port(computer: Path) -> None:
         ("ati-can://can0?base=0x7F", "socketcan://can0?base=0x7F"),
         ("ati-can:///dev/ttyACM0?interface=slcan&bitrate=500000", "slcan:///dev/ttyACM0?bitrate=500000"),
         ("robotous-can:///dev/ttyACM0?interface=slcan", "slcan:///dev/ttyACM0?bitrate=1000000"),
+        ("robotous-can:///dev/my%20port?interface=slcan", "slcan:///dev/my%20port?bitrate=1000000"),
         ("ati-can://PCAN_USBBUS1?interface=pcan", None),
         ("ati-can:///dev/ttyUSB0?interface=robotell", None),
         ("bota:///dev/serial/by-id/my%20port", "/dev/serial/by-id/my port"),

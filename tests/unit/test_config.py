@@ -40,7 +40,7 @@ def test_every_section_reaches_the_cell(tmp_path: Path) -> None:
         GOOD
         + "height_mm = 33\nmass_kg = 0.255\n"
         + '[tool]\nname = "gripper"\ncylinders_mm = [[0, 33, 80], [33, 200, 100, 0, -5.5]]\nmass_kg = 1.2\n'
-        + '[workcell]\nmounting = "30"\nplanes_mm = [[-1, 0, 0, -800]]\nboxes_mm = [[1, 2, 3, 4, 5, 6]]\n'
+        + '[workcell]\nmounting = "30"\nplanes_mm = [[-1, 0, 0, -800]]\nboxes_mm = [[10, 20, 30, 40, 50, 60]]\n'
         + "measured = true\n"
     )
     cell = load(path)
@@ -52,7 +52,7 @@ def test_every_section_reaches_the_cell(tmp_path: Path) -> None:
     )
     assert cell.tool.cylinders_mm == ((0.0, 33.0, 80.0), (33.0, 200.0, 100.0, 0.0, -5.5))
     assert cell.workcell.planes_mm == ((-1.0, 0.0, 0.0, -800.0),)
-    assert cell.workcell.boxes_mm == ((1.0, 2.0, 3.0, 4.0, 5.0, 6.0),)
+    assert cell.workcell.boxes_mm == ((10.0, 20.0, 30.0, 40.0, 50.0, 60.0),)
     assert (cell.workcell.mounting, cell.workcell.measured) == ("30", True)
 
 
@@ -192,6 +192,8 @@ def test_other_programs_variables_are_left_alone(monkeypatch: pytest.MonkeyPatch
         (GOOD + "sign = true\n", "sign"),
         (GOOD + "sign = 0\n", "sign = 0.*-1 for"),
         (GOOD + "height_mm = 3300\n", "0 to 500"),
+        (GOOD + "height_mm = 0.033\n", "is it mm"),
+        (GOOD.replace("10.0.0.2", "http://10.0.0.2/"), "name or IPv4 address alone"),
         (GOOD + "[robot", "TOML"),
         (GOOD + '[site]\ng_m_s2 = "9.8"\n', "g_m_s2"),
         (GOOD + "[site]\ng_m_s2 = -9.8\n", "9.7 to 9.9"),
@@ -203,7 +205,9 @@ def test_other_programs_variables_are_left_alone(monkeypatch: pytest.MonkeyPatch
         (GOOD + "[tool]\ncylinders_mm = [[0, 60, 90], [60, 200, 4]]\n", "5 mm for what is thinner"),
         (GOOD + "[workcell]\nplanes_mm = [[0, 0, 0, 5]]\n", "plane"),
         (GOOD + "[workcell]\nboxes_mm = [[0, 0, 0, 1, 1, 0]]\n", "box"),
+        (GOOD + "[workcell]\nboxes_mm = [[0.6, 0.6, 0, 0.8, 0.8, 0.2]]\n", "are these mm"),
         (GOOD + '[workcell]\nmounting = "sideways"\n', "mounting"),
+        (GOOD + "[workcell]\nmounting = 450\n", "-180 to 180"),
         (GOOD + '[workcell]\nmounting = "nan"\n', "mounting"),
         (GOOD + "[workcell]\nmeasured = 1\n", "measured"),
     ],
@@ -214,6 +218,19 @@ def test_errors_name_file_and_key(text: str, word: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=word) as error:
         load(path)
     assert str(path) in str(error.value) or "is not set" in str(error.value)
+
+
+def test_a_file_of_another_kind_is_told_what_its_first_line_must_be(tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text("[robot]\n")
+    with pytest.raises(ConfigError, match=r'first line must be format = "ftdrive.config/1"$'):
+        load(path)
+
+
+def test_a_mark_of_the_byte_order_is_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(GOOD, encoding="utf-8-sig")  # as an editor on Windows may write it
+    assert load(path).robot.host == "10.0.0.2"
 
 
 def test_every_number_has_a_range_and_every_range_a_key() -> None:

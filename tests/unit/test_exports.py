@@ -284,6 +284,11 @@ def test_files_are_new_and_plans_unchanged(path: Path, tmp_path: Path) -> None:
     assert isinstance(again.exception, ConfigError)
     assert "never overwritten" in str(again.exception)
     assert out.read_text() == written
+    (other := tmp_path / "other.json").write_text('{"format": "ftdrive.dataset/1"}')
+    refused = export(other, "--format", "urscript").exception
+    assert refused is not None
+    assert exit_code(refused) == 6
+    assert f"{other}: the format is" in str(refused)
     edited = tmp_path / "edited.json"
     edited.write_text(path.read_text().replace('"speed_rad_s": 1.0471975511965976', '"speed_rad_s": 3.0'))
     refused = export(edited, "--format", "urscript").exception

@@ -183,6 +183,26 @@ def test_plain_lines_tell_what_is_worth_a_line() -> None:
     assert "\x1b" not in stderr.getvalue()
 
 
+@pytest.mark.parametrize("quiet", [True, False])
+def test_what_is_told_goes_on_behind_its_mark(quiet: bool) -> None:
+    person, program = pty.openpty()
+    termios.tcsetwinsize(program, (24, 40))
+    with os.fdopen(program, "w", encoding="utf-8") as file:
+        operator = PlainOperator(stdin=io.StringIO("yes\n"), stderr=file, quiet=quiet)
+        operator.tell(Checked(name="load", passed=True, words="not compared: the tool's mass is not known"))
+        operator.tell(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
+        operator.ask(Question("Go?"))
+        told = os.read(person, 4096).decode().splitlines()
+    os.close(person)
+    assert told == [
+        "ok   load: not compared: the tool's mass",
+        "     is not known",
+        "! the first run of a plan is slow,",
+        "  whatever was asked",
+        "Go? [yes/no] yes",
+    ]
+
+
 def test_a_terminal_gets_whole_words_and_a_file_whole_lines() -> None:
     person, program = pty.openpty()
     termios.tcsetwinsize(program, (24, 40))

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
 
 from drivers._stream import StreamingSensor
 from drivers.ati.can import AtiCanSensor
@@ -14,7 +16,7 @@ from drivers.ati.serial import AtiSerialSensor
 from drivers.bota.sensor import BotaSensor
 from drivers.interfaces import Fact
 from drivers.netft import NetFtSensor
-from drivers.registry import BadUrl, arm_class, sensor_from_url
+from drivers.registry import BadUrl, arm_class, in_url, sensor_from_url, split_url
 from drivers.robotiq.sensor import RobotiqFt300
 from drivers.robotous.can import RobotousCan
 from drivers.robotous.serial import RobotousSerial
@@ -24,6 +26,18 @@ from ftdrive.commands import doctor
 from ftdrive.config import FORMAT, CellConfig, RobotConfig, SensorConfig
 from ftdrive.errors import ConfigError
 from ftdrive.wiring import build_arm
+
+
+@given(st.text(min_size=1))
+def test_any_name_of_a_port_is_read_back_from_its_address(name: str) -> None:
+    for path in (name, f"/dev/{name}"):
+        parts = split_url(f"bota://{in_url(path)}?baud=460800")
+        assert (parts.address, parts.query, parts.fragment) == (path, "baud=460800", "")
+
+
+def test_usual_names_stand_in_an_address_as_they_are() -> None:
+    for path in ("/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0-port0", "COM3", "/dev/ttyACM0@1000000"):
+        assert in_url(path) == path
 
 
 def test_can_addresses() -> None:

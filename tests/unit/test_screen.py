@@ -23,6 +23,7 @@ from ftdrive.keyboard import Keyboard
 from ftdrive.screen import Screen, View, frame, open_operator
 from ftdrive.session.events import (
     Asked,
+    Checked,
     Estimated,
     Event,
     GuardTripped,
@@ -465,6 +466,19 @@ def test_enter_in_step_mode_leaves_no_line_behind() -> None:
         operator.tell(Asked(question="Is the tool free?", answer="yes", by="--yes"))
     assert "Enter moves" not in file.getvalue()
     assert "Is the tool free? yes (--yes)" in file.getvalue()
+
+
+def test_a_long_finding_goes_on_under_its_text() -> None:
+    console = Console(file=(file := io.StringIO()), width=40, force_terminal=True, color_system=None)
+    words = "the controller carries 0.50 kg; nothing in [tool] to compare it with"
+    with Screen(console, stdin=io.StringIO()) as operator:
+        operator.tell(Checked(name="payload", passed=True, words=words))
+    told = file.getvalue()
+    begins = told.index("ok   payload:")
+    lines = [line.rstrip() for line in told[begins : told.index("with", begins) + 4].splitlines()]
+    assert lines[0] == "ok   payload: the controller carries"
+    assert all(line.startswith(" " * 5) and len(line) <= 40 for line in lines[1:])
+    assert " ".join(" ".join(lines).split()) == f"ok payload: {words}"
 
 
 def test_without_a_terminal_there_are_plain_lines_and_json_where_asked_for() -> None:

@@ -312,6 +312,9 @@ def test_keep_ends_it_when_the_poses_are_enough_and_not_before() -> None:
     words = outcome.person.words()
     assert "The light is amber: these poses are not enough yet; press q to stop all the same." in words
     assert words.count("These poses are enough: press k to finish") == 1
+    moves = [event.words for event in outcome.person.told if isinstance(event, StateChanged) and event.words]
+    move_on = "move on to another orientation"
+    assert moves == [move_on] * 5 + [f"enough: press k to finish, or {move_on}"]  # the screen says so all the time
     assert outcome.person.told[-1].to_dict()["words"] == "Finished: 6 poses are kept."
     assert outcome.cell.now_s == pytest.approx(32.0, abs=0.2)
 

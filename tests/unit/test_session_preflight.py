@@ -13,6 +13,7 @@ from drivers.errors import DeviceFault, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus
 from ftdrive import checks
 from ftdrive.config import ToolConfig, WorkcellConfig
+from ftdrive.diagnosis import SLOWEST_SLIDER, check_speed
 from ftdrive.errors import NotAccepted
 from ftdrive.session import preflight
 from ftdrive.session.events import (
@@ -67,6 +68,14 @@ def test_a_tour_that_would_wind_up_the_cable_is_refused(lab: Lab, tmp_path: Path
 def test_a_payload_that_is_not_that_of_the_tool_is_refused(lab: Lab) -> None:
     lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=3.0))
     refuse(lab, "1.50 kg, sensor and tool are 3.00 kg")
+
+
+def test_a_speed_slider_that_doctor_calls_too_low_is_refused(lab: Lab) -> None:
+    lab.arm.set_status(speed_slider=SLOWEST_SLIDER)
+    assert lab.calibrate(dry_run=True) is None
+    lab.arm.set_status(speed_slider=SLOWEST_SLIDER - 0.01)
+    assert check_speed(lab.arm.status()).state == "failed"
+    refuse(lab, "slider: speed slider at 4%.*raise the speed slider at the pendant")
 
 
 def test_a_pose_the_controller_forbids_is_refused(lab: Lab) -> None:

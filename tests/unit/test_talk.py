@@ -4,6 +4,7 @@ import io
 import logging
 import re
 import sys
+from errno import ENOSPC
 from pathlib import Path
 
 import pytest
@@ -109,5 +110,8 @@ def test_errors_of_the_system_name_the_file_and_what_to_look_at(tmp_path: Path) 
         (tmp_path / "gone").read_text()
     assert in_a_sentence(error.value) == (
         f"{tmp_path}/gone: No such file or directory: check this path, and who may read and write there"
+    )
+    assert in_a_sentence(OSError(ENOSPC, "No space left on device")) == (
+        "No space left on device: make room where the output goes"
     )
     assert in_a_sentence(FileExistsError("it is there: choose another name")) == "it is there: choose another name"

@@ -1,5 +1,6 @@
 """Which sensor is on a port: found by its stream or by its answer, with nothing but requests to read."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from drivers import probe as module
 from drivers.errors import ConnectError
 from drivers.probe import probe
+from drivers.registry import sensor_from_url
 from mocks.ati_can import AtiCanNode
 from mocks.ati_serial import AtiSerialBox
 from mocks.bota import BotaBox
@@ -46,6 +48,20 @@ def test_a_sensor_shows_itself(kind: Any, options: dict[str, Any], scheme: str |
         assert answer.url is not None
         assert answer.url.partition("?")[0] == f"{scheme}://{port}"
         assert what in answer.what
+
+
+def test_the_address_of_a_port_with_a_strange_name_works(tmp_path: Path) -> None:
+    port, rng = tmp_path / "my port #1?50%20", np.random.default_rng(1)
+    box = BotaBox(lambda n: rng.normal(size=(n, 6)), seed=1)
+    try:
+        port.symlink_to(box.start())
+        answer = probe(str(port))
+        assert answer is not None
+        assert answer.url is not None
+        with sensor_from_url(answer.url) as sensor:
+            assert len(sensor.collect(0.2).seq)
+    finally:
+        box.stop()
 
 
 def test_a_silent_port_is_asked_by_readings_only(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ import sys
 import threading
 import tty
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -129,6 +130,15 @@ def test_a_sensor_shows_itself_and_its_address_works(
     port = start(kind, **options)
     (answer,) = probe_can(port, interface="slcan", bitrate=bitrate, base=base)
     assert (answer.url, answer.what) == (url.format(port), what)
+    assert answer.url is not None
+    with sensor_from_url(answer.url) as sensor:
+        assert len(sensor.collect(0.2).seq)
+
+
+def test_the_address_of_an_adapter_with_a_strange_name_works(start: Callable[..., str], tmp_path: Path) -> None:
+    port = tmp_path / "my adapter #1?50%20"
+    port.symlink_to(start(AtiCanNode))
+    (answer,) = probe_can(str(port), interface="slcan", bitrate=250_000)
     assert answer.url is not None
     with sensor_from_url(answer.url) as sensor:
         assert len(sensor.collect(0.2).seq)
