@@ -69,7 +69,7 @@ def read_object(path: Path, error: type[Exception]) -> dict[str, Any]:
         raise error("the file is empty: the run that wrote it left nothing to read.")
     try:
         document = json.loads(text)
-    except ValueError as exc:
+    except (ValueError, RecursionError) as exc:  # the latter from thousands of brackets in brackets
         raise error(f"this is not valid JSON ({exc}): the file is damaged or of another kind.") from exc
     if not isinstance(document, dict):
         raise error(f"the file holds a JSON {type(document).__name__}, not an object: is it the right file?")

@@ -140,12 +140,12 @@ def plan(
         box_mm=box_mm,
         tip_unlimited=_unlimited(tip_speed_limit),
     )
-    if output is not None:
-        made.save(output)
     if png is not None:
         from ftdrive.planning.picture import draw
 
         draw(made, certifier, png)
+    if output is not None:
+        made.save(output)
     if as_json:
         write_json({"schema_version": 1} | made.to_dict())
     else:

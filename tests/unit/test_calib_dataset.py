@@ -162,6 +162,7 @@ def without(name: str) -> str:
     [
         ("", "the file is empty"),
         ("{", "this is not valid JSON"),
+        pytest.param("[" * 100_000, "this is not valid JSON", id="brackets in brackets"),
         ("[1]", "holds a JSON list, not an object"),
         ("{}", "the field 'format' is missing"),
         ('{"format": "ftdrive.calibration/1"}', "format is 'ftdrive.calibration/1', not 'ftdrive.dataset/1'"),
