@@ -310,6 +310,7 @@ def test_a_sensor_that_fails_twice_at_a_pose_needs_a_person(lab: Lab) -> None:
 
     def on_event(event: Event) -> None:
         if isinstance(event, StateChanged) and (event.state, event.stop) == (State.SAMPLE, 3):
+            assert len(samplings) < 2
             samplings.append(len(lab.arm.moves))
             lab.sensor.failure = StreamBroken("a cable came off")
 

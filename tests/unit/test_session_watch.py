@@ -109,10 +109,10 @@ def test_the_time_that_this_computer_takes_is_no_silence_of_the_sensor() -> None
 
     def every_second(*, timeout_s: float) -> FtSamples:
         looks[0] += 1
-        if looks[0] == 4:
+        if looks[0] == 5:
             time.sleep(3 * Limits().sensor_age_moving_s)  # the guards' thread gets no time
         samples = latest(timeout_s=timeout_s)
-        samples.seq[:] = looks[0] // 2  # looks 4 and 5 see the same sample
+        samples.seq[:] = looks[0] // 2  # look 5 sees the same sample as look 4
         if looks[0] == 8:
             late.set()
         return samples
