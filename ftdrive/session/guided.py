@@ -205,7 +205,7 @@ class _Begun:
         document = self._plan.to_dict()
         self._key = (info.serial, str(document["sha256"]))
         self._known = not options.real or has_completed(*self._key)
-        speeds = slower(speeds_of(cell), SLOW) if self._pace.slow else speeds_of(cell)
+        speeds = slower(speeds_of(cell), SLOW) if self._slow else speeds_of(cell)
         self._driven = at_most(self._plan, self._certifier, speeds)
         down_base = self._certifier.scene.down_base
         self._running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base, advise=False)
@@ -319,7 +319,7 @@ class _Begun:
         self._sampling, noise = self._chosen_sampling()
         mass_kg, average_s = self._cell.tool.mass_kg, self._sampling.average_s
         self._desk.tell(Noted(words=prediction(self._plan, self._certifier, mass_kg, average_s, noise)))
-        if self._options.fast and self._pace.slow:
+        if self._options.fast and self._slow:
             self._desk.tell(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
         fastest_rad_s = max(step.speed_rad_s for step in self._driven.steps)
         total_s = moves_s(self._driven, self._todo, self._stands_rad, self._before.approach)
@@ -332,10 +332,13 @@ class _Begun:
         )
 
     @property
+    def _slow(self) -> bool:
+        return self._options.real and not (self._options.fast and self._known)
+
+    @property
     def _pace(self) -> Pace:
         options = self._options
         return Pace(
-            slow=options.real and not (options.fast and self._known),
             step=options.mode == "step",
             trusted=self._known,
             asks=self._options.questions,
@@ -390,7 +393,7 @@ class _Begun:
             )
             with _kept(desk, run):
                 tour.run(self._todo)
-        if self._pace.slow and run.stops() == list(range(1, len(plan.steps) + 2)):
+        if self._slow and run.stops() == list(range(1, len(plan.steps) + 2)):
             remember_completed(*self._key)
         return run
 

@@ -76,9 +76,8 @@ class Turned(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How fast, and how much of it a person confirms."""
+    """How much of it a person confirms."""
 
-    slow: bool
     step: bool
     """Enter for each pose."""
     trusted: bool
@@ -217,8 +216,6 @@ class Tour:
         speed_rad_s = self._own_speed(index)
         if speed_rad_s is None:
             return f"Enter plans the way and shows it, {joints}, {largest}"
-        if self._pace.slow:
-            speed_rad_s = min(speed_rad_s, SLOW.joint_rad_s)
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
 
     def _hear(self) -> None:
@@ -332,19 +329,14 @@ class Tour:
 
     def _go(self, index: int, stop: int) -> None:
         """Bring the arm to a pose of the plan, over certified moves only."""
-        q = self._arm.state().q_rad
-        at = self._at
-        if at is not None and np.abs(q - self._nodes[at]).max() > _AT_RAD:
-            self._at = self._stood_at = None
-            raise Tripped(21, DeviceFault("the arm is not where this program left it: somebody has moved it"))
+        at, speed_rad_s = self._at, self._own_speed(index)
         if index == at:
             return
-        speed_rad_s = self._own_speed(index)
-        if speed_rad_s is None:
-            self._approach(q, index, stop)
+        if at is None or speed_rad_s is None:
+            self._approach(self._arm.state().q_rad, index, stop)
         else:
             self._tell(State.MOVE, stop)
-            self._move(q, self._nodes[index], speed_rad_s, self._plan.acceleration_rad_s2)
+            self._move(self._nodes[at], self._nodes[index], speed_rad_s, self._plan.acceleration_rad_s2)
         self._at = self._stood_at = index
 
     def _go_back(self, index: int, why: str) -> None:
@@ -410,13 +402,19 @@ class Tour:
         self._moved = True
 
     def _move(self, start: Array, goal: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
+        """Make one certified move, from nowhere else than where it was certified to begin."""
         if not self._moved:
             self._confirm("The arm begins the tour.")
         self._recovery.require_answers()
-        if self._pace.slow:
-            speed_rad_s, acceleration_rad_s2 = (
-                min(speed_rad_s, SLOW.joint_rad_s),
-                min(acceleration_rad_s2, SLOW.joint_rad_s2),
+        off_rad = np.abs(self._arm.state().q_rad - start)
+        if off_rad.max() > _AT_RAD:
+            self._at = self._stood_at = None
+            raise Tripped(
+                21,
+                DeviceFault(
+                    f"joint {off_rad.argmax() + 1} is {np.degrees(off_rad.max()):.1f}° from where its move begins: "
+                    "somebody has moved the arm; end that, then go on"
+                ),
             )
         turn = np.abs(goal - start).max()
         duration_s = float(move_duration_s(turn, speed_rad_s, acceleration_rad_s2))
@@ -448,8 +446,11 @@ class Tour:
         stop, back = self._todo[0], self._left_behind()
         self._at = None
         words = str(error if trip is None else trip).rstrip(".")
-        if trip is not None and trip is not self._watcher.tripped(wait_s=0.0):
+        told, untold = self._watcher.tripped(wait_s=0.0), self._watcher.untold
+        if trip is not None and (trip is not told or untold is not None):
             self._desk.tell(GuardTripped(hazard=trip.hazard, words=words))
+        if untold is not None:
+            self._note(f"not told at once, for {untold!r}, see to screen, pipe and disk: {told}", warning=True)
         self._tell(State.STOP, words=words)
         self._recovery.tell_news()
         self._tell(State.HOLD, words=words)

@@ -2,7 +2,9 @@
 
 import json
 import sys
+import termios
 from collections.abc import Mapping
+from contextlib import suppress
 from threading import Lock
 from typing import Any, TextIO
 
@@ -138,11 +140,14 @@ class PlainOperator:
             self._write(f"{head}{words}\n", head)
 
     def ask(self, question: Question) -> str:
-        """Answer from stdin; raises `Declined` at its end."""
+        """Answer from stdin; raises `Declined` at its end. What was typed before, at a terminal, is no answer."""
         self._asked = question.text
         untold, self._untold = self._untold, []
         for head, words in untold:
             self._write(f"{head}{words}\n", head)
+        if self._stdin.isatty():
+            with suppress(termios.error):  # a terminal that was closed: reading says so
+                termios.tcflush(self._stdin.fileno(), termios.TCIFLUSH)
         while True:
             self._write(prompt(question))
             try:

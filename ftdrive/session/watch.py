@@ -55,10 +55,13 @@ class Watcher:
     ) -> None:
         self._arm, self._sensor, self._guards, self._on_trip = arm, sensor, tuple(guards), on_trip
         self._motion: Motion | None = None
+        self._seen: Motion | None = None  # which all guards have looked at
         self._wake = threading.Event()
         self._end = threading.Event()
         self._told = threading.Event()
         self._tripped: Tripped | None = None
+        self.untold: Exception | None = None
+        """What the last trip could not be told for: whoever holds the arm says both."""
         self.safety_stop: Tripped | None = None
         """The last emergency or safeguard stop that was seen, whatever the arm did; one for each, never forgotten."""
         self.unseen = False
@@ -82,18 +85,22 @@ class Watcher:
 
     def begin(self) -> None:
         """Forget a trip, and take the next look as what is normal."""
-        self._tripped = None
+        self._tripped = self.untold = None
         self._told.clear()
         self._begun = False
 
     @contextmanager
     def watching(self, start_rad: Array, goal_rad: Array, *, moving: bool) -> Iterator[None]:
-        """Watch while the block runs. What trips is raised at its end, and by `check`."""
+        """Watch while the block runs, after a first look. What trips is raised before it, after it, and by `check`."""
+        self.check()
         self._last = None
         self._looked_s = time.monotonic()
-        self._motion = Motion(np.asarray(start_rad), np.asarray(goal_rad), moving)
+        motion = self._motion = Motion(np.asarray(start_rad), np.asarray(goal_rad), moving)
         self._wake.set()
         try:
+            while self._seen is not motion:
+                self.check()
+                time.sleep(0.001)
             yield
         finally:
             self._motion = None
@@ -128,9 +135,11 @@ class Watcher:
                 self.safety_stop, self._stopped_by_safety = trip, True
 
     def check(self) -> None:
-        """Raise what has tripped. Called in the loops that wait for the arm."""
+        """Raise what has tripped, or that nobody watches. Called in the loops that wait for the arm."""
         if self._tripped is not None:
             raise self._tripped
+        if not self._thread.is_alive():
+            raise Tripped(18, DeviceFault("the guards' thread has ended, nothing is watched", "end this session"))
         if self._motion is not None and time.monotonic() - self._looked_s > _HUNG_S:
             raise Tripped(18, DeviceFault("the guards have not looked for a second: give this computer less to do"))
 
@@ -192,6 +201,7 @@ class Watcher:
             self._begun = True
         for guard in self._guards:
             guard.look(seen)
+        self._seen = motion
 
     def _stop(self, trip: Tripped) -> None:
         self._tripped = trip
@@ -201,9 +211,11 @@ class Watcher:
         stopping.join(_TELL_S)
         try:
             self._on_trip(trip)
-        finally:
-            stopping.join()
-            self._told.set()
+        except Exception as error:  # a screen or a disk: the arm has to be watched all the same
+            log.exception("a stop could not be told")
+            self.untold = error
+        stopping.join()
+        self._told.set()
 
     def _stop_arm(self) -> None:
         try:

@@ -4,8 +4,10 @@ import io
 import json
 import os
 import pty
+import select
 import sys
 import termios
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -219,3 +221,29 @@ def test_a_terminal_gets_whole_words_and_a_file_whole_lines() -> None:
     assert folded.endswith("again: ")
     assert in_whole_words("a\n  b\n", sys.__stderr__ or sys.stderr) == "a\n  b\n"
     assert in_whole_words(text, io.StringIO()) == text
+
+
+def test_what_was_typed_before_a_question_is_no_answer_to_it() -> None:
+    person, program = pty.openpty()
+    told, answers = list[bytes](), list[str]()
+
+    def read_until(words: bytes, times: int = 1) -> None:
+        while b"".join(told).count(words) < times:
+            assert select.select([person], [], [], 10.0)[0], "nothing more is told"
+            told.append(os.read(person, 4096))
+
+    with os.fdopen(program, "r+b", buffering=0) as device:
+        stdin = io.TextIOWrapper(io.BufferedReader(device), encoding="utf-8")
+        stderr = io.TextIOWrapper(io.FileIO(program, "w", closefd=False), write_through=True)
+        operator = PlainOperator(stdin=stdin, stderr=stderr)
+        for question, answer in ((STEP, "stop"), (FREE, "no"), (STEP, "")):
+            told.clear()
+            os.write(person, b"\n\nyes\n")
+            read_until(b"\n", 3)  # the terminal's echo: it has them all
+            asking = threading.Thread(target=lambda asked: answers.append(operator.ask(asked)), args=(question,))
+            asking.start()
+            read_until(b"] ")
+            os.write(person, answer.encode() + b"\n")
+            asking.join(10.0)
+            assert answers.pop() == answer
+    os.close(person)

@@ -205,6 +205,13 @@ def test_a_push_is_seen_once_the_tool_is_known(moving: bool) -> None:
     assert Looks(contact(), moving=moving).trip(50, wrench=np.add(WEIGHT, [0, 0, 0, 0, 0, 2.0])).hazard == 14
 
 
+def test_a_turning_arm_is_given_room_in_torque_for_what_the_tool_itself_gives() -> None:
+    twisted = np.add(WEIGHT, [0, 0, 0, 0, 0.95, 0])  # 0.8 N·m, and at 1 rad/s 1.2 N of allowance on 0.2 m
+    assert Looks(contact()).trips(50, wrench=twisted, turn_rad_s=1.0) is None
+    assert "0.88 N·m" in str(Looks(contact()).trip(50, wrench=twisted, turn_rad_s=0.0))
+    assert Looks(contact(), moving=False).trip(50, wrench=twisted).hazard == 14
+
+
 def test_before_the_tool_is_known_any_tool_may_turn_over_but_no_more() -> None:
     looks = Looks(contact(known=False))
     assert looks.trips(20, wrench=-WEIGHT) is None

@@ -15,7 +15,7 @@ from ftdrive import checks
 from ftdrive.config import ToolConfig, WorkcellConfig
 from ftdrive.diagnosis import SLOWEST_SLIDER, check_speed
 from ftdrive.errors import NotAccepted
-from ftdrive.session import preflight
+from ftdrive.session import guided, preflight
 from ftdrive.session.events import (
     Checked,
     Noted,
@@ -68,6 +68,29 @@ def test_a_tour_that_would_wind_up_the_cable_is_refused(lab: Lab, tmp_path: Path
 def test_a_payload_that_is_not_that_of_the_tool_is_refused(lab: Lab) -> None:
     lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=3.0))
     refuse(lab, "1.50 kg, sensor and tool are 3.00 kg")
+
+
+@pytest.mark.parametrize(
+    ("range_N", "range_Nm", "share", "passes"),
+    [
+        (40.0, 10.0, 74, True),  # 2 · 1.5 kg · 9.81 m/s² = 29.4 N
+        (35.0, 10.0, 84, False),
+        (200.0, 8.0, 74, True),  # on the 0.2 m of the tool: 5.9 N·m
+        (200.0, 7.0, 84, False),
+    ],
+)
+def test_a_tool_too_heavy_or_too_long_for_the_sensor_is_refused(
+    range_N: float, range_Nm: float, share: int, passes: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits = np.array([200.0, range_N, 200, 20, 20, range_Nm])
+    monkeypatch.setattr(guided, "_range_of", lambda _: limits)
+    lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=1.5))
+    words = f"twice the tool's weight is {share} % of the sensor's range"
+    if passes:
+        assert lab.calibrate(dry_run=True) is None
+        assert words in next(event.words for event in lab.operator.of(Checked) if event.name == "load")
+    else:
+        refuse(lab, f"{words}: take a larger sensor")
 
 
 def test_a_speed_slider_that_doctor_calls_too_low_is_refused(lab: Lab) -> None:

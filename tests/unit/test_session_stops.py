@@ -3,16 +3,23 @@
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from calib.routine import PoseRecord
 from drivers.errors import DeviceFault, DeviceTimeout, StreamBroken
+from drivers.interfaces import FtSamples
 from ftdrive.errors import Declined
+from ftdrive.planning.approach import Approach, plan_approach
+from ftdrive.planning.certify import Certifier
+from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.runs import Run
-from ftdrive.session import guided
+from ftdrive.session import guided, machine
 from ftdrive.session.events import (
     Checked,
     Event,
@@ -24,6 +31,8 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.operator import Key
 from tests.unit.fake_cell import Lab
+
+Array = NDArray[np.float64]
 
 FAULTS: dict[str, tuple[int, Callable[[Lab], None], Callable[[Lab], None], type[Exception]]] = {
     "a joint pushed off": (
@@ -296,6 +305,24 @@ def test_a_sensor_that_comes_back_while_the_arm_stands_needs_nobody(lab: Lab) ->
     assert any("begins anew" in event.words for event in lab.operator.of(Noted))
 
 
+def test_a_sensor_that_fails_twice_at_a_pose_needs_a_person(lab: Lab) -> None:
+    samplings: list[int] = []
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, StateChanged) and (event.state, event.stop) == (State.SAMPLE, 3):
+            assert len(samplings) < 2
+            samplings.append(len(lab.arm.moves))
+            lab.sensor.failure = StreamBroken("a cable came off")
+
+    lab.sensor.heals = True
+    lab.operator.on_event = on_event
+    with pytest.raises(StreamBroken, match="a cable came off"):
+        lab.calibrate()
+    assert samplings == [3, 3]
+    assert len([event for event in lab.operator.of(Noted) if "begins anew" in event.words]) == 1
+    assert lab.stops() == [1, 2]
+
+
 def test_a_full_disk_holds_before_the_arm_moves_on(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     commit, failed = Run.commit, list[int]()
 
@@ -319,9 +346,81 @@ def test_an_arm_that_was_moved_between_two_poses_is_noticed(lab: Lab) -> None:
             lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 0, 2.0])
 
     lab.operator.on_event = on_event
-    with pytest.raises(DeviceFault, match=r"somebody has moved it|something else moves it"):
+    with pytest.raises(DeviceFault, match=r"joint 6 is 2\.0° from where its move begins: somebody has moved the arm"):
         lab.calibrate()
     assert lab.operator.of(GuardTripped)[0].hazard == 21
+
+
+@pytest.mark.parametrize(
+    ("way", "moves", "answers"), [("way to pose 1", 0, []), ("way to pose 4", 4, ["resume"]), ("way back", 4, ["back"])]
+)
+def test_an_arm_that_was_moved_while_a_way_waits_for_its_word_does_not_begin_it(
+    way: str, moves: int, answers: list[str], lab: Lab
+) -> None:
+    def move() -> None:
+        lab.arm.q = lab.arm.q + np.radians([25.0, 0, 0, 0, 0, 0])
+
+    lab.push_on_the_way(4)
+    lab.operator.answers["Type resume"] = answers
+    lab.operator.at_question.append((f"The arm goes the {way}", move))
+    with pytest.raises(DeviceFault, match=r"joint 1 is 25\.0° from where its move begins: somebody has moved the arm"):
+        lab.calibrate()
+    assert lab.operator.of(GuardTripped)[-1].hazard == 21
+    assert len(lab.arm.moves) == moves
+
+
+def test_each_part_of_a_way_begins_where_the_one_before_should_have_ended(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    move_to = lab.arm.move_to
+
+    def in_two(certifier: Certifier, q_now: Array, q_first: Array, speeds: Speeds) -> Approach:
+        whole = plan_approach(certifier, q_now, q_first, speeds)
+        way_rad = np.linspace(whole.way_rad[0], whole.way_rad[-1], 3)
+        return replace(whole, way_rad=way_rad, speed_rad_s=np.repeat(whole.speed_rad_s, 2))
+
+    def past_it(*args: Any, **kwargs: Any) -> None:
+        move_to(*args, **kwargs)
+        lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 1.0, 0])
+
+    monkeypatch.setattr(machine, "plan_approach", in_two)
+    monkeypatch.setattr(lab.arm, "move_to", past_it)
+    with pytest.raises(DeviceFault, match=r"joint 5 is 1\.0° from where its move begins"):
+        lab.calibrate()
+    assert len(lab.arm.moves) == 1
+
+
+def test_the_controller_is_asked_for_the_way_on_itself(lab: Lab) -> None:
+    def on_event(event: Event) -> None:
+        if isinstance(event, StateChanged) and event.state is State.HOLD:
+            lab.arm.forbidden = None if lab.arm.forbidden is not None else lab.arm.q.copy()  # no pose of the plan
+
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.PAUSE)
+    lab.operator.on_event = on_event
+    moves: list[int] = []
+    lab.operator.at_question.append(("Type resume", lambda: moves.append(len(lab.arm.moves))))
+    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    assert lab.calibrate() is not None
+    assert moves == [4, 4]
+    words = [event.words for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
+    assert words[1].startswith("the controller's safety limits forbid")
+
+
+def test_saturation_that_only_the_samples_of_a_pose_show_discards_it(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    collect = lab.sensor.collect
+
+    def one_high(duration_s: float) -> FtSamples:
+        samples = collect(duration_s)
+        if len(lab.arm.moves) == 4:
+            samples.wrench[7, 5] = -3.8  # the newest ones, which the guards see, are as ever
+        return samples
+
+    monkeypatch.setattr(guided, "_range_of", lambda _: np.array([40.0, 40, 40, 4, 4, 4]))
+    monkeypatch.setattr(lab.sensor, "collect", one_high)
+    with pytest.raises(DeviceFault, match="95 % of its range in Tz"):
+        lab.calibrate()
+    assert lab.operator.of(GuardTripped)[0].hazard == 13
+    assert lab.stops() == [1, 2, 3]
 
 
 def test_saturated_samples_discard_the_pose(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -431,3 +530,16 @@ def test_reduced_mode_that_stays_is_confirmed_before_the_arm_goes_on(stays: bool
     asked = [question for question in lab.operator.asked if "in reduced mode" in question.text]
     assert len(asked) == stays
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_reduced_mode_that_comes_a_second_time_is_confirmed_again(lab: Lab) -> None:
+    lab.arm.at_move |= {
+        3: lambda: lab.arm.set_status(safety_mode="reduced"),
+        5: lab.arm.set_status,
+        7: lambda: lab.arm.set_status(safety_mode="reduced"),
+    }
+    lab.operator.answers["Type resume"] = ["resume"] * 3
+    asked: list[int] = []
+    lab.operator.at_question.append(("in reduced mode", lambda: asked.append(len(lab.arm.moves))))
+    assert lab.calibrate() is not None
+    assert asked == [3, 7]
