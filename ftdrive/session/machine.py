@@ -84,6 +84,8 @@ class Pace:
     trusted: bool
     """This plan has run to its end on this arm, or nothing real moves: `--yes` may answer."""
     asks: bool = True
+    yes: bool = False
+    """`--yes` answers where it may."""
 
 
 class Tour:
@@ -134,6 +136,7 @@ class Tour:
         self._skipped: set[int] = set()  # indices of postures where the arm should not go
         self._reopened: set[int] = set()
         self._payload_kg: float | None = None  # as the controller told it when it was compared
+        self._driven: set[int] = set()  # indices of poses whose move to the next one was driven to its end
 
     # -------------------------------------------------------------------------------------------- the tour
 
@@ -158,6 +161,11 @@ class Tour:
                 self._hold(error)
         self._recovery.tell_news()
         self._tell(State.CLOSE)
+
+    @property
+    def undriven(self) -> list[int]:
+        """Poses, from 1, whose move to the next one was not driven as planned, but over an approach or not at all."""
+        return [index + 1 for index in range(len(self._nodes)) if index not in self._driven]
 
     def _next(self) -> None:
         if self._back is not None:
@@ -216,7 +224,8 @@ class Tour:
         largest = f"largest turn {np.degrees(turn_rad.max()):.0f}°"
         speed_rad_s = self._own_speed(index)
         if speed_rad_s is None:
-            return f"Enter plans the way and shows it, {joints}, {largest}"
+            drives = ", and drives it where --yes may confirm it" if self._pace.trusted and self._pace.yes else ""
+            return f"Enter plans the way and shows it{drives}, {joints}, {largest}"
         if self._pace.slow:
             speed_rad_s = min(speed_rad_s, SLOW.joint_rad_s)
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
@@ -345,6 +354,8 @@ class Tour:
         else:
             self._tell(State.MOVE, stop)
             self._move(q, self._nodes[index], speed_rad_s, self._plan.acceleration_rad_s2)
+            if at is not None and index == (at + 1) % len(self._nodes):
+                self._driven.add(at)
         self._at = self._stood_at = index
 
     def _go_back(self, index: int, why: str) -> None:
