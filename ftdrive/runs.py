@@ -213,6 +213,7 @@ _KINDS: Mapping[str, _Kind] = {
     "devices": _OBJECTS,
     "devices.arm.serial": _TEXT,
     "devices.sensor.serial": _TEXT,
+    "devices.sensor.facts": _OBJECTS,
     "mode": (f"one of {', '.join(get_args(Mode))}", lambda value: value in get_args(Mode)),
     "said": _OBJECT,
     "said.config": _TEXT_OR_NULL,

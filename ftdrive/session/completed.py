@@ -5,6 +5,8 @@ import os
 from datetime import UTC, datetime
 from pathlib import Path
 
+from drivers.interfaces import NOT_REPORTED
+
 FORMAT = "ftdrive.completed/1"
 
 
@@ -16,9 +18,12 @@ def state_file() -> Path:
 
 
 def has_completed(arm_serial: str, plan_sha256: str) -> bool:
-    """Tell whether this plan has run to its end on this arm before. A line that cannot be read counts for nothing."""
+    """Tell whether this plan has run to its end on this arm before. A line that cannot be read counts for nothing.
+
+    Never on an arm that tells no serial number: nobody knows whether it is the same one.
+    """
     path = state_file()
-    if not path.is_file():
+    if arm_serial == NOT_REPORTED or not path.is_file():
         return False
     wanted = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256}
     return any(
@@ -28,7 +33,7 @@ def has_completed(arm_serial: str, plan_sha256: str) -> bool:
 
 
 def remember_completed(arm_serial: str, plan_sha256: str) -> None:
-    """Note that it has: slowly, and every pose of it was taken."""
+    """Note that it has: slowly, all of its own moves in one session, and every pose of it was taken."""
     path = state_file()
     path.parent.mkdir(parents=True, exist_ok=True)
     line = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256, "utc": datetime.now(UTC).isoformat()}

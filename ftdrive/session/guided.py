@@ -13,9 +13,9 @@ from calib.allan import averaging_time
 from calib.noise import LEAST_SAMPLES, mean_and_covariance, noise_level
 from calib.routine import PoseRecord, Sampling
 from drivers.errors import DriverError
-from drivers.interfaces import DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
+from drivers.interfaces import NOT_REPORTED, DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
 from ftdrive.config import CellConfig
-from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
+from ftdrive.errors import ConfigError, Declined, NotAccepted
 from ftdrive.planning.approach import arm_moves, plan_approach
 from ftdrive.planning.cell import certifier_for, plan_for, speeds_of
 from ftdrive.planning.constant_tour import constant_tour
@@ -41,6 +41,7 @@ from ftdrive.session.guards import (
     StallGuard,
     Tripped,
 )
+from ftdrive.session.identity import require_same_devices
 from ftdrive.session.machine import SLOW, Pace, Tour
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Operator
@@ -60,6 +61,10 @@ _TARGET_N, _TARGET_NM = 0.057, 0.0035
 _BY_HAND: Final = ("manual", "listen")
 _HEAVIEST_KG: Final = {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5, "UR16e": 16.0, "UR20": 20.0}
 _HEAVIEST_OF_ALL_KG: Final = 30.0
+_NO_SERIAL: Final = (
+    "the controller tells no serial number, so nobody knows which arm has run a plan to its end (a younger PolyScope "
+    "tells it)"
+)
 _EMULATED: Final = Limits(sensor_age_moving_s=0.3)
 """An emulated sensor shares this computer with all else."""
 
@@ -248,7 +253,7 @@ class _Begun:
         stops = range(1, len(self._plan.steps) + 2)
         if self._old is None:
             return list(stops), []
-        _require_same_devices(self._old, self._arm, self._sensor)
+        require_same_devices(self._old, self._cell, self._arm, self._sensor)
         kept = [record for record in self._old.records() if record.stop not in self._options.redo]
         have = {record.stop for record in kept}
         return [stop for stop in stops if stop not in have], kept
@@ -320,7 +325,9 @@ class _Begun:
         mass_kg, average_s = self._cell.tool.mass_kg, self._sampling.average_s
         self._desk.tell(Noted(words=prediction(self._plan, self._certifier, mass_kg, average_s, noise)))
         if self._options.fast and self._slow:
-            self._desk.tell(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
+            why = f": {_NO_SERIAL}" if self._key[0] == NOT_REPORTED else ""
+            words = f"{'every' if why else 'the first'} run of a plan is slow, whatever was asked{why}"
+            self._desk.tell(Noted(words=words, warning=True))
         fastest_rad_s = max(step.speed_rad_s for step in self._driven.steps)
         total_s = moves_s(self._driven, self._todo, self._stands_rad, self._before.approach)
         total_s += len(self._todo) * (average_s + 0.6)
@@ -341,7 +348,8 @@ class _Begun:
         return Pace(
             step=options.mode == "step",
             trusted=self._known,
-            asks=self._options.questions,
+            asks=options.questions,
+            yes=options.yes,
         )
 
     def tour(self, devices: Mapping[str, Any]) -> Run:
@@ -393,9 +401,21 @@ class _Begun:
             )
             with _kept(desk, run):
                 tour.run(self._todo)
-        if self._slow and run.stops() == list(range(1, len(plan.steps) + 2)):
-            remember_completed(*self._key)
+        if self._todo and not self._known:
+            self._judge_completed(run, tour.undriven)
         return run
+
+    def _judge_completed(self, run: Run, undriven: Sequence[int]) -> None:
+        """Note that the plan has run to its end, slowly, or say why this does not count."""
+        if undriven or len(run.stops()) <= len(self._plan.steps):
+            why = "a plan counts as run to its end when one session takes every pose and drives every move along it; "
+            why += f"not driven so: from {_poses(undriven)} on" if undriven else "poses are missing"
+        elif self._key[0] == NOT_REPORTED:
+            why = _NO_SERIAL
+        else:
+            remember_completed(*self._key)
+            return
+        self._desk.tell(Noted(words=f"the next run of this plan is slow again and begins with the typed word: {why}"))
 
     def _recheck(self, asks: bool) -> None:
         """Do the checks again after a stop; with `asks`, all of the preflight: the questions again too."""
@@ -441,13 +461,9 @@ class _Begun:
         return run
 
 
-def _require_same_devices(run: Run, arm: RobotArm, sensor: ForceTorqueSensor) -> None:
-    devices = run.header()["devices"]
-    for name, info in (("arm", arm.identify()), ("sensor", sensor.identify())):
-        if devices[name]["serial"] != info.serial:
-            raise PlanRefused(
-                f"the run was made with the {name} {devices[name]['serial']}, this is {info.serial}: make a new run"
-            )
+def _poses(numbers: Sequence[int]) -> str:
+    *most, last = map(str, numbers)
+    return f"poses {', '.join(most)} and {last}" if most else f"pose {last}"
 
 
 def _range_of(sensor: ForceTorqueSensor) -> Array | None:
@@ -482,7 +498,7 @@ def _by_hand(
         desk.keep_in(run)
     else:
         run = Run(options.resume)
-        _require_same_devices(run, arm, sensor)
+        require_same_devices(run, cell, arm, sensor)
         earlier = run.records()
     down_base, listen = down_of(cell.workcell.mounting), options.mode == "listen"
     running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base)

@@ -83,6 +83,8 @@ class Pace:
     trusted: bool
     """This plan has run to its end on this arm, or nothing real moves: `--yes` may answer."""
     asks: bool = True
+    yes: bool = False
+    """`--yes` answers where it may."""
 
 
 class Tour:
@@ -133,6 +135,7 @@ class Tour:
         self._skipped: set[int] = set()  # indices of postures where the arm should not go
         self._reopened: set[int] = set()
         self._payload_kg: float | None = None  # as the controller told it when it was compared
+        self._driven: set[int] = set()  # indices of poses whose move to the next one was driven to its end
 
     # -------------------------------------------------------------------------------------------- the tour
 
@@ -157,6 +160,11 @@ class Tour:
                 self._hold(error)
         self._recovery.tell_news()
         self._tell(State.CLOSE)
+
+    @property
+    def undriven(self) -> list[int]:
+        """Poses, from 1, whose move to the next one was not driven as planned, but over an approach or not at all."""
+        return [index + 1 for index in range(len(self._nodes)) if index not in self._driven]
 
     def _next(self) -> None:
         if self._back is not None:
@@ -215,7 +223,8 @@ class Tour:
         largest = f"largest turn {np.degrees(turn_rad.max()):.0f}°"
         speed_rad_s = self._own_speed(index)
         if speed_rad_s is None:
-            return f"Enter plans the way and shows it, {joints}, {largest}"
+            drives = ", and drives it where --yes may confirm it" if self._pace.trusted and self._pace.yes else ""
+            return f"Enter plans the way and shows it{drives}, {joints}, {largest}"
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
 
     def _hear(self) -> None:
@@ -337,6 +346,8 @@ class Tour:
         else:
             self._tell(State.MOVE, stop)
             self._move(self._nodes[at], self._nodes[index], speed_rad_s, self._plan.acceleration_rad_s2)
+            if index == (at + 1) % len(self._nodes):
+                self._driven.add(at)
         self._at = self._stood_at = index
 
     def _go_back(self, index: int, why: str) -> None:

@@ -230,9 +230,10 @@ class _Collection:
         returned = back and self._light == "green" and not self._passes_first
         if others and others[nearest] < REPEAT_RAD and not returned:
             self._passes_first |= back
+            further = " Press k to finish, or turn the tool further." if self._may_finish else " Turn the tool further."
             self._note(
                 f"This is pose {nearest} again, {degrees(others[nearest]):.0f}° from it: it is left out."
-                + ("" if self._listen else " Turn the tool further.")
+                + ("" if self._listen else further)
             )
             self._deal_with()
             return
@@ -296,9 +297,14 @@ class _Collection:
         """Be done with where the arm stands, and say so: the state must not go on as if something were measured."""
         self._dealt_with = True
         words = "the program goes on" if self._listen else "move on to another orientation"
-        if self._light == "green" and not (self._listen or self._ends_by_itself):
+        if self._may_finish:
             words = f"enough: press k to finish, or {words}"
         self._tell_state(State.MOVE, words)
+
+    @property
+    def _may_finish(self) -> bool:
+        """Whether all that is left to do is to press k."""
+        return self._light == "green" and not (self._listen or self._ends_by_itself)
 
     def _learn(self, record: PoseRecord) -> None:
         """Take in what a pose that is on disk tells, and tell it."""

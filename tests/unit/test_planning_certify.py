@@ -199,6 +199,31 @@ def test_a_thin_post_between_two_poses_is_not_missed() -> None:
     assert Certifier(arm, Scene()).certify(start, end).clear[0]
 
 
+@pytest.mark.parametrize("tight", [True, False])
+@pytest.mark.parametrize(("room_m", "clear"), [(-1e-4, False), (5e-4, True)])
+def test_the_bound_holds_where_a_point_comes_as_fast_as_it_can(room_m: float, clear: bool, tight: bool) -> None:
+    """Stretched out level, joint 2 alone turns: the tip comes up to a block at nearly lever times rate."""
+    arm = ArmModel("UR5e", [Cylinder(0, 0.2, 0.01)])
+
+    def tip(q: Array) -> Array:
+        at = arm.frames(q)
+        return np.asarray(at.flange_m[0] + 0.2 * at.R_base_flange[0, :, 2])
+
+    def below(gap_m: float) -> Certifier:
+        x, y, z = tip(end)
+        block = Box((x - 0.1, y - 0.02, z + gap_m), (x + 0.02, y + 0.02, z + 0.5))
+        return Certifier(arm, Scene(planes=(), boxes=(block,)))
+
+    end = np.array([0, 0, 0, np.radians(-18.5), np.pi / 2, 0])
+    end[1] += np.arctan2(tip(end)[2] - arm.geometry.d1_m, -tip(end)[0])
+    start = end + 0.2 * np.eye(6)[1]  # less than the first interval of the proof
+    far, near = (below(0.05).clearances([q])[1][0] for q in (start, end))
+    assert 0.98 < (far - near) / (0.2 * arm.travel_m[-1, 1]) <= 1
+    certifier = below(0.05 - near + Margins().scene_m + room_m)
+    assert certifier.clearances([end])[1][0] == pytest.approx(Margins().scene_m + room_m, abs=2e-5)
+    assert certifier.certify(start, end, tight=tight).clear[0] is np.bool_(clear)
+
+
 def test_margins_are_kept_exactly() -> None:
     arm = ArmModel("UR5e", TOOLS[1])
     within, outside = Certifier(arm, Scene()).clearances([STANDS])

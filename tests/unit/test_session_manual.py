@@ -303,6 +303,14 @@ def test_a_repeat_is_told_once_and_left_out(turn_deg: float) -> None:
     assert outcome.person.words().count(f"This is pose 1 again, {turn_deg:.0f}° from it") == 1
 
 
+def test_a_repeat_once_the_poses_are_enough_names_the_key_that_finishes() -> None:
+    near = Rotation.from_euler("y", 5.0, degrees=True)
+    outcome = Outcome(dwells(UP, near, DOWN, LEFT, RIGHT, FRONT, BACK, near), keys={40.0: Key.KEEP})
+    told = [words for words in outcome.person.words().splitlines() if words.startswith("This is pose 1 again")]
+    left_out = "This is pose 1 again, 5° from it: it is left out."
+    assert told == [f"{left_out} Turn the tool further.", f"{left_out} Press k to finish, or turn the tool further."]
+
+
 def test_a_quarter_turn_about_gravity_is_no_repeat() -> None:
     assert Outcome(dwells(UP, Rotation.from_euler("z", 90, degrees=True))).stops == [1, 2]
 

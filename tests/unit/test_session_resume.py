@@ -11,7 +11,7 @@ import pytest
 
 from calib.routine import DriftCheck
 from drivers.errors import DeviceFault
-from drivers.interfaces import DeviceInfo
+from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
 from ftdrive.config import ToolConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
 from ftdrive.planning.constant_tour import constant_tour
@@ -292,6 +292,93 @@ def test_a_run_is_not_gone_on_with_another_tool(lab: Lab) -> None:
     assert lab.arm.moves == []
 
 
+def broken_off(lab: Lab, url: str = "fake://", **facts: Any) -> Path:
+    """Begin a run and stop it at its third move."""
+    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, url=url))
+    tells(lab, facts=facts)
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined):
+        lab.calibrate()
+    lab.arm.moves.clear()
+    return lab.run().folder
+
+
+def tells(lab: Lab, model: str = "fake", serial: str = "S1", facts: dict[str, Any] | None = None) -> None:
+    """Let the sensor say who it is."""
+    known = {name: Fact(value, "device") for name, value in (facts or {}).items()}
+    lab.sensor.identify = lambda: DeviceInfo(model, serial, "1", known)  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "cure"),
+    [
+        (("Robotiq FT 300", NOT_REPORTED), ("UR wrist", NOT_REPORTED), "serial=… in its address"),
+        (("Robotiq FT 300", "1"), ("UR wrist", "1"), "connect that of the run, or make a new run"),
+        (("Robotiq FT 300", NOT_REPORTED), ("Robotiq FT 300", "1"), "serial=… in its address"),
+        (("Robotiq FT 300", NOT_REPORTED), ("Robotiq FT 300", NOT_REPORTED), ""),
+    ],
+)
+def test_a_sensor_without_a_serial_number_is_the_same_where_its_model_is(
+    then: tuple[str, str], now: tuple[str, str], cure: str, lab: Lab
+) -> None:
+    folder = broken_off(lab)
+    header = folder / "run.json"
+    header.write_text(header.read_text().replace('"fake"', f'"{then[0]}"').replace('"S1"', f'"{then[1]}"'))
+    tells(lab, *now)
+    if not cure:
+        assert lab.calibrate(resume=folder) is not None
+        return
+    with pytest.raises(PlanRefused, match=f"{then[0]}, serial {then[1]}, connected is {now[0]}.*{cure}"):
+        lab.calibrate(resume=folder)
+    assert lab.arm.moves == []
+
+
+def test_an_arm_without_a_serial_number_is_the_same_where_its_model_is(lab: Lab) -> None:
+    lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
+    folder = broken_off(lab)
+    lab.arm.identify = lambda: DeviceInfo("UR7e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
+    with pytest.raises(PlanRefused, match="the arm UR5e, serial not reported, connected is UR7e"):
+        lab.calibrate(resume=folder)
+    lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
+    assert lab.calibrate(resume=folder) is not None
+
+
+def test_a_run_is_not_gone_on_with_the_other_sign(lab: Lab) -> None:
+    folder = broken_off(lab)
+    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, sign=-1))
+    with pytest.raises(PlanRefused, match=r"\[sensor\] sign was 1 and is -1: set it back, or make a new run"):
+        lab.calibrate(resume=folder)
+    assert lab.arm.moves == []
+    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, sign=1))
+    assert lab.calibrate(resume=folder) is not None
+
+
+@pytest.mark.parametrize(
+    ("url", "facts", "changed"),
+    [
+        ("ati-can://can0?slot=2", {}, "option slot was 0 and is 2"),
+        ("ati-serial:///dev/ttyUSB0?calibration=2", {}, "option calibration was 1 and is 2"),
+        ("ati-can://can0", {"counts_per_N": 200.0}, "counts_per_N was 100.0 and is 200.0"),
+        ("ati-can://can0", {"counts_per_Nm": 200.0}, "counts_per_Nm was 1000.0 and is 200.0"),
+        ("ati-can://can0", {"range": (99.0,) * 6}, "range was"),
+        ("ati-can:///dev/ttyACM0?interface=slcan&slot=0x0&recover=1&bitrate=250000", {}, ""),
+    ],
+)
+def test_a_run_is_not_gone_on_where_the_numbers_mean_something_else(
+    url: str, facts: dict[str, Any], changed: str, lab: Lab
+) -> None:
+    begun = {"counts_per_N": 100.0, "counts_per_Nm": 1000.0, "range": (300.0,) * 6}
+    folder = broken_off(lab, "ati-can://can0", **begun)
+    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, url=url))
+    tells(lab, facts=begun | facts)
+    if not changed:
+        assert lab.calibrate(resume=folder) is not None
+        return
+    with pytest.raises(PlanRefused, match=changed):
+        lab.calibrate(resume=folder)
+    assert lab.arm.moves == []
+
+
 # ----------------------------------------------------------------------------------------------------------- by hand
 
 
@@ -407,7 +494,7 @@ def test_a_cell_that_cannot_be_built_is_told_before_its_sensor_opens(lab: Lab, m
 def test_a_run_of_another_sensor_is_not_gone_on_with(lab: Lab) -> None:
     lab.calibrate()
     lab.sensor.identify = lambda: DeviceInfo("fake", "S2", "1")  # type: ignore[method-assign]
-    with pytest.raises(PlanRefused, match="S1, this is S2"):
+    with pytest.raises(PlanRefused, match="serial S1, connected is fake, serial S2"):
         lab.calibrate(resume=lab.run().folder)
 
 

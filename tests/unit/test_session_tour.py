@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calib.routine import Sampling
 from drivers.errors import DeviceFault
+from drivers.interfaces import NOT_REPORTED, DeviceInfo
 from ftdrive.config import WorkcellConfig
 from ftdrive.errors import Declined, NotAccepted
 from ftdrive.planning import view
@@ -22,7 +23,7 @@ from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
 from ftdrive.session import preflight
-from ftdrive.session.completed import has_completed
+from ftdrive.session.completed import has_completed, remember_completed
 from ftdrive.session.events import (
     Asked,
     Checked,
@@ -31,6 +32,7 @@ from ftdrive.session.events import (
     PoseTaken,
     RunOpened,
     State,
+    StateChanged,
 )
 from ftdrive.session.operator import Key
 from ftdrive.session.operators import in_words
@@ -162,19 +164,97 @@ def test_a_run_that_was_ended_does_not_count_as_complete(lab: Lab) -> None:
     assert len(lab.arm.moves) == 1
 
 
-def test_only_a_run_with_every_pose_counts_as_complete(lab: Lab) -> None:
+def has_run(lab: Lab) -> bool:
+    """Tell whether the plan of the run counts as run to its end."""
+    return has_completed("A1", str(Plan.load(lab.run().plan_path).to_dict()["sha256"]))
+
+
+@pytest.mark.parametrize("mode", ["auto", "step"])
+def test_a_run_without_interruption_counts_as_complete_and_nothing_is_said_of_it(mode: str, lab: Lab) -> None:
+    lab.calibrate(mode=mode)
+    assert has_run(lab)
+    assert "slow again" not in lab.said()
+
+
+def test_a_plan_that_moves_the_whole_arm_counts_as_complete_too(lab: Lab) -> None:
+    certifier = certifier_for(lab.cell, "UR5e")
+    path = lab.folder / "plan.json"
+    plan = plan_tour(certifier, USUAL_POSTURE_RAD, 6, speeds=Speeds.first_run(), guess=guess_of(certifier))
+    plan.save(path)
+    lab.calibrate(plan=path)
+    assert has_run(lab)
+
+
+def test_a_skipped_pose_counts_against_the_plan_though_resume_takes_it(lab: Lab) -> None:
     lab.operator.answers["Pose 3 of 7"] = ["s"]
-    lab.operator.answers["Pose 7 of 7"] = ["s"]
     lab.calibrate(mode="step")
-    run = lab.run()
-    key = "A1", str(Plan.load(run.plan_path).to_dict()["sha256"])
-    assert not has_completed(*key)
-    lab.operator.answers["Pose 7 of 7"] = ["s"]
-    lab.calibrate(resume=run.folder, mode="step", fast=True)
-    assert lab.stops() == [1, 2, 3, 4, 5, 6]
-    assert not has_completed(*key)
-    lab.calibrate(resume=run.folder)
-    assert has_completed(*key)
+    assert "the next run of this plan is slow again" in lab.said()
+    assert "not driven so: from poses 2 and 3 on" in lab.said()
+    lab.operator.told.clear()
+    lab.calibrate(resume=lab.run().folder, mode="auto")
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+    assert not has_run(lab)
+    assert "the next run of this plan is slow again" in lab.said()
+    lab.operator.told.clear()
+    lab.calibrate(resume=lab.run().folder)  # nothing is left to take: nothing to be said of moves
+    assert "slow again" not in lab.said()
+    lab.calibrate(resume=lab.run().folder, redo=(1, 2, 3, 4, 5, 6, 7), fast=True)
+    assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
+    assert has_run(lab)
+
+
+def test_a_pose_that_is_skipped_where_the_arm_stands_counts_against_the_plan(lab: Lab) -> None:
+    lab.sensor.collecting = lambda: lab.operator.keys.append(Key.SKIP) if len(lab.arm.moves) == 4 else None
+    lab.calibrate()
+    assert lab.taken() == [1, 2, 3, 5, 6, 7]
+    assert not has_run(lab)
+    assert "poses are missing" in lab.said()
+
+
+@pytest.mark.parametrize(("key", "answer"), [(Key.PAUSE, "resume"), (Key.PAUSE, "back"), (Key.STOP, "")])
+def test_a_move_that_was_broken_off_counts_against_the_plan(key: Key, answer: str, lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(key)
+    lab.operator.answers["poses are kept"] = [answer, "resume"]
+    if key is Key.STOP:
+        with pytest.raises(Declined):
+            lab.calibrate()
+        lab.calibrate(resume=lab.run().folder)
+    else:
+        lab.calibrate()
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+    assert not has_run(lab)
+    assert "not driven so: from pose" in lab.said()
+
+
+def test_poses_taken_again_and_a_pause_while_one_is_measured_do_not_count_against_the_plan(lab: Lab) -> None:
+    def pause() -> None:
+        if len(lab.taken()) == 5 and not paused:
+            paused.append(True)
+            lab.operator.keys.append(Key.PAUSE)
+
+    paused: list[bool] = []
+    lab.sensor.collecting = pause
+    lab.press((Key.REDO, PoseTaken, 1), (Key.REDO, StateChanged, 4))
+    lab.operator.answers["poses are kept"] = ["resume"]
+    lab.calibrate()
+    assert lab.taken() == [1, 1, 2, 3, 3, 4, 5, 6, 7]
+    assert len(lab.holds()) == 1
+    assert has_run(lab)
+
+
+def test_an_arm_that_tells_no_serial_number_runs_slowly_each_time_and_the_reason_is_said(lab: Lab) -> None:
+    lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
+    for _ in range(2):
+        lab.arm.moves.clear()
+        lab.operator.told.clear()
+        lab.operator.asked.clear()
+        lab.calibrate(fast=True, yes=True)
+        assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
+        assert len([question for question in lab.operator.asked if "Type MOVE" in question.text]) == 1
+        assert lab.said().count("the controller tells no serial number") == 2
+        assert "every run of a plan is slow" in lab.said()
+    remember_completed(NOT_REPORTED, "p")  # as an earlier version did
+    assert not has_completed(NOT_REPORTED, "p")
 
 
 def test_a_run_in_which_nothing_moved_does_not_count_as_complete(lab: Lab) -> None:
@@ -319,3 +399,16 @@ def test_step_mode_says_what_enter_does(lab: Lab) -> None:
         assert "at 30°/s" in text  # slow, as in any first run
     assert "the arm stands there, Enter measures" in asked[3]  # pose 2 again, where the arm is
     assert "moves" not in asked[3]
+
+
+def test_step_mode_says_whether_enter_may_move_the_arm_to_the_first_pose(lab: Lab) -> None:
+    for yes, words in (
+        (True, "shows it, joint"),
+        (True, "shows it, and drives it where --yes may confirm it"),
+        (False, "shows it, joint"),
+    ):
+        lab.operator.asked.clear()
+        lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 0, 5.0])
+        lab.calibrate(mode="step", yes=yes)
+        first = next(question.text for question in lab.operator.asked if question.text.startswith("Pose 1"))
+        assert words in first
