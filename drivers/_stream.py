@@ -285,7 +285,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._lost = self._malformed = 0
         """Since the last `_connect`; a subclass may count or assign them."""
         self._events: deque[tuple[int, str]] = deque(maxlen=_EVENTS)
-        self._rate = Rate(self.name)
+        self._rate = Rate(self.name, self._why_rate)
         self._seq_offset = 0
         self._start_watching()
 
@@ -496,6 +496,11 @@ class StreamingSensor(ForceTorqueSensor):
     def _why_silent(self) -> str:
         """Say what to do about a silence; a subclass may know more."""
         return "check cable and supply"
+
+    def _why_rate(self, rate_Hz: float) -> str:
+        """Say what to do about a rate that is not the nominal one; a subclass may know more."""
+        how = "are lost" if rate_Hz < self._nominal_Hz else "come twice"
+        return f"samples {how} or the sensor is set differently, look at health()"
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
