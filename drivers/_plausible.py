@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -97,10 +98,11 @@ class DeviceClock:
 
 
 class Rate:
-    """Samples per second against what the device says of itself."""
+    """Samples per second against what the device says of itself; `why` says what to do about a wrong rate in Hz."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, why: Callable[[float], str]) -> None:
         self._name = name
+        self._why = why
         self._is_wrong = False
         self.forget()
 
@@ -126,12 +128,6 @@ class Rate:
             return f"rate {rate_Hz:.1f} Hz, right again"
         if not self._is_wrong and error > _RATE_TOLERANCE:
             self._is_wrong = True
-            log.warning(
-                "%s: %.1f Hz instead of %g Hz; samples %s or the sensor is set differently, look at health()",
-                self._name,
-                rate_Hz,
-                nominal_Hz,
-                "are lost" if rate_Hz < nominal_Hz else "come twice",
-            )
+            log.warning("%s: %.1f Hz instead of %g Hz; %s", self._name, rate_Hz, nominal_Hz, self._why(rate_Hz))
             return f"rate {rate_Hz:.1f} Hz instead of {nominal_Hz:g} Hz"
         return None

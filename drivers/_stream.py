@@ -67,8 +67,9 @@ class StreamingSensor(ForceTorqueSensor):
     max_collect_samples : int
         What one `collect` may hold; more is an error, never a dropped sample.
     recover : bool
-        After an interruption or silence connect again, for up to 10 s, instead of ending the stream. Every call made
-        meanwhile is an error all the same, and so is a `collect` with an interruption inside. May be set until `open`.
+        After an interruption or silence connect again, for up to 10 s until a sample comes, instead of ending the
+        stream. Every call made meanwhile is an error all the same, and so is a `collect` with an interruption inside.
+        May be set until `open`.
     """
 
     def __init__(
@@ -284,7 +285,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._lost = self._malformed = 0
         """Since the last `_connect`; a subclass may count or assign them."""
         self._events: deque[tuple[int, str]] = deque(maxlen=_EVENTS)
-        self._rate = Rate(self.name)
+        self._rate = Rate(self.name, self._why_rate)
         self._seq_offset = 0
         self._start_watching()
 
@@ -296,26 +297,30 @@ class StreamingSensor(ForceTorqueSensor):
         self._is_late = False
 
     def _run(self) -> None:
-        cause: DriverError | None = None
-        while self._is_mine():
-            try:
-                if cause is not None:
-                    self._reconnect(cause)
-                    cause = None
-                self._pump()
-            except Exception as exc:
-                again = self.recover and cause is None
-                cause = exc if again and isinstance(exc, StreamBroken | DeviceTimeout) else None
-                with self._news:
-                    if not self._is_mine():
-                        return
-                    self._failure, self._has_ended = exc, cause is None
-                    if cause is not None:
-                        self._failure = StreamBroken(f"{self.name}: interrupted, connecting again ({exc})")
-                    self._note(f"ended: {exc}" if cause is None else str(exc))
-                    self._news.notify_all()
-                if cause is None:
-                    return
+        """Read until `close`, or until something ends the stream for good."""
+        try:
+            while self._is_mine():
+                try:
+                    self._pump()
+                except (StreamBroken, DeviceTimeout) as exc:
+                    if not self.recover:
+                        raise
+                    if self._failure is None:  # else no sample has come since the last one: it is not over yet
+                        first, deadline_s = exc, time.monotonic() + _RECOVER_S
+                        self._note(str(exc))
+                    self._fail(StreamBroken(f"{self.name}: interrupted, connecting again ({exc})"))
+                    self._reconnect(first, exc, deadline_s)
+        except Exception as exc:
+            self._fail(exc, for_good=True)
+
+    def _fail(self, failure: Exception, *, for_good: bool = False) -> None:
+        with self._news:
+            if not self._is_mine():
+                return
+            self._failure, self._has_ended = failure, for_good
+            if for_good:
+                self._note(f"ended: {failure}")
+            self._news.notify_all()
 
     def _pump(self) -> None:
         """Read and publish until `close`."""
@@ -352,13 +357,18 @@ class StreamingSensor(ForceTorqueSensor):
             self._liveness.forget()
             self._rate.forget()
 
-    def _reconnect(self, cause: DriverError) -> None:
-        """Connect again to the same device; the first sample that comes then ends the failure."""
-        deadline = time.monotonic() + _RECOVER_S
+    def _reconnect(self, first: DriverError, last: DriverError, deadline_s: float) -> None:
+        """Connect again to the same device; the first sample that comes then ends the failure.
+
+        `first` began the interruption, `last` is why it goes on.
+        """
         self._earlier_lost += self._lost
         self._earlier_malformed += self._malformed
         self._lost = self._malformed = 0
-        while True:
+        while self._is_mine():
+            if time.monotonic() > deadline_s:
+                found = f"{first.found}, not back within {_RECOVER_S:g} s ({last})"
+                raise StreamBroken(found, first.cure) from last
             self._let_go()
             try:
                 info = self._connect_and_identify()
@@ -366,12 +376,8 @@ class StreamingSensor(ForceTorqueSensor):
             except DeviceFault:
                 raise
             except DriverError as exc:
-                if not self._is_mine():
-                    return
-                if time.monotonic() > deadline:
-                    found = f"{cause.found}, not back within {_RECOVER_S:g} s ({exc})"
-                    raise StreamBroken(found, cause.cure) from exc
-            time.sleep(_RETRY_S)
+                last = exc
+                time.sleep(_RETRY_S)
         if not self._is_mine():
             self._let_go()
             return
@@ -380,8 +386,6 @@ class StreamingSensor(ForceTorqueSensor):
         with self._news:
             self._start_watching()
             self._newest_ns, self._heard_s = time.monotonic_ns(), awake_s()  # silence is judged anew
-            self._reconnects += 1
-            self._note("connected again")
 
     def _is_mine(self) -> bool:
         return self._thread is threading.current_thread()
@@ -414,7 +418,10 @@ class StreamingSensor(ForceTorqueSensor):
             while self._arrivals[0][0] < t_ns - 1_000_000_000:
                 self._arrivals.popleft()
             self._newest, self._newest_ns = _rows(block, slice(-1, None)), t_ns
-            self._failure = None  # of an interruption that is over
+            if self._failure is not None:
+                self._failure = None  # an interruption is over when the device measures, not when it answers
+                self._reconnects += 1
+                self._note("connected again")
             for tap in self._taps:
                 tap.append(block)
             self._news.notify_all()
@@ -489,6 +496,11 @@ class StreamingSensor(ForceTorqueSensor):
     def _why_silent(self) -> str:
         """Say what to do about a silence; a subclass may know more."""
         return "check cable and supply"
+
+    def _why_rate(self, rate_Hz: float) -> str:
+        """Say what to do about a rate that is not the nominal one; a subclass may know more."""
+        how = "are lost" if rate_Hz < self._nominal_Hz else "come twice"
+        return f"samples {how} or the sensor is set differently, look at health()"
 
     def _raise_failure(self) -> None:
         if self._failure is not None:

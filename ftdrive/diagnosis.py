@@ -171,6 +171,8 @@ def _check_lost(health: Health, address: SensorAddress) -> Check:
         return Check("sensor.lost", "ok", found)
     state: State = "failed" if gone > 0.01 * health.received else "warning"  # of what comes twice nothing is missing
     fix = "check the cable, its shield and the termination of the bus" if address.host is None else _BETTER_NETWORK
+    if address.scheme == "ati-can":  # it is polled
+        fix += ", or run fewer programs on this computer: an answer that is read too late is lost too"
     return Check("sensor.lost", state, found, fix)
 
 

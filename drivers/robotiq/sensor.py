@@ -7,7 +7,6 @@ Modbus RTU for set-up, then a bare stream at 100 Hz which only 50 bytes of 0xFF 
 sensor has booted. The sensor has no zero command: what others call zeroing is done on the host.
 """
 
-import logging
 import time
 from typing import TYPE_CHECKING, Self
 
@@ -22,8 +21,6 @@ from drivers.robotiq import codec
 
 if TYPE_CHECKING:
     from drivers.registry import Options
-
-log = logging.getLogger(__name__)
 
 _BAUD = 19_200
 _REPLY_S = 0.2
@@ -67,7 +64,6 @@ class RobotiqFt300(StreamingSensor):
         self._ask(codec.write_register(codec.STREAM, codec.START_STREAM))
         self._frames = codec.deframer()
         self._nominal_Hz = codec.NOMINAL_RATE_Hz
-        self._hint_since_ns, self._hint_frames, self._hinted = 0, 0, False
         return DeviceInfo(
             model="Robotiq FT 300",
             serial=serial,
@@ -84,7 +80,6 @@ class RobotiqFt300(StreamingSensor):
         counts = np.array([codec.decode_frame(frame) for _, frame in frames], np.int32)
         if (np.abs(counts + 0.5) > 32767).any():
             raise DeviceFault(f"{self.name}: a value is at the end of its range", "take the load off, check the cable")
-        self._watch_rate(t_host_ns, len(frames))
         n = len(frames)
         return FtSamples(
             t_host_ns=np.full(n, t_host_ns, np.int64),
@@ -114,22 +109,10 @@ class RobotiqFt300(StreamingSensor):
         """Exchange with retries, each after another stop: a stream may run that we did not start."""
         return ask(self._port, self.name, request, codec.check_reply, _REPLY_S, self._stop_stream)
 
-    def _watch_rate(self, t_host_ns: int, frames: int) -> None:
-        """Once a second compare the rate with what a slow USB adapter makes of it."""
-        self._hint_frames += frames
-        if not self._hint_since_ns:
-            self._hint_since_ns, self._hint_frames = t_host_ns, 0
-        elapsed_s = (t_host_ns - self._hint_since_ns) / 1e9
-        if self._hinted or elapsed_s < 1.0:
-            return
-        rate_Hz = self._hint_frames / elapsed_s
-        self._hint_since_ns, self._hint_frames = t_host_ns, 0
-        if _LATENT_RATE_Hz[0] < rate_Hz < _LATENT_RATE_Hz[1]:
-            self._hinted = True
-            log.warning(
-                "%s: %.1f Hz instead of %.0f Hz; the USB adapter waits 16 ms before it delivers: "
-                "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer (with the name of your port)",
-                self.name,
-                rate_Hz,
-                codec.NOMINAL_RATE_Hz,
-            )
+    def _why_rate(self, rate_Hz: float) -> str:
+        if not _LATENT_RATE_Hz[0] < rate_Hz < _LATENT_RATE_Hz[1]:
+            return super()._why_rate(rate_Hz)
+        return (
+            "the USB adapter waits 16 ms before it delivers: "
+            "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer (with the name of your port)"
+        )

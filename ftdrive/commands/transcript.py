@@ -66,12 +66,12 @@ def _emulated(sensor: str | None) -> str:
 
 def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) -> tuple[str, dict[str, Any]]:
     """Record, and name the file if it is kept; returns the address that a driver was given, and what it saw."""
-    url = sensor_url(sensor)
-    address = SensorAddress.of(url)
-    if address.scheme == "ur-ft":
+    if sensor.startswith("ur-ft:") or sensor == f"{EMULATED}ur-ft":  # which need not be started for this
         raise ConfigError(
             f"{sensor} is read over RTDE, which is not recorded: capture TCP port 30004 of the arm with Wireshark"
         )
+    url = sensor_url(sensor)
+    address = SensorAddress.of(url)
     if address.serial_port is None and address.scheme != "ati-netft" and not address.scheme.endswith("-can"):
         raise ConfigError(
             f"{sensor} is neither on a serial port or a CAN bus nor an ati-netft: only these can be recorded; capture "

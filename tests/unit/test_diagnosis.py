@@ -176,6 +176,12 @@ def test_a_sensor_on_ethernet_gets_no_advice_about_cables_it_has_not(address: Se
     assert "termination" in str(on_can["sensor.lost"].fix)
 
 
+def test_a_polled_sensor_may_lose_samples_to_a_busy_computer() -> None:
+    polled, streaming = (stream(80, lost=1, address=address)["sensor.lost"].fix for address in (BY_PCAN, PORT))
+    assert "fewer programs on this computer" in str(polled)
+    assert "fewer programs" not in str(streaming)
+
+
 def test_noise_at_rest_under_a_hand_and_none_at_all() -> None:
     noise = np.random.default_rng(0).normal(size=(2000, 6)) * ([0.03] * 3 + [0.001] * 3)
     level, accuracy = diagnosis.check_noise(noise, 2.0, 2.0, 1.2)

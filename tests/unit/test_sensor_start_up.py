@@ -225,8 +225,8 @@ FT300 = {
 }
 
 
-def ft300(change: Mapping[bytes, bytes] = NONE, *, running: bool = False, period_s: float = 0.01) -> SerialPeer:
-    peer = SerialPeer({**FT300, **change}, stream=FT300_FRAME, start=FT300_START, stop=FT300_STOP, period_s=period_s)
+def ft300(change: Mapping[bytes, bytes] = NONE, *, running: bool = False) -> SerialPeer:
+    peer = SerialPeer({**FT300, **change}, stream=FT300_FRAME, start=FT300_START, stop=FT300_STOP, period_s=0.01)
     peer.streaming = running
     return peer
 
@@ -236,6 +236,7 @@ def test_robotiq_start_up_is_golden() -> None:
         with RobotiqFt300(peer.path) as sensor:
             samples = sensor.collect(0.1)
             info = sensor.identify()
+            assert sensor.health().nominal_rate_Hz == 100
         wait_for(lambda: not peer.streaming)
     assert bytes(peer.heard) == FT300_STOP + ASK_SERIAL + ASK_FIRMWARE + FT300_START + FT300_STOP
     assert (info.serial, info.firmware) == ("FTS-1234", "FTS-2.0.1")
@@ -262,14 +263,17 @@ def test_robotiq_that_refuses_to_stream() -> None:
         RobotiqFt300(peer.path).open()
 
 
-@pytest.mark.parametrize(("period_s", "hints"), [(0.016, 1), (0.01, 0)])
+@pytest.mark.parametrize(("rate_Hz", "hint"), [(62.5, "latency_timer"), (80.0, "are lost"), (100.0, "")])
 def test_robotiq_slow_usb_adapter_is_named_with_its_cure(
-    period_s: float, hints: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    rate_Hz: float, hint: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("drivers._plausible._FROZEN_S", math.inf)  # the peer repeats one frame
-    with ft300(period_s=period_s) as peer, RobotiqFt300(peer.path) as sensor:
-        sensor.collect(1.3)
-    assert caplog.text.count("latency_timer") == hints
+    sensor = RobotiqFt300("/dev/ttyUSB0")
+    sensor._nominal_Hz = 100.0
+    note = [sensor._rate.judge(1, round(1e9 * (5 + n / rate_Hz)), 100.0) for n in range(round(5 * rate_Hz))]
+    warned = [record.message for record in caplog.records if "instead of" in record.message]
+    assert len(warned) == bool(hint)  # one fault, one warning
+    assert all(hint in text for text in warned)
+    assert note.count(f"rate {rate_Hz:.1f} Hz instead of 100 Hz") == bool(hint)
 
 
 # ------------------------------------------------------------------ Bota
@@ -335,6 +339,18 @@ def test_bota_gaps_are_seen_on_its_clock(monkeypatch: pytest.MonkeyPatch) -> Non
         health = sensor.health()
     assert sorted(np.diff(samples.seq))[-2:] == [2, 3]
     assert health.lost == 3
+
+
+def test_bota_sample_that_comes_twice_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers._plausible._FROZEN_S", math.inf)  # the peer repeats one wrench
+    with Bota() as peer:
+        sensor = BotaSensor(peer.path)
+        sensor._stale_after_s = 3.0  # the peer is a thread beside it, and may be late
+        with sensor:
+            begin_us = peer._t_us + 300_000  # it tells the time meanwhile
+            peer._times += [begin_us, begin_us, begin_us + 10_000]
+            wait_for(lambda: sensor.latest(timeout_s=0.0).t_device_s[0] > begin_us / 1e6)
+            assert sensor.health().duplicated == 1
 
 
 def test_noise_is_no_sensor() -> None:

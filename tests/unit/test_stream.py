@@ -4,6 +4,7 @@ import json
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 
@@ -448,6 +449,101 @@ def test_what_has_piled_up_while_the_computer_slept_is_never_delivered(monkeypat
     assert "nobody read for 3600" in event[1]
 
 
+class Clocked(FakeSensor):
+    """Its clock moves only in reads, as the test says: what waits in `script` is (s a read takes, samples)."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, stale_after_s: float) -> None:
+        super().__init__(stale_after_s=stale_after_s)
+        self.now_s = 0.0
+        self.script: deque[tuple[float, int]] = deque()
+        self.silent_reads = 0
+        monkeypatch.setattr(_stream, "awake_s", lambda: self.now_s)
+
+    def _read_block(self) -> FtSamples:
+        if self.script:
+            read_s, samples = self.script.popleft()
+            self.feed.put(samples)
+        else:
+            read_s = 0.02
+        block = super()._read_block()
+        self.silent_reads += not len(block)
+        self.now_s += read_s
+        return block
+
+
+def test_who_is_away_again_while_the_backlog_is_thrown_away_begins_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Clocked(monkeypatch, stale_after_s=0.3) as sensor:
+        backlog, live = (0.0005, 10), (0.02, 1)
+        sensor.script += [(5.0, 1), backlog, (5.0, 10), *[backlog] * 5, *[live] * 4]
+        wait_for(lambda: sensor.health().received == 2)
+        health = sensor.health()
+    assert health.lost == 1 + 10 + 10 + 5 * 10 + 3  # the last read to wait ends the 50 ms
+
+
+def test_a_pause_shorter_than_a_silence_may_be_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Clocked(monkeypatch, stale_after_s=0.45) as sensor:
+        sensor.script += [(0.4, 5)]
+        wait_for(lambda: sensor.health().received == 6)
+        assert sensor.health().events == ()
+        sensor.script += [(0.5, 5)]
+        wait_for(lambda: sensor.health().lost == 5)
+
+
+def test_after_a_pause_a_sensor_has_time_before_it_is_connected_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = Clocked(monkeypatch, stale_after_s=5.0)
+    sensor.recover = True
+    with sensor:
+        sensor.script += [(3600.0, 1)]
+        wait_for(lambda: sensor._fresh_from_ns > 0)
+        reads = sensor.silent_reads
+        wait_for(lambda: sensor.silent_reads > reads + 2)
+        sensor.feed.put(1)
+        sensor.await_received(2)
+        assert sensor.connects == 1
+
+
+class Unseen(FakeSensor):
+    """What interrupts it is over before anybody else has had a look: the lock is held from then to the next sample."""
+
+    held = False
+
+    def _read_block(self) -> FtSamples:
+        try:
+            return super()._read_block()
+        except StreamBroken:
+            self.hold()
+            raise
+
+    def hold(self) -> None:
+        self._news.acquire()
+        self.held = True
+
+    def _publish(self, block: FtSamples) -> None:
+        super()._publish(block)
+        if self.held:
+            self.held = False
+            self._news.release()
+
+
+def test_a_collect_across_a_pause_too_short_to_be_seen_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    asleep_s = [0.0]
+    monkeypatch.setattr(_stream, "awake_s", lambda: awake_s() + asleep_s[0])
+
+    class Suspended(Unseen):
+        def _read_block(self) -> FtSamples:
+            block = super()._read_block()
+            if self.seq == 20:
+                self.hold()
+                asleep_s[0] = 3600.0
+            return block
+
+    with Suspended(stale_after_s=5.0) as sensor:
+        feeder = feeding(sensor, 60, 1)
+        with pytest.raises(DeviceTimeout, match="nobody read for 3600"):
+            sensor.collect(0.25)
+        feeder.join()
+
+
 def test_samples_that_were_long_on_their_way_are_dropped_and_told(sensor: FakeSensor) -> None:
     sensor.feed.put(at(0.0, [5], t_device_s=10.0))
     for number in range(1, 11):  # all at once, half a second later
@@ -534,7 +630,7 @@ def test_silences_are_counted(sensor: FakeSensor) -> None:
 class TestRecover:
     @pytest.fixture
     def sensor(self) -> Iterator[FakeSensor]:
-        fake = FakeSensor()
+        fake = FakeSensor(stale_after_s=1.0)
         fake.recover = True
         fake.open()
         yield fake
@@ -555,16 +651,62 @@ class TestRecover:
         assert health.events[0][0] < health.events[1][0]
         assert len(sensor.latest(timeout_s=0.5)) == 1
 
-    def test_a_collect_across_a_quick_reconnection_is_an_error(self, sensor: FakeSensor) -> None:
-        feeder = feeding(sensor, 60, 1)
-        threading.Timer(0.05, sensor.feed.put, [StreamBroken("gone")]).start()
-        with pytest.raises(StreamBroken, match="interrupted"):
-            sensor.collect(0.25)
-        feeder.join()
-        assert sensor.health().reconnects == 1
+    def test_a_device_that_connects_again_and_stays_mute_is_not_mended(
+        self, sensor: FakeSensor, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(_stream, "_RECOVER_S", 60.0)
+        sensor._stale_after_s, sensor.first = 0.05, 0
+        sensor.feed.put(StreamBroken("gone"))
+        wait_for(lambda: sensor.connects >= 4)  # mute for a whole silence, again and again
+        health = sensor.health()
+        assert (health.reconnects, [what for _, what in health.events]) == (0, ["gone"])
+        with pytest.raises(StreamBroken, match="connecting again"):
+            sensor.check()
+        sensor._stale_after_s = 5.0
+        sensor.feed.put(1)
+        wait_for(lambda: failure_of(sensor) is None)
+        health = sensor.health()
+        assert (health.reconnects, [what for _, what in health.events]) == (1, ["gone", "connected again"])
+
+    def test_a_device_that_stays_mute_is_given_up(self, sensor: FakeSensor, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(_stream, "_RECOVER_S", 0.3)
+        sensor._stale_after_s, sensor.first = 0.05, 0
+        sensor.feed.put(StreamBroken("gone"))
+        reader = sensor._thread
+        assert reader
+        reader.join(5.0)
+        with pytest.raises(StreamBroken, match=r"^gone, not back within 0.3 s \(fake: silent for .*\)$"):
+            sensor.check()
+        assert sensor.connects > 1
+        assert sensor.health().reconnects == 0
+
+    def test_a_collect_across_a_reconnection_too_quick_to_be_seen_is_an_error(self) -> None:
+        sensor = Unseen(stale_after_s=5.0)
+        sensor.recover = True
+        with sensor:
+            feeder = feeding(sensor, 60, 1)
+            threading.Timer(0.05, sensor.feed.put, [StreamBroken("gone")]).start()
+            with pytest.raises(StreamBroken, match="the stream was interrupted and came back; collect again"):
+                sensor.collect(0.25)
+            feeder.join()
+            assert sensor.health().reconnects == 1
 
     def test_silence_is_mended_too(self, sensor: FakeSensor) -> None:
+        sensor._stale_after_s = 0.1
+        wait_for(lambda: sensor.health().reconnects >= 1)
+
+    def test_what_was_lost_and_damaged_before_stays_counted(self, sensor: FakeSensor) -> None:
+        sensor._lost, sensor._malformed = 3, 2  # as a driver counts them since it has connected
+        sensor.feed.put(StreamBroken("gone"))
         wait_for(lambda: sensor.health().reconnects == 1)
+        sensor._lost, sensor._malformed = 10, 20
+        assert (sensor.health().lost, sensor.health().malformed) == (13, 22)
+
+    def test_a_fault_found_while_connecting_again_is_final(self, sensor: FakeSensor) -> None:
+        sensor.connect_error = DeviceFault("hot")
+        sensor.feed.put(StreamBroken("gone"))
+        wait_for(lambda: failure_of(sensor) is DeviceFault)
+        assert sensor.connects == 2
 
     def test_numbers_go_on(self, sensor: FakeSensor) -> None:
         sensor._nominal_Hz = 1000.0
