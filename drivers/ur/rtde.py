@@ -258,7 +258,7 @@ CONTROL_REGISTERS: Final = (
 def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float) -> list[str]:
     """Tell which of these inputs belong to another client or a fieldbus, leaving all of them as they are.
 
-    Raises `StreamBroken` or `DeviceTimeout`.
+    Raises `StreamBroken`, `DeviceTimeout` or `ProtocolError`.
     """
     try:
         connection = _Connection(socket.create_connection((host, PORT), timeout=timeout_s))
