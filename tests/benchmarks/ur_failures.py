@@ -216,6 +216,9 @@ def rows() -> dict[str, Callable[[], Row]]:
     silent, silent_ends = (on("silent", what="rtde", on=state) for state in (True, False))
     freeze, freeze_ends = (on("freeze", on=state) for state in (True, False))
     return named | {
+        "foreign-program": partial(
+            befall, of_the_cell(on("foreign-program")), on("dashboard-stop")
+        ),  # nobody waits for it
         "rtde-silent for 3 s": partial(befall, of_the_cell(silent), silent_ends, later_s=3.0),
         "freeze for 6 s": partial(befall, of_the_cell(freeze), freeze_ends, later_s=6.0, frozen=True),
         "closed in a freeze": closed_while_frozen,
