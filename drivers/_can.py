@@ -1,8 +1,8 @@
 """A CAN bus that fails in our words, on any adapter python-can knows."""
 
 import contextlib
+import fcntl
 import os
-import sys
 import time
 from collections.abc import Iterable
 from typing import Any
@@ -13,9 +13,6 @@ from can.interfaces.slcan import slcanBus
 
 from drivers._serial import LINK_ERRORS, refusal
 from drivers.errors import ConnectError, StreamBroken
-
-if sys.platform != "win32":
-    import fcntl
 
 BUS_ERRORS = (can.CanError, ValueError, *LINK_ERRORS)
 _SEND_S = 0.1
@@ -92,9 +89,8 @@ class CanBus:
 
     def _take(self, tty: str) -> None:
         """Take a serial port for this process alone, before python-can speaks to the adapter: it would not ask."""
-        if sys.platform != "win32":  # where a port opens only once
-            self._lock = os.open(tty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._lock = os.open(tty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def close(self) -> None:
         """Leave the bus. Idempotent."""

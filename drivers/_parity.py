@@ -7,17 +7,15 @@ configures a port, so that the system hands out damaged bytes like all others.
 
 import re
 import sys
+import termios
 from typing import Final
 
 import serial
 
-if sys.platform == "linux":
-    import termios
-
 
 def ask_for_marks(port: serial.Serial | int) -> bool:
     """Let the system mark damaged bytes; whether it can. What arrived before has no marks and is thrown away."""
-    if sys.platform != "linux":  # Windows has no marks; elsewhere setting flags may undo pyserial's unusual bit rates
+    if sys.platform != "linux":  # setting flags may undo pyserial's unusual bit rates there
         return False
     settings = termios.tcgetattr(port)
     # BRKINT would have a break, which is a framing error, empty the input without a word

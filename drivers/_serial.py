@@ -4,20 +4,15 @@ import contextlib
 import errno
 import os
 import shlex
-import sys
+import termios
 
 import serial
 
 from drivers._parity import Unmarker, ask_for_marks
 from drivers.errors import ConnectError, PortInUse, StreamBroken
 
-if sys.platform == "win32":
-    LINK_ERRORS: tuple[type[Exception], ...] = (OSError,)
-else:
-    import termios
-
-    LINK_ERRORS = (OSError, termios.error)
-    """What a vanished serial port raises; `termios.error` is not an `OSError`."""
+LINK_ERRORS = (OSError, termios.error)
+"""What a vanished serial port raises; `termios.error` is not an `OSError`."""
 
 _WRITE_S = 0.2
 

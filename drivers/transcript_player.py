@@ -4,9 +4,9 @@ import contextlib
 import os
 import select
 import socket
-import sys
 import threading
 import time
+import tty
 from collections.abc import Callable
 from socketserver import BaseRequestHandler
 from typing import Any, Final
@@ -14,9 +14,6 @@ from typing import Any, Final
 from drivers._parity import leave_marks_to_far_side, marks_asked_for
 from drivers.transcript import Page, Passage, Transcript, asked_for
 from drivers.transcript_ports import AT_ONCE, HTTP_S, LOOK_S, LOOPBACK, PageServer
-
-if sys.platform != "win32":
-    import tty
 
 _EARLY_S: Final = 0.05
 """A driver may ask this much earlier than it did; what the device had sent before is then sent at once."""

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from math import radians
 from typing import Final
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, Guard, RobotArm
 from drivers.ur.control import ControlProcess
 from drivers.ur.control_child import DECELERATION_RAD_S2, UNWATCHED_S
@@ -103,7 +103,7 @@ class UrArm(RobotArm):
         try:
             self._drop_what_is_lost(control)
             self._connect(control)
-        except (StreamBroken, DeviceTimeout, DeviceFault) as error:
+        except (StreamBroken, DeviceTimeout, DeviceFault, ProtocolError) as error:
             self.close()
             raise ConnectError(f"cannot open the arm at {self._host}: {error.found}", error.cure) from error
         except BaseException:
@@ -216,9 +216,8 @@ class UrArm(RobotArm):
             if look and control.alive and look.program_state == PROGRAM_PLAYING and not look.safety_fault():
                 if self._is_ours(control, timeout_s=0.3):
                     self._left_behind = not control.quit(timeout_s=0.7)
-                else:
+                elif not self._left_behind:
                     log.warning("%s runs a program of somebody else: it is left alone", self._host)
-                    self._left_behind = False
         except DriverError as error:
             log.info("%s: %s", self._host, error)
         finally:

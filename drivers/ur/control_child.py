@@ -116,7 +116,6 @@ def main() -> None:
     host, frequency_Hz = sys.argv[1], float(sys.argv[2])
     replies = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what the C++ library prints must not reach the replies
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle: it stops the arm through us
 
     def reply(**content: object) -> None:
         with suppress(OSError):  # the parent is gone: the end of stdin will say so

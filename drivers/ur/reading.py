@@ -24,7 +24,7 @@ from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ModelUnknow
 from drivers.interfaces import NOT_REPORTED, ArmState, ArmStatus, DeviceInfo
 from drivers.ur.kinematics import MODELS, Pose, forward, model_named
 from drivers.ur.library import Dashboard, Receive, ask_dashboard, connect_receive, require, retire
-from drivers.ur.rtde import LiveReader
+from drivers.ur.live import LiveReader
 
 log = logging.getLogger(__name__)
 

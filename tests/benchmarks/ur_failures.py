@@ -214,8 +214,10 @@ def rows() -> dict[str, Callable[[], Row]]:
         event.name: partial(befall, of_the_cell(event.do), event.cure, frozen=event.name == FROZEN) for event in EVENTS
     }
     silent, silent_ends = (on("silent", what="rtde", on=state) for state in (True, False))
+    foreign = on("foreign-program")  # the tests wait until it plays
     freeze, freeze_ends = (on("freeze", on=state) for state in (True, False))
     return named | {
+        "foreign-program": partial(befall, of_the_cell(foreign), on("dashboard-stop")),
         "rtde-silent for 3 s": partial(befall, of_the_cell(silent), silent_ends, later_s=3.0),
         "freeze for 6 s": partial(befall, of_the_cell(freeze), freeze_ends, later_s=6.0, frozen=True),
         "closed in a freeze": closed_while_frozen,

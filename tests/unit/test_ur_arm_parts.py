@@ -1,20 +1,24 @@
 """What of `UrArm` needs no controller."""
 
+import os
 import re
+import signal
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from math import inf, nan, radians
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from drivers.errors import ConnectError, StreamBroken
+from drivers.errors import ConnectError, ProtocolError, StreamBroken
 from drivers.ur import arm as arm_module
 from drivers.ur import control_child, library
 from drivers.ur.arm import UrArm
 from drivers.ur.control import ControlProcess
-from drivers.ur.reading import Look
+from drivers.ur.reading import STALE_S, Look
 
 
 def look(**different: Any) -> Look:
@@ -127,3 +131,142 @@ def test_what_the_library_says_comes_with_a_cure(tmp_path: Path, monkeypatch: py
             control.call("progress")
     finally:
         control.kill()
+
+
+class FakeReader:
+    """Tells these looks one after the other, then the last one for ever."""
+
+    def __init__(self, *looks: Look, silent: bool = False) -> None:
+        self._looks = looks
+        self.silent = silent
+        self.told: list[Look] = []
+
+    def look(self, *, limit_s: float = STALE_S) -> Look:
+        assert limit_s <= STALE_S
+        self.told.append(self._looks[min(len(self.told), len(self._looks) - 1)])
+        return self.told[-1]
+
+    def close(self) -> None:
+        pass
+
+
+def arm_with(reader: FakeReader, control: object = None) -> UrArm:
+    arm: Any = UrArm("192.0.2.1")
+    arm._reader, arm._control = reader, control
+    assert isinstance(arm, UrArm)
+    return arm
+
+
+@pytest.mark.parametrize(
+    "disturbed",
+    [
+        {"qd_rad_s": [0.0, 0.0, -0.003, 0.0, 0.0, 0.0]},
+        {"target_qd_rad_s": [0.0, 0.0, 0.0, 0.0, 0.0, -1e-4]},
+        {"target_q_rad": [0.0, 0.0, 0.0, 0.002, 0.0, 0.0]},
+    ],
+    ids=["shaking", "about to move", "not at the goal"],
+)
+def test_still_is_three_tenths_of_a_second_without_a_break(disturbed: dict[str, Any]) -> None:
+    looks = [look(t_device_s=0.01 * k) for k in range(100)]
+    looks[20] = replace(looks[20], **disturbed)
+    arm = arm_with(reader := FakeReader(*looks))
+    arm._goal = [0.0] * 6
+    arm.wait_until_still(timeout_s=60, guard=lambda: None)
+    assert reader.told[-1].t_device_s == pytest.approx(0.51, abs=0.011)  # counted from 0.21 s on
+
+
+def test_still_needs_no_goal_where_the_arm_was_sent_nowhere() -> None:
+    arm = arm_with(reader := FakeReader(*(look(t_device_s=0.01 * k, target_q_rad=[1.0] * 6) for k in range(100))))
+    arm.wait_until_still(timeout_s=60, guard=lambda: None)
+    assert reader.told[-1].t_device_s == pytest.approx(0.3, abs=0.011)
+
+
+@pytest.mark.parametrize(
+    ("silent", "set_point_rad_s", "fails", "ways"),
+    [
+        (False, 0.0, False, ["stop softly"]),
+        (False, 0.1, False, ["stop softly", "kill", "stop the program"]),  # it says so, and the arm goes on
+        (False, 0.0, True, ["stop softly", "kill", "stop the program"]),
+        (True, 0.0, False, ["kill", "stop the program"]),  # there is no time for a way that cannot work
+    ],
+    ids=["works", "without effect", "fails", "silent"],
+)
+def test_the_ways_to_stop(
+    silent: bool, set_point_rad_s: float, fails: bool, ways: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone: list[str] = []
+
+    class Control:
+        alive = True
+
+        def call(self, name: str, *_: object, **__: object) -> None:
+            gone.append(f"{name} softly")
+            if fails:
+                raise StreamBroken("the control connection was lost")
+
+        def kill(self) -> None:
+            gone.append("kill")
+
+    class Pendant:
+        def stop(self) -> None:
+            gone.append("stop the program")
+
+    def ask(_: str, do: Callable[[Pendant], object], **__: float) -> None:
+        do(Pendant())
+
+    monkeypatch.setattr(arm_module, "ask_dashboard", ask)
+    reader = FakeReader(look(target_qd_rad_s=[set_point_rad_s] * 6), silent=silent)
+    arm_with(reader, Control()).stop()
+    assert gone == ways
+    assert not (silent and reader.told)
+
+
+def test_what_rtde_may_not_say_refuses_the_opening_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def damaged(*_: object) -> None:
+        raise ProtocolError("RTDE recipe cannot be read: 01", "is this an RTDE server?")
+
+    monkeypatch.setattr(arm_module, "Reader", damaged)
+    with pytest.raises(ConnectError, match=r"cannot open .* recipe cannot be read: 01; is this an RTDE server\?"):
+        UrArm("192.0.2.1").open()
+
+
+LIBRARY = """
+import threading
+
+class RTDEControlInterface:
+    FLAG_UPLOAD_SCRIPT, FLAG_NO_EXT_FT = 1, 2
+
+    def __init__(self, hostname, **how):
+        if hostname == "hangs":
+            threading.Event().wait()
+
+    def getAsyncOperationProgressEx(self):
+        return self
+
+    def isAsyncOperationRunning(self):
+        return False
+
+    def stopScript(self):
+        threading.Event().wait()
+"""
+
+
+@pytest.mark.parametrize(("host", "hangs"), [("hangs", "STARTING_S"), ("answers", "LEAVING_S")])
+def test_a_library_that_hangs_does_not_keep_its_process(host: str, hangs: str, tmp_path: Path) -> None:
+    (tmp_path / "rtde_control.py").write_text(LIBRARY)
+    code = f"from drivers.ur import control_child; control_child.{hangs} = 1; control_child.main()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, host, "125"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+    ) as child:
+        try:
+            if host == "answers":
+                assert child.stdout is not None
+                assert child.stdout.readline() == b'{"id": 0, "value": null}\n'
+                assert child.stdin is not None
+                child.stdin.close()
+            assert child.wait(20) == -signal.SIGALRM
+        finally:
+            child.kill()

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import ConnectError, DeviceTimeout, ProtocolError, StreamBroken
-from drivers.ur import rtde
+from drivers.ur import live, rtde
+from drivers.ur.live import LiveReader, Sample
 
 # Real bytes of an e-Series controller answering, and of a client asking.
 ASK_PROTOCOL, ANSWER_PROTOCOL = bytes.fromhex("0005560002"), bytes.fromhex("00045601")
@@ -139,8 +140,8 @@ def served(outputs: dict[str, str] = OUTPUTS, replace: dict[str, bytes] = ANSWER
 
 
 @contextmanager
-def opened(server: Server) -> Iterator[rtde.LiveReader]:
-    reader = rtde.LiveReader(server.host)
+def opened(server: Server) -> Iterator[LiveReader]:
+    reader = LiveReader(server.host)
     try:
         reader.open(timeout_s=2.0)
         yield reader
@@ -184,40 +185,66 @@ def test_an_old_controller_tells_at_least_its_time() -> None:
         assert outputs == {"timestamp": (7.0,), "safety_mode": (3,)}
 
 
-def test_what_has_piled_up_is_not_now() -> None:
+class Clock:
+    """Stands still, so that no sample seems waited for, until a test moves it on."""
+
+    t_s = 0.0
+
+    def __call__(self) -> float:
+        return self.t_s
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(live, "awake_s", clock)
+    return clock
+
+
+def pile_up(server: Server, reader: LiveReader, clock: Clock) -> None:
+    """Let a pause be far longer than between two samples, then tell what a socket held back."""
+    server.tell(1.0)
+    reader.newest(since_s=1.0, limit_s=2.0)
+    clock.t_s += 0.15
+    for k in range(101):
+        server.tell(2.0 + 0.008 * k)
+    reader.newest(since_s=2.8, limit_s=2.0)
+
+
+def tell_on(server: Server, reader: LiveReader, clock: Clock, asking: threading.Thread, safety_mode: int) -> None:
+    """Tell samples of 3 s and later, each of them waited for, until who asks has an answer."""
+    t_s = 3.0
+    while asking.is_alive():
+        clock.t_s += 0.008
+        server.tell(t_s := t_s + 0.008, safety_mode=safety_mode)
+        reader.newest(since_s=t_s, limit_s=2.0)
+
+
+def test_what_has_piled_up_is_not_now(clock: Clock) -> None:
     with served() as server, opened(server) as reader:
-        server.tell(1.0)
-        reader.newest(since_s=1.0, limit_s=2.0)
         told: list[float] = []
         asking = threading.Thread(target=lambda: told.append(reader.now_s(limit_s=5.0)))
         asking.start()
-        time.sleep(0.15)  # a pause far longer than between two samples, then what a socket held back
-        for k in range(100):
-            server.tell(2.0 + 0.008 * k)
-        t_s = 3.0
-        while asking.is_alive():
-            time.sleep(0.008)
-            server.tell(t_s := t_s + 0.008)
+        pile_up(server, reader, clock)
+        tell_on(server, reader, clock, asking, 1)
         assert told[0] > 3.0
+        with pytest.raises(DeviceTimeout):
+            reader.now_s(limit_s=0.0)  # what was now before this question is not now
 
 
-def test_what_has_piled_up_is_no_status() -> None:
+def test_what_has_piled_up_is_no_status(clock: Clock) -> None:
     with served() as server, opened(server) as reader:
-        server.tell(1.0)
-        reader.newest(since_s=1.0, limit_s=2.0)
-        time.sleep(0.15)
-        for k in range(100):
-            server.tell(2.0 + 0.008 * k)
+        pile_up(server, reader, clock)
         with pytest.raises(DeviceTimeout):
             reader.live(max_age_s=0.05, limit_s=0.1)
-        told: list[rtde.Sample] = []
+        told: list[Sample] = []
         asking = threading.Thread(target=lambda: told.append(reader.live(max_age_s=0.05, limit_s=5.0)))
         asking.start()
-        t_s = 3.0
-        while asking.is_alive():
-            time.sleep(0.008)
-            server.tell(t_s := t_s + 0.008, safety_mode=3)
+        tell_on(server, reader, clock, asking, 3)
         assert told[0].outputs["safety_mode"] == (3,)
+        clock.t_s += 0.06
+        with pytest.raises(DeviceTimeout):
+            reader.live(max_age_s=0.05, limit_s=0.0)
 
 
 def test_a_clock_that_stands_still_is_found_after_a_fifth_of_a_second() -> None:
@@ -266,7 +293,7 @@ def test_inputs_of_others_are_told(types: bytes, taken: list[str]) -> None:
 )
 def test_whoever_does_not_speak_rtde_is_refused_in_time(replace: dict[str, bytes], says: str) -> None:
     with served(replace=replace) as server:
-        reader = rtde.LiveReader(server.host)
+        reader = LiveReader(server.host)
         t0 = time.monotonic()
         with pytest.raises(ConnectError, match=says):
             reader.open(timeout_s=0.2)
@@ -276,4 +303,4 @@ def test_whoever_does_not_speak_rtde_is_refused_in_time(replace: dict[str, bytes
 
 def test_nobody_there() -> None:
     with pytest.raises(ConnectError, match=r"cannot be reached .*switched on"):
-        rtde.LiveReader("127.83.7.2").open(timeout_s=0.5)
+        LiveReader("127.83.7.2").open(timeout_s=0.5)

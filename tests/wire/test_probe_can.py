@@ -3,7 +3,6 @@
 import contextlib
 import os
 import re
-import sys
 import threading
 import tty
 from collections.abc import Callable, Iterator
@@ -220,7 +219,6 @@ def test_a_bus_that_does_not_open() -> None:
         probe_can(bus.path, interface="slcan", bitrate=300_000)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="there a port opens only once")
 def test_an_adapter_that_another_program_reads_is_left_alone(start: Callable[..., str]) -> None:
     port = start(AtiCanNode)
     with sensor_from_url(f"ati-can://{port}?interface=slcan") as sensor:

