@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import degrees, radians
-from typing import Final, Protocol
+from typing import Final, Protocol, TypeVar
 
 import numpy as np
 
@@ -43,6 +43,9 @@ SURPRISE_N: Final = 0.5
 """A pose that differs from the others by both was probably touched."""
 LEAST_TO_COMPARE: Final = 6
 """Poses with this one."""
+
+
+T = TypeVar("T")
 
 
 class WatchedArm(Protocol):
@@ -153,7 +156,7 @@ class _Collection:
             self._note("The poses that are there are enough: it ends with the next one.")
         self._tell_state(State.MOVE)
         while not self._over:
-            state = self._arm.state()
+            state = self._ask(self._arm.state)
             self._collect(LOOK_S)  # paces the loop, and raises as soon as the sensor fails
             self._obey_keys()
             if self._over or not self._may_measure():
@@ -162,6 +165,20 @@ class _Collection:
                 self._take(state)
             elif self._program == "stopped" and self._dealt_with and self._rests_at is not None:
                 self._end("The program has ended")
+
+    def _ask(self, arm: Callable[[], T]) -> T:
+        """Ask the arm; nothing of ours moves it, so its silence is waited out, as a sensor's is."""
+        deadline, told = time.monotonic() + BACK_S, False
+        while True:
+            try:
+                return arm()
+            except DeviceTimeout as silence:
+                if time.monotonic() > deadline:
+                    raise
+                if not told:
+                    self._note(f"Nothing is measured until the arm is heard again: {silence.found}.", warning=True)
+                told = True
+            time.sleep(LOOK_S)
 
     def _collect(self, duration_s: float) -> FtSamples | None:
         """Samples of the time to come; None when they were interrupted and the driver has the sensor back."""
@@ -191,7 +208,7 @@ class _Collection:
 
     def _may_measure(self) -> bool:
         """Tell whether a standstill now is one to measure at."""
-        status = self._arm.status()
+        status = self._ask(self._arm.status)
         fault = str(status.fault or "")
         if fault and fault != self._fault:
             self._note(f"Nothing is measured: {fault}.", warning=True)
@@ -250,11 +267,11 @@ class _Collection:
         """Average, again while something is not quiet, and keep the pose; False when the arm moved on."""
         for attempt in range(1, self._sampling.attempts + 1):
             self._tell_state(State.SAMPLE)
-            before = self._arm.state()
+            before = self._ask(self._arm.state)
             if (found := self._collect(self._sampling.average_s)) is None:
                 return False
             samples = found
-            after = self._arm.state()
+            after = self._ask(self._arm.state)
             if turned_rad(before, after) >= MOVED_RAD or np.abs(after.qd_rad_s).max() >= STILL_RAD_S:
                 self._still_since_s = after.t_device_s
                 self._note(f"The arm moved while pose {stop} was measured: {self._hold_still()}.", warning=True)

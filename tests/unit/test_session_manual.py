@@ -13,7 +13,7 @@ from calib import solve
 from calib.errors import TooFewSamples
 from calib.model import Array
 from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
-from drivers.errors import DeviceFault, StreamBroken
+from drivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
 from ftdrive.session import manual
 from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
@@ -65,6 +65,7 @@ class Cell(ForceTorqueSensor):
         self.unplugged_s = np.inf
         self.back_s = 0.0
         self.away_s = 0.3
+        self.silent_s = (np.inf, np.inf)
         self.events: tuple[tuple[int, str], ...] = ()
         starts = np.cumsum([0.0, *(dwell.seconds + MOVE_S for dwell in dwells)])
         self.starts, self.end_s = starts[:-1], float(starts[-1]) - MOVE_S
@@ -87,6 +88,9 @@ class Cell(ForceTorqueSensor):
         self.now_s += 0.002
         assert self.now_s < self.end_s + 100, "it should have ended"
         self._may_fail("arm")
+        if self.silent_s[0] < self.now_s < self.silent_s[1]:
+            self.now_s += 0.2
+            raise DeviceTimeout("its clock has stood still", "press the emergency stop if the arm moves")
         R, speed, _ = self._where(self.now_s)
         return ArmState(
             t_host_ns=round(self.now_s * 1e9),
@@ -417,6 +421,21 @@ def test_a_sensor_that_recovers_is_waited_for_and_what_it_went_through_is_told_o
 def test_a_sensor_that_does_not_come_back_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(manual, "BACK_S", 0.05)
     outcome = Outcome(dwells(UP, DOWN), recover=True, unplugged_s=8.0, away_s=1e9, raises=pytest.raises(StreamBroken))
+    assert outcome.stops == [1]
+
+
+@pytest.mark.parametrize("listen", [False, True])
+@pytest.mark.parametrize("since_s", [4.5, 6.3, 8.2])  # on the way, before and while pose 2 is averaged
+def test_an_arm_that_is_silent_for_a_second_is_waited_for(since_s: float, listen: bool) -> None:
+    outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), silent_s=(since_s, since_s + 1.0), listen=listen)
+    assert [r.before.R_base_flange[2, 2].round(3) for r in outcome.kept] == [1.0, -1.0, 0.0]
+    words = "Nothing is measured until the arm is heard again: its clock has stood still."
+    assert outcome.person.words().count(words) == 1
+
+
+def test_an_arm_that_stays_silent_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(manual, "BACK_S", 0.05)
+    outcome = Outcome(dwells(UP, DOWN), silent_s=(8.0, np.inf), raises=pytest.raises(DeviceTimeout))
     assert outcome.stops == [1]
 
 
