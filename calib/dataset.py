@@ -238,16 +238,16 @@ def _shaped(name: str, value: object, shape: tuple[int, ...]) -> Array:
 
 def _numbers(name: str, value: object, shape: tuple[int, ...]) -> Array:
     array = _shaped(name, value, shape)
-    for index in np.argwhere(~np.isfinite(array)):
-        entry = "".join(f"[{j}]" for j in index[1:])
-        raise BadDataset(f"row {index[0] + 1}: {name}{entry} is {array[tuple(index)]}, not a finite number.")
-    for index in np.argwhere(np.abs(array) > LARGEST):
-        entry = "".join(f"[{j}]" for j in index[1:])
-        raise BadDataset(
-            f"row {index[0] + 1}: {name}{entry} is {array[tuple(index)]:.3g}, more than any sensor measures "
-            f"({LARGEST:g}): check the units."
-        )
+    _refuse(name, array, ~np.isfinite(array), "not a finite number.")
+    _refuse(name, array, np.abs(array) > LARGEST, f"more than any sensor measures ({LARGEST:g}): check the units.")
     return array
+
+
+def _refuse(name: str, array: Array, wrong: NDArray[np.bool_], why: str) -> None:
+    """Raise `BadDataset` for the first entry that is wrong."""
+    for row, *rest in np.argwhere(wrong):
+        entry = "".join(f"[{j}]" for j in rest)
+        raise BadDataset(f"row {row + 1}: {name}{entry} is {array[(row, *rest)]:.3g}, {why}")
 
 
 def _rotations(R: Array) -> Array:

@@ -283,13 +283,12 @@ def second_basin(R_base_flange: Array, guess: Guess) -> tuple[float, Parameters 
     """Give the gap of `second_basin_gap` and the other solution, None where there is not just one; infinite if none."""
     if len(R_base_flange) < 3:
         return 0.0, None  # there is a continuum of solutions
-    other = second_minimum(R_base_flange, guess.parameters)
+    gap, other = second_minimum(R_base_flange, guess.parameters)
     if other is None:
-        return float("inf"), None
+        return gap, None
     wrench, R = predict(guess.parameters, R_base_flange), other.R
     gravity_N, bias_N = given_rotation(R, R_base_flange, wrench[:, :3], np.ones(len(wrench)))
     com_m, torque_bias_Nm = com_and_torque_bias(gravity_N @ R_base_flange @ R.T, wrench[:, 3:])
-    gap = max(other.cost, 0.0) / (len(R_base_flange) * guess.weight_N**2)
     return gap, Parameters(R.T, gravity_N, bias_N, com_m, torque_bias_Nm)
 
 

@@ -175,17 +175,18 @@ def second_basin_gap(R_base_flange: Array, parameters: Parameters = NOMINAL) -> 
     Without noise, and from the forces alone: torques rarely decide. With white force noise sigma the wrong solution
     of n poses is worse by n (weight / sigma)² times the gap. Infinite if there is no other minimum.
     """
-    other = second_minimum(R_base_flange, parameters)
-    weight_N2 = float(parameters.gravity_force_base_N @ parameters.gravity_force_base_N)
-    return float("inf") if other is None else max(0.0, other.cost / (len(R_base_flange) * weight_N2))
+    return second_minimum(R_base_flange, parameters)[0]
 
 
-def second_minimum(R_base_flange: Array, parameters: Parameters) -> Minimum | None:
-    """Give the best solution with another mounting of the sensor, from the exact forces of these parameters."""
+def second_minimum(R_base_flange: Array, parameters: Parameters) -> tuple[float, Minimum | None]:
+    """Give the gap of `second_basin_gap` and the best solution with another mounting of the sensor, if there is one."""
     force_N = gravity_wrench(parameters, R_base_flange)[:, :3]
     found = minima(force_cost(R_base_flange, force_N, np.ones(len(force_N))))
     others = (m for m in found if angle_between(m.R.T, parameters.R_flange_sensor) > _SAME_MINIMUM_RAD)
-    return next(others, None)
+    if (other := next(others, None)) is None:
+        return float("inf"), None
+    weight_N2 = float(parameters.gravity_force_base_N @ parameters.gravity_force_base_N)
+    return max(0.0, other.cost / (len(R_base_flange) * weight_N2)), other
 
 
 def wrong_basin_probability(delta_chi2: float) -> float:
