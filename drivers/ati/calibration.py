@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import ProtocolError
+from drivers.errors import DeviceFault, ProtocolError
 from drivers.interfaces import Array
 
 FORCE_UNITS_N: Mapping[str, float] = MappingProxyType(
@@ -119,3 +119,10 @@ def saturated_gauges(gauges: NDArray[np.int32]) -> list[int]:
     No status bit tells: an overload and a broken cable both show only here.
     """
     return [int(g) for g in np.flatnonzero(((gauges == _LOWEST) | (gauges == _HIGHEST)).any(axis=0))]
+
+
+def refuse_saturated(name: str, gauges: NDArray[np.int32]) -> None:
+    """Raise `DeviceFault` when a gauge of the sensor is at the end of its range in any of n rows (n, 6)."""
+    if saturated := saturated_gauges(gauges):
+        names = ", ".join(f"G{gauge}" for gauge in saturated)
+        raise DeviceFault(f"{name}: gauge {names} at the end of its range", "take the load off, check the cable")

@@ -24,7 +24,7 @@ from drivers.ati.calibration import (
     Calibration,
     parse_counts,
     parse_units,
-    saturated_gauges,
+    refuse_saturated,
     unit_names,
 )
 from drivers.ati.codec import Op
@@ -231,11 +231,7 @@ class AtiCanSensor(StreamingSensor):
         if new := status & ~self._seen_status:
             log.warning("%s: status %s; measuring goes on", self.name, describe_status(new, codec.STATUS_BITS))
             self._seen_status |= new
-        if gauges := saturated_gauges(reading.gauges[np.newaxis]):
-            names = ", ".join(f"G{g}" for g in gauges)
-            raise DeviceFault(
-                f"{self.name}: gauge {names} at the end of its range", "take the load off, check the cable"
-            )
+        refuse_saturated(self.name, reading.gauges[np.newaxis])
 
     def _ask(self, op: Op, *args: int) -> list[bytes]:
         """Exchange with retries, for the start-up sequence."""

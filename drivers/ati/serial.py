@@ -19,7 +19,7 @@ from drivers._serial import SerialPort
 from drivers._status import describe_status
 from drivers._stream import StreamingSensor, scale_facts
 from drivers.ati import modbus
-from drivers.ati.calibration import Calibration, saturated_gauges, units
+from drivers.ati.calibration import Calibration, refuse_saturated, units
 from drivers.errors import UNUSABLE, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 
@@ -151,11 +151,7 @@ class AtiSerialSensor(StreamingSensor):
             self._last_good_ns = self._last_good_ns or t_host_ns
         if suspect:
             self._look_at_status(t_host_ns)
-        if saturated := saturated_gauges(gauges):
-            names = ", ".join(f"G{g}" for g in saturated)
-            raise DeviceFault(
-                f"{self.name}: gauge {names} at the end of its range", "take the load off, check the cable"
-            )
+        refuse_saturated(self.name, gauges)
         n = len(gauges)
         return FtSamples(
             t_host_ns=np.full(n, t_host_ns, np.int64),
