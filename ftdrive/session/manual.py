@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.noise import CHANNELS, is_stationary, restless_channels
 from calib.routine import MOVED_RAD, PoseRecord, Sampling, TourPose, require_enough, turned_rad
-from drivers.errors import DeviceTimeout, StreamBroken
+from drivers.errors import DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, ForceTorqueSensor, FtSamples
 from ftdrive.session.events import (
     Array,
@@ -168,17 +168,11 @@ class _Collection:
 
     def _ask(self, arm: Callable[[], T]) -> T:
         """Ask the arm; nothing of ours moves it, so its silence is waited out, as a sensor's is."""
-        deadline, told = time.monotonic() + BACK_S, False
-        while True:
-            try:
-                return arm()
-            except DeviceTimeout as silence:
-                if time.monotonic() > deadline:
-                    raise
-                if not told:
-                    self._note(f"Nothing is measured until the arm is heard again: {silence.found}.", warning=True)
-                told = True
-            time.sleep(LOOK_S)
+        try:
+            return arm()
+        except DeviceTimeout as silence:
+            self._note(f"Nothing is measured until the arm is heard again: {silence.found}.", warning=True)
+        return self._wait_out(arm, DeviceTimeout)
 
     def _collect(self, duration_s: float) -> FtSamples | None:
         """Samples of the time to come; None when they were interrupted and the driver has the sensor back."""
@@ -187,22 +181,21 @@ class _Collection:
         except (StreamBroken, DeviceTimeout):
             if not getattr(self._sensor, "recover", False):
                 raise
-            self._await_sensor()
+            self._wait_out(self._sensor.check, StreamBroken, DeviceTimeout)
             return None
         finally:
             self._witness.tell_news()
         return samples
 
-    def _await_sensor(self) -> None:
+    def _wait_out(self, ask: Callable[[], T], *losses: type[DriverError]) -> T:
+        """Ask until there is an answer, for some seconds."""
         deadline = time.monotonic() + BACK_S
         while True:
             try:
-                self._sensor.check()
-            except (StreamBroken, DeviceTimeout):
+                return ask()
+            except losses:
                 if time.monotonic() > deadline:
                     raise
-            else:
-                return
             self._witness.tell_news()
             time.sleep(LOOK_S)
 
