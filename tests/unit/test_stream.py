@@ -349,6 +349,12 @@ def wait_for(condition: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
+def wait_for_end(sensor: FakeSensor, most_s: float) -> None:
+    reader = sensor._thread
+    assert reader
+    reader.join(most_s)
+
+
 def failure_of(sensor: FakeSensor) -> type[Exception] | None:
     try:
         sensor.check()
@@ -672,9 +678,7 @@ class TestRecover:
         monkeypatch.setattr(_stream, "_RECOVER_S", 0.3)
         sensor._stale_after_s, sensor.first = 0.05, 0
         sensor.feed.put(StreamBroken("gone"))
-        reader = sensor._thread
-        assert reader
-        reader.join(5.0)
+        wait_for_end(sensor, 5.0)
         with pytest.raises(StreamBroken, match=r"^gone, not back within 0.3 s \(fake: silent for .*\)$"):
             sensor.check()
         assert sensor.connects > 1
@@ -727,9 +731,7 @@ class TestRecover:
         monkeypatch.setattr("drivers._stream._RECOVER_S", 0.3)
         sensor.connect_error = ConnectError("not plugged in")
         sensor.feed.put(StreamBroken("gone"))
-        reader = sensor._thread
-        assert reader
-        reader.join(2.0)
+        wait_for_end(sensor, 2.0)
         with pytest.raises(StreamBroken, match=r"gone, not back within 0.3 s \(not plugged in\)"):
             sensor.check()
 
