@@ -1,6 +1,6 @@
 """Draw the papers' figures and ours from simulation.
 
-uv run --group bench python tests/benchmarks/figures.py --out DIR [--quick]
+uv run python tests/benchmarks/figures.py --out DIR [--quick]
 """
 
 import argparse

@@ -1,0 +1,78 @@
+"""Time as the drivers measure it: one object that is given to everything that waits or judges an age.
+
+`REAL` is the computer's own clock. An emulated cell has a clock of its own that waits for a starved reader, and tests
+have one that moves only when they say so. No module of `drivers` calls `time.monotonic` or `time.sleep` itself.
+"""
+
+import sys
+import time
+from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, nullcontext
+from typing import Protocol
+
+
+class Waitable(Protocol):
+    """A `threading.Condition` whose lock is held, or a `threading.Event`."""
+
+    def wait(self, timeout: float | None = None, /) -> bool:
+        """Return whether it was notified or set within `timeout` seconds."""
+
+
+class Clock(ABC):
+    """A monotonic clock and the ways to wait on it. Every method may be called from any thread."""
+
+    emulated = False
+    """Whether the cell is emulated: then only the far side's own time may run out, never that of the computer."""
+
+    @abstractmethod
+    def now_ns(self) -> int:
+        """Return the time in nanoseconds; samples are stamped with it as `t_host_ns`."""
+
+    def now_s(self) -> float:
+        """Return the same time in seconds."""
+        return self.now_ns() / 1e9
+
+    def awake_s(self) -> float:
+        """Return seconds of a clock that also counts while the computer sleeps; silence is judged by it."""
+        return self.now_s()
+
+    @abstractmethod
+    def sleep(self, duration_s: float) -> None:
+        """Return after `duration_s` seconds, at once where that is not positive."""
+
+    @abstractmethod
+    def wait(self, waitable: Waitable, timeout_s: float) -> bool:
+        """Wait until `waitable` is notified or set, at most `timeout_s` seconds; return whether it was."""
+
+    def keeping_up(self) -> AbstractContextManager[object]:
+        """Mark a block whose thread must see time pass in small steps, such as the loop that reads a stream.
+
+        While the block runs, an emulated cell's time goes on by at most some milliseconds between two calls of this
+        clock in this thread. A real clock waits for no thread.
+        """
+        return nullcontext()
+
+
+class RealClock(Clock):
+    """The computer's monotonic clock."""
+
+    def now_ns(self) -> int:
+        """Return `time.monotonic_ns()`."""
+        return time.monotonic_ns()
+
+    def awake_s(self) -> float:
+        """Return CLOCK_BOOTTIME in seconds, where the system has it."""
+        if sys.platform == "linux":
+            return time.clock_gettime(time.CLOCK_BOOTTIME)
+        return time.monotonic()
+
+    def sleep(self, duration_s: float) -> None:
+        """Sleep."""
+        time.sleep(max(0.0, duration_s))
+
+    def wait(self, waitable: Waitable, timeout_s: float) -> bool:
+        """Wait."""
+        return waitable.wait(max(0.0, timeout_s))
+
+
+REAL = RealClock()
