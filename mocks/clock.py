@@ -94,7 +94,10 @@ class CellClock:
 
     def close(self) -> None:
         """End the clock; clients see that the station has ended."""
-        os.close(self._descriptor)
+        descriptor, self._descriptor = self._descriptor, -1
+        if descriptor >= 0:
+            fcntl.flock(descriptor, fcntl.LOCK_UN)  # the mapping holds a descriptor of its own
+            os.close(descriptor)
 
     def _slowest_ns(self) -> int:
         """Return how far the slowest follower is; the present time plus a debt where there is none."""
