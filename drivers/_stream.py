@@ -86,8 +86,8 @@ class StreamingSensor(ForceTorqueSensor):
         What one `collect` may hold; more is an error, never a dropped sample.
     recover : bool
         After an interruption or silence connect again, until a sample comes or `recover_s` are over, instead of ending
-        the stream. Every call made meanwhile is an error all the same, and so is a `collect` with an interruption inside.
-        May be set until `open`.
+        the stream. Every call made meanwhile is an error all the same, and so is a `collect` with an interruption
+        inside. May be set until `open`.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class StreamingSensor(ForceTorqueSensor):
         *,
         sign: int = 1,
         clock: Clock = REAL,
-        limits: StreamLimits = StreamLimits(),  # noqa: B008 (it is frozen)
+        limits: StreamLimits = StreamLimits(),
         max_collect_samples: int = 1_000_000,
         recover: bool = False,
     ) -> None:
