@@ -451,9 +451,8 @@ class StreamingSensor(ForceTorqueSensor):
                 self._arrivals.popleft()
             self._newest, self._newest_ns = _rows(block, slice(-1, None)), t_ns
             if self._failure is not None:
-                self._failure = self._interruption = (
-                    None  # an interruption is over when the device measures, not when it answers
-                )
+                # an interruption is over when the device measures, not when it answers
+                self._failure = self._interruption = None
                 self._reconnects += 1
                 self._note("connected again")
             for tap in self._taps:
