@@ -126,11 +126,11 @@ class SerialPort:
 
     def drain(self, silence_s: float, at_most_s: float) -> None:
         """Throw away what arrives, until nothing has come for so long. Raises `StreamBroken`."""
-        heard_s = self._clock.now_s()
+        heard_ns = self._clock.now_ns()
         for _ in self._clock.looks(at_most_s):
             if self.read(_DRAIN_BYTES):
-                heard_s = self._clock.now_s()
-            elif self._clock.now_s() - heard_s >= silence_s:
+                heard_ns = self._clock.now_ns()
+            elif self._clock.now_ns() - heard_ns >= round(silence_s * 1e9):
                 return
 
     def write(self, data: bytes, *, discard: bool = False) -> None:
