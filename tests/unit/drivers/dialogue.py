@@ -22,27 +22,32 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Stream:
-    """Bytes that come again and again from a turn on, until the next one."""
+    """What comes again and again from a turn on, until the next one: bytes, or lists of lines."""
 
-    reply: bytes
-    chunks: Iterable[bytes]
+    chunks: Iterable[Any]
     period_s: float = 1e-3
+    reply: Any = None
 
     @classmethod
-    def of(cls, chunk: bytes, period_s: float = 1e-3, reply: bytes = b"") -> Self:
-        return cls(reply, repeat(chunk), period_s)
+    def of(cls, chunk: Any, period_s: float = 1e-3, reply: Any = None) -> Self:
+        return cls(repeat(chunk), period_s, reply)
 
 
 class _Wire(Generic[T]):
     """What both wires share: time, what is on its way, and whether all went as it stands in the table."""
 
-    def __init__(self, turns: Iterable[tuple[Any, Any]]) -> None:
+    def __init__(self, turns: Iterable[tuple[Any, Any]], streaming: Stream | None = None) -> None:
         self.clock = FakeClock()
         self.sent: list[T] = []
         self.wrong: list[str] = []
+        self.once: list[T] = []
+        """Comes before the next chunk of a stream."""
         self._turns: Iterator[tuple[Any, Any]] = iter(turns)
         self._arrived: list[T] = []
         self._news = threading.Condition()
+        self._streams = 0
+        if streaming:
+            self._run(streaming)
 
     def __enter__(self) -> Self:
         return self
@@ -52,54 +57,61 @@ class _Wire(Generic[T]):
         if kind is None:
             assert next(self._turns, None) is None, "the driver has not sent all that stands in the table"
 
-    def take(self, sent: T) -> Any:
-        """Compare what is sent with the next turn, and return what is received."""
+    def _take(self, sent: T) -> list[tuple[float, T]]:
+        """Compare what is sent with the next turn; return what is received, and after how many seconds."""
         self.sent.append(sent)
+        self._streams += 1
         expected, received = next(self._turns, (None, None))
         if sent != expected:
             self.wrong.append(f"sent {sent!r}, not {expected!r}")
-            return None
-        return received
+            return []
+        if isinstance(received, Stream):
+            self._run(received)
+            received = received.reply
+        items = received if isinstance(received, list) else [received] if received else []
+        return [(item[0] * 1e-3, item[1]) if isinstance(item, tuple) else (DELAY_S, item) for item in items]
 
-    def arrive(self, after_s: float, what: T) -> None:
+    def _arrive(self, after_s: float, what: T) -> None:
         self.clock.at(after_s, lambda: self._arrived.append(what))
 
-    def wait_for(self, enough: Callable[[], bool], timeout_s: float) -> None:
+    def _wait_for(self, enough: Callable[[], bool], timeout_s: float) -> None:
         for left_s in self.clock.looks(timeout_s):
             if enough():
                 return
             self.clock.wait(self._news, left_s)
 
+    def _run(self, stream: Stream) -> None:
+        """Send in step with the clock: what a driver was too late for has piled up."""
+        number, chunks = self._streams, iter(stream.chunks)
+        due_s = self.clock.now_s() + DELAY_S
+
+        def schedule() -> None:
+            nonlocal due_s
+            due_s += stream.period_s
+            self.clock.at(due_s - self.clock.now_s(), send)
+
+        def send() -> None:
+            if number == self._streams and (chunk := next(chunks, None)):
+                self._arrived += [*self.once, *(chunk if isinstance(chunk, list) else [chunk])]
+                self.once.clear()
+                schedule()
+
+        schedule()
+
 
 class SerialWire(_Wire[bytes]):
     """Stands in for `serial.Serial`, and for its class."""
 
-    def __init__(self, turns: Iterable[tuple[bytes, Any]], streaming: Stream | None = None) -> None:
-        super().__init__(turns)
-        self._flow = 0
-        """Counts the streams: an older one ends."""
-        self.timeout = 0.0
-        self.once: list[bytes] = []
-        """Comes before the next chunk of a stream."""
-        if streaming:
-            self._run(streaming)
-
-    def __call__(self, *_: object, timeout: float, **__: object) -> Self:
+    def __call__(self, *_: object, timeout: float = 0.0, **__: object) -> Self:
         self.timeout = timeout
         return self
 
     def write(self, data: bytes) -> None:
-        self._flow += 1
-        received = self.take(data)
-        if isinstance(received, Stream):
-            self._run(received)
-            received = received.reply
-        after_ms, received = received if isinstance(received, tuple) else (DELAY_S * 1e3, received)
-        if received:
-            self.arrive(after_ms * 1e-3, received)
+        for after_s, received in self._take(data):
+            self._arrive(after_s, received)
 
     def read(self, size: int) -> bytes:
-        self.wait_for(lambda: self.in_waiting >= size, self.timeout)
+        self._wait_for(lambda: self.in_waiting >= size, self.timeout)
         data = b"".join(self._arrived)
         self._arrived = [data[size:]]
         return data[:size]
@@ -115,24 +127,11 @@ class SerialWire(_Wire[bytes]):
 
     def close(self) -> None: ...
 
-    def _run(self, stream: Stream) -> None:
-        flow, chunks = self._flow, iter(stream.chunks)
-
-        def send() -> None:
-            if flow == self._flow and (chunk := next(chunks, b"")):
-                self._arrived += [*self.once, chunk]
-                self.once.clear()
-                self.clock.at(stream.period_s, send)
-
-        self.clock.at(DELAY_S + stream.period_s, send)
-
 
 class CanWire(_Wire[str]):
     """Stands in for a bus of python-can, and for its class."""
 
-    def __init__(self, turns: Iterable[tuple[str, Any]], *, echo: bool = False) -> None:
-        super().__init__(turns)
-        self._echo = echo
+    echoes = False
 
     def __call__(self, *_: object, **__: object) -> Self:
         return self
@@ -140,23 +139,13 @@ class CanWire(_Wire[str]):
     def send(self, message: can.Message, timeout: float) -> None:
         assert timeout
         request = f"{message.arbitration_id:03X} {message.data.hex().upper()}".strip()
-        received = self.take(request) or ()
-        for item in [(0.0, request), *received] if self._echo else received:
-            after_ms, line = item if isinstance(item, tuple) else (DELAY_S * 1e3, item)
-            self.arrive(after_ms * 1e-3, line)
-
-    def stream(self, lines: Iterable[str], period_s: float) -> None:
-        """Send lines for ever, those of one turn together."""
-        lines = list(lines)
-
-        def send() -> None:
-            self._arrived.extend(lines)
-            self.clock.at(period_s, send)
-
-        self.clock.at(period_s, send)
+        if self.echoes:
+            self._arrive(0.0, request)
+        for after_s, line in self._take(request):
+            self._arrive(after_s, line)
 
     def recv(self, timeout: float) -> can.Message | None:
-        self.wait_for(lambda: bool(self._arrived), timeout)
+        self._wait_for(lambda: bool(self._arrived), timeout)
         if not self._arrived:
             return None
         identifier, _, payload = self._arrived.pop(0).partition(" ")
@@ -179,7 +168,8 @@ class Table:
         self.monkeypatch.setattr("drivers._serial.ask_for_marks", lambda _: marks)
         return wire
 
-    def can(self, turns: Iterable[tuple[str, Any]], *, echo: bool = False) -> CanWire:
-        wire = CanWire(turns, echo=echo)
+    def can(self, turns: Iterable[tuple[str, Any]], streaming: Stream | None = None, *, echo: bool = False) -> CanWire:
+        wire = CanWire(turns, streaming)
+        wire.echoes = echo
         self.monkeypatch.setattr("can.Bus", wire)
         return wire

@@ -269,7 +269,7 @@ def test_error_bit_that_comes_later_may_be_harmless_and_the_next_one_not(table: 
         yield flagged(RECORD)  # and this is another one
         yield from repeat(BATCH)
 
-    harmless = [(JAM, b""), (STATUS, read_reply(b"\xc0\0")), started(Stream(STARTED, records()))]
+    harmless = [(JAM, b""), (STATUS, read_reply(b"\xc0\0")), started(Stream(records(), reply=STARTED))]
     critical = [(JAM, b""), (STATUS, read_reply(b"\x80\x80"))]
     with table.serial(start_up(None, FINE, *harmless, *critical)) as wire, Sensor(wire.clock) as sensor:
         wire.clock.at(0.02, lambda: wire.once.append(RECORD_ERROR))
