@@ -241,7 +241,8 @@ class Emulator:
             ports = [f"{key}={where[key]}" for key in ("rdt_port", "http_port")]
             where = where["host"]
         query = "&".join(filter(None, [self.kind.query, *ports, options]))
-        sensor = sensor_from_url(f"{self.kind.scheme}://{where}?{query}".rstrip("?"), sign=sign, clock=clock or self.clock)
+        url = f"{self.kind.scheme}://{where}?{query}".rstrip("?")
+        sensor = sensor_from_url(url, sign=sign, clock=clock or self.clock)
         assert isinstance(sensor, StreamingSensor)
         self._sensors.append(sensor)
         return sensor
