@@ -1,16 +1,13 @@
 """The emulated UR controller and the emulated sensors, as the tests of their drivers use them."""
 
 import json
-import select
-import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from math import radians
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,73 +17,60 @@ from drivers._stream import StreamingSensor
 from drivers.clock import Clock
 from drivers.registry import sensor_from_url
 from drivers.ur.arm import UrArm
+from drivers.ur.timing import UrTiming
 from ftdrive.emulated_clock import EmulatedClock
+from tests.wire.station_process import StationProcess
 
-ROOT = Path(__file__).parents[2]
+TIME_SCALE = 10
+"""The arm lives so many times faster: a protective stop can be unlocked after 5 s of its time."""
+SPEED_RAD_S, ACCELERATION_RAD_S2 = radians(60) / TIME_SCALE, radians(200) / TIME_SCALE
 
 
-class Station:
-    """The emulator's process and its control lines."""
+class Station(StationProcess):
+    """The emulator's process, its control lines and its clock."""
 
-    def __init__(self, *options: str) -> None:
-        command = [sys.executable, "-m", "mocks", "station", "--sensor", "none", *options]
-        self.process = subprocess.Popen(
-            command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
-        self.host: str = self._line()["arm"]["host"]
-
-    def _line(self) -> dict[str, Any]:
-        assert self.process.stdout
-        assert select.select([self.process.stdout], [], [], 20)[0], "the station says nothing"
-        answer: dict[str, Any] = json.loads(self.process.stdout.readline())
-        assert "error" not in answer, answer
-        return answer
-
-    def do(self, verb: str, /, **how: object) -> dict[str, Any]:
-        assert self.process.stdin
-        self.process.stdin.write(json.dumps({"do": verb} | how) + "\n")
-        self.process.stdin.flush()
-        return self._line()
-
-    def wait_for(self, condition: Callable[[dict[str, Any]], bool], within_s: float = 2.0) -> None:
-        deadline = time.monotonic() + within_s
-        while not condition(state := self.do("state")):
-            assert time.monotonic() < deadline, state
-            time.sleep(0.01)
+    def start(self) -> None:
+        super().start()
+        self.clock = EmulatedClock(self.hello["clock"])
 
     def dashboard(self, command: str) -> str:
         """Ask as another client does."""
-        with socket.create_connection((self.host, 29999), timeout=2) as sock, sock.makefile("rw") as lines:
+        with self.connect(29999) as sock, sock.makefile("rw") as lines:
             lines.readline()
             lines.write(command + "\n")
             lines.flush()
             return lines.readline().strip()
 
-    def as_new(self) -> bool:
+    def arm(self, **how: Any) -> UrArm:
+        """Make an arm that lives by the clock of this cell, if nothing else is said."""
+        how = {"clock": self.clock, "timing": UrTiming.emulated()} | how
+        return UrArm(self.host, speed_rad_s=SPEED_RAD_S, acceleration_rad_s2=ACCELERATION_RAD_S2, **how)
+
+    def is_as_new(self) -> bool:
         if self.process.poll() is not None:
             return False
-        state = self.do("state")
+        state = self.ask("state")
         return bool(
             (state["safety_mode"], state["robot_mode"], state["remote_control"]) == ("NORMAL", "RUNNING", True)
+            and (state["runtime_state"], state["speed_fraction"]) == ("STOPPED", 1.0)
             and not any(state["tcp_offset"])
         )
 
-    def close(self) -> None:
-        self.process.kill()
-        self.process.communicate()
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    item.stash[FAILED] = item.stash.get(FAILED, False) or report.failed
+    return report
+
+
+FAILED = pytest.StashKey[bool]()
 
 
 @pytest.fixture(scope="module")
 def start_station() -> Iterator[Callable[..., Station]]:
-    stations: list[Station] = []
-
-    def start(*options: str) -> Station:
-        stations.append(Station(*options))
-        return stations[-1]
-
-    yield start
-    for station in stations:
-        station.close()
+    with ExitStack() as stations:
+        yield lambda *options: stations.enter_context(Station(*options))
 
 
 @pytest.fixture(scope="module")
@@ -96,28 +80,25 @@ def kept() -> list[Station]:
 
 
 @pytest.fixture
-def station(kept: list[Station], start_station: Callable[..., Station]) -> Iterator[Station]:
-    if not kept or not kept[0].as_new():
-        kept[:] = [start_station()]
-    yield kept[0]
-    if kept[0].process.poll() is None:
-        assert kept[0].do("state")["bad_inputs"] == []
+def station(
+    kept: list[Station], start_station: Callable[..., Station], request: pytest.FixtureRequest
+) -> Iterator[Station]:
+    """Give a station whose arm stands and has no program; one that a test has failed with is not used again."""
+    if not kept or not kept[0].is_as_new():
+        kept[:] = [start_station("--time-scale", str(TIME_SCALE))]
+    station = kept[0]
+    yield station
+    if request.node.stash.get(FAILED, False):
+        station.kill()
+    elif station.process.poll() is None:
+        assert station.ask("state")["bad_inputs"] == []
 
 
 @pytest.fixture
 def new_arm(station: Station) -> Iterator[Callable[..., UrArm]]:
     """Make arms at the station, and close them after the test."""
-    arms: list[UrArm] = []
-
-    def make(host: str = station.host, model: str | None = None) -> UrArm:
-        arms.append(UrArm(host, model=model, speed_rad_s=radians(60), acceleration_rad_s2=radians(200)))
-        return arms[-1]
-
-    yield make
-    for arm in arms:
-        t0 = time.monotonic()
-        arm.close()
-        assert time.monotonic() - t0 < 1.5
+    with ExitStack() as arms:
+        yield lambda **how: arms.enter_context(closing(station.arm(**how)))
 
 
 @pytest.fixture
