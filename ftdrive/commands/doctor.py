@@ -18,9 +18,9 @@ from rich.text import Text
 from calib import CalibrationResult
 from drivers.errors import DriverError
 from drivers.interfaces import ArmStatus, ForceTorqueSensor, RobotArm
-from drivers.ur.library import Dashboard, ask_dashboard
-from drivers.ur.reading import CONNECT_S
+from drivers.ur.dashboard import Dashboard, ask_dashboard
 from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
+from drivers.ur.timing import STRICT
 from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
 from ftdrive.commands.common import CELL, JSON, MODEL, Number, check_simulate, read_cell, runs, simulate, write_json
@@ -122,7 +122,7 @@ def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> Ro
     try:
         arm.open()
         info, status = arm.identify(), arm.status()
-        after = f" in {1e3 * ask_dashboard(host, _answer_s, timeout_s=CONNECT_S):.1f} ms" if is_ur else ""
+        after = f" in {1e3 * ask_dashboard(host, _answer_s, timeout_s=STRICT.connect_s):.1f} ms" if is_ur else ""
     except DriverError as error:
         found.append(diagnosis.check_unreachable(error, host))
         return None
@@ -148,14 +148,14 @@ def _answer_s(dashboard: Dashboard) -> float:
 
 def _registers(host: str) -> Check:
     try:
-        return diagnosis.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=CONNECT_S))
+        return diagnosis.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=STRICT.connect_s))
     except DriverError as error:
         return Check("robot.registers", "failed", error.found, error.cure or f"ping {host}")
 
 
 def _script_port(host: str) -> Check:
     try:
-        find_script_port(host, timeout_s=CONNECT_S)
+        find_script_port(host, timeout_s=STRICT.connect_s)
     except DriverError as error:
         return Check("robot.programs", "failed", error.found, error.cure or f"ping {host}")
     return Check("robot.programs", "ok", f"port {SCRIPT_PORT}, which takes programs, is open")
