@@ -13,7 +13,7 @@ from drivers.interfaces import FtSamples
 from ftdrive.session.events import Event, GuardTripped, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.guards import Guard, Limits, Seen, SensorGuard
 from ftdrive.session.watch import Watcher
-from tests.unit.fake_cell import FakeArm, FakeSensor, Lab
+from tests.unit.ftdrive.fake_cell import FakeArm, FakeSensor, Lab
 
 
 @contextmanager

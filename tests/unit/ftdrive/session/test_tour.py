@@ -36,7 +36,7 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.operator import Key
 from ftdrive.session.operators import in_words
-from tests.unit.fake_cell import MODEL, Lab
+from tests.unit.ftdrive.fake_cell import MODEL, Lab
 
 Array = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.operator import Key
 from ftdrive.session.running import faces
-from tests.unit.fake_cell import Lab
+from tests.unit.ftdrive.fake_cell import Lab
 
 
 def test_pause_holds_the_arm_on_its_way_and_goes_on_or_ends(lab: Lab) -> None:

@@ -18,7 +18,7 @@ from ftdrive.mismatch import LEAN_DEG, lean_in_words, mismatches, payload_in_wor
 from ftdrive.planning.scene import Scene, lean_of
 from ftdrive.session.events import Noted, PoseTaken, Weighed
 from ftdrive.session.preflight import Before, check_payload
-from tests.unit.fake_cell import Lab
+from tests.unit.ftdrive.fake_cell import Lab
 
 Array = NDArray[np.float64]
 

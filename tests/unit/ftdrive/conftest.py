@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.unit.fake_cell import Lab
+from tests.unit.ftdrive.fake_cell import Lab
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from drivers.errors import ConnectError, DeviceFault
 from ftdrive.errors import Declined
 from ftdrive.session.events import GuardTripped, Noted, State, StateChanged
 from ftdrive.session.operator import Key
-from tests.unit.fake_cell import Lab
+from tests.unit.ftdrive.fake_cell import Lab
 
 QUESTIONS = ("Is the tool free", "Is the ball of", "Is the emergency stop in reach")
 

@@ -20,7 +20,7 @@ from ftdrive.session.events import (
     Checked,
     Noted,
 )
-from tests.unit.fake_cell import Lab
+from tests.unit.ftdrive.fake_cell import Lab
 
 
 def refuse(lab: Lab, words: str) -> None:

@@ -30,7 +30,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Key
-from tests.unit.fake_cell import Lab
+from tests.unit.ftdrive.fake_cell import Lab
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from ftdrive.session import manual
 from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Key, Question
-from tests.unit.fake_cell import STATUS
+from tests.unit.ftdrive.fake_cell import STATUS
 
 RATE_HZ = 200
 MOVE_S = 1.5
