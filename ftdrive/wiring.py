@@ -2,14 +2,14 @@
 
 from collections.abc import Callable
 from math import radians
-from typing import cast
+from typing import Any, cast
 
 from calib.ports import Arm, Sensor
 from drivers.interfaces import ForceTorqueSensor, RobotArm
 from drivers.registry import arm_class, sensor_from_url
 from ftdrive.config import CellConfig
 from ftdrive.errors import ConfigError
-from ftdrive.simulation import sensor_url
+from ftdrive.simulation import sensor_clock, sensor_url
 
 
 def build_arm(cell: CellConfig) -> RobotArm:
@@ -23,15 +23,26 @@ def build_arm(cell: CellConfig) -> RobotArm:
         model=cell.robot.model,
         speed_rad_s=radians(cell.robot.speed_deg_s),
         acceleration_rad_s2=radians(cell.robot.acceleration_deg_s2),
+        **_emulated(cell),
     )
     _fits: Arm = arm  # checked statically: what the routine asks for is what the driver gives
     return arm
 
 
+def _emulated(cell: CellConfig) -> dict[str, Any]:
+    """Give what only an emulated arm is built with: drivers of other packages know nothing of it."""
+    if not cell.clock.emulated:
+        return {}
+    from drivers.ur.timing import UrTiming
+
+    return {"clock": cell.clock, "timing": UrTiming.emulated()}
+
+
 def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
     """Build the sensor's driver, not yet open."""
+    url = cell.sensor.url
     try:
-        sensor = sensor_from_url(sensor_url(cell.sensor.url), sign=cell.sensor.sign)
+        sensor = sensor_from_url(sensor_url(url), sign=cell.sensor.sign, clock=sensor_clock(url, cell.clock))
     except ValueError as error:
         raise ConfigError(str(error)) from error
     _fits: Sensor = sensor

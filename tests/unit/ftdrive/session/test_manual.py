@@ -19,6 +19,7 @@ from ftdrive.session import manual
 from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Key, Question
+from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import STATUS
 
 RATE_HZ = 200
@@ -56,7 +57,8 @@ class Cell(ForceTorqueSensor):
 
     def __init__(self, dwells: Sequence[Dwell]) -> None:
         self.dwells = dwells
-        self.now_s = 0.0
+        self.clock = FakeClock()
+        self.clock.ns = 0
         self.rng = np.random.default_rng(1)
         self.rate_Hz = RATE_HZ
         self.says: Callable[[float], ArmStatus] = lambda _: status()
@@ -69,6 +71,14 @@ class Cell(ForceTorqueSensor):
         self.events: tuple[tuple[int, str], ...] = ()
         starts = np.cumsum([0.0, *(dwell.seconds + MOVE_S for dwell in dwells)])
         self.starts, self.end_s = starts[:-1], float(starts[-1]) - MOVE_S
+
+    @property
+    def now_s(self) -> float:
+        return self.clock.now_s()
+
+    @now_s.setter
+    def now_s(self, t_s: float) -> None:
+        self.clock.ns = round(t_s * 1e9)
 
     def _where(self, t_s: float) -> tuple[Rotation, float, int]:
         """Orientation, joint speed, dwell."""
@@ -234,6 +244,7 @@ class Outcome:
                 down_base=FLOOR,
                 listen=listen,
                 earlier=earlier,
+                clock=self.cell.clock,
             )
 
         if raises is None:
