@@ -204,9 +204,9 @@ class _Collection:
         """Samples of one pose, collected again for longer where they are too few; None as in `_collect`."""
         for times in LONGER:
             average_s = times * self._sampling.average_s
-            samples = self._collect(average_s)
-            if samples is None:
+            if (found := self._collect(average_s)) is None:
                 return None
+            samples = found
             if len(samples) >= LEAST_SAMPLES:
                 break
         require_enough(samples, average_s)

@@ -44,6 +44,12 @@ MODEL = ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)])
 NOISE = np.repeat([0.02, 0.001], 3)
 
 
+@lru_cache(maxsize=1000)
+def _flange(q_rad: tuple[float, ...]) -> tuple[Array, Array]:
+    at = MODEL.frames(np.array(q_rad))
+    return at.R_base_flange[0], at.flange_m[0]
+
+
 class FakeArm(RobotArm):
     """Joints that go where they are sent, in steps; faults by `at_move`."""
 
@@ -88,8 +94,7 @@ class FakeArm(RobotArm):
             raise self.gone
         self.clock.sleep(self.answers_s)
         q = self.q + self.push_rad
-        at = MODEL.frames(q)
-        return ArmState(self.clock.now_ns(), 0.0, q, np.zeros(6), at.R_base_flange[0], at.flange_m[0])
+        return ArmState(self.clock.now_ns(), 0.0, q, np.zeros(6), *_flange(tuple(q.tolist())))
 
     def status(self) -> ArmStatus:
         self.at_look()
@@ -188,8 +193,8 @@ class FakeSensor(ForceTorqueSensor):
         return self._newest
 
     def _wrenches(self, n: int) -> Array:
-        at = MODEL.frames(self.arm.q).R_base_flange[0]
-        force = at.T @ [0, 0, -1.2 * 9.81]
+        R_base_flange, _ = _flange(tuple(self.arm.q.tolist()))
+        force = R_base_flange.T @ [0, 0, -1.2 * 9.81]
         free = np.add(np.r_[force, np.cross([0.01, 0, 0.06], force)], [1, 2, 3, 0.1, 0.2, 0.3])
         return free + self.push + self.rng.normal(0, self.noise, (n, 6))
 
@@ -347,7 +352,7 @@ class Lab:
             SensorConfig("fake://"),
             ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),)),
             WorkcellConfig(measured=True),
-            Sampling(average_s=0.3, noise_record_s=0.0),
+            Sampling(average_s=0.1, noise_record_s=0.0),
             clock=self.clock,
         )
         self.watchers: list[SteppedWatcher] = []
@@ -357,6 +362,7 @@ class Lab:
         monkeypatch.setattr(guided, "plan_for", planned_once)
         monkeypatch.setattr(guided, "Watcher", self._watcher)
         monkeypatch.setattr("shutil.which", lambda _: None)
+        monkeypatch.setattr("os.fsync", lambda _: None)  # the disk of whoever runs the tests is slow
 
     def _watcher(self, *args: Any, **kwargs: Any) -> SteppedWatcher:
         self.watchers.append(SteppedWatcher(*args, **kwargs))

@@ -15,7 +15,6 @@ from calib.model import Array
 from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
 from drivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
-from ftdrive.session import manual
 from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.manual import collect_manually
 from ftdrive.session.operator import Key, Question
@@ -429,9 +428,16 @@ def test_a_sensor_that_recovers_is_waited_for_and_what_it_went_through_is_told_o
     assert "a cable came off" in outcome.person.words()
 
 
-def test_a_sensor_that_does_not_come_back_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(manual, "BACK_S", 0.05)
-    outcome = Outcome(dwells(UP, DOWN), recover=True, unplugged_s=8.0, away_s=1e9, raises=pytest.raises(StreamBroken))
+def test_a_sensor_that_comes_back_within_12_s_is_waited_for() -> None:
+    outcome = Outcome(dwells(UP, DOWN), recover=True, unplugged_s=8.0, away_s=11.7)
+    assert outcome.stops == [1, 2]
+
+
+@pytest.mark.parametrize("away_s", [12.5, 1e9])
+def test_a_sensor_that_does_not_come_back_ends_it(away_s: float) -> None:
+    outcome = Outcome(
+        dwells(UP, DOWN), recover=True, unplugged_s=8.0, away_s=away_s, raises=pytest.raises(StreamBroken)
+    )
     assert outcome.stops == [1]
 
 
@@ -444,9 +450,13 @@ def test_an_arm_that_is_silent_for_a_second_is_waited_for(since_s: float, listen
     assert outcome.person.words().count(words) == 1
 
 
-def test_an_arm_that_stays_silent_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(manual, "BACK_S", 0.05)
-    outcome = Outcome(dwells(UP, DOWN), silent_s=(8.0, np.inf), raises=pytest.raises(DeviceTimeout))
+def test_an_arm_that_is_heard_again_within_12_s_is_waited_for() -> None:
+    assert Outcome(dwells(UP, DOWN), silent_s=(8.0, 19.7)).stops == [1, 2]
+
+
+@pytest.mark.parametrize("again_s", [21.6, np.inf])
+def test_an_arm_that_stays_silent_ends_it(again_s: float) -> None:
+    outcome = Outcome(dwells(UP, DOWN), silent_s=(8.0, again_s), raises=pytest.raises(DeviceTimeout))
     assert outcome.stops == [1]
 
 
@@ -569,8 +579,13 @@ def test_a_device_that_fails_ends_it_at_once_and_what_is_committed_stands(what: 
     assert outcome.cell.now_s < at_s + AVERAGE_S + 0.2
 
 
+def test_a_slow_sensor_is_averaged_for_longer() -> None:
+    outcome = Outcome(dwells(UP, DOWN, seconds=12.0), rate_Hz=9)
+    assert [len(record.samples.wrench) for record in outcome.kept] == [36, 36]
+
+
 def test_a_sensor_that_is_too_slow_is_refused() -> None:
-    outcome = Outcome(dwells(UP), rate_Hz=9, raises=pytest.raises(TooFewSamples, match=r"18 samples in 2\.0 s"))
+    outcome = Outcome(dwells(UP), rate_Hz=2, raises=pytest.raises(TooFewSamples, match=r"16 samples in 8\.0 s"))
     assert outcome.stops == []
 
 
