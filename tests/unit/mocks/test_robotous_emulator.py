@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mocks.robotous import Model, RobotousCanNode, RobotousSensor, RobotousSerialBox, fields, packet, sample_field
-from mocks.stream import Pacer
 
 WRENCH = np.array([10, -5, 20, 1, -0.5, 0.05])
 SAMPLE = "0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000"
@@ -35,7 +34,7 @@ def readings() -> Readings:
 @pytest.fixture
 def sensor(readings: Readings) -> RobotousSerialBox:
     sensor = RobotousSerialBox(readings)
-    sensor.boot(Pacer())
+    sensor.boot()
     return sensor
 
 
@@ -131,7 +130,7 @@ def test_rates(code: int, rate_hz: int, sensor: RobotousSensor) -> None:
         return
     assert sensor.rate_hz == pytest.approx(115_200 / 190), "no more than the line carries"
     sensor.execute(command("06 01"))
-    sensor.boot(Pacer())
+    sensor.boot()
     assert sensor.rate_hz == rate_hz
 
 
@@ -140,33 +139,31 @@ def test_settings_read_back_and_those_of_the_line_wait_for_a_reboot(sensor: Robo
     sensor.execute(command("08 01 05"))
     assert sensor.execute(command("07"))[0][:3] == bytes.fromhex("07 00 01")
     assert sensor.execute(command("09"))[0][:3] == bytes.fromhex("09 01 05")
-    sensor.boot(Pacer())
+    sensor.boot()
     assert sensor.execute(command("07"))[0][:3] == bytes.fromhex("07 01 01")
 
 
 def test_can_node_sets_identifiers_but_no_baud_rate(readings: Readings) -> None:
     node = RobotousCanNode(readings)
-    node.boot(Pacer())
+    node.boot()
     assert node.execute(command("06 01"))[0][:3] == bytes.fromhex("06 00 01")
     assert node.execute(command("04 10 10 12"))[0][:3] == bytes.fromhex("04 00 02")
     assert node.execute(command("04 10 11 12"))[0][:3] == bytes.fromhex("04 01 00")
     assert node.execute(command("05"))[0][:7] == bytes.fromhex("05 64 01 02 10 11 12")
-    node.boot(Pacer())
+    node.boot()
     assert node.execute(command("05"))[0][:7] == bytes.fromhex("05 10 11 12 10 11 12")
 
 
-def test_while_streaming_only_stop_and_bias_are_taken(sensor: RobotousSensor) -> None:
-    stream = Pacer()
-    sensor.boot(stream)
+def test_while_streaming_only_stop_and_bias_are_taken(sensor: RobotousSerialBox) -> None:
     sensor.execute(command("0B"))
     for code in range(0x14):
         if code != 0x0C:
             assert sensor.execute(bytes([code, 1]).ljust(8, b"\0")) == []
-    assert stream.running
+    assert sensor.streaming
     assert sensor.rate_code == 0
     assert sensor.samples(1)[0][1:13] == bytes(12), "the bias was taken"
     sensor.execute(command("0C"))
-    assert not stream.running
+    assert not sensor.streaming
 
 
 def test_bias_is_taken_lifted_and_lost(sensor: RobotousSensor, readings: Readings) -> None:
@@ -177,7 +174,7 @@ def test_bias_is_taken_lifted_and_lost(sensor: RobotousSensor, readings: Reading
     readings.wrench = WRENCH
     assert sensor.samples(1) == [bytes.fromhex(SAMPLE)]
     sensor.execute(command("11 01"))
-    sensor.boot(Pacer())
+    sensor.boot()
     assert sensor.samples(1) == [bytes.fromhex(SAMPLE)]
 
 

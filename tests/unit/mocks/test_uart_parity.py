@@ -1,16 +1,17 @@
 """Wrong parity in the emulators: what a frame knows of it, how it is marked, and a terminal that is full."""
 
-import time
-
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from mocks.ati_serial import RECORD_BYTES, AtiSerialBox
+from mocks.clock import CellClock
 from mocks.faults import Faults, FaultyWire
 from mocks.uart import WrongParity, marked
+from tests.unit.mocks.real_time import RealTime
 
+CLOCK = CellClock(RealTime())
 LATER = 1e6  # seconds: whatever is on its way has arrived
 BYTES = st.binary(max_size=30) | st.lists(st.sampled_from([0x00, 0x01, 0xFF]), max_size=30).map(bytes)
 
@@ -68,9 +69,9 @@ def test_corrupt_shows_when_an_odd_number_of_bits_is_wrong(seed: int) -> None:
 
 
 def corrupted(frame: bytes, seed: int, byte_slip: float) -> bytes:
-    wire: FaultyWire[bytes] = FaultyWire(Faults(corrupt=1, byte_slip=byte_slip), seed)
+    wire: FaultyWire[bytes] = FaultyWire(Faults(corrupt=1, byte_slip=byte_slip), CLOCK, seed)
     wire.put([frame])
-    return wire.due(time.monotonic() + LATER)[0]
+    return wire.due(CLOCK.now_s() + LATER)[0]
 
 
 @given(

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mocks.clock import CellClock
 from mocks.disturbances import Cable, Drift, Push
 from mocks.kinematics import MODELS, Vector6, forward, inverse, matrix_of, vector6
 from mocks.world import Truth, World
+from tests.unit.mocks.real_time import RealTime
 
 DH = MODELS["UR5e"]
 POSTURE = vector6(np.radians([45, -100, 60, -50, 90, 45]))
@@ -93,11 +95,11 @@ def test_a_push_adds_to_the_reading_until_it_ends() -> None:
 
 
 def test_bias_drifts_with_time() -> None:
-    now_ns = 0
+    real = RealTime()
     truth = plain(force_drift_N_min=np.array([0.6, 0, 0]), torque_drift_Nm_min=np.array([0, 0, 0.01]))
-    world = World(truth, DH, POSTURE, clock_ns=lambda: now_ns)
+    world = World(truth, DH, POSTURE, clock=CellClock(real))
     before = world.true_wrench()
-    now_ns = 30_000_000_000
+    real.pass_s(30.0)
     np.testing.assert_allclose(world.true_wrench() - before, [0.3, 0, 0, 0, 0, 0.005], atol=1e-9)
 
 
@@ -105,16 +107,16 @@ TURNED = vector6([*POSTURE[:5], POSTURE[5] + 0.7])
 
 
 def test_a_push_in_base_axes_stays_there_while_the_arm_turns_and_ends_in_time() -> None:
-    now_ns = 0
-    world = World(plain(), DH, POSTURE, clock_ns=lambda: now_ns)
-    world.touch("push", Push(np.array([0, 0, -9.81, 0, 0, 0.5]), until_s=2.0))
+    real = RealTime()
+    world = World(plain(), DH, POSTURE, clock=CellClock(real))
+    world.touch("push", Push(np.array([0, 0, -9.81, 0, 0, 0.5]), until_s=world.now_s + 2.0))
     for q in (POSTURE, TURNED):
         world.q = q
         R_base_sensor = forward(DH, q)[:3, :3] @ world.truth.R_flange_sensor
         felt = world.contact_wrench()
         np.testing.assert_allclose(R_base_sensor @ felt[:3], [0, 0, -9.81], atol=1e-12)
         np.testing.assert_allclose(R_base_sensor @ felt[3:], [0, 0, 0.5], atol=1e-12)
-    now_ns = 2_000_000_000
+    real.pass_s(2.0)
     assert not world.contact_wrench().any()
 
 
@@ -151,12 +153,12 @@ def test_a_cable_pulls_in_some_orientations() -> None:
 
 
 def test_a_drift_is_linear_and_ends_at_its_total() -> None:
-    now_ns = 0
-    world = World(plain(), DH, POSTURE, clock_ns=lambda: now_ns)
+    real = RealTime()
+    world = World(plain(), DH, POSTURE, clock=CellClock(real))
     before = world.true_wrench()
     world.drifts += (Drift(np.array([0.5, 0, 0, 0, 0, 0.02]), world.now_s, 10.0),)
-    for now_s, share in ((0, 0.0), (5, 0.5), (10, 1.0), (60, 1.0)):
-        now_ns = now_s * 1_000_000_000
+    for later_s, share in ((0, 0.0), (5, 0.5), (5, 1.0), (50, 1.0)):
+        real.pass_s(later_s)
         change = world.true_wrench() - before
         np.testing.assert_allclose(change, [0.5 * share, 0, 0, 0, 0, 0.02 * share], atol=1e-9)
 
