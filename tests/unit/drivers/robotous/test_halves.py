@@ -1,7 +1,6 @@
 """Which halves of a Robotous sensor on CAN are believed to be one sample: none that may be of two."""
 
 import random
-import time
 from collections.abc import Iterable
 
 import pytest
@@ -10,6 +9,7 @@ from hypothesis import strategies as st
 
 from drivers.robotous.can import CanLink, RobotousCan
 from drivers.robotous.halves import Halves
+from tests.fake_clock import FakeClock
 
 PERIOD_S = 0.005
 Half = tuple[float, int, bool]
@@ -177,28 +177,32 @@ def test_no_crosswise_pair_while_the_host_keeps_up(loss: float, swaps: float, se
 @pytest.mark.parametrize(("slept_s", "fields"), [(0.0, 1), (0.02, 0)])
 def test_a_silence_the_host_slept_through_is_none(slept_s: float, fields: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second half that comes twice shows that the first may be foreign: unless it came after a silence."""
-    link = CanLink("can0")
+    clock = FakeClock()
+    link = CanLink("can0", clock=clock)
     frames: list[tuple[int, bytes] | None] = [(1, data(1)), (2, data(1)), None, (2, data(1))]
 
-    def receive(timeout_s: float) -> tuple[int, bytes] | None:
+    def look(wait_s: float) -> tuple[int, bytes] | None:
         frame = frames.pop(0) if frames else None
         if frame is None:
-            time.sleep(timeout_s + slept_s)
+            clock.stall(wait_s + slept_s)
         return frame
 
-    monkeypatch.setattr(link._bus, "receive", receive)
+    monkeypatch.setattr(link._bus, "look", look)
     assert len(link.receive()) == fields
 
 
 def test_a_silence_while_halves_come_is_not_the_fault_of_cable_or_supply(monkeypatch: pytest.MonkeyPatch) -> None:
-    link = CanLink("can0")
+    clock = FakeClock()
+    link = CanLink("can0", clock=clock)
     sensor = RobotousCan(link)
-    clock_ns = time.monotonic_ns()
-    monkeypatch.setattr(time, "monotonic_ns", lambda: clock_ns)
-    sensor._is_back = True
-    assert "check cable and supply" in str(sensor._stale(0.4))
-    monkeypatch.setattr(link._bus, "receive", lambda _: (1, data(1)))  # first halves only
+    assert "cable" in sensor._stale(0.4).cure
+
+    def look(_: float) -> tuple[int, bytes]:
+        clock.stall(0.001)
+        return 1, data(1)  # first halves only
+
+    monkeypatch.setattr(link._bus, "look", look)
     assert link.receive() == []
-    assert "frames come but cannot be paired: give this computer less to do" in str(sensor._stale(0.4))
-    clock_ns += 200_000_000
-    assert "check cable and supply" in str(sensor._stale(0.4))
+    assert "cannot be paired" in sensor._stale(0.4).cure
+    clock.stall(0.2)
+    assert "cable" in sensor._stale(0.4).cure
