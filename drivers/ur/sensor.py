@@ -8,7 +8,7 @@ reference point, and a user has seen values above 20 000. So this driver reads `
 insists on being told the scale by somebody who has hung a known weight on the flange.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": `ft_raw_wrench`, `actual_TCP_force`.
-Checked on hardware: no. Verified against: tests/unit/test_ur_sensor.py.
+Checked on hardware: no. Verified against: tests/unit/drivers/ur/test_wrist_sensor.py.
 """
 
 import math

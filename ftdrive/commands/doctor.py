@@ -18,8 +18,7 @@ from calib import CalibrationResult
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import ArmStatus, ForceTorqueSensor, RobotArm
-from drivers.ur.library import Dashboard, ask_dashboard
-from drivers.ur.reading import CONNECT_S
+from drivers.ur.dashboard import Dashboard, ask_dashboard
 from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
 from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
@@ -28,7 +27,7 @@ from ftdrive.config import USUAL_KG, CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.simulation import Station, sensor_name, sensor_url
 from ftdrive.talk import hanging, talk
-from ftdrive.wiring import build_arm, build_sensor
+from ftdrive.wiring import build_arm, build_sensor, ur_timing
 
 Array = NDArray[np.float64]
 Blame = Callable[[str, DriverError], Check]
@@ -122,7 +121,7 @@ def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> Ro
     try:
         arm.open()
         info, status = arm.identify(), arm.status()
-        after = f" in {1e3 * _dashboard_s(host, cell.clock):.1f} ms" if is_ur else ""
+        after = f" in {1e3 * _dashboard_s(cell):.1f} ms" if is_ur else ""
     except DriverError as error:
         found.append(diagnosis.check_unreachable(error, host))
         return None
@@ -132,34 +131,37 @@ def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> Ro
         found.append(diagnosis.check_remote(arm.in_remote_control()))
     except DriverError as error:
         found.append(replace(diagnosis.check_unreachable(error, host), name="robot.remote"))
-    found += [_registers(host), _script_port(host)] if is_ur else [_NOT_UR]
+    found += [_registers(cell), _script_port(cell)] if is_ur else [_NOT_UR]
     found += diagnosis.check_status(status)
     found.append(_flange(arm, status))
     found.append(_clock(arm, cell.clock))
     return arm
 
 
-def _dashboard_s(host: str, clock: Clock) -> float:
+def _dashboard_s(cell: CellConfig) -> float:
     """Measure a question to the dashboard server and its answer."""
+    clock = cell.clock
 
     def answer_s(dashboard: Dashboard) -> float:
         begun_s = clock.now_s()
         dashboard.polyscopeVersion()
         return clock.now_s() - begun_s
 
-    return ask_dashboard(host, answer_s, timeout_s=CONNECT_S)
+    return ask_dashboard(cell.robot.host, answer_s, timeout_s=ur_timing(cell).connect_s, clock=clock)
 
 
-def _registers(host: str) -> Check:
+def _registers(cell: CellConfig) -> Check:
+    host, limit_s = cell.robot.host, ur_timing(cell).connect_s
     try:
-        return diagnosis.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=CONNECT_S))
+        return diagnosis.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=limit_s, clock=cell.clock))
     except DriverError as error:
         return Check("robot.registers", "failed", error.found, error.cure or f"ping {host}")
 
 
-def _script_port(host: str) -> Check:
+def _script_port(cell: CellConfig) -> Check:
+    host = cell.robot.host
     try:
-        find_script_port(host, timeout_s=CONNECT_S)
+        find_script_port(host, timeout_s=ur_timing(cell).connect_s)
     except DriverError as error:
         return Check("robot.programs", "failed", error.found, error.cure or f"ping {host}")
     return Check("robot.programs", "ok", f"port {SCRIPT_PORT}, which takes programs, is open")

@@ -95,7 +95,7 @@ def test_what_is_wrong_already_is_seen_before_the_arm_moves(lab: Lab) -> None:
 def test_the_time_that_this_computer_takes_counts_only_in_part(between_s: float, counted_s: float) -> None:
     looks = Looks()
     cell = Cell(looks)
-    with cell.watched() as watcher:
+    with cell.watched():
         cell.clock.stall(looks.seen[-1].t_s + between_s - cell.clock.now_s())
         cell.clock.advance(0.0)
     assert looks.seen[-1].dt_s == pytest.approx(counted_s)
