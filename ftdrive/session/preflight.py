@@ -346,7 +346,7 @@ def awake() -> Iterator[str]:
         if process.stdin is not None:
             process.stdin.close()
         try:
-            process.wait(timeout=1.0)
+            process.wait(timeout=5.0)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

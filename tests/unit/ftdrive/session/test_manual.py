@@ -290,7 +290,7 @@ def test_a_pose_is_on_disk_before_it_is_told() -> None:
     assert kinds[1:-1] == ["move", *one, *(words.replace("1", "2") for words in one)]
     taken = next(event for event in told if isinstance(event, PoseTaken))
     np.testing.assert_allclose(taken.gravity_flange, [0, 0, -1])
-    assert taken.settle_s == pytest.approx(1.0, abs=0.3)
+    assert 1.0 <= taken.settle_s < 1.15
     assert taken.attempts == 1
     estimates = [event for event in told if isinstance(event, Estimated)]
     assert [event.hint for event in estimates] == ["point it down"] * 2

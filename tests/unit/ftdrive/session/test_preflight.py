@@ -264,3 +264,18 @@ def test_a_link_is_refused_only_where_it_is_late_in_three_half_seconds(lab: Lab)
     assert link(lab, old=False, late_s=lambda _: 0.03 if lab.clock.now_s() < begin_s + 0.9 else 0.008).passed
     begin_s = lab.clock.now_s()
     assert not link(lab, old=False, late_s=lambda _: 0.03 if lab.clock.now_s() < begin_s + 1.4 else 0.008).passed
+
+
+@pytest.mark.parametrize("granted", [True, False])
+def test_the_computer_is_kept_awake_by_a_process_that_ends_with_our_end_of_its_pipe(
+    granted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inhibit, ended = tmp_path / "systemd-inhibit", tmp_path / "ended"
+    inhibit.write_text(f"#!/bin/sh\n{'cat' if granted else 'exit 1'}\necho by itself > {ended}\n")
+    inhibit.chmod(0o755)
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("shutil.which", lambda _: str(inhibit))
+    with preflight.awake() as words:
+        assert words.startswith("this computer is kept awake") == granted
+        assert not ended.exists()
+    assert ended.exists() == granted
