@@ -125,7 +125,7 @@ class ControlProcess:
         patience = Patience(self._clock, timeout_s)
         while True:
             with self._changed:
-                if to not in self._replies and not self._ended and patience.left_s > 0:
+                if to not in self._replies and not self._ended and not patience.is_over:
                     patience.wait(self._changed)
                 reply = self._replies.pop(to, None)
                 ended = self._ended
@@ -137,7 +137,7 @@ class ControlProcess:
                 return reply["value"]
             if ended:
                 raise self._loss()
-            if patience.left_s <= 0:
+            if patience.is_over:
                 self.kill()
                 raise DeviceTimeout(
                     f"ur_rtde did not answer within {timeout_s:.1f} s and its process was ended",

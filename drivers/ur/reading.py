@@ -177,7 +177,7 @@ class Reader:
                     raise copy.copy(self._failure) from self._failure
                 if self._live is not None and is_new():
                     return self._live
-                if patience.left_s <= 0:
+                if patience.is_over:
                     self.silent = True
                     at = "" if math.isnan(self._t_device_s) else f" at {self._t_device_s:.3f} s"
                     raise DeviceTimeout(

@@ -5,7 +5,7 @@ from typing import Final, Self
 
 from drivers.clock import Clock, Waitable
 
-_TURN_S: Final = 0.05
+_TURN_NS: Final = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -94,11 +94,17 @@ class Patience:
 
     def __init__(self, clock: Clock, limit_s: float) -> None:
         self._clock = clock
-        self.left_s = limit_s
-        """Not positive when the patience is over."""
+        self._left_ns = round(limit_s * 1e9)
+        self._counted_ns = clock.now_ns()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether `limit_s` has passed."""
+        return self._left_ns <= 0
 
     def wait(self, changed: Waitable) -> None:
-        """Wait until `changed` is notified, a turn at most."""
-        begin_s = self._clock.now_s()
-        self._clock.wait(changed, min(self.left_s, _TURN_S))
-        self.left_s -= min(self._clock.now_s() - begin_s, 2 * _TURN_S)
+        """Wait until `changed` is notified, a turn at most; what was done since the last turn counts too."""
+        self._clock.wait(changed, min(self._left_ns, _TURN_NS) / 1e9)
+        now_ns = self._clock.now_ns()
+        self._left_ns -= min(now_ns - self._counted_ns, 2 * _TURN_NS)
+        self._counted_ns = now_ns

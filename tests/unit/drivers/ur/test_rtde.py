@@ -2,17 +2,16 @@ import os
 import socket
 import struct
 import threading
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import ConnectError, DeviceTimeout, ProtocolError, StreamBroken
-from drivers.ur import live, rtde
-from drivers.ur.live import LiveReader, Sample
+from drivers.errors import ConnectError, DeviceTimeout, ProtocolError, StreamBroken, Unreachable
+from drivers.ur import rtde
+from tests.fake_clock import FakeClock
 
 # Real bytes of an e-Series controller answering, and of a client asking.
 ASK_PROTOCOL, ANSWER_PROTOCOL = bytes.fromhex("0005560002"), bytes.fromhex("00045601")
@@ -102,11 +101,10 @@ class Server:
         except OSError:
             pass
 
-    def tell(self, t_s: float, *tcp: float, safety_mode: int = 1) -> None:
-        assert self.started.wait(5)
+    def send(self, data: bytes) -> None:
+        assert self.started.wait(30)
         assert self.client is not None
-        values = struct.pack(">di6d", t_s, safety_mode, *(tcp or [0.0] * 6))
-        self.client.sendall(rtde.encode(rtde.DATA, b"\x01" + values))
+        self.client.sendall(data)
 
     def close(self) -> None:
         for sock in (self._listener, self.client):
@@ -114,7 +112,7 @@ class Server:
                 with suppress(OSError):
                     sock.shutdown(socket.SHUT_RDWR)
                 sock.close()
-        self._thread.join(5)
+        self._thread.join(30)
 
 
 ANSWERS = {"V": ANSWER_PROTOCOL, "v": ANSWER_VERSION, "S": ANSWER_START}
@@ -139,133 +137,51 @@ def served(outputs: dict[str, str] = OUTPUTS, replace: dict[str, bytes] = ANSWER
         server.close()
 
 
-@contextmanager
-def opened(server: Server) -> Iterator[LiveReader]:
-    reader = LiveReader(server.host)
-    try:
-        reader.open(timeout_s=2.0)
-        yield reader
-    finally:
-        reader.close()
-        reader.close()
+def sample(t_s: float, *tcp: float, safety_mode: int = 1) -> bytes:
+    return rtde.encode(rtde.DATA, b"\x01" + struct.pack(">di6d", t_s, safety_mode, *(tcp or [0.0] * 6)))
 
 
-def test_the_newest_offset_is_told_with_its_time() -> None:
-    with served() as server, opened(server) as reader:
-        assert reader.tells_tcp
-        assert not reader.missing & OUTPUTS.keys()
-        assert reader.version == (5, 15, 0, 1)
-        server.tell(1.0)
-        server.tell(2.0, 0.1, 0, 0.2, 0, 0, 1)
-        sample = reader.newest(since_s=1.5, limit_s=2.0)
-        assert sample.t_device_s == 2.0
-        assert sample.outputs == {"timestamp": (2.0,), "tcp_offset": (0.1, 0, 0.2, 0, 0, 1), "safety_mode": (1,)}
+def subscribe(server: Server) -> rtde.Subscription:
+    return rtde.Subscription(server.host, OUTPUTS, 125.0, timeout_s=30.0)
 
 
-def test_a_lost_connection_is_raised_at_the_consumer() -> None:
-    with served() as server, opened(server) as reader:
-        server.tell(1.0)
-        reader.newest(since_s=1.0, limit_s=2.0)
+def test_samples_come_whole_and_in_order() -> None:
+    with served() as server, closing(subscribe(server)) as stream:
+        assert stream.version == (5, 15, 0, 1)
+        assert stream.missing == []
+        text = rtde.encode(ord("M"), b"words of the controller")
+        both = sample(1.0) + text + sample(2.0, 0.1, 0, 0.2, 0, 0, 1, safety_mode=3)
+        server.send(both[:90])  # in the middle of the second
+        assert stream.read(30.0) == [(1.0,), (1,), (0.0,) * 6]
+        with pytest.raises(TimeoutError):
+            stream.read(0.01)
+        server.send(both[90:])
+        assert stream.read(30.0) == [(2.0,), (3,), (0.1, 0, 0.2, 0, 0, 1)]
+
+
+def test_outputs_that_a_controller_does_not_know_are_left_out() -> None:
+    with served({"timestamp": "DOUBLE", "safety_mode": "INT32"}) as server, closing(subscribe(server)) as stream:
+        assert stream.missing == ["tcp_offset"]
+        server.send(rtde.encode(rtde.DATA, b"\x01" + struct.pack(">di", 7.0, 3)))
+        assert stream.read(30.0) == [(7.0,), (3,)]
+
+
+def test_a_lost_connection_is_raised() -> None:
+    with served() as server, closing(subscribe(server)) as stream:
+        server.send(sample(1.0))
+        stream.read(30.0)
         server.close()
         for _ in range(2):
-            with pytest.raises(StreamBroken, match="open the arm again"):
-                reader.newest(since_s=5.0, limit_s=2.0)
-            with pytest.raises(StreamBroken):
-                reader.now_s(limit_s=2.0)
+            with pytest.raises((StreamBroken, OSError)):
+                stream.read(30.0)
 
 
-def test_an_old_controller_tells_at_least_its_time() -> None:
-    with served({"timestamp": "DOUBLE", "safety_mode": "INT32"}) as server, opened(server) as reader:
-        assert not reader.tells_tcp
-        assert reader.version[:2] == (5, 15)
-        assert server.started.wait(5)
-        assert server.client is not None
-        server.client.sendall(rtde.encode(rtde.DATA, b"\x01" + struct.pack(">di", 7.0, 3)))
-        outputs = reader.newest(since_s=7.0, limit_s=2.0).outputs
-        assert outputs == {"timestamp": (7.0,), "safety_mode": (3,)}
-
-
-class Clock:
-    """Stands still, so that no sample seems waited for, until a test moves it on."""
-
-    t_s = 0.0
-
-    def __call__(self) -> float:
-        return self.t_s
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
-    monkeypatch.setattr(live, "awake_s", clock)
-    return clock
-
-
-def pile_up(server: Server, reader: LiveReader, clock: Clock) -> None:
-    """Let a pause be far longer than between two samples, then tell what a socket held back."""
-    server.tell(1.0)
-    reader.newest(since_s=1.0, limit_s=2.0)
-    clock.t_s += 0.15
-    for k in range(101):
-        server.tell(2.0 + 0.008 * k)
-    reader.newest(since_s=2.8, limit_s=2.0)
-
-
-def tell_on(server: Server, reader: LiveReader, clock: Clock, asking: threading.Thread, safety_mode: int) -> None:
-    """Tell samples of 3 s and later, each of them waited for, until who asks has an answer."""
-    t_s = 3.0
-    while asking.is_alive():
-        clock.t_s += 0.008
-        server.tell(t_s := t_s + 0.008, safety_mode=safety_mode)
-        reader.newest(since_s=t_s, limit_s=2.0)
-
-
-def test_what_has_piled_up_is_not_now(clock: Clock) -> None:
-    with served() as server, opened(server) as reader:
-        told: list[float] = []
-        asking = threading.Thread(target=lambda: told.append(reader.now_s(limit_s=5.0)))
-        asking.start()
-        pile_up(server, reader, clock)
-        tell_on(server, reader, clock, asking, 1)
-        assert told[0] > 3.0
-        with pytest.raises(DeviceTimeout):
-            reader.now_s(limit_s=0.0)  # what was now before this question is not now
-
-
-def test_what_has_piled_up_is_no_status(clock: Clock) -> None:
-    with served() as server, opened(server) as reader:
-        pile_up(server, reader, clock)
-        with pytest.raises(DeviceTimeout):
-            reader.live(max_age_s=0.05, limit_s=0.1)
-        told: list[Sample] = []
-        asking = threading.Thread(target=lambda: told.append(reader.live(max_age_s=0.05, limit_s=5.0)))
-        asking.start()
-        tell_on(server, reader, clock, asking, 3)
-        assert told[0].outputs["safety_mode"] == (3,)
-        clock.t_s += 0.06
-        with pytest.raises(DeviceTimeout):
-            reader.live(max_age_s=0.05, limit_s=0.0)
-
-
-def test_a_clock_that_stands_still_is_found_after_a_fifth_of_a_second() -> None:
-    with served() as server, opened(server) as reader:
-        server.tell(1.0)
-        t0 = time.monotonic()
-        with pytest.raises(DeviceTimeout, match=r"stood still at 1\.000 s"):
-            reader.newest(since_s=1.001, limit_s=0.2)
-        assert 0.2 < time.monotonic() - t0 < 1.0
-
-
-def test_our_own_pause_is_not_the_controllers(monkeypatch: pytest.MonkeyPatch) -> None:
-    with served() as server, opened(server) as reader:
-        server.tell(1.0)
-        reader.newest(since_s=1.0, limit_s=2.0)
-        pauses = iter(range(0, 10**9, 30))  # 30 s between any two looks at the clock: the computer sleeps all the time
-        monkeypatch.setattr(time, "monotonic", lambda: float(next(pauses)))
-        later = threading.Timer(0.04, server.tell, (2.0,))
-        later.start()
-        assert reader.newest(since_s=2.0, limit_s=0.2).t_device_s == 2.0
-        later.join()
+def test_closing_wakes_whoever_reads() -> None:
+    with served() as server, closing(subscribe(server)) as stream:
+        assert server.started.wait(30)
+        threading.Timer(0.05, stream.close).start()
+        with pytest.raises((StreamBroken, OSError)):
+            stream.read(60.0)
 
 
 @pytest.mark.parametrize(
@@ -273,7 +189,7 @@ def test_our_own_pause_is_not_the_controllers(monkeypatch: pytest.MonkeyPatch) -
 )
 def test_inputs_of_others_are_told(types: bytes, taken: list[str]) -> None:
     with served(replace={"I": rtde.encode(rtde.SETUP_INPUTS, b"\x01" + types)}) as server:
-        assert rtde.registers_in_use(server.host, ("a", "b"), timeout_s=2.0) == taken
+        assert rtde.registers_in_use(server.host, ("a", "b"), timeout_s=30.0) == taken
     with served(replace={"I": b""}) as server, pytest.raises(DeviceTimeout, match="did not answer"):
         rtde.registers_in_use(server.host, ("a", "b"), timeout_s=0.1)
     with pytest.raises(StreamBroken, match="was lost"):
@@ -291,16 +207,28 @@ def test_inputs_of_others_are_told(types: bytes, taken: list[str]) -> None:
         ({"O": rtde.encode(rtde.SETUP_OUTPUTS, b"\x01" + b",".join([b"DOUBLE"] * 10))}, "DOUBLE, DOUBLE"),
     ],
 )
-def test_whoever_does_not_speak_rtde_is_refused_in_time(replace: dict[str, bytes], says: str) -> None:
-    with served(replace=replace) as server:
-        reader = LiveReader(server.host)
-        t0 = time.monotonic()
-        with pytest.raises(ConnectError, match=says):
-            reader.open(timeout_s=0.2)
-        reader.close()
-        assert time.monotonic() - t0 < 1.0
+def test_whoever_does_not_speak_rtde_is_refused(replace: dict[str, bytes], says: str) -> None:
+    with served(replace=replace) as server, pytest.raises(ConnectError, match=says):
+        rtde.Subscription(server.host, OUTPUTS, 125.0, timeout_s=0.2 if "did not answer" in says else 30.0)
+
+
+def test_the_greeting_has_one_time_out_in_all() -> None:
+    """A server that sends anything but the answer, again and again, is given up by the clock."""
+    clock = FakeClock()
+
+    def chatter(_: bytes) -> bytes:
+        clock.advance(3.0)
+        return rtde.encode(ord("M"), b"wait")
+
+    server = Server(chatter)
+    try:
+        with pytest.raises(ConnectError, match="did not answer"):
+            rtde.Subscription(server.host, OUTPUTS, 125.0, timeout_s=2.0, clock=clock)
+    finally:
+        server.close()
 
 
 def test_nobody_there() -> None:
-    with pytest.raises(ConnectError, match=r"cannot be reached .*switched on"):
-        LiveReader("127.83.7.2").open(timeout_s=0.5)
+    with pytest.raises(Unreachable, match="cannot be reached") as error:
+        rtde.Subscription("127.83.7.2", OUTPUTS, 125.0, timeout_s=0.5)
+    assert "switched on" in error.value.cure
