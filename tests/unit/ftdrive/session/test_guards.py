@@ -94,12 +94,12 @@ def test_an_arm_that_is_moved_while_it_should_stand_is_somebody_elses() -> None:
 
 def test_only_an_arm_that_comes_no_nearer_has_stalled() -> None:
     looks = Looks(StallGuard(LIMITS))
-    for share in np.linspace(0, 1, 5000):  # 50 s for one move: a slider at a few percent
+    for share in np.linspace(0, 1, 1500):  # 15 s for one move
         assert looks.trips(state=state(START + share * (GOAL - START))) is None
     looks = Looks(StallGuard(LIMITS))
     trip = looks.trip(1010, status=replace(STATUS, speed_slider=0.0))
     assert (trip.hazard, "slider 0 %" in str(trip)) == (22, True)
-    assert 9.9 < looks.t_s < 10.2
+    assert 10.0 < looks.t_s < 10.1
 
 
 @pytest.mark.parametrize("by", ["place", "angle"])
@@ -144,7 +144,7 @@ def test_every_stop_and_change_of_the_controller_is_seen_at_once(different: dict
 
 def test_a_protective_stop_is_told_with_the_payload_that_may_have_caused_it() -> None:
     stopped = replace(STATUS, fault=DeviceFault("protective stop", "…"), safety_mode="protective stop")
-    assert "payload or centre of mass (it was told 1.50 kg)" in str(Looks(SafetyGuard()).trip(status=stopped))
+    assert "1.50 kg" in str(Looks(SafetyGuard()).trip(status=stopped))
     untold = str(Looks(SafetyGuard()).trip(status=replace(stopped, payload_kg=None)))
     assert untold.endswith("payload or centre of mass")
     braked = replace(STATUS, fault=DeviceFault("emergency stop", "…"), safety_mode="robot emergency stop")
@@ -156,7 +156,7 @@ def test_an_arm_out_of_sight_may_be_ending_its_move() -> None:
     under_way, standing = out_of_sight(lost, moving=True), out_of_sight(lost, moving=False)
     assert (under_way.hazard, standing.hazard) == (16, 16)
     assert isinstance(under_way.error, DeviceTimeout)
-    assert "stands still; the arm was told to stop, but may not have heard it: then it ends the one" in str(under_way)
+    assert "may not have heard" in str(under_way)
     assert under_way.error.cure == "check the robot"
     assert str(standing) == str(lost)
 
@@ -167,7 +167,7 @@ def test_a_silent_sensor_is_seen_in_time(moving: bool, after_s: float) -> None:
     assert looks.trips(50) is None
     before_s = looks.t_s
     assert looks.trip(100, new=False).hazard == 15
-    assert looks.t_s - before_s == pytest.approx(after_s, abs=0.03)
+    assert after_s < looks.t_s - before_s < after_s + 0.015
 
 
 def test_a_sensor_that_repeats_itself_and_one_that_says_nothing_are_seen() -> None:
@@ -175,7 +175,7 @@ def test_a_sensor_that_repeats_itself_and_one_that_says_nothing_are_seen() -> No
     before_s = looks.t_s
     trip = looks.trip(100, wrench=WEIGHT)
     assert (trip.hazard, "repeats" in str(trip)) == (15, True)
-    assert looks.t_s - before_s == pytest.approx(0.2, abs=0.05)
+    assert 0.2 < looks.t_s - before_s < 0.225
     assert Looks(SensorGuard(LIMITS)).trip(wrench=np.full(6, np.nan)).hazard == 15
 
 

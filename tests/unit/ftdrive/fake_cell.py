@@ -1,25 +1,29 @@
-"""A fake cell for the guided session: an arm, a sensor and an operator that do what a test says."""
+"""A fake cell for the guided session: an arm, a sensor and an operator that do what a test says, on a fake clock."""
 
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from calib.routine import Sampling
+from drivers.clock import Clock
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
 from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import Declined
 from ftdrive.planning.arm_model import ArmModel, Cylinder
+from ftdrive.planning.cell import certifier_for, plan_for
+from ftdrive.planning.certify import Certifier
+from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
 from ftdrive.runs import Run
-from ftdrive.session import guided, preflight
+from ftdrive.session import guided
 from ftdrive.session.events import (
     Event,
     Noted,
@@ -30,6 +34,8 @@ from ftdrive.session.events import (
 from ftdrive.session.guided import Options
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.outcome import Outcome
+from ftdrive.session.watch import Watcher
+from tests.fake_clock import FakeClock
 
 Array = NDArray[np.float64]
 
@@ -38,10 +44,19 @@ MODEL = ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)])
 NOISE = np.repeat([0.02, 0.001], 3)
 
 
+@lru_cache(maxsize=1000)
+def _flange(q_rad: tuple[float, ...]) -> tuple[Array, Array]:
+    at = MODEL.frames(np.array(q_rad))
+    return at.R_base_flange[0], at.flange_m[0]
+
+
 class FakeArm(RobotArm):
     """Joints that go where they are sent, in steps; faults by `at_move`."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+        self.answers_s = 0.008
+        """How long it takes to read a state."""
         self.q = USUAL_POSTURE_RAD + np.radians([0, 0, 0, 3.0, -2, 4])
         self._status = STATUS
         self.push_rad = np.zeros(6)
@@ -77,9 +92,9 @@ class FakeArm(RobotArm):
             if self.gone_status:
                 self.set_status(**self.gone_status)
             raise self.gone
+        self.clock.sleep(self.answers_s)
         q = self.q + self.push_rad
-        at = MODEL.frames(q)
-        return ArmState(time.monotonic_ns(), 0.0, q, np.zeros(6), at.R_base_flange[0], at.flange_m[0])
+        return ArmState(self.clock.now_ns(), 0.0, q, np.zeros(6), *_flange(tuple(q.tolist())))
 
     def status(self) -> ArmStatus:
         self.at_look()
@@ -130,12 +145,12 @@ class FakeArm(RobotArm):
             self.q = start + step / steps * (goal - start)
             if fault is not None and step == 2:
                 fault()
-                deadline = time.monotonic() + 20  # held here until something stops it
+                deadline_s = self.clock.now_s() + 20  # held here until something stops it
                 while not self.halted.is_set():
                     guard()
-                    assert time.monotonic() < deadline
-                    time.sleep(0.002)
-            time.sleep(0.001)
+                    assert self.clock.now_s() < deadline_s
+                    self.clock.sleep(0.002)
+            self.clock.sleep(0.02)
 
     def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
         assert timeout_s > 0
@@ -174,18 +189,23 @@ class FakeSensor(ForceTorqueSensor):
 
     def _wrench(self) -> Array:
         if not self.stuck:
-            at = MODEL.frames(self.arm.q).R_base_flange[0]
-            force = at.T @ [0, 0, -1.2 * 9.81]
-            free = np.add(np.r_[force, np.cross([0.01, 0, 0.06], force)], [1, 2, 3, 0.1, 0.2, 0.3])
-            self._newest = free + self.push + self.rng.normal(0, self.noise)
+            self._newest = self._wrenches(1)[0]
         return self._newest
+
+    def _wrenches(self, n: int) -> Array:
+        R_base_flange, _ = _flange(tuple(self.arm.q.tolist()))
+        force = R_base_flange.T @ [0, 0, -1.2 * 9.81]
+        free = np.add(np.r_[force, np.cross([0.01, 0, 0.06], force)], [1, 2, 3, 0.1, 0.2, 0.3])
+        return free + self.push + self.rng.normal(0, self.noise, (n, 6))
 
     def collect(self, duration_s: float) -> FtSamples:
         self.check()
         n = max(40, int(duration_s * 100))
         self.collecting()
-        rows = np.array([self._wrench() for _ in range(n)])
-        now = time.monotonic_ns()
+        self.arm.clock.sleep(duration_s)
+        self.check()
+        rows = np.array([self._wrench()] * n) if self.stuck else self._wrenches(n)
+        now = self.arm.clock.now_ns()
         self._seq += n
         return FtSamples(
             now - (np.arange(n)[::-1] * 1_000_000).astype(np.int64),
@@ -201,7 +221,7 @@ class FakeSensor(ForceTorqueSensor):
         self.check()
         self._seq += 1
         return FtSamples(
-            np.array([time.monotonic_ns()]),
+            np.array([self.arm.clock.now_ns()]),
             np.array([np.nan]),
             np.array([self._seq]),
             np.zeros((1, 0), np.int32),
@@ -256,12 +276,75 @@ class Scripted:
         return [event for event in self.told if isinstance(event, kind)]
 
 
+class SteppedWatcher(Watcher):
+    """The guards without their thread: they look when the fake clock says so, in the thread of the test."""
+
+    looking = False
+    """Whether what happens now is a look of the guards."""
+    ended = False
+    """As if their thread had ended: set by a test, or by a `SystemExit` in a look."""
+    stop_takes_s = 0.0
+
+    def __enter__(self) -> Self:
+        self._step()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+
+    @property
+    def _has_ended(self) -> bool:
+        return self.ended
+
+    def _step(self) -> None:
+        if self.ended or self._end.is_set():
+            return
+        self.looking = True
+        try:
+            pause_s = self.turn()
+        except SystemExit:
+            self.ended = True
+            return
+        finally:
+            self.looking = False
+        self._fake_clock.at(max(pause_s, 0.001), self._step)
+
+    def _begin_to_stop(self) -> threading.Event:
+        stopped = threading.Event()
+
+        def stop() -> None:
+            self._arm.stop()
+            stopped.set()
+
+        if self.stop_takes_s:
+            self._fake_clock.at(self.stop_takes_s, stop)
+        else:
+            stop()
+        return stopped
+
+    @property
+    def _fake_clock(self) -> FakeClock:
+        assert isinstance(self.clock, FakeClock)
+        return self.clock
+
+
+@lru_cache(maxsize=100)
+def _planned(cell: CellConfig, model: str, q_rad: tuple[float, ...], poses: int) -> Plan:
+    return plan_for(cell, certifier_for(cell, model), np.array(q_rad), poses)
+
+
+def planned_once(cell: CellConfig, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
+    """As `plan_for`, but the same question is answered from memory: planning takes most of a test's time."""
+    return _planned(cell, certifier.arm.name, tuple(q_rad.tolist()), poses)
+
+
 class Lab:
     """A fake cell and what a test wants of it."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder = folder
-        self.arm = FakeArm()
+        self.clock = FakeClock()
+        self.arm = FakeArm(self.clock)
         self.sensor = FakeSensor(self.arm)
         self.operator = Scripted()
         self.cell = CellConfig(
@@ -269,12 +352,26 @@ class Lab:
             SensorConfig("fake://"),
             ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),)),
             WorkcellConfig(measured=True),
-            Sampling(average_s=0.3, noise_record_s=0.0),
+            Sampling(average_s=0.1, noise_record_s=0.0),
+            clock=self.clock,
         )
+        self.watchers: list[SteppedWatcher] = []
+        """Of each session that came to its tour."""
         monkeypatch.setattr(guided, "build_arm", lambda _: self.arm)
         monkeypatch.setattr(guided, "build_sensor", lambda _: self.sensor)
-        monkeypatch.setattr(preflight, "_LINK_S", 0.02)
+        monkeypatch.setattr(guided, "plan_for", planned_once)
+        monkeypatch.setattr(guided, "Watcher", self._watcher)
         monkeypatch.setattr("shutil.which", lambda _: None)
+        monkeypatch.setattr("os.fsync", lambda _: None)  # the disk of whoever runs the tests is slow
+
+    def _watcher(self, *args: Any, **kwargs: Any) -> SteppedWatcher:
+        self.watchers.append(SteppedWatcher(*args, **kwargs))
+        return self.watchers[-1]
+
+    @property
+    def guards_look(self) -> bool:
+        """Whether what happens now happens in a look of the guards."""
+        return any(watcher.looking for watcher in self.watchers)
 
     def calibrate(self, **options: Any) -> Outcome | None:
         return guided.calibrate(self.cell, self.operator, Options(self.folder / "runs", poses=6, **options))

@@ -3,7 +3,6 @@
 import json
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -189,7 +188,7 @@ def stations(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Sequence[str]]]
 
 def test_an_emulated_run_goes_on_in_the_same_cell(cells: list[Any], stations: list[Any], tmp_path: Path) -> None:
     station = {"sensor": "serial", "options": ["--seed", "7"], "truth": {}}
-    config = asdict(CellConfig(RobotConfig("127.0.0.1"), SensorConfig("ati-serial:///dev/pts/9")))
+    config = CellConfig(RobotConfig("127.0.0.1"), SensorConfig("ati-serial:///dev/pts/9")).to_dict()
     run = Run.create(tmp_path, "demo", {"station": station, "config": config})
     run.plan_path.touch()
     for words in (shlex.split(run.resume_command)[2:], ["--simulate", "--resume", str(run.folder)]):
@@ -217,4 +216,4 @@ def test_a_run_with_a_field_of_the_wrong_type_is_refused_in_one_sentence(
 
 
 def test_every_error_of_the_solver_has_an_exit_code() -> None:
-    assert exit_code(CalibError("the run holds no pose yet")) == 7
+    assert exit_code(CalibError("holds no pose yet")) == 7

@@ -41,7 +41,7 @@ class Cell:
         self.restless = 0
         self.drifting = 0
         self.fails_at: str | None = None
-        self.samples = 300
+        self.rate_Hz = 600
 
     def _did(self, what: str) -> None:
         self.log.append(what)
@@ -61,9 +61,10 @@ class Cell:
 
     def collect(self, duration_s: float) -> Samples:
         self._did(f"collect {duration_s}")
-        slope = np.linspace(-1, 1, self.samples)[:, None] if self.drifting else 0.0
+        n = int(duration_s * self.rate_Hz)
+        slope = np.linspace(-1, 1, n)[:, None] if self.drifting else 0.0
         self.drifting -= bool(self.drifting)
-        return Samples(self.rng.normal(0, 0.01, (self.samples, 6)) + slope)
+        return Samples(self.rng.normal(0, 0.01, (n, 6)) + slope)
 
     def check(self) -> None:
         pass
@@ -120,11 +121,20 @@ def test_a_failure_is_passed_on(fails_at: str) -> None:
         take(cell)
 
 
-def test_a_sensor_that_is_too_slow_ends_the_tour_with_a_sentence() -> None:
+@pytest.mark.parametrize(("rate_Hz", "averages_s"), [(40, [0.5]), (39, [0.5, 1.0]), (19, [0.5, 1.0, 2.0])])
+def test_a_slow_sensor_is_averaged_for_longer(rate_Hz: int, averages_s: list[float]) -> None:
     cell = Cell()
-    cell.samples = 7
-    with pytest.raises(TooFewSamples, match=r"7 samples in 0\.5 s"):
+    cell.rate_Hz = rate_Hz
+    assert len(take(cell).samples.wrench) == rate_Hz * averages_s[-1]
+    assert cell.log == ["still", *(f"collect {average_s}" for average_s in averages_s)]
+
+
+def test_a_sensor_that_is_too_slow_ends_the_tour() -> None:
+    cell = Cell()
+    cell.rate_Hz = 9
+    with pytest.raises(TooFewSamples, match=r"18 samples in 2\.0 s"):
         take(cell)
+    assert cell.log == ["still", "collect 0.5", "collect 1.0", "collect 2.0"]
 
 
 def test_a_guard_that_trips_at_the_very_end_of_a_pose_discards_it() -> None:

@@ -1,7 +1,8 @@
 """What is checked before anything moves, on the fake cell: each finding is refused with its words."""
 
-import time
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -10,17 +11,15 @@ import numpy as np
 import pytest
 
 from drivers.errors import DeviceFault, StreamBroken
-from drivers.interfaces import ArmState, ArmStatus
+from drivers.interfaces import ArmState
 from ftdrive import checks
 from ftdrive.config import ToolConfig, WorkcellConfig
 from ftdrive.diagnosis import SLOWEST_SLIDER, check_speed
 from ftdrive.errors import NotAccepted
 from ftdrive.session import guided, preflight
-from ftdrive.session.events import (
-    Checked,
-    Noted,
-)
-from tests.unit.fake_cell import Lab
+from ftdrive.session.events import Checked, Noted
+from ftdrive.session.guards import Limits
+from tests.unit.ftdrive.fake_cell import Lab
 
 
 def refuse(lab: Lab, words: str) -> None:
@@ -42,9 +41,9 @@ def test_a_workcell_nobody_measured_is_refused(lab: Lab) -> None:
         ({"payload_kg": 0.0}, "told of no payload"),
         (
             {"p_flange_payload_m": (0.0, 0.0, -0.15)},
-            r"centre at \(0, 0, -150\) mm from the flange, where the tool is not",
+            r"\(0, 0, -150\) mm",
         ),
-        ({"p_flange_payload_m": (0.3, 0.0, 0.05)}, r"centre at \(300, 0, 50\) mm"),
+        ({"p_flange_payload_m": (0.3, 0.0, 0.05)}, r"\(300, 0, 50\) mm"),
     ],
 )
 def test_a_controller_that_is_not_ready_is_refused(different: dict[str, Any], words: str, lab: Lab) -> None:
@@ -59,7 +58,7 @@ def test_a_tour_that_would_wind_up_the_cable_is_refused(lab: Lab, tmp_path: Path
     assert "wrist 3 stands at -90°" in next(e.words for e in lab.operator.of(Checked) if e.name == "cable")
     lab.arm.q[5] = np.radians(160)
     lab.operator.told.clear()
-    refuse_plan = pytest.raises(NotAccepted, match=r"wrist 3 stands at 160°.*jog it to between -?\d+° and -?\d+°")
+    refuse_plan = pytest.raises(NotAccepted, match=r"stands at 160°.*between -?\d+° and -?\d+°")
     with refuse_plan:
         lab.calibrate(plan=made_there)
     assert lab.arm.moves == []
@@ -168,7 +167,6 @@ def test_a_plan_for_another_tool_is_refused(lab: Lab) -> None:
 def test_a_program_of_somebody_else_is_refused_before_anything_is_done(
     program: str, dry_run: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(preflight, "_ENDS_S", 0.1)
     monkeypatch.setattr(lab.arm, "program_told", lambda: "PLAYING pick.urp")
     lab.arm.program = program
     words = r"a program is on the controller \(PLAYING pick\.urp\) .* stop it at the pendant, then start again"
@@ -178,23 +176,33 @@ def test_a_program_of_somebody_else_is_refused_before_anything_is_done(
 
 
 def test_what_a_killed_session_left_behind_is_waited_for(lab: Lab) -> None:
-    left = iter(["playing", "playing", "stopping", "stopped"])
     lab.arm.program = "playing"
-    looked = lab.arm.status
-
-    def status() -> ArmStatus:
-        lab.arm.program = next(left, "stopped")
-        return looked()
-
-    lab.arm.status = status  # type: ignore[method-assign]  # this arm only
+    lab.clock.at(0.3, lambda: setattr(lab.arm, "program", "stopping"))
+    lab.clock.at(1.4, lambda: setattr(lab.arm, "program", "stopped"))
     assert lab.calibrate(dry_run=True) is None
-    assert next(left, None) is None
+
+
+def test_a_program_that_goes_on_is_none_that_was_left_behind(lab: Lab) -> None:
+    lab.arm.program = "playing"
+    lab.clock.at(1.6, lambda: setattr(lab.arm, "program", "stopped"))
+    with pytest.raises(NotAccepted):
+        lab.calibrate(dry_run=True)
+
+
+def test_a_computer_that_stalls_does_not_refuse_a_program_that_has_ended_meanwhile(lab: Lab) -> None:
+    def stall() -> None:
+        lab.clock.stall(5.0)
+        lab.arm.program = "stopped"
+
+    lab.arm.program = "playing"
+    lab.clock.at(0.01, stall)
+    assert lab.calibrate(dry_run=True) is None
 
 
 def test_a_dry_run_takes_no_control_and_says_what_it_left_out(lab: Lab) -> None:
     assert lab.calibrate(dry_run=True) is None
     assert (lab.arm.opened, lab.arm.asked_limits) == (1, 0)
-    assert "safety limits are not asked for" in lab.said()
+    assert "limits are not asked for" in lab.said()
 
 
 def test_control_is_taken_when_all_else_is_well(lab: Lab) -> None:
@@ -224,27 +232,50 @@ def test_local_control_is_refused_in_a_dry_run_too(lab: Lab) -> None:
     assert lab.calibrate(dry_run=True) is None
 
 
-@pytest.mark.parametrize(
-    ("late_s", "busy_for", "old", "passes"),
-    [
-        (0.03, 9999, False, False),
-        (0.03, 1, False, True),
-        (0.008, 9999, False, True),
-        (0.03, 9999, True, True),
-        (0.07, 9999, True, False),
-    ],
-)
-def test_an_arm_that_answers_late_is_refused(late_s: float, busy_for: int, old: bool, passes: bool, lab: Lab) -> None:
-    if old:  # its program is asked for the TCP, twice for each state
-        lab.arm.set_status(tcp_offset=None)
-    right, left = lab.arm.state, [busy_for]
+def link(lab: Lab, *, old: bool, late_s: Callable[[int], float]) -> Checked:
+    """Check an arm that answers each question after so long; `old`: its program is asked for the TCP, twice a time."""
+    lab.arm.set_status(tcp_offset=None if old else (0.0,) * 6)
+    looks = count()
 
     def late() -> ArmState:
-        left[0] -= 1
-        time.sleep(late_s if left[0] >= 0 else 0.0)
+        lab.clock.sleep(late_s(next(looks)))
         return right()
 
+    right, lab.arm.answers_s = lab.arm.state, 0.0
     lab.arm.state = late  # type: ignore[method-assign]  # this arm only
-    found = preflight.check_link(cast("preflight.Before", SimpleNamespace(arm=lab.arm)))
-    assert found.passed == passes
-    assert passes or f"{60 if old else 20} ms are usual at most" in found.words
+    return preflight.check_link(cast("preflight.Before", SimpleNamespace(arm=lab.arm, cell=lab.cell, limits=Limits())))
+
+
+@pytest.mark.parametrize(("old", "limit_s"), [(False, 0.02), (True, 0.06)])
+def test_an_arm_that_answers_late_is_refused(old: bool, limit_s: float, lab: Lab) -> None:
+    assert link(lab, old=old, late_s=lambda _: 0.9 * limit_s).passed
+    found = link(lab, old=old, late_s=lambda _: 1.1 * limit_s)
+    assert not found.passed
+    assert f"{1e3 * limit_s:.0f} ms" in found.words
+
+
+def test_a_link_with_gaps_is_refused(lab: Lab) -> None:
+    assert link(lab, old=False, late_s=lambda look: 0.09 if look % 5 == 4 else 0.008).passed
+    assert not link(lab, old=False, late_s=lambda look: 0.11 if look % 5 == 4 else 0.008).passed
+
+
+def test_a_link_is_refused_only_where_it_is_late_in_three_half_seconds(lab: Lab) -> None:
+    begin_s = lab.clock.now_s()
+    assert link(lab, old=False, late_s=lambda _: 0.03 if lab.clock.now_s() < begin_s + 0.9 else 0.008).passed
+    begin_s = lab.clock.now_s()
+    assert not link(lab, old=False, late_s=lambda _: 0.03 if lab.clock.now_s() < begin_s + 1.4 else 0.008).passed
+
+
+@pytest.mark.parametrize("granted", [True, False])
+def test_the_computer_is_kept_awake_by_a_process_that_ends_with_our_end_of_its_pipe(
+    granted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inhibit, ended = tmp_path / "systemd-inhibit", tmp_path / "ended"
+    inhibit.write_text(f"#!/bin/sh\n{'cat' if granted else 'exit 1'}\necho by itself > {ended}\n")
+    inhibit.chmod(0o755)
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("shutil.which", lambda _: str(inhibit))
+    with preflight.awake() as words:
+        assert words.startswith("this computer is kept awake") == granted
+        assert not ended.exists()
+    assert ended.exists() == granted
