@@ -16,7 +16,8 @@ from calib.compare import compare
 from calib.errors import BadDataset
 from calib.known import Known
 from calib.ml import fit
-from calib.model import STANDARD_GRAVITY_M_S2, Array, jacobian, predict
+from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, jacobian, predict
+from calib.published import published
 from calib.result import Method
 from calib.yu import SPECIAL_R_flange_base
 
@@ -32,6 +33,12 @@ TRUTH = Parameters(
     np.array([0.01, -0.02, -0.07]),
     np.array([0.1, 0.2, -0.3]),
 )
+
+
+@pytest.fixture(autouse=True)
+def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The uncertainty of closed forms is simulated: a tenth of the runs is enough where it is not judged."""
+    monkeypatch.setattr("calib.solver.SIMULATIONS", 40)
 
 
 def dataset(R_base_flange: Array, wrench: Array, cov: Array | None = None) -> CalibrationDataset:
@@ -98,41 +105,49 @@ def test_any_mounting_is_found_from_any_orientations(n: int) -> None:
         assert result.chi2 < 1e-15
 
 
-@pytest.mark.parametrize(("orientations", "seed"), [("24", 1), ("7", 2)])
-def test_the_covariance_is_honest(orientations: str, seed: int) -> None:
+@pytest.mark.parametrize(
+    ("orientations", "seed", "runs"),
+    [
+        ("24", 1, 40),
+        pytest.param("24", 1, 150, marks=pytest.mark.slow),
+        pytest.param("7", 2, 150, marks=pytest.mark.slow),
+    ],
+)
+def test_the_covariance_is_honest(orientations: str, seed: int, runs: int) -> None:
     rng = np.random.default_rng(seed)
     R = R24 if orientations == "24" else Rotation.random(7, rng=rng).as_matrix()
     cov = uneven(rng, len(R))
     distance, chi2, squared, stated = [], [], np.zeros(15), np.zeros(15)
-    for _ in range(150):
+    for _ in range(runs):
         result = solve(dataset(R, noisy(rng, R, cov), cov))
         error = result.parameters.difference(TRUTH)
         distance.append(error @ np.linalg.solve(result.covariance, error))
         chi2.append(result.chi2)
-        squared += error**2 / 150
-        stated += np.diag(result.covariance) / 150
+        squared += error**2 / runs
+        stated += np.diag(result.covariance) / runs
+    assert np.mean(distance) == pytest.approx(15, abs=2.5 * np.sqrt(30 / runs))
+    assert np.mean(chi2) == pytest.approx(result.dof, abs=2.5 * np.sqrt(2 * result.dof / runs))
     assert stats.kstest(distance, "chi2", args=(15,)).pvalue > 1e-3
     assert stats.kstest(chi2, "chi2", args=(result.dof,)).pvalue > 1e-3
     # Efficient: the mean square error of every block is the Cramer-Rao bound at the truth.
     J = np.linalg.inv(np.linalg.cholesky(cov)) @ jacobian(TRUTH, R)
     bound = np.diag(np.linalg.inv(np.einsum("nki,nkj->ij", J, J))).reshape(5, 3).sum(axis=1)
-    np.testing.assert_allclose(squared.reshape(5, 3).sum(axis=1) / bound, 1, atol=0.25)
+    np.testing.assert_allclose(squared.reshape(5, 3).sum(axis=1) / bound, 1, atol=3 * np.sqrt(2 / 3 / runs))
     # Seven poses now and then seem to show more than the measured noise; that can only widen what is stated.
     widened = 0.05 if orientations == "24" else 0.1
     np.testing.assert_allclose(stated.reshape(5, 3).sum(axis=1) / bound, 1, atol=widened)
 
 
 @pytest.mark.parametrize("method", ["srom", "lrom"])
-def test_sigmas_of_the_closed_forms_are_their_own(method: Method) -> None:
+def test_sigmas_of_the_closed_forms_are_their_own(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
     rng = np.random.default_rng(3)
     cov = white(24, 4 * SIGMA)
-    squared, stated = np.zeros(15), np.zeros(15)
-    for _ in range(16):
-        result = solve(dataset(R24, noisy(rng, R24, cov), cov), method)
-        squared += result.parameters.difference(TRUTH) ** 2 / 16
-        stated += np.diag(result.covariance) / 16
+    stated = np.diag(solve(dataset(R24, noisy(rng, R24, cov), cov), method).covariance)
+    estimate = published(method, R24, gravity_direction_base=-UP_IN_BASE)
+    squared = np.mean([estimate(noisy(rng, R24, cov)).difference(TRUTH) ** 2 for _ in range(100)], axis=0)
     ratio = squared.reshape(5, 3).sum(axis=1) / stated.reshape(5, 3).sum(axis=1)
-    np.testing.assert_allclose(ratio, 1, atol=0.5)
+    np.testing.assert_allclose(ratio, 1, atol=0.3)
     best = np.diag(solve(dataset(R24, noisy(rng, R24, cov), cov)).covariance)
     assert stated[:3].sum() > 2 * best[:3].sum()  # torques tell ML more about the rotation
 
@@ -140,7 +155,7 @@ def test_sigmas_of_the_closed_forms_are_their_own(method: Method) -> None:
 def test_noise_is_estimated_from_the_residuals_when_nobody_measured_it() -> None:
     rng = np.random.default_rng(4)
     stated = []
-    for _ in range(30):
+    for _ in range(12):
         R = Rotation.random(8, rng=rng).as_matrix()
         best = fit(R, noisy(rng, R, white(8)), None)
         stated.append(np.sqrt(np.diag(best.wrench_cov[0]))[[0, 3]])
@@ -221,8 +236,13 @@ def test_a_walk_is_looked_for_where_there_is_nothing_to_see(measured: bool) -> N
     no_lever = replace(TRUTH, p_sensor_com_m=np.zeros(3), torque_bias_Nm=np.zeros(3))
     rng = np.random.default_rng(4)
     pushed = predict(no_lever, R) + rng.normal(size=(8, 6)) * SIGMA * [1, 1, 1, 0, 0, 0]  # torques are exactly 0
-    for wrench in (predict(TRUTH, R), pushed):
-        solve(dataset(R, wrench, white(8) if measured else None), drift="random-walk")
+    for truth, wrench in ((TRUTH, predict(TRUTH, R)), (no_lever, pushed)):
+        result = solve(dataset(R, wrench, white(8) if measured else None), drift="random-walk")
+        error = np.abs(truth.difference(result.parameters))
+        assert (error < 4 * np.sqrt(np.diag(result.covariance)) + 1e-12).all()
+        assert result.components.get("walk_force_N", 0.0) < SIGMA[0] / 100
+        assert result.components.get("walk_torque_Nm", 0.0) < SIGMA[3] / 100
+        assert result.drift is None or (np.abs(result.drift.change) < result.drift.sigma).all()
 
 
 def test_rounding_is_no_evidence_of_inverted_orientations() -> None:
