@@ -119,7 +119,7 @@ def test_poses_that_were_not_used_are_predicted_like_new_ones() -> None:
 def test_left_out_residuals_spread_as_stated() -> None:
     rng = np.random.default_rng(2)
     squares = []
-    for _ in range(100):
+    for _ in range(60):
         R = Rotation.random(6, rng=rng).as_matrix()
         quality = judge(fit(R, noisy(rng, R), white(6)))
         squares.append(quality.residual_sigma**2)
@@ -162,12 +162,12 @@ def test_the_expected_error_is_the_mean_over_all_orientations() -> None:
 
 def test_p_values_are_uniform_and_clean_runs_are_good_without_a_word() -> None:
     rng = np.random.default_rng(7)
-    judged = [judge(fit(R24, noisy(rng, R24), white(24))) for _ in range(150)]
+    judged = [judge(fit(R24, noisy(rng, R24), white(24))) for _ in range(80)]
     p = np.sort([q.chi2_p for q in judged if q.chi2_p is not None])
-    assert len(p) == 150
-    assert np.abs(p - np.arange(1, 151) / 150).max() < 0.13  # Kolmogorov's 1 %
+    assert len(p) == 80
+    assert np.abs(p - np.arange(1, 81) / 80).max() < 0.18  # Kolmogorov's 1 %
     assert all(q.verdict == "good" for q in judged)
-    assert sum(bool(q.reasons) for q in judged) <= 3
+    assert sum(bool(q.reasons) for q in judged) <= 2
     assert np.mean([q.lag1 for q in judged]) == pytest.approx(0, abs=0.04)
 
 
@@ -202,7 +202,7 @@ def test_strong_correlations_are_named() -> None:
 def test_contact_alarms_are_as_rare_as_asked_for(n: int, alone: float) -> None:
     rng = np.random.default_rng(n)
     alarms, noise_only, tared, seen = [], [], [], []
-    for _ in range(300):
+    for _ in range(120):
         R = R24 if n == 24 else Rotation.random(n, rng=rng).as_matrix()
         J = (jacobian(TRUTH, R) / SIGMA[:, None]).reshape(-1, 15)
         covariance = np.linalg.inv(J.T @ J)

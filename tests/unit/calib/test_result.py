@@ -68,7 +68,7 @@ def test_every_promised_key_is_in_the_file_with_its_value() -> None:
 
 def test_sigmas_of_mass_and_tilt_agree_with_sampling() -> None:
     rng = np.random.default_rng(2)
-    steps = rng.multivariate_normal(np.zeros(15), RESULT.covariance, 4000)
+    steps = rng.multivariate_normal(np.zeros(15), RESULT.covariance, 1000)
     samples = [replace(RESULT, parameters=RESULT.parameters.moved(step)) for step in steps]
     for name in ("mass_kg", "weight_N", "tilt_alpha_rad", "tilt_beta_rad"):
         assert np.std([getattr(s, name) for s in samples]) == pytest.approx(RESULT.sigma[name], rel=0.06), name

@@ -37,8 +37,8 @@ TRUTH = Parameters(
 
 @pytest.fixture(autouse=True)
 def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The uncertainty of closed forms is simulated: a tenth of the runs is enough where it is not judged."""
-    monkeypatch.setattr("calib.solver.SIMULATIONS", 40)
+    """The uncertainty of closed forms is simulated: a few runs are enough where it is not judged."""
+    monkeypatch.setattr("calib.solver.SIMULATIONS", 20)
 
 
 def dataset(R_base_flange: Array, wrench: Array, cov: Array | None = None) -> CalibrationDataset:

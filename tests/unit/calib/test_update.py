@@ -114,7 +114,7 @@ def test_the_covariance_covers_noise_and_the_old_errors(retare: bool) -> None:
     old, new, R = truth(), loaded(truth()), tilted(-60, 20, 60, 100)
     rng = np.random.default_rng(2)
     distances, misfits = [], []
-    for seed in range(200):
+    for seed in range(80):
         noise = rng.multivariate_normal(np.zeros(6), NOISE, size=4)
         update = update_payload(calibration(old, seed=seed), R, predict(new, R) + noise, noise_of(4), retare=retare)
         error = new.difference(update.parameters)
@@ -167,7 +167,7 @@ def test_the_covariance_of_a_tare_covers_noise_and_the_old_errors() -> None:
     R = tilted(20, 70)
     for n in (1, 2):
         distances = []
-        for seed in range(150):
+        for seed in range(60):
             update = tare(calibration(truth(), seed=seed), R[:n], [dwell(truth(), R[i], rng, 40) for i in range(n)])
             error = truth().difference(update.parameters)
             distances.append(error @ np.linalg.solve(update.covariance, error))
@@ -210,7 +210,7 @@ def test_a_tare_with_another_payload_is_refused_though_every_pose_could_be_drift
 def test_good_tares_pass() -> None:
     rng = np.random.default_rng(9)
     R = Rotation.random(2, rng=rng).as_matrix()
-    for seed in range(100):
+    for seed in range(40):
         now = drifted(truth(), rng.normal(size=3), rng.normal(size=3) * 0.03)
         tare(calibration(truth(), seed=seed), R[:1], [dwell(now, R[0], rng, 400)])
 
