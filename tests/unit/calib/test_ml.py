@@ -335,6 +335,25 @@ def test_knowledge_is_used_for_what_it_is_worth(name: str, unknowns: int) -> Non
     assert np.mean(chi2) == pytest.approx(best.dof, abs=2.5 * np.sqrt(2 * best.dof / runs))
 
 
+@pytest.mark.parametrize(
+    ("name", "block", "information"),
+    [
+        ("rotation about", slice(0, 3), 3 / 0.004**2),
+        ("yaw about", slice(0, 3), 2 / 0.004**2),
+        ("direction about", slice(3, 6), 2 / (0.004 * WEIGHT_N) ** 2),
+        ("mass about", slice(3, 6), 1 / 0.02**2),
+    ],
+)
+def test_a_tolerance_counts_as_a_measurement_of_that_sigma(name: str, block: slice, information: float) -> None:
+    rng = np.random.default_rng(10)
+    p, R = truth(rng), haar(rng, 8)
+    wrench = predict(p, R) + 1e-3 * noise(rng, 8)
+    free = fit(R, wrench, WHITE, drift="none")
+    best = fit(R, wrench, WHITE, known=random_known(name, p, rng), drift="none")
+    added = np.linalg.inv(best.covariance) - np.linalg.inv(free.covariance)
+    assert np.trace(added[block, block]) == pytest.approx(information, rel=0.05)
+
+
 @pytest.mark.parametrize("name", ["rotation", "direction", "mass", "yaw"])
 def test_an_exact_constraint_is_the_limit_of_a_tolerance(name: str) -> None:
     rng = np.random.default_rng(8)

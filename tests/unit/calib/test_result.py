@@ -136,10 +136,10 @@ def without(name: str) -> str:
     [
         ("", "the file is empty"),
         ("nonsense", "this is not valid JSON"),
-        ("3", "holds a JSON int, not an object"),
-        ("{}", "the field 'format' is missing: this is not an ftdrive.calibration file"),
-        (json.dumps(DATA.to_dict()), "the format is 'ftdrive.dataset/1', not 'ftdrive.calibration/1'"),
-        ('{"format": "ftdrive.calibration/2"}', "version '2' of ftdrive.calibration is unknown"),
+        ("3", "holds a JSON int"),
+        ("{}", "the field 'format' is missing"),
+        (json.dumps(DATA.to_dict()), "the format is 'ftdrive.dataset/1'"),
+        ('{"format": "ftdrive.calibration/2"}', "version '2' of ftdrive.calibration"),
         (without("chi2"), "lacks the field chi2"),
         (json.dumps({**RESULT.to_dict(), "covariance": [[1]]}), "covariance must be"),
         (json.dumps({**RESULT.to_dict(), "force_bias_N": "x"}), "cannot be read"),
@@ -156,5 +156,5 @@ def test_a_file_that_is_something_else_is_named_in_one_sentence(tmp_path: Path, 
 
 
 def test_provenance_must_be_writable() -> None:
-    with pytest.raises(ValueError, match="provenance cannot be written as JSON"):
+    with pytest.raises(ValueError, match="provenance cannot be written"):
         solve(DATA, provenance={"x": object()})

@@ -195,17 +195,17 @@ def spin(axis: str, tilt_deg: float, n: int = 8) -> Array:
 @pytest.mark.parametrize(
     ("R", "method", "words"),
     [
-        (R24[:3], "ml", "3 poses are too few, at least 4 are needed: add 1, better 3"),
-        (R24[:4], "lrom", "4 poses are too few, at least 5 are needed: add 1, better 2"),
-        (np.tile(R24[:1], (9, 1, 1)), "ml", "all 9 poses have the same orientation: turn and tilt"),
-        (np.tile(R24[:3], (3, 1, 1)), "ml", "the 9 poses have only 3 different orientations, at least 4"),
+        (R24[:3], "ml", "3 poses are too few.* 4 .* add 1"),
+        (R24[:4], "lrom", "4 poses are too few.* 5 .* add 1"),
+        (np.tile(R24[:1], (9, 1, 1)), "ml", "9 poses have the same orientation"),
+        (np.tile(R24[:3], (3, 1, 1)), "ml", "9 poses have only 3 different"),
         (
             spin("z", 150.0),
             "ml",
-            "only the last joint was turned: .* is mixed with .*; add",
+            "the last joint .* is mixed",
         ),
-        (spin("x", 0.0), "ml", "the tool was turned about the flange's x axis only: .* is mixed with"),
-        (R24[:23], "srom", "SROM needs its 24 orientations once each: missing 24. Use LROM or ML"),
+        (spin("x", 0.0), "ml", "about the flange's x axis only: .* mixed"),
+        (R24[:23], "srom", "24 orientations .*: missing 24. Use LROM"),
     ],
 )
 def test_what_the_poses_cannot_tell_is_refused_in_words(R: Array, method: Method, words: str, measured: bool) -> None:
@@ -215,9 +215,9 @@ def test_what_the_poses_cannot_tell_is_refused_in_words(R: Array, method: Method
 
 
 def test_a_sensor_that_feels_nothing_is_refused() -> None:
-    with pytest.raises(NotObservable, match="the force is the same in all poses"):
+    with pytest.raises(NotObservable, match="force is the same"):
         solve(dataset(R24, np.tile([1.0, 2, 3, 0, 0, 0], (24, 1))))
-    with pytest.raises(NotObservable, match="the force is the same in all poses"):
+    with pytest.raises(NotObservable, match="force is the same"):
         solve(dataset(R24, 1e-160 * predict(TRUTH, R24)))
 
 
@@ -272,7 +272,7 @@ def test_knowledge_makes_poor_poses_enough() -> None:
     R = spin("z", 150.0)
     wrench = noisy(np.random.default_rng(12), R, white(8))
     data = dataset(R, wrench, white(8))
-    with pytest.raises(NotObservable, match="only the last joint was turned"):
+    with pytest.raises(NotObservable, match="the last joint"):
         solve(data)
     known = Known(
         gravity_direction_base=TRUTH.gravity_force_base_N,
@@ -282,7 +282,7 @@ def test_knowledge_makes_poor_poses_enough() -> None:
     assert np.linalg.norm(error[:3]) < 0.05
     with pytest.raises(NotObservable, match="the poses leave 1 of 12"):
         solve(data, known=Known(R_flange_sensor=TRUTH.R_flange_sensor))
-    with pytest.raises(ValueError, match="lrom cannot use what is known before"):
+    with pytest.raises(ValueError, match="lrom cannot use"):
         solve(data, "lrom", known=known)
 
 
@@ -346,7 +346,7 @@ def test_verdicts_give_their_reason() -> None:
 
     verdict, reasons = verdict_of(wrench, cov=white(24, SIGMA / 20))
     assert verdict == "usable"
-    assert re.search(r"residuals are (1[7-9]|2[0-3])\.\d times the measured noise", reasons)
+    assert re.search(r"(1[7-9]|2[0-3])\.\d times the measured noise", reasons)
 
     bumps = (
         wrench + 0.4 * np.eye(24, 6) @ np.diag([1.0, 1, 1, 0, 0, 0]) + rng.normal(size=(24, 6)) * ([0.3] * 3 + [0] * 3)
@@ -377,7 +377,7 @@ def test_nothing_on_the_sensor_is_never_a_calibration() -> None:
         R = Rotation.random(12, rng=rng).as_matrix()
         verdict, reasons = verdict_of(rng.normal(size=(12, 6)) * SIGMA + [1, 2, 3, 0, 0, 0], R, white(12))
         assert verdict in ("rejected", "refused")
-        assert "hang something heavier on the sensor" in reasons
+        assert "hang something heavier" in reasons
 
 
 def test_what_is_known_to_be_down_depends_on_the_mounting() -> None:
@@ -400,7 +400,7 @@ def test_poses_of_one_tilt_are_refused_because_up_and_down_look_alike() -> None:
     azimuth = np.arange(8) * np.pi / 4
     lean = np.deg2rad(40) * np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
     R = (Rotation.from_rotvec(lean) * Rotation.from_euler("x", 180, degrees=True)).as_matrix()
-    with pytest.raises(NotObservable, match=r"at one angle to gravity, 40° .* add a pose"):
+    with pytest.raises(NotObservable, match=r"one angle to gravity, 40°"):
         solve(dataset(R, predict(level, R), white(8)))
 
 
