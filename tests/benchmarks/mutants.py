@@ -98,8 +98,8 @@ def tests_of(path: Path) -> list[str]:
     folder = PROJECT / "tests/unit" / path.parent
     while not folder.is_dir():
         folder = folder.parent
-    package, module = ".".join(path.parent.parts), path.stem
-    name = re.compile(rf"{re.escape(package)}\.{module}\b|from {re.escape(package)} import .*\b{module}\b")
+    package = re.escape(".".join(path.parent.parts))
+    name = re.compile(rf"{package}\.{path.stem}\b|from {package} import .*\b{path.stem}\b")
     files = sorted(folder.rglob("test_*.py"), key=lambda file: (not name.search(file.read_text()), file))
     return [str(file.relative_to(PROJECT)) for file in files]
 
@@ -120,32 +120,30 @@ def outcome(root: Path, tests: list[str], limit_s: float) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("paths", nargs="+", help="packages or modules, as calib, ftdrive/session, drivers/clock.py")
+    parser.add_argument("paths", nargs="+", help="packages or modules: calib, ftdrive/session, drivers/clock.py")
     parser.add_argument("--number", type=int, default=20, help="of mutants (default 20)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tests", nargs="+", help="tests to run for every mutant, instead of those of its folder")
     parser.add_argument("--limit", type=float, default=300.0, help="seconds for the tests of one mutant (default 300)")
     options = parser.parse_args()
 
-    roots = [(PROJECT / path).resolve() for path in options.paths]
-    files = sorted(file for root in roots for file in ([root] if root.suffix else root.rglob("*.py")))
+    patterns = [path if path.endswith(".py") else f"{path}/**/*.py" for path in options.paths]
+    files = sorted(file for pattern in patterns for file in PROJECT.glob(pattern))
     every = [mutant for file in files for mutant in mutants_of(file.relative_to(PROJECT))]
     drawn = random.Random(options.seed).sample(every, min(options.number, len(every)))
     sys.stdout.write(f"{len(drawn)} of {len(every)} mutants\n")
     with TemporaryDirectory() as folder:
-        root = Path(folder, "project")
-        shutil.copytree(PROJECT, root, ignore=shutil.ignore_patterns(".*", "__pycache__"))
+        root = shutil.copytree(PROJECT, Path(folder, "project"), ignore=shutil.ignore_patterns(".*", "__pycache__"))
         for tests in {tuple(options.tests or sorted(tests_of(mutant.path))) for mutant in drawn}:
             if outcome(root, list(tests), options.limit) != "survived":
                 sys.exit(f"Without a mutant {' '.join(tests)} fail or take longer than {options.limit:g} s. Fix them.")
-        killed = 0
+        ends = []
         for mutant in drawn:
             mutant.plant(root)
-            end = outcome(root, options.tests or tests_of(mutant.path), options.limit)
+            ends.append(outcome(root, options.tests or tests_of(mutant.path), options.limit))
             shutil.copy2(PROJECT / mutant.path, root / mutant.path)
-            killed += end != "survived"
-            print(f"{end:8} {mutant}", flush=True)  # noqa: T201
-    sys.stdout.write(f"{killed} of {len(drawn)} killed\n")
+            print(f"{ends[-1]:8} {mutant}", flush=True)  # noqa: T201
+    sys.stdout.write(f"{ends.count('survived')} of {len(drawn)} survived\n")
 
 
 if __name__ == "__main__":

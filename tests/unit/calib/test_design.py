@@ -195,6 +195,12 @@ def test_a_guess_of_nothing_is_refused(name: str) -> None:
         replace(GUESS, walk_force_N=-1.0)
 
 
+@pytest.mark.parametrize(("com_m", "lever_m"), [(0.0, 0.04), (0.03, 0.04), (0.05, 0.05)])
+def test_the_lever_is_that_of_the_tool_or_of_the_noise(com_m: float, lever_m: float) -> None:
+    guess = Guess(2.0, 0.1, 0.004, p_sensor_com_m=(0, -com_m, 0), g_m_s2=10.0)
+    assert_allclose(guess.scale, np.repeat([1, 20, 20, lever_m, 20 * lever_m], 3))
+
+
 def test_a_centre_of_mass_near_the_sensor_is_observable() -> None:
     for com_m in (0.0, 1e-7, 1e-3):
         prediction = predicted_sigma(ALL, replace(GUESS, p_sensor_com_m=(0, 0, com_m)))
