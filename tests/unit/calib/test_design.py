@@ -6,6 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, solve
@@ -422,7 +423,7 @@ def test_no_random_order_is_better_than_the_chosen_one() -> None:
     guess = Guess(20 / 9.80665, 0.02, 0.0005, walk_force_N=0.07, walk_torque_Nm=0.00175)
     rng, six = np.random.default_rng(6), special(SUBSET_6)
 
-    def variance(index: Array) -> float:
+    def variance(index: NDArray[np.integer]) -> float:
         J = whitened_jacobian(six[index], guess)
         return float(np.trace(np.linalg.inv(information(J, guess))[:6, :6]))
 

@@ -273,6 +273,18 @@ def test_few_poses_and_left_out_poses_are_said() -> None:
         assert quality.worst_pose not in bumped
 
 
+@pytest.mark.parametrize("channel", range(6))
+def test_what_is_known_is_doubted_where_the_data_fit_without_it(channel: int) -> None:
+    wrench = noisy(np.random.default_rng(24), R24)
+    free = fit(R24, wrench, white(24))
+    off = 3.0 if channel < 3 else 0.2  # N or N·m of every pose, as from a constraint that is wrong
+    constrained = replace(free, wrench=wrench + off * np.eye(6)[channel])
+    said = words(judge(constrained, unconstrained=free))
+    assert f"the {'force' if channel < 3 else 'torque'}s fit to" in said
+    assert f"instead of {off:.2g} N" in said
+    assert "fit to" not in words(judge(free, unconstrained=free))
+
+
 def test_a_pose_out_of_line_is_pointed_at() -> None:
     wrench = noisy(np.random.default_rng(13), R24)
     wrench[12, 0] += 0.5
