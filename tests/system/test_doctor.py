@@ -5,7 +5,7 @@ import re
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,15 +14,7 @@ from click.testing import CliRunner
 from ftdrive.cli import cli
 from ftdrive.config import CellConfig
 from ftdrive.simulation import Station
-
-
-class CommandLine(Protocol):
-    folder: Path
-
-    def start(self, *arguments: str | Path) -> subprocess.Popen[str]: ...
-    def run(self, *arguments: str | Path, typed: str = "") -> subprocess.CompletedProcess[str]: ...
-    def json(self, *arguments: str | Path, typed: str = "") -> dict[str, Any]: ...
-
+from tests.system.command_line import CommandLine
 
 NAMED = {
     *("robot.reachable", "robot.identity", "robot.remote", "robot.safety", "robot.program", "robot.flange"),

@@ -6,8 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from subprocess import CompletedProcess
-from typing import Any, Protocol
+from typing import Any
 
 import click
 import pytest
@@ -15,10 +14,7 @@ from click.testing import CliRunner
 
 from ftdrive.cli import cli, main
 from ftdrive.errors import ConfigError
-
-
-class CommandLine(Protocol):
-    def run(self, *arguments: str | Path, typed: str = "") -> CompletedProcess[str]: ...
+from tests.system.command_line import CommandLine
 
 
 def names(command: click.Command, path: tuple[str, ...] = ()) -> Iterator[str]:

@@ -6,23 +6,15 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
 
 import pytest
 
 from ftdrive.config import CellConfig
 from ftdrive.simulation import Station
+from tests.system.command_line import CommandLine
 
 ANSWERS = "yes\nyes\nyes\nMOVE\nyes\n"
 """Tool free, ball free, emergency stop in reach; the first motion; the tour."""
-
-
-class CommandLine(Protocol):
-    folder: Path
-
-    def start(self, *arguments: str | Path) -> subprocess.Popen[str]: ...
-    def run(self, *arguments: str | Path, typed: str = "") -> subprocess.CompletedProcess[str]: ...
-    def poses(self) -> list[Path]: ...
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,16 +16,7 @@ from calib import CalibrationResult
 from ftdrive.config import CellConfig
 from ftdrive.planning.plan import Plan
 from ftdrive.simulation import Station
-
-
-class CommandLine(Protocol):
-    folder: Path
-
-    def start(self, *arguments: str | Path) -> subprocess.Popen[str]: ...
-    def run(self, *arguments: str | Path, typed: str = "") -> subprocess.CompletedProcess[str]: ...
-    def json(self, *arguments: str | Path, typed: str = "") -> dict[str, Any]: ...
-    def poses(self) -> list[Path]: ...
-
+from tests.system.command_line import CommandLine
 
 QUESTIONS = "yes\nyes\nyes\n"
 """Tool free, ball free, emergency stop in reach."""

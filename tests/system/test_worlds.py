@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 import pytest
@@ -10,11 +9,7 @@ import pytest
 from ftdrive.config import CellConfig
 from ftdrive.report import errors_in_sigma
 from ftdrive.simulation import Station
-
-
-class CommandLine(Protocol):
-    def json(self, *arguments: str | Path, typed: str = "") -> dict[str, Any]: ...
-
+from tests.system.command_line import CommandLine
 
 WORLDS = {
     "base tilted by 8 degrees": ("can", ["--tilt-deg", "8,0"]),
