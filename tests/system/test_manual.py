@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from calib import solve
 from calib.routine import PoseRecord, TourPose, dataset_from, drift_check
-from drivers.errors import DriverError, StreamBroken
+from drivers.errors import StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, RobotArm
 from ftdrive import simulation
 from ftdrive.cli import cli
@@ -195,8 +195,6 @@ def test_somebody_in_the_emulated_cell_brings_it_to_its_end(
     monkeypatch.setattr(simulation, "MOVED_BY", {mode: ({**request, "rest_s": 1.2}, words)})  # in a hurry
     arguments = ["calibrate", "--simulate", f"--{mode}", "--runs", str(tmp_path), "--json"]
     outcome = CliRunner().invoke(cli, arguments)
-    if isinstance(outcome.exception, DriverError):  # where much else runs, an emulated sensor may get no time for 0.3 s
-        outcome = CliRunner().invoke(cli, arguments)
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)
     assert words in outcome.stderr
     told = json.loads(outcome.stdout.splitlines()[-1])
