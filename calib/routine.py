@@ -24,6 +24,10 @@ MOVED_RAD = float(np.radians(0.05))
 """The flange may turn this much while a pose is averaged: a tenth of the noise of a good sensor at 1 kg."""
 
 
+LONGER = (1, 2, 4)
+"""How many times as long to average until there are enough samples: a sensor that is asked for each may be slow."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TourPose:
     """One stop of a tour."""
@@ -123,17 +127,32 @@ def take_pose(
         arm.wait_until_still(timeout_s=sampling.still_timeout_s, guard=guard)
         on_stage("sample")
         before = arm.state()
-        samples = sensor.collect(sampling.average_s)
+        samples = collect_enough(sensor, sampling.average_s)
         after = arm.state()
         guard()
-        steady = len(samples.wrench) >= LEAST_SAMPLES and turned_rad(before, after) < MOVED_RAD
+        steady = turned_rad(before, after) < MOVED_RAD
         if steady:
             wrench = samples.wrench
             steady = is_stationary(wrench) if quiet_std is None else is_quiet(wrench, quiet_std)
         if steady:
             break
-    require_enough(samples, sampling.average_s)
     return PoseRecord(stop, pose, before, after, samples, steady)
+
+
+def collect_enough(sensor: Sensor, average_s: float) -> WrenchSamples:
+    """Collect for `average_s` seconds; where that gives too few samples, again and for longer.
+
+    Raises
+    ------
+    TooFewSamples
+        It never gave enough.
+    """
+    for times in LONGER:
+        samples = sensor.collect(times * average_s)
+        if len(samples.wrench) >= LEAST_SAMPLES:
+            break
+    require_enough(samples, times * average_s)
+    return samples
 
 
 def require_enough(samples: WrenchSamples, average_s: float) -> None:

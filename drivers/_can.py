@@ -3,7 +3,6 @@
 import contextlib
 import fcntl
 import os
-import time
 from collections.abc import Iterable
 from typing import Any
 
@@ -12,6 +11,7 @@ import serial
 from can.interfaces.slcan import slcanBus
 
 from drivers._serial import LINK_ERRORS, refusal
+from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, StreamBroken
 
 BUS_ERRORS = (can.CanError, ValueError, *LINK_ERRORS)
@@ -32,14 +32,25 @@ class CanBus:
         Bit/s; on socketcan it is set with ``ip link`` and this value is not used.
     identifiers : iterable of int
         What the device sends; everything else is ignored. None of them: nothing is ignored.
+    clock : Clock
+        What waits are measured by.
     """
 
-    def __init__(self, owner: str, channel: str, interface: str, bitrate: int, identifiers: Iterable[int] = ()) -> None:
+    def __init__(
+        self,
+        owner: str,
+        channel: str,
+        interface: str,
+        bitrate: int,
+        identifiers: Iterable[int] = (),
+        clock: Clock = REAL,
+    ) -> None:
         self._owner = owner
         self._channel = channel
         self._interface = interface
         self._bitrate = bitrate
         self._identifiers = frozenset(identifiers)
+        self._clock = clock
         self._bus: can.BusABC | None = None
         self._lock: int | None = None
         """What keeps the serial port of an slcan adapter ours, a file descriptor."""
@@ -119,16 +130,20 @@ class CanBus:
 
     def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
         """Wait for the next data frame of the device as (identifier, data). Raises `StreamBroken`."""
+        for left_s in self._clock.looks(timeout_s):
+            if frame := self.look(left_s):
+                return frame
+        return None
+
+    def look(self, wait_s: float) -> tuple[int, bytes] | None:
+        """Take the next data frame; wait for it in real time, `wait_s` or `Clock.poll_s`. Raises `StreamBroken`."""
         if self._bus is None:
             raise StreamBroken(f"{self._owner}: closed")
-        deadline = time.monotonic() + timeout_s
         while True:
             try:
-                message = self._bus.recv(timeout=max(0.0, deadline - time.monotonic()))
+                message = self._bus.recv(timeout=min(wait_s, self._clock.poll_s))
             except (ValueError, LookupError):
                 self.malformed += 1
-                if time.monotonic() < deadline:
-                    continue
                 return None
             except (can.CanError, *LINK_ERRORS) as exc:
                 raise self._broken(exc) from exc
@@ -144,9 +159,9 @@ class CanBus:
             with contextlib.suppress(*BUS_ERRORS):  # `send` will tell
                 self._bus.flush()  # its `recv` sits out 1 ms before it says that there is nothing
             return
-        deadline = time.monotonic() + _DISCARD_S
-        while self.receive(0.0) and time.monotonic() < deadline:
-            pass
+        for _ in self._clock.looks(_DISCARD_S):
+            if self.look(0.0) is None:
+                return
 
     def _broken(self, exc: Exception) -> StreamBroken:
         return StreamBroken(f"{self._owner}: the CAN interface is gone ({exc})", "plug it in and open it again")

@@ -4,13 +4,13 @@ Ref: Modbus over Serial Line 1.02, section 2.5; Modbus Application Protocol 1.1b
 """
 
 import struct
-import time
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TypeVar
 
 from drivers._crc import crc16_modbus
 from drivers._serial import SerialPort
+from drivers.clock import Clock
 from drivers.errors import DeviceTimeout, ProtocolError
 
 T = TypeVar("T")
@@ -93,6 +93,7 @@ def ask(
     name: str,
     request: bytes,
     check: Callable[[bytes, bytes], T],
+    clock: Clock,
     timeout_s: float,
     before_again: Callable[[], object],
 ) -> T:
@@ -107,26 +108,30 @@ def ask(
     """
     for _ in range(_ATTEMPTS - 1):
         try:
-            return _exchange(port, name, request, check, timeout_s)
+            return _exchange(port, name, request, check, clock, timeout_s)
         except Refused:
             raise
         except (DeviceTimeout, ProtocolError):
             before_again()
-    return _exchange(port, name, request, check, timeout_s)
+    return _exchange(port, name, request, check, clock, timeout_s)
 
 
-def _exchange(port: SerialPort, name: str, request: bytes, check: Callable[[bytes, bytes], T], timeout_s: float) -> T:
+def _exchange(
+    port: SerialPort, name: str, request: bytes, check: Callable[[bytes, bytes], T], clock: Clock, timeout_s: float
+) -> T:
     port.write(request, discard=True)
-    deadline = time.monotonic() + timeout_s
     reply, wanted = b"", 5  # of a refusal
-    while len(reply) < wanted:
-        reply += port.read(wanted - len(reply))
-        if len(reply) == 5 and not reply[1] & 0x80:
-            wanted = reply_size(request)
-        if len(reply) < wanted and time.monotonic() > deadline:
-            raise DeviceTimeout(
-                f"{name}: no reply within {timeout_s} s ({len(reply)} of {wanted} bytes)", "check supply and wiring"
-            )
+    for _ in clock.looks(timeout_s):
+        while len(reply) < wanted and (more := port.read(wanted - len(reply))):
+            reply += more
+            if len(reply) == 5 and not reply[1] & 0x80:
+                wanted = reply_size(request)
+        if len(reply) == wanted:
+            break
+    else:
+        raise DeviceTimeout(
+            f"{name}: no reply within {timeout_s} s ({len(reply)} of {wanted} bytes)", "check supply and wiring"
+        )
     try:
         return check(request, reply)
     except ProtocolError as exc:

@@ -9,12 +9,15 @@ import termios
 import serial
 
 from drivers._parity import Unmarker, ask_for_marks
+from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, PortInUse, StreamBroken
 
 LINK_ERRORS = (OSError, termios.error)
 """What a vanished serial port raises; `termios.error` is not an `OSError`."""
 
 _WRITE_S = 0.2
+_DRAIN_BYTES = 416
+"""5 ms of the quickest sensor."""
 
 
 def refusal(owner: str, path: str, error: Exception, found: str, cure: str) -> ConnectError:
@@ -39,15 +42,27 @@ class SerialPort:
     even_parity : bool
         Without it no parity. With it the system marks bytes of wrong parity, where it can; the marks are undone here.
     read_s : float
-        What one read waits at most.
+        What one read waits at most, in real time.
+    clock : Clock
+        What a silence is measured by.
     """
 
-    def __init__(self, owner: str, path: str, baud: int, *, even_parity: bool = False, read_s: float = 0.05) -> None:
+    def __init__(
+        self,
+        owner: str,
+        path: str,
+        baud: int,
+        *,
+        even_parity: bool = False,
+        read_s: float = 0.05,
+        clock: Clock = REAL,
+    ) -> None:
         self._owner = owner
         self._path = path
         self._baud = baud
         self._even_parity = even_parity
-        self._read_s = read_s
+        self._read_s = min(read_s, clock.poll_s)
+        self._clock = clock
         self._port: serial.Serial | None = None
         self._marks: Unmarker | None = None
         """While the system marks damaged bytes."""
@@ -108,6 +123,15 @@ class SerialPort:
         except (TypeError, *LINK_ERRORS) as exc:
             raise self._broken(exc) from exc
         return self._undo(data)[0]
+
+    def drain(self, silence_s: float, at_most_s: float) -> None:
+        """Throw away what arrives, until nothing has come for so long. Raises `StreamBroken`."""
+        heard_ns = self._clock.now_ns()
+        for _ in self._clock.looks(at_most_s):
+            if self.read(_DRAIN_BYTES):
+                heard_ns = self._clock.now_ns()
+            elif self._clock.now_ns() - heard_ns >= round(silence_s * 1e9):
+                return
 
     def write(self, data: bytes, *, discard: bool = False) -> None:
         """Send bytes, on request after throwing away what has arrived so far. Raises `StreamBroken`."""

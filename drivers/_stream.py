@@ -4,16 +4,15 @@ import copy
 import logging
 import math
 import threading
-import time
 from abc import abstractmethod
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from drivers._clock import awake_s
 from drivers._plausible import DeviceClock, Liveness, Rate
+from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
 
@@ -37,15 +36,32 @@ def scale_facts(
     return {"counts_per_N": Fact(counts_per_N, source), "counts_per_Nm": Fact(counts_per_Nm, source)}
 
 
-_JOIN_S = 0.6
-_FIRST_SAMPLE_S = 1.0
-_AWAY_S = 0.3
-"""A shorter pause between two reads is not told from a busy computer."""
-_SETTLE_S, _WAITED_S, _DISCARD_S = 0.05, 0.001, 0.5
-"""After a pause: how long an adapter may still deliver what it has held back, how long a read lasts that had to wait
-for something new, and how long to try for one."""
-_RECOVER_S = 10.0
-_RETRY_S = 0.2
+@dataclass(frozen=True, slots=True)
+class StreamLimits:
+    """Every limit of time of a stream, in seconds of its clock; the defaults are those of a real sensor."""
+
+    stale_s: float = 0.3
+    """The longest silence that still counts as a stream."""
+    first_sample_s: float = 1.0
+    """From the answer of a device to its first sample."""
+    away_s: float = 0.3
+    """A shorter pause between two reads is not told from a busy computer; at least `stale_s`."""
+    settle_s: float = 0.05
+    """After a pause: how long an adapter may still deliver what it has held back."""
+    waited_s: float = 0.001
+    """A read that lasts longer had to wait for something new."""
+    discard_s: float = 0.5
+    """After a pause: how long to try for a read that had to wait."""
+    recover_s: float = 10.0
+    """From an interruption to the first sample of the stream that follows."""
+    retry_s: float = 0.2
+    """Between two attempts to connect again."""
+    join_s: float = 0.6
+    """In real time: how long `close` waits for the reader before it frees the port under it."""
+
+
+_PATIENCE_S = 30.0
+"""`join_s` where the cell is emulated: the reader may be starved."""
 _EVENTS = 1000
 
 
@@ -62,14 +78,16 @@ class StreamingSensor(ForceTorqueSensor):
         The device as the user knows it; begins every error message.
     sign : int
         -1 for a sensor that reports the reaction. Applied here, once, to the wrench; counts stay raw.
-    stale_after_s : float
-        The longest silence that still counts as a stream.
+    clock : Clock
+        What every limit is measured by; samples are stamped with it.
+    limits : StreamLimits
+        How long anything may take.
     max_collect_samples : int
         What one `collect` may hold; more is an error, never a dropped sample.
     recover : bool
-        After an interruption or silence connect again, for up to 10 s until a sample comes, instead of ending the
-        stream. Every call made meanwhile is an error all the same, and so is a `collect` with an interruption inside.
-        May be set until `open`.
+        After an interruption or silence connect again, until a sample comes or `recover_s` are over, instead of ending
+        the stream. Every call made meanwhile is an error all the same, and so is a `collect` with an interruption
+        inside. May be set until `open`.
     """
 
     def __init__(
@@ -77,7 +95,8 @@ class StreamingSensor(ForceTorqueSensor):
         name: str,
         *,
         sign: int = 1,
-        stale_after_s: float = 0.3,
+        clock: Clock = REAL,
+        limits: StreamLimits = StreamLimits(),
         max_collect_samples: int = 1_000_000,
         recover: bool = False,
     ) -> None:
@@ -85,7 +104,8 @@ class StreamingSensor(ForceTorqueSensor):
             raise ValueError(f"sign is {sign}; it is 1, or -1 for a sensor that reports the reaction")
         self.name = name
         self._sign = sign
-        self._stale_after_s = stale_after_s
+        self._clock = clock
+        self._limits = limits
         self._max_collect_samples = max_collect_samples
         self.recover = recover
         self.configured: dict[str, Fact] = {}
@@ -97,6 +117,8 @@ class StreamingSensor(ForceTorqueSensor):
         self._news = threading.Condition()
         self._info: DeviceInfo | None = None
         self._failure: Exception | None = None
+        self._interruption: tuple[DriverError, float] | None = None
+        """While it connects again: what began it, and when to give up."""
         self._taps: list[deque[FtSamples]] = []
         self._arrivals: deque[tuple[int, int]] = deque()
         self._reset()
@@ -122,8 +144,10 @@ class StreamingSensor(ForceTorqueSensor):
             turn_s = self._turn()
             if self._was_away(turn_s):
                 begin_s = self._turn_s
-            elif self._turn_s - begin_s > (_SETTLE_S if rows and turn_s > _WAITED_S else _DISCARD_S):
-                return
+            else:
+                has_waited = rows and turn_s > self._limits.waited_s
+                if self._turn_s - begin_s > (self._limits.settle_s if has_waited else self._limits.discard_s):
+                    return
 
     def open(self) -> None:
         """Connect, start the stream and wait for its first sample.
@@ -142,33 +166,33 @@ class StreamingSensor(ForceTorqueSensor):
             return
         self.close()
         self._reset()
-        try:
-            self._info = self._connect_and_identify()
-        except BaseException as exc:
-            self._let_go()
-            if isinstance(exc, DriverError) and not isinstance(exc, ConnectError | DeviceFault):
-                raise self._not_opened(exc) from exc
-            raise
-        self._opened_ns = time.monotonic_ns()
-        self._thread = threading.Thread(target=self._run, name=f"reader of {self.name}", daemon=True)
-        self._thread.start()
-        try:
-            self._await_first_sample()
-        except BaseException:
-            self.close()
-            raise
+        with self._clock.keeping_up():
+            try:
+                self._info = self._connect_and_identify()
+            except BaseException as exc:
+                self._let_go()
+                if isinstance(exc, DriverError) and not isinstance(exc, ConnectError | DeviceFault):
+                    raise self._not_opened(exc) from exc
+                raise
+            self._opened_ns = self._clock.now_ns()
+            self._start_reader()
+            try:
+                self._await_first_sample()
+            except BaseException:
+                self.close()
+                raise
 
     def close(self) -> None:
         """Stop the stream, free the port and the thread within a second. Idempotent; never raises on a lost device."""
-        thread, self._thread = self._thread, None
+        with self._news:
+            thread, self._thread = self._thread, None
+            self._news.notify_all()
         if thread is None:
             return
-        thread.join(_JOIN_S)
+        thread.join(_PATIENCE_S if self._clock.emulated else self._limits.join_s)
         if thread.is_alive():
             log.warning("%s: the reader thread is stuck in a read; freeing the port under it", self.name)
         self._let_go()
-        with self._news:
-            self._news.notify_all()
 
     def identify(self) -> DeviceInfo:
         """Tell who the device is, as read by the last successful `open`."""
@@ -186,13 +210,13 @@ class StreamingSensor(ForceTorqueSensor):
         blocks: deque[FtSamples] = deque()
         with self._news:
             self._check()
-            start_ns = time.monotonic_ns()
+            start_ns = self._clock.now_ns()
             end_ns = start_ns + round(duration_s * 1e9)
             before, reconnects, pauses = self._received, self._reconnects, self._pauses
             self._taps.append(blocks)
             try:
                 while self._newest_ns < end_ns:
-                    self._news.wait(max(0.0, self._stale_after_s - self._age_s()) + 1e-3)
+                    self._clock.wait(self._news, max(0.0, self._limits.stale_s - self._age_s()) + 1e-3)
                     self._check()
                     if self._reconnects != reconnects:
                         raise StreamBroken(f"{self.name}: the stream was interrupted and came back", "collect again")
@@ -212,22 +236,20 @@ class StreamingSensor(ForceTorqueSensor):
         inside = (samples.t_host_ns >= start_ns) & (samples.t_host_ns < end_ns)
         samples = _rows(samples, inside)
         silence_s = float(np.diff(samples.t_host_ns, prepend=start_ns, append=end_ns).max()) / 1e9
-        if silence_s > self._stale_after_s:
+        if silence_s > self._limits.stale_s:
             raise self._stale(silence_s)
         return samples
 
     def latest(self, *, timeout_s: float) -> FtSamples:
         """The newest sample (one row), waiting up to `timeout_s` for one that is fresh. Never an old value."""
-        deadline = time.monotonic() + timeout_s
         with self._news:
             self._raise_failure()
-            while self._age_s() > self._stale_after_s:
-                left_s = deadline - time.monotonic()
-                if left_s <= 0:
-                    raise self._stale(self._age_s())
-                self._news.wait(left_s)
+            for left_s in self._clock.looks(timeout_s):
+                if self._age_s() <= self._limits.stale_s:
+                    return self._newest
+                self._clock.wait(self._news, left_s)
                 self._raise_failure()
-            return self._newest
+            raise self._stale(self._age_s())
 
     def check(self) -> None:
         """Raise the stream's failure, if it has one: broken, silent for too long, or a critical device status."""
@@ -237,7 +259,7 @@ class StreamingSensor(ForceTorqueSensor):
     def health(self) -> Health:
         """Counters since `open`."""
         with self._news:
-            now_ns = time.monotonic_ns()
+            now_ns = self._clock.now_ns()
             since_ns = max(now_ns - 1_000_000_000, self._opened_ns)
             recent = sum(n for t_ns, n in self._arrivals if t_ns >= since_ns)
             return Health(
@@ -272,8 +294,9 @@ class StreamingSensor(ForceTorqueSensor):
         self._failure = None
         self._has_ended = False
         self._newest = NOTHING
-        self._opened_ns = self._newest_ns = time.monotonic_ns()
-        self._heard_s = self._turn_s = awake_s()
+        self._interruption = None
+        self._opened_ns = self._newest_ns = self._clock.now_ns()
+        self._heard_s = self._turn_s = self._clock.awake_s()
         """When the newest sample came, and when a read last returned."""
         self._pauses, self._pause, self._fresh_from_ns = 0, "", 0
         self._is_back = True
@@ -296,20 +319,28 @@ class StreamingSensor(ForceTorqueSensor):
         self._rate.forget()
         self._is_late = False
 
+    def _start_reader(self) -> None:
+        self._thread = threading.Thread(target=self._run, name=f"reader of {self.name}", daemon=True)
+        self._thread.start()
+
     def _run(self) -> None:
         """Read until `close`, or until something ends the stream for good."""
         try:
-            while self._is_mine():
-                try:
-                    self._pump()
-                except (StreamBroken, DeviceTimeout) as exc:
-                    if not self.recover:
-                        raise
-                    if self._failure is None:  # else no sample has come since the last one: it is not over yet
-                        first, deadline_s = exc, time.monotonic() + _RECOVER_S
-                        self._note(str(exc))
-                    self._fail(StreamBroken(f"{self.name}: interrupted, connecting again ({exc})"))
-                    self._reconnect(first, exc, deadline_s)
+            with self._clock.keeping_up():
+                while self._is_mine() and not self._has_ended:
+                    self._take_turn()
+        except Exception as exc:
+            self._fail(exc, for_good=True)
+
+    def _take_turn(self) -> None:
+        """Read once and publish, or connect again; keep the error that ends the stream for good."""
+        try:
+            try:
+                self._pump()
+            except (StreamBroken, DeviceTimeout) as exc:
+                if not self.recover:
+                    raise
+                self._reconnect(exc)
         except Exception as exc:
             self._fail(exc, for_good=True)
 
@@ -323,24 +354,23 @@ class StreamingSensor(ForceTorqueSensor):
             self._news.notify_all()
 
     def _pump(self) -> None:
-        """Read and publish until `close`."""
-        while self._is_mine():
-            block = self._read_block()
-            turn_s = self._turn()  # after the read: a stamp tells when a sample was read, not how long it had waited
-            if self._was_away(turn_s):
-                self._start_afresh(turn_s, len(block))
-            elif len(block):
-                self._publish(block)
-            elif self.recover and min(self._age_s(), self._settled_s()) > self._stale_after_s:
-                raise self._stale(self._age_s())
+        """Read once and publish."""
+        block = self._read_block()
+        turn_s = self._turn()  # after the read: a stamp tells when a sample was read, not how long it had waited
+        if self._was_away(turn_s):
+            self._start_afresh(turn_s, len(block))
+        elif len(block):
+            self._publish(block)
+        elif self.recover and min(self._age_s(), self._settled_s()) > self._limits.stale_s:
+            raise self._stale(self._age_s())
 
     def _turn(self) -> float:
         """Return how long ago this was called last; the time this computer has slept counts."""
-        before_s, self._turn_s = self._turn_s, awake_s()
+        before_s, self._turn_s = self._turn_s, self._clock.awake_s()
         return self._turn_s - before_s
 
     def _was_away(self, turn_s: float) -> bool:
-        return turn_s > max(_AWAY_S, self._stale_after_s)
+        return turn_s > max(self._limits.away_s, self._limits.stale_s)
 
     def _start_afresh(self, away_s: float, rows: int) -> None:
         """Forget `rows` samples just read, and all that waits, after nobody has read for a while."""
@@ -353,22 +383,24 @@ class StreamingSensor(ForceTorqueSensor):
         self._earlier_lost += rows
         self._discard_backlog()
         with self._news:
-            self._fresh_from_ns = time.monotonic_ns()
+            self._fresh_from_ns = self._clock.now_ns()
             self._liveness.forget()
             self._rate.forget()
 
-    def _reconnect(self, first: DriverError, last: DriverError, deadline_s: float) -> None:
-        """Connect again to the same device; the first sample that comes then ends the failure.
-
-        `first` began the interruption, `last` is why it goes on.
-        """
+    def _reconnect(self, error: DriverError) -> None:
+        """Connect again to the same device; the first sample that comes then ends the failure."""
+        if self._interruption is None:  # else no sample has come since: it is not over yet
+            self._interruption = error, self._clock.now_s() + self._limits.recover_s
+            self._note(str(error))
+        first, deadline_s = self._interruption
+        self._fail(StreamBroken(f"{self.name}: interrupted, connecting again ({error})"))
         self._earlier_lost += self._lost
         self._earlier_malformed += self._malformed
         self._lost = self._malformed = 0
         while self._is_mine():
-            if time.monotonic() > deadline_s:
-                found = f"{first.found}, not back within {_RECOVER_S:g} s ({last})"
-                raise StreamBroken(found, first.cure) from last
+            if self._clock.now_s() > deadline_s:
+                found = f"{first.found}, not back within {self._limits.recover_s:g} s ({error})"
+                raise StreamBroken(found, first.cure) from error
             self._let_go()
             try:
                 info = self._connect_and_identify()
@@ -376,8 +408,8 @@ class StreamingSensor(ForceTorqueSensor):
             except DeviceFault:
                 raise
             except DriverError as exc:
-                last = exc
-                time.sleep(_RETRY_S)
+                error = exc
+                self._clock.sleep(self._limits.retry_s)
         if not self._is_mine():
             self._let_go()
             return
@@ -385,13 +417,13 @@ class StreamingSensor(ForceTorqueSensor):
             raise ConnectError(f"{self.name}: {info} answers where {self._info} was", "open it again if that is meant")
         with self._news:
             self._start_watching()
-            self._newest_ns, self._heard_s = time.monotonic_ns(), awake_s()  # silence is judged anew
+            self._newest_ns, self._heard_s = self._clock.now_ns(), self._clock.awake_s()  # silence is judged anew
 
     def _is_mine(self) -> bool:
         return self._thread is threading.current_thread()
 
     def _note(self, what: str) -> None:
-        self._events.append((time.monotonic_ns(), what))
+        self._events.append((self._clock.now_ns(), what))
         log.info("%s: %s", self.name, what)
 
     def _publish(self, block: FtSamples) -> None:
@@ -402,7 +434,7 @@ class StreamingSensor(ForceTorqueSensor):
             if not len(block):
                 return
             # the earlier look at the one clock, the later at the other: a pause between them makes it older, not newer
-            heard_s = self._turn_s - (time.monotonic_ns() - int(block.t_host_ns[-1])) / 1e9
+            heard_s = self._turn_s - (self._clock.now_ns() - int(block.t_host_ns[-1])) / 1e9
             block = self._fresh_rows(block, heard_s)
             if not len(block):
                 return
@@ -410,7 +442,7 @@ class StreamingSensor(ForceTorqueSensor):
             self._liveness.judge(block, self._nominal_Hz)
             if note := self._rate.judge(len(block), t_ns, self._nominal_Hz):
                 self._note(note)
-            if self._received and heard_s - self._heard_s > self._stale_after_s:
+            if self._received and heard_s - self._heard_s > self._limits.stale_s:
                 self._silences += 1
             self._heard_s, self._is_back = heard_s, True
             self._received += len(block)
@@ -419,7 +451,8 @@ class StreamingSensor(ForceTorqueSensor):
                 self._arrivals.popleft()
             self._newest, self._newest_ns = _rows(block, slice(-1, None)), t_ns
             if self._failure is not None:
-                self._failure = None  # an interruption is over when the device measures, not when it answers
+                # an interruption is over when the device measures, not when it answers
+                self._failure = self._interruption = None
                 self._reconnects += 1
                 self._note("connected again")
             for tap in self._taps:
@@ -448,11 +481,11 @@ class StreamingSensor(ForceTorqueSensor):
     def _fresh_rows(self, block: FtSamples, heard_s: float) -> FtSamples:
         """Drop what was measured too long ago: it has waited in this computer, in the device or on its way."""
         late_s = self._device_clock.late_s(block.t_device_s, heard_s)
-        is_late = bool(late_s[-1] > self._stale_after_s)
+        is_late = bool(late_s[-1] > self._limits.stale_s)
         if is_late and not self._is_late:
             self._note(f"samples come {late_s[-1]:.2f} s late and are thrown away")
         self._is_late = is_late
-        fresh = (block.t_host_ns >= self._fresh_from_ns) & (late_s <= self._stale_after_s)
+        fresh = (block.t_host_ns >= self._fresh_from_ns) & (late_s <= self._limits.stale_s)
         if fresh.all():
             return block
         self._earlier_lost += int((~fresh).sum())
@@ -471,27 +504,32 @@ class StreamingSensor(ForceTorqueSensor):
 
     def _await_first_sample(self) -> None:
         with self._news:
-            self._news.wait_for(lambda: self._received or self._failure, _FIRST_SAMPLE_S)
+            for left_s in self._clock.looks(self._limits.first_sample_s):
+                if self._received or self._failure:
+                    break
+                self._clock.wait(self._news, left_s)
             failure = self._failure
             if self._received and not isinstance(failure, DeviceFault):
                 return
             if isinstance(failure, DriverError) and not isinstance(failure, DeviceFault):
                 raise self._not_opened(failure) from failure
             self._raise_failure()
-            raise ConnectError(f"{self.name}: connected, but no sample came within {_FIRST_SAMPLE_S} s", "try again")
+            raise ConnectError(
+                f"{self.name}: connected, but no sample came within {self._limits.first_sample_s} s", "try again"
+            )
 
     def _age_s(self) -> float:
-        return awake_s() - self._heard_s
+        return self._clock.awake_s() - self._heard_s
 
     def _settled_s(self) -> float:
         """How long ago the last pause was over."""
-        return (time.monotonic_ns() - self._fresh_from_ns) / 1e9
+        return (self._clock.now_ns() - self._fresh_from_ns) / 1e9
 
     def _stale(self, age_s: float) -> DeviceTimeout:
         hint = self._why_silent()
-        if self._was_away(awake_s() - self._turn_s) or not self._is_back:
+        if self._was_away(self._clock.awake_s() - self._turn_s) or not self._is_back:
             hint = "nobody read, for this program or computer was suspended or too busy: try again"
-        return DeviceTimeout(f"{self.name}: silent for {age_s:.3f} s (allowed: {self._stale_after_s:g} s)", hint)
+        return DeviceTimeout(f"{self.name}: silent for {age_s:.3f} s (allowed: {self._limits.stale_s:g} s)", hint)
 
     def _why_silent(self) -> str:
         """Say what to do about a silence; a subclass may know more."""
@@ -511,7 +549,7 @@ class StreamingSensor(ForceTorqueSensor):
     def _check(self) -> None:
         self._raise_failure()
         age_s = self._age_s()
-        if age_s > self._stale_after_s:
+        if age_s > self._limits.stale_s:
             raise self._stale(age_s)
 
 

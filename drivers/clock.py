@@ -7,6 +7,7 @@ have one that moves only when they say so. No module of `drivers` calls `time.mo
 import sys
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
 from typing import Protocol
 
@@ -24,6 +25,11 @@ class Clock(ABC):
     emulated = False
     """Whether the cell is emulated: then only the far side's own time may run out, never that of the computer."""
 
+    @property
+    def poll_s(self) -> float:
+        """How long one read may block in real time; an emulated cell stands still meanwhile."""
+        return 0.005 if self.emulated else 0.05
+
     @abstractmethod
     def now_ns(self) -> int:
         """Return the time in nanoseconds; samples are stamped with it as `t_host_ns`."""
@@ -39,6 +45,16 @@ class Clock(ABC):
     @abstractmethod
     def sleep(self, duration_s: float) -> None:
         """Return after `duration_s` seconds, at once where that is not positive."""
+
+    def looks(self, duration_s: float) -> Iterator[float]:
+        """Yield how many seconds are left of `duration_s`, and 0 for a last look when they are over.
+
+        So what has come in time is found, however late this thread is.
+        """
+        end_ns = self.now_ns() + round(duration_s * 1e9)
+        while (left_ns := end_ns - self.now_ns()) > 0:
+            yield left_ns / 1e9
+        yield 0.0
 
     @abstractmethod
     def wait(self, waitable: Waitable, timeout_s: float) -> bool:

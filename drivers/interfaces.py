@@ -55,7 +55,7 @@ class FtSamples:
     """
 
     t_host_ns: NDArray[np.int64]
-    """(n,) `time.monotonic_ns()` at receipt."""
+    """(n,) `Clock.now_ns()` of the driver at receipt."""
     t_device_s: Array
     """(n,) the device's own clock, own epoch; NaN where it has none. Never subtract it from host time."""
     seq: NDArray[np.int64]

@@ -12,7 +12,6 @@ import http.client
 import logging
 import math
 import re
-import time
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
@@ -23,8 +22,9 @@ import numpy as np
 import pynetft
 
 from drivers._status import describe_status
-from drivers._stream import NOTHING, StreamingSensor, scale_facts
+from drivers._stream import NOTHING, StreamingSensor, StreamLimits, scale_facts
 from drivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM, units
+from drivers.clock import REAL, Clock
 from drivers.errors import UNUSABLE, ConnectError, DeviceFault, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples, Health
 
@@ -38,8 +38,11 @@ _SILENCE_S = 0.3
 _STARTS = 5
 """The request to start is a datagram and can be lost."""
 _HTTP_S = 1.0
+_PATIENCE_S = 30.0
+"""In place of it where the cell is emulated: its pages are served in real time."""
 _NEVER_S = 3600.0
-_BATCH_S = 0.002
+_WAIT_S, _BATCH_S = 0.05, 0.002
+"""In real time for the first sample, then for those that come with it."""
 _QUEUE = 16_384
 """More than two seconds at 7 kHz; the oldest is dropped then, and its number is missing."""
 _ONROBOT_COUNTS = (10_000, 100_000)
@@ -164,11 +167,19 @@ class NetFtSensor(StreamingSensor):
     """
 
     def __init__(
-        self, host: str, *, onrobot: bool = False, rdt_port: int = 49152, http_port: int = 80, sign: int = 1
+        self,
+        host: str,
+        *,
+        onrobot: bool = False,
+        rdt_port: int = 49152,
+        http_port: int = 80,
+        sign: int = 1,
+        clock: Clock = REAL,
     ) -> None:
         name = f"{'OnRobot' if onrobot else 'ATI'} Ethernet sensor at {host}"
-        # UDP has no cable that breaks: pynetft notices the silence, and that is to be heard before we call it stale
-        super().__init__(name, sign=sign, stale_after_s=_SILENCE_S + 0.15)
+        # UDP has no cable that breaks: a silence ends the stream, and that is to be known before it is called stale
+        super().__init__(name, sign=sign, clock=clock, limits=StreamLimits(stale_s=_SILENCE_S + 0.15))
+        self._http_s = _PATIENCE_S if clock.emulated else _HTTP_S
         self._host = host
         self._onrobot = onrobot
         self._rdt_port = rdt_port
@@ -176,7 +187,7 @@ class NetFtSensor(StreamingSensor):
         self._client: pynetft.Client | None = None
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``ati-netft://192.168.1.1?onrobot=0&rdt_port=49152&http_port=80``."""
         return cls(
             address,
@@ -184,6 +195,7 @@ class NetFtSensor(StreamingSensor):
             rdt_port=options.integer("rdt_port", 49152, 1, 65535),
             http_port=options.integer("http_port", 80, 1, 65535),
             sign=sign,
+            clock=clock,
         )
 
     def _connect(self) -> DeviceInfo:
@@ -199,7 +211,9 @@ class NetFtSensor(StreamingSensor):
             sensor_host=self._host,
             rdt_port=self._rdt_port,
             http_port=self._http_port,
-            receive_timeout=_SILENCE_S,
+            receive_timeout=_NEVER_S,  # in real time; silence is judged here
+            configuration_connect_timeout=self._http_s,
+            configuration_timeout=self._http_s,
             deliver_samples_with_error_status=True,  # so that the fault can be named
             # A doubled or late datagram ends a stream that fails at once. So it may recover, but not before we noticed.
             recovery_policy=pynetft.RecoveryPolicy.RECONNECT,
@@ -233,9 +247,10 @@ class NetFtSensor(StreamingSensor):
 
     def _read_block(self) -> FtSamples:
         samples = self._fetch()
-        t_host_ns = time.monotonic_ns()
+        t_host_ns = self._clock.now_ns()
         if not samples:
             return NOTHING
+        self._arrived_ns = t_host_ns
         numbers = [sample.rdt_sequence for sample in samples]
         before = numbers[0] - 1 if self._newest_number is None else self._newest_number
         self._lost += max(0, numbers[-1] - before - len(numbers))
@@ -285,7 +300,8 @@ class NetFtSensor(StreamingSensor):
                 client.start()
             except pynetft.NetFTError as exc:
                 raise self._untold(exc) from exc
-            arrived = client.wait_for_first_sample(_SILENCE_S)
+            arrived = any(client.wait_for_first_sample(min(s, _WAIT_S)) for s in self._clock.looks(_SILENCE_S))
+            self._arrived_ns = self._clock.now_ns()
             health = client.health()
             if health.sensor_configuration is None:
                 raise ConnectError(f"{self.name}: the sensor told no scale", "open it again")
@@ -301,25 +317,30 @@ class NetFtSensor(StreamingSensor):
         )
 
     def _fetch(self) -> list[pynetft.Sample]:
-        """Take everything that has arrived, waiting up to 0.05 s for the first sample and 2 ms for company."""
+        """Take everything that has arrived, waiting a little for the first sample and 2 ms for company."""
         client = self._client
         if client is None:
             raise StreamBroken(f"{self.name}: closed")
         samples: list[pynetft.Sample] = []
         try:
-            samples.append(next(client.samples(timeout=0.05)))
-            time.sleep(_BATCH_S)
+            samples.append(next(client.samples(timeout=_WAIT_S)))
+            self._clock.sleep(_BATCH_S)
             for sample in client.samples(timeout=0.0):
                 samples.append(sample)
         except TimeoutError:
             pass
         except StopIteration:
             raise StreamBroken(f"{self.name}: closed") from None
-        if not samples and (health := client.health()).state is not pynetft.ClientState.STREAMING:
-            self._judge(health.last_status)
-            raise StreamBroken(
-                f"{self.name}: the stream has ended ({health.last_error})", "check cable and supply, then open it again"
-            )
+        if not samples:
+            health, silent_s = client.health(), (self._clock.now_ns() - self._arrived_ns) / 1e9
+            has_failed = health.state is not pynetft.ClientState.STREAMING
+            if has_failed:
+                self._judge(health.last_status)
+            if has_failed or silent_s > _SILENCE_S:
+                why = health.last_error if has_failed else f"nothing came for {silent_s:.2f} s"
+                raise StreamBroken(
+                    f"{self.name}: the stream has ended ({why})", "check cable and supply, then open it again"
+                )
         return samples
 
     def _judge(self, status: int) -> None:
@@ -336,7 +357,7 @@ class NetFtSensor(StreamingSensor):
     def _read_page(self, path: str) -> bytes:
         """Ask for what pynetft does not: serial number of the calibration in use, rate, range."""
         try:
-            with closing(http.client.HTTPConnection(self._host, self._http_port, timeout=_HTTP_S)) as connection:
+            with closing(http.client.HTTPConnection(self._host, self._http_port, timeout=self._http_s)) as connection:
                 connection.request("GET", path)
                 return connection.getresponse().read(65536)
         except (OSError, ValueError, http.client.HTTPException) as exc:

@@ -4,7 +4,6 @@ Nothing is set, started or stopped: what is sent are requests to read, in the pr
 They are still bytes, and what an unknown device makes of them is unknown. CAN buses: `probe_can`.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,6 +12,7 @@ from drivers._serial import SerialPort
 from drivers.ati import modbus
 from drivers.ati.codec import decode_text
 from drivers.bota import codec as bota
+from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, ProtocolError, StreamBroken
 from drivers.registry import in_url
 from drivers.robotiq import codec as robotiq
@@ -45,7 +45,7 @@ class _Known:
     """What the device says of itself; raises `ProtocolError`."""
 
 
-def probe(port: str) -> Answer | None:
+def probe(port: str, clock: Clock = REAL) -> Answer | None:
     """Tell which known sensor is on this port, or None.
 
     Raises
@@ -53,27 +53,28 @@ def probe(port: str) -> Answer | None:
     ConnectError
         The port does not open.
     """
-    for known in _KNOWN:
-        if known.streams(_hear(port, known, None, _LISTEN_S)):
-            return Answer(known.url.format(port=in_url(port)), "it streams")
-    for known in _KNOWN:
-        if known.request is not None:
-            try:
-                what = known.reply(_hear(port, known, known.request, _REPLY_S))
-            except ProtocolError:
-                continue
-            return Answer(known.url.format(port=in_url(port)), what)
+    with clock.keeping_up():
+        for known in _KNOWN:
+            if known.streams(_hear(port, known, None, _LISTEN_S, clock)):
+                return Answer(known.url.format(port=in_url(port)), "it streams")
+        for known in _KNOWN:
+            if known.request is not None:
+                try:
+                    what = known.reply(_hear(port, known, known.request, _REPLY_S, clock))
+                except ProtocolError:
+                    continue
+                return Answer(known.url.format(port=in_url(port)), what)
     return None
 
 
-def _hear(path: str, known: _Known, request: bytes | None, duration_s: float) -> bytes:
-    port = SerialPort(path, path, known.baud, even_parity=known.even_parity, read_s=0.02)
-    data, end = b"", time.monotonic() + duration_s
+def _hear(path: str, known: _Known, request: bytes | None, duration_s: float, clock: Clock) -> bytes:
+    port = SerialPort(path, path, known.baud, even_parity=known.even_parity, read_s=0.02, clock=clock)
+    data = b""
     try:
         port.open()
         if request is not None:
             port.write(request)
-        while time.monotonic() < end:
+        for _ in clock.looks(duration_s):
             data += port.read(4096)
     except StreamBroken as exc:
         raise ConnectError(exc.found, exc.cure) from exc

@@ -8,7 +8,6 @@ Ref: ATI 9610-05-1030-04, command list; Robotous RFT manual 1.7, communication p
 set.
 """
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from dataclasses import dataclass
 from drivers._can import CanBus
 from drivers.ati import codec as ati
 from drivers.ati.codec import Op
+from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, ProtocolError, StreamBroken
 from drivers.probe import Answer
 from drivers.registry import in_url
@@ -41,10 +41,12 @@ class _Known:
     must_be_silent: AbstractSet[int]
     """Identifiers on which nothing may be heard before it is asked."""
     shows_itself: Callable[[Sequence[Frame]], str | None]
-    ask: Callable[[CanBus], str | None]
+    ask: Callable[[CanBus, Clock], str | None]
 
 
-def probe_can(channel: str, *, interface: str, bitrate: int | None, base: int = 0x20) -> list[Answer]:
+def probe_can(
+    channel: str, *, interface: str, bitrate: int | None, base: int = 0x20, clock: Clock = REAL
+) -> list[Answer]:
     """Tell which known sensors are on a bus, and which could not be asked.
 
     Parameters
@@ -55,6 +57,8 @@ def probe_can(channel: str, *, interface: str, bitrate: int | None, base: int = 
         Bit/s of the bus: a wrong one disturbs it. None on socketcan, where it is not known.
     base : int
         Where an ATI sensor is looked for, 0x00 to 0x7F.
+    clock : Clock
+        What the waits are measured by.
 
     Raises
     ------
@@ -64,26 +68,23 @@ def probe_can(channel: str, *, interface: str, bitrate: int | None, base: int = 
     known = [_ati(channel, interface, bitrate, base)]
     if bitrate in {None, robotous_can.BITRATE}:
         known.append(_robotous(channel, interface))
-    bus = CanBus(f"{interface} {channel}", channel, interface, bitrate or 250_000)
+    bus = CanBus(f"{interface} {channel}", channel, interface, bitrate or 250_000, clock=clock)
     try:
-        bus.open()
-        heard = _hear(bus)
-        return [answer for sensor in known if (answer := _look(sensor, heard, bus))]
+        with clock.keeping_up():
+            bus.open()
+            heard = _hear(bus, clock)
+            return [answer for sensor in known if (answer := _look(sensor, heard, bus, clock))]
     except StreamBroken as exc:
         raise ConnectError(exc.found, exc.cure) from exc
     finally:
         bus.close()
 
 
-def _hear(bus: CanBus) -> list[Frame]:
-    frames, end = [], time.monotonic() + _LISTEN_S
-    while (left_s := end - time.monotonic()) > 0:
-        if frame := bus.receive(left_s):
-            frames.append(frame)
-    return frames
+def _hear(bus: CanBus, clock: Clock) -> list[Frame]:
+    return [frame for left_s in clock.looks(_LISTEN_S) if (frame := bus.look(left_s))]
 
 
-def _look(known: _Known, heard: Sequence[Frame], bus: CanBus) -> Answer | None:
+def _look(known: _Known, heard: Sequence[Frame], bus: CanBus, clock: Clock) -> Answer | None:
     if what := known.shows_itself(heard):
         return Answer(known.url, what)
     if busy := sorted(known.must_be_silent & {identifier for identifier, _ in heard}):
@@ -93,7 +94,7 @@ def _look(known: _Known, heard: Sequence[Frame], bus: CanBus) -> Answer | None:
             f"{known.name} was not asked, because something else sends on {some}; "
             f"if you know that it is there, its address is {known.url}",
         )
-    return Answer(known.url, what) if (what := known.ask(bus)) else None
+    return Answer(known.url, what) if (what := known.ask(bus, clock)) else None
 
 
 def _ati(channel: str, interface: str, bitrate: int | None, base: int) -> _Known:
@@ -113,9 +114,9 @@ def _ati(channel: str, interface: str, bitrate: int | None, base: int) -> _Known
         ours = [frame for frame in heard if frame[0] in own and frame != request]
         return "another host reads it" if len(_messages(ours, replies(Op.GAUGES))) >= _ENOUGH_SAMPLES else None
 
-    def ask(bus: CanBus) -> str | None:
-        serial = _ask(bus, first | Op.SERIAL, b"", replies(Op.SERIAL))
-        firmware = None if serial is None else _ask(bus, first | Op.FIRMWARE, b"", replies(Op.FIRMWARE))
+    def ask(bus: CanBus, clock: Clock) -> str | None:
+        serial = _ask(bus, clock, first | Op.SERIAL, b"", replies(Op.SERIAL))
+        firmware = None if serial is None else _ask(bus, clock, first | Op.FIRMWARE, b"", replies(Op.FIRMWARE))
         if serial is None or firmware is None:
             return None
         major, minor, build = ati.decode_firmware(firmware)
@@ -142,8 +143,8 @@ def _robotous(channel: str, interface: str) -> _Known:
         plausible = all(sample.overload < 0x40 for sample in samples)
         return "it streams" if plausible and len(samples) >= _ENOUGH_SAMPLES else None
 
-    def ask(bus: CanBus) -> str | None:
-        field = _ask(bus, robotous_can.COMMAND, robotous.encode(robotous.Command.MODEL), reply)
+    def ask(bus: CanBus, clock: Clock) -> str | None:
+        field = _ask(bus, clock, robotous_can.COMMAND, robotous.encode(robotous.Command.MODEL), reply)
         try:
             told = field and field[0] == robotous.Command.MODEL and robotous.decode_text(field)
         except ProtocolError:
@@ -163,13 +164,12 @@ def _url(scheme: str, channel: str, options: Sequence[str]) -> str:
     return f"{scheme}://{in_url(channel)}?{'&'.join(filter(None, options))}".rstrip("?")
 
 
-def _ask(bus: CanBus, identifier: int, data: bytes, parts: Mapping[int, int]) -> bytes | None:
+def _ask(bus: CanBus, clock: Clock, identifier: int, data: bytes, parts: Mapping[int, int]) -> bytes | None:
     """Send a request and return its reply, or None."""
     bus.send(identifier, data)
     frames: list[Frame] = []
-    end = time.monotonic() + _REPLY_S
-    while (left_s := end - time.monotonic()) > 0:
-        frame = bus.receive(left_s)
+    for left_s in clock.looks(_REPLY_S):
+        frame = bus.look(left_s)
         if frame and len(frame[1]) == parts.get(frame[0]):
             frames.append(frame)
             if replies := _messages(frames, parts):

@@ -17,6 +17,7 @@ from typing import Any, Protocol, cast
 from urllib.parse import parse_qsl, quote, unquote, urlsplit
 
 from drivers._stream import StreamingSensor
+from drivers.clock import REAL, Clock
 from drivers.interfaces import Fact, ForceTorqueSensor, RobotArm
 
 SENSORS: Mapping[str, str] = MappingProxyType(
@@ -154,10 +155,10 @@ def in_url(address: str) -> str:
 
 
 class _FromUrl(Protocol):
-    def from_url(self, address: str, options: Options, *, sign: int = 1) -> ForceTorqueSensor: ...
+    def from_url(self, address: str, options: Options, *, sign: int = 1, **clock: Clock) -> ForceTorqueSensor: ...
 
 
-def sensor_from_url(url: str, *, sign: int = 1) -> ForceTorqueSensor:
+def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTorqueSensor:
     """Build the sensor an address names; nothing is opened.
 
     Parameters
@@ -167,6 +168,8 @@ def sensor_from_url(url: str, *, sign: int = 1) -> ForceTorqueSensor:
         ``ati-serial:///dev/serial/by-id/NAME?calibration=1``; all are in drivers/README.md.
     sign : int
         -1 for a sensor that reports the reaction.
+    clock : Clock
+        That of an emulated cell; a driver of another package is given none.
 
     Raises
     ------
@@ -185,8 +188,9 @@ def sensor_from_url(url: str, *, sign: int = 1) -> ForceTorqueSensor:
         raise BadUrl(f"{url}: {entry.value} has no from_url, so it is no driver: reinstall {_package(entry)}")
     options = Options(url, parts.query)
     recover, configured = bool(options.integer("recover", 0, 0, 1)), options.configured()
+    own_time = {} if clock is REAL else {"clock": clock}
     try:
-        sensor = driver.from_url(parts.address, options, sign=sign)
+        sensor = driver.from_url(parts.address, options, sign=sign, **own_time)
     except BadUrl:
         raise
     except ValueError as exc:

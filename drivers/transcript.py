@@ -1,7 +1,7 @@
 """The bytes on the wire of a sensor, kept in a file: `transcript_taps.py` writes it, `transcript_player.py` plays it.
 
 A transcript (``ftdrive.transcript/1``) is JSON lines. The first says which sensor, when and with which versions; then
-come, with `time.monotonic_ns()` as `t_ns`:
+come, with the time of the driver's clock as `t_ns`:
 
 {"t_ns", "event": "open", "port", "baudrate", "bytesize", "parity", "stopbits", "parity_marks"}   a serial port
 {"t_ns", "event": "open", "port", "frames": true}                                                 a CAN interface
@@ -23,13 +23,13 @@ import json
 import math
 import os
 import threading
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Final, Self
 from urllib.parse import parse_qsl, urlencode
 
+from drivers.clock import REAL, Clock
 from drivers.registry import split_url
 
 FORMAT: Final = "ftdrive.transcript/1"
@@ -54,6 +54,8 @@ class Writer:
         Must not exist.
     header : mapping
         Goes into the first line.
+    clock : Clock
+        The driver's.
 
     Raises
     ------
@@ -61,9 +63,10 @@ class Writer:
         The file, or one of an unfinished recording, exists already, or cannot be written.
     """
 
-    def __init__(self, path: Path, header: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, header: Mapping[str, Any], clock: Clock = REAL) -> None:
         self.has_port = False
         """Whether a port of any kind was opened: without one there is nothing to play."""
+        self.clock = clock
         self._path = path
         self._partial = path.parent / (path.name + ".partial")
         for existing in (path, self._partial):
@@ -84,19 +87,19 @@ class Writer:
         with self._lock:
             self._flush_received()
             self.has_port |= name == "open"
-            self._line({"t_ns": time.monotonic_ns(), "event": name, **content})
+            self._line({"t_ns": self.clock.now_ns(), "event": name, **content})
 
     def sent(self, data: bytes) -> None:
         """Note one write of the driver."""
         with self._lock:
             self._flush_received()
-            self._line({"t_ns": time.monotonic_ns(), "dir": "tx", "hex": data.hex()})
+            self._line({"t_ns": self.clock.now_ns(), "dir": "tx", "hex": data.hex()})
 
     def received(self, data: bytes) -> None:
         """Note what the driver was given; reads that follow each other closely become one line."""
         if not data:
             return
-        now_ns = time.monotonic_ns()
+        now_ns = self.clock.now_ns()
         with self._lock:
             if self._received and now_ns - self._received_ns > _TOGETHER_NS:
                 self._flush_received()
@@ -108,7 +111,7 @@ class Writer:
         """Note one datagram for the driver, which stays one."""
         with self._lock:
             self._flush_received()
-            self._line({"t_ns": time.monotonic_ns(), "dir": "rx", "hex": data.hex()})
+            self._line({"t_ns": self.clock.now_ns(), "dir": "rx", "hex": data.hex()})
 
     def end(self, **content: Any) -> None:
         """Write the last line, and give the file its name."""

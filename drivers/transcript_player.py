@@ -5,13 +5,13 @@ import os
 import select
 import socket
 import threading
-import time
 import tty
 from collections.abc import Callable
 from socketserver import BaseRequestHandler
 from typing import Any, Final
 
 from drivers._parity import leave_marks_to_far_side, marks_asked_for
+from drivers.clock import REAL, Clock
 from drivers.transcript import Page, Passage, Transcript, asked_for
 from drivers.transcript_ports import AT_ONCE, HTTP_S, LOOK_S, LOOPBACK, PageServer
 
@@ -27,10 +27,11 @@ class Player:
     Pages are asked for at any time; of one that was asked for several times the answers come in their order.
     """
 
-    def __init__(self, transcript: Transcript) -> None:
+    def __init__(self, transcript: Transcript, clock: Clock = REAL) -> None:
+        self._clock = clock
         self._passages = transcript.passages
         self._datagrams = transcript.datagrams
-        self._far = _Ethernet(transcript.pages, self._diverge) if transcript.datagrams else _Terminal(transcript)
+        self._far = _Ethernet(transcript.pages, self._diverge, clock) if transcript.datagrams else _Terminal(transcript)
         self._next = 0
         self._t_ns = transcript.opened_ns  # of the recording, at `_t`
         self._t = 0.0
@@ -63,16 +64,17 @@ class Player:
     def _serve(self) -> None:
         if not self._far.wait_for_driver(self._ended):
             return
-        self._t = time.monotonic()
-        while not self._ended.is_set():
-            wait_s = min(LOOK_S, max(0.0, self._play()))
-            readable, _, _ = select.select([self._far], [], [], wait_s)
-            if readable:
-                data = self._far.read()
-                if data is None:
-                    return
-                self._asked += data
-                self._listen()
+        with self._clock.keeping_up():
+            self._t = self._clock.now_s()
+            while not self._ended.is_set():
+                wait_s = min(self._clock.poll_s, max(0.0, self._play()))
+                readable, _, _ = select.select([self._far], [], [], wait_s)
+                if readable:
+                    data = self._far.read()
+                    if data is None:
+                        return
+                    self._asked += data
+                    self._listen()
 
     def _play(self) -> float:
         """Send what is due; return the seconds until something else may be."""
@@ -90,7 +92,7 @@ class Player:
         return 0.001
 
     def _due_in_s(self, passage: Passage) -> float:
-        return self._t + (passage.t_ns - self._t_ns) / 1e9 - time.monotonic()
+        return self._t + (passage.t_ns - self._t_ns) / 1e9 - self._clock.now_s()
 
     def _listen(self) -> None:
         """Compare what the driver writes with the next request of the recording."""
@@ -117,7 +119,7 @@ class Player:
             request = self._passages[found]
             del self._asked[: len(request.data)]
             self._next = found + 1
-            self._t, self._t_ns = time.monotonic(), request.t_ns
+            self._t, self._t_ns = self._clock.now_s(), request.t_ns
 
     def _is_asked(self, request: bytes) -> bool:
         return self._asked == request if self._datagrams else self._asked.startswith(request)
@@ -199,8 +201,9 @@ class _Ethernet:
 
     is_full = False
 
-    def __init__(self, pages: tuple[Page, ...], diverge: Callable[[str], None]) -> None:
+    def __init__(self, pages: tuple[Page, ...], diverge: Callable[[str], None], clock: Clock) -> None:
         self._pages = pages
+        self._clock = clock
         self._diverge = diverge
         self._driver: Any = None
         self._opened = contextlib.ExitStack()
@@ -208,7 +211,7 @@ class _Ethernet:
     def open(self) -> str:
         self._socket = self._opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         self._socket.bind((LOOPBACK, 0))
-        answers = self._opened.enter_context(_PageAnswers(self._pages, self._diverge))
+        answers = self._opened.enter_context(_PageAnswers(self._pages, self._diverge, self._clock))
         return f"{LOOPBACK}?rdt_port={self._socket.getsockname()[1]}&http_port={answers.port}"
 
     def close(self) -> None:
@@ -232,9 +235,10 @@ class _Ethernet:
 class _PageAnswers(PageServer):
     """Answers with the recorded bytes after the recorded time."""
 
-    def __init__(self, pages: tuple[Page, ...], diverge: Callable[[str], None]) -> None:
+    def __init__(self, pages: tuple[Page, ...], diverge: Callable[[str], None], clock: Clock) -> None:
         super().__init__("player of pages", _PageAnswer)
         self._diverge = diverge
+        self._clock = clock
         self._left: dict[bytes, list[Page]] = {}
         for page in pages:
             self._left.setdefault(asked_for(page.request), []).append(page)
@@ -246,7 +250,7 @@ class _PageAnswers(PageServer):
             self._diverge(f"the driver asked {asked.decode(errors='replace')}, which was not asked in the recording")
             return b""
         page = left.pop(0) if len(left) > 1 else left[0]
-        self.ended.wait(page.took_s)
+        self._clock.wait(self.ended, page.took_s)
         return page.reply
 
 

@@ -10,7 +10,6 @@ import http.client
 import select
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -119,7 +118,7 @@ class _DatagramRelay:
                 readable, _, _ = select.select([self._near, self._far], [], [], LOOK_S)
             elif at_once == AT_ONCE:  # after a pause of this computer
                 at_once = 0
-                time.sleep(0.001)
+                self._writer.clock.sleep(0.001)
             try:
                 if self._near in readable:
                     data, driver = self._near.recvfrom(65536)
@@ -160,7 +159,8 @@ class _PageExchange(BaseRequestHandler):
         driver: socket.socket = self.request
         request = reply = b""
         error = None
-        began = time.monotonic()
+        clock = self.server.writer.clock
+        began_s = clock.now_s()
         try:
             driver.settimeout(HTTP_S)
             request = self.server.for_the_device(driver.recv(65536))
@@ -180,5 +180,5 @@ class _PageExchange(BaseRequestHandler):
                         device.sendall(data)
         except OSError as exc:
             error = str(exc)
-        took_s = round(time.monotonic() - began, 6)
+        took_s = round(clock.now_s() - began_s, 6)
         self.server.writer.event("page", request=request.hex(), reply=reply.hex(), took_s=took_s, error=error)

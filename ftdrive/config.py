@@ -11,12 +11,13 @@ import json
 import os
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import MISSING, Field, asdict, dataclass, field, fields
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
 from calib.routine import Sampling
+from drivers.clock import REAL, Clock
 from ftdrive.errors import ConfigError
 
 FORMAT = "ftdrive.config/1"
@@ -106,6 +107,12 @@ class CellConfig:
     workcell: WorkcellConfig = field(default_factory=WorkcellConfig)
     sampling: Sampling = field(default_factory=Sampling)
     site: SiteConfig = field(default_factory=SiteConfig)
+    clock: Clock = field(default=REAL, compare=False, repr=False)
+    """By which everything in the cell is timed; an emulated cell has its own. It is in no file."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give the sections as files have them."""
+        return {name: asdict(getattr(self, name)) for name in _SECTIONS}
 
 
 @dataclass(frozen=True, slots=True)

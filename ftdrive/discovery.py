@@ -5,6 +5,7 @@ from pathlib import Path
 
 from serial.tools import list_ports
 
+from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError
 from drivers.probe import Answer, probe
 from drivers.probe_can import probe_can
@@ -27,18 +28,18 @@ _CAN = ("socketcan", "slcan")
 _SLCAN = "slcan:///dev/ttyACM0?bitrate=250000"
 
 
-def look_at_robot(host: str, model: str | None) -> tuple[str, str]:
+def look_at_robot(host: str, model: str | None, clock: Clock = REAL) -> tuple[str, str]:
     """Model of the arm at an address, and in words what it says of itself; raises `DriverError`."""
-    with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig("")))) as arm:
+    with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig(""), clock=clock))) as arm:
         arm.open()
         info, remote = arm.identify(), arm.in_remote_control()
     told = who(info, "PolyScope")
     return info.model, told if remote is None else f"{told}, remote control {'ON' if remote else 'OFF'}"
 
 
-def look_at_sensor(url: str) -> str:
+def look_at_sensor(url: str, clock: Clock = REAL) -> str:
     """Say in words what the sensor at an address is and how fast it streams; raises `DriverError` or `ConfigError`."""
-    with build_sensor(CellConfig(RobotConfig(""), SensorConfig(url))) as sensor:
+    with build_sensor(CellConfig(RobotConfig(""), SensorConfig(url), clock=clock)) as sensor:
         info = sensor.identify()
         rate_Hz = len(sensor.collect(_LOOK_S).t_host_ns) / _LOOK_S
     return f"{who(info)}, {rate_Hz:.0f} Hz"

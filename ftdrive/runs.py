@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from calib.errors import BadDataset
 from calib.files import check_format, read_object, write_new
 from calib.routine import PoseRecord, TourPose
+from drivers.clock import REAL, Clock
 from drivers.interfaces import FtSamples
 from ftdrive import __version__
 from ftdrive.config import recorded
@@ -61,15 +62,22 @@ class Reading:
 
 
 class Run:
-    """A run folder on disk."""
+    """A run folder on disk.
 
-    def __init__(self, folder: Path) -> None:
+    Parameters
+    ----------
+    folder : Path
+    clock : Clock
+        Of the cell whose poses are added: each is kept with what to add to its `t_host_ns` for UTC.
+    """
+
+    def __init__(self, folder: Path, clock: Clock = REAL) -> None:
         self.folder = folder
-        self._clock_offset_ns = time.time_ns() - time.monotonic_ns()
+        self._clock_offset_ns = time.time_ns() - clock.now_ns()  # the anchor of all times in the files
         self._events_lock = threading.Lock()
 
     @classmethod
-    def create(cls, parent: Path, name: str, description: Mapping[str, Any]) -> "Run":
+    def create(cls, parent: Path, name: str, description: Mapping[str, Any], clock: Clock = REAL) -> "Run":
         """Make a new folder `<UTC time>-<name>` and write its run.json."""
         now = datetime.now(UTC)
         folder = parent / f"{now:%Y-%m-%dT%H%M%SZ}-{name}"
@@ -85,13 +93,13 @@ class Run:
         header = {
             "format": RUN_FORMAT,
             "created_utc": now.isoformat(),
-            "created_host_ns": time.monotonic_ns(),
+            "created_host_ns": clock.now_ns(),
             "argv": sys.argv,
             "versions": versions(),
             **description,
         }
         write_new(folder / "run.json", json.dumps(header, indent=1))
-        return cls(folder)
+        return cls(folder, clock)
 
     @property
     def calibration_path(self) -> Path:

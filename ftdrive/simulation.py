@@ -4,15 +4,15 @@ import atexit
 import json
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, Self
 
 from calib.routine import Sampling
+from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError
 from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.emulated_clock import EmulatedClock
 from ftdrive.errors import ConfigError
 
 TIME_SCALE = 20
@@ -38,7 +38,6 @@ MOVED_BY: Mapping[str, tuple[Mapping[str, Any], str]] = {
 
 _PAYLOAD_COG_M = "0,0,0.06"
 """What its controller is told about the tool, as somebody should have; it knows the mass."""
-_CONNECTIONS_END_S = 3.0
 TOOL_MM = (0.0, 200.0, 100.0)
 
 
@@ -56,6 +55,8 @@ class Station:
         self.sensor = sensor
         self.options = tuple(options)
         self.endpoints: Mapping[str, Any] = {}
+        self.clock: Clock = REAL
+        """The cell's own, once it has started."""
         self._process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> Self:
@@ -66,13 +67,13 @@ class Station:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )
         self.endpoints = self._answer()
+        self.clock = EmulatedClock(self.endpoints["clock"])
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._process is None:
             return
         process, self._process = self._process, None
-        _let_connections_end()
         try:
             process.communicate(timeout=3)  # closes its stdin, which ends it
         except subprocess.TimeoutExpired:
@@ -120,15 +121,8 @@ class Station:
             tool=ToolConfig("emulated", (TOOL_MM,)),
             workcell=WorkcellConfig(self.mounting, measured=True),
             sampling=Sampling(average_s=0.4, noise_record_s=0.0),
+            clock=self.clock,
         )
-
-
-def _let_connections_end() -> None:
-    """Wait for what drivers do after `close`: ur_rtde says on stderr that its controller is gone, if that is first."""
-    deadline = time.monotonic() + _CONNECTIONS_END_S
-    for thread in threading.enumerate():
-        if thread.name.startswith("ur-rtde"):
-            thread.join(max(0.0, deadline - time.monotonic()))
 
 
 def sensor_url(url: str) -> str:
@@ -141,7 +135,12 @@ def sensor_url(url: str) -> str:
     ConfigError
         Unknown name.
     """
-    return _emulated_alone(sensor_name(url)) if url.startswith(EMULATED) else url
+    return _emulated_alone(sensor_name(url)).sensor.url if url.startswith(EMULATED) else url
+
+
+def sensor_clock(url: str, clock: Clock = REAL) -> Clock:
+    """Return the clock of a sensor: for emulated://NAME its own, for any other address that of its cell."""
+    return _emulated_alone(sensor_name(url)).clock if url.startswith(EMULATED) else clock
 
 
 def sensor_name(url: str | None) -> str:
@@ -154,8 +153,8 @@ def sensor_name(url: str | None) -> str:
 
 
 @cache
-def _emulated_alone(name: str) -> str:
+def _emulated_alone(name: str) -> CellConfig:
     """Start one, which lives as long as this process."""
     station = Station(name, ["--time-scale", "1"])
     atexit.register(station.__exit__)
-    return station.__enter__().cell.sensor.url
+    return station.__enter__().cell

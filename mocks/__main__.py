@@ -86,8 +86,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--force-bias", type=_vector(3), metavar="x,y,z", help="N")
     add("--torque-bias", type=_vector(3), metavar="x,y,z", help="N·m")
     add("--noise", type=_vector(2), metavar="sF,sT", help="standard deviation of one reading, N and N·m")
-    add("--force-drift", type=_vector(3), metavar="x,y,z", help="N per minute of real time (default 0)")
-    add("--torque-drift", type=_vector(3), metavar="x,y,z", help="N·m per minute of real time (default 0)")
+    add("--force-drift", type=_vector(3), metavar="x,y,z", help="N per minute (default 0)")
+    add("--torque-drift", type=_vector(3), metavar="x,y,z", help="N·m per minute (default 0)")
     return parser
 
 

@@ -9,13 +9,13 @@ ignores them).
 
 import random
 import struct
-import time
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mocks.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
+from mocks.clock import CellClock
 from mocks.faults import Faults
 from mocks.slcan import CanFrame
 from mocks.stream import CanSensor, Measure
@@ -62,6 +62,8 @@ class AtiCanNode(CanSensor):
         Base identifier (7 bits) and bit rate; a client at another bit rate gets no answer.
     seed, faults
         Of the wire.
+    clock
+        Of the cell.
     calibrations
         What each slot 0 to 15 holds; a slot not named is empty.
     serial
@@ -90,6 +92,7 @@ class AtiCanNode(CanSensor):
         bitrate: int = 250_000,
         seed: int = 0,
         faults: Faults | None = None,
+        clock: CellClock | None = None,
         calibrations: Mapping[int, Calibration] | None = None,
         serial: str = "FT12345",
         firmware: tuple[int, int, int] = (3, 8, 2),
@@ -100,7 +103,7 @@ class AtiCanNode(CanSensor):
         reset_applies_settings: bool = True,
         wrong_echo: int | None = None,
     ) -> None:
-        super().__init__(seed=seed, faults=faults, bitrate=bitrate)
+        super().__init__(seed=seed, faults=faults, clock=clock, bitrate=bitrate)
         self.measure = measure
         self.base = self._next_base = base
         self._next_bitrate = bitrate
@@ -126,7 +129,7 @@ class AtiCanNode(CanSensor):
     def _reset(self, *, applies_settings: bool) -> None:
         self._slot = 0
         self._wire.clear()
-        self._booted_s = time.monotonic() + self.boot_s
+        self._booted_s = self.clock.now_s() + self.boot_s
         if applies_settings:
             self.base, self.bitrate = self._next_base, self._next_bitrate
 
@@ -135,7 +138,7 @@ class AtiCanNode(CanSensor):
 
     def _answer(self, request: CanFrame) -> list[CanFrame]:
         opcode = request.identifier & 0xF
-        if time.monotonic() < self._booted_s:
+        if self.clock.now_s() < self._booted_s:
             return []
         if request.extended or request.remote or request.identifier >> 4 != self.base:
             return []

@@ -8,13 +8,13 @@ slot reads zeros, the 23 registers between two slots do not exist, a read of mor
 """
 
 import struct
-import time
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mocks.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
+from mocks.clock import CellClock
 from mocks.faults import Faults, FaultyWire
 from mocks.modbus import (
     DEVICE_FAILURE,
@@ -32,14 +32,13 @@ from mocks.stream import Measure
 
 ADDRESS = 0x0A
 STREAM_HZ = 7000.0
-BURST_S = 1e-3
+BURST_S = 2e-3  # as a USB adapter delivers them
 RECORD_BYTES = 13
 CHARACTER_BITS = 11
 JAM_BYTES = 14
 JAM_PAUSE_S = 0.050  # a longer pause and the jam counts from the start again
 FRAME_GAP_S = 1.75e-3  # Modbus RTU: fixed above 19 200 baud
 MAX_READ = 64
-MAX_BACKLOG = 1400  # records, 0.2 s: what the terminal buffers anyway
 
 GAINS, OFFSETS, SESSION, STATUS, BAUD_STORE, BAUD = 0x0000, 0x0006, 0x000C, 0x001D, 0x001E, 0x001F
 WRITABLE = {*range(GAINS, SESSION + 1), BAUD_STORE, BAUD}
@@ -101,6 +100,8 @@ class AtiSerialBox(PtyDevice):
         the noise must reach a gauge count, or shifted records validate.
     seed, faults
         Of the wire; a frame is a reply or a record.
+    clock
+        Of the cell.
     calibrations
         What each slot 1 to 16 holds; a slot not named is empty. The lowest one describes the transducer.
     needs_gains
@@ -127,6 +128,7 @@ class AtiSerialBox(PtyDevice):
         *,
         seed: int = 0,
         faults: Faults | None = None,
+        clock: CellClock | None = None,
         calibrations: Mapping[int, Calibration] | None = None,
         needs_gains: bool = True,
         status: int = 0,
@@ -136,7 +138,7 @@ class AtiSerialBox(PtyDevice):
         refuse_start: bool = False,
         bad_checksum: float = 0.0,
     ) -> None:
-        super().__init__()
+        super().__init__(clock)
         self.measure = measure
         self.faults = Faults() if faults is None else faults
         self.calibrations = {1: REFERENCE} if calibrations is None else dict(calibrations)
@@ -151,7 +153,7 @@ class AtiSerialBox(PtyDevice):
         self.produced_records = 0
         self.dropped_records = 0
         self._random = np.random.default_rng(seed)
-        self._wire: FaultyWire[bytes] = FaultyWire(self.faults, seed)
+        self._wire: FaultyWire[bytes] = FaultyWire(self.faults, self.clock, seed)
         self._stored_baud_code = 0
         self._registers: dict[int, int] = {}
         self._unlocked = False
@@ -177,7 +179,7 @@ class AtiSerialBox(PtyDevice):
             self._start_streaming()
 
     def _received(self, data: bytes) -> None:
-        now_s = time.monotonic()
+        now_s = self.clock.now_s()
         if self.streaming and now_s - self._last_byte_s > JAM_PAUSE_S:
             self._burst.clear()
         self._last_byte_s = now_s
@@ -187,23 +189,22 @@ class AtiSerialBox(PtyDevice):
             self._wire.clear()
             self._forget_unsent()
 
-    def _tick(self) -> float | None:
-        wait_s = None if self.streaming else self._take_request()
+    def _tick(self, now_s: float) -> float | None:
+        wait_s = None if self.streaming else self._take_request(now_s)
         if self.streaming:
-            elapsed_s = max(0.0, time.monotonic() - self._stream_start_s)
+            elapsed_s = max(0.0, now_s - self._stream_start_s)
             self._stream(elapsed_s)
             wait_s = BURST_S - elapsed_s % BURST_S
-        now_s = time.monotonic()
-        for data in self._wire.due(now_s):
+        for data in self._wire.due(self.clock.now_s()):
             self.dropped_records += self._send(data, RECORD_BYTES if self.streaming else len(data))
         on_the_way_s = self._wire.wait_s(now_s)
         return min((s for s in (wait_s, on_the_way_s) if s is not None), default=None)
 
-    def _take_request(self) -> float | None:
+    def _take_request(self, now_s: float) -> float | None:
         """Answer what came before a pause; return the seconds until that can be told."""
         if not self._burst:
             return None
-        wait_s = self._last_byte_s + FRAME_GAP_S - time.monotonic()
+        wait_s = self._last_byte_s + FRAME_GAP_S - now_s
         if wait_s > 0:
             return wait_s
         answer = self._reply(bytes(self._burst))
@@ -254,16 +255,14 @@ class AtiSerialBox(PtyDevice):
         self.streaming = True
         self.produced_records = self.dropped_records = 0
         self._stream_hz = min(STREAM_HZ, BAUD_RATES[self._registers[BAUD]] / (CHARACTER_BITS * RECORD_BYTES))
-        self._stream_start_s = time.monotonic()
+        self._stream_start_s = self.clock.now_s()
 
     def _stream(self, elapsed_s: float) -> None:
-        """Send the records that are due; those of a backlog no terminal would hold are dropped."""
-        due = int(elapsed_s * self._stream_hz) - self.produced_records
-        if due <= 0:
+        """Send the records that are due."""
+        count = int(elapsed_s * self._stream_hz) - self.produced_records
+        if count <= 0:
             return
-        self.produced_records += due
-        count = min(due, MAX_BACKLOG)
-        self.dropped_records += due - count
+        self.produced_records += count
         records = stream_records(self._gauges(count), error=bool(self.status & 0x8000))
         if self.bad_checksum:
             records[self._random.random(count) < self.bad_checksum, 12] ^= 0x01

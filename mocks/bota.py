@@ -11,11 +11,11 @@ the CSV format is one line per sample with the fields of the frame; the sinc len
 
 import re
 import struct
-import time
 from collections.abc import Sequence
 
 import numpy as np
 
+from mocks.clock import CellClock
 from mocks.faults import Faults
 from mocks.stream import Measure, SerialSensor
 
@@ -65,6 +65,8 @@ class BotaBox(SerialSensor):
         Returns (n, 6) successive noisy readings in N and N·m, sensor axes; called for every sample that is made.
     seed, faults
         Of the wire.
+    clock
+        Of the cell.
     sinc_length
         Of the filter at power-up: a sample takes 19.53125 µs times this.
     capacity
@@ -87,6 +89,7 @@ class BotaBox(SerialSensor):
         *,
         seed: int = 0,
         faults: Faults | None = None,
+        clock: CellClock | None = None,
         sinc_length: int = 512,
         capacity: Sequence[float] = CAPACITY,
         temperature_C: float = 25.5,
@@ -95,7 +98,7 @@ class BotaBox(SerialSensor):
         streaming_at_start: bool = True,
         boot_s: float = 0.1,
     ) -> None:
-        super().__init__(seed=seed, faults=faults)
+        super().__init__(seed=seed, faults=faults, clock=clock)
         self.measure = measure
         self.sinc_length = sinc_length
         self.capacity = capacity
@@ -127,8 +130,8 @@ class BotaBox(SerialSensor):
         self._wire.clear()
         self._forget_unsent()
         self._pacer.stop()
-        self._powered_s = time.monotonic()
-        self._boots_at_s = time.monotonic() + self.boot_s
+        self._powered_s = self.clock.now_s()
+        self._boots_at_s = self.clock.now_s() + self.boot_s
 
     def _work(self, now_s: float) -> float | None:
         if self._boots_at_s is None:
@@ -206,5 +209,5 @@ class BotaBox(SerialSensor):
 
     def _run(self) -> None:
         """Stream, with the timestamp that counts since power-up."""
-        self._stream_start_us = (time.monotonic() - self._powered_s) * 1e6
+        self._stream_start_us = (self.clock.now_s() - self._powered_s) * 1e6
         self._pacer.start(1 / self.sample_s)

@@ -16,6 +16,7 @@ The page holds signed 64-bit integers in native order:
 
 To claim a slot, take a POSIX record lock (`lockf`) on the first 8 bytes, write the time, then the process id, and
 unlock. To release it, write 0 as process id. The station holds an exclusive `flock` on the page as long as it lives.
+A slot whose owner has ended is released by the station.
 """
 
 import fcntl
@@ -23,41 +24,55 @@ import mmap
 import os
 import threading
 import time
-from collections.abc import Iterator
+import weakref
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 PAGE_VERSION = 1
-SLOTS = 126
+SLOTS = 30
 LEAD_NS = 10_000_000
-"""Less than any limit a client may have, and more than the period of the slowest sensor."""
+"""Less than any limit a client may have, and no less than the period of the slowest sensor."""
 DEBT_NS = 200_000_000
-"""Of real time that could not be followed, so much is made up for."""
-SUSPECT_S = 0.1
+"""Of the real time in which the clock was held, so much is made up for."""
 PATIENCE_S = 10.0
-"""A living process that does not follow for so long is not waited for until it does again."""
+"""The clock stops waiting for a living process that has not followed for so long, until it follows again."""
+SUSPECT_S = 0.1
+"""When a slot has held the clock for so long, and again after each such time, its owner is looked up."""
+LOOK_S = 0.005
+"""A thread that keeps up looks at the clock at least this often."""
+REST_S = 0.0005
+"""It waits at least so long in between, or it would spin while the clock is held."""
 _HEAD = 4
 
 
 class CellClock:
-    """The clock. Any thread of the station may read it; reading moves it on."""
+    """The clock of one cell. Every method may be called from any thread.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    real_ns
+        The computer's clock; a test passes one that it moves itself.
+    """
+
+    def __init__(self, real_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._real_ns = real_ns
         self._descriptor = os.memfd_create("emulated-cell-clock")
         os.ftruncate(self._descriptor, 8 * (_HEAD + 2 * SLOTS))
         fcntl.flock(self._descriptor, fcntl.LOCK_EX)
         self._page = memoryview(mmap.mmap(self._descriptor, 0)).cast("q")
-        self._now_ns = time.monotonic_ns()
+        self._now_ns = self._looked_ns = real_ns()
         self._page[1] = self._now_ns
         self._page[2] = SLOTS
         self._page[0] = PAGE_VERSION
         self._lost_ns = 0
+        """How much later the real clock is, but for the debt."""
         self._lock = threading.Lock()
         self._own: dict[int, int] = {}
-        """What the station's own threads have followed up to, by thread."""
-        self._held_by: tuple[int, int] | None = None
-        self._held_since_s = 0.0
-        self._given_up: dict[int, int] = {}
+        """Time up to which the station's own threads have followed, by thread."""
+        self._held: dict[int, tuple[int, int]] = {}
+        """Slots that hold the clock: the time at which they stand, and for how long (real time, ns)."""
+        self._end = weakref.finalize(self, _end, self._descriptor)
 
     @property
     def path(self) -> str:
@@ -65,25 +80,30 @@ class CellClock:
         return f"/proc/{os.getpid()}/fd/{self._descriptor}"
 
     def now_ns(self) -> int:
-        """Move the clock on as far as real time and the slowest follower allow, and return it."""
+        """Move the clock on as far as real time and the slowest follower allow, publish the time and return it."""
         with self._lock:
-            wall_ns = time.monotonic_ns() - self._lost_ns
-            now_ns = max(self._now_ns, min(wall_ns, self._slowest_ns() + LEAD_NS))
-            self._lost_ns += max(0, wall_ns - now_ns - DEBT_NS)
-            self._now_ns = self._page[1] = now_ns
-            thread = threading.get_ident()
-            if thread in self._own:
-                self._own[thread] = now_ns
-            return now_ns
+            return self._move_on()
 
     def now_s(self) -> float:
         """Return the same in seconds."""
         return self.now_ns() * 1e-9
 
+    def follow(self) -> int:
+        """Return `now_ns()`; a thread that keeps up confirms by this that it has done all that was due before."""
+        with self._lock:
+            now_ns = self._move_on()
+            thread = threading.get_ident()
+            if thread in self._own:
+                self._own[thread] = now_ns
+            return now_ns
+
     @contextmanager
     def keeping_up(self) -> Iterator[None]:
-        """Let the clock wait for this thread, which reads it at least every 5 ms."""
+        """Let the clock wait for this thread, which calls `follow` every `LOOK_S`; blocks may be nested."""
         thread = threading.get_ident()
+        if thread in self._own:
+            yield
+            return
         with self._lock:
             self._own[thread] = self._now_ns
         try:
@@ -93,34 +113,53 @@ class CellClock:
                 del self._own[thread]
 
     def close(self) -> None:
-        """End the clock; clients see that the station has ended."""
-        os.close(self._descriptor)
+        """End the clock: clients see that the station has ended. May be called twice."""
+        self._end()
 
-    def _slowest_ns(self) -> int:
-        """Return how far the slowest follower is; the present time plus a debt where there is none."""
-        slowest_ns = min(self._own.values(), default=self._now_ns + DEBT_NS)
+    def _move_on(self) -> int:
+        real_ns = self._real_ns()
+        target_ns = real_ns - self._lost_ns
+        slowest_ns = min((*self._own.values(), *self._slots(real_ns)), default=target_ns)
+        now_ns = max(self._now_ns, min(target_ns, slowest_ns + LEAD_NS))
+        self._lost_ns += max(0, target_ns - now_ns - DEBT_NS)
+        self._now_ns = self._page[1] = now_ns
+        return now_ns
+
+    def _slots(self, real_ns: int) -> list[int]:
+        """Return how far the owners of the slots have followed, but for those who are not waited for."""
+        # A stall of this process is not a delay of the others.
+        elapsed_ns = min(real_ns - self._looked_ns, round(SUSPECT_S * 1e9))
+        self._looked_ns = real_ns
         slots = self._page[_HEAD:].tolist()
-        for k in range(SLOTS):
-            pid, seen_ns = slots[2 * k], slots[2 * k + 1]
-            if pid and seen_ns < slowest_ns and self._given_up.get(k) != seen_ns:
-                if seen_ns + LEAD_NS <= self._now_ns and self._is_gone(k, pid, seen_ns):
-                    continue
-                slowest_ns = seen_ns
-        return slowest_ns
+        return [
+            slots[k + 1]
+            for k in range(0, 2 * SLOTS, 2)
+            if slots[k] and not self._is_given_up(k, slots[k], slots[k + 1], elapsed_ns)
+        ]
 
-    def _is_gone(self, k: int, pid: int, seen_ns: int) -> bool:
-        """Whether the owner of a slot that holds the clock up has ended, or has not followed for too long."""
-        now_s = time.monotonic()
-        if self._held_by != (k, seen_ns):
-            self._held_by, self._held_since_s = (k, seen_ns), now_s
-        held_s = now_s - self._held_since_s
-        if held_s > SUSPECT_S and not _lives(pid):
-            self._page[_HEAD + 2 * k] = 0
+    def _is_given_up(self, k: int, pid: int, seen_ns: int, elapsed_ns: int) -> bool:
+        """Whether the owner of a slot has ended, or has held the clock for too long."""
+        if seen_ns + LEAD_NS > self._now_ns:
+            return False
+        held_at_ns, before_ns = self._held.get(k, (seen_ns, 0))
+        held_ns = before_ns + elapsed_ns if held_at_ns == seen_ns else 0
+        self._held[k] = seen_ns, held_ns
+        suspect_ns = round(SUSPECT_S * 1e9)
+        if held_ns // suspect_ns > before_ns // suspect_ns and not _lives(pid):
+            self._page[_HEAD + k] = 0
+            del self._held[k]
             return True
-        if held_s > PATIENCE_S:
-            self._given_up[k] = seen_ns
-            return True
-        return False
+        return held_ns > PATIENCE_S * 1e9
+
+
+def time_out_s(wait_s: float | None) -> float:
+    """Return how long a thread that keeps up may wait, when the next thing to do is due in `wait_s` (None: nothing)."""
+    return LOOK_S if wait_s is None else min(max(wait_s, REST_S), LOOK_S)
+
+
+def _end(descriptor: int) -> None:
+    fcntl.flock(descriptor, fcntl.LOCK_UN)  # the mapping has a copy of the descriptor, which would keep the lock
+    os.close(descriptor)
 
 
 def _lives(pid: int) -> bool:

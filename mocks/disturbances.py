@@ -30,7 +30,7 @@ class Push:
     given
         (6,) N and N·m, in the axes of the base, or of the sensor when `in_sensor`.
     until_s
-        On the monotonic clock.
+        On the cell's clock.
     """
 
     given: Array

@@ -4,12 +4,12 @@ Does not model: damaged frames on CAN (its controllers discard them: use `drop`)
 """
 
 import random
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+from mocks.clock import CellClock
 from mocks.slcan import CanFrame
 from mocks.uart import WrongParity
 
@@ -64,6 +64,8 @@ class FaultyWire(Generic[Frame]):
     ----------
     faults
         Read anew at every `put`.
+    clock
+        Of the cell, for delays.
     seed
         Of all chances.
     foreign
@@ -71,9 +73,15 @@ class FaultyWire(Generic[Frame]):
     """
 
     def __init__(
-        self, faults: Faults, seed: int = 0, *, foreign: Callable[[random.Random], Frame] | None = None
+        self,
+        faults: Faults,
+        clock: CellClock,
+        seed: int = 0,
+        *,
+        foreign: Callable[[random.Random], Frame] | None = None,
     ) -> None:
         self._faults = faults
+        self._clock = clock
         self._random = random.Random(seed)
         self._foreign: Callable[[random.Random], Frame] | None = foreign
         self._outbox: deque[tuple[float, Frame]] = deque()
@@ -91,7 +99,7 @@ class FaultyWire(Generic[Frame]):
         """
         if self._faults.stall:
             return
-        due_s = time.monotonic() + self._faults.delay_s
+        due_s = self._clock.now_s() + self._faults.delay_s
         if self._held or self._faults.harm_frames:
             frames = self._with_faults(frames, stream)
         for frame in frames:

@@ -15,7 +15,6 @@ import select
 import socket
 import struct
 import threading
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -28,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mocks.ati_gauges import Scale
+from mocks.clock import CellClock, time_out_s
 from mocks.faults import Faults, FaultyWire
 from mocks.stream import Measure, Pacer
 
@@ -108,6 +108,8 @@ class NetFtBox:
         Returns (n, 6) successive noisy readings in N and N·m, sensor axes; called for every sample that is made.
     seed, faults
         Of the UDP datagrams; a stalled box does not answer HTTP either.
+    clock
+        Of the cell; None makes one for this box alone.
     host
         Address to listen at.
     rdt_port, http_port
@@ -136,6 +138,7 @@ class NetFtBox:
         *,
         seed: int = 0,
         faults: Faults | None = None,
+        clock: CellClock | None = None,
         host: str = "127.0.0.1",
         rdt_port: int = RDT_PORT,
         http_port: int = 0,
@@ -150,6 +153,7 @@ class NetFtBox:
     ) -> None:
         self.measure = measure
         self.faults = Faults() if faults is None else faults
+        self.clock = clock or CellClock()
         self.calibration = calibration or Calibration()
         self.product = product
         self.rate_hz = rate_hz
@@ -159,8 +163,8 @@ class NetFtBox:
         self.saturated_axis = saturated_axis
         self.streaming_at_start = streaming_at_start
         self._ports = (host, rdt_port, http_port)
-        self._wire: FaultyWire[bytes] = FaultyWire(self.faults, seed)
-        self._pacer = Pacer()
+        self._wire: FaultyWire[bytes] = FaultyWire(self.faults, self.clock, seed)
+        self._pacer = Pacer(self.clock)
         self._client: tuple[str, int] | None = None
         self._left: int | None = None
         self._buffer = b""
@@ -232,24 +236,31 @@ class NetFtBox:
         self._wire.clear()
         self._pacer.stop()
         self._bias = np.zeros(6)
-        self._booted_s = time.monotonic()
+        self._booted_s = self.clock.now_s()
         if self.streaming_at_start:
             self._request(Command.REAL_TIME, 0, self.streaming_at_start)
 
     def _serve(self) -> None:
-        while True:
-            readable, _, _ = select.select([self._socket.fileno(), self._wake_read], [], [], self._tick())
-            if self._wake_read in readable:
-                if os.read(self._wake_read, 1) == _END:
-                    return
-                self._boot()
-            if self._socket.fileno() in readable:
-                with contextlib.suppress(OSError):  # a client that is gone is reported as a refused connection
-                    data, client = self._socket.recvfrom(256)
-                    if len(data) == REQUEST.size and self.rdt_enabled:
-                        header, command, count = REQUEST.unpack(data)
-                        if header == REQUEST_HEADER:
-                            self._request(command, count, client)
+        with self.clock.keeping_up():
+            while self._turn():
+                pass
+
+    def _turn(self) -> bool:
+        """Do what is due, then wait for a request and take it; False when the box has been unplugged."""
+        wait_s = time_out_s(self._tick(self.clock.follow() * 1e-9))
+        readable, _, _ = select.select([self._socket.fileno(), self._wake_read], [], [], wait_s)
+        if self._wake_read in readable:
+            if os.read(self._wake_read, 1) == _END:
+                return False
+            self._boot()
+        if self._socket.fileno() in readable:
+            with contextlib.suppress(OSError):  # a client that is gone is reported as a refused connection
+                data, client = self._socket.recvfrom(256)
+                if len(data) == REQUEST.size and self.rdt_enabled:
+                    header, command, count = REQUEST.unpack(data)
+                    if header == REQUEST_HEADER:
+                        self._request(command, count, client)
+        return True
 
     def _request(self, command: int, count: int, client: tuple[str, int]) -> None:
         match command:
@@ -259,7 +270,7 @@ class NetFtBox:
                 self._client = client
                 self._left = count or (1 if command == Command.ONE_SHOT else None)
                 self._buffered, self._buffer = command == Command.BUFFERED, b""
-                self._ft_start = int((time.monotonic() - self._booted_s) * INTERNAL_HZ)
+                self._ft_start = int((self.clock.now_s() - self._booted_s) * INTERNAL_HZ)
                 self._stream_hz = float(min(max(self.rate_hz, 1), INTERNAL_HZ))
                 self._pacer.start(self._stream_hz)
             case Command.RESET_LATCH if self.status & LATCH:
@@ -268,16 +279,14 @@ class NetFtBox:
             case Command.BIAS:
                 self._bias = self._counts(1)[0][0]
 
-    def _tick(self) -> float | None:
-        now_s = time.monotonic()
+    def _tick(self, now_s: float) -> float | None:
         count = self._pacer.due(now_s)
         if count:
             self._sample(count)
-        for datagram in self._wire.due(time.monotonic()):
+        for datagram in self._wire.due(self.clock.now_s()):
             with contextlib.suppress(OSError):  # no room, or nobody there: a datagram is lost
                 if self._client is not None:
                     self._socket.sendto(datagram, self._client)
-        now_s = time.monotonic()
         waits_s = (self._pacer.wait_s(now_s), self._wire.wait_s(now_s))
         return min((wait_s for wait_s in waits_s if wait_s is not None), default=None)
 

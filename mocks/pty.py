@@ -1,4 +1,4 @@
-"""A device behind a pseudo-terminal: one thread that sleeps until bytes arrive or the device has something to do.
+"""A device behind a pseudo-terminal: one thread that waits until bytes arrive or the device has something to do.
 
 Ref: pty(7), termios(3). The slave end stays open here, or the master would read EIO as soon as a client leaves.
 
@@ -19,6 +19,7 @@ from abc import ABC, abstractmethod
 from bisect import bisect_left
 from collections.abc import Callable
 
+from mocks.clock import CellClock, time_out_s
 from mocks.uart import marked
 
 _END, _RESET = b"!", b"r"
@@ -28,11 +29,17 @@ class PtyDevice(ABC):
     """Base of the emulated serial devices: opening, unplugging, reading, and writing that never blocks.
 
     A subclass says what happens at power-up, on received bytes, and when its time comes.
+
+    Parameters
+    ----------
+    clock
+        Of the cell; None makes one for this device alone.
     """
 
     has_parity = False  # of the line: whether wrong parity can be marked
 
-    def __init__(self) -> None:
+    def __init__(self, clock: CellClock | None) -> None:
+        self.clock = clock or CellClock()
         self._thread: threading.Thread | None = None
         self._master = self._wake_read = self._wake_write = -1
         self._unsent = b""
@@ -97,7 +104,7 @@ class PtyDevice(ABC):
         """Take what the client wrote, in whatever pieces it arrives."""
 
     @abstractmethod
-    def _tick(self) -> float | None:
+    def _tick(self, now_s: float) -> float | None:
         """Do what is due and return the seconds until the next call is needed, None for not before new bytes."""
 
     def _send(self, data: bytes, record_bytes: int) -> int:
@@ -163,18 +170,24 @@ class PtyDevice(ABC):
 
     def _serve(self, slave: int) -> None:
         try:
-            while True:
-                wait_s = self._tick()
-                unfinished = [self._master] if self._unsent or self._begun else []
-                readable, writable, _ = select.select([self._master, self._wake_read], unfinished, [], wait_s)
-                if self._wake_read in readable:
-                    if os.read(self._wake_read, 1) == _END:
-                        return
-                    self._restart()
-                if self._master in writable:
-                    self._finish_record()
-                if self._master in readable:
-                    self._received(os.read(self._master, 4096))
+            with self.clock.keeping_up():
+                while self._turn():
+                    pass
         finally:
             os.close(self._master)
             os.close(slave)
+
+    def _turn(self) -> bool:
+        """Do what is due, then wait for bytes and take them; False when the device has been unplugged."""
+        wait_s = time_out_s(self._tick(self.clock.follow() * 1e-9))
+        unfinished = [self._master] if self._unsent or self._begun else []
+        readable, writable, _ = select.select([self._master, self._wake_read], unfinished, [], wait_s)
+        if self._wake_read in readable:
+            if os.read(self._wake_read, 1) == _END:
+                return False
+            self._restart()
+        if self._master in writable:
+            self._finish_record()
+        if self._master in readable:
+            self._received(os.read(self._master, 4096))
+        return True

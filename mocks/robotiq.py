@@ -9,12 +9,12 @@ stream at 0x0200 and takes any other value without effect. The stream has neithe
 """
 
 import struct
-import time
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mocks import modbus
+from mocks.clock import CellClock
 from mocks.faults import Faults
 from mocks.stream import Measure, SerialSensor
 
@@ -52,6 +52,8 @@ class RobotiqBox(SerialSensor):
         Returns (n, 6) successive noisy readings in N and N·m, sensor axes; called for every sample that is made.
     seed, faults
         Of the wire.
+    clock
+        Of the cell.
     firmware
         Three letters, the first an F, then three numbers.
     serial
@@ -70,13 +72,14 @@ class RobotiqBox(SerialSensor):
         *,
         seed: int = 0,
         faults: Faults | None = None,
+        clock: CellClock | None = None,
         firmware: tuple[str, int, int, int] = ("FTS", 2, 0, 1),
         serial: tuple[str, int] = ("FTS", 1234),
         year: int = 2022,
         saturated_axis: int | None = None,
         streaming_at_start: bool = False,
     ) -> None:
-        super().__init__(seed=seed, faults=faults)
+        super().__init__(seed=seed, faults=faults, clock=clock)
         self.measure = measure
         self.firmware = firmware
         self.serial = serial
@@ -98,7 +101,7 @@ class RobotiqBox(SerialSensor):
             self._pacer.start(STREAM_HZ)
 
     def _received(self, data: bytes) -> None:
-        self._last_byte_s = time.monotonic()
+        self._last_byte_s = self.clock.now_s()
         for byte in data:
             if not self.streaming:
                 self._burst += bytes([byte])[: modbus.LONGEST_FRAME + 1 - len(self._burst)]

@@ -19,6 +19,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from mocks.clock import CellClock
 from mocks.faults import Faults
 from mocks.slcan import CanFrame
 from mocks.stream import CanSensor, Measure, Pacer, SerialSensor
@@ -117,6 +118,8 @@ class RobotousSensor:
     ----------
     measure
         Returns (n, 6) successive noisy readings in N and N·m, sensor axes; called for every sample that is made.
+    stream
+        What paces the samples.
     model
         Name, divisors and capacity.
     serial, firmware
@@ -134,6 +137,7 @@ class RobotousSensor:
     def __init__(
         self,
         measure: Measure,
+        stream: Pacer,
         *,
         model: Model,
         serial: str,
@@ -156,21 +160,20 @@ class RobotousSensor:
         self.overload_counts = [0] * 6
         self._overloaded = 0
         self._bias = np.zeros(6)
-        self._stream = Pacer()
+        self._stream = stream
 
     @property
     def rate_hz(self) -> float:
         """Samples a second of a stream."""
         return RATES_HZ[self.rate_code]
 
-    def boot(self, stream: Pacer) -> None:
+    def boot(self) -> None:
         """Set the state after power-up."""
-        self._stream = stream
         self.ids, self.baud_code = self.stored_ids, self.stored_baud_code
         self._bias = np.zeros(6)
-        stream.stop()
+        self._stream.stop()
         if self.streaming_at_start:
-            stream.start(self.rate_hz)
+            self._stream.start(self.rate_hz)
 
     def execute(self, command: bytes) -> list[bytes]:
         """Return the responses to a command field: one or none."""
@@ -261,6 +264,8 @@ class RobotousCanNode(RobotousSensor, CanSensor):
         As for `RobotousSensor`.
     seed, faults
         Of the wire.
+    clock
+        Of the cell.
     """
 
     unsupported = frozenset({Command.SET_BAUD})
@@ -271,6 +276,7 @@ class RobotousCanNode(RobotousSensor, CanSensor):
         *,
         seed: int = 0,
         faults: Faults | None = None,
+        clock: CellClock | None = None,
         model: Model | None = None,
         serial: str = "A60HA00123",
         firmware: str = "VER 1.7",
@@ -278,10 +284,11 @@ class RobotousCanNode(RobotousSensor, CanSensor):
         saturated_axis: int | None = None,
         streaming_at_start: bool = False,
     ) -> None:
-        CanSensor.__init__(self, seed=seed, faults=faults, bitrate=1_000_000)
+        CanSensor.__init__(self, seed=seed, faults=faults, clock=clock, bitrate=1_000_000)
         RobotousSensor.__init__(
             self,
             measure,
+            self._pacer,
             model=model or Model(),
             serial=serial,
             firmware=firmware,
@@ -291,7 +298,7 @@ class RobotousCanNode(RobotousSensor, CanSensor):
         )
 
     def _boot(self) -> None:
-        self.boot(self._pacer)
+        self.boot()
 
     def _answer(self, request: CanFrame) -> list[CanFrame]:
         if request != CanFrame(self.ids[0], request.data) or len(request.data) != COMMAND_BYTES:
@@ -323,6 +330,8 @@ class RobotousSerialBox(RobotousSensor, SerialSensor):
         In force at power-up, the index in `BAUD_RATES`; a pty does not notice a client at another rate.
     seed, faults
         Of the wire.
+    clock
+        Of the cell.
     """
 
     unsupported = frozenset({Command.SET_IDS})
@@ -333,6 +342,7 @@ class RobotousSerialBox(RobotousSensor, SerialSensor):
         *,
         seed: int = 0,
         faults: Faults | None = None,
+        clock: CellClock | None = None,
         model: Model | None = None,
         serial: str = "A60HA00123",
         firmware: str = "VER 1.7",
@@ -341,10 +351,11 @@ class RobotousSerialBox(RobotousSensor, SerialSensor):
         saturated_axis: int | None = None,
         streaming_at_start: bool = False,
     ) -> None:
-        SerialSensor.__init__(self, seed=seed, faults=faults)
+        SerialSensor.__init__(self, seed=seed, faults=faults, clock=clock)
         RobotousSensor.__init__(
             self,
             measure,
+            self._pacer,
             model=model or Model(),
             serial=serial,
             firmware=firmware,
@@ -364,7 +375,7 @@ class RobotousSerialBox(RobotousSensor, SerialSensor):
         self._line.clear()
         self._wire.clear()
         self._forget_unsent()
-        self.boot(self._pacer)
+        self.boot()
 
     def _received(self, data: bytes) -> None:
         self._line += data

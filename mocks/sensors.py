@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, Protocol
 
+from mocks.clock import CellClock
 from mocks.faults import Faults
 from mocks.stream import Measure
 
@@ -96,9 +97,11 @@ class Sensor:
         Readings (n, 6) in N and N·m.
     host
         Loopback address of the station.
+    clock
+        Of the cell.
     """
 
-    def __init__(self, name: str, measure: Measure, *, seed: int, host: str) -> None:
+    def __init__(self, name: str, measure: Measure, *, seed: int, host: str, clock: CellClock) -> None:
         self.name = name
         self._kind = KINDS.get(name)
         self._emulator: SensorEmulator | None = None
@@ -108,7 +111,7 @@ class Sensor:
         module, _, class_name = self._kind.emulator.partition(":")
         options = self._kind.options | ({"host": host} if name == "netft" else {})
         make: Callable[..., SensorEmulator] = getattr(import_module(module), class_name)
-        self._emulator = make(measure, seed=seed, **options)
+        self._emulator = make(measure, seed=seed, clock=clock, **options)
         self.endpoint = self._endpoint(self._kind, self._emulator.start())
 
     def _endpoint(self, kind: Kind, where: Any) -> dict[str, Any]:

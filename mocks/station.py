@@ -10,7 +10,6 @@ import os
 import selectors
 import signal
 import sys
-import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -18,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from mocks.clock import CellClock
 from mocks.kinematics import MODELS, Array, Vector6, rotation, vector3, vector6
 from mocks.sensors import WRIST, Sensor
 from mocks.ur.operator import Operator
@@ -91,14 +91,17 @@ class Station:
     ----------
     options
         Parsed command line, see `mocks.__main__`.
+    clock
+        Of the cell; None makes one.
     """
 
-    def __init__(self, options: Namespace) -> None:
+    def __init__(self, options: Namespace, clock: CellClock | None = None) -> None:
         self._options = options
+        self._clock = clock or CellClock()
         options.model = options.model or ("UR5" if options.polyscope[0] <= 3 else "UR5e")
         nominal = MODELS[options.model]
         dh = nominal.disturbed(options.seed, 1e-3 * options.dh_noise, 3e-4 * options.dh_noise)
-        self.world = World(truth_from(options), dh, start_posture(options), options.seed)
+        self.world = World(truth_from(options), dh, start_posture(options), options.seed, self._clock)
         self.robot = Robot(
             self.world,
             RobotSettings(
@@ -143,6 +146,7 @@ class Station:
             for sensor in self._sensors.values():
                 sensor.stop()
             self.server.close()
+            self._clock.close()
         return 0
 
     def _on_signal(self, _number: int, _frame: object) -> None:
@@ -161,12 +165,15 @@ class Station:
         if WRIST in wanted:
             self.robot.wrist_sensor = self.world.measure
         for name in wanted:
-            self._sensors[name] = Sensor(name, self.world.measure, seed=self._options.seed, host=self.server.host)
+            self._sensors[name] = Sensor(
+                name, self.world.measure, seed=self._options.seed, host=self.server.host, clock=self._clock
+            )
 
     def _hello(self) -> dict[str, Any]:
         sensors = {name: sensor.endpoint for name, sensor in self._sensors.items()}
         return {
             "format": FORMAT,
+            "clock": self._clock.path,
             "arm": {
                 "host": self.server.host,
                 "model": self._options.model,
@@ -228,8 +235,7 @@ class Station:
             "speed_scaling": arm.pace,
             "true_wrench": self.world.true_wrench().tolist(),
             "bad_inputs": self.server.bad_inputs,
-            "dropped_cycles": self.server.dropped_cycles,
-            "t_host_ns": time.monotonic_ns(),
+            "t_host_ns": self._clock.now_ns(),
             "events": [event.to_json() for event in robot.events[int(request.get("since", 0)) :]],
         }
 

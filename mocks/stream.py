@@ -4,7 +4,6 @@ Does not model: the time a frame takes on the wire, which is short beside the sa
 """
 
 import random
-import time
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Generic
@@ -12,23 +11,24 @@ from typing import Generic
 import numpy as np
 from numpy.typing import NDArray
 
+from mocks.clock import CellClock
 from mocks.faults import Faults, FaultyWire, Frame
 from mocks.pty import PtyDevice
 from mocks.slcan import CanFrame, SlcanAdapter
 
 Measure = Callable[[int], NDArray[np.float64]]
-MAX_BACKLOG_S = 0.2  # of stream: about what a terminal or a socket buffers anyway
 MIN_WAIT_S = 1e-3
 
 
 class Pacer:
     """The absolute schedule of a stream: the first sample at its start, then one per period.
 
-    `made` counts the samples of this stream, those of a backlog too long to be sent included.
+    `made` counts the samples of this stream.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, clock: CellClock) -> None:
         self.made = 0
+        self._clock = clock
         self._start_s = 0.0
         self._rate_hz: float | None = None
 
@@ -39,19 +39,18 @@ class Pacer:
 
     def start(self, rate_hz: float) -> None:
         """Begin a stream, or begin it anew."""
-        self._rate_hz, self._start_s, self.made = rate_hz, time.monotonic(), 0
+        self._rate_hz, self._start_s, self.made = rate_hz, self._clock.now_s(), 0
 
     def stop(self) -> None:
         """End the stream."""
         self._rate_hz = None
 
     def due(self, now_s: float) -> int:
-        """Return how many samples must be sent now; older ones are left out, as after a pause of the whole process."""
+        """Return how many samples must be sent now."""
         if self._rate_hz is None or now_s < self._start_s:
             return 0
-        total = int((now_s - self._start_s) * self._rate_hz) + 1
-        count = min(total - self.made, max(1, int(MAX_BACKLOG_S * self._rate_hz)))
-        self.made = total
+        count = int((now_s - self._start_s) * self._rate_hz) + 1 - self.made
+        self.made += count
         return count
 
     def wait_s(self, now_s: float) -> float | None:
@@ -67,12 +66,19 @@ class PtySensor(PtyDevice, Generic[Frame]):
     `dropped_frames` counts those the terminal had no room for, because the client does not read.
     """
 
-    def __init__(self, *, seed: int, faults: Faults | None, foreign: Callable[[random.Random], Frame] | None) -> None:
-        super().__init__()
+    def __init__(
+        self,
+        *,
+        seed: int,
+        faults: Faults | None,
+        clock: CellClock | None,
+        foreign: Callable[[random.Random], Frame] | None,
+    ) -> None:
+        super().__init__(clock)
         self.faults = Faults() if faults is None else faults
         self.dropped_frames = 0
-        self._pacer = Pacer()
-        self._wire: FaultyWire[Frame] = FaultyWire(self.faults, seed, foreign=foreign)
+        self._pacer = Pacer(self.clock)
+        self._wire: FaultyWire[Frame] = FaultyWire(self.faults, self.clock, seed, foreign=foreign)
 
     @property
     def streaming(self) -> bool:
@@ -91,17 +97,15 @@ class PtySensor(PtyDevice, Generic[Frame]):
         """Do what else is due and return the seconds until it is due again."""
         return None
 
-    def _tick(self) -> float | None:
-        now_s = time.monotonic()
+    def _tick(self, now_s: float) -> float | None:
         waits_s = [self._work(now_s)]
         count = self._pacer.due(now_s)
         if count:
             self._wire.put(self._samples(count))
-        frames = self._wire.due(time.monotonic())
+        frames = self._wire.due(self.clock.now_s())
         data = self._encode(frames)
         if data and self._send(data, len(data)):
             self.dropped_frames += len(frames)
-        now_s = time.monotonic()
         waits_s += [self._pacer.wait_s(now_s), self._wire.wait_s(now_s)]
         return min((wait_s for wait_s in waits_s if wait_s is not None), default=None)
 
@@ -109,8 +113,8 @@ class PtySensor(PtyDevice, Generic[Frame]):
 class SerialSensor(PtySensor[bytes]):
     """A sensor on a serial line."""
 
-    def __init__(self, *, seed: int, faults: Faults | None) -> None:
-        super().__init__(seed=seed, faults=faults, foreign=None)
+    def __init__(self, *, seed: int, faults: Faults | None, clock: CellClock | None) -> None:
+        super().__init__(seed=seed, faults=faults, clock=clock, foreign=None)
 
     def _encode(self, frames: list[bytes]) -> bytes:
         return b"".join(frames)
@@ -125,8 +129,8 @@ class CanSensor(PtySensor[CanFrame]):
         Of the sensor; a client at another one gets no answer.
     """
 
-    def __init__(self, *, seed: int, faults: Faults | None, bitrate: int) -> None:
-        super().__init__(seed=seed, faults=faults, foreign=self._foreign_frame)
+    def __init__(self, *, seed: int, faults: Faults | None, clock: CellClock | None, bitrate: int) -> None:
+        super().__init__(seed=seed, faults=faults, clock=clock, foreign=self._foreign_frame)
         self.bitrate = bitrate
         self._adapter = SlcanAdapter()
         self._answers = b""

@@ -7,13 +7,12 @@ points down reads ``+m g`` on z.
 
 import math
 import threading
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from mocks.clock import CellClock
 from mocks.disturbances import Contact, Drift
 from mocks.kinematics import Array, Dh, Vector6, cross, forward, rotation
 
@@ -120,13 +119,12 @@ class World:
         Joint angles (rad) to start with.
     seed
         Seed of the noise.
-    clock_ns
-        Time for drift and pushes: real time, whatever the speed of the arm.
+    clock
+        Of the cell, for drift and pushes, whatever the speed of the arm; None makes one.
     """
 
-    def __init__(
-        self, truth: Truth, dh: Dh, q: Vector6, seed: int = 0, clock_ns: Callable[[], int] = time.monotonic_ns
-    ) -> None:
+    def __init__(self, truth: Truth, dh: Dh, q: Vector6, seed: int = 0, clock: CellClock | None = None) -> None:
+        self.clock = clock or CellClock()
         self.truth = truth
         self.dh = dh
         self.q = q
@@ -135,7 +133,6 @@ class World:
         """What touches the tool, by any name."""
         self.drifts: tuple[Drift, ...] = ()
         """How the zero moves besides the drift of the truth."""
-        self._clock_ns = clock_ns
         self._t0_s = self.now_s
         self._lock = threading.Lock()
         self._noise = np.random.default_rng([seed, 2])
@@ -146,7 +143,7 @@ class World:
     @property
     def now_s(self) -> float:
         """The clock of pushes and drift."""
-        return self._clock_ns() * 1e-9
+        return self.clock.now_s()
 
     def true_wrench(self) -> Array:
         """Wrench on the sensor without noise, (6,): N and N·m, sensor axes, bias and drift included."""

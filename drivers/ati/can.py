@@ -9,7 +9,6 @@ report saturation, and falls back to calibration slot 0 after every reset: all t
 
 import contextlib
 import logging
-import time
 from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
@@ -28,6 +27,7 @@ from drivers.ati.calibration import (
     unit_names,
 )
 from drivers.ati.codec import Op
+from drivers.clock import REAL, Clock
 from drivers.errors import UNUSABLE, ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import Array, DeviceInfo, FtSamples
 
@@ -40,8 +40,8 @@ _TRANSACTION_S = 0.1
 _ATTEMPTS = 3
 _POLL_S = 0.05
 """A poll takes 1 to 3 ms, more on a busy computer; a lost frame must not make the stream stale."""
-_GRACE_S = 0.002
-"""A last look after the deadline: on a busy host it is often this process that was late, not the answer."""
+_LATE_FRAMES = 32
+"""So many are looked at after the deadline: on a busy host it is often this process that is late, not the answer."""
 _QUIET_S = 0.01
 _STRAGGLER_S = 0.004
 """How long a reading in the wrong order waits for a frame that would contradict it."""
@@ -86,10 +86,11 @@ class AtiCanSensor(StreamingSensor):
         unit_codes: tuple[int, int] | None = None,
         counts_per_unit: tuple[int, int] | None = None,
         sign: int = 1,
+        clock: Clock = REAL,
     ) -> None:
-        super().__init__(f"ATI CAN sensor 0x{base:02X} on {interface} {channel}", sign=sign)
+        super().__init__(f"ATI CAN sensor 0x{base:02X} on {interface} {channel}", sign=sign, clock=clock)
         replies = {base << 4 | opcode for reply in codec.REPLIES.values() for opcode in reply}
-        self._bus = CanBus(self.name, channel, interface, bitrate, replies)
+        self._bus = CanBus(self.name, channel, interface, bitrate, replies, clock)
         self._base = base
         self._slot = slot
         self._unit_codes = unit_codes
@@ -99,7 +100,7 @@ class AtiCanSensor(StreamingSensor):
         self._next_poll_s = 0.0
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``ati-can://can0?bitrate=250000&base=0x20&slot=0&interface=socketcan``.
 
         Old firmware wants ``units=lbf,lbf-in`` and, if the certificate says so, ``counts=1000000,1000000``.
@@ -114,6 +115,7 @@ class AtiCanSensor(StreamingSensor):
             unit_codes=parse_units(units) if units else None,
             counts_per_unit=parse_counts(counts) if counts else None,
             sign=sign,
+            clock=clock,
         )
 
     def _connect(self) -> DeviceInfo:
@@ -139,7 +141,7 @@ class AtiCanSensor(StreamingSensor):
 
     def _read_block(self) -> FtSamples:
         if not self._asked:
-            time.sleep(max(0.0, self._next_poll_s - time.monotonic()))
+            self._clock.sleep(self._next_poll_s - self._clock.now_s())
             self._poll()
         self._asked = False
         try:
@@ -153,9 +155,9 @@ class AtiCanSensor(StreamingSensor):
             return NOTHING
         finally:
             self._malformed = self._bus.malformed
-        t_host_ns, seq = time.monotonic_ns(), self._polls
+        t_host_ns, seq = self._clock.now_ns(), self._polls
         self._missed = 0
-        if time.monotonic() >= self._next_poll_s:
+        if t_host_ns >= self._next_poll_s * 1e9:
             self._poll()  # the sensor works on the next reading while we work on this one
         reading = codec.decode_gauges(first, second)
         self._judge(reading)
@@ -170,7 +172,7 @@ class AtiCanSensor(StreamingSensor):
         )
 
     def _poll(self) -> None:
-        self._next_poll_s = max(self._next_poll_s + _PERIOD_S, time.monotonic())
+        self._next_poll_s = max(self._next_poll_s + _PERIOD_S, self._clock.now_s())
         self._polls += 1
         self._request(Op.GAUGES, b"")
         self._asked = True
@@ -268,13 +270,15 @@ class AtiCanSensor(StreamingSensor):
         parts: dict[int, bytes] = {}
         # only the reply to SELECT_SLOT looks like its request: on a bus that echoes, the first one is ours
         skip_echo = self._echoes and op is Op.SELECT_SLOT
-        deadline = time.monotonic() + timeout_s
+        deadline_s = self._clock.now_s() + timeout_s
+        late = 0
         while len(parts) < len(expected) or list(parts) != sorted(parts):
             whole = len(parts) == len(expected)
-            left_s = deadline - time.monotonic()
+            left_s = max(0.0, deadline_s - self._clock.now_s())
+            late += not left_s
             frame = None
-            if left_s > -timeout_s:
-                frame = self._bus.receive(_STRAGGLER_S if whole else max(left_s, _GRACE_S))
+            if late <= _LATE_FRAMES:
+                frame = self._bus.receive(_STRAGGLER_S if whole else left_s)
             if frame is None and whole:
                 break
             if frame is None:
@@ -293,9 +297,9 @@ class AtiCanSensor(StreamingSensor):
 
     def _await_quiet(self) -> None:
         """Throw away what arrives until nothing comes any more; at most for a transaction."""
-        deadline = time.monotonic() + _TRANSACTION_S
-        while self._bus.receive(_QUIET_S) and time.monotonic() < deadline:
-            pass
+        for _ in self._clock.looks(_TRANSACTION_S):
+            if self._bus.receive(_QUIET_S) is None:
+                return
 
 
 def _scale_text(counts: tuple[int, int], unit_codes: tuple[int, int]) -> str:

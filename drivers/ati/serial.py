@@ -8,7 +8,6 @@ outlives the program that started it. Gauge gains and offsets are volatile and a
 """
 
 import logging
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Self
 
@@ -20,6 +19,7 @@ from drivers._status import describe_status
 from drivers._stream import StreamingSensor, scale_facts
 from drivers.ati import modbus
 from drivers.ati.calibration import Calibration, refuse_saturated, units
+from drivers.clock import REAL, Clock
 from drivers.errors import UNUSABLE, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 _BAUD = 1_250_000
 _READ_S = 0.02
-"""The port's only time-out, also the silence after which a stopped stream is believed to have stopped."""
+"""What one read waits, and the silence after which a stopped stream is believed to have stopped."""
 _REPLY_S = 0.1
 _SILENCE_S = 0.2
 _BATCH_BYTES = 32 * modbus.RECORD_SIZE
@@ -58,10 +58,10 @@ class AtiSerialSensor(StreamingSensor):
         -1 for a sensor mounted or wired to report the reaction.
     """
 
-    def __init__(self, port: str, *, calibration: int = 1, sign: int = 1) -> None:
-        super().__init__(f"ATI serial sensor on {port}", sign=sign)
+    def __init__(self, port: str, *, calibration: int = 1, sign: int = 1, clock: Clock = REAL) -> None:
+        super().__init__(f"ATI serial sensor on {port}", sign=sign, clock=clock)
         self._calibration_index = calibration
-        self._port = SerialPort(self.name, port, _BAUD, even_parity=True, read_s=_READ_S)
+        self._port = SerialPort(self.name, port, _BAUD, even_parity=True, read_s=_READ_S, clock=clock)
         self._buffer = bytearray()
         self._damaged: list[int] = []
         """Places in the buffer of bytes that were received with wrong parity."""
@@ -71,9 +71,9 @@ class AtiSerialSensor(StreamingSensor):
         """While a restarted stream has not delivered: when the old one last did."""
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``ati-serial:///dev/serial/by-id/…?calibration=1``."""
-        return cls(address, calibration=options.integer("calibration", 1, 1, 16), sign=sign)
+        return cls(address, calibration=options.integer("calibration", 1, 1, 16), sign=sign, clock=clock)
 
     def _connect(self) -> DeviceInfo:
         self._seq = self._restarts = self._status = 0
@@ -115,7 +115,7 @@ class AtiSerialSensor(StreamingSensor):
         if self._slipped:
             self._restart()
         data, damaged = self._port.read_marked(_BATCH_BYTES)
-        t_host_ns = time.monotonic_ns()
+        t_host_ns = self._clock.now_ns()
         self._damaged += [len(self._buffer) + place for place in damaged]
         self._buffer += data
         whole = len(self._buffer) // modbus.RECORD_SIZE * modbus.RECORD_SIZE
@@ -220,14 +220,12 @@ class AtiSerialSensor(StreamingSensor):
     def _jam(self) -> None:
         """Stop whatever is streaming and wait until the line is silent."""
         self._port.write(modbus.JAM, discard=True)
-        deadline = time.monotonic() + _SILENCE_S
-        while self._port.read(_BATCH_BYTES) and time.monotonic() < deadline:
-            pass
+        self._port.drain(_READ_S, _SILENCE_S)
 
     def _ask(self, request: bytes, before_again: Callable[[], object] | None = None) -> bytes:
         """Exchange with retries; unless told otherwise, a late reply passes between them."""
         again = before_again or (lambda: self._port.read(_BATCH_BYTES))
-        return ask(self._port, self.name, request, modbus.check_reply, _REPLY_S, again)
+        return ask(self._port, self.name, request, modbus.check_reply, self._clock, _REPLY_S, again)
 
     def _judge_status(self, status: int) -> None:
         """Raise on what makes the data unusable, log the rest of a status word once."""

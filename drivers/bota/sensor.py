@@ -8,7 +8,6 @@ closing leaves the stream running. The text a sensor prints when it boots is not
 """
 
 import logging
-import time
 from itertools import pairwise
 from statistics import median
 from typing import TYPE_CHECKING, Self
@@ -19,6 +18,7 @@ from drivers._serial import SerialPort
 from drivers._status import describe_status
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.bota import codec
+from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
 
@@ -54,15 +54,15 @@ class BotaSensor(StreamingSensor):
         -1 for a sensor mounted or wired to report the reaction.
     """
 
-    def __init__(self, port: str, *, sinc: int | None = None, sign: int = 1) -> None:
-        super().__init__(f"Bota sensor on {port}", sign=sign)
-        self._port = SerialPort(self.name, port, _BAUD)
+    def __init__(self, port: str, *, sinc: int | None = None, sign: int = 1, clock: Clock = REAL) -> None:
+        super().__init__(f"Bota sensor on {port}", sign=sign, clock=clock)
+        self._port = SerialPort(self.name, port, _BAUD, clock=clock)
         self._sinc = sinc
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``bota:///dev/serial/by-id/…?sinc=512``."""
-        return cls(address, sinc=options.integer("sinc", 0, 0, 512) or None, sign=sign)
+        return cls(address, sinc=options.integer("sinc", 0, 0, 512) or None, sign=sign, clock=clock)
 
     def _connect(self) -> DeviceInfo:
         self._port.open()
@@ -87,7 +87,7 @@ class BotaSensor(StreamingSensor):
 
     def _read_block(self) -> FtSamples:
         received = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))
-        t_host_ns = time.monotonic_ns()
+        t_host_ns = self._clock.now_ns()
         self._malformed = self._frames.damaged
         if not received:
             return NOTHING
@@ -122,8 +122,7 @@ class BotaSensor(StreamingSensor):
         for _ in range(_ATTEMPTS):
             self._port.write(command)
             answer = b""  # until it listens the sensor streams: its answer comes somewhere behind the frames
-            deadline = time.monotonic() + _REPLY_S
-            while time.monotonic() < deadline:
+            for _ in self._clock.looks(_REPLY_S):
                 answer = answer[-len(codec.success(command)) :] + self._port.read_all(1)
                 if codec.success(command) in answer:
                     return
@@ -134,16 +133,15 @@ class BotaSensor(StreamingSensor):
 
     def _first_frames(self) -> list[codec.Frame]:
         frames: list[codec.Frame] = []
-        deadline = time.monotonic() + _FIRST_FRAMES_S
-        while len(frames) < _FIRST_FRAMES:
-            if time.monotonic() > deadline:
-                raise ConnectError(
-                    f"{self.name}: {len(frames)} intact frames within {_FIRST_FRAMES_S} s",
-                    "check supply and wiring; a sensor that was left in set-up, in text mode or at another rate is "
-                    "put right by ?sinc=512",
-                )
+        for _ in self._clock.looks(_FIRST_FRAMES_S):
             frames += [codec.decode_frame(frame) for _, frame in self._frames.feed(self._port.read_all(1))]
-        return frames
+            if len(frames) >= _FIRST_FRAMES:
+                return frames
+        raise ConnectError(
+            f"{self.name}: {len(frames)} intact frames within {_FIRST_FRAMES_S} s",
+            "check supply and wiring; a sensor that was left in set-up, in text mode or at another rate is put right "
+            "by ?sinc=512",
+        )
 
     def _elapse(self, t_us: int) -> tuple[int, int]:
         """Follow the sensor's clock over its wraps; returns (time in µs, sequence number)."""

@@ -7,7 +7,6 @@ Modbus RTU for set-up, then a bare stream at 100 Hz which only 50 bytes of 0xFF 
 sensor has booted. The sensor has no zero command: what others call zeroing is done on the host.
 """
 
-import time
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from drivers._modbus import ask
 from drivers._serial import SerialPort
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
+from drivers.clock import REAL, Clock
 from drivers.errors import DeviceFault
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 from drivers.robotiq import codec
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 _BAUD = 19_200
 _REPLY_S = 0.2
-_STOP_S = 1.0
+_SILENCE_S, _STOP_S = 0.05, 1.0
+"""How long nothing may come before a stopped stream is believed to have stopped, and how long to wait for that."""
 _LATENT_RATE_Hz = (55.0, 70.0)
 """Around 62.5 Hz, one answer in each 16 ms of an FTDI adapter's latency timer."""
 
@@ -44,14 +45,14 @@ class RobotiqFt300(StreamingSensor):
         -1 for a sensor mounted or wired to report the reaction.
     """
 
-    def __init__(self, port: str, *, sign: int = 1) -> None:
-        super().__init__(f"Robotiq FT 300 on {port}", sign=sign)
-        self._port = SerialPort(self.name, port, _BAUD)
+    def __init__(self, port: str, *, sign: int = 1, clock: Clock = REAL) -> None:
+        super().__init__(f"Robotiq FT 300 on {port}", sign=sign, clock=clock)
+        self._port = SerialPort(self.name, port, _BAUD, clock=clock)
 
     @classmethod
-    def from_url(cls, address: str, _options: "Options", *, sign: int = 1) -> Self:
+    def from_url(cls, address: str, _options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``robotiq-ft300:///dev/serial/by-id/…``."""
-        return cls(address, sign=sign)
+        return cls(address, sign=sign, clock=clock)
 
     def _connect(self) -> DeviceInfo:
         self._port.open()
@@ -73,7 +74,7 @@ class RobotiqFt300(StreamingSensor):
 
     def _read_block(self) -> FtSamples:
         frames = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))
-        t_host_ns = time.monotonic_ns()
+        t_host_ns = self._clock.now_ns()
         self._lost = self._malformed = self._frames.damaged
         if not frames:
             return NOTHING
@@ -101,13 +102,11 @@ class RobotiqFt300(StreamingSensor):
     def _stop_stream(self) -> None:
         """End a stream and wait for silence."""
         self._port.write(codec.STOP)
-        deadline = time.monotonic() + _STOP_S
-        while self._port.read(64) and time.monotonic() < deadline:
-            pass
+        self._port.drain(_SILENCE_S, _STOP_S)
 
     def _ask(self, request: bytes) -> tuple[int, ...]:
         """Exchange with retries, each after another stop: a stream may run that we did not start."""
-        return ask(self._port, self.name, request, codec.check_reply, _REPLY_S, self._stop_stream)
+        return ask(self._port, self.name, request, codec.check_reply, self._clock, _REPLY_S, self._stop_stream)
 
     def _why_rate(self, rate_Hz: float) -> str:
         if not _LATENT_RATE_Hz[0] < rate_Hz < _LATENT_RATE_Hz[1]:

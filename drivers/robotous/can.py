@@ -3,10 +3,10 @@
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7: 1 Mbit/s, 11-bit identifiers.
 """
 
-import time
 from typing import TYPE_CHECKING, Self
 
 from drivers._can import CanBus
+from drivers.clock import REAL, Clock
 from drivers.robotous import codec
 from drivers.robotous.codec import Command, Field
 from drivers.robotous.halves import Halves
@@ -30,10 +30,11 @@ class CanLink:
     The second half of a field says nothing about the first; `Halves` says which belong together.
     """
 
-    def __init__(self, channel: str, *, interface: str = "socketcan") -> None:
+    def __init__(self, channel: str, *, interface: str = "socketcan", clock: Clock = REAL) -> None:
         self.name = f"Robotous sensor on {interface} {channel}"
         self.fastest_Hz = 1000
-        self._bus = CanBus(self.name, channel, interface, BITRATE, (FIRST_HALF, SECOND_HALF))
+        self.clock = clock
+        self._bus = CanBus(self.name, channel, interface, BITRATE, (FIRST_HALF, SECOND_HALF), clock)
         self._halves = Halves()
         self._heard_ns: int | None = None
 
@@ -45,7 +46,7 @@ class CanLink:
     @property
     def unpaired(self) -> bool:
         """Whether halves come: where no fields do, they are not believed, as on a computer that is too busy."""
-        return self._heard_ns is not None and time.monotonic_ns() - self._heard_ns < _HEARD_S * 1e9
+        return self._heard_ns is not None and self.clock.now_ns() - self._heard_ns < _HEARD_S * 1e9
 
     def open(self) -> None:
         """Join the bus."""
@@ -63,24 +64,23 @@ class CanLink:
 
     def receive(self) -> list[Field]:
         """Take the next fields, or none after 0.05 s."""
-        deadline = time.monotonic() + _WAIT_S
         overslept = False
-        while True:
-            begin_s = time.monotonic()
-            left_s = max(0.0, deadline - begin_s)
+        for left_s in self.clock.looks(_WAIT_S):
+            begin_s = self.clock.now_s()
             wait_s = left_s if self._halves.quiet else 0.0 if overslept else self._halves.silence_s
             fields: list[Field] = []
-            if frame := self._bus.receive(wait_s):
+            if frame := self._bus.look(wait_s):
                 identifier, data = frame
-                self._heard_ns = time.monotonic_ns()
+                self._heard_ns = self.clock.now_ns()
                 self._halves.take(self._heard_ns, data, second=identifier == SECOND_HALF)
                 overslept = False
-            elif overslept or time.monotonic() - begin_s < wait_s + _OVERSLEPT_S:
+            elif overslept or self.clock.now_s() - begin_s < wait_s + _OVERSLEPT_S:
                 fields = self._halves.silence()
             else:
                 overslept = True
-            if fields or not left_s:
+            if fields:
                 return fields
+        return []
 
     def close(self) -> None:
         """Leave the bus."""
@@ -91,7 +91,7 @@ class RobotousCan(RobotousSensor):
     """A Robotous RFT on a CAN bus."""
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``robotous-can://can0?interface=socketcan&rate=500``."""
-        link = CanLink(address, interface=options.text("interface", "socketcan"))
+        link = CanLink(address, interface=options.text("interface", "socketcan"), clock=clock)
         return cls(link, rate_Hz=options.integer("rate", 0, 0, 1000) or None, sign=sign)

@@ -7,12 +7,12 @@ While it streams the sensor hears only stop and bias, so an answer to any other 
 has a bias command; this driver never sends it.
 """
 
-import time
 from typing import Protocol
 
 import numpy as np
 
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
+from drivers.clock import Clock
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.interfaces import DeviceInfo, FtSamples
 from drivers.robotous import codec
@@ -29,6 +29,8 @@ class Link(Protocol):
     """The device as the user knows it."""
     fastest_Hz: int
     """The highest output rate it carries."""
+    clock: Clock
+    """What the sensor's limits are measured by."""
 
     @property
     def damaged(self) -> int:
@@ -73,7 +75,7 @@ class RobotousSensor(StreamingSensor):
     """
 
     def __init__(self, link: Link, *, rate_Hz: int | None = None, sign: int = 1) -> None:
-        super().__init__(link.name, sign=sign)
+        super().__init__(link.name, sign=sign, clock=link.clock)
         if rate_Hz is not None and rate_Hz not in codec.RATE_CODES:
             raise ValueError(f"rate is {rate_Hz} Hz; the sensor knows {', '.join(map(str, codec.RATE_CODES))}")
         if rate_Hz is not None and rate_Hz > link.fastest_Hz:
@@ -140,8 +142,7 @@ class RobotousSensor(StreamingSensor):
         for _ in range(_ATTEMPTS):
             self._link.send(codec.encode(Command.STOP))
             self._link.send(codec.encode(command, *parameters))
-            deadline = time.monotonic() + _REPLY_S
-            while time.monotonic() < deadline:
+            for _ in self._clock.looks(_REPLY_S):
                 for field in self._link.receive():
                     if field.data[0] == command:
                         return field.data

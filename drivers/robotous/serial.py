@@ -3,10 +3,10 @@
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7: 8N1, 115200 baud from the factory.
 """
 
-import time
 from typing import TYPE_CHECKING, Self
 
 from drivers._serial import SerialPort
+from drivers.clock import REAL, Clock
 from drivers.robotous import codec
 from drivers.robotous.codec import Command, Field
 from drivers.robotous.sensor import RobotousSensor
@@ -20,13 +20,14 @@ BAUDS = (57_600, 115_200, 230_400, 460_800, 921_600)
 class SerialLink:
     """The wire of a Robotous sensor on a serial port."""
 
-    def __init__(self, path: str, *, baud: int = 115_200) -> None:
+    def __init__(self, path: str, *, baud: int = 115_200, clock: Clock = REAL) -> None:
         if baud not in BAUDS:
             raise ValueError(f"baud is {baud}; the sensor knows {', '.join(map(str, BAUDS))}")
         self.name = f"Robotous sensor on {path}"
+        self.clock = clock
         # 1 kHz needs 921600 baud (manual); below, a frame of 19 bytes takes 190 bits
         self.fastest_Hz = 1000 if baud == 921_600 else min(500, baud // 190)
-        self._port = SerialPort(self.name, path, baud)
+        self._port = SerialPort(self.name, path, baud, clock=clock)
         self._frames = codec.deframer()
 
     @property
@@ -55,7 +56,7 @@ class SerialLink:
     def receive(self) -> list[Field]:
         """Take the fields that have come, waiting up to 0.05 s for the first."""
         frames = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))
-        t_host_ns = time.monotonic_ns()
+        t_host_ns = self.clock.now_ns()
         return [Field(number, t_host_ns, frame[1:-2]) for number, frame in frames]
 
     def close(self) -> None:
@@ -67,7 +68,7 @@ class RobotousSerial(RobotousSensor):
     """A Robotous RFT on a serial port."""
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``robotous-serial:///dev/serial/by-id/…?baud=921600&rate=1000``."""
-        link = SerialLink(address, baud=options.integer("baud", 115_200, BAUDS[0], BAUDS[-1]))
+        link = SerialLink(address, baud=options.integer("baud", 115_200, BAUDS[0], BAUDS[-1]), clock=clock)
         return cls(link, rate_Hz=options.integer("rate", 0, 0, 1000) or None, sign=sign)

@@ -11,42 +11,29 @@ Checked on hardware: no.
 import logging
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from math import radians
 from typing import Final
 
+from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, Guard, RobotArm
 from drivers.ur.control import ControlProcess
-from drivers.ur.control_child import DECELERATION_RAD_S2, UNWATCHED_S
+from drivers.ur.control_child import DECELERATION_RAD_S2
+from drivers.ur.dashboard import Dashboard, T, ask_dashboard
 from drivers.ur.kinematics import MODELS, model_named
-from drivers.ur.library import FREQUENCY_HZ, Dashboard, ask_dashboard
-from drivers.ur.reading import CONNECT_S, PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Look, Reader
+from drivers.ur.reading import FREQUENCY_HZ, Reader
 from drivers.ur.rtde import CONTROL_REGISTERS, find_script_port, registers_in_use
+from drivers.ur.sample import PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Sample
+from drivers.ur.timing import STRICT, UrTiming
 
 log = logging.getLogger(__name__)
 
-_PROGRESS_S: Final = 0.4
-"""A read of memory in the control process, done in 0.03 ms; the guard is not called meanwhile."""
-_OURS_EVERY_S: Final = 0.1
-_OURS_S: Final = 0.4
-"""A question to our program on the controller, which answers within two control cycles."""
-_OURS_AGAIN_S: Final = 1.0
-"""The same when the arm is opened again, where nothing hurries."""
-_STOP_S: Final = 0.4
-_STOP_SILENT_S: Final = 0.15
-_REACH_S: Final = 1.5
-"""The dashboard server stops the arm in 0.02 s. How long a caller waits for that, at most; the same when nothing has
-been heard of the controller for 0.2 s; and how long the attempt to connect goes on, one retransmission of TCP."""
-_RELEASE_S: Final = 1.0
-"""A control process whose parent was killed needs half of that to stop the arm, end its program and let go."""
 _ARRIVED_RAD: Final = 1e-3
 _STANDING_RAD_S: Final = 1e-6
 """Of the set-point, which is exactly zero at rest."""
 _STILL_RAD_S: Final = 0.002
-_STILL_S: Final = 0.3
 _SIMULATORS: Final = ("localhost", "127.0.0.1", "192.168.56.101")
 """Addresses at which ur_rtde itself does not ask for remote control, because URSim runs there."""
 
@@ -63,6 +50,10 @@ class UrArm(RobotArm):
     speed_rad_s, acceleration_rad_s2
         Of the leading joint in `move_to`, where it is not told others. The speed slider of the pendant scales them
         down further.
+    clock
+        Measures and waits; that of an emulated cell belongs to the cell.
+    timing
+        Every limit of time.
     """
 
     def __init__(
@@ -72,6 +63,8 @@ class UrArm(RobotArm):
         model: str | None = None,
         speed_rad_s: float = radians(30),
         acceleration_rad_s2: float = radians(40),
+        clock: Clock = REAL,
+        timing: UrTiming = STRICT,
     ) -> None:
         _check_speed(speed_rad_s, acceleration_rad_s2)
         if model is not None and model_named(model, 0) is None:
@@ -80,6 +73,8 @@ class UrArm(RobotArm):
         self._model = None if model is None else model_named(model, 0)
         self._speed_rad_s = float(speed_rad_s)
         self._acceleration_rad_s2 = float(acceleration_rad_s2)
+        self._clock = clock
+        self._timing = timing
         self._moves_at_rad_s = self._speed_rad_s
         self._reader: Reader | None = None
         self._control: ControlProcess | None = None
@@ -124,17 +119,17 @@ class UrArm(RobotArm):
         if not control or self._control is None:
             return
         plays = self._control.alive and not look.program_fault()
-        if plays and (look.safety_fault() or self._is_ours(self._control, timeout_s=_OURS_AGAIN_S)):
+        if plays and (look.safety_fault() or self._is_ours(self._control, timeout_s=self._timing.ours_again_s)):
             return
         self._control.kill()
         self._control = None
 
     def _connect(self, control: bool) -> None:
         if self._reader is None:
-            self._reader = Reader(self._host, self._model)
+            self._reader = Reader(self._host, self._model, clock=self._clock, timing=self._timing)
         if control and self._control is None:
             self._open_control(self._reader)
-        if self._reader.look().robot_mode == ROBOT_RUNNING and (self._reader.tells_tcp or self._control is not None):
+        if self._reader.look().robot_mode == ROBOT_RUNNING and (self._reader.reports_tcp or self._control is not None):
             self.state()  # is it the right model?
 
     def _open_control(self, reader: Reader) -> None:
@@ -162,13 +157,13 @@ class UrArm(RobotArm):
                 dashboard.stop()
 
         look_out()
-        find_script_port(self._host, timeout_s=CONNECT_S)
+        find_script_port(self._host, timeout_s=self._timing.connect_s)
         self._claim_nothing_of_others()
         self._stop_wanted.clear()  # an attempt that is still on its way would stop the new program
-        ask_dashboard(self._host, prepare, timeout_s=CONNECT_S)
+        self._ask_dashboard(prepare)
         self._end_nothing_of_others(reader)
         self._left_behind = self._starting = True
-        self._control = ControlProcess(self._host, FREQUENCY_HZ)
+        self._control = ControlProcess(self._host, FREQUENCY_HZ, clock=self._clock, timing=self._timing)
         try:
             self._control.wait_until_ready(look_out)
             self._starting = False
@@ -178,24 +173,24 @@ class UrArm(RobotArm):
 
     def _claim_nothing_of_others(self) -> None:
         """Raise `ConnectError` when somebody else has the registers, before anything of theirs is stopped."""
-        deadline = time.monotonic() + _RELEASE_S
-        while taken := registers_in_use(self._host, CONTROL_REGISTERS, timeout_s=CONNECT_S):
-            if time.monotonic() > deadline:
+        deadline_s = self._clock.now_s() + self._timing.release_s
+        connect_s = self._timing.connect_s
+        while taken := registers_in_use(self._host, CONTROL_REGISTERS, timeout_s=connect_s, clock=self._clock):
+            if self._clock.now_s() > deadline_s:
                 raise _taken(self._host, f"{taken[0]} and {len(taken) - 1} more")
-            time.sleep(0.05)
+            self._clock.sleep(0.05)
 
     def _end_nothing_of_others(self, reader: Reader) -> None:
         """Raise `ConnectError` when a program stays on the controller: ur_rtde would end it, or wait 300 s for it."""
-        deadline = time.monotonic() + _RELEASE_S
+        deadline_s = self._clock.now_s() + self._timing.release_s
         while reader.look().program_state != PROGRAM_STOPPED:
-            if time.monotonic() > deadline:
+            if self._clock.now_s() > deadline_s:
                 told = self.program_told()
                 raise ConnectError(
                     f"a program that this one has not started is on {self._host}{f' ({told})' if told else ''} and is "
                     "not ended",
                     "stop it at the pendant, then start again",
                 )
-            time.sleep(0.02)
 
     def close(self) -> None:
         """Let the arm go, stopping it and its control script first. Idempotent; within 1.5 s even when all is lost."""
@@ -205,17 +200,17 @@ class UrArm(RobotArm):
         if control is not None:
             self._end_program(control, reader)
         if self._left_behind:
-            self._stop_program(timeout_s=_STOP_S)
+            self._stop_program(timeout_s=self._timing.stop_s)
         if reader is not None:
             reader.close()
 
     def _end_program(self, control: ControlProcess, reader: Reader | None) -> None:
         """End our program in its own way, if it can be confirmed that this works."""
         try:
-            look = None if reader is None else reader.look(limit_s=0.1)
+            look = None if reader is None else reader.look(limit_s=self._timing.glance_s)
             if look and control.alive and look.program_state == PROGRAM_PLAYING and not look.safety_fault():
-                if self._is_ours(control, timeout_s=0.3):
-                    self._left_behind = not control.quit(timeout_s=0.7)
+                if self._is_ours(control, timeout_s=self._timing.ours_closing_s):
+                    self._left_behind = not control.quit(timeout_s=self._timing.quit_s)
                 elif not self._left_behind:
                     log.warning("%s runs a program of somebody else: it is left alone", self._host)
         except DriverError as error:
@@ -235,7 +230,7 @@ class UrArm(RobotArm):
         `ConnectError` when the controller is too old to tell its TCP and the arm was opened without control.
         """
         reader = self._reading()
-        if not reader.tells_tcp and self._control is None:
+        if not reader.reports_tcp and self._control is None:
             raise ConnectError(
                 f"the controller {self._host} is too old to tell its active TCP, without which its poses say nothing "
                 "about the flange",
@@ -255,7 +250,7 @@ class UrArm(RobotArm):
         """
         if self._reading().version[:2] < (5, 6) or self._host in _SIMULATORS:
             return None
-        return ask_dashboard(self._host, lambda dashboard: dashboard.isInRemoteControl(), timeout_s=CONNECT_S)
+        return self._ask_dashboard(lambda dashboard: dashboard.isInRemoteControl())
 
     def program_told(self) -> str | None:
         """Ask the dashboard server for the program's state and name; None where it does not answer.
@@ -263,11 +258,14 @@ class UrArm(RobotArm):
         A program that a client has sent may come under the name of one that is loaded: not tried on hardware.
         """
         try:
-            told = ask_dashboard(self._host, lambda dashboard: dashboard.programState(), timeout_s=CONNECT_S)
+            told = self._ask_dashboard(lambda dashboard: dashboard.programState())
         except DriverError as error:
             log.info("%s does not tell its program: %s", self._host, error)
             return None
         return told.strip() or None
+
+    def _ask_dashboard(self, ask: Callable[[Dashboard], T]) -> T:
+        return ask_dashboard(self._host, ask, timeout_s=self._timing.connect_s, clock=self._clock)
 
     # ------------------------------------------------------------------ moving
 
@@ -297,7 +295,7 @@ class UrArm(RobotArm):
     ) -> None:
         """Move all joints to `q_rad` (6,) and return when they have arrived; see `RobotArm` for the speed.
 
-        `guard` is called about 60 times a second. Whatever ends the wait early stops the arm first and is raised after:
+        `guard` is called about 100 times a second. Whatever ends the wait early stops the arm first and is raised then:
         `DeviceFault` (protective, emergency or safeguard stop, program ended, not arrived), `StreamBroken`,
         `DeviceTimeout` (silent controller, or `timeout_s` is over), an exception of the guard, KeyboardInterrupt.
         A stop of the safety system is never reset; what is left of the move is taken from the controller, so that
@@ -316,32 +314,42 @@ class UrArm(RobotArm):
         guard()
         self._moves_at_rad_s = speed
         with self._stopping_on_error():
-            if not control.call("move", q, speed, acceleration, look_out=self._look_out):
-                raise self._fault() or DeviceFault(f"the controller did not accept the move to {_degrees(q)}")
-            checked = time.monotonic()
-            for look in self._watch(timeout_s, guard, f"the move to {_degrees(q)} has not ended"):
-                if self._stop_requested.is_set():
-                    raise DeviceFault("the arm was told to stop before it had arrived")
-                ended, unwatched = control.call("progress", timeout_s=_PROGRESS_S, look_out=self._look_out)
-                if unwatched:
-                    raise DeviceTimeout(
-                        f"nothing was heard from this program for {UNWATCHED_S} s of a move, so the arm was stopped",
-                        "keep the computer awake and give it less to do, then move on",
-                    )
-                if not ended:
-                    if time.monotonic() - checked > _OURS_EVERY_S:
+            with self._reporting_stop():
+                if not control.call("move", q, speed, acceleration, look_out=self._look_out):
+                    raise self._fault() or DeviceFault(f"the controller did not accept the move to {_degrees(q)}")
+            checked_s = self._clock.now_s()
+            for look in self._watch(
+                timeout_s, guard, f"the move to {_degrees(q)} has not ended", self._look_out_moving
+            ):
+                with self._reporting_stop():
+                    if self._has_ended(control):
+                        self._check_arrival(look, q)
+                        self._goal = q
+                        return
+                    if self._clock.now_s() - checked_s > self._timing.ours_every_s:
                         self._check_ours(control)
-                        checked = time.monotonic()
-                    continue
-                # The end may be told by one connection a cycle before the set-points come by the other.
-                end = look if _near(look.target_q_rad, q) else self._reading().look()
-                if not _near(end.target_q_rad, q):
-                    raise self._fault() or DeviceFault(
-                        f"the move ended at {_degrees(end.target_q_rad)} instead of {_degrees(q)}",
-                        "see the pendant for what ended it",
-                    )
-                self._goal = q
-                return
+                        checked_s = self._clock.now_s()
+
+    def _has_ended(self, control: ControlProcess) -> bool:
+        if self._stop_requested.is_set():
+            raise _stopped()
+        ended, unwatched = control.call("progress", timeout_s=self._timing.progress_s, look_out=self._look_out)
+        if unwatched:
+            raise DeviceTimeout(
+                f"nothing was heard from this program for {self._timing.unwatched_s} s of a move, so the arm was "
+                "stopped",
+                "keep the computer awake and give it less to do, then move on",
+            )
+        return bool(ended)
+
+    def _check_arrival(self, look: Sample, q: list[float]) -> None:
+        # The end may be told by one connection a cycle before the set-points come by the other.
+        end = look if _near(look.target_q_rad, q) else self._reading().look()
+        if not _near(end.target_q_rad, q):
+            raise self._fault() or DeviceFault(
+                f"the move ended at {_degrees(end.target_q_rad)} instead of {_degrees(q)}",
+                "see the pendant for what ended it",
+            )
 
     def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
         """Return when the joints have been at rest long enough for the structure to stop ringing.
@@ -353,7 +361,7 @@ class UrArm(RobotArm):
         """
         still_since_s: float | None = None
         with self._stopping_on_error():
-            for look in self._watch(timeout_s, guard, "the arm has not come to rest"):
+            for look in self._watch(timeout_s, guard, "the arm has not come to rest", self._look_out):
                 still = (
                     max(map(abs, look.target_qd_rad_s)) <= _STANDING_RAD_S
                     and max(map(abs, look.qd_rad_s)) < _STILL_RAD_S
@@ -363,7 +371,7 @@ class UrArm(RobotArm):
                     still_since_s = None
                 elif still_since_s is None:
                     still_since_s = look.t_device_s
-                elif look.t_device_s - still_since_s >= _STILL_S:
+                elif look.t_device_s - still_since_s >= self._timing.still_s:
                     return
 
     def stop(self) -> None:
@@ -372,20 +380,30 @@ class UrArm(RobotArm):
             self._stop_requested.set()
             self._halt()
 
-    def _watch(self, timeout_s: float, guard: Guard, what: str) -> Iterator[Look]:
+    def _watch(self, timeout_s: float, guard: Guard, what: str, look_out: Callable[[], Sample]) -> Iterator[Sample]:
         """Yield each new look, raising whatever is wrong with the arm, until the time is over."""
-        deadline = time.monotonic() + timeout_s
+        deadline_s = self._clock.now_s() + timeout_s
         while True:
-            look = self._look_out()
+            look = look_out()
             guard()
             yield look
-            if time.monotonic() > deadline:
+            if self._clock.now_s() > deadline_s:
                 raise DeviceTimeout(
                     f"{what} within {timeout_s:.1f} s; set-points are at {_degrees(look.target_q_rad)}",
                     "check the speed slider, and whether something else moves the arm",
                 )
 
-    def _look_out(self) -> Look:
+    @contextmanager
+    def _reporting_stop(self) -> Iterator[None]:
+        """What fails after `stop` was called in another thread failed because of it."""
+        try:
+            yield
+        except DriverError as error:
+            if self._stop_requested.is_set():
+                raise _stopped() from error
+            raise
+
+    def _look_out(self) -> Sample:
         """Look, and raise whatever is wrong with the arm, its program or the connections."""
         look = self._reading().look()
         if self._control is not None:
@@ -394,13 +412,17 @@ class UrArm(RobotArm):
             self._in_control()
         return look
 
-    def _fault(self, look: Look | None = None) -> DeviceFault | None:
+    def _look_out_moving(self) -> Sample:
+        with self._reporting_stop():
+            return self._look_out()
+
+    def _fault(self, look: Sample | None = None) -> DeviceFault | None:
         """Say why the arm does not move, if the controller knows a reason."""
         reader = self._reading()
         look = look or reader.look()
-        deadline = time.monotonic() + 0.05
-        while not look.safety_fault() and look.program_fault() and time.monotonic() < deadline:
-            look = reader.look()  # the program may end some cycles before its reason is told
+        deadline_s = self._clock.now_s() + self._timing.reason_s
+        while not look.safety_fault() and look.program_fault() and self._clock.now_s() < deadline_s:
+            look = reader.look()
         fault = look.safety_fault() or look.program_fault()
         if fault is None:
             return None
@@ -426,19 +448,20 @@ class UrArm(RobotArm):
             if not stopped:
                 control.kill()  # on a lost link ur_rtde would start the program again and again
                 silent = self._reader is not None and self._reader.silent
-                self._stop_program(timeout_s=_STOP_SILENT_S if silent else _STOP_S)
+                self._stop_program(timeout_s=self._timing.stop_silent_s if silent else self._timing.stop_s)
 
     def _stop_softly(self, control: ControlProcess) -> bool:
         try:
             if self._reading().silent:
                 return False
-            look = self._reading().look(limit_s=0.1)
+            glance_s = self._timing.glance_s
+            look = self._reading().look(limit_s=glance_s)
             if not control.alive or look.safety_fault() or look.program_fault():
                 return False
-            limit_s = 0.5 + self._moves_at_rad_s / DECELERATION_RAD_S2
+            limit_s = self._timing.braking_s + self._moves_at_rad_s / DECELERATION_RAD_S2
             control.call("stop", timeout_s=limit_s, look_out=self._look_out)
             for _ in range(10):  # ur_rtde does not say whether it was done
-                if max(map(abs, self._reading().look(limit_s=0.1).target_qd_rad_s)) <= _STANDING_RAD_S:
+                if max(map(abs, self._reading().look(limit_s=glance_s).target_qd_rad_s)) <= _STANDING_RAD_S:
                     return True
         except DriverError as error:
             log.info("%s: cannot be stopped softly: %s", self._host, error)
@@ -453,14 +476,14 @@ class UrArm(RobotArm):
 
         self._stop_wanted.set()
         try:
-            ask_dashboard(self._host, stop, timeout_s=timeout_s, connect_s=_REACH_S)
+            ask_dashboard(self._host, stop, timeout_s=timeout_s, connect_s=self._timing.reach_s, clock=self._clock)
             self._left_behind = self._starting
         except DriverError as error:
             log.warning("%s could not be told to stop, press the emergency stop if it moves: %s", self._host, error)
 
     def _check_ours(self, control: ControlProcess) -> None:
         """Raise `DeviceFault` when the program that runs is not ours: its registers would say nothing."""
-        if not self._is_ours(control, timeout_s=_OURS_S, look_out=self._look_out):
+        if not self._is_ours(control, timeout_s=self._timing.ours_s, look_out=self._look_out):
             raise self._fault() or DeviceFault(
                 f"the control program on {self._host} does not answer: another program may have been started, or "
                 "controller or computer are too busy",
@@ -495,6 +518,10 @@ class UrArm(RobotArm):
         if reader is None:
             raise ConnectError(f"the arm at {self._host} is not open", "open it first")
         return reader
+
+
+def _stopped() -> DeviceFault:
+    return DeviceFault("the arm was told to stop before it had arrived")
 
 
 def _check_speed(speed_rad_s: float, acceleration_rad_s2: float) -> None:

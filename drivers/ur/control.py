@@ -9,32 +9,31 @@ import logging
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from contextlib import suppress
-from queue import Empty, SimpleQueue
-from typing import IO, Any, Final, cast
+from typing import IO, Any, cast
 
+from drivers.clock import Clock
 from drivers.errors import DeviceTimeout, DriverError, StreamBroken
 from drivers.ur import control_child
+from drivers.ur.timing import Patience, UrTiming
 
 log = logging.getLogger(__name__)
-
-_STARTING_S: Final = 4.5
-_CALL_S: Final = 2.0
-"""An answer takes 10 ms, or a hundred times that on a busy computer; motion is watched meanwhile by other means."""
 
 
 class ControlProcess:
     """A disposable process with ur_rtde's control interface in it. Any thread may call."""
 
-    def __init__(self, host: str, frequency_Hz: float) -> None:
+    def __init__(self, host: str, frequency_Hz: float, *, clock: Clock, timing: UrTiming) -> None:
         """Start the process; `wait_until_ready` before the first call."""
         self._host = host
+        self._clock = clock
+        self._timing = timing
+        limits = (timing.child_starting_s, timing.child_leaving_s, timing.unwatched_s)
         # By path and not by forking or importing, so that nothing of the application runs again; in a session of its
         # own, so that Ctrl-C or a closed terminal cannot end it before it has stopped the arm.
         self._process = subprocess.Popen(
-            [sys.executable, "-P", control_child.__file__, host, str(frequency_Hz)],
+            [sys.executable, "-P", control_child.__file__, host, *map(str, (frequency_Hz, *limits))],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -43,10 +42,12 @@ class ControlProcess:
             start_new_session=True,
         )
         self._requests = cast(IO[str], self._process.stdin)
-        self._replies: SimpleQueue[dict[str, Any] | None] = SimpleQueue()
+        self._changed = threading.Condition()
+        self._replies: dict[int, dict[str, Any]] = {}
         self._lock = threading.RLock()  # re-entrant: a signal handler may stop the arm in the middle of a call
         self._last_id = 0
-        self._gone = threading.Event()
+        self._ended = False  # its last reply has been read
+        self._killed = False
         self._readers = [
             threading.Thread(target=read, args=(pipe,), name=f"ur-control-{read.__name__}", daemon=True)
             for read, pipe in ((self._read_replies, self._process.stdout), (self._read_talk, self._process.stderr))
@@ -62,35 +63,40 @@ class ControlProcess:
     @property
     def alive(self) -> bool:
         """Whether it can still be called."""
-        return not self._gone.is_set()
+        return not (self._ended or self._killed)
 
     def wait_until_ready(self, look_out: Callable[[], object]) -> None:
         """Return when the control script runs on the controller. Raises what `call` and `look_out` raise.
 
         `look_out` is called about 20 times a second.
         """
-        self._answer(0, _STARTING_S, look_out)
+        self._answer(0, self._timing.starting_s, look_out)
 
     def call(
         self,
         name: str,
         *args: object,
-        timeout_s: float = _CALL_S,
+        timeout_s: float | None = None,
         look_out: Callable[[], object] = lambda: None,
     ) -> Any:
-        """Call one of `control_child.Calls`.
+        """Call one of `control_child.Calls`, within `call_s` of the timing where no time-out is given.
 
         Raises `StreamBroken` when the process is gone or says that the call failed, `DeviceTimeout` after killing
         one that hangs, and what `look_out` raises, which is called about 20 times a second until the answer comes.
         """
-        with self._lock:
+        while not self._lock.acquire(timeout=0.02):
+            self._clock.now_ns()  # an emulated cell may wait for this thread
+        try:
             self._last_id += 1
+            request = self._last_id
             try:
-                self._requests.write(json.dumps({"id": self._last_id, "call": name, "args": args}) + "\n")
+                self._requests.write(json.dumps({"id": request, "call": name, "args": args}) + "\n")
                 self._requests.flush()
             except (OSError, ValueError):  # ValueError: closed by `kill`
                 raise self._loss() from None
-            return self._answer(self._last_id, timeout_s, look_out)
+            return self._answer(request, self._timing.call_s if timeout_s is None else timeout_s, look_out)
+        finally:
+            self._lock.release()
 
     def quit(self, *, timeout_s: float) -> bool:
         """Stop the arm, end its script and the process; whether all that was confirmed in time."""
@@ -105,7 +111,7 @@ class ControlProcess:
 
     def kill(self) -> None:
         """End the process at once, whatever it does. The arm goes on with what it was told: stop it another way."""
-        self._gone.set()
+        self._killed = True
         self._process.kill()
         self._process.wait()
         for reader in self._readers:
@@ -116,31 +122,28 @@ class ControlProcess:
                     pipe.close()
 
     def _answer(self, to: int, timeout_s: float, look_out: Callable[[], object]) -> Any:
-        left_s = timeout_s
+        patience = Patience(self._clock, timeout_s)
         while True:
-            t0 = time.monotonic()
-            try:
-                reply = self._replies.get(timeout=max(min(left_s, 0.05), 0.0))
-            except Empty:
-                # A process that was itself suspended has not been waiting: that time does not count in full.
-                left_s -= min(time.monotonic() - t0, 0.1)
-                if left_s > 0:
-                    look_out()
-                    continue
+            with self._changed:
+                if to not in self._replies and not self._ended and not patience.is_over:
+                    patience.wait(self._changed)
+                reply = self._replies.pop(to, None)
+                ended = self._ended
+            if reply is not None:
+                if "error" in reply:
+                    # of the start, `UrArm` knows the cure
+                    cure = "check the robot and the cable, then open the arm again" if to else ""
+                    raise StreamBroken(f"ur_rtde says: {reply['error']}", cure)
+                return reply["value"]
+            if ended:
+                raise self._loss()
+            if patience.is_over:
                 self.kill()
                 raise DeviceTimeout(
                     f"ur_rtde did not answer within {timeout_s:.1f} s and its process was ended",
                     "check the robot and the network, then open the arm again",
-                ) from None
-            if reply is None:
-                self._replies.put(None)  # for whoever asks next
-                raise self._loss()
-            if reply["id"] != to:
-                continue  # the answer to a call that was interrupted
-            if "error" in reply:
-                cure = "check the robot and the cable, then open the arm again" if to else ""  # at the start: `UrArm`
-                raise StreamBroken(f"ur_rtde says: {reply['error']}", cure)
-            return reply["value"]
+                )
+            look_out()
 
     def _loss(self) -> StreamBroken:
         with suppress(subprocess.TimeoutExpired):
@@ -153,11 +156,16 @@ class ControlProcess:
     def _read_replies(self, pipe: IO[str]) -> None:
         for line in pipe:
             try:
-                self._replies.put(json.loads(line))
+                reply = json.loads(line)
             except ValueError:  # something at the interpreter's start-up may print
                 log.info("not a reply: %s", line.rstrip())
-        self._gone.set()
-        self._replies.put(None)
+                continue
+            with self._changed:
+                self._replies[reply["id"]] = reply
+                self._changed.notify_all()
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
 
     def _read_talk(self, pipe: IO[str]) -> None:
         for line in pipe:

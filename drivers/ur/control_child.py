@@ -2,7 +2,10 @@
 
 Requests and replies are lines of JSON on stdin and stdout. When stdin ends, for whatever reason, the arm is stopped,
 the control script is ended and the process exits; SIGALRM ends it when ur_rtde hangs, whatever locks it holds. When the
-parent lives but asks nothing for half a second of a move (it is suspended, or hangs), the arm is stopped.
+parent lives but asks nothing for too long of a move (it is suspended, or hangs), the arm is stopped.
+
+Arguments: host, frequency in Hz, and three limits in seconds of `UrTiming`: `child_starting_s`, `child_leaving_s` and
+`unwatched_s`.
 
 Ref: ur_rtde 1.6.5, API reference of `RTDEControlInterface`.
 Checked on hardware: no.
@@ -20,9 +23,6 @@ from importlib import import_module
 from queue import Empty, SimpleQueue
 from typing import Final, Protocol, cast
 
-STARTING_S: Final = 9  # uploading the script and seeing it run takes 0.1 s, and ur_rtde gives up after 5 s
-LEAVING_S: Final = 3
-UNWATCHED_S: Final = 0.5
 DECELERATION_RAD_S2: Final = 4.0  # UR's own external-control program stops with this
 
 
@@ -77,7 +77,7 @@ class Calls:
         return ended, self._unwatched
 
     def stop_unwatched(self) -> None:
-        """Stop a move that nobody has asked about for `UNWATCHED_S`."""
+        """Stop a move that nobody has asked about for too long."""
         time.sleep(0.02)  # when this process was suspended as well, ur_rtde has to catch up
         ended, _ = self.progress()
         if not ended:
@@ -113,7 +113,8 @@ class Calls:
 
 def main() -> None:
     """Serve until stdin ends."""
-    host, frequency_Hz = sys.argv[1], float(sys.argv[2])
+    host = sys.argv[1]
+    frequency_Hz, starting_s, leaving_s, unwatched_s = map(float, sys.argv[2:])
     replies = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what the C++ library prints must not reach the replies
 
@@ -122,7 +123,7 @@ def main() -> None:
             replies.write(json.dumps(content) + "\n")
             replies.flush()
 
-    signal.alarm(STARTING_S)
+    signal.setitimer(signal.ITIMER_REAL, starting_s)
     try:
         interface = import_module("rtde_control").RTDEControlInterface
         # rt_priority: the library's default would put this thread under real-time scheduling, where it spins.
@@ -132,36 +133,41 @@ def main() -> None:
     except Exception as error:
         reply(id=0, error=str(error))
         os._exit(1)
-    signal.alarm(0)
+    signal.setitimer(signal.ITIMER_REAL, 0)
     calls = Calls(control)
     reply(id=0, value=None)
 
     requests: SimpleQueue[str | None] = SimpleQueue()
-    threading.Thread(target=_listen, args=(requests,), daemon=True).start()
+    threading.Thread(target=_listen, args=(requests, leaving_s), daemon=True).start()
+    serve(calls, requests, reply, unwatched_s)
+    with suppress(Exception):
+        calls.quit()
+    os._exit(0)  # the library's own way out takes half a second and may crash
+
+
+def serve(calls: Calls, requests: "SimpleQueue[str | None]", reply: Callable[..., None], unwatched_s: float) -> None:
+    """Answer requests until None comes."""
     while True:
         try:
-            line = requests.get(timeout=UNWATCHED_S if calls.moving else None)
+            line = requests.get(timeout=unwatched_s if calls.moving else None)
         except Empty:
             with suppress(Exception):  # then the parent will stop it in its own way, once it is back
                 calls.stop_unwatched()
             continue
         if line is None:
-            break
+            return
         request = json.loads(line)
         call = cast(Callable[..., object], getattr(calls, request["call"]))
         try:
             reply(id=request["id"], value=call(*request["args"]))
         except Exception as error:  # whatever the library raises: the parent decides
             reply(id=request["id"], error=str(error))
-    with suppress(Exception):
-        calls.quit()
-    os._exit(0)  # the library's own way out takes half a second and may crash
 
 
-def _listen(requests: "SimpleQueue[str | None]") -> None:
+def _listen(requests: "SimpleQueue[str | None]", leaving_s: float) -> None:
     for line in sys.stdin:
         requests.put(line)
-    signal.alarm(LEAVING_S)
+    signal.setitimer(signal.ITIMER_REAL, leaving_s)
     requests.put(None)
 
 

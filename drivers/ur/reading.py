@@ -1,121 +1,47 @@
-"""Looking at a Universal Robots arm: fresh, consistent samples and a flange pose that no TCP setting can spoil.
+"""Looking at a Universal Robots arm: samples that are new, and a flange pose that no TCP setting can spoil.
 
-ur_rtde repeats the last values for ever once a link is lost, and goes through old ones after this process has been
-suspended. So a sample is believed only if it is as new as one that a reader of our own has waited for. The TCP offset
-is read with the controller's time stamp before and after each pose and taken off again, and the flange pose that
-results is compared with the nominal forward kinematics.
+One RTDE subscription carries everything. After a suspension of this process the socket holds seconds of old samples,
+whose time stamps advance like new ones: a sample is believed only if the reader had to wait for it. The TCP offset of
+the same sample is taken off its pose, and the flange pose is compared with the nominal forward kinematics.
 
-Ref: ur_rtde 1.6.5, API reference of `RTDEReceiveInterface`; Universal Robots, "Real-Time Data Exchange (RTDE) Guide"
-(modes, states and safety status bits).
 Checked on hardware: no.
 """
 
+import copy
 import logging
 import math
-import time
+import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from math import radians
 from typing import Final
 
 import numpy as np
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ModelUnknown, StreamBroken
+from drivers.clock import Clock
+from drivers.errors import (
+    ConnectError,
+    DeviceFault,
+    DeviceTimeout,
+    DriverError,
+    ModelUnknown,
+    StreamBroken,
+)
 from drivers.interfaces import NOT_REPORTED, ArmState, ArmStatus, DeviceInfo
+from drivers.ur.dashboard import Dashboard, ask_dashboard
 from drivers.ur.kinematics import MODELS, Pose, forward, model_named
-from drivers.ur.library import Dashboard, Receive, ask_dashboard, connect_receive, require, retire
-from drivers.ur.live import LiveReader
+from drivers.ur.rtde import Subscription
+from drivers.ur.sample import OPTIONAL, OUTPUTS, Sample
+from drivers.ur.timing import Patience, UrTiming
 
 log = logging.getLogger(__name__)
 
-CONNECT_S: Final = 2.0
-STALE_S: Final = 0.2
-_STATUS_S: Final = 0.05
-_YOUNGER: Final = {"tcp_offset", "payload", "payload_cog"}
-"""What some controllers that ur_rtde can read from do not tell yet."""
+FREQUENCY_HZ: Final = 125.0
+"""The full rate of the CB3 generation; e-Series arms send every fourth cycle."""
+_WAITED_S: Final = (0.002, 0.1)
+"""The reader waits 8 ms for a sample that has just been taken. What has piled up comes without waiting."""
+_READ_S: Final = 0.02
 _MODEL_POSITION_M: Final = 0.005
 _MODEL_ANGLE_RAD: Final = radians(0.5)
-
-PROGRAM_STOPPED: Final = 1
-PROGRAM_PLAYING: Final = 2
-ROBOT_IDLE: Final = 5
-ROBOT_RUNNING: Final = 7
-_MEASURING: Final = (ROBOT_IDLE, 6, ROBOT_RUNNING)
-_ROBOT_MODES: Final = {
-    -1: "no controller",
-    0: "disconnected",
-    1: "safety not confirmed",
-    2: "booting",
-    3: "power off",
-    4: "power on",
-    5: "idle",
-    6: "backdrive",
-    7: "running",
-    8: "updating firmware",
-}
-_PROGRAM_STATES: Final = {0: "stopping", 1: "stopped", 2: "playing", 3: "pausing", 4: "paused", 5: "resuming"}
-_SAFETY_MODES: Final = {
-    1: "normal",
-    2: "reduced",
-    3: "protective stop",
-    4: "recovery",
-    5: "safeguard stop",
-    6: "system emergency stop",
-    7: "robot emergency stop",
-    8: "violation",
-    9: "fault",
-    10: "joint identification",
-    11: "undefined",
-}
-_SAFETY: Final = (  # the first that applies says most
-    (0b0_1110_0000, "emergency stop", "make the cell safe, release the button, power the arm on at the pendant"),
-    (0b0_0000_0100, "protective stop", "find and remove its cause, then clear it at the pendant"),
-    (0b0_0001_0000, "safeguard stop", "close the safeguard and reset it"),
-    (0b0_0000_1000, "recovery mode", "move the arm back inside its limits at the pendant"),
-    (0b11_0000_0000, "safety violation or fault", "read the pendant's log and restart the arm"),
-    (0b100_0000_0000, "stop for a safety reason", "read the pendant's log"),
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Look:
-    """One sample of the controller."""
-
-    t_host_ns: int
-    t_device_s: float
-    q_rad: list[float]
-    qd_rad_s: list[float]
-    target_q_rad: list[float]
-    target_qd_rad_s: list[float]
-    tcp_pose: list[float]
-    robot_mode: int
-    safety_bits: int
-    program_state: int
-
-    def safety_fault(self) -> DeviceFault | None:
-        """Say why the arm may not move, as far as the arm itself is concerned."""
-        return _safety_fault(self.safety_bits, self.robot_mode)
-
-    def program_fault(self) -> DeviceFault | None:
-        """Say why our program on the controller does not move the arm."""
-        if self.program_state == PROGRAM_PLAYING:
-            return None
-        state = _PROGRAM_STATES.get(self.program_state, "unknown")
-        return DeviceFault(
-            f"the control program was ended or paused by somebody else (state {self.program_state}, {state})",
-            "leave the arm to this program",
-        )
-
-
-def _safety_fault(safety_bits: int, robot_mode: int) -> DeviceFault | None:
-    for bits, meaning, cure in _SAFETY:
-        if safety_bits & bits:
-            return DeviceFault(f"{meaning} (safety status bits 0x{safety_bits:x})", cure)
-    if robot_mode != ROBOT_RUNNING:
-        mode = _ROBOT_MODES.get(robot_mode, "unknown")
-        cure = "release its brakes" if robot_mode == ROBOT_IDLE else "power the arm on and release its brakes"
-        return DeviceFault(f"robot mode {robot_mode} ({mode})", f"{cure} at the pendant")
-    return None
 
 
 class Reader:
@@ -124,31 +50,100 @@ class Reader:
     Raises `ConnectError` when the arm cannot be reached, or is not the `model` (a key of `MODELS`) it should be.
     """
 
-    def __init__(self, host: str, model: str | None) -> None:
+    def __init__(self, host: str, model: str | None, *, clock: Clock, timing: UrTiming) -> None:
         self._host = host
-        self._live = LiveReader(host)
-        self._receive: Receive | None = None
-        require()
+        self._clock = clock
+        self._timing = timing
+        self._changed = threading.Condition()
+        self._live: Sample | None = None
+        self._read_s = self._live_s = clock.awake_s()
+        self._t_device_s = math.nan
+        self._failure: DriverError | None = None
+        self.silent = False
+        """Whether nothing has come since `DeviceTimeout` was raised."""
+        self._stream = Subscription(host, OUTPUTS, FREQUENCY_HZ, timeout_s=timing.connect_s, clock=clock)
+        self.version = self._stream.version
+        """Of the controller: major, minor, bugfix, build."""
+        missing = set(self._stream.missing)
+        self._names = [name for name in OUTPUTS if name not in missing]
+        self.reports_tcp = "tcp_offset" in self._names
+        """Whether the controller reports its TCP offset without being controlled; old ones do not."""
+        self._thread = threading.Thread(target=self._run, name="ur-reader", daemon=True)
+        self._thread.start()
         try:
-            self._live.open(timeout_s=CONNECT_S)
-            self.version = self._live.version
-            """Of the controller: major, minor, bugfix, build."""
-            self.info = self._identify(model)
-            self._receive = connect_receive(host)
+            self.info = self._identify(model, missing - OPTIONAL)
         except BaseException:
             self.close()
             raise
 
-    def _identify(self, model: str | None) -> DeviceInfo:
+    def close(self) -> None:
+        """Close the connection. Idempotent."""
+        self._stream.close()
+        self._thread.join(timeout=1.0)
+
+    def look(self, *, limit_s: float | None = None) -> Sample:
+        """Wait for a sample taken after this call.
+
+        Raises `StreamBroken` when the connection is lost and `DeviceTimeout` when the controller is silent for
+        `limit_s` (`stale_s` of the timing where not given).
+        """
+        before = self._live
+        return self._wait(lambda: self._live is not before, self._timing.stale_s if limit_s is None else limit_s)
+
+    def status(self) -> ArmStatus:
+        """Return the controller's modes and settings, of one sample at most `status_s` old. Raises as `look`."""
+        oldest_s = self._clock.awake_s() - self._timing.status_s
+        return self._wait(lambda: self._live_s >= oldest_s, self._timing.stale_s).status()
+
+    def state(self, ask_tcp: Callable[[], Sequence[float]]) -> ArmState:
+        """Read a state; `ask_tcp` asks for the TCP offset (6,) if samples lack it. Errors as `UrArm.state`."""
+        sample, tcp_offset = self._look_with_tcp(ask_tcp)
+        if not sample.measures and (fault := sample.safety_fault()):
+            raise DeviceFault(f"{self._host} does not measure its joints: {fault.found}", fault.cure)
+        flange = sample.flange(tcp_offset)
+        self._check_model(sample, flange)
+        return ArmState(
+            t_host_ns=sample.t_host_ns,
+            t_device_s=sample.t_device_s,
+            q_rad=np.array(sample.q_rad),
+            qd_rad_s=np.array(sample.qd_rad_s),
+            R_base_flange=flange.R,
+            p_base_flange_m=flange.p_m,
+        )
+
+    def _look_with_tcp(self, ask_tcp: Callable[[], Sequence[float]]) -> tuple[Sample, Sequence[float]]:
+        for _ in range(5):
+            before = None if self.reports_tcp else tuple(ask_tcp())
+            sample = self.look()
+            if sample.tcp_offset is not None:
+                return sample, sample.tcp_offset
+            if before is not None and before == tuple(ask_tcp()):  # so it was active when the sample was taken
+                return sample, before
+        raise DeviceFault(f"the TCP of {self._host} changes all the time", "find out what sets it")
+
+    def _check_model(self, sample: Sample, flange: Pose) -> None:
+        nominal = forward(MODELS[self.info.model], sample.q_rad)
+        distance_m = float(np.linalg.norm(flange.p_m - nominal.p_m))
+        angle_rad = flange.angle_to_rad(nominal)
+        if distance_m > _MODEL_POSITION_M or angle_rad > _MODEL_ANGLE_RAD:
+            raise DeviceFault(
+                f"the flange is {1e3 * distance_m:.1f} mm and {math.degrees(angle_rad):.2f} degrees from where a "
+                f"{self.info.model} has it with these joint angles: the arm at {self._host} is another model, or its "
+                "TCP was changed this moment",
+                "check both and read again",
+            )
+
+    def _identify(self, model: str | None, lacking: set[str]) -> DeviceInfo:
         major = self.version[0]
         if major > 5:
             raise ConnectError(
                 f"{self._host} runs PolyScope X (version {major}), which has no dashboard server to stop the arm with",
                 "PolyScope 5 or the CB3 generation is needed",
             )
-
-        if lacking := sorted(self._live.missing - _YOUNGER):
-            raise ConnectError(f"{self._host} does not tell {', '.join(lacking)} over RTDE", "update its PolyScope")
+        if lacking:
+            raise ConnectError(
+                f"{self._host} does not tell {', '.join(sorted(lacking))} over RTDE", "update its PolyScope"
+            )
 
         def ask(dashboard: Dashboard) -> tuple[str, str, str]:
             told = dashboard.getRobotModel().strip()
@@ -159,7 +154,7 @@ class Reader:
                 serial = NOT_REPORTED
             return told, serial, dashboard.polyscopeVersion().strip()
 
-        told, serial, polyscope = ask_dashboard(self._host, ask, timeout_s=CONNECT_S)
+        told, serial, polyscope = ask_dashboard(self._host, ask, timeout_s=self._timing.connect_s, clock=self._clock)
         says = model_named(told, major)
         if model is None and says is None:
             raise ModelUnknown(
@@ -171,126 +166,55 @@ class Reader:
             raise ConnectError(f"{self._host} is a {says}, not a {model}", "check the address and the model")
         return DeviceInfo(model=model or says or told, serial=serial, firmware=polyscope)
 
-    @property
-    def tells_tcp(self) -> bool:
-        """Whether the controller tells its TCP offset without being controlled; old ones do not."""
-        return self._live.tells_tcp
+    # ------------------------------------------------------------------ following the stream
 
-    @property
-    def silent(self) -> bool:
-        """Whether nothing has come since `look` or another call said that the controller's clock stands still."""
-        return self._live.silent
+    def _wait(self, is_new: Callable[[], bool], limit_s: float) -> Sample:
+        """Return the newest live sample as soon as it `is_new`."""
+        patience = Patience(self._clock, limit_s)
+        with self._changed:
+            while True:
+                if self._failure:
+                    raise copy.copy(self._failure) from self._failure
+                if self._live is not None and is_new():
+                    return self._live
+                if patience.is_over:
+                    self.silent = True
+                    at = "" if math.isnan(self._t_device_s) else f" at {self._t_device_s:.3f} s"
+                    raise DeviceTimeout(
+                        f"the clock of {self._host} has stood still{at} for {limit_s:.2f} s",
+                        "check the robot and the network, and press the emergency stop if the arm moves",
+                    )
+                patience.wait(self._changed)
 
-    def status(self) -> ArmStatus:
-        """Tell the controller's modes and settings, as one sample has them. Raises as `look`."""
-        sample = self._live.live(max_age_s=_STATUS_S, limit_s=STALE_S)
-        told = sample.outputs
-        robot_mode, safety_mode, bits, program = (
-            int(told[name][0]) for name in ("robot_mode", "safety_mode", "safety_status_bits", "runtime_state")
-        )
-        return ArmStatus(
-            t_host_ns=sample.t_host_ns,
-            t_device_s=sample.t_device_s,
-            robot_mode=_ROBOT_MODES.get(robot_mode, f"unknown ({robot_mode})"),
-            safety_mode=_SAFETY_MODES.get(safety_mode, f"unknown ({safety_mode})"),
-            program=_PROGRAM_STATES.get(program, f"unknown ({program})"),
-            fault=_safety_fault(bits, robot_mode),
-            speed_slider=told["target_speed_fraction"][0],
-            speed_scaling=told["speed_scaling"][0],
-            payload_kg=told.get("payload", (None,))[0],
-            p_flange_payload_m=told.get("payload_cog"),
-            tcp_offset=told.get("tcp_offset"),
-        )
+    def _run(self) -> None:
+        with self._clock.keeping_up():
+            while self._follow():
+                pass
 
-    def close(self) -> None:
-        """Let the connections go. Idempotent."""
-        self._live.close()
-        receive, self._receive = self._receive, None
-        if receive is not None:
-            retire(receive)
-
-    def look(self, *, since_s: float | None = None, limit_s: float = STALE_S) -> Look:
-        """Wait for a sample taken after this call, or at `since_s` or later.
-
-        Raises `StreamBroken` once the loss of a connection is known, and `DeviceTimeout` when the controller is silent
-        for `limit_s`.
-        """
-        if since_s is None:
-            since_s = self._live.now_s(limit_s=limit_s)
-        silent_s = 0.0
-        while (look := self._newest()).t_device_s < since_s:
-            if silent_s > limit_s:
-                raise DeviceTimeout(
-                    f"samples of {self._host} have stayed away for {silent_s:.2f} s",
-                    "check the robot and the network, and press the emergency stop if the arm moves",
-                )
-            t0 = time.monotonic()
-            time.sleep(0.001)
-            silent_s += min(time.monotonic() - t0, 0.05)  # as in `LiveReader`
-        return look
-
-    def _newest(self) -> Look:
-        receive = self._receive
-        if receive is None or not receive.isConnected():
-            raise StreamBroken(
-                f"the connection to {self._host} was lost", "check the robot and the cable, then open the arm again"
+    def _follow(self) -> bool:
+        """Read the next sample; whether to go on. What ends the stream is raised at the next look."""
+        try:
+            outputs = dict(zip(self._names, self._stream.read(_READ_S), strict=True))
+        except TimeoutError:
+            self._clock.now_ns()  # an emulated cell waits for this thread
+            return True
+        except (OSError, StreamBroken) as error:
+            failure: DriverError = StreamBroken(
+                f"the RTDE connection to {self._host} was lost ({error})",
+                "check the robot and the cable, then open the arm again",
             )
-        self._live.check()
-        for _ in range(100):  # ur_rtde has no snapshot: read again when a new sample came in between
-            t_device_s = receive.getTimestamp()
-            look = Look(
-                t_host_ns=time.monotonic_ns(),
-                t_device_s=t_device_s,
-                q_rad=receive.getActualQ(),
-                qd_rad_s=receive.getActualQd(),
-                target_q_rad=receive.getTargetQ(),
-                target_qd_rad_s=receive.getTargetQd(),
-                tcp_pose=receive.getActualTCPPose(),
-                robot_mode=receive.getRobotMode(),
-                safety_bits=receive.getSafetyStatusBits(),
-                program_state=receive.getRuntimeState(),
-            )
-            if receive.getTimestamp() == t_device_s:
-                return look
-        raise DeviceTimeout(f"no consistent sample of {self._host} could be read", "give this computer less to do")
-
-    def state(self, ask_tcp: Callable[[], Sequence[float]]) -> ArmState:
-        """Read a state; `ask_tcp` tells the TCP offset (6,) where the controller does not. Errors as `UrArm.state`."""
-        for _ in range(5):
-            t_before_s, before = self._tcp_offset(self._live.now_s(limit_s=STALE_S), ask_tcp)
-            look = self.look(since_s=t_before_s)
-            _, after = self._tcp_offset(look.t_device_s, ask_tcp)
-            if tuple(before) == tuple(after):  # so this TCP was active when the pose was taken
-                break
+        except DriverError as error:
+            failure = error
         else:
-            raise DeviceFault(f"the TCP of {self._host} changes all the time", "find out what sets it")
-        if look.robot_mode not in _MEASURING and (fault := look.safety_fault()):
-            raise DeviceFault(f"{self._host} does not measure its joints: {fault.found}", fault.cure)
-        flange = Pose.from_ur(look.tcp_pose) @ Pose.from_ur(before).inverse()
-        self._check_model(look, flange)
-        return ArmState(
-            t_host_ns=look.t_host_ns,
-            t_device_s=look.t_device_s,
-            q_rad=np.array(look.q_rad),
-            qd_rad_s=np.array(look.qd_rad_s),
-            R_base_flange=flange.R,
-            p_base_flange_m=flange.p_m,
-        )
-
-    def _tcp_offset(self, since_s: float, ask_tcp: Callable[[], Sequence[float]]) -> tuple[float, Sequence[float]]:
-        if self.tells_tcp:
-            sample = self._live.newest(since_s=since_s, limit_s=STALE_S)
-            return sample.t_device_s, sample.outputs["tcp_offset"]
-        return since_s, ask_tcp()
-
-    def _check_model(self, look: Look, flange: Pose) -> None:
-        nominal = forward(MODELS[self.info.model], look.q_rad)
-        distance_m = float(np.linalg.norm(flange.p_m - nominal.p_m))
-        angle_rad = flange.angle_to_rad(nominal)
-        if distance_m > _MODEL_POSITION_M or angle_rad > _MODEL_ANGLE_RAD:
-            raise DeviceFault(
-                f"the flange is {1e3 * distance_m:.1f} mm and {math.degrees(angle_rad):.2f} degrees from where a "
-                f"{self.info.model} has it with these joint angles: the arm at {self._host} is another model, or its "
-                "TCP was changed this moment",
-                "check both and read again",
-            )
+            before_s, self._read_s = self._read_s, self._clock.awake_s()
+            with self._changed:
+                self.silent = False
+                self._t_device_s = outputs["timestamp"][0]
+                if _WAITED_S[0] <= self._read_s - before_s <= _WAITED_S[1]:
+                    self._live, self._live_s = Sample.of(self._clock.now_ns(), outputs), self._read_s
+                    self._changed.notify_all()
+            return True
+        with self._changed:
+            self._failure = failure
+            self._changed.notify_all()
+        return False

@@ -1,8 +1,8 @@
-"""A small RTDE client of our own, for what ur_rtde cannot do.
+"""A small RTDE client of our own: all that is read from a controller comes through it.
 
-ur_rtde's constructors freeze the whole interpreter when the controller accepts and stays silent, so somebody has to
-say hello first with a time-out. ur_rtde cannot parse `tcp_offset`, without which a TCP pose says nothing about the
-flange. Nothing is ever written to the controller's registers here: this client cannot disturb a program.
+ur_rtde's receiving side freezes the whole interpreter when the controller accepts and stays silent, repeats its last
+values when a link is lost, has no snapshot, and cannot parse `tcp_offset`, without which a TCP pose says nothing about
+the flange. Nothing is ever written to the controller's registers here: this client cannot disturb a program.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
 Checked on hardware: no.
@@ -12,13 +12,13 @@ import contextlib
 import logging
 import socket
 import struct
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate, pairwise
 from typing import Final
 
+from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceTimeout, ProtocolError, StreamBroken, Unreachable
 
 log = logging.getLogger(__name__)
@@ -127,13 +127,15 @@ def _layout(types: tuple[str, ...]) -> tuple[struct.Struct, list[slice]]:
 
 
 class _Connection:
-    """One connection, one package at a time."""
+    """One connection, one package at a time. Raises `OSError` when there is none within `timeout_s`."""
 
-    def __init__(self, sock: socket.socket) -> None:
-        self._socket = sock
+    def __init__(self, host: str, timeout_s: float, clock: Clock) -> None:
+        self._clock = clock
+        self._deadline_s = clock.now_s() + timeout_s
+        self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
         self._buffer = bytearray()
 
-    def read(self, timeout_s: float | None) -> tuple[int, bytes]:
+    def read(self, timeout_s: float) -> tuple[int, bytes]:
         """Read the next package as (type, payload)."""
         self._socket.settimeout(timeout_s)
         while (package := take_package(self._buffer)) is None:
@@ -143,11 +145,14 @@ class _Connection:
             self._buffer += received
         return package
 
-    def ask(self, request: bytes, deadline: float) -> bytes:
-        """Send a request and return the payload of its answer; an answer has the type of its request."""
+    def ask(self, request: bytes) -> bytes:
+        """Send a request and return the payload of its answer; an answer has the type of its request.
+
+        All of them have to come within the time-out of the connection.
+        """
         self._socket.sendall(request)
         while True:
-            kind, payload = self.read(max(deadline - time.monotonic(), 1e-3))
+            kind, payload = self.read(max(self._deadline_s - self._clock.now_s(), 1e-3))
             if kind == request[2]:
                 return payload
             log.debug("RTDE package of type %d instead of an answer: %s", kind, payload.hex(" "))
@@ -172,6 +177,8 @@ class Subscription:
         How often; at most the controller's own rate.
     timeout_s : float
         For the whole greeting.
+    clock : Clock
+        Measures it.
 
     Raises
     ------
@@ -181,14 +188,16 @@ class Subscription:
         No RTDE, or outputs of other types.
     """
 
-    def __init__(self, host: str, outputs: Mapping[str, str], frequency_Hz: float, *, timeout_s: float) -> None:
+    def __init__(
+        self, host: str, outputs: Mapping[str, str], frequency_Hz: float, *, timeout_s: float, clock: Clock = REAL
+    ) -> None:
         where = f"{host}:{PORT}"
         self.version = (0, 0, 0, 0)
         """Of the controller: major, minor, bugfix, build."""
         self.missing: list[str] = []
         """Outputs this controller does not know: the samples come without them."""
         try:
-            self._connection = _Connection(socket.create_connection((host, PORT), timeout=timeout_s))
+            self._connection = _Connection(host, timeout_s, clock)
         except OSError as error:
             raise Unreachable(
                 f"{where} cannot be reached ({error})",
@@ -196,7 +205,7 @@ class Subscription:
                 "stands between",
             ) from error
         try:
-            self._greet(outputs, frequency_Hz, time.monotonic() + timeout_s)
+            self._greet(outputs, frequency_Hz)
         except TimeoutError as error:
             self.close()
             raise ConnectError(
@@ -210,7 +219,7 @@ class Subscription:
                 "check that this is a robot controller and that RTDE is enabled under Settings, Security, Services",
             ) from error
 
-    def read(self, timeout_s: float | None) -> list[tuple[float, ...]]:
+    def read(self, timeout_s: float) -> list[tuple[float, ...]]:
         """Read the next sample: one tuple for each output.
 
         Raises `TimeoutError` when none comes, `OSError` or `StreamBroken` when the connection is lost, `ProtocolError`.
@@ -224,22 +233,22 @@ class Subscription:
         """Let the connection go, and wake a thread that reads. Idempotent."""
         self._connection.close()
 
-    def _greet(self, outputs: Mapping[str, str], frequency_Hz: float, deadline: float) -> None:
+    def _greet(self, outputs: Mapping[str, str], frequency_Hz: float) -> None:
         ask = self._connection.ask
-        if ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02"), deadline) != b"\x01":
+        if ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02")) != b"\x01":
             raise ProtocolError("protocol version 2 is refused")
-        self.version = decode_version(ask(encode(GET_CONTROLLER_VERSION), deadline))
-        self._recipe = Recipe.decode(ask(encode_setup_outputs(frequency_Hz, tuple(outputs)), deadline))
+        self.version = decode_version(ask(encode(GET_CONTROLLER_VERSION)))
+        self._recipe = Recipe.decode(ask(encode_setup_outputs(frequency_Hz, tuple(outputs))))
         if len(self._recipe.types) == len(outputs):
             self.missing = [name for name, kind in zip(outputs, self._recipe.types, strict=True) if kind == "NOT_FOUND"]
         known = {name: kind for name, kind in outputs.items() if name not in self.missing}
         if not known:
             return
         if self.missing:
-            self._recipe = Recipe.decode(ask(encode_setup_outputs(frequency_Hz, tuple(known)), deadline))
+            self._recipe = Recipe.decode(ask(encode_setup_outputs(frequency_Hz, tuple(known))))
         if self._recipe.types != tuple(known.values()):
             raise ProtocolError(f"{', '.join(known)} come as {', '.join(self._recipe.types)}")
-        if ask(encode(START), deadline) != b"\x01":
+        if ask(encode(START)) != b"\x01":
             raise ProtocolError("the controller does not start the stream")
 
 
@@ -250,17 +259,16 @@ CONTROL_REGISTERS: Final = (
 """What ur_rtde's control interface writes to, and nobody else may."""
 
 
-def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float) -> list[str]:
+def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float, clock: Clock = REAL) -> list[str]:
     """Tell which of these inputs belong to another client or a fieldbus, leaving all of them as they are.
 
     Raises `StreamBroken`, `DeviceTimeout` or `ProtocolError`.
     """
     try:
-        connection = _Connection(socket.create_connection((host, PORT), timeout=timeout_s))
+        connection = _Connection(host, timeout_s, clock)
         try:
-            deadline = time.monotonic() + timeout_s
-            connection.ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02"), deadline)
-            recipe = Recipe.decode(connection.ask(encode_setup_inputs(names), deadline))
+            connection.ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02"))
+            recipe = Recipe.decode(connection.ask(encode_setup_inputs(names)))
         finally:
             connection.close()
     except TimeoutError as error:

@@ -8,24 +8,24 @@ reference point, and a user has seen values above 20 000. So this driver reads `
 insists on being told the scale by somebody who has hung a known weight on the flange.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": `ft_raw_wrench`, `actual_TCP_force`.
-Checked on hardware: no. Verified against: tests/unit/test_ur_sensor.py.
+Checked on hardware: no. Verified against: tests/unit/drivers/ur/test_wrist_sensor.py.
 """
 
 import math
-import time
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from drivers._stream import NOTHING, StreamingSensor, scale_facts
+from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
 from drivers.ur.rtde import Subscription
+from drivers.ur.timing import STRICT, UrTiming
 
 if TYPE_CHECKING:
     from drivers.registry import Options
 
-_CONNECT_S = 2.0
 _RATE_Hz = 500.0
 
 
@@ -45,17 +45,21 @@ class UrWristSensor(StreamingSensor):
         What `ft_raw_wrench` tells for 1 N and for 1 N·m. Measure them: see drivers/README.md.
     sign : int
         -1 for a sensor that reports the reaction.
+    clock : Clock
+        Measures and waits; that of an emulated cell belongs to the cell.
     """
 
-    def __init__(self, host: str, *, counts_per_N: float, counts_per_Nm: float, sign: int = 1) -> None:
-        super().__init__(f"wrist sensor of the arm at {host}", sign=sign)
+    def __init__(
+        self, host: str, *, counts_per_N: float, counts_per_Nm: float, sign: int = 1, clock: Clock = REAL
+    ) -> None:
+        super().__init__(f"wrist sensor of the arm at {host}", sign=sign, clock=clock)
         self._host = host
         self._facts = scale_facts(counts_per_N, counts_per_Nm, "configured")
         self._counts_per_unit = np.repeat([counts_per_N, counts_per_Nm], 3)
         self._stream: Subscription | None = None
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1) -> Self:
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``ur-ft://192.168.1.10?counts_per_N=…&counts_per_Nm=…``; both are required."""
         why = "the unit of ft_raw_wrench is not documented, measure it as drivers/README.md says"
         return cls(
@@ -63,11 +67,13 @@ class UrWristSensor(StreamingSensor):
             counts_per_N=options.positive("counts_per_N", why),
             counts_per_Nm=options.positive("counts_per_Nm", why),
             sign=sign,
+            clock=clock,
         )
 
     def _connect(self) -> DeviceInfo:
         outputs = {"timestamp": "DOUBLE", "ft_raw_wrench": "VECTOR6D"}
-        self._stream = Subscription(self._host, outputs, _RATE_Hz, timeout_s=_CONNECT_S)
+        connect_s = (UrTiming.emulated() if self._clock.emulated else STRICT).connect_s
+        self._stream = Subscription(self._host, outputs, _RATE_Hz, timeout_s=connect_s, clock=self._clock)
         version = ".".join(map(str, self._stream.version))
         if self._stream.missing:
             raise ConnectError(
@@ -88,14 +94,14 @@ class UrWristSensor(StreamingSensor):
         if stream is None:
             raise StreamBroken(f"{self.name}: closed")
         try:
-            (t_device_s,), raw = stream.read(0.1)
+            (t_device_s,), raw = stream.read(0.05)
         except TimeoutError:
             return NOTHING
         except (OSError, StreamBroken) as exc:
             raise StreamBroken(
                 f"{self.name}: the connection was lost ({exc})", "check the robot and the cable, then open it again"
             ) from exc
-        t_host_ns = time.monotonic_ns()
+        t_host_ns = self._clock.now_ns()
         if not (math.isfinite(t_device_s) and all(map(math.isfinite, raw))):
             raise ProtocolError(f"{self.name}: at {t_device_s} s the controller tells {raw}, which is no wrench")
         seq = round(t_device_s * _RATE_Hz)

@@ -1,8 +1,7 @@
 """`ftdrive doctor`: is the cell connected, quiet and permitted? Nothing moves."""
 
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from functools import partial
@@ -16,10 +15,10 @@ from rich.console import Console
 from rich.text import Text
 
 from calib import CalibrationResult
+from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import ArmStatus, ForceTorqueSensor, RobotArm
-from drivers.ur.library import Dashboard, ask_dashboard
-from drivers.ur.reading import CONNECT_S
+from drivers.ur.dashboard import Dashboard, ask_dashboard
 from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
 from ftdrive import checks, diagnosis
 from ftdrive.checks import Check, SensorAddress
@@ -28,7 +27,7 @@ from ftdrive.config import USUAL_KG, CellConfig
 from ftdrive.errors import NotAccepted
 from ftdrive.simulation import Station, sensor_name, sensor_url
 from ftdrive.talk import hanging, talk
-from ftdrive.wiring import build_arm, build_sensor
+from ftdrive.wiring import build_arm, build_sensor, ur_timing
 
 Array = NDArray[np.float64]
 Blame = Callable[[str, DriverError], Check]
@@ -38,7 +37,7 @@ _CLOCK_S = 1.0
 _LOOK_S = 2.0
 _PUSH_S = 3.0
 _PUSH_WINDOW_S = 0.2
-_SIMULATED_PUSH_N = 15.0
+_SIMULATED_PUSH_N, _SIMULATED_PUSH_S = 15.0, 0.6
 _NOT_UR = Check("robot.programs", "skipped", "not applicable: only a UR has dashboard, RTDE registers and port 30003")
 _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "red"), "skipped": ("-", "")}
 
@@ -122,7 +121,7 @@ def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> Ro
     try:
         arm.open()
         info, status = arm.identify(), arm.status()
-        after = f" in {1e3 * ask_dashboard(host, _answer_s, timeout_s=CONNECT_S):.1f} ms" if is_ur else ""
+        after = f" in {1e3 * _dashboard_s(cell):.1f} ms" if is_ur else ""
     except DriverError as error:
         found.append(diagnosis.check_unreachable(error, host))
         return None
@@ -132,30 +131,37 @@ def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> Ro
         found.append(diagnosis.check_remote(arm.in_remote_control()))
     except DriverError as error:
         found.append(replace(diagnosis.check_unreachable(error, host), name="robot.remote"))
-    found += [_registers(host), _script_port(host)] if is_ur else [_NOT_UR]
+    found += [_registers(cell), _script_port(cell)] if is_ur else [_NOT_UR]
     found += diagnosis.check_status(status)
     found.append(_flange(arm, status))
-    found.append(_clock(arm))
+    found.append(_clock(arm, cell.clock))
     return arm
 
 
-def _answer_s(dashboard: Dashboard) -> float:
-    """Measure a question and its answer."""
-    begun_s = time.perf_counter()
-    dashboard.polyscopeVersion()
-    return time.perf_counter() - begun_s
+def _dashboard_s(cell: CellConfig) -> float:
+    """Measure a question to the dashboard server and its answer."""
+    clock = cell.clock
+
+    def answer_s(dashboard: Dashboard) -> float:
+        begun_s = clock.now_s()
+        dashboard.polyscopeVersion()
+        return clock.now_s() - begun_s
+
+    return ask_dashboard(cell.robot.host, answer_s, timeout_s=ur_timing(cell).connect_s, clock=clock)
 
 
-def _registers(host: str) -> Check:
+def _registers(cell: CellConfig) -> Check:
+    host, limit_s = cell.robot.host, ur_timing(cell).connect_s
     try:
-        return diagnosis.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=CONNECT_S))
+        return diagnosis.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=limit_s, clock=cell.clock))
     except DriverError as error:
         return Check("robot.registers", "failed", error.found, error.cure or f"ping {host}")
 
 
-def _script_port(host: str) -> Check:
+def _script_port(cell: CellConfig) -> Check:
+    host = cell.robot.host
     try:
-        find_script_port(host, timeout_s=CONNECT_S)
+        find_script_port(host, timeout_s=ur_timing(cell).connect_s)
     except DriverError as error:
         return Check("robot.programs", "failed", error.found, error.cure or f"ping {host}")
     return Check("robot.programs", "ok", f"port {SCRIPT_PORT}, which takes programs, is open")
@@ -173,15 +179,16 @@ def _flange(arm: RobotArm, status: ArmStatus) -> Check:
     return Check(name, "ok", f"TCP told; the flange is at ({where}) mm in base, where the model has it")
 
 
-def _clock(arm: RobotArm) -> Check:
+def _clock(arm: RobotArm, clock: Clock) -> Check:
     host_ns: list[int] = []
     device_s: list[float] = []
     try:
-        while not host_ns or host_ns[-1] - host_ns[0] < _CLOCK_S * 1e9:
-            time.sleep(0.02)
-            status = arm.status()
-            host_ns.append(status.t_host_ns)
-            device_s.append(status.t_device_s)
+        with clock.keeping_up():
+            while not host_ns or host_ns[-1] - host_ns[0] < _CLOCK_S * 1e9:
+                clock.sleep(0.02)
+                status = arm.status()
+                host_ns.append(status.t_host_ns)
+                device_s.append(status.t_device_s)
     except DriverError as error:
         return Check("clock.pace", "failed", error.found, error.cure or "check the robot and the network")
     return diagnosis.check_clock(host_ns, device_s)
@@ -240,7 +247,9 @@ def _examine_push(
                 force = (R_base_flange @ R_flange_sensor).T @ [_SIMULATED_PUSH_N, 0.0, 0.0]
                 station.control(do="push", wrench=[*force.tolist(), 0.0, 0.0, 0.0])
                 stack.callback(station.control, do="push", wrench=[0.0] * 6)
-            changes = [force - before for force in _means(device, _PUSH_S if station is None else 0.5)]
+            windows = round((_PUSH_S if station is None else _SIMULATED_PUSH_S) / _PUSH_WINDOW_S)
+            pieces = (device.collect(_PUSH_WINDOW_S).wrench[:, :3] for _ in range(windows))
+            changes = [force_N.mean(axis=0) - before for force_N in pieces]
     except DriverError as error:
         found.append(blame("push.sign", error))
         return None
@@ -248,12 +257,6 @@ def _examine_push(
     check, moved = diagnosis.check_push(largest, R_base_flange, R_flange_sensor, sign)
     found.append(check)
     return moved
-
-
-def _means(device: ForceTorqueSensor, duration_s: float) -> Iterator[Array]:
-    end = time.monotonic() + duration_s
-    while time.monotonic() < end:
-        yield device.collect(_PUSH_WINDOW_S).wrench[:, :3].mean(axis=0)
 
 
 def _print(found: list[Check]) -> None:

@@ -3,13 +3,14 @@
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
+from drivers.clock import REAL, Clock
 from ftdrive.commands.common import JSON, MODEL, NewFile, check_simulate, rows, simulate, write_json
 
 T = TypeVar("T")
@@ -75,17 +76,18 @@ def init(
 
     check_simulate(simulate, real={"--robot": robot})
     said = settings()
+    clock: Clock = REAL
     with ExitStack() as stack:
         if simulate:
             station = stack.enter_context(Station(sensor_name(sensor), ["--time-scale", "1"]))
-            robot, sensor = station.cell.robot.host, station.cell.sensor.url
+            robot, sensor, clock = station.cell.robot.host, station.cell.sensor.url, station.clock
         ask = Questions(yes)
-        host, model, robot_told = _robot(ask, robot, said["robot.host"].value, model)
+        host, model, robot_told = _robot(ask, robot, said["robot.host"].value, model, clock)
         if model is not None and model_named(model, controller_major=0) not in SHAPES:
             _say(
                 f"the shape of the {model} is not measured, so no motion can be planned: use calibrate --manual", "  ! "
             )
-        url, sensor_told = _sensor(ask, sensor, said["sensor.url"].value)
+        url, sensor_told = _sensor(ask, sensor, said["sensor.url"].value, clock)
     height_mm = ask.number("Sensor height above the flange, mm (measure it)", "sensor.height_mm", "--height", height)
     sensor_kg = ask.number(
         "Sensor and adapter, kg (scale or datasheet; Enter: not known)",
@@ -142,7 +144,7 @@ def init(
     write_new(output, cell_file(cell, [f"Robot: {robot_told}.", f"Sensor: {sensor_told}."]))
     if as_json:
         told = {"file": str(output), "robot": robot_told, "sensor": sensor_told}
-        write_json({"schema_version": 1, **told, "config": asdict(cell)})
+        write_json({"schema_version": 1, **told, "config": cell.to_dict()})
     if simulate:
         _say(f"Wrote {output}, to look at only: the emulated robot and sensor in it have ended with this command.")
         _say("Next: ftdrive doctor --simulate, then ftdrive plan --simulate")
@@ -254,7 +256,9 @@ def _number(key: str, flag: str, text: str) -> Any:
     return checked(flag, key, value)
 
 
-def _robot(ask: Questions, given: str | None, usual: str | None, model: str | None) -> tuple[str, str | None, str]:
+def _robot(
+    ask: Questions, given: str | None, usual: str | None, model: str | None, clock: Clock
+) -> tuple[str, str | None, str]:
     """Host, model, and what the arm says of itself; a person may keep an address that does not answer."""
     from drivers.errors import DriverError
     from ftdrive.config import checked
@@ -265,7 +269,7 @@ def _robot(ask: Questions, given: str | None, usual: str | None, model: str | No
     host = ask.text("Robot address", "robot.host", "--robot", given, usual)
     while True:
         try:
-            found, told = look_at_robot(host, model)
+            found, told = look_at_robot(host, model, clock)
         except DriverError as error:
             if not ask.somebody_answers:
                 raise
@@ -281,7 +285,7 @@ def _robot(ask: Questions, given: str | None, usual: str | None, model: str | No
         return host, found, told
 
 
-def _sensor(ask: Questions, given: str | None, usual: str | None) -> tuple[str, str]:
+def _sensor(ask: Questions, given: str | None, usual: str | None, clock: Clock) -> tuple[str, str]:
     """Address, and what the sensor says of itself; a person may keep an address that does not answer."""
     from drivers.errors import DriverError
     from ftdrive.discovery import is_place, look_at_sensor, places, sensor_at
@@ -303,7 +307,7 @@ def _sensor(ask: Questions, given: str | None, usual: str | None) -> tuple[str, 
             return url, _SILENT
         try:
             url = sensor_at(url) if is_place(url) else url
-            told = look_at_sensor(url)
+            told = look_at_sensor(url, clock)
         except (DriverError, ConfigError) as error:
             if not ask.somebody_answers:
                 raise

@@ -158,7 +158,7 @@ def _recorded_looks(run: Run) -> Iterator[Look]:
         for start in range(0, n - size + 1, size):
             mean = mean_and_covariance(samples.wrench[start : start + size])
             yield Look(mean, record.before.R_base_flange, rate_Hz, lost)
-            time.sleep(size / rate_Hz)
+            time.sleep(size / rate_Hz)  # for whoever watches: as fast as it was recorded
 
 
 def _refuse_other_devices(calibration: CalibrationResult, found: dict[str, DeviceInfo]) -> None:

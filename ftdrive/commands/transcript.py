@@ -11,6 +11,7 @@ from typing import Any
 import click
 import numpy as np
 
+from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceTimeout, ProtocolError
 from drivers.interfaces import ForceTorqueSensor
 from drivers.registry import BadUrl, sensor_from_url
@@ -21,7 +22,7 @@ from ftdrive.checks import SensorAddress
 from ftdrive.commands.common import EMULATED_SENSOR, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs import versions
-from ftdrive.simulation import EMULATED, sensor_name, sensor_url
+from ftdrive.simulation import EMULATED, sensor_clock, sensor_name, sensor_url
 from ftdrive.talk import talk
 
 _PIECE_S = 60.0
@@ -77,12 +78,12 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
             f"{sensor} is neither on a serial port or a CAN bus nor an ati-netft: only these can be recorded; capture "
             "others with Wireshark"
         )
-    device = _sensor(url)
+    device = _sensor(url, sensor_clock(sensor))
     header = {
         "url": url,
         "duration_s": duration_s,
         "utc": datetime.now(UTC).isoformat(),
-        "t_ns": time.monotonic_ns(),
+        "t_ns": time.monotonic_ns(),  # of the same moment as `utc`: the anchor of all lines
         "versions": versions(),
     }
     writer = Writer(path, header)
@@ -157,9 +158,9 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
         talk.print(f" The recording was broken off: {duration_s:.3g} s of {told.header['duration_s']:g} s were played.")
 
 
-def _sensor(url: str) -> ForceTorqueSensor:
+def _sensor(url: str, clock: Clock = REAL) -> ForceTorqueSensor:
     try:
-        return sensor_from_url(url)
+        return sensor_from_url(url, clock=clock)
     except BadUrl as error:
         raise ConfigError(str(error)) from error
 

@@ -7,7 +7,7 @@ robot and the user's risk assessment. README.md lists every row, where it is wat
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,31 @@ class Limits:
     skew_s: float = 0.03
     """How far the times of pose and wrench may be apart."""
     stalled_s: float = 10.0
+    look_s: float = 0.01
+    """Period of the guards."""
+    counted_s: float = 0.02
+    """Of the time between two looks, so much counts: when this process gets no time, nothing else is late."""
+    aside_s: float = 0.05
+    """Between two looks for a stop of the safety system, while nothing else is watched."""
+    blind_s: float = 1.0
+    """Nobody presses a stop, releases it and has the arm ready again in less."""
+    hung_s: float = 1.0
+    """Guards that have not looked for so long do not watch."""
+    slow_stop_s: float = 0.2
+    """A stop that takes longer is reported meanwhile. An arm that answers brakes from 60 deg/s in 0.26 s."""
+    link_usual_s: float = 0.02
+    """Until the arm answers, as a rule. 8 ms of it are the wait for the next sample."""
+    link_asked_s: float = 0.04
+    """On top of it where a controller reports its TCP only to a program, which is asked twice: 24 ms if all is well."""
+    link_gap_s: float = 0.1
+    """Until the arm answers, nine times in ten."""
+    program_ends_s: float = 1.5
+    """What a session that was killed has left on the controller ends by itself within 0.5 s."""
+
+    @classmethod
+    def emulated(cls) -> Self:
+        """Limits of an emulated cell: the same, but that its clock leads those who follow it by 10 ms each."""
+        return cls(link_usual_s=0.05)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

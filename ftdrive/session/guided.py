@@ -65,8 +65,6 @@ _NO_SERIAL: Final = (
     "the controller tells no serial number, so nobody knows which arm has run a plan to its end (a younger PolyScope "
     "tells it)"
 )
-_EMULATED: Final = Limits(sensor_age_moving_s=0.3)
-"""An emulated sensor shares this computer with all else."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +109,7 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
     DriverError, OSError
         It was broken off; what was taken stands in the run, which can be resumed.
     """
+    limits = limits or (Limits.emulated() if cell.clock.emulated else Limits())
     desk = Desk(operator, yes=options.yes)
     desk.tell(StateChanged(state=State.IDLE))
     options = as_begun(options)
@@ -123,7 +122,7 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
         arm.open()
         desk.tell(StateChanged(state=State.PREFLIGHT))
         if not by_hand:
-            preflight.leave_programs_alone(arm)
+            preflight.leave_programs_alone(arm, cell.clock, limits)
         devices = {"arm": asdict(arm.identify()), "sensor": asdict(sensor.identify())}
         if by_hand:
             run = _by_hand(cell, arm, sensor, desk, options, devices)
@@ -131,7 +130,7 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
             desk.tell(Noted(words=kept_awake))
             if not options.dry_run and arm.status().tcp_offset is None:
                 arm.open(control=True)  # an old controller tells no poses before
-            begun = _Begun(cell, arm, sensor, desk, options, plan, limits or (Limits() if options.real else _EMULATED))
+            begun = _Begun(cell, arm, sensor, desk, options, plan, limits)
             begun.look()
             begun.check(preflight.CHECKS)
             if options.dry_run:
@@ -205,7 +204,7 @@ class _Begun:
         self._reduced = False  # as a person has said it should be
         info: DeviceInfo = arm.identify()
         self._certifier = certifier_for(cell, info.model)
-        self._old = None if options.resume is None else Run(options.resume)
+        self._old = None if options.resume is None else Run(options.resume, cell.clock)
         self._plan = plan or self._planned()
         document = self._plan.to_dict()
         self._key = (info.serial, str(document["sha256"]))
@@ -379,7 +378,8 @@ class _Begun:
         def on_trip(trip: Tripped) -> None:
             desk.tell(GuardTripped(hazard=trip.hazard, words=str(trip)))
 
-        with Watcher(self._arm, self._sensor, rows, on_trip) as watcher:  # an emergency stop at a question counts too
+        watcher = Watcher(self._arm, self._sensor, rows, on_trip, clock=cell.clock, limits=self._limits)
+        with watcher:  # an emergency stop at a question counts too
             if self._options.questions and self._todo:
                 self._ask(assumed=self._known and not arm_moves(self._way))  # nobody has seen a way of the arm
             run = self._run(devices)
@@ -455,7 +455,8 @@ class _Begun:
     def _run(self, devices: Mapping[str, Any]) -> Run:
         if self._old is not None:
             return self._old
-        run = Run.create(self._options.runs, self._options.name, _description(self._cell, devices, self._options))
+        options, clock = self._options, self._cell.clock
+        run = Run.create(options.runs, options.name, _description(self._cell, devices, options), clock)
         self._plan.save(run.plan_path)
         self._desk.keep_in(run)
         return run
@@ -494,10 +495,10 @@ def _by_hand(
 ) -> Run:
     """No motion command at all: a person moves the arm, or a program on the pendant does."""
     if options.resume is None:
-        run, earlier = Run.create(options.runs, options.name, _description(cell, devices, options)), []
+        run, earlier = Run.create(options.runs, options.name, _description(cell, devices, options), cell.clock), []
         desk.keep_in(run)
     else:
-        run = Run(options.resume)
+        run = Run(options.resume, cell.clock)
         require_same_devices(run, cell, arm, sensor)
         earlier = run.records()
     down_base, listen = down_of(cell.workcell.mounting), options.mode == "listen"
@@ -510,6 +511,7 @@ def _by_hand(
             desk,
             running.add,
             run.commit,
+            clock=cell.clock,
             down_base=down_base,
             listen=listen,
             earlier=earlier,
@@ -518,4 +520,4 @@ def _by_hand(
 
 
 def _description(cell: CellConfig, devices: Mapping[str, Any], options: Options) -> dict[str, Any]:
-    return {"config": asdict(cell), "devices": dict(devices), "mode": options.mode, **options.description}
+    return {"config": cell.to_dict(), "devices": dict(devices), "mode": options.mode, **options.description}

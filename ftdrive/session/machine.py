@@ -5,7 +5,6 @@ that is planned from where the arm stands, shown and confirmed.
 """
 
 import logging
-import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -298,12 +297,13 @@ class Tour:
     def _take(self, stop: int, index: int) -> PoseRecord:
         step = self._plan.steps[index]
         pose = TourPose(step.number, np.array(step.q_rad))
-        began_s, settled_s, attempts = time.monotonic(), 0.0, 0
+        clock = self._watcher.clock
+        began_s, settled_s, attempts = clock.now_s(), 0.0, 0
 
         def on_stage(stage: Stage) -> None:
             nonlocal settled_s, attempts
             if stage == "sample":
-                settled_s, attempts = time.monotonic() - began_s, attempts + 1
+                settled_s, attempts = clock.now_s() - began_s, attempts + 1
             self._tell(State.SETTLE if stage == "settle" else State.SAMPLE, stop)
 
         with self._watcher.watching(pose.q_rad, pose.q_rad, moving=False):

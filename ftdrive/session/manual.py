@@ -4,7 +4,6 @@ Nothing here commands the arm, which may be open for reading only. Each time it 
 orientation that is new, the sensor is averaged and the pose is put on disk.
 """
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import degrees, radians
@@ -12,8 +11,17 @@ from typing import Final, Protocol, TypeVar
 
 import numpy as np
 
-from calib.noise import CHANNELS, is_stationary, restless_channels
-from calib.routine import MOVED_RAD, PoseRecord, Sampling, TourPose, require_enough, turned_rad
+from calib.noise import CHANNELS, LEAST_SAMPLES, is_stationary, restless_channels
+from calib.routine import (
+    LONGER,
+    MOVED_RAD,
+    PoseRecord,
+    Sampling,
+    TourPose,
+    require_enough,
+    turned_rad,
+)
+from drivers.clock import REAL, Clock
 from drivers.errors import DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, ForceTorqueSensor, FtSamples
 from ftdrive.session.events import (
@@ -69,6 +77,7 @@ def collect_manually(
     down_base: Array,
     listen: bool,
     earlier: Sequence[PoseRecord] = (),
+    clock: Clock = REAL,
 ) -> None:
     """Take poses until there are enough, in place of a tour.
 
@@ -93,6 +102,8 @@ def collect_manually(
         `calib.routine.drift_check`. A program that passes its first pose before is followed to its end.
     earlier : sequence of PoseRecord
         Poses of the run that is continued; `estimate` is given them too.
+    clock : Clock
+        Of the cell; an emulated one waits for this thread, which must see each standstill.
 
     Notes
     -----
@@ -106,7 +117,8 @@ def collect_manually(
     Exception
         Whatever the arm or the sensor raises; the poses committed so far stand.
     """
-    _Collection(arm, sensor, sampling, operator, estimate, commit, down_base, listen, earlier).run()
+    with clock.keeping_up():
+        _Collection(arm, sensor, sampling, operator, estimate, commit, clock, down_base, listen, earlier).run()
 
 
 class _Collection:
@@ -118,6 +130,7 @@ class _Collection:
         operator: Operator,
         estimate: Callable[[PoseRecord], Estimated],
         commit: Callable[[PoseRecord], None],
+        clock: Clock,
         down_base: Array,
         listen: bool,
         earlier: Sequence[PoseRecord],
@@ -125,7 +138,7 @@ class _Collection:
         self._arm, self._sensor, self._sampling = arm, sensor, sampling
         self._witness = Witness(sensor, operator.tell)
         self._operator, self._estimate, self._commit = operator, estimate, commit
-        self._down_base, self._listen = down_base, listen
+        self._clock, self._down_base, self._listen = clock, down_base, listen
         self._earlier = earlier
         self._taken: dict[int, PoseRecord] = {}
         self._level: Array | None = None
@@ -187,17 +200,29 @@ class _Collection:
             self._witness.tell_news()
         return samples
 
+    def _collect_enough(self) -> FtSamples | None:
+        """Samples of one pose, collected again for longer where they are too few; None as in `_collect`."""
+        for times in LONGER:
+            average_s = times * self._sampling.average_s
+            if (found := self._collect(average_s)) is None:
+                return None
+            samples = found
+            if len(samples) >= LEAST_SAMPLES:
+                break
+        require_enough(samples, average_s)
+        return samples
+
     def _wait_out(self, ask: Callable[[], T], *losses: type[DriverError]) -> T:
         """Ask until there is an answer, for some seconds."""
-        deadline = time.monotonic() + BACK_S
+        deadline_s = self._clock.now_s() + BACK_S
         while True:
             try:
                 return ask()
             except losses:
-                if time.monotonic() > deadline:
+                if self._clock.now_s() > deadline_s:
                     raise
             self._witness.tell_news()
-            time.sleep(LOOK_S)
+            self._clock.sleep(LOOK_S)
 
     def _may_measure(self) -> bool:
         """Tell whether a standstill now is one to measure at."""
@@ -261,7 +286,7 @@ class _Collection:
         for attempt in range(1, self._sampling.attempts + 1):
             self._tell_state(State.SAMPLE)
             before = self._ask(self._arm.state)
-            if (found := self._collect(self._sampling.average_s)) is None:
+            if (found := self._collect_enough()) is None:
                 return False
             samples = found
             after = self._ask(self._arm.state)
@@ -270,7 +295,6 @@ class _Collection:
                 self._note(f"The arm moved while pose {stop} was measured: {self._hold_still()}.", warning=True)
                 self._tell_state(State.SETTLE)
                 return False
-            require_enough(samples, self._sampling.average_s)
             unrest = self._unrest(samples)
             if not unrest:
                 break

@@ -3,7 +3,6 @@
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.noise import LEAST_SAMPLES
+from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
 from ftdrive import checks, diagnosis
@@ -34,13 +34,6 @@ Array = NDArray[np.float64]
 LISTEN_S: Final = 2.0
 _LINK_S: Final = 0.5
 _LINK_TRIES: Final = 3
-_LATENCY_S, _GAP_S = 0.02, 0.1
-"""Of a usual answer, and of nine in ten. 8 ms of it are the wait for the next sample; on a healthy link to an emulated
-arm it is 8 ms, and up to 16 ms with more to do than the computer has cores for."""
-_ASKING_S: Final = 0.04
-"""On top of it where a controller tells its TCP only to a program, which is asked twice: 24 ms on a healthy link."""
-_ENDS_S: Final = 1.5
-"""What a session that was killed has left on the controller ends by itself within 0.5 s."""
 _EDGE_RAD: Final = float(np.radians(5))
 """Each question takes the controller some 10 ms. Between two points no part is more than 1 mm off their chord."""
 _ROUNDED_RAD: Final = float(np.radians(1))
@@ -156,16 +149,16 @@ def check_remote(before: Before) -> Checked:
         return _failed("remote", str(error))
 
 
-def leave_programs_alone(arm: RobotArm) -> None:
+def leave_programs_alone(arm: RobotArm, clock: Clock, limits: Limits) -> None:
     """Row 21: raise `NotAccepted` where a program is, and stays, on the controller: no session ends one to begin."""
-    deadline = time.monotonic() + _ENDS_S
+    deadline_s = clock.now_s() + limits.program_ends_s
     while (program := arm.status().program) != "stopped":
-        if time.monotonic() > deadline:
+        if clock.now_s() > deadline_s:
             raise NotAccepted(
                 f"a program is on the controller ({arm.program_told() or program}) and is not ended by this one: stop "
                 "it at the pendant, then start again; nothing was touched"
             )
-        time.sleep(0.02)
+        clock.sleep(0.02)
 
 
 def check_model(before: Before) -> Checked:
@@ -263,23 +256,31 @@ def check_load(before: Before) -> Checked:
 
 def check_link(before: Before) -> Checked:
     """Row 16: states of the arm come soon and without gaps, in one of three half seconds."""
-    words, limit_s = "", _LATENCY_S
+    limits, clock, words = before.limits, before.cell.clock, ""
+    limit_s = limits.link_usual_s
     if before.arm.status().tcp_offset is None:
-        limit_s += _ASKING_S
+        limit_s += limits.link_asked_s
     for _ in range(_LINK_TRIES):  # a computer that is busy for a moment is no bad link
-        took_s, end_s = list[float](), time.monotonic() + _LINK_S
         try:
-            while (started_s := time.monotonic()) < end_s:
-                before.arm.state()
-                took_s.append(time.monotonic() - started_s)
+            with clock.keeping_up():
+                took_s = _answers_s(before.arm, clock)
         except DriverError as error:
             return _failed("link", str(error))
         usual_s = float(np.median(took_s))
         words = f"the arm answers within {1e3 * usual_s:.0f} ms, once {1e3 * max(took_s):.0f} ms"
-        if usual_s < limit_s and np.quantile(took_s, 0.9) < _GAP_S:
+        if usual_s < limit_s and np.quantile(took_s, 0.9) < limits.link_gap_s:
             return _passed("link", words)
     limit = f"{1e3 * limit_s:.0f} ms are usual at most"
     return _failed("link", f"{words} ({limit}): use a cable, and give this computer and network less to do")
+
+
+def _answers_s(arm: RobotArm, clock: Clock) -> list[float]:
+    """Ask the arm for its state again and again; return how long it took each time."""
+    took_s, end_s = list[float](), clock.now_s() + _LINK_S
+    while (started_s := clock.now_s()) < end_s:
+        arm.state()
+        took_s.append(clock.now_s() - started_s)
+    return took_s
 
 
 def check_disk(before: Before) -> Checked:
@@ -345,7 +346,7 @@ def awake() -> Iterator[str]:
         if process.stdin is not None:
             process.stdin.close()
         try:
-            process.wait(timeout=1.0)
+            process.wait(timeout=5.0)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

@@ -1,6 +1,5 @@
 """From a stop back to where the arm may move again: what has stopped it, and whether that is mended."""
 
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
@@ -91,7 +90,7 @@ class Recovery:
         self._watcher.begin()
         q = self._arm.state().q_rad
         with self._watcher.watching(q, q, moving=False):  # is what tripped them gone?
-            time.sleep(_LOOK_AGAIN_S)
+            self._watcher.clock.sleep(_LOOK_AGAIN_S)
         self.require_answers()
 
     def _row_of(self, error: Exception, *, moving: bool) -> Tripped | None:

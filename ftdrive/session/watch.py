@@ -5,33 +5,21 @@ A stop that nobody answers takes a second or two: that is told while it goes on.
 
 import logging
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.routine import turned_rad
+from drivers.clock import Clock
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ArmState, ForceTorqueSensor, RobotArm
-from ftdrive.session.guards import Guard, Motion, Seen, Tripped, by_safety, out_of_sight
+from ftdrive.session.guards import Guard, Limits, Motion, Seen, Tripped, by_safety, out_of_sight
 
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
-
-PERIOD_S: Final = 0.01
-_LATE_S: Final = 0.02
-"""So much of the time between two looks counts as silence: when this process gets no time, nothing else is late."""
-_ASIDE_S: Final = 0.05
-"""Between two looks for a stop of the safety system, while nothing else is watched."""
-_BLIND_S: Final = 1.0
-"""Nobody presses a stop, releases it and has the arm ready again in less."""
-_HUNG_S: Final = 1.0
-_TELL_S: Final = 0.2
-"""A stop that takes longer is told meanwhile. An arm that answers brakes from 60 deg/s in 0.26 s."""
 
 
 class Watcher:
@@ -44,6 +32,10 @@ class Watcher:
     guards : sequence of Guard
     on_trip : callable
         Is told from the thread, once the arm was stopped or is slow to.
+    clock
+        Of the cell; it waits for the thread where it can.
+    limits
+        Periods and limits of the thread itself.
     """
 
     def __init__(
@@ -52,7 +44,11 @@ class Watcher:
         sensor: ForceTorqueSensor,
         guards: Sequence[Guard],
         on_trip: Callable[[Tripped], None],
+        *,
+        clock: Clock,
+        limits: Limits,
     ) -> None:
+        self.clock, self._limits = clock, limits
         self._arm, self._sensor, self._guards, self._on_trip = arm, sensor, tuple(guards), on_trip
         self._motion: Motion | None = None
         self._seen: Motion | None = None  # which all guards have looked at
@@ -94,13 +90,13 @@ class Watcher:
         """Watch while the block runs, after a first look. What trips is raised before it, after it, and by `check`."""
         self.check()
         self._last = None
-        self._looked_s = time.monotonic()
+        self._looked_s = self.clock.now_s()
         motion = self._motion = Motion(np.asarray(start_rad), np.asarray(goal_rad), moving)
         self._wake.set()
         try:
             while self._seen is not motion:
                 self.check()
-                time.sleep(0.001)
+                self.clock.sleep(0.001)
             yield
         finally:
             self._motion = None
@@ -117,9 +113,9 @@ class Watcher:
                 status = self._arm.status()
             except Exception as error:  # whatever the arm of another package raises: it is opened again, and says so
                 log.debug("the arm does not tell how it is: %r", error)
-                now_s = time.monotonic()
+                now_s = self.clock.now_s()
                 self._blind_since_s = self._blind_since_s or now_s
-                self.unseen |= now_s - self._blind_since_s > _BLIND_S
+                self.unseen |= now_s - self._blind_since_s > self._limits.blind_s
                 return
             self._blind_since_s = None
             trip = None if status.fault is None else by_safety(status, f"the arm stopped: {status.fault}")
@@ -138,40 +134,49 @@ class Watcher:
         """Raise what has tripped, or that nobody watches. Called in the loops that wait for the arm."""
         if self._tripped is not None:
             raise self._tripped
-        if not self._thread.is_alive():
+        if self._has_ended:
             raise Tripped(18, DeviceFault("the guards' thread has ended, nothing is watched", "end this session"))
-        if self._motion is not None and time.monotonic() - self._looked_s > _HUNG_S:
-            raise Tripped(18, DeviceFault("the guards have not looked for a second: give this computer less to do"))
+        if self._motion is not None and (late_s := self.clock.now_s() - self._looked_s) > self._limits.hung_s:
+            raise Tripped(
+                18, DeviceFault(f"the guards have not looked for {late_s:.1f} s: give this computer less to do")
+            )
 
     def tripped(self, *, wait_s: float) -> Tripped | None:
         """Tell what has tripped, once the arm was stopped and that was told; None after `wait_s` without."""
-        deadline = time.monotonic() + wait_s
-        while self._tripped is None and time.monotonic() < deadline:
-            time.sleep(0.005)
+        deadline_s = self.clock.now_s() + wait_s
+        while self._tripped is None and self.clock.now_s() < deadline_s:
+            self.clock.sleep(0.005)
         if self._tripped is not None:
-            self._told.wait(5.0)
+            self.clock.wait(self._told, 5.0)
         return self._tripped
 
+    def turn(self) -> float:
+        """Look once; return after how many seconds the thread does so again."""
+        motion = self._motion
+        if motion is None or self._tripped is not None:
+            self.look_aside()
+            return self._limits.aside_s
+        started_s = self.clock.now_s()
+        try:
+            self._look(motion)
+        except Tripped as trip:
+            self._stop(trip)
+        except DriverError as error:
+            self._stop(out_of_sight(error, moving=motion.moving))
+        except Exception as error:
+            log.exception("a guard failed")
+            self._stop(Tripped(18, DeviceFault(f"a guard failed ({error!r}): report this, and do not go on")))
+        return started_s + self._limits.look_s - self.clock.now_s()
+
+    @property
+    def _has_ended(self) -> bool:
+        return not self._thread.is_alive()
+
     def _run(self) -> None:
-        while not self._end.is_set():
-            motion = self._motion
-            if motion is None or self._tripped is not None:
-                self.look_aside()
-                self._wake.wait(_ASIDE_S)
-                if self._tripped is not None:
-                    self._end.wait(0.02)
-                continue
-            started_s = time.monotonic()
-            try:
-                self._look(motion)
-            except Tripped as trip:
-                self._stop(trip)
-            except DriverError as error:
-                self._stop(out_of_sight(error, moving=motion.moving))
-            except Exception as error:
-                log.exception("a guard failed")
-                self._stop(Tripped(18, DeviceFault(f"a guard failed ({error!r}): report this, and do not go on")))
-            self._end.wait(max(0.0, started_s + PERIOD_S - time.monotonic()))
+        with self.clock.keeping_up():
+            while not self._end.is_set():
+                pause_s = self.turn()
+                self.clock.wait(self._wake if self._motion is None else self._end, pause_s)
 
     def _look(self, motion: Motion) -> None:
         status = self._arm.status()
@@ -187,8 +192,8 @@ class Watcher:
             raise Tripped(15, error) from error
         if motion is not self._motion:  # the block has ended meanwhile: what was seen may belong to the next one
             return
-        now_s = time.monotonic()
-        dt_s = min(now_s - self._looked_s, _LATE_S)
+        now_s = self.clock.now_s()
+        dt_s = min(now_s - self._looked_s, self._limits.counted_s)
         turn_rad_s = 0.0
         if self._last is not None:
             then_s, before = self._last
@@ -206,19 +211,28 @@ class Watcher:
     def _stop(self, trip: Tripped) -> None:
         self._tripped = trip
         self.keep(trip)
-        stopping = threading.Thread(target=self._stop_arm, name="guards stop", daemon=True)
-        stopping.start()
-        stopping.join(_TELL_S)
+        stopped = self._begin_to_stop()
+        self.clock.wait(stopped, self._limits.slow_stop_s)
         try:
             self._on_trip(trip)
         except Exception as error:  # a screen or a disk: the arm has to be watched all the same
             log.exception("a stop could not be told")
             self.untold = error
-        stopping.join()
+        while not self.clock.wait(stopped, 1.0):
+            pass
         self._told.set()
 
-    def _stop_arm(self) -> None:
-        try:
-            self._arm.stop()
-        except Exception:
-            log.exception("the arm could not be told to stop: press the emergency stop")
+    def _begin_to_stop(self) -> threading.Event:
+        """Stop the arm in a thread of its own; the event is set when that has ended."""
+        stopped = threading.Event()
+
+        def stop() -> None:
+            try:
+                self._arm.stop()
+            except Exception:
+                log.exception("the arm could not be told to stop: press the emergency stop")
+            finally:
+                stopped.set()
+
+        threading.Thread(target=stop, name="guards stop", daemon=True).start()
+        return stopped

@@ -1,6 +1,5 @@
 """What happened in the controller, in order, for whoever asserts on it afterwards."""
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,7 @@ class Event:
     Parameters
     ----------
     t_host_ns
-        `time.monotonic_ns()`: comparable with every process on this machine.
+        The cell's clock, which every process on this machine can read.
     t_robot_s
         The controller's own clock, as on the wire.
     by
@@ -47,8 +46,3 @@ class Event:
             "why": self.why,
             **self.detail,
         }
-
-
-def happened(t_robot_s: float, by: str, what: str, accepted: bool, why: str, detail: dict[str, Any]) -> Event:
-    """Make an event of this moment."""
-    return Event(time.monotonic_ns(), t_robot_s, by, what, accepted, why, detail)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 SPEED_RAD_S = 0.6
 ACCELERATION_RAD_S2 = 1.5
 REST_S = 3.5
-"""How long each orientation is held. Real time: sensors sample in real time, whatever the speed of the arm."""
+"""How long each orientation is held, in the cell's time, in which sensors sample, whatever the speed of the arm."""
 
 TIPS = ((0, 0), (0, 1), (1, 0), (2, 0), (0, -1), (-1, 0))
 """Quarter turns of joints 4 and 5: the tool points in six directions."""

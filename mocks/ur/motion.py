@@ -172,7 +172,7 @@ class HandMove(JointMove):
 
 
 class Stop:
-    """stopj and stopl: slow down linearly along the present direction, within `duration_s` of real time."""
+    """stopj and stopl: slow down linearly along the present direction, within `duration_s` at any slider."""
 
     real_time = True
 

@@ -1,8 +1,8 @@
 """The controller without its sockets: arm, modes, safety, program and registers, one step per control cycle.
 
-Time: a cycle takes one control period of real time; the controller and its arm live through `time_scale` times as much
-in it (clock, motion, settling, the waiting times of the controller). The watchdog, which watches us, keeps real time,
-and so does the clock when the arm's own sensor is the station's: every sensor samples in real time.
+Time: a cycle takes one control period on the cell's clock; the controller and its arm live through `time_scale` times
+as much in it (clock, motion, settling, the waiting times of the controller). The watchdog, which watches the client,
+keeps the cell's time, and so does the controller's clock when the arm's own sensor is the station's sensor.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mocks.kinematics import ZERO6, Array, Dh, Vector3, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
-from mocks.ur.events import Event, happened
+from mocks.ur.events import Event
 from mocks.ur.library import ScriptError
 from mocks.ur.modes import PAUSING, PERMITTED, POWERED, POWERLESS, RobotMode, Runtime, SafetyMode
 from mocks.ur.motion import Arm, CannotFollow, HandMove, MotionError
@@ -28,7 +28,6 @@ PROGRAM_START_S = 0.1
 POWER_STEP_S = 0.5
 COMMAND_REGISTERS = {"input_int_register_0", "input_int_register_24"}
 HAND_ACCELERATION_RAD_S2 = 1.5
-WATCHDOG_STEP_S = 0.01  # a stall of this process may age the watchdog by no more than this
 
 
 @dataclass(frozen=True)
@@ -97,11 +96,12 @@ class Robot:
     Parameters
     ----------
     world
-        The shared truth; its `q` is written in every cycle.
+        The shared truth; its `q` is written in every cycle. Its clock is the controller's.
     """
 
     def __init__(self, world: World, settings: RobotSettings) -> None:
         self.world = world
+        self.clock = world.clock
         self.settings = settings
         self.arm = Arm(world.dh, world.q)
         self.limits = Limits(world.dh, settings.joint_limit_rad, settings.plane)
@@ -148,7 +148,7 @@ class Robot:
 
     @property
     def timestamp_s(self) -> float:
-        """Controller clock on the wire; where it stamps the samples of the station's sensor, it keeps real time."""
+        """Controller clock on the wire; it is the cell's clock where it stamps the samples of the station's sensor."""
         scale = 1.0 if self.wrist_sensor else self.settings.time_scale
         return 100.0 + self.cycle * self.period_s * scale
 
@@ -161,6 +161,7 @@ class Robot:
         self._later = [(when, action) for when, action in self._later if when > self._physical_s]
         for action in due:
             action()
+        self._watch()
         if self.hand is not None:
             next(self.hand, None)
         if self.runtime == Runtime.PLAYING and self._program is not None:
@@ -182,22 +183,18 @@ class Robot:
 
     def note(self, by: str, what: str, *, accepted: bool = True, why: str = "", **detail: Any) -> None:
         """Write into the diary."""
-        self.events.append(happened(self.timestamp_s, by, what, accepted, why, detail))
+        self.events.append(Event(self.clock.now_ns(), self.timestamp_s, by, what, accepted, why, detail))
 
     def _leaves_limits(self, before: Vector6) -> bool:
         """Whether the last step crossed a safety limit outwards; the way back is free."""
         X = self.X_flange_tcp
         return not self.limits.allow(self.arm.q, X) and self.limits.allow(before, X)
 
-    def skip(self, cycles: int) -> None:
-        """Let wire time pass in which the controller did nothing."""
-        self.cycle += cycles
-
-    def watch(self, elapsed_s: float) -> None:
-        """Age the watchdog by real time; a program whose client is silent is stopped."""
+    def _watch(self) -> None:
+        """Age the watchdog by a cycle; a program whose client is silent is stopped."""
         if self._watchdog is None or self.runtime != Runtime.PLAYING:
             return
-        self._watchdog_age_s += min(elapsed_s, WATCHDOG_STEP_S)
+        self._watchdog_age_s += self.period_s
         name, period_s = self._watchdog
         if self._watchdog_age_s > period_s:
             self.stop_program(f"watchdog: {name} not written for {period_s:.3f} s")

@@ -3,13 +3,14 @@
 One thread does everything: between two control cycles it waits for the sockets. Nothing needs a lock.
 """
 
+import select
 import selectors
 import socket
 import struct
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
+from mocks.clock import time_out_s
 from mocks.ur import dashboard, rtde
 from mocks.ur.robot import Robot
 from mocks.ur.script import take_uploads
@@ -17,7 +18,6 @@ from mocks.ur.variables import INPUTS, OUTPUTS, Reader, output_type
 
 PORTS = {30001: "script", 30002: "script", 30003: "script", 30004: "rtde", 29999: "dashboard"}
 BACKLOG_LIMIT_S = 10.0  # a client that does not read for so long is disconnected
-CATCH_UP_CYCLES = 250  # a longer stall of this process is not made good
 
 Select = selectors.BaseSelector
 
@@ -84,7 +84,7 @@ class Client(ABC):
             self.close()
             return
         del self._out[:sent]
-        now = time.monotonic()
+        now = self.robot.clock.now_s()
         if sent or self._stuck_since is None:
             self._stuck_since = now
         elif now - self._stuck_since > BACKLOG_LIMIT_S:
@@ -260,8 +260,6 @@ class UrServer:
         """Input variables that a fieldbus holds, as far as no client had them before."""
         self.bad_inputs: list[str] = []
         """Packages a well-behaved client would not have sent."""
-        self.dropped_cycles = 0
-        """Control cycles lost because this process was stalled for too long."""
         self.frozen = False
         """While true nothing runs and nothing is read or sent, but connections stay."""
         self.streaming = True
@@ -276,7 +274,6 @@ class UrServer:
         except OSError:
             self.close()
             raise
-        self._next_s = time.monotonic() + robot.period_s
 
     def _listen(self, port: int, kind: str) -> None:
         self._listeners[port] = listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -364,31 +361,27 @@ class UrServer:
             self._close_listener(port)
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Serve until `ended()`: it is asked once per control cycle."""
-        while not ended():
-            for key, _events in self._selector.select(max(0.0, self._next_s - time.monotonic())):
-                if not (self.frozen and isinstance(key.fileobj, (Client, socket.socket))):
+        """Serve until `ended()`: it is asked at least once per control cycle."""
+        clock, period_ns = self.robot.clock, round(1e9 * self.robot.period_s)
+        with clock.keeping_up():
+            due_ns = clock.now_ns() + period_ns
+            while not ended():
+                now_ns = clock.follow()
+                while due_ns <= now_ns:
+                    due_ns += period_ns
+                    if not self.frozen:
+                        self.robot.tick()
+                        self._send_samples()
+                for key in self._ready(time_out_s(1e-9 * (due_ns - now_ns))):
                     key.data()
-            if self.frozen:  # unread sockets stay ready: do not spin on them
-                time.sleep(self.robot.period_s)
-            self._run_due_cycles()
 
-    def _run_due_cycles(self) -> None:
-        period_s = self.robot.period_s
-        late_s = time.monotonic() - self._next_s
-        if late_s < 0.0:
-            return
-        due = int(late_s / period_s) + 1
-        self._next_s += due * period_s
-        if self.frozen:
-            return
-        cycles = min(due, CATCH_UP_CYCLES)
-        self.dropped_cycles += due - cycles
-        self.robot.skip(due - cycles)
-        self.robot.watch(due * period_s)
-        for _ in range(cycles):
-            self.robot.tick()
-            self._send_samples()
+    def _ready(self, time_out_s: float) -> list[selectors.SelectorKey]:
+        """Wait for the network and the control channel; while frozen only for the latter, as sockets stay unread."""
+        if not self.frozen:
+            return [key for key, _events in self._selector.select(time_out_s)]
+        keys = self._selector.get_map().values()
+        others = {key.fd: key for key in keys if not isinstance(key.fileobj, (Client, socket.socket))}
+        return [others[fd] for fd in select.select(list(others), [], [], time_out_s)[0]]
 
     def _send_samples(self) -> None:
         for client in list(self._clients):

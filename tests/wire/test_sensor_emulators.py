@@ -3,7 +3,6 @@
 import socket
 import struct
 import termios
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -16,12 +15,12 @@ import pytest
 import serial
 from numpy.typing import NDArray
 
-from mocks.bota import BotaBox, crc16_x25, stream_frame
-from mocks.faults import Faults
+from mocks.bota import BotaBox, crc16_x25
 from mocks.modbus import crc16, with_crc
 from mocks.netft import RECORD, NetFtBox
 from mocks.robotiq import RobotiqBox
 from mocks.robotous import RobotousCanNode, RobotousSerialBox, packet
+from tests.wire.waiting import LIMIT_S, read_to, wait_until
 
 UNPLUGGED = (serial.SerialException, can.CanError, OSError, termios.error)
 RFT_WRENCH = np.array([10, -5, 20, 1, -0.5, 0.05])
@@ -61,27 +60,13 @@ class Counter:
         return readings
 
 
-def wait_until(condition: Callable[[], bool], timeout_s: float = 5.0) -> None:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline_s, "the condition never came true"
-        time.sleep(0.002)
-
-
 @contextmanager
-def serial_client(device: RobotousSerialBox | RobotiqBox | BotaBox, timeout_s: float = 2.0) -> Iterator[serial.Serial]:
-    with serial.Serial(device.start(), timeout=timeout_s) as port:
-        yield port
-    device.stop()
-
-
-def until_silence(port: serial.Serial, silence_s: float = 0.05) -> bytes:
-    port.timeout = silence_s
-    data = b""
-    while piece := port.read(4096):
-        data += piece
-    port.timeout = 2.0
-    return data
+def serial_client(device: RobotousSerialBox | RobotiqBox | BotaBox) -> Iterator[serial.Serial]:
+    try:
+        with serial.Serial(device.start(), timeout=LIMIT_S) as port:
+            yield port
+    finally:
+        device.stop()
 
 
 # ---------------------------------------------------------------- Robotous, CAN
@@ -96,12 +81,14 @@ def node() -> Iterator[RobotousCanNode]:
 
 @contextmanager
 def can_client(node: RobotousCanNode, bitrate: int = 1_000_000) -> Iterator[can.BusABC]:
-    bus = can.Bus(interface="slcan", channel=node.start(), bitrate=bitrate, sleep_after_open=0)
     try:
-        yield bus
+        bus = can.Bus(interface="slcan", channel=node.start(), bitrate=bitrate, sleep_after_open=0)
+        try:
+            yield bus
+        finally:
+            with suppress(*UNPLUGGED):
+                bus.shutdown()
     finally:
-        with suppress(*UNPLUGGED):
-            bus.shutdown()
         node.stop()
 
 
@@ -110,9 +97,15 @@ def tell(bus: can.BusABC, command: str, identifier: int = 0x64) -> None:
     bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
 
-def hear(bus: can.BusABC, count: int, timeout_s: float = 2.0) -> list[tuple[int, str]]:
-    messages = [bus.recv(timeout_s) for _ in range(count)]
+def hear(bus: can.BusABC, count: int) -> list[tuple[int, str]]:
+    messages = [bus.recv(LIMIT_S) for _ in range(count)]
     return [(m.arbitration_id, m.data.hex().upper()) for m in messages if m is not None]
+
+
+def hear_to(bus: can.BusABC, first: tuple[int, str]) -> None:
+    """Take what was on its way up to the answer that begins so."""
+    wait_until(lambda: hear(bus, 1) == [first])
+    hear(bus, 1)
 
 
 CAN_SAMPLE = [(1, "0B01F4FF0603E807"), (2, "D0FC180064000000")]
@@ -127,16 +120,12 @@ def test_robotous_can_commands_and_stream(node: RobotousCanNode) -> None:
         tell(bus, "0F 08")
         assert hear(bus, 2)[0] == (1, "0F01000000000000")
         tell(bus, "0B")
-        start_s = time.monotonic()
-        assert hear(bus, 800) == CAN_SAMPLE * 400
-        assert 0.35 < time.monotonic() - start_s < 0.8
+        assert hear(bus, 400) == CAN_SAMPLE * 200
         tell(bus, "01")
         tell(bus, "0C")
         wait_until(lambda: not node.streaming)
-        while bus.recv(0.02):
-            pass
         tell(bus, "10")
-        assert hear(bus, 2)[0] == (1, "1008000000000000")
+        hear_to(bus, (1, "1008000000000000"))
 
 
 def test_robotous_can_ignores_what_is_no_command(node: RobotousCanNode) -> None:
@@ -162,7 +151,7 @@ def test_robotous_can_faults(node: RobotousCanNode) -> None:
         assert [i for i, _ in hear(bus, 2)] == [2, 1]
         node.faults.swap, node.faults.foreign = 0.0, 1.0
         tell(bus, "0A")
-        messages = [bus.recv(1.0) for _ in range(4)]
+        messages = [bus.recv(LIMIT_S) for _ in range(4)]
         seen = [(m.arbitration_id, m.is_extended_id) for m in messages if m]
         assert seen[1::2] == [(1, False), (2, False)]
         assert not {(1, False), (2, False)} & set(seen[::2])
@@ -179,8 +168,8 @@ def test_robotous_can_identifiers_change_with_a_reset(node: RobotousCanNode) -> 
         assert hear(bus, 2) == CAN_SAMPLE
         node.reset()
         wait_until(lambda: not node.streaming)
-        while bus.recv(0.02):
-            pass
+        tell(bus, "10", identifier=0x70)
+        hear_to(bus, (0x71, "1000000000000000"))
         tell(bus, "0A", identifier=0x70)
         assert [i for i, _ in hear(bus, 2)] == [0x71, 0x72]
 
@@ -188,20 +177,25 @@ def test_robotous_can_identifiers_change_with_a_reset(node: RobotousCanNode) -> 
 # ---------------------------------------------------------------- Robotous, UART
 
 
-def test_robotous_uart_stream_is_paced_and_stops() -> None:
+RFT_GET_RATE = packet(b"\x10".ljust(8, b"\0"))
+
+
+def rft_rate(code: int) -> bytes:
+    return packet(bytes([0x10, code]).ljust(16, b"\0"))
+
+
+def test_robotous_uart_streams_and_stops() -> None:
     box = RobotousSerialBox(constant(RFT_WRENCH), baud_code=1)
     with serial_client(box) as port:
         port.write(RFT_RATE_1_KHZ)
         assert port.read(19) == packet(bytes.fromhex("0F 01").ljust(16, b"\0"))
         port.write(RFT_START)
-        start_s = time.monotonic()
-        assert port.read(19 * 500) == RFT_SAMPLE * 500
-        assert 0.45 < time.monotonic() - start_s < 0.8
+        assert port.read(19 * 200) == RFT_SAMPLE * 200
         port.write(packet(b"\x02".ljust(8, b"\0")) + RFT_STOP)
-        rest = until_silence(port)
+        wait_until(lambda: not box.streaming)
+        port.write(b"\x55\x55" + packet(b"\x0a".ljust(8, b"\0"))[:-1] + b"\0" + RFT_GET_RATE)
+        rest = read_to(port, rft_rate(8))
         assert rest == RFT_SAMPLE * (len(rest) // 19), "nothing else is answered, and no frame is cut"
-        port.write(b"\x55\x55" + packet(b"\x0a".ljust(8, b"\0"))[:-1] + b"\0" + packet(b"\x10".ljust(8, b"\0")))
-        assert port.read(19)[:3] == b"\x55\x10\x08"
 
 
 def test_robotous_uart_delivers_every_reading_once() -> None:
@@ -210,8 +204,8 @@ def test_robotous_uart_delivers_every_reading_once() -> None:
     with serial_client(box) as port:
         port.write(RFT_START)
         frames = port.read(19 * 50)
-        port.write(RFT_STOP)
-        frames += until_silence(port)
+        port.write(RFT_STOP + RFT_GET_RATE)
+        frames += read_to(port, rft_rate(0))
     numbers = [struct.unpack(">h", frames[i + 2 : i + 4])[0] for i in range(0, len(frames), 19)]
     assert numbers == list(range(counter.made))
 
@@ -223,9 +217,9 @@ def test_robotous_uart_streaming_at_start_and_reset() -> None:
         box.streaming_at_start = False
         box.reset()
         wait_until(lambda: not box.streaming)
-        until_silence(port)
-        port.write(packet(b"\x10".ljust(8, b"\0")))
-        assert port.read(19)[1] == 0x10
+        port.write(RFT_GET_RATE)
+        rest = read_to(port, rft_rate(0))
+        assert rest == RFT_SAMPLE * (len(rest) // 19)
 
 
 @pytest.mark.parametrize("fault", ["corrupt", "byte_slip", "drop", "duplicate"])
@@ -252,17 +246,15 @@ def test_robotiq_start_stream_stop() -> None:
     with serial_client(box) as port:
         for _ in range(2):
             port.write(FT300_READ)
-            assert port.read(17) == with_crc(bytes.fromhex("09 03 0C 04D2 FDC9 2710 0096 FFE7 03E8"))
+            rest = read_to(port, with_crc(bytes.fromhex("09 03 0C 04D2 FDC9 2710 0096 FFE7 03E8")))
+            assert rest == FT300_FRAME * (len(rest) // 16), "no frame of the last stream is cut"
             port.write(FT300_START)
             assert port.read(8) == FT300_STARTED
-            start_s = time.monotonic()
-            assert port.read(16 * 30) == FT300_FRAME * 30
-            assert 0.28 < time.monotonic() - start_s < 0.6
+            assert port.read(16 * 20) == FT300_FRAME * 20
             port.write(FT300_READ)
             assert port.read(32) == FT300_FRAME * 2, "no reply in the stream"
             port.write(b"\xff" * 50)
-            rest = until_silence(port)
-            assert rest == FT300_FRAME * (len(rest) // 16)
+            wait_until(lambda: not box.streaming)
 
 
 def test_robotiq_needs_the_whole_stop_sequence() -> None:
@@ -271,10 +263,10 @@ def test_robotiq_needs_the_whole_stop_sequence() -> None:
         port.write(b"\xff" * 49 + b"\0" + b"\xff" * 49)
         assert port.read(160) == FT300_FRAME * 10
         port.write(b"\xff" * 300)
-        wait_until(lambda: not box.streaming)
-        until_silence(port)
+        wait_until(lambda: not box.streaming and not box._burst)  # after a pause, what is more than 50 is forgotten
         port.write(FT300_START)
-        assert port.read(8) == FT300_STARTED
+        rest = read_to(port, FT300_STARTED)
+        assert rest == FT300_FRAME * (len(rest) // 16)
 
 
 def test_robotiq_header_in_the_payload_and_corruption() -> None:
@@ -284,10 +276,8 @@ def test_robotiq_header_in_the_payload_and_corruption() -> None:
         assert frame[:14] == b"\x20\x4e" * 7
         assert crc16(frame) == b"\0\0"
         box.faults.corrupt = 1.0
-        until = time.monotonic() + 2
-        while crc16(frame := port.read(16)) == b"\0\0":
-            assert time.monotonic() < until
-        assert len(frame) == 16
+        wait_until(lambda: crc16(port.read(16)) != b"\0\0")
+        assert len(port.read(16)) == 16
 
 
 # ---------------------------------------------------------------- Bota
@@ -306,7 +296,7 @@ def test_bota_streams_when_opened_and_can_be_configured_at_once() -> None:
         assert [round(x, 5) for x in frames[0][1:7]] == BOTA_WRENCH.tolist()
         assert np.diff([f[7] for f in frames]).tolist() == [10_000] * 9
         port.write(b"C")
-        assert until_silence(port).endswith(b"r,0,C,0\r\n")
+        assert len(read_to(port, b"r,0,C,0\r\n")) % 37 == 0
         for command, answer in (
             (b"c,0,1,0,4", b"r,0,c,0\r\n"),
             (b"f,64,0,0,0", b"r,0,f,0\r\n"),
@@ -315,10 +305,8 @@ def test_bota_streams_when_opened_and_can_be_configured_at_once() -> None:
             for byte in command:
                 port.write(bytes([byte]))
             assert port.read(len(answer)) == answer
-        start_s = time.monotonic()
-        frames = [bota_fields(port.read(37)) for _ in range(240)]
-        assert 0.28 < time.monotonic() - start_s < 0.6, "800 Hz"
-        assert np.diff([f[7] for f in frames]).tolist() == [1250] * 239
+        frames = [bota_fields(port.read(37)) for _ in range(100)]
+        assert np.diff([f[7] for f in frames]).tolist() == [1250] * 99, "800 Hz"
 
 
 def test_bota_banner_at_power_up_and_after_a_reset() -> None:
@@ -339,7 +327,6 @@ def test_bota_banner_at_power_up_and_after_a_reset() -> None:
         (b"x", b"r,1,x,0\r\n"),
         (b"C", b"r,0,C,0\r\n"),
         (b"\r\n c,1,1,0,4 f,512,0,0,0\r\n", b"r,0,c,0\r\nr,0,f,0\r\n"),
-        (b"c,what", b""),
         (b"cccccccccccccccccc", b"r,1,c,0\r\n"),
     ],
 )
@@ -347,18 +334,29 @@ def test_bota_configuration_answers(written: bytes, answers: bytes) -> None:
     box = BotaBox(constant(BOTA_WRENCH))
     with serial_client(box) as port:
         port.write(b"garbage C")
-        wait_until(lambda: not box.streaming)
-        until_silence(port)
+        read_to(port, b"r,0,C,0\r\n")
         port.write(written)
-        assert until_silence(port) == answers
+        assert port.read(len(answers)) == answers
+        port.write(b"C")
+        assert read_to(port, b"r,0,C,0\r\n") == b"", "and nothing else"
+
+
+def test_bota_waits_for_the_rest_of_a_command() -> None:
+    box = BotaBox(constant(BOTA_WRENCH))
+    with serial_client(box) as port:
+        port.write(b"C")
+        read_to(port, b"r,0,C,0\r\n")
+        port.write(b"c,0,1,")
+        wait_until(lambda: box._line == b"c,0,1,")
+        port.write(b"0,4")
+        assert port.read_until(b"\n") == b"r,0,c,0\r\n"
 
 
 def test_bota_text_and_uncalibrated_output() -> None:
     box = BotaBox(constant(BOTA_WRENCH))
     with serial_client(box) as port:
         port.write(b"C")
-        wait_until(lambda: not box.streaming)
-        until_silence(port)
+        read_to(port, b"r,0,C,0\r\n")
         port.write(b"c,0,0,1,4R")
         assert port.read_until(b"r,0,R,0\r\n") == b"r,0,c,0\r\nr,0,R,0\r\n"
         values = port.read_until(b"\n").decode().split(",")
@@ -380,10 +378,11 @@ class RdtClient:
     """A UDP socket that talks to the box."""
 
     def __init__(self, box: NetFtBox) -> None:
+        self.box = box
         self.endpoint = box.start()
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 21)
-        self.socket.settimeout(2.0)
+        self.socket.settimeout(LIMIT_S)
         self.socket.connect((self.endpoint["host"], self.endpoint["rdt_port"]))
 
     def datagrams(self, count: int) -> list[bytes]:
@@ -397,22 +396,33 @@ class RdtClient:
         with suppress(TimeoutError):
             self.socket.recv(2048)
             return False
-        self.socket.settimeout(2.0)
+        self.socket.settimeout(LIMIT_S)
         return True
+
+    def records_to(self, status: int) -> NDArray[np.void]:
+        """Records of a stream that has ended, up to one with this status, which the box is asked for."""
+        self.box.status = status
+        self.socket.send(RDT_ONE)
+        records = [self.records(1)]
+        while records[-1]["status"] != status:
+            records.append(self.records(1))
+        return np.concatenate(records)[:-1]
 
     def page(self, path: str) -> bytes:
         url = f"http://{self.endpoint['host']}:{self.endpoint['http_port']}{path}"
-        with urllib.request.urlopen(url, timeout=2.0) as answer:
+        with urllib.request.urlopen(url, timeout=LIMIT_S) as answer:
             content: bytes = answer.read()
         return content
 
 
 @contextmanager
 def rdt_client(box: NetFtBox) -> Iterator[RdtClient]:
-    client = RdtClient(box)
-    with client.socket:
-        yield client
-    box.stop()
+    try:
+        client = RdtClient(box)
+        with client.socket:
+            yield client
+    finally:
+        box.stop()
 
 
 @pytest.fixture
@@ -439,14 +449,13 @@ def test_rdt_listens_at_its_documented_port() -> None:
         assert len(client.socket.recv(2048)) == 36
 
 
-@pytest.mark.parametrize(("rate_hz", "count"), [(500, 150), (1000, 300), (7000, 2100)])
-def test_rdt_real_time_stream(net_box: NetFtBox, rate_hz: int, count: int) -> None:
+@pytest.mark.parametrize("rate_hz", [500, 1000, 7000])
+def test_rdt_real_time_stream(net_box: NetFtBox, rate_hz: int) -> None:
+    count = 200  # no more than a socket holds: the client may be slower than the box
     net_box.rate_hz = rate_hz
     with rdt_client(net_box) as client:
         client.socket.send(RDT_START)
-        start_s = time.monotonic()
         records = client.records(count)
-        assert 0.27 < time.monotonic() - start_s < 0.6
         assert records["rdt"].tolist() == list(range(1, count + 1))
         assert (np.diff(records["ft"].astype(int)) == 7000 // rate_hz).all()
         client.socket.send(RDT_STOP)
@@ -508,9 +517,8 @@ def test_rdt_bias_status_latch_and_reset(net_box: NetFtBox) -> None:
         assert client.records(1)["status"][0] == 0
         net_box.reset()
         wait_until(lambda: not net_box.streaming)
-        while not client.is_silent():
-            pass
-        net_box.saturated_axis = 2
+        client.records_to(status=1)
+        net_box.status, net_box.saturated_axis = 0, 2
         client.socket.send(RDT_ONE)
         record = client.records(1)[0]
         assert record["status"] == 0x80020000
@@ -525,19 +533,15 @@ def test_rdt_every_reading_is_in_one_record_and_faults_show(net_box: NetFtBox) -
         client.socket.send(struct.pack(">HHI", 0x1234, 2, 100))
         assert np.rint(client.records(100)["counts"][:, 0] / (1e6 * counter.step_N)).tolist() == list(range(100))
         net_box.faults.drop, net_box.faults.duplicate, net_box.faults.swap = 0.1, 0.1, 0.1
-        client.socket.send(struct.pack(">HHI", 0x1234, 2, 500))
-        client.socket.settimeout(0.3)
-        sequence: list[int] = []
-        with suppress(TimeoutError):
-            while True:
-                sequence += client.records(1)["rdt"].tolist()
-        client.socket.settimeout(2.0)
-        assert 420 < len(sequence) < 580
+        client.socket.send(struct.pack(">HHI", 0x1234, 2, 200))
+        wait_until(lambda: net_box._pacer.made >= 200 and not net_box.streaming)
+        net_box.faults.drop = net_box.faults.duplicate = net_box.faults.swap = 0.0
+        sequence = client.records_to(status=1)["rdt"].tolist()
+        assert 160 < len(sequence) < 240
         steps = np.diff(sequence)
         assert (steps == 2).any()
         assert (steps == 0).any()
         assert (steps < 0).any()
-        net_box.faults.drop = net_box.faults.duplicate = net_box.faults.swap = 0.0
         net_box.faults.stall = True
         client.socket.send(RDT_ONE)
         assert client.is_silent()
@@ -548,7 +552,7 @@ def test_rdt_every_reading_is_in_one_record_and_faults_show(net_box: NetFtBox) -
 def test_rdt_left_streaming_to_a_dead_client() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heir:
         heir.bind(("127.0.0.1", 0))
-        heir.settimeout(2.0)
+        heir.settimeout(LIMIT_S)
         box = NetFtBox(constant(RDT_WRENCH), rdt_port=0, rate_hz=1000, streaming_at_start=heir.getsockname())
         with rdt_client(box) as client:
             assert len(heir.recv(2048)) == 36
@@ -583,18 +587,19 @@ def test_net_box_unplugged_leaves_its_ports_and_starts_again(net_box: NetFtBox) 
 def test_pynetft_reads_the_box(net_box: NetFtBox) -> None:
     """What the published client asks for: the configuration page, a real-time stream, bias, and the stream again."""
     pynetft = pytest.importorskip("pynetft")
+    net_box.rate_hz = 200
     endpoint = net_box.start()
     config = pynetft.Config(
         sensor_host=endpoint["host"], rdt_port=endpoint["rdt_port"], http_port=endpoint["http_port"]
     )
     with pynetft.Client(config, queue_size=1000) as client:
-        samples = client.samples(timeout=2.0)
+        samples = client.samples(timeout=LIMIT_S)
         first = next(samples)
         np.testing.assert_allclose(first.wrench, RDT_WRENCH)
         assert first.force_unit is pynetft.ForceUnit.NEWTON
         assert first.torque_unit is pynetft.TorqueUnit.NEWTON_METER
-        following = [next(samples).rdt_sequence for _ in range(100)]
-        assert following == list(range(first.rdt_sequence + 1, first.rdt_sequence + 101))
+        following = [next(samples).rdt_sequence for _ in range(50)]
+        assert following == list(range(first.rdt_sequence + 1, first.rdt_sequence + 51))
         health = client.health()
         assert (health.lost_count, health.malformed_count, health.device_error_count) == (0, 0, 0)
         client.bias()
@@ -619,22 +624,13 @@ def test_serial_sensors_stall_and_are_unplugged(device: Callable[[], RobotousSer
     with serial_client(box) as port:
         assert len(port.read(37)) == 37
         box.faults.stall = True
-        until_silence(port)
-        assert box.streaming
+        made = box._pacer.made
+        wait_until(lambda: box._pacer.made > made + 2)
+        port.reset_input_buffer()
+        wait_until(lambda: box._pacer.made > made + 10)
+        assert port.in_waiting == 0
         box.faults.stall = False
         assert len(port.read(37)) == 37
         box.unplug()
         with pytest.raises(UNPLUGGED):
             wait_until(lambda: not port.read(4096))
-
-
-def test_delay_shifts_the_stream_in_time() -> None:
-    box = BotaBox(constant(BOTA_WRENCH), faults=Faults(delay_s=0.15))
-    start_s = time.monotonic()
-    with serial_client(box) as port:
-        assert port.read(37) == stream_frame(0, BOTA_WRENCH.tolist(), bota_fields_time(box), 25.5)
-        assert 0.14 < time.monotonic() - start_s < 0.4
-
-
-def bota_fields_time(box: BotaBox) -> int:
-    return int(box._stream_start_us) & 0xFFFFFFFF

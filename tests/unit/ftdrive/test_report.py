@@ -22,7 +22,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.hints import hints
 from ftdrive.report import error_in_words, print_comparison, print_result
 from ftdrive.talk import talk
-from tests.unit.fake_cell import Lab
+from tests.unit.ftdrive.fake_cell import Lab
 
 SIGMA = np.repeat([2e-3, 1e-4], 3)
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)

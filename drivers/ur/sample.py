@@ -1,0 +1,167 @@
+"""One sample of a Universal Robots controller, and what its numbers mean.
+
+Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide" (outputs, modes, states and safety status bits).
+Checked on hardware: no.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, Self
+
+from drivers.errors import DeviceFault
+from drivers.interfaces import ArmStatus
+from drivers.ur.kinematics import Pose
+
+OUTPUTS: Final = MappingProxyType(
+    {
+        "timestamp": "DOUBLE",
+        "actual_q": "VECTOR6D",
+        "actual_qd": "VECTOR6D",
+        "target_q": "VECTOR6D",
+        "target_qd": "VECTOR6D",
+        "actual_TCP_pose": "VECTOR6D",
+        "robot_mode": "INT32",
+        "safety_mode": "INT32",
+        "safety_status_bits": "UINT32",
+        "runtime_state": "UINT32",
+        "speed_scaling": "DOUBLE",
+        "target_speed_fraction": "DOUBLE",
+        "tcp_offset": "VECTOR6D",
+        "payload": "DOUBLE",
+        "payload_cog": "VECTOR3D",
+    }
+)
+"""Names and types of what is subscribed to."""
+OPTIONAL: Final = frozenset({"tcp_offset", "payload", "payload_cog"})
+"""Some controllers do not know these yet."""
+
+PROGRAM_STOPPED: Final = 1
+PROGRAM_PLAYING: Final = 2
+ROBOT_IDLE: Final = 5
+ROBOT_RUNNING: Final = 7
+_MEASURING: Final = (ROBOT_IDLE, 6, ROBOT_RUNNING)
+_ROBOT_MODES: Final = {
+    -1: "no controller",
+    0: "disconnected",
+    1: "safety not confirmed",
+    2: "booting",
+    3: "power off",
+    4: "power on",
+    5: "idle",
+    6: "backdrive",
+    7: "running",
+    8: "updating firmware",
+}
+_PROGRAM_STATES: Final = {0: "stopping", 1: "stopped", 2: "playing", 3: "pausing", 4: "paused", 5: "resuming"}
+_SAFETY_MODES: Final = {
+    1: "normal",
+    2: "reduced",
+    3: "protective stop",
+    4: "recovery",
+    5: "safeguard stop",
+    6: "system emergency stop",
+    7: "robot emergency stop",
+    8: "violation",
+    9: "fault",
+    10: "joint identification",
+    11: "undefined",
+}
+_SAFETY: Final = (  # the first that applies says most
+    (0b0_1110_0000, "emergency stop", "make the cell safe, release the button, power the arm on at the pendant"),
+    (0b0_0000_0100, "protective stop", "find and remove its cause, then clear it at the pendant"),
+    (0b0_0001_0000, "safeguard stop", "close the safeguard and reset it"),
+    (0b0_0000_1000, "recovery mode", "move the arm back inside its limits at the pendant"),
+    (0b11_0000_0000, "safety violation or fault", "read the pendant's log and restart the arm"),
+    (0b100_0000_0000, "stop for a safety reason", "read the pendant's log"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What the controller reported once. Vectors are tuples of radians, m and rotation vectors."""
+
+    t_host_ns: int
+    t_device_s: float
+    q_rad: tuple[float, ...]
+    qd_rad_s: tuple[float, ...]
+    target_q_rad: tuple[float, ...]
+    target_qd_rad_s: tuple[float, ...]
+    tcp_pose: tuple[float, ...]
+    robot_mode: int
+    safety_mode: int
+    safety_bits: int
+    program_state: int
+    speed_scaling: float
+    speed_slider: float
+    tcp_offset: tuple[float, ...] | None
+    payload_kg: float | None
+    p_flange_payload_m: tuple[float, ...] | None
+
+    @classmethod
+    def of(cls, t_host_ns: int, outputs: Mapping[str, tuple[float, ...]]) -> Self:
+        """Take a sample from outputs by their names; those of `OPTIONAL` may be missing."""
+        return cls(
+            t_host_ns,
+            outputs["timestamp"][0],
+            outputs["actual_q"],
+            outputs["actual_qd"],
+            outputs["target_q"],
+            outputs["target_qd"],
+            outputs["actual_TCP_pose"],
+            int(outputs["robot_mode"][0]),
+            int(outputs["safety_mode"][0]),
+            int(outputs["safety_status_bits"][0]),
+            int(outputs["runtime_state"][0]),
+            outputs["speed_scaling"][0],
+            outputs["target_speed_fraction"][0],
+            outputs.get("tcp_offset"),
+            outputs.get("payload", (None,))[0],
+            outputs.get("payload_cog"),
+        )
+
+    @property
+    def measures(self) -> bool:
+        """Whether the joints are measured, which needs power."""
+        return self.robot_mode in _MEASURING
+
+    def safety_fault(self) -> DeviceFault | None:
+        """Say why the arm may not move, as far as the arm itself is concerned."""
+        for bits, meaning, cure in _SAFETY:
+            if self.safety_bits & bits:
+                return DeviceFault(f"{meaning} (safety status bits 0x{self.safety_bits:x})", cure)
+        if self.robot_mode != ROBOT_RUNNING:
+            mode = _ROBOT_MODES.get(self.robot_mode, "unknown")
+            cure = "release its brakes" if self.robot_mode == ROBOT_IDLE else "power the arm on and release its brakes"
+            return DeviceFault(f"robot mode {self.robot_mode} ({mode})", f"{cure} at the pendant")
+        return None
+
+    def program_fault(self) -> DeviceFault | None:
+        """Say why our program on the controller does not move the arm."""
+        if self.program_state == PROGRAM_PLAYING:
+            return None
+        state = _PROGRAM_STATES.get(self.program_state, "unknown")
+        return DeviceFault(
+            f"the control program was ended or paused by somebody else (state {self.program_state}, {state})",
+            "leave the arm to this program",
+        )
+
+    def flange(self, tcp_offset: Sequence[float]) -> Pose:
+        """Return the pose of the flange in base: `tcp_pose` without the TCP offset, (6,)."""
+        return Pose.from_ur(self.tcp_pose) @ Pose.from_ur(tcp_offset).inverse()
+
+    def status(self) -> ArmStatus:
+        """Return modes and settings in words."""
+        return ArmStatus(
+            t_host_ns=self.t_host_ns,
+            t_device_s=self.t_device_s,
+            robot_mode=_ROBOT_MODES.get(self.robot_mode, f"unknown ({self.robot_mode})"),
+            safety_mode=_SAFETY_MODES.get(self.safety_mode, f"unknown ({self.safety_mode})"),
+            program=_PROGRAM_STATES.get(self.program_state, f"unknown ({self.program_state})"),
+            fault=self.safety_fault(),
+            speed_slider=self.speed_slider,
+            speed_scaling=self.speed_scaling,
+            payload_kg=self.payload_kg,
+            p_flange_payload_m=self.p_flange_payload_m,
+            tcp_offset=self.tcp_offset,
+        )

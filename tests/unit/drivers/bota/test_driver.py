@@ -1,0 +1,132 @@
+"""The Bota driver as a table of bytes: it listens, is configured only when asked, and reads the sensor's clock."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, count
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers._crc import crc16_x25
+from drivers.bota.sensor import BotaSensor
+from drivers.clock import Clock
+from drivers.errors import ConnectError, StreamBroken
+from tests.unit.drivers.dialogue import Stream, Table
+from tests.unit.drivers.in_one_thread import InOneThread
+
+NUMBERS = np.array([1, -2, 9.81, 0.1, -0.2, 0.3], "<f4")
+PAYLOAD = bytes.fromhex("0000803F 000000C0 C3F51C41 CDCCCC3D CDCC4CBE 9A99993E")
+
+
+def frame(t_us: int, payload: bytes = PAYLOAD) -> bytes:
+    body = bytes(2) + payload + (t_us % 2**32).to_bytes(4, "little") + bytes.fromhex("0000CC41")
+    return b"\xaa" + body + crc16_x25(body).to_bytes(2, "little")
+
+
+def frames(times_us: Iterable[int]) -> Iterator[bytes]:
+    """One each 10 ms, with noise: a repeated wrench would be a frozen sensor."""
+    for number, t_us in enumerate(times_us):
+        yield frame(t_us, (NUMBERS + np.float32(1e-3 * (number % 7))).astype("<f4").tobytes())
+
+
+def stream(*times_us: int) -> Stream:
+    """Tell these times, then go on in steps of 10 ms."""
+    last = times_us[-1] if times_us else 1_000_000
+    return Stream(frames(chain(times_us, count(last + 10_000, 10_000))), 0.01)
+
+
+class Sensor(InOneThread, BotaSensor):
+    def __init__(self, clock: Clock, **options: Any) -> None:
+        super().__init__("/dev/ttyUSB0", clock=clock, **options)
+
+
+def test_it_is_only_listened_to(table: Table) -> None:
+    with table.serial([], stream()) as wire, Sensor(wire.clock) as sensor:
+        samples = sensor.collect(0.5)
+        assert sensor.health().nominal_rate_Hz == pytest.approx(100)
+    assert wire.sent == []
+    np.testing.assert_allclose(samples.wrench.min(axis=0), NUMBERS, rtol=1e-6)
+    np.testing.assert_allclose(np.diff(samples.t_device_s), 0.01, atol=1e-9)
+
+
+COMMANDS: Sequence[tuple[bytes, bytes]] = [
+    (b"C", b"r,0,C,0"),
+    (b"c,0,1,0,4", b"r,0,c,0"),
+    (b"f,512,0,0,1", b"r,0,f,0"),
+]
+
+
+def test_it_is_configured_when_asked(table: Table) -> None:
+    run = b"R", Stream(frames(count(0, 10_000)), 0.01, b"r,0,R,0")
+    with table.serial([*COMMANDS, run], stream()) as wire, Sensor(wire.clock, sinc=512) as sensor:
+        assert len(sensor.collect(0.1)) == pytest.approx(10, abs=1)
+
+
+def test_a_command_has_a_second_and_is_sent_three_times(table: Table) -> None:
+    run = b"R", Stream(frames(count(0, 10_000)), 0.01, b"r,0,R,0")
+    late = b"C", (990.0, b"r,0,C,0")
+    with table.serial([late, *COMMANDS[1:], run]) as wire, Sensor(wire.clock, sinc=512):
+        pass
+    wire = table.serial([(b"C", b"")] * 3)
+    start_s = wire.clock.now_s()
+    with wire, pytest.raises(ConnectError, match="'C'"):
+        Sensor(wire.clock, sinc=512).open()
+    assert wire.clock.now_s() - start_s == pytest.approx(3.0, abs=0.2)
+
+
+@pytest.mark.parametrize(("boot_s", "opens"), [(2.8, True), (3.1, False)])
+def test_first_frames_are_waited_for_three_seconds(table: Table, boot_s: float, opens: bool) -> None:
+    wire = table.serial([])
+    wire.clock.at(boot_s, lambda: wire._run(stream()))
+    sensor = Sensor(wire.clock)
+    if opens:
+        sensor.open()
+        assert len(sensor.collect(0.1))
+        sensor.close()
+    else:
+        with pytest.raises(ConnectError, match=" 0 intact frames"):
+            sensor.open()
+
+
+def test_frames_that_waited_for_a_slow_computer_are_first_frames(table: Table) -> None:
+    wire = table.serial([], stream())
+    wire.clock.advance(0.2)
+    wire.clock.at(0.001, lambda: wire.clock.stall(5.0))
+    with Sensor(wire.clock) as sensor:
+        assert sensor.health().nominal_rate_Hz == pytest.approx(100)
+
+
+def test_clock_wraps(table: Table) -> None:
+    with table.serial([], stream(2**32 - 150_000)) as wire, Sensor(wire.clock) as sensor:
+        samples = sensor.collect(0.25)
+    assert (np.diff(samples.seq) == 1).all()
+    assert samples.t_device_s[-1] > 2**32 / 1e6
+    np.testing.assert_allclose(np.diff(samples.t_device_s), 0.01, atol=1e-9)
+
+
+def test_gaps_are_seen_on_its_clock(table: Table) -> None:
+    times = [10_000 * k for k in range(1, 40) if k not in {25, 26, 30}]
+    with table.serial([], stream(*times)) as wire, Sensor(wire.clock) as sensor:
+        samples, health = sensor.collect(0.35), sensor.health()
+    assert sorted(np.diff(samples.seq))[-3:] == [1, 2, 3]
+    assert health.lost == 3
+
+
+def test_a_sample_that_comes_twice_is_one(table: Table) -> None:
+    times = [10_000 * k for k in range(1, 20)]
+    with table.serial([], stream(*times, times[-1])) as wire, Sensor(wire.clock) as sensor:
+        samples = sensor.collect(0.2)
+        assert sensor.health().duplicated == 1
+    assert (np.diff(samples.seq) == 1).all()
+
+
+def test_a_clock_that_goes_back_is_a_restart(table: Table) -> None:
+    wire = table.serial([], stream(*range(5_000_000, 5_200_000, 10_000), 10_000))
+    with wire, Sensor(wire.clock) as sensor, pytest.raises(StreamBroken, match="restarted"):
+        sensor.collect(1.0)
+
+
+def test_noise_is_no_sensor(table: Table) -> None:
+    wire = table.serial([], Stream.of(b"\xaa" * 40, 0.005))
+    with wire, pytest.raises(ConnectError, match="check supply and wiring"):
+        Sensor(wire.clock).open()

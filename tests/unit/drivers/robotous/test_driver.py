@@ -1,0 +1,152 @@
+"""The Robotous driver on both wires as a table: golden start-up, halves that pair up, what is waited for."""
+
+import struct
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout
+from drivers.interfaces import Fact
+from drivers.robotous.can import CanLink
+from drivers.robotous.sensor import RobotousSensor
+from drivers.robotous.serial import SerialLink
+from tests.unit.drivers.dialogue import CanWire, SerialWire, Stream, Table
+from tests.unit.drivers.in_one_thread import InOneThread
+
+STOP, GO, MODEL = "0C00000000000000", "0B00000000000000", "0100000000000000"
+WRENCH = [10, -5, 20, 1, -0.5, 0.05]
+ANSWERS = {
+    MODEL: b"\x01RFT60-HA01".ljust(16, b"\0"),
+    "0200000000000000": b"\x02A60HA00123".ljust(16, b"\0"),
+    "0300000000000000": b"\x03VER 1.7".ljust(16, b"\0"),
+    "1000000000000000": bytes.fromhex("1000").ljust(16, b"\0"),
+}
+SET_1_KHZ = {"0F08000000000000": bytes.fromhex("0F01").ljust(16, b"\0")}
+SAMPLE = bytes.fromhex("0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000".replace(" ", ""))
+OVERLOAD = bytes.fromhex("0B 01F4 FF06 03E8 07D0 FC18 0064 21 0000".replace(" ", ""))
+
+
+OTHER = bytes.fromhex("0B FE0C 0102 FC18 F830 03E8 FF9C 00 0000".replace(" ", ""))
+
+
+class Sensor(InOneThread, RobotousSensor): ...
+
+
+def counts(field: bytes) -> tuple[int, ...]:
+    return struct.unpack(">6h", field[1:13])
+
+
+def frame(field: bytes) -> bytes:
+    return b"\x55" + field + bytes([sum(field) & 0xFF, 0xAA])
+
+
+def halves(field: bytes) -> list[str]:
+    return [f"001 {field[:8].hex().upper()}", f"002 {field[8:].hex().upper()}"]
+
+
+def on_uart(answers: dict[str, bytes], samples: Stream) -> list[tuple[bytes, Any]]:
+    asked = [(frame(bytes.fromhex(request)), frame(reply)) for request, reply in answers.items()]
+    stop = frame(bytes.fromhex(STOP)), b""
+    talk = [turn for question in asked for turn in (stop, question)]
+    return [*talk, (frame(bytes.fromhex(GO)), samples), stop]  # no bias, 0x11, anywhere
+
+
+def on_can(answers: dict[str, bytes], samples: Stream) -> list[tuple[str, Any]]:
+    asked = [(f"064 {request}", halves(reply)) for request, reply in answers.items()]
+    stop: tuple[str, list[str]] = f"064 {STOP}", []
+    return [*(turn for question in asked for turn in (stop, question)), (f"064 {GO}", samples), stop]
+
+
+def uart(wire: SerialWire, rate_Hz: int | None = None) -> Sensor:
+    return Sensor(SerialLink("/dev/ttyUSB0", baud=921_600, clock=wire.clock), rate_Hz=rate_Hz)
+
+
+def bus(wire: CanWire, rate_Hz: int | None = None) -> Sensor:
+    return Sensor(CanLink("can0", clock=wire.clock), rate_Hz=rate_Hz)
+
+
+def test_start_up_on_a_uart_is_golden(table: Table) -> None:
+    with table.serial(on_uart(ANSWERS | SET_1_KHZ, Stream.of(frame(SAMPLE)))) as wire, uart(wire, 1000) as sensor:
+        samples, info = sensor.collect(0.1), sensor.identify()
+        assert sensor.health().nominal_rate_Hz == 1000
+    assert (info.model, info.serial, info.firmware) == ("Robotous RFT60-HA01", "A60HA00123", "VER 1.7")
+    assert info.facts["counts_per_N"] == Fact(50, "documented")
+    np.testing.assert_allclose(samples.wrench, [WRENCH] * len(samples))
+    assert samples.counts[0].tolist() == [500, -250, 1000, 2000, -1000, 100]
+    assert (np.diff(samples.seq) == 1).all()
+    assert len(samples) == pytest.approx(100, abs=2)
+
+
+@pytest.mark.parametrize(("rate_Hz", "period_s"), [(None, 0.005), (1000, 0.001)])
+def test_can_carries_the_same_commands(table: Table, rate_Hz: int | None, period_s: float) -> None:
+    answers = ANSWERS | (SET_1_KHZ if rate_Hz else {})
+    with table.can(on_can(answers, Stream.of(halves(SAMPLE), period_s))) as wire, bus(wire, rate_Hz) as sensor:
+        samples = sensor.collect(0.15)
+        assert (sensor.health().lost, sensor.health().nominal_rate_Hz) == (0, 1 / period_s)
+    np.testing.assert_allclose(samples.wrench, [WRENCH] * len(samples))
+    assert (np.diff(samples.seq) == 1).all()
+    assert len(samples) == pytest.approx(0.15 / period_s, abs=3)
+
+
+def test_foreign_frames_between_halves_do_not_matter(table: Table) -> None:
+    first, second = halves(SAMPLE)
+    mixed = Stream.of([first, "003 0011223344556677", second], 0.005)
+    with table.can(on_can(ANSWERS, mixed)) as wire, bus(wire) as sensor:
+        np.testing.assert_allclose(sensor.collect(0.1).wrench[0], WRENCH)
+
+
+@pytest.mark.parametrize("late_s", [0.012, 0.2])
+def test_halves_that_have_piled_up_while_this_computer_was_slow_are_never_paired_crosswise(
+    table: Table, late_s: float
+) -> None:
+    two = Stream(cycle([halves(SAMPLE), halves(OTHER)]))
+    with table.can(on_can(ANSWERS | SET_1_KHZ, two)) as wire, bus(wire, 1000) as sensor:
+        for t_s in (0.02, 0.05 + late_s):
+            wire.clock.at(t_s, lambda: wire.clock.stall(late_s))
+        samples = sensor.collect(2 * late_s + 0.1)
+        assert {tuple(row) for row in samples.counts.tolist()} == {tuple(counts(SAMPLE)), tuple(counts(OTHER))}
+        assert (np.diff(samples.seq) >= 1).all()
+        assert sensor.health().received > 50
+
+
+def test_halves_that_never_leave_a_silence_are_no_samples(table: Table) -> None:
+    busy = Stream.of(halves(SAMPLE), 0.0004)  # no half period without a frame
+    wire = table.can(on_can(ANSWERS | SET_1_KHZ, busy))
+    with wire, pytest.raises(ConnectError, match="no sample"):
+        bus(wire, 1000).open()
+
+
+def test_overload_names_its_axes(table: Table) -> None:
+    wire = table.can(on_can(ANSWERS, Stream.of(halves(OVERLOAD), 0.005)))
+    with wire, pytest.raises(DeviceFault, match="Fx, Tz;"):
+        bus(wire).open()
+
+
+@pytest.mark.parametrize(("after_ms", "asked"), [(145.0, 1), (205.0, 2), (None, 3)])
+def test_an_answer_has_a_seventh_of_a_second_and_is_asked_for_three_times(
+    table: Table, after_ms: float | None, asked: int
+) -> None:
+    """And one turn of 50 ms that looks for it."""
+    turns = on_uart(ANSWERS, Stream.of(frame(SAMPLE), 0.005))
+    reply: Any = [] if after_ms is None else [(after_ms, turns[1][1])]
+    late = [turns[0], (turns[1][0], reply)]
+    if after_ms is not None:
+        with table.serial([*late, *turns[2 if asked == 1 else 0 :]]) as wire, uart(wire):
+            return
+    wire = table.serial([*late * asked, turns[0]])
+    start_s = wire.clock.now_s()
+    with wire, pytest.raises(ConnectError, match="MODEL") as caught:
+        uart(wire).open()
+    assert wire.clock.now_s() - start_s == pytest.approx(0.5, abs=0.11)
+    assert isinstance(caught.value.__cause__, DeviceTimeout)
+
+
+def test_noise_is_no_sensor(table: Table) -> None:
+    turns = on_uart({MODEL: b""}, Stream.of(b""))[:2]
+    mute = [(sent, b"") for sent, _ in turns]
+    noise = Stream.of(b"\xaa" * 40, 0.005)
+    wire = table.serial([*[mute[0], (mute[1][0], noise)] * 3, mute[0]], noise)
+    with wire, pytest.raises(ConnectError, match="check supply, wiring"):
+        uart(wire).open()

@@ -1,0 +1,208 @@
+"""Which halves of a Robotous sensor on CAN are believed to be one sample: none that may be of two."""
+
+import random
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.robotous.can import CanLink, RobotousCan
+from drivers.robotous.halves import Halves
+from tests.fake_clock import FakeClock
+
+PERIOD_S = 0.005
+Half = tuple[float, int, bool]
+"""When it can be received, of which sample it is, and whether it is the second."""
+
+
+MANY = [f"F{number} S{number}" for number in range(200)]
+
+
+def data(number: int) -> bytes:
+    return bytes([0x0B]) + number.to_bytes(2, "big") + bytes(5)
+
+
+def halves(pattern: str, period_s: float = PERIOD_S, *, begin: int = 0) -> list[Half]:
+    """Halves such as ``F0 S0 F1 S1``, each when its sample is due or with the half before it, if that is later."""
+    out: list[Half] = []
+    for word in pattern.split():
+        number = begin + int(word[1:])
+        t_s = 1 + number * period_s + (1.3e-4 if word[0] == "S" else 0)
+        out.append((max([t_s, *[half[0] + 1e-5 for half in out[-1:]]]), number, word[0] == "S"))
+    return out
+
+
+def heard(link: Halves, sent: Iterable[Half], late_s: Iterable[float] = ()) -> list[tuple[int, int, int]]:
+    """Receive halves as a host does, by whom some are taken late; (number, sample, sample) of every field believed.
+
+    The two samples are those of its first and of its second half.
+    """
+    now_s, fields, late = 0.0, [], iter(late_s)
+    for t_s, number, second in sent:
+        while not link.quiet and t_s > now_s + link.silence_s:
+            now_s += link.silence_s
+            fields += link.silence()
+        now_s = max(now_s, t_s) + next(late, 0.0) + 2e-5
+        link.take(round(now_s * 1e9), data(number), second=second)
+    fields += link.silence()
+    return [
+        (field.number, int.from_bytes(field.data[1:3], "big"), int.from_bytes(field.data[9:11], "big"))
+        for field in fields
+    ]
+
+
+def in_step() -> Halves:
+    """Pairing that has heard of samples 0 and 1, which it needs to set its clock."""
+    link = Halves(PERIOD_S)
+    assert heard(link, halves(" ".join(MANY[:2]))) == []
+    return link
+
+
+def whole(samples: Iterable[int]) -> list[tuple[int, int, int]]:
+    """Halves that belong together; the third sample of a stream is its number 1."""
+    return [(sample - 1, sample, sample) for sample in samples]
+
+
+def test_a_healthy_stream_is_believed_but_for_the_first_two() -> None:
+    link = Halves(PERIOD_S)
+    assert heard(link, halves(" ".join(MANY[:5]))) == whole([2, 3, 4])
+    assert link.lost == 0
+
+
+@pytest.mark.parametrize(
+    ("pattern", "believed"),
+    [
+        ("F0 S0 F1 S1 F2 S3 F4 S4 F5 S5", [0, 1, 4, 5]),  # two losses, and what is left takes turns
+        ("F0 S0 F1 S1 F2 S4 F5 S5 F6 S6", [0, 1, 5, 6]),
+        ("F0 S0 F1 S1 F2 S3 S4 F5 S5 F6 S6", [0, 1, 6]),
+        ("F0 S0 F1 S1 F3 S3 F4 S4", [0, 1, 4]),  # one as a whole: it might have been two halves
+        ("F0 S0 F1 S1 F2 F3 S3 F4 S4 F5 S5", [0, 1, 5]),
+        ("F0 S0 F1 S1 S2 F3 S3 F4 S4", [0, 1, 4]),
+        ("F0 S0 F1 F2 S1 S2 F3 S3 F4 S4", [0, 4]),  # changed places
+        ("F0 S0 S1 F1 S2 F2 S3 F3 F4 S4 F5 S5", [0, 5]),
+        ("F0 S0 F1 S1 S1 F2 S2 F3 S3", [0, 3]),  # twice: a foreign half would look the same
+        ("F0 S0 F1 S1 F2 F2 S2 F3 S3 F4 S4", [0, 1, 4]),
+        ("S0 F1 S1 F2 S2", [2]),
+    ],
+)
+def test_what_is_out_of_turn_or_short_of_the_clock_is_thrown_away(pattern: str, believed: list[int]) -> None:
+    got = heard(in_step(), halves(pattern, begin=2))
+    assert [(first - 2, second - 2) for _, first, second in got] == [(number, number) for number in believed]
+
+
+def test_what_is_missing_is_numbered_and_counted_by_the_clock() -> None:
+    link = in_step()
+    assert heard(link, halves("F2 S2 F6 S6 F7 S7 F8 S8")) == whole([2, 7, 8])
+    assert link.lost == 4  # three that never came, and the one that sets the clock
+
+
+def test_a_late_host_loses_nothing() -> None:
+    sent = halves(" ".join(MANY[:12]))
+    link = Halves(PERIOD_S)
+    assert heard(link, sent, [0.0] * 6 + [0.022]) == whole(range(2, 12))
+    assert link.lost == 0
+
+
+def test_a_late_host_does_not_pair_what_was_lost() -> None:
+    """It finds `F4 S5` among halves that are not crosswise, as if it had come so."""
+    sent = halves("F2 S2 F3 S3 F4 S5 F6 S6 F7 S7 F8 S8 F9 S9")
+    assert heard(in_step(), sent, [0.0] * 2 + [0.022]) == whole([2, 8, 9])
+
+
+@pytest.mark.parametrize("slower", [0.9, 1.0, 1.001, 1.1])
+def test_the_sensor_may_be_slower_or_faster_than_it_says(slower: float) -> None:
+    sent = halves(" ".join(MANY), PERIOD_S * slower)
+    assert heard(Halves(PERIOD_S), sent) == whole(range(2, 200))
+
+
+@pytest.mark.parametrize("shift", [0.1, 0.3, 0.5, 0.6, 0.7, 0.9, 5.6])
+def test_a_sensor_that_pauses_is_believed_again(shift: float) -> None:
+    link = Halves(PERIOD_S)
+    heard(link, halves("F0 S0 F1 S1 F2 S2 F3 S3"))
+    later = [(t_s + shift * PERIOD_S, number, second) for t_s, number, second in halves(" ".join(MANY[4:]))]
+    assert len(heard(link, later)) > 190
+
+
+@pytest.mark.parametrize("slower", [0.9, 1.0, 1.001, 1.1])
+def test_losses_on_a_sensor_slower_or_faster_than_it_says(slower: float) -> None:
+    chance = random.Random(1)
+    kept = [word for words in MANY for word in words.split() if chance.random() >= 0.05]
+    got = heard(Halves(PERIOD_S), halves(" ".join(kept), PERIOD_S * slower))
+    assert len(got) > 100
+    assert all(first == second for _, first, second in got)
+
+
+def test_replies_need_no_clock() -> None:
+    assert heard(Halves(), halves("F0 S0 F1 F2 S2 F9 S9")) == [(1, 0, 0), (2, 9, 9)]
+
+
+def test_halves_of_another_length_are_out_of_turn() -> None:
+    link = Halves()
+    link.take(10**9, data(1)[:7], second=False)
+    link.take(10**9, data(1) + b"\0", second=True)
+    assert link.silence() == []
+
+
+def test_a_stream_that_never_is_silent_is_not_kept_for_ever() -> None:
+    link = Halves(PERIOD_S)
+    for number in range(5000):
+        link.take(10**9 + number, data(1), second=number % 2 == 1)
+    assert link.silence() == []
+
+
+@given(
+    loss=st.floats(0, 0.4),
+    swaps=st.floats(0, 0.4),
+    seed=st.integers(0, 2**32),
+    period_s=st.sampled_from([0.001, 0.005, 0.1]),
+)
+def test_no_crosswise_pair_while_the_host_keeps_up(loss: float, swaps: float, seed: int, period_s: float) -> None:
+    """Whatever is lost or changes places within its sample; lateness is below half a period."""
+    chance = random.Random(seed)
+    order = []
+    for number in range(300):
+        pair = [f"F{number}", f"S{number}"]
+        order += pair[::-1] if chance.random() < swaps else pair
+    sent = halves(" ".join(word for word in order if chance.random() >= loss), period_s)
+    late_s = [chance.random() * 0.2 * period_s for _ in sent]
+    link = Halves(period_s)
+    got = heard(link, sent, late_s)
+    assert all(first == second for _, first, second in got)
+    numbers = [number for number, _, _ in got]
+    assert numbers == sorted(set(numbers))
+    assert len(got) > 290 or loss + swaps > 0
+
+
+@pytest.mark.parametrize(("slept_s", "fields"), [(0.0, 1), (0.02, 0)])
+def test_a_silence_the_host_slept_through_is_none(slept_s: float, fields: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second half that comes twice shows that the first may be foreign: unless it came after a silence."""
+    clock = FakeClock()
+    link = CanLink("can0", clock=clock)
+    frames: list[tuple[int, bytes] | None] = [(1, data(1)), (2, data(1)), None, (2, data(1))]
+
+    def look(wait_s: float) -> tuple[int, bytes] | None:
+        frame = frames.pop(0) if frames else None
+        if frame is None:
+            clock.stall(wait_s + slept_s)
+        return frame
+
+    monkeypatch.setattr(link._bus, "look", look)
+    assert len(link.receive()) == fields
+
+
+def test_a_silence_while_halves_come_is_not_the_fault_of_cable_or_supply(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = FakeClock()
+    link = CanLink("can0", clock=clock)
+    sensor = RobotousCan(link)
+    assert "cable" in sensor._stale(0.4).cure
+
+    def look(_: float) -> tuple[int, bytes]:
+        clock.stall(0.001)
+        return 1, data(1)  # first halves only
+
+    monkeypatch.setattr(link._bus, "look", look)
+    assert link.receive() == []
+    assert "cannot be paired" in sensor._stale(0.4).cure
+    clock.stall(0.2)
+    assert "cable" in sensor._stale(0.4).cure

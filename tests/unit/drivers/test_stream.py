@@ -1,0 +1,818 @@
+"""The reader shared by all streaming sensors: nothing lost, nothing old, nothing silent, every limit to the tick."""
+
+import json
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers._stream import NOTHING, StreamingSensor, StreamLimits
+from drivers.clock import REAL, Clock, Waitable
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, Frozen, ProtocolError, StreamBroken
+from drivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, FtSamples
+from tests.fake_clock import FakeClock
+from tests.unit.drivers.in_one_thread import InOneThread
+
+READ_S = 0.02
+Feed = int | FtSamples | Exception
+
+
+class Fed(StreamingSensor):
+    """A sensor whose blocks the test puts into `feed`; an exception among them is raised in the reader."""
+
+    def __init__(self, clock: Clock, *, sign: int = 1, limits: StreamLimits | None = None, most: int = 10**6) -> None:
+        super().__init__("fake", sign=sign, clock=clock, limits=limits or StreamLimits(), max_collect_samples=most)
+        self.feed: deque[Feed] = deque()
+        self.connect_error: Exception | None = None
+        self.disconnect_error: Exception | None = None
+        self.connects = self.disconnects = 0
+        self.first = 1
+        self.seq = 0
+        self.arrived = threading.Condition()
+
+    def _connect(self) -> DeviceInfo:
+        self.connects += 1
+        if self.connect_error:
+            raise self.connect_error
+        if self.first:
+            self.feed.append(self.first)
+        return DeviceInfo("fake", "F1", "1.0")
+
+    def _read_block(self) -> FtSamples:
+        with self.arrived:
+            for left_s in self._clock.looks(READ_S):
+                if self.feed:
+                    break
+                self._clock.wait(self.arrived, left_s)
+            else:
+                return NOTHING
+            item = self.feed.popleft()
+        if isinstance(item, Exception):
+            raise item
+        if isinstance(item, FtSamples):
+            return item
+        seq = self.seq + np.arange(item)
+        self.seq += item
+        return FtSamples(
+            t_host_ns=np.full(item, self._clock.now_ns()),
+            t_device_s=np.full(item, np.nan),
+            seq=seq,
+            counts=np.ones((item, 6), np.int32),
+            wrench=self.wrench(seq),
+            status=np.zeros(item, np.uint32),
+        )
+
+    def wrench(self, seq: NDArray[np.int64]) -> Array:
+        return np.arange(1.0, 7.0) + 1e-3 * seq[:, np.newaxis]
+
+    def _disconnect(self) -> None:
+        self.disconnects += 1
+        if self.disconnect_error:
+            raise self.disconnect_error
+
+
+class FakeSensor(InOneThread, Fed):
+    """On a fake clock of its own."""
+
+    def __init__(
+        self,
+        *,
+        sign: int = 1,
+        limits: StreamLimits | None = None,
+        most: int = 10**6,
+        recover: bool = False,
+        clock: FakeClock | None = None,
+    ) -> None:
+        self.time = clock or FakeClock()
+        super().__init__(self.time, sign=sign, limits=limits, most=most)
+        self.recover = recover
+
+    def at(self, delay_s: float, *items: Feed) -> None:
+        self.time.at(delay_s, lambda: self.feed.extend(items))
+
+    def stream(self, size: int = 1, period_s: float = 0.005) -> None:
+        """Feed for ever."""
+
+        def send() -> None:
+            self.feed.append(size)
+            self.time.at(period_s, send)
+
+        self.time.at(period_s, send)
+
+    def settle(self) -> None:
+        """Let the reader take what it was fed."""
+        while self.feed:
+            self.time.advance(0.001)
+
+    def block(self, seq: list[int], *, after_s: float = 0.0, **what: float) -> FtSamples:
+        """Samples as a driver hands them over, received `after_s` from now."""
+        made = block(seq, **what)
+        return replace(made, t_host_ns=made.t_host_ns + self.time.now_ns() + round(after_s * 1e9))
+
+
+def block(seq: list[int], *, wrench: float | None = None, t_device_s: float = np.nan) -> FtSamples:
+    """A wrench that is not given is another one in each row."""
+    n = len(seq)
+    rows = np.arange(6.0) + np.array(seq)[:, np.newaxis] if wrench is None else np.full((n, 6), wrench)
+    return FtSamples(
+        t_host_ns=np.zeros(n, np.int64),
+        t_device_s=np.full(n, t_device_s),
+        seq=np.array(seq),
+        counts=np.zeros((n, 0), np.int32),
+        wrench=rows,
+        status=np.zeros(n, np.uint32),
+    )
+
+
+@pytest.fixture
+def sensor() -> Iterator[FakeSensor]:
+    with FakeSensor() as fake:
+        yield fake
+
+
+def failure_of(sensor: StreamingSensor) -> type[Exception] | None:
+    try:
+        sensor.check()
+    except Exception as exc:
+        return type(exc)
+    return None
+
+
+def test_constructor_touches_nothing() -> None:
+    fake = FakeSensor()
+    assert fake.connects == 0
+    with pytest.raises(StreamBroken, match="not open"):
+        fake.check()
+    with pytest.raises(ConnectError, match="open it first"):
+        fake.identify()
+
+
+def test_collect_has_every_sample_of_the_window_and_no_other(sensor: FakeSensor) -> None:
+    sensor.stream(3, 0.005)
+    sensor.collect(0.012)
+    start_ns = sensor.time.now_ns()
+    samples = sensor.collect(0.2)
+    assert (np.diff(samples.seq) == 1).all()
+    assert 0 <= samples.t_host_ns[0] - start_ns <= 5_100_000
+    assert 0 < start_ns + 200_000_000 - samples.t_host_ns[-1] <= 5_100_000
+    assert sensor.time.now_ns() - start_ns <= 205_100_000  # with the first sample after the end
+
+
+@pytest.mark.parametrize(
+    "error", [StreamBroken("gone"), DeviceFault("hot"), ProtocolError("odd"), ZeroDivisionError("bug")]
+)
+def test_death_of_the_reader_is_raised_at_every_consumer_at_once(sensor: FakeSensor, error: Exception) -> None:
+    sensor.at(0.03, error)
+    start_s = sensor.time.now_s()
+    with pytest.raises(type(error), match=str(error)) as caught:
+        sensor.collect(5.0)
+    assert sensor.time.now_s() - start_s == pytest.approx(0.03, abs=1e-3)
+    assert caught.value.__cause__ is error
+    for call in (sensor.check, lambda: sensor.latest(timeout_s=0.1), lambda: sensor.collect(0.1)):
+        with pytest.raises(type(error), match=str(error)):
+            call()
+
+
+def test_silence_is_a_timeout_never_an_old_value(sensor: FakeSensor) -> None:
+    assert len(sensor.latest(timeout_s=0.0)) == 1
+    heard_s = sensor.latest(timeout_s=0.0).t_host_ns[0] / 1e9
+    failures: list[type[Exception] | None] = []
+    for t_s in (0.2999, 0.3001):
+        sensor.time.at(heard_s + t_s - sensor.time.now_s(), lambda: failures.append(failure_of(sensor)))
+    with pytest.raises(DeviceTimeout, match=r"0\.3\d\d s"):
+        sensor.collect(1.0)
+    assert failures == [None, DeviceTimeout]
+    assert sensor.time.now_s() - heard_s == pytest.approx(0.3, abs=READ_S + 0.002)
+    for call in (sensor.check, lambda: sensor.latest(timeout_s=0.0)):
+        with pytest.raises(DeviceTimeout):
+            call()
+    begin_s = sensor.time.now_s()
+    with pytest.raises(DeviceTimeout):
+        sensor.latest(timeout_s=0.5)
+    assert sensor.time.now_s() - begin_s == pytest.approx(0.5, abs=READ_S + 1e-3)
+    sensor.at(0.1, 1)
+    assert sensor.latest(timeout_s=1.0).seq[0] == 1  # fresh again: silence is judged anew
+    sensor.check()
+
+
+def test_a_gap_inside_a_collect_is_an_error_although_the_stream_came_back(sensor: FakeSensor) -> None:
+    for t_s in (0.02, 0.04, 0.35, 0.37, 0.39, 0.41):
+        sensor.at(t_s, 1)
+    start_s = sensor.time.now_s()
+    with pytest.raises(DeviceTimeout):
+        sensor.collect(0.4)
+    assert sensor.time.now_s() - start_s < 0.4
+    for t_s in (0.02, 0.31, 0.42):  # no gap of 0.3 s
+        sensor.at(t_s, 1)
+    sensor.latest(timeout_s=0.1)
+    assert len(sensor.collect(0.3)) >= 1
+
+
+def test_a_gap_that_no_wait_noticed_is_found_in_the_stamps(sensor: FakeSensor) -> None:
+    """A consumer that was suspended sees the stream as it was, not as it is."""
+    sensor.stream(1, 0.01)
+    first = sensor.block([10**6])
+    late = sensor.block([10**6 + 1], after_s=0.35)
+
+    def skip() -> None:
+        sensor.feed.extend((first, late))
+        sensor.time.stall(0.35)
+
+    sensor.time.at(0.05, skip)
+    with pytest.raises(DeviceTimeout):
+        sensor.collect(0.3)
+
+
+def test_more_samples_than_a_collect_may_hold_is_an_error() -> None:
+    with FakeSensor(most=10) as fake:
+        fake.stream(3)
+        with pytest.raises(StreamBroken, match="more than 10 samples"):
+            fake.collect(1.0)
+
+
+def test_what_the_device_does_not_report_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = Fact((100.0,) * 6, "device")
+    fake = FakeSensor(sign=-1)
+    monkeypatch.setattr(fake, "_connect", lambda: DeviceInfo("fake", NOT_REPORTED, "1.0", {"range": told}))
+    fake.feed.append(1)
+    fake.configured = {"serial": Fact("F7", "configured")}
+    with fake:
+        info = fake.identify()
+    assert info.serial == "F7"
+    assert info.facts == {"serial": Fact("F7", "configured"), "range": told, "sign": Fact(-1, "configured")}
+    assert json.loads(json.dumps(asdict(info)))["facts"]["range"] == {"value": [100.0] * 6, "source": "device"}
+
+
+def test_a_sensor_with_another_serial_number_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = FakeSensor()
+    fake.configured = {"serial": Fact("F2", "configured")}
+    with pytest.raises(ConnectError, match=r"F1 .* F2"):
+        fake.open()
+    assert fake.disconnects == 1
+    fake.configured = {"serial": Fact("F1", "configured"), "range": Fact((1.0,) * 6, "configured")}
+    monkeypatch.setattr(fake, "_connect", lambda: DeviceInfo("fake", "F1", "1.0", {"range": Fact(2.0, "device")}))
+    fake.feed.append(1)
+    with fake:
+        assert fake.identify().facts["range"] == Fact((1.0,) * 6, "configured")  # the user knows why
+
+
+def test_sign_turns_the_wrench_once_and_leaves_counts_raw() -> None:
+    with FakeSensor(sign=-1) as fake:
+        newest = fake.latest(timeout_s=1.0)
+        assert newest.wrench.tolist() == [[-1.0, -2.0, -3.0, -4.0, -5.0, -6.0]]
+        assert newest.counts.tolist() == [[1] * 6]
+    with pytest.raises(ValueError, match="sign is 0"):
+        FakeSensor(sign=0)
+
+
+def test_open_after_a_failure_starts_clean(sensor: FakeSensor) -> None:
+    sensor.feed.append(StreamBroken("gone"))
+    sensor.settle()
+    assert failure_of(sensor) is StreamBroken
+    sensor.open()
+    sensor.check()
+    assert (sensor.connects, sensor.disconnects) == (2, 1)
+    assert sensor.health().received == 1
+
+
+def test_what_a_codec_says_gets_the_name_of_the_device() -> None:
+    fake = FakeSensor()
+    for said in ("odd", "fake: odd"):
+        fake.connect_error = ProtocolError(said)
+        with pytest.raises(ConnectError, match=r"^fake: odd$"):
+            fake.open()
+
+
+@pytest.mark.parametrize(
+    ("raised", "seen"),
+    [(ProtocolError("odd"), ConnectError), (DeviceFault("hot"), DeviceFault), (KeyError(1), KeyError)],
+)
+def test_a_failed_connect_frees_the_port(raised: Exception, seen: type[Exception]) -> None:
+    fake = Fed(REAL)
+    fake.connect_error = raised
+    with pytest.raises(seen):
+        fake.open()
+    assert fake.disconnects == 1
+    assert not readers()
+
+
+def test_a_device_that_connects_and_stays_silent_for_a_second_is_not_open() -> None:
+    fake = FakeSensor()
+    fake.first = 0
+    start_s = fake.time.now_s()
+    with pytest.raises(ConnectError, match="no sample"):
+        fake.open()
+    assert fake.time.now_s() - start_s == pytest.approx(1.0, abs=READ_S)
+    assert fake.disconnects == 1
+    fake.at(0.99, 1)
+    fake.open()
+
+
+def test_health_counts_and_knows_the_rate(sensor: FakeSensor) -> None:
+    sensor.stream(2, 0.01)
+    sensor.collect(2.0)
+    health = sensor.health()
+    assert health.received == pytest.approx(1 + 400, abs=2)
+    assert health.rate_Hz == pytest.approx(200, abs=4)
+    assert health.age_s <= 0.01
+
+
+@pytest.mark.parametrize("duration_s", [0.0, -1.0, float("nan")])
+def test_a_duration_without_length_is_refused(sensor: FakeSensor, duration_s: float) -> None:
+    with pytest.raises(ValueError, match="positive"):
+        sensor.collect(duration_s)
+
+
+class TestThread:
+    """What takes a thread of its own."""
+
+    def test_open_and_close_are_idempotent_and_a_closed_sensor_opens_again(self) -> None:
+        fake = Fed(REAL)
+        fake.close()
+        fake.open()
+        fake.open()
+        assert fake.connects == 1
+        assert len(readers()) == 1
+        fake.close()
+        fake.close()
+        assert fake.disconnects == 1
+        with pytest.raises(StreamBroken, match="not open"):
+            fake.latest(timeout_s=0.1)
+        fake.open()
+        assert fake.health().received == 1
+        fake.close()
+        assert not readers()
+
+    def test_two_threads_collect_the_same_samples(self) -> None:
+        class Shared(FakeClock):
+            """Moves in this thread only; others wait."""
+
+            def wait(self, waitable: Waitable, timeout_s: float) -> bool:
+                here = threading.current_thread() is threading.main_thread()
+                return super().wait(waitable, timeout_s) if here else waitable.wait(0.01)
+
+        collected: list[FtSamples] = []
+        with FakeSensor(clock=Shared()) as fake:
+            fake.stream()
+            threads = [threading.Thread(target=lambda: collected.append(fake.collect(0.1))) for _ in range(2)]
+            for thread in threads:
+                thread.start()
+            while len(fake._taps) < 2:
+                time.sleep(0.001)
+            fake.time.advance(0.12)
+            for thread in threads:
+                thread.join()
+        one, other = collected
+        assert one.seq.tolist() == other.seq.tolist()
+        assert len(one) == pytest.approx(20, abs=1)
+
+    @pytest.mark.parametrize("wait", ["collect", "latest"])
+    def test_close_ends_a_wait_elsewhere_at_once(self, wait: str) -> None:
+        limits = StreamLimits(stale_s=3600.0)  # so that nothing else ends it
+
+        class Waiting(Fed):
+            def _age_s(self) -> float:
+                return 4000.0 if wait == "latest" and threading.current_thread() is consumer else super()._age_s()
+
+        fake = Waiting(REAL, limits=limits)
+        ended: list[Exception] = []
+
+        def consume() -> None:
+            try:
+                fake.collect(3600.0) if wait == "collect" else fake.latest(timeout_s=3600.0)
+            except StreamBroken as exc:
+                ended.append(exc)
+
+        consumer = threading.Thread(target=consume, daemon=True)
+        fake.disconnect_error = OSError("gone")  # and close does not raise it
+        with fake:
+            consumer.start()
+            while not fake._news._waiters:  # type: ignore[attr-defined]
+                time.sleep(0.001)
+        consumer.join(30.0)
+        assert len(ended) == 1
+        assert not readers()
+
+    def test_close_ends_attempts_to_connect_again(self) -> None:
+        fake = Fed(REAL, limits=StreamLimits(retry_s=0.001))
+        fake.recover = True
+        with fake:
+            fake.connect_error = ConnectError("not plugged in")
+            fake.feed.append(StreamBroken("gone"))
+            while fake.connects < 3:
+                time.sleep(0.001)
+        assert not readers()
+
+    @pytest.mark.realtime
+    def test_silence_is_found_after_three_tenths_of_a_real_second(self) -> None:
+        with Fed(REAL) as fake:
+            begin_s = time.monotonic()
+            with pytest.raises(DeviceTimeout):
+                fake.collect(5.0)
+            assert 0.25 < time.monotonic() - begin_s < 0.4
+
+
+def readers() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if "fake" in thread.name]
+
+
+def test_what_came_twice_or_too_late_is_dropped_and_counted(sensor: FakeSensor) -> None:
+    sensor.at(0.02, *(block_now(sensor, seq) for seq in ([5, 5, 6], [6, 9, 7, 10], [8])))
+    sensor.at(0.08, block_now(sensor, [11], 0.08))
+    samples = sensor.collect(0.06)
+    health = sensor.health()
+    assert samples.seq.tolist() == [5, 6, 9, 10]
+    assert (health.duplicated, health.out_of_order) == (2, 2)
+
+
+def block_now(sensor: FakeSensor, seq: list[int], after_s: float = 0.02) -> FtSamples:
+    return sensor.block(seq, after_s=after_s)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_wrench_that_is_no_number_is_never_delivered(sensor: FakeSensor, bad: float) -> None:
+    sensor.feed.append(sensor.block([5, 6], wrench=bad))
+    with pytest.raises(ProtocolError, match="not finite"):
+        sensor.collect(1.0)
+    assert sensor.health().received == 1
+
+
+def test_a_frozen_sensor_is_a_fault_after_a_fifth_of_a_second(sensor: FakeSensor) -> None:
+    start_s = sensor.time.now_s()
+    for number in range(100):
+        sensor.at(0.004 * number, sensor.block([10 + number], after_s=0.004 * number, wrench=3.0))
+    with pytest.raises(Frozen, match="51 identical samples"):
+        sensor.collect(1.0)
+    assert sensor.time.now_s() - start_s == pytest.approx(0.2, abs=1e-3)
+
+
+def test_few_identical_samples_or_a_short_while_are_not_frozen(sensor: FakeSensor) -> None:
+    sensor.feed.append(sensor.block(list(range(10, 1000)), wrench=3.0))  # many, in no time
+    sensor.settle()
+    sensor.feed.append(sensor.block([1000]))
+    for seq in range(1001, 1031):  # a long while, few
+        sensor.at(0.01 * (seq - 1000), sensor.block([seq], after_s=0.01 * (seq - 1000), wrench=3.0))
+    sensor.time.advance(0.31)
+    assert sensor.health().received == 1 + 990 + 1 + 30
+    sensor.check()
+
+
+@pytest.mark.parametrize(("nominal_Hz", "enough"), [(7000.0, 50), (200.0, 40), (100.0, 20), (10.0, 20), (np.nan, 50)])
+def test_how_many_identical_samples_are_enough_depends_on_the_rate(
+    sensor: FakeSensor, nominal_Hz: float, enough: int
+) -> None:
+    sensor._nominal_Hz = nominal_Hz
+    frozen = [sensor.block([10 + number], after_s=0.011 * number, wrench=3.0) for number in range(enough)]
+    sensor.feed.extend(frozen[:-1])
+    sensor.settle()
+    sensor.check()
+    sensor.feed.append(frozen[-1])
+    sensor.settle()
+    assert failure_of(sensor) is Frozen
+
+
+class AsleepClock(FakeClock):
+    """Of a computer that was suspended: only one of its clocks went on."""
+
+    asleep_s = 0.0
+
+    def awake_s(self) -> float:
+        return self.now_s() + self.asleep_s
+
+
+def test_what_has_piled_up_while_the_computer_slept_is_never_delivered() -> None:
+    clock = AsleepClock()
+    with FakeSensor(clock=clock) as sensor:
+        sensor.stream(1, 0.005)
+        told: list[str] = []
+
+        def sleep() -> None:
+            clock.asleep_s = 3600.0
+            sensor.feed.extend([1] * 1000)
+
+        clock.at(0.1, sleep)
+        with pytest.raises(DeviceTimeout) as caught:
+            sensor.collect(5.0)
+        told.append(str(caught.value))
+        newest = sensor.latest(timeout_s=2.0)
+        assert newest.seq[0] > 1000
+        assert 10 < len(sensor.collect(0.1)) < 25
+        health = sensor.health()
+        assert health.lost + health.received == sensor.seq > 1000
+    assert health.stale == 1
+    ((_, what),) = health.events
+    assert "3600" in what
+    assert "3600" in told[0]
+
+
+class TestAway:
+    """Somebody else had the computer: `_take_turn` comes late, and finds what has piled up."""
+
+    def test_a_third_of_a_second_is_the_limit(self, sensor: FakeSensor) -> None:
+        sensor.time.stall(0.29)
+        sensor.feed.append(5)
+        sensor.settle()
+        assert (sensor.health().received, sensor.health().lost) == (6, 0)
+        sensor.time.stall(0.31)
+        sensor.feed.append(5)
+        sensor.settle()
+        assert (sensor.health().received, sensor.health().lost) == (6, 5)
+
+    def test_it_is_never_shorter_than_a_silence_may_be(self) -> None:
+        with FakeSensor(limits=StreamLimits(stale_s=0.45)) as sensor:
+            sensor.time.stall(0.4)
+            sensor.feed.append(5)
+            sensor.settle()
+            assert sensor.health().events == ()
+            sensor.time.stall(0.5)
+            sensor.feed.append(5)
+            sensor.settle()
+            assert sensor.health().lost == 5
+
+    def test_the_backlog_is_thrown_away_until_a_read_has_to_wait(self, sensor: FakeSensor) -> None:
+        sensor.time.stall(5.0)
+        sensor.feed.extend([1, *[10] * 20])  # at once
+        sensor.stream(1, 0.01)
+        sensor.time.advance(1.0)
+        health = sensor.health()
+        assert health.lost == pytest.approx(1 + 200 + 5, abs=1)  # the first read to wait after 50 ms ends it
+        assert health.received == sensor.seq - health.lost
+
+    def test_who_is_away_again_meanwhile_begins_again(self, sensor: FakeSensor) -> None:
+        sensor.time.stall(5.0)
+        sensor.feed.extend([1, 10])
+        sensor.stream(1, 0.01)
+        sensor.time.at(0.045, lambda: sensor.time.stall(5.0))  # once more before the 50 ms are over
+        sensor.time.advance(0.06)
+        assert sensor.health().received == 1
+        sensor.time.advance(0.1)
+        assert sensor.health().received > 1
+        assert sensor.health().lost >= 11 + 4 + 5
+
+    def test_a_stream_that_never_has_to_be_waited_for_is_believed_after_half_a_second(self, sensor: FakeSensor) -> None:
+        read = sensor._read_block
+
+        def busy() -> FtSamples:
+            sensor.feed.append(1)
+            sensor.time.ns += 400_000
+            return read()
+
+        sensor._read_block = busy  # type: ignore[method-assign]
+        start_s = sensor.time.now_s()
+        sensor.time.stall(1.0)
+        while sensor.health().received == 1:
+            sensor.time.advance(0.001)
+        assert sensor.time.now_s() - start_s == pytest.approx(1.5, abs=0.01)
+
+    def test_a_sensor_has_time_before_it_is_connected_again(self) -> None:
+        with FakeSensor(recover=True) as sensor:
+            sensor.time.stall(3600.0)
+            sensor.feed.append(1)
+            sensor.at(0.75, 1)  # 0.5 s go to a backlog that is none
+            sensor.time.advance(0.79)
+            assert sensor.health().received == 2
+            assert sensor.connects == 1
+
+    def test_a_collect_across_a_pause_too_short_to_be_seen_is_an_error(self, sensor: FakeSensor) -> None:
+        sensor.stream(1, 0.005)
+
+        def pause() -> None:
+            sensor.time.stall(0.35)
+            sensor.feed.append(1)
+            sensor._take_turn()
+            sensor.feed.append(1)
+            sensor._take_turn()  # what was away is back before the collect has had a look
+
+        sensor.time.at(0.1, pause)
+        with pytest.raises(DeviceTimeout, match="nobody read"):
+            sensor.collect(5.0)
+
+
+def test_samples_that_were_long_on_their_way_are_dropped_and_noted(sensor: FakeSensor) -> None:
+    sensor.feed.append(sensor.block([5], t_device_s=10.0))
+    for number in range(1, 11):  # all at once, half a second later
+        sensor.feed.append(sensor.block([5 + number], after_s=0.5, t_device_s=10 + 0.01 * number))
+    sensor.feed.append(sensor.block([60], after_s=0.501, t_device_s=10.48))
+    sensor.settle()
+    health = sensor.health()
+    assert int(sensor.latest(timeout_s=0.1).seq[0]) == 60
+    assert (health.received, health.lost) == (3, 10)
+    ((_, what),) = health.events
+    assert "0.48 s late" in what
+
+
+def test_a_device_clock_that_is_a_hundredth_slow_is_not_late(sensor: FakeSensor) -> None:
+    for number in range(200):
+        sensor.feed.append(sensor.block([5 + number], after_s=float(number), t_device_s=10 + 0.99 * number))
+    sensor.settle()
+    assert sensor.health().received == 201
+    assert sensor.health().events == ()
+
+
+@pytest.mark.parametrize(
+    ("clock", "says"),
+    [
+        ([1.0, 1.1, 1.09], "back by 0.010 s"),
+        ([1.0, 1.1, 0.0], "back by 1.100 s to 0.000 s"),
+        ([1.0, 1.1, 9.1], "ahead by 8.000 s to 9.100 s"),
+    ],
+)
+def test_a_jump_of_the_devices_clock_is_named(sensor: FakeSensor, clock: list[float], says: str) -> None:
+    for number, t_device_s in enumerate(clock):
+        sensor.feed.append(sensor.block([5 + number], t_device_s=t_device_s))
+    with pytest.raises(StreamBroken, match=says):
+        sensor.collect(1.0)
+
+
+def test_a_late_block_or_a_slow_reader_is_no_jump() -> None:
+    with FakeSensor(limits=StreamLimits(stale_s=1.0)) as sensor:
+        sensor.feed.append(sensor.block([5], t_device_s=10.0))
+        sensor.settle()
+        sensor.time.stall(0.6)  # what came meanwhile waits in the port's buffer and is then read in pieces
+        for seq in range(6, 66):
+            sensor.feed.append(sensor.block([seq], t_device_s=10.0 + 0.01 * (seq - 5)))
+        sensor.settle()
+        assert sensor.health().received == 62
+        sensor.check()
+
+
+@pytest.mark.parametrize(("nominal_Hz", "hint"), [(1000.0, "lost"), (200.0, None), (100.0, "twice")])
+def test_a_rate_off_by_more_than_a_tenth_is_said_once(
+    sensor: FakeSensor, nominal_Hz: float, hint: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    sensor._nominal_Hz = nominal_Hz
+    sensor.feed.extend(sensor.block([5 + number], after_s=0.005 * number) for number in range(1, 1001))
+    sensor.settle()
+    health = sensor.health()
+    warned = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warned) == len(health.events) == bool(hint)
+    if hint:
+        assert hint in warned[0]
+        assert health.events[0][1] == f"rate 200.0 Hz instead of {nominal_Hz:g} Hz"
+    assert health.nominal_rate_Hz == nominal_Hz
+
+
+def test_a_rate_that_is_right_again_is_said_and_so_is_the_next_wrong_one(sensor: FakeSensor) -> None:
+    sensor._nominal_Hz = 200.0
+    t_s, seq = 0.0, 5
+    for rate_Hz in (100.0, 200.0, 100.0):
+        for _ in range(round(4.5 * rate_Hz)):
+            t_s, seq = t_s + 1 / rate_Hz, seq + 1
+            sensor.feed.append(sensor.block([seq], after_s=t_s))
+    sensor.settle()
+    assert ["again" in what for _, what in sensor.health().events] == [False, True, False]
+
+
+def test_silences_are_counted(sensor: FakeSensor) -> None:
+    for _ in range(2):
+        sensor.time.advance(0.32)
+        sensor.feed.append(1)
+        sensor.settle()
+    assert sensor.health().stale == 2
+    assert sensor.health().received == 3
+
+
+class TestRecover:
+    @pytest.fixture
+    def sensor(self) -> Iterator[FakeSensor]:
+        with FakeSensor(recover=True) as fake:
+            yield fake
+
+    def test_a_broken_stream_comes_back_and_says_so(self, sensor: FakeSensor) -> None:
+        sensor.connect_error = ConnectError("not plugged in")
+        sensor.feed.append(StreamBroken("gone"))
+        seen: list[bool] = []
+
+        def look() -> None:
+            with pytest.raises(StreamBroken, match="gone"):
+                sensor.latest(timeout_s=0.0)
+            sensor.open()  # leaves alone what connects again by itself
+            seen.append(failure_of(sensor) is StreamBroken)
+            sensor.connect_error = None
+
+        sensor.time.at(0.5, look)
+        sensor.time.advance(0.7)
+        assert seen == [True]
+        assert sensor.connects == 1 + 3 + 1  # each 0.2 s
+        health = sensor.health()
+        assert health.reconnects == 1
+        assert [what for _, what in health.events] == ["gone", "connected again"]
+        assert health.events[1][0] - health.events[0][0] == pytest.approx(0.6e9, abs=READ_S * 1e9)
+
+    def test_a_device_that_connects_again_and_stays_mute_is_not_back(self, sensor: FakeSensor) -> None:
+        sensor.first = 0
+        sensor.feed.append(StreamBroken("gone"))
+        sensor.time.advance(2.0)
+        assert sensor.connects == pytest.approx(1 + 2.0 / 0.31, abs=1)  # mute for a whole silence, again and again
+        assert sensor.health().reconnects == 0
+        assert failure_of(sensor) is StreamBroken
+        sensor.feed.append(1)
+        sensor.time.advance(0.1)
+        health = sensor.health()
+        assert (health.reconnects, [what for _, what in health.events]) == (1, ["gone", "connected again"])
+
+    @pytest.mark.parametrize(
+        ("error", "said"), [(ConnectError("not plugged in"), "not plugged in"), (None, "silent for")]
+    )
+    def test_it_gives_up_after_ten_seconds(self, sensor: FakeSensor, error: Exception | None, said: str) -> None:
+        sensor.connect_error, sensor.first = error, 0
+        sensor.feed.append(StreamBroken("gone", "plug it in"))
+        ended: list[bool] = []
+        for t_s in (9.9, 10.6):
+            sensor.time.at(t_s, lambda: ended.append(sensor._has_ended))
+        sensor.time.advance(11.0)
+        assert ended == [False, True]
+        with pytest.raises(StreamBroken, match=rf"^gone, not back within 10 s \(.*{said}.*\)") as caught:
+            sensor.check()
+        assert caught.value.cure == "plug it in"
+        assert sensor.health().reconnects == 0
+
+    def test_a_second_interruption_has_its_own_ten_seconds(self, sensor: FakeSensor) -> None:
+        def plug_in() -> None:
+            sensor.connect_error = None
+
+        for _ in range(2):
+            sensor.connect_error = ConnectError("not plugged in")
+            sensor.feed.append(StreamBroken("gone"))
+            sensor.time.at(8.0, plug_in)
+            sensor.time.advance(8.25)
+        assert sensor.health().reconnects == 2
+
+    def test_a_collect_across_a_reconnection_too_quick_to_be_seen_is_an_error(self, sensor: FakeSensor) -> None:
+        sensor.stream(1, 0.005)
+
+        def interrupt() -> None:
+            sensor.feed.clear()
+            sensor.feed.append(StreamBroken("gone"))
+            sensor._take_turn()
+            sensor._take_turn()
+
+        sensor.time.at(0.05, interrupt)
+        with pytest.raises(StreamBroken, match="came back"):
+            sensor.collect(0.25)
+        assert sensor.health().reconnects == 1
+
+    def test_silence_is_an_interruption_too(self, sensor: FakeSensor) -> None:
+        connects: list[int] = []
+        for t_s in (0.29, 0.33):
+            sensor.time.at(t_s, lambda: connects.append(sensor.connects))
+        sensor.time.advance(0.35)
+        assert connects == [1, 2]
+        assert sensor.health().reconnects == 1
+
+    def test_what_was_lost_and_damaged_before_stays_counted(self, sensor: FakeSensor) -> None:
+        sensor._lost, sensor._malformed = 3, 2  # as a driver counts them since it has connected
+        sensor.feed.append(StreamBroken("gone"))
+        sensor.settle()
+        assert sensor.health().reconnects == 1
+        sensor._lost, sensor._malformed = 10, 20
+        assert (sensor.health().lost, sensor.health().malformed) == (13, 22)
+
+    def test_a_fault_found_while_connecting_again_is_final(self, sensor: FakeSensor) -> None:
+        sensor.connect_error = DeviceFault("hot")
+        sensor.feed.append(StreamBroken("gone"))
+        sensor.settle()
+        assert failure_of(sensor) is DeviceFault
+        sensor.time.advance(5.0)
+        assert sensor.connects == 2
+
+    def test_numbers_go_on(self, sensor: FakeSensor) -> None:
+        sensor._nominal_Hz = 1000.0
+        sensor.feed.append(sensor.block([40]))
+        sensor.settle()
+        before = sensor.latest(timeout_s=0.0)
+        sensor.seq = 0  # the device counts anew
+        sensor.at(0.1, StreamBroken("gone"))
+        sensor.time.advance(0.2)
+        after = sensor.latest(timeout_s=0.0)
+        missed = round(int(after.t_host_ns[0] - before.t_host_ns[0]) / 1e6)
+        assert after.seq[0] - before.seq[0] - 1 == sensor.health().lost == missed > 99
+
+    def test_another_device_is_not_the_same_stream(self, sensor: FakeSensor, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(sensor, "_connect", lambda: DeviceInfo("fake", "F2", "1.0"))
+        sensor.feed.append(StreamBroken("gone"))
+        sensor.settle()
+        assert failure_of(sensor) is ConnectError
+
+    @pytest.mark.parametrize("error", [DeviceFault("hot"), ProtocolError("odd")])
+    def test_a_fault_is_final_all_the_same(self, sensor: FakeSensor, error: Exception) -> None:
+        sensor.feed.append(error)
+        sensor.settle()
+        assert failure_of(sensor) is type(error)
+        assert sensor.connects == 1
+
+
+@pytest.mark.parametrize("what", [lambda sensor: sensor.collect(0.1), lambda sensor: sensor.latest(timeout_s=0.1)])
+def test_a_consumer_that_comes_late_finds_what_came_in_time(
+    sensor: FakeSensor, what: Callable[[FakeSensor], FtSamples]
+) -> None:
+    """It looks at the data first, at the deadline second."""
+    sensor.stream(1, 0.01)
+    sensor.time.advance(0.05)
+    sensor.time.at(0.02, lambda: sensor.time.advance(0.2))  # the consumer itself gets no time, the reader does
+    assert len(what(sensor))

@@ -1,0 +1,323 @@
+"""A UR controller, its dashboard server and the control process, all in memory and on a `FakeClock`.
+
+The parts of `UrArm` that touch sockets and processes are replaced: the subscription, the dashboard client, the pipe to
+the control process and ur_rtde inside it. Everything else, `Calls` of the control process included, is the real code.
+"""
+
+import json
+import subprocess
+import time
+from collections import deque
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drivers.clock import Clock
+from drivers.errors import NoDashboard
+from drivers.ur import arm as arm_module
+from drivers.ur import control_child, reading
+from drivers.ur.control import ControlProcess
+from drivers.ur.dashboard import Dashboard
+from drivers.ur.kinematics import MODELS, Pose, forward
+from drivers.ur.reading import Reader
+from drivers.ur.sample import OUTPUTS
+from drivers.ur.timing import STRICT, UrTiming
+from tests.fake_clock import FakeClock
+
+CYCLE_S = 0.008
+HOST = "192.0.2.1"
+
+
+@lru_cache(maxsize=1)
+def tcp_pose(*q_and_tcp: float) -> tuple[float, ...]:
+    pose = forward(MODELS["UR5e"], q_and_tcp[:6]) @ Pose.from_ur(q_and_tcp[6:])
+    return (*pose.p_m, *Rotation.from_matrix(pose.R).as_rotvec())
+
+
+class Controller:
+    """What the far side does. Tests set its attributes."""
+
+    def __init__(self, clock: FakeClock) -> None:
+        self.clock = clock
+        self.t_s = 100.0
+        self.q_rad = [0.1, -1.2, 1.5, -0.7, -1.4, 0.3]
+        self.qd_rad_s = [0.0] * 6
+        self.goal_rad: list[float] | None = None
+        self.speed_rad_s = 0.0
+        self.tcp_offset = [0.1, -0.02, 0.25, 0.3, -1.2, 0.7]
+        self.robot_mode, self.safety_mode, self.safety_bits, self.program = 7, 1, 1, 1
+        self.unknown: set[str] = set()
+        """Outputs it does not know."""
+        self.registers_taken = False
+        self.silent = False
+        """It sends no samples."""
+        self.held_back = False
+        """What it sends stays in the socket of a client that is suspended."""
+        self.failure: Exception | None = None
+        """Of the connection."""
+        self.dashboard_answers = True
+        self.control_delay_s = 0.004
+        self.starts_in_s = 0.1
+        self.hanging: set[str] = set()
+        """Calls to which the control process never answers."""
+        self.did: list[str] = []
+        """What it was asked to do."""
+        self.dashboard_limits_s: list[float] = []
+        self.stopping_works = True
+        self._sent: deque[list[tuple[float, ...]]] = deque()
+        self._operation = 0
+
+    # ------------------------------------------------------------------ RTDE
+
+    version = (5, 15, 0, 1)
+
+    @property
+    def missing(self) -> list[str]:
+        return sorted(self.unknown)
+
+    def read(self, timeout_s: float) -> list[tuple[float, ...]]:
+        assert timeout_s <= 0.05
+        if self.failure:
+            raise self.failure
+        if not self._sent:
+            raise TimeoutError
+        return self._sent.popleft()
+
+    def close(self) -> None:
+        pass
+
+    def sample(self) -> dict[str, tuple[float, ...]]:
+        moving = 0.0 if self.goal_rad is None else self.speed_rad_s
+        return {
+            "timestamp": (self.t_s,),
+            "actual_q": tuple(self.q_rad),
+            "actual_qd": tuple(self.qd_rad_s),
+            "target_q": tuple(self.q_rad),
+            "target_qd": (0.0,) * 5 + (moving,),
+            "actual_TCP_pose": tcp_pose(*self.q_rad, *self.tcp_offset),
+            "robot_mode": (self.robot_mode,),
+            "safety_mode": (self.safety_mode,),
+            "safety_status_bits": (self.safety_bits,),
+            "runtime_state": (self.program,),
+            "speed_scaling": (1.0,),
+            "target_speed_fraction": (0.5,),
+            "tcp_offset": tuple(self.tcp_offset),
+            "payload": (1.5,),
+            "payload_cog": (0.0, 0.0, 0.05),
+        }
+
+    def run(self, reader: Reader) -> None:
+        """Send a sample every 8 ms to a reader that has nothing else to do."""
+
+        def cycle() -> None:
+            self.t_s += CYCLE_S
+            self._move()
+            if not self.silent:
+                sample = self.sample()
+                self._sent.append([sample[name] for name in OUTPUTS if name not in self.unknown])
+            if not self.held_back:
+                for _ in range(max(1, len(self._sent))):
+                    reader._follow()
+            self.clock.at(CYCLE_S, cycle)
+
+        self.clock.at(CYCLE_S, cycle)
+
+    def _move(self) -> None:
+        if self.goal_rad is None or self.program != 2 or self.safety_bits != 1:
+            return
+        left_rad = self.goal_rad[5] - self.q_rad[5]
+        step_rad = self.speed_rad_s * CYCLE_S
+        if abs(left_rad) <= step_rad:
+            self.q_rad, self.goal_rad = self.goal_rad, None
+        else:
+            self.q_rad = [*self.goal_rad[:5], self.q_rad[5] + (step_rad if left_rad > 0 else -step_rad)]
+
+    # ------------------------------------------------------------------ dashboard server
+
+    def ask_dashboard(
+        self, host: str, ask: Callable[[Dashboard], Any], *, timeout_s: float, clock: Clock, **_: float
+    ) -> Any:
+        assert host == HOST
+        self.dashboard_limits_s.append(timeout_s)
+        if not self.dashboard_answers:
+            clock.sleep(timeout_s)
+            raise NoDashboard("the dashboard server does not answer")
+        clock.sleep(0.02)
+        return ask(self)
+
+    def connect(self, timeout_ms: int) -> None: ...
+
+    def disconnect(self) -> None: ...
+
+    def stop(self) -> None:
+        self.did.append("dashboard stop")
+        self.program, self.goal_rad = 1, None
+
+    def getRobotModel(self) -> str:
+        return "UR5"
+
+    def getSerialNumber(self) -> str:
+        return "20225500001"
+
+    def polyscopeVersion(self) -> str:
+        return "5.15.0"
+
+    def programState(self) -> str:
+        return "PLAYING other.urp"
+
+    def isInRemoteControl(self) -> bool:
+        return True
+
+    # ------------------------------------------------------------------ ur_rtde in the control process
+
+    def moveJ(self, q: list[float], speed: float, acceleration: float, asynchronous: bool, /) -> bool:
+        assert asynchronous
+        assert acceleration > 0
+        self.did.append("move")
+        self._operation += 1
+        self.goal_rad, self.speed_rad_s = q, speed
+        return True
+
+    def getAsyncOperationProgressEx(self) -> "Controller":
+        return self
+
+    def operationId(self) -> int:
+        return self._operation
+
+    def isAsyncOperationRunning(self) -> bool:
+        return self.goal_rad is not None
+
+    def stopJ(self, deceleration: float, /) -> None:
+        assert deceleration > 0
+        self.did.append("stop softly")
+        if self.stopping_works:
+            self.goal_rad = None
+
+    def stopScript(self) -> None:
+        self.did.append("end our program")
+        self.program = 1
+
+    def isJointsWithinSafetyLimits(self, q: list[float], /) -> bool:
+        return abs(q[5]) < 2.0
+
+    def getTCPOffset(self) -> list[float]:
+        return self.tcp_offset
+
+    def isProgramRunning(self) -> bool:
+        return self.program == 2
+
+    def isConnected(self) -> bool:
+        return True
+
+
+class ControlInMemory(ControlProcess):
+    """The control process without a process: its answers come by the fake clock."""
+
+    def __init__(self, controller: Controller, timing: UrTiming) -> None:
+        self._far = controller
+        self._calls = control_child.Calls(controller)
+        self._asked = 0
+        self._hangs = False
+        super().__init__(HOST, 125.0, clock=controller.clock, timing=timing)
+        assert isinstance(self._process, ProcessInMemory)
+        self._process.take = self._take
+        controller.clock.at(controller.starts_in_s, self._start)
+
+    def _start(self) -> None:
+        self._far.did.append("start our program")
+        self._far.program = 2
+        self._replies[0] = {"id": 0, "value": None}
+
+    def _take(self, line: str) -> None:
+        """Answer as `control_child.serve` does, later; and stop a move that nobody watches."""
+        request = json.loads(line)
+        self._asked += 1
+        asked, far = self._asked, self._far
+        self._hangs |= request["call"] in far.hanging
+        if self._hangs:
+            return
+
+        def answer() -> None:
+            if self.alive and (far.program == 2 or request["call"] in ("progress", "stop")):
+                try:
+                    value = getattr(self._calls, request["call"])(*request["args"])
+                    self._replies[request["id"]] = {"id": request["id"], "value": value}
+                except Exception as error:
+                    self._replies[request["id"]] = {"id": request["id"], "error": str(error)}
+
+        def watch() -> None:
+            if self.alive and asked == self._asked and self._calls.moving:
+                self._calls.stop_unwatched()
+
+        far.clock.at(far.control_delay_s, answer)
+        far.clock.at(self._timing.unwatched_s, watch)
+
+    def die(self) -> None:
+        """End by itself, as after SIGSEGV in ur_rtde."""
+        self._process.kill()
+        self._ended = True
+
+    def kill(self) -> None:
+        super().kill()
+        self._ended = True
+
+    def _read_replies(self, pipe: object) -> None:
+        pass  # a fake clock is for one thread
+
+    def _read_talk(self, pipe: object) -> None:
+        pass
+
+
+class ProcessInMemory:
+    """What of `subprocess.Popen` the parent uses."""
+
+    pid, returncode = 0, -11
+
+    def __init__(self, *_: object, **__: object) -> None:
+        self._alive = True
+        self.take: Callable[[str], None] = lambda _: None
+        self.stdin = self.stdout = self.stderr = self
+
+    def write(self, line: str) -> None:
+        if not self._alive:
+            raise BrokenPipeError
+        self.take(line)
+
+    def flush(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def kill(self) -> None:
+        self._alive = False
+
+    def wait(self, _: float | None = None) -> int:
+        return self.returncode
+
+
+class ReaderInMemory(Reader):
+    """A reader whose samples come by the fake clock."""
+
+    def __init__(self, controller: Controller, model: str | None, timing: UrTiming = STRICT) -> None:
+        super().__init__(HOST, model, clock=controller.clock, timing=timing)
+        controller.run(self)
+
+    def _run(self) -> None:
+        pass  # a fake clock is for one thread
+
+
+def install(controller: Controller, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every `UrArm` and `Reader` find this controller."""
+    monkeypatch.setattr(subprocess, "Popen", ProcessInMemory)
+    monkeypatch.setattr(time, "sleep", controller.clock.sleep)  # in `Calls`
+    monkeypatch.setattr(reading, "Subscription", lambda *_, **__: controller)
+    monkeypatch.setattr(reading, "ask_dashboard", controller.ask_dashboard)
+    monkeypatch.setattr(arm_module, "ask_dashboard", controller.ask_dashboard)
+    monkeypatch.setattr(arm_module, "find_script_port", lambda *_, **__: None)
+    monkeypatch.setattr(arm_module, "registers_in_use", lambda _, names, **__: [*names] * controller.registers_taken)
+    monkeypatch.setattr(
+        arm_module, "Reader", lambda _, model, *, timing, **__: ReaderInMemory(controller, model, timing)
+    )
+    monkeypatch.setattr(arm_module, "ControlProcess", lambda *_, timing, **__: ControlInMemory(controller, timing))

@@ -1,0 +1,507 @@
+"""`UrArm` with a controller in memory and a fake clock: every limit of time, every way to stop."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import fields
+from itertools import pairwise
+from math import inf, nan, radians
+from typing import Any
+
+import pytest
+
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
+from drivers.interfaces import Guard
+from drivers.ur import arm as arm_module
+from drivers.ur import dashboard
+from drivers.ur.arm import UrArm
+from drivers.ur.timing import STRICT, UrTiming
+from tests.fake_clock import FakeClock
+from tests.unit.drivers.ur.controller_in_memory import HOST, ControlInMemory, Controller
+
+MakeArm = Callable[..., UrArm]
+
+
+@pytest.fixture
+def make_arm(controller: Controller) -> MakeArm:
+    def make(timing: UrTiming = STRICT) -> UrArm:
+        return UrArm(HOST, speed_rad_s=1.0, acceleration_rad_s2=3.0, clock=controller.clock, timing=timing)
+
+    return make
+
+
+@pytest.fixture
+def arm(make_arm: MakeArm) -> UrArm:
+    arm = make_arm()
+    arm.open(control=True)
+    return arm
+
+
+def control_of(arm: UrArm) -> ControlInMemory:
+    assert isinstance(arm._control, ControlInMemory)
+    return arm._control
+
+
+def away(controller: Controller) -> list[float]:
+    return [*controller.q_rad[:5], controller.q_rad[5] + 1.0]  # 1 s
+
+
+def no_guard() -> None:
+    pass
+
+
+def move(arm: UrArm, controller: Controller, guard: Guard = no_guard) -> None:
+    arm.move_to(away(controller), timeout_s=5, guard=guard)
+
+
+class After:
+    """A guard that does something once, so long after the move has begun."""
+
+    def __init__(self, clock: FakeClock, delay_s: float, do: Callable[[], object]) -> None:
+        self._clock, self._delay_s, self._do = clock, delay_s, do
+        self._begin_s: float | None = None
+        self.did_s: float | None = None
+
+    def __call__(self) -> None:
+        self._begin_s = self._begin_s or self._clock.now_s()
+        if self.did_s is None and self._clock.now_s() - self._begin_s >= self._delay_s:
+            self.did_s = self._clock.now_s()
+            self._do()
+
+    def ago_s(self) -> float:
+        assert self.did_s is not None
+        return self._clock.now_s() - self.did_s
+
+
+def setting(thing: object, **values: object) -> Callable[[], None]:
+    def do() -> None:
+        for name, value in values.items():
+            setattr(thing, name, value)
+
+    return do
+
+
+# ---------------------------------------------------------------------- before anything is opened
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, 1e-4, 30.0, nan, inf])
+def test_absurd_speeds_and_accelerations_are_refused(speed: float, arm: UrArm, controller: Controller) -> None:
+    q = away(controller)
+    with pytest.raises(ValueError, match="speed_rad_s"):
+        UrArm(HOST, speed_rad_s=speed)
+    with pytest.raises(ValueError, match="acceleration_rad_s2"):
+        UrArm(HOST, acceleration_rad_s2=speed)
+    with pytest.raises(ValueError, match="speed_rad_s"):
+        arm.move_to(q, timeout_s=5, guard=no_guard, speed_rad_s=speed)
+    with pytest.raises(ValueError, match="acceleration_rad_s2"):
+        arm.move_to(q, timeout_s=5, guard=no_guard, acceleration_rad_s2=speed)
+    assert "move" not in controller.did
+
+
+def test_unknown_models_are_refused_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"'kr6' .*UR5e"):
+        UrArm(HOST, model="kr6")
+
+
+@pytest.mark.parametrize(
+    ("q_rad", "says"),
+    [([0.0] * 5, "six"), ([0.0] * 5 + [nan], "six finite"), ([0, -90, 0, 0, 0, 0], "radians")],
+)
+def test_bad_targets_never_leave_the_house(arm: UrArm, controller: Controller, q_rad: list[float], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        arm.move_to(q_rad, timeout_s=1, guard=no_guard)
+    with pytest.raises(ValueError, match=says):
+        arm.within_safety_limits(q_rad)
+    assert "move" not in controller.did
+
+
+def test_a_new_arm_talks_to_nobody_and_closes() -> None:
+    arm = UrArm(HOST, model="ur5e", speed_rad_s=radians(60))
+    arm.stop()
+    arm.close()
+    arm.close()
+    with pytest.raises(ConnectError, match="not open"):
+        arm.identify()
+
+
+def test_importing_the_driver_does_not_load_ur_rtde() -> None:
+    code = "import sys, drivers.ur.arm; sys.exit(any('rtde_' in n or n == 'dashboard_client' for n in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_without_ur_rtde_the_error_says_where_it_exists(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise ModuleNotFoundError(f"No module named {name!r}")
+
+    monkeypatch.setattr(dashboard, "import_module", missing)
+    with pytest.raises(ConnectError, match=r"not installed for Python .*CPython 3\.11 or 3\.12"):
+        dashboard.ask_dashboard(HOST, lambda _: None, timeout_s=1)
+
+
+@pytest.mark.parametrize(
+    ("words", "found", "cure"),
+    [
+        ("ur_rtde: One of the RTDE input registers are already in use! Currently", "another client", "end it"),
+        ("ur_rtde: Please enable remote control on the robot!", "remote control", "press Local"),
+        ("Failed to start control script, before timeout of 5 seconds", "Failed to start", "pendant"),
+    ],
+)
+def test_the_librarys_words_become_advice(words: str, found: str, cure: str) -> None:
+    error = arm_module._refusal(HOST, words)
+    assert found in error.found
+    assert cure in error.cure
+
+
+# ---------------------------------------------------------------------- opening
+
+
+def test_opening_twice_starts_one_program(arm: UrArm, controller: Controller) -> None:
+    arm.open(control=True)
+    arm.open()
+    assert controller.did == ["start our program"]
+
+
+def test_reading_starts_nothing(make_arm: MakeArm, controller: Controller) -> None:
+    arm = make_arm()
+    arm.open()
+    assert arm.state().q_rad.tolist() == controller.q_rad
+    arm.stop()
+    with pytest.raises(ConnectError, match="reading only"):
+        move(arm, controller)
+    arm.close()
+    assert controller.did == []
+
+
+@pytest.mark.parametrize(("timing", "release_s"), [(STRICT, 1.0), (UrTiming.emulated(), 5.0)], ids=["real", "emulated"])
+@pytest.mark.parametrize("what", ["registers_taken", "program"])
+def test_another_client_is_waited_for_and_not_ended(
+    make_arm: MakeArm, controller: Controller, clock: FakeClock, what: str, timing: UrTiming, release_s: float
+) -> None:
+    taken, free = {"registers_taken": (True, False), "program": (4, 1)}[what]
+    setattr(controller, what, taken)
+    begin_s = clock.now_s()
+    with pytest.raises(ConnectError) as error:
+        make_arm(timing).open(control=True)
+    assert release_s <= clock.now_s() - begin_s < release_s + 0.2
+    assert ("another client" if what == "registers_taken" else "PLAYING other.urp") in error.value.found
+    assert controller.did == []
+
+    clock.at(0.9 * release_s, setting(controller, **{what: free}))
+    arm = make_arm(timing)
+    arm.open(control=True)
+    assert controller.did == ["start our program"]
+
+
+def test_a_control_process_that_does_not_start_is_given_up(
+    make_arm: MakeArm, controller: Controller, clock: FakeClock
+) -> None:
+    controller.starts_in_s = 60.0
+    begin_s = clock.now_s()
+    with pytest.raises(ConnectError, match=r"within 4\.5 s"):
+        make_arm().open(control=True)
+    assert 4.5 <= clock.now_s() - begin_s < 5
+    assert controller.did == ["dashboard stop"]  # a program may have been sent
+
+
+def test_a_safety_stop_while_starting_is_the_reason(
+    make_arm: MakeArm, controller: Controller, clock: FakeClock
+) -> None:
+    controller.starts_in_s = 60.0
+    clock.at(0.5, setting(controller, safety_bits=0x404))
+    begin_s = clock.now_s()
+    with pytest.raises(ConnectError, match="protective stop"):
+        make_arm().open(control=True)
+    assert clock.now_s() - begin_s < 1.0
+
+
+def test_what_rtde_may_not_say_refuses_the_opening_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def damaged(*_: object, **__: object) -> None:
+        raise ProtocolError("RTDE recipe cannot be read: 01", "is this an RTDE server?")
+
+    monkeypatch.setattr(arm_module, "Reader", damaged)
+    with pytest.raises(ConnectError, match="recipe cannot be read: 01") as error:
+        UrArm(HOST).open()
+    assert error.value.cure == "is this an RTDE server?"
+
+
+# ---------------------------------------------------------------------- moving
+
+
+def test_a_move_arrives_and_is_watched(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    calls: list[float] = []
+    q, begin_s = away(controller), clock.now_s()
+    arm.move_to(q, timeout_s=5, guard=lambda: calls.append(clock.now_s()))
+    assert controller.q_rad == q
+    assert 1.0 < clock.now_s() - begin_s < 1.1
+    assert len(calls) > 50
+    assert max(b - a for a, b in pairwise(calls)) < 0.05  # `RobotArm`: 20 times a second
+    arm.close()
+    assert controller.did == ["start our program", "move", "end our program"]
+
+
+def test_a_guard_that_has_tripped_lets_no_move_begin(arm: UrArm, controller: Controller) -> None:
+    def tripped() -> None:
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        move(arm, controller, tripped)
+    assert controller.did == ["start our program"]
+
+
+def test_a_move_has_its_time_and_no_more(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    begin_s = clock.now_s()
+    with pytest.raises(DeviceTimeout, match="speed slider"):
+        arm.move_to(away(controller), timeout_s=0.5, guard=no_guard)
+    assert 0.5 < clock.now_s() - begin_s < 0.6
+    assert controller.did[-1] == "stop softly"
+    move(arm, controller)  # without opening it again
+
+
+def test_an_end_before_the_goal_is_no_arrival(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    with pytest.raises(DeviceFault, match="instead of"):
+        move(arm, controller, After(clock, 0.5, setting(controller, goal_rad=None)))
+
+
+@pytest.mark.parametrize("disturbed", ["qd_rad_s", "speed_rad_s", "goal_rad"])
+def test_still_is_three_tenths_of_a_second_without_a_break(
+    arm: UrArm, controller: Controller, clock: FakeClock, disturbed: str
+) -> None:
+    move(arm, controller)
+    begin_s = clock.now_s()
+    arm.wait_until_still(timeout_s=5, guard=no_guard)
+    assert 0.3 <= clock.now_s() - begin_s < 0.33
+    if disturbed == "qd_rad_s":  # it shakes
+        clock.at(0.2, setting(controller, qd_rad_s=[0.0, 0.0, -0.003, 0.0, 0.0, 0.0]))
+        clock.at(0.22, setting(controller, qd_rad_s=[0.0] * 6))
+    elif disturbed == "speed_rad_s":  # its set-point moves
+        clock.at(0.2, setting(controller, speed_rad_s=-1e-4, goal_rad=away(controller)))
+        clock.at(0.22, setting(controller, goal_rad=None))
+    else:  # it is somewhere else
+        here = controller.q_rad
+        clock.at(0.2, setting(controller, q_rad=[*here[:5], here[5] + 0.002]))
+        clock.at(0.22, setting(controller, q_rad=here))
+    begin_s = clock.now_s()
+    arm.wait_until_still(timeout_s=5, guard=no_guard)
+    assert 0.52 <= clock.now_s() - begin_s < 0.55
+
+
+def test_still_needs_no_goal_where_the_arm_was_sent_nowhere(arm: UrArm, clock: FakeClock) -> None:
+    begin_s = clock.now_s()
+    arm.wait_until_still(timeout_s=5, guard=no_guard)
+    assert 0.3 <= clock.now_s() - begin_s < 0.33
+
+
+# ---------------------------------------------------------------------- limits of a move
+
+
+def test_a_silent_controller_is_found_in_a_fifth_of_a_second(
+    arm: UrArm, controller: Controller, clock: FakeClock
+) -> None:
+    """Reported after 0.2 s and one short attempt at the dashboard server; the soft stop is not tried."""
+    controller.dashboard_answers = False
+    provoke = After(clock, 0.3, setting(controller, silent=True))
+    with pytest.raises(DeviceTimeout, match="press the emergency stop"):
+        move(arm, controller, provoke)
+    assert 0.2 < provoke.ago_s() < 0.2 + 0.15 + 0.02
+    assert controller.dashboard_limits_s[-1] == 0.15
+    assert "stop softly" not in controller.did
+    controller.silent, controller.dashboard_answers = False, True
+    controller.dashboard_limits_s.clear()
+    arm.open(control=True)  # what was left there is ended first
+    assert controller.did == ["start our program", "move", "dashboard stop", "start our program"]
+
+
+def test_a_lost_connection_is_reported_at_once(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    provoke = After(clock, 0.3, setting(controller, failure=StreamBroken("closed")))
+    with pytest.raises(StreamBroken):
+        move(arm, controller, provoke)
+    assert provoke.ago_s() < 0.05
+    assert controller.did[-1] == "dashboard stop"
+    assert controller.dashboard_limits_s[-1] == 0.4
+
+
+@pytest.mark.parametrize(("answers_in_s", "ours"), [(0.38, True), (0.42, False)])
+def test_a_question_to_our_program_has_four_tenths_of_a_second(
+    arm: UrArm, controller: Controller, clock: FakeClock, answers_in_s: float, ours: bool
+) -> None:
+    controller.control_delay_s = answers_in_s
+    begin_s = clock.now_s()
+    assert arm._is_ours(control_of(arm), timeout_s=STRICT.ours_s) == ours
+    assert clock.now_s() - begin_s == pytest.approx(min(answers_in_s, 0.4), abs=1e-6)
+    assert control_of(arm).alive == ours
+
+
+def test_another_program_is_found_in_a_move(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    provoke = After(clock, 0.3, setting(controller, hanging={"tcp_offset"}))
+    with pytest.raises(DeviceFault, match="another program"):
+        move(arm, controller, provoke)
+    assert 0.4 < provoke.ago_s() < 0.1 + 0.4 + 0.05  # asked ten times a second
+    assert controller.did[-1] == "dashboard stop"  # it could also be ours that hangs
+
+
+def test_another_program_found_before_a_move_is_left_alone(arm: UrArm, controller: Controller) -> None:
+    controller.hanging = {"tcp_offset"}
+    with pytest.raises(DeviceFault, match="another program"):
+        move(arm, controller)
+    arm.close()
+    assert controller.did == ["start our program"]
+
+
+@pytest.mark.parametrize("hanging", ["progress", "move"])
+def test_a_control_process_that_hangs_is_killed(
+    arm: UrArm, controller: Controller, clock: FakeClock, hanging: str
+) -> None:
+    controller.hanging = {hanging}
+    begin_s, limit_s = clock.now_s(), 0.4 if hanging == "progress" else 2.0
+    with pytest.raises(DeviceTimeout, match=f"within {limit_s} s"):
+        move(arm, controller)
+    assert limit_s < clock.now_s() - begin_s < limit_s + 0.1
+    assert not control_of(arm).alive
+    assert controller.did[-1] == "dashboard stop"
+
+
+def test_a_control_process_that_ends_is_reported_at_once(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    provoke = After(clock, 0.3, lambda: control_of(arm).die())
+    with pytest.raises(StreamBroken, match=r"control.* ended \(exit code -11\)"):
+        move(arm, controller, provoke)
+    assert provoke.ago_s() < 0.05
+    assert controller.did[-1] == "dashboard stop"
+    with pytest.raises(StreamBroken, match="open the arm again"):
+        move(arm, controller)
+    arm.open(control=True)
+    move(arm, controller)
+
+
+@pytest.mark.parametrize(("hangs_s", "stopped"), [(0.45, False), (0.55, True)])
+def test_a_move_that_nobody_watches_is_stopped_after_half_a_second(
+    arm: UrArm, controller: Controller, clock: FakeClock, hangs_s: float, stopped: bool
+) -> None:
+    provoke = After(clock, 0.3, lambda: clock.sleep(hangs_s))
+    if not stopped:
+        move(arm, controller, provoke)
+        return
+    with pytest.raises(DeviceTimeout, match=r"0\.5 s of a move"):
+        move(arm, controller, provoke)
+    assert controller.did[-1] == "stop softly"
+    move(arm, controller)  # and it is still ours
+
+
+def test_a_safety_stop_is_the_reason_of_an_ended_program(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    def trip() -> None:
+        controller.program = 4
+        clock.at(0.04, setting(controller, safety_bits=0x404))  # reported some cycles later
+
+    provoke = After(clock, 0.3, trip)
+    with pytest.raises(DeviceFault, match="protective stop"):
+        move(arm, controller, provoke)
+    assert provoke.ago_s() < 0.1
+    assert controller.did[-1] == "dashboard stop"  # nobody can resume what is left
+
+
+# ---------------------------------------------------------------------- stopping
+
+
+@pytest.mark.parametrize(
+    ("trouble", "ways"),
+    [
+        ({}, ["stop softly"]),
+        ({"stopping_works": False}, ["stop softly", "dashboard stop"]),  # it reports so, and the arm goes on
+        ({"hanging": {"stop"}}, ["dashboard stop"]),
+        ({"safety_bits": 0x404}, ["dashboard stop"]),
+        ({"program": 1}, ["dashboard stop"]),
+    ],
+    ids=["works", "without effect", "hangs", "safety stop", "program ended"],
+)
+def test_the_ways_to_stop(
+    arm: UrArm, controller: Controller, clock: FakeClock, trouble: dict[str, Any], ways: list[str]
+) -> None:
+    control_of(arm).call("move", away(controller), 1.0, 3.0)
+    setting(controller, **trouble)()
+    before, begin_s = len(controller.did), clock.now_s()
+    arm.stop()
+    assert controller.did[before:] == ways
+    assert control_of(arm).alive == (ways == ["stop softly"])
+    assert clock.now_s() - begin_s < (0.85 if "hanging" in trouble else 0.25)  # 0.5 s, and the braking
+
+
+@pytest.mark.parametrize(
+    "trouble", [{}, {"stopping_works": False}, {"hanging": {"stop", "tcp_offset"}}, {"hanging": {"stop", "progress"}}]
+)
+@pytest.mark.parametrize("delay_s", [0.3, 0.311, 0.333, 0.347, 0.402, 0.404])
+def test_a_move_that_was_told_to_stop_says_so(
+    arm: UrArm, controller: Controller, clock: FakeClock, trouble: dict[str, Any], delay_s: float
+) -> None:
+    """Wherever the move is when another thread stops the arm, and however that ends."""
+
+    def stop() -> None:
+        setting(controller, **trouble)()
+        arm.stop()
+
+    clock.at(delay_s, stop)
+    with pytest.raises(DeviceFault, match="told to stop"):
+        move(arm, controller)
+    assert controller.goal_rad is None
+
+
+def test_a_guard_says_why_it_has_stopped_the_arm(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    def trip() -> None:
+        arm.stop()
+        raise DeviceFault("overload")
+
+    with pytest.raises(DeviceFault, match="overload"):
+        move(arm, controller, After(clock, 0.3, trip))
+
+
+def test_a_stop_of_old_is_not_the_reason_of_a_fault(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    with pytest.raises(DeviceFault, match="told to stop"):
+        move(arm, controller, After(clock, 0.3, arm.stop))
+    clock.at(0.1, setting(controller, safety_bits=0x404))
+    with pytest.raises(DeviceFault, match="protective stop"):
+        arm.wait_until_still(timeout_s=5, guard=no_guard)
+
+
+@pytest.mark.parametrize(
+    ("trouble", "longest_s"),
+    [
+        ({}, 0.1),
+        ({"silent": True, "dashboard_answers": False}, 0.1 + 0.4),
+        ({"hanging": {"tcp_offset"}}, 0.3 + 0.1),
+        ({"hanging": {"quit"}}, 0.7 + 0.1),
+        ({"hanging": {"quit"}, "dashboard_answers": False}, 0.7 + 0.4 + 0.1),
+    ],
+    ids=["well", "all lost", "another program", "hangs", "hangs, and no dashboard"],
+)
+def test_closing_takes_a_second_and_a_half_at_most(
+    arm: UrArm, controller: Controller, clock: FakeClock, trouble: dict[str, Any], longest_s: float
+) -> None:
+    control = control_of(arm)
+    setting(controller, **trouble)()
+    begin_s = clock.now_s()
+    arm.close()
+    assert clock.now_s() - begin_s <= longest_s < 1.5
+    assert not control.alive
+
+
+# ---------------------------------------------------------------------- an emulated cell
+
+
+def test_an_emulated_cell_may_be_slow_and_not_silent(
+    make_arm: MakeArm, controller: Controller, clock: FakeClock
+) -> None:
+    arm = make_arm(UrTiming.emulated())
+    controller.starts_in_s = 20.0
+    controller.control_delay_s = 1.0
+    arm.open(control=True)
+    arm.move_to(away(controller), timeout_s=60, guard=no_guard)
+    controller.silent = True
+    begin_s = clock.now_s()
+    with pytest.raises(DeviceTimeout):
+        arm.state()
+    assert clock.now_s() - begin_s == pytest.approx(0.2, abs=1e-6)
+
+
+def test_what_samples_prove_is_the_same_in_an_emulated_cell() -> None:
+    emulated, by_samples = UrTiming.emulated(), {"stale_s", "status_s", "glance_s", "reason_s", "still_s"}
+    for field in fields(UrTiming):
+        strict, generous = getattr(STRICT, field.name), getattr(emulated, field.name)
+        assert strict == generous if field.name in by_samples else strict <= generous, field.name

@@ -1,0 +1,271 @@
+"""What a `Reader` believes of what a controller sends, and for how long it waits, on a fake clock."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
+from drivers.ur.kinematics import MODELS, Pose, forward
+from drivers.ur.reading import Reader
+from drivers.ur.sample import Sample
+from drivers.ur.timing import STRICT
+from tests.fake_clock import FakeClock
+from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, ReaderInMemory
+
+
+@pytest.fixture
+def reader(controller: Controller) -> Reader:
+    return ReaderInMemory(controller, "UR5e")
+
+
+def wait_s(clock: FakeClock, look: Callable[[], object], error: type[Exception]) -> float:
+    """Expect this error; return after how long it came."""
+    begin_s = clock.now_s()
+    with pytest.raises(error):
+        look()
+    return clock.now_s() - begin_s
+
+
+def never() -> list[float]:
+    raise AssertionError("this controller reports its TCP by itself")
+
+
+# ---------------------------------------------------------------------- new samples
+
+
+def test_a_look_is_the_next_sample(controller: Controller, reader: Reader, clock: FakeClock) -> None:
+    for _ in range(3):
+        asked_s = controller.t_s
+        assert reader.look().t_device_s == pytest.approx(asked_s + CYCLE_S)
+    sample = reader.look()
+    assert sample.t_host_ns == clock.now_ns()
+    assert sample.q_rad == tuple(controller.q_rad)
+    assert (sample.robot_mode, sample.safety_bits, sample.program_state) == (7, 1, 1)
+
+
+@pytest.mark.parametrize("paused_s", [0.15, 3.0, 3600.0])
+def test_what_has_piled_up_in_a_pause_is_not_now(
+    controller: Controller, reader: Reader, clock: FakeClock, paused_s: float
+) -> None:
+    reader.look()
+    controller.held_back = True
+    clock.advance(min(paused_s, 3.0))
+    clock.stall(paused_s)
+    controller.held_back = False
+    woke_s = controller.t_s
+    controller.safety_mode = 3
+    assert reader.look().t_device_s > woke_s
+    assert reader.status().safety_mode == "protective stop"
+
+
+def test_a_status_is_the_newest_sample_and_costs_no_wait(
+    controller: Controller, reader: Reader, clock: FakeClock
+) -> None:
+    reader.look()
+    begin_s = clock.now_s()
+    status = reader.status()
+    assert clock.now_s() == begin_s
+    assert (status.robot_mode, status.safety_mode, status.program, status.fault) == (
+        "running",
+        "normal",
+        "stopped",
+        None,
+    )
+    assert (status.speed_slider, status.speed_scaling) == (0.5, 1.0)
+    assert (status.payload_kg, status.p_flange_payload_m) == (1.5, (0.0, 0.0, 0.05))
+    assert status.tcp_offset == tuple(controller.tcp_offset)
+
+
+def test_a_status_is_at_most_fifty_milliseconds_old(controller: Controller, reader: Reader, clock: FakeClock) -> None:
+    reader.look()
+    controller.silent = True
+    clock.advance(0.049)
+    reader.status()
+    clock.advance(0.002)
+    assert wait_s(clock, reader.status, DeviceTimeout) == pytest.approx(STRICT.stale_s, abs=1e-6)
+
+
+# ---------------------------------------------------------------------- silence
+
+
+def test_silence_is_found_after_a_fifth_of_a_second(controller: Controller, reader: Reader, clock: FakeClock) -> None:
+    reader.look()
+    controller.silent = True
+    assert not reader.silent
+    assert wait_s(clock, reader.look, DeviceTimeout) == pytest.approx(0.2, abs=1e-6)
+    assert reader.silent
+    assert wait_s(clock, lambda: reader.look(limit_s=0.1), DeviceTimeout) == pytest.approx(0.1, abs=1e-6)
+    controller.silent = False
+    reader.look()
+    assert not reader.silent
+
+
+def test_a_shorter_silence_is_none(controller: Controller, reader: Reader, clock: FakeClock) -> None:
+    reader.look()
+    controller.silent = True
+
+    def speak() -> None:
+        controller.silent = False
+
+    clock.at(0.18, speak)  # the sample after the silence came without being waited for, as far as anybody knows
+    reader.look()
+    assert not reader.silent
+
+
+def test_a_pause_of_our_own_is_not_the_controllers(controller: Controller, reader: Reader, clock: FakeClock) -> None:
+    reader.look()
+    controller.silent = True
+    clock.at(0.04, lambda: clock.stall(30.0))
+
+    def speak() -> None:
+        controller.silent = False
+
+    clock.at(0.08, speak)  # due in the pause, so it comes after it
+    reader.look()
+
+
+def test_a_computer_that_sleeps_all_the_time_finds_silence_too(
+    controller: Controller, reader: Reader, clock: FakeClock
+) -> None:
+    controller.silent = True
+
+    def sleep() -> None:
+        clock.stall(30.0)
+        clock.at(0.01, sleep)
+
+    sleep()
+    assert wait_s(clock, reader.look, DeviceTimeout) < 120
+
+
+@pytest.mark.parametrize(
+    ("failure", "raised"),
+    [
+        (StreamBroken("the controller closed the connection"), StreamBroken),
+        (ConnectionResetError(), StreamBroken),
+        (ProtocolError("RTDE data of 3 bytes"), ProtocolError),
+    ],
+)
+def test_the_end_of_the_stream_is_raised_at_every_look(
+    controller: Controller, reader: Reader, clock: FakeClock, failure: Exception, raised: type[Exception]
+) -> None:
+    reader.look()
+
+    def fail() -> None:
+        controller.failure = failure
+
+    clock.at(0.05, fail)
+    with pytest.raises(raised):  # noqa: PT012
+        for _ in range(20):
+            reader.look()
+    for ask in (reader.look, reader.status, lambda: reader.state(never)):
+        assert wait_s(clock, ask, raised) == 0
+
+
+# ---------------------------------------------------------------------- the flange
+
+
+def test_the_flange_is_of_one_sample_whatever_tcp_is_set(controller: Controller, reader: Reader) -> None:
+    for k in range(5):
+        controller.tcp_offset = [0.01 * k, 0.0, 0.2, 0.05 * k, 0.0, 0.0]
+        state = reader.state(never)
+        nominal = forward(MODELS["UR5e"], controller.q_rad)
+        np.testing.assert_allclose(state.p_base_flange_m, nominal.p_m, atol=1e-12)
+        np.testing.assert_allclose(state.R_base_flange, nominal.R, atol=1e-12)
+
+
+def test_an_old_controller_is_asked_for_its_tcp_before_and_after(controller: Controller) -> None:
+    controller.unknown = {"tcp_offset", "payload", "payload_cog"}
+    reader = ReaderInMemory(controller, "UR5e")
+    assert not reader.reports_tcp
+    status = reader.status()
+    assert (status.tcp_offset, status.payload_kg, status.p_flange_payload_m) == (None, None, None)
+    answers = [[0.0] * 6, controller.tcp_offset, controller.tcp_offset, controller.tcp_offset]  # set on the way
+    state = reader.state(lambda: answers.pop(0))
+    np.testing.assert_allclose(state.p_base_flange_m, forward(MODELS["UR5e"], controller.q_rad).p_m, atol=1e-12)
+    assert not answers
+    changing = iter(range(100))
+    with pytest.raises(DeviceFault, match="TCP"):
+        reader.state(lambda: [float(next(changing))] * 6)
+
+
+@pytest.mark.parametrize("mode", [3, 4])
+def test_joints_without_power_are_not_measured(controller: Controller, reader: Reader, mode: int) -> None:
+    controller.robot_mode = mode
+    with pytest.raises(DeviceFault, match="measure its joints"):
+        reader.state(never)
+    controller.robot_mode = 5  # idle: powered, brakes closed
+    reader.state(never)
+
+
+@pytest.mark.parametrize(
+    ("moved_mm", "turned_deg", "wrong"),
+    [(0, 0, False), (4, 0.4, False), (6, 0, True), (0, 0.6, True)],
+)
+def test_a_flange_that_does_not_fit_the_joints_is_refused(
+    reader: Reader, moved_mm: float, turned_deg: float, wrong: bool
+) -> None:
+    nudge = Pose.from_ur([1e-3 * moved_mm, 0.0, 0.0, 0.0, math.radians(turned_deg), 0.0])
+    sample = reader.look()
+    flange = forward(MODELS["UR5e"], sample.q_rad) @ nudge
+    if not wrong:
+        reader._check_model(sample, flange)
+        return
+    with pytest.raises(DeviceFault, match=f"{moved_mm}.0 mm and {turned_deg:.2f} degrees .* UR5e"):
+        reader._check_model(sample, flange)
+
+
+# ---------------------------------------------------------------------- who it is
+
+
+def test_a_controller_that_lacks_what_is_needed_is_refused(controller: Controller) -> None:
+    controller.unknown = {"runtime_state", "payload", "payload_cog", "tcp_offset"}  # not the three younger ones
+    with pytest.raises(ConnectError, match="does not tell runtime_state over RTDE"):
+        ReaderInMemory(controller, "UR5e")
+
+
+def test_another_model_is_refused(controller: Controller) -> None:
+    info = ReaderInMemory(controller, None).info
+    assert (info.model, info.serial, info.firmware) == ("UR5e", "20225500001", "5.15.0")
+    assert ReaderInMemory(controller, "UR7e").info.model == "UR7e"  # its newer name
+    with pytest.raises(ConnectError, match="UR5e, not a UR10e"):
+        ReaderInMemory(controller, "UR10e")
+
+
+# ---------------------------------------------------------------------- what a sample means
+
+
+@pytest.mark.parametrize(
+    ("different", "found", "cure"),
+    [
+        ({"safety_bits": 0x404}, "protective stop", "clear it"),
+        ({"safety_bits": 0x4C0, "robot_mode": 3}, "emergency stop", "release the button"),
+        ({"safety_bits": 0x420}, "emergency stop", "release the button"),
+        ({"safety_bits": 0x410}, "safeguard stop", "safeguard"),
+        ({"safety_bits": 0x408}, "recovery", "inside its limits"),
+        ({"safety_bits": 0x600}, "violation or fault", "log"),
+        ({"safety_bits": 0x400}, "safety reason", "log"),
+        ({"robot_mode": 3}, "power off", "power the arm on"),
+        ({"robot_mode": 5}, "idle", "release its brakes"),
+        ({"robot_mode": 42}, "unknown", "power the arm on"),
+    ],
+)
+def test_every_safety_stop_has_a_cure(reader: Reader, different: dict[str, int], found: str, cure: str) -> None:
+    sample: Sample = replace(reader.look(), **different)  # type: ignore[arg-type]
+    fault = sample.safety_fault()
+    assert fault is not None
+    assert found in fault.found
+    assert cure in fault.cure
+    assert sample.status().fault is not None
+
+
+@pytest.mark.parametrize("bits", [1, 2, 3])
+def test_normal_and_reduced_mode_are_no_fault(reader: Reader, bits: int) -> None:
+    sample = replace(reader.look(), safety_bits=bits, program_state=2)
+    assert sample.safety_fault() is None
+    assert sample.program_fault() is None
+    fault = replace(sample, program_state=4).program_fault()
+    assert fault is not None
+    assert "paused" in fault.found

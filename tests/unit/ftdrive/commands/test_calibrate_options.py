@@ -1,0 +1,219 @@
+"""`ftdrive calibrate` before it opens anything: which options go together, and which settings count."""
+
+import json
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from calib.errors import BadDataset, CalibError
+from ftdrive.cli import cli, exit_code
+from ftdrive.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.errors import ConfigError
+from ftdrive.runs import Run
+from ftdrive.session import guided
+from ftdrive.session.guided import Options
+
+CELL = """format = "ftdrive.config/1"
+[robot]
+host = "10.0.0.1"
+[sensor]
+url = "ati-can://can0"
+[tool]
+name = "gripper"
+mass_kg = 1.3
+cylinders_mm = [[0, 200, 100]]
+[workcell]
+planes_mm = [[-1, 0, 0, -800]]
+measured = true
+"""
+
+
+class Opened(Exception):
+    """The session would begin."""
+
+
+@pytest.fixture
+def cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[CellConfig, Options]]:
+    """What the session would begin with."""
+    found = list[tuple[CellConfig, Options]]()
+
+    def guide(cell: CellConfig, operator: object, options: Options) -> None:
+        del operator
+        found.append((cell, options))
+        raise Opened
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(guided, "calibrate", guide)
+    return found
+
+
+def call(*arguments: str) -> BaseException:
+    error = CliRunner().invoke(cli, ["calibrate", *arguments]).exception
+    assert error is not None
+    return error
+
+
+@pytest.mark.parametrize(
+    ("options", "both"),
+    [
+        (["--step", "--manual"], "--step and --manual"),
+        (["--manual", "--listen"], "--manual and --listen"),
+        (["--quick", "--minimal"], "--quick and --minimal"),
+        (["--quick", "--resume", "run"], "--quick and --resume"),
+        (["--plan", "plan.json", "--resume", "run"], "--plan and --resume"),
+        (["--minimal", "--listen"], "--listen and --minimal"),
+        (["--simulate", "--tool", "0:60:90"], "--simulate and --tool"),
+    ],
+)
+def test_options_that_exclude_one_another_are_both_named(
+    options: list[str], both: str, cells: list[Any], tmp_path: Path
+) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "plan.json").touch()
+    error = call(*options)
+    assert isinstance(error, ConfigError)
+    assert str(error).startswith(f"{both} exclude one another")
+    assert cells == []
+
+
+@pytest.mark.parametrize(
+    "cell", [CELL.replace("measured = true", "measured = false"), CELL[: CELL.index("[workcell]")]]
+)
+def test_a_tool_on_the_command_line_does_not_make_the_cell_measured(cell: str, cells: list[Any]) -> None:
+    Path("ftdrive.toml").write_text(cell.replace("planes_mm = [[-1, 0, 0, -800]]\n", ""))
+    assert isinstance(call("--tool", "0:60:90"), Opened)
+    assert not cells[0][0].workcell.measured
+
+
+def test_without_a_file_nothing_is_measured(cells: list[Any]) -> None:
+    assert isinstance(call("--robot", "10.0.0.2", "--sensor", "ati-can://can1", "--tool", "0:60:90"), Opened)
+    assert not cells[0][0].workcell.measured
+
+
+def test_a_tool_on_the_command_line_keeps_name_and_mass(cells: list[Any]) -> None:
+    Path("ftdrive.toml").write_text(CELL)
+    assert isinstance(call("--tool", "0:60:90", "--tool", "60:200:60:0:5"), Opened)
+    tool = cells[0][0].tool
+    assert (tool.name, tool.mass_kg) == ("gripper", 1.3)
+    assert tool.cylinders_mm == ((0, 60, 90), (60, 200, 60, 0, 5))
+    assert "give 3 or 5 numbers" in str(call("--tool", "0:60"))
+    assert "no cylinder" in str(call("--tool", "60:20:90"))
+
+
+Begin = Callable[..., str]
+
+
+@pytest.fixture
+def begin(cells: list[Any], tmp_path: Path) -> Begin:
+    """Begin a run with the cell the command line puts together, as the session writes it down; returns its folder."""
+
+    def begun(*arguments: str) -> str:
+        assert isinstance(call(*arguments), Opened)
+        cell, options = cells.pop()
+        description = guided._description(cell, {}, options)
+        run = Run.create(tmp_path / "runs", "calibrate", json.loads(json.dumps(description)))
+        run.plan_path.touch()
+        return str(run.folder)
+
+    return begun
+
+
+def test_a_resumed_run_takes_the_files_as_they_are_now(begin: Begin, cells: list[Any]) -> None:
+    Path("ftdrive.toml").write_text(CELL)
+    run = begin()
+    Path("ftdrive.toml").write_text(CELL.replace("200, 100", "260, 100").replace("-800", "-500"))
+    assert isinstance(call("--resume", run), Opened)
+    cell, options = cells[0]
+    assert cell.tool.cylinders_mm == ((0, 260, 100),)
+    assert cell.workcell.planes_mm == ((-1, 0, 0, -500),)
+    assert options.resume == Path(run)
+
+
+@pytest.mark.parametrize("change", ["cell.toml is changed", "cell.toml is gone"])
+def test_a_resumed_run_reads_the_file_it_was_begun_with(change: str, begin: Begin, cells: list[Any]) -> None:
+    path = Path("cell.toml")
+    path.write_text(CELL)
+    run = begin("--config", "cell.toml", "--robot", "10.0.0.9")
+    if change.endswith("gone"):
+        path.unlink()
+    else:
+        path.write_text(CELL.replace("200, 100", "260, 100"))
+    outcome = CliRunner().invoke(cli, ["calibrate", "--resume", run])
+    assert isinstance(outcome.exception, Opened)
+    cell = cells[0][0]
+    assert cell.robot.host == "10.0.0.9"
+    assert cell.workcell.measured
+    assert cell.tool.cylinders_mm == ((0, 200 if change.endswith("gone") else 260, 100),)
+    assert ("as the run was begun" if change.endswith("gone") else "cell.toml") in outcome.stderr
+
+
+def test_a_resumed_run_keeps_the_tool_it_was_given(begin: Begin, cells: list[Any]) -> None:
+    Path("ftdrive.toml").write_text(CELL)
+    run = begin("--tool", "0:60:90")
+    assert isinstance(call("--resume", run), Opened)
+    assert cells.pop()[0].tool.cylinders_mm == ((0, 60, 90),)
+    assert isinstance(call("--resume", run, "--tool", "0:70:90"), Opened)
+    assert cells.pop()[0].tool.cylinders_mm == ((0, 70, 90),)
+    Path("ftdrive.toml").unlink()
+    assert isinstance(call("--resume", run, "--tool", "0:70:90"), Opened)
+    assert cells.pop()[0].tool.cylinders_mm == ((0, 70, 90),)
+
+
+@pytest.fixture
+def stations(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Sequence[str]]]:
+    """Which emulated cells are started, by sensor and options; none is."""
+    found = list[tuple[str, Sequence[str]]]()
+
+    class Emulated:
+        cell = CellConfig(RobotConfig("127.0.0.1"), SensorConfig("emulated://"))
+        truth: Mapping[str, Any] = MappingProxyType({})
+
+        def __init__(self, sensor: str, options: Sequence[str] = ()) -> None:
+            self.sensor, self.options = sensor, options
+            found.append((sensor, tuple(options)))
+
+        def __enter__(self) -> "Emulated":
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+    monkeypatch.setattr("ftdrive.simulation.Station", Emulated)
+    return found
+
+
+def test_an_emulated_run_goes_on_in_the_same_cell(cells: list[Any], stations: list[Any], tmp_path: Path) -> None:
+    station = {"sensor": "serial", "options": ["--seed", "7"], "truth": {}}
+    config = CellConfig(RobotConfig("127.0.0.1"), SensorConfig("ati-serial:///dev/pts/9")).to_dict()
+    run = Run.create(tmp_path, "demo", {"station": station, "config": config})
+    run.plan_path.touch()
+    for words in (shlex.split(run.resume_command)[2:], ["--simulate", "--resume", str(run.folder)]):
+        assert isinstance(call(*words), Opened)
+        assert stations.pop() == ("serial", ("--seed", "7"))
+        assert not cells.pop()[1].real
+    assert isinstance(call("--resume", str(run.folder), "--robot", "10.0.0.9"), Opened)
+    assert stations == []
+    assert cells.pop()[1].real
+
+
+@pytest.mark.parametrize("more", [(), ("--redo", "3"), ("--dry-run",), ("--simulate",)])
+@pytest.mark.parametrize("wrong", [{"said": 5}, {"said": {"tool": "0:60:90"}}, {"mode": 5}, {"station": ["can"]}])
+def test_a_run_with_a_field_of_the_wrong_type_is_refused_in_one_sentence(
+    wrong: Mapping[str, Any], more: Sequence[str], begin: Begin, cells: list[Any], stations: list[Any]
+) -> None:
+    Path("ftdrive.toml").write_text(CELL)
+    folder = Path(begin())
+    header = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(header | wrong))
+    outcome = CliRunner().invoke(cli, ["calibrate", "--resume", str(folder), *more])
+    assert isinstance(outcome.exception, BadDataset)
+    assert str(outcome.exception).startswith(f"{folder / 'run.json'}: '{next(iter(wrong))}")
+    assert cells == stations == []
+
+
+def test_every_error_of_the_solver_has_an_exit_code() -> None:
+    assert exit_code(CalibError("the run holds no pose yet")) == 7

@@ -1,0 +1,13 @@
+"""What the unit tests share."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.unit.ftdrive.fake_cell import Lab
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lab:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    return Lab(tmp_path, monkeypatch)

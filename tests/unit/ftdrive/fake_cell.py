@@ -1,0 +1,420 @@
+"""A fake cell for the guided session: an arm, a sensor and an operator that do what a test says, on a fake clock."""
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.routine import Sampling
+from drivers.clock import Clock
+from drivers.errors import DeviceFault, DriverError
+from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
+from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.errors import Declined
+from ftdrive.planning.arm_model import ArmModel, Cylinder
+from ftdrive.planning.cell import certifier_for, plan_for
+from ftdrive.planning.certify import Certifier
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import USUAL_POSTURE_RAD
+from ftdrive.runs import Run
+from ftdrive.session import guided
+from ftdrive.session.events import (
+    Event,
+    Noted,
+    PoseTaken,
+    State,
+    StateChanged,
+)
+from ftdrive.session.guided import Options
+from ftdrive.session.operator import Key, Question
+from ftdrive.session.outcome import Outcome
+from ftdrive.session.watch import Watcher
+from tests.fake_clock import FakeClock
+
+Array = NDArray[np.float64]
+
+STATUS = ArmStatus(0, 0.0, "running", "normal", "playing", None, 1.0, 1.0, 1.5, (0.0, 0.0, 0.05), (0.0,) * 6)
+MODEL = ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)])
+NOISE = np.repeat([0.02, 0.001], 3)
+
+
+@lru_cache(maxsize=1000)
+def _flange(q_rad: tuple[float, ...]) -> tuple[Array, Array]:
+    at = MODEL.frames(np.array(q_rad))
+    return at.R_base_flange[0], at.flange_m[0]
+
+
+class FakeArm(RobotArm):
+    """Joints that go where they are sent, in steps; faults by `at_move`."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+        self.answers_s = 0.008
+        """How long it takes to read a state."""
+        self.q = USUAL_POSTURE_RAD + np.radians([0, 0, 0, 3.0, -2, 4])
+        self._status = STATUS
+        self.push_rad = np.zeros(6)
+        self.moves: list[tuple[Array, float, float]] = []
+        self.stops = 0
+        self.opened = 0
+        self.control = False
+        self.program = "stopped"
+        """Of somebody else, as long as nobody has taken control."""
+        self.remote: bool | None = True
+        self.asked_limits = 0
+        self.at_move: dict[int, Callable[[], None]] = {}
+        self.at_look: Callable[[], None] = lambda: None
+        """Whenever somebody asks for the status."""
+        self.forbidden: Array | None = None
+        self.halted = threading.Event()
+        self.gone: DriverError | None = None
+        self.gone_status: dict[str, Any] = {}
+
+    def open(self, *, control: bool = False) -> None:
+        self.opened += 1
+        self.control |= control
+        assert not control or self.program == "stopped", "a program of somebody else was ended"
+
+    def close(self) -> None:
+        self.control = False
+
+    def identify(self) -> DeviceInfo:
+        return DeviceInfo("UR5e", "A1", "5.15")
+
+    def state(self) -> ArmState:
+        if self.gone:
+            if self.gone_status:
+                self.set_status(**self.gone_status)
+            raise self.gone
+        self.clock.sleep(self.answers_s)
+        q = self.q + self.push_rad
+        return ArmState(self.clock.now_ns(), 0.0, q, np.zeros(6), *_flange(tuple(q.tolist())))
+
+    def status(self) -> ArmStatus:
+        self.at_look()
+        return self._status if self.control else replace(self._status, program=self.program)
+
+    def in_remote_control(self) -> bool | None:
+        return self.remote
+
+    def set_status(self, **different: Any) -> None:
+        self._status = replace(STATUS, **different)
+
+    def lose_power(self) -> None:
+        """An emergency stop, of which the joints tell before the status does."""
+        self.gone_status = {"fault": DeviceFault("emergency stop", "…"), "safety_mode": "robot emergency stop"}
+        self.gone = DeviceFault("the joints are not measured")
+
+    def power_up(self) -> None:
+        self.gone_status, self.gone = {}, None
+        self.set_status()
+
+    def within_safety_limits(self, q_rad: Sequence[float]) -> bool:
+        assert self.control
+        self.asked_limits += 1
+        return self.forbidden is None or not np.allclose(q_rad, self.forbidden)
+
+    def move_to(
+        self,
+        q_rad: Sequence[float],
+        *,
+        timeout_s: float,
+        guard: Guard,
+        speed_rad_s: float | None = None,
+        acceleration_rad_s2: float | None = None,
+    ) -> None:
+        assert self.control
+        assert timeout_s > 0
+        assert speed_rad_s is not None
+        assert acceleration_rad_s2 is not None
+        goal = np.array(q_rad)
+        self.moves.append((goal, speed_rad_s, acceleration_rad_s2))
+        self.halted.clear()
+        start, steps = self.q, 4
+        fault = self.at_move.pop(len(self.moves), None)
+        for step in range(1, steps + 1):
+            guard()
+            if self.halted.is_set():
+                raise DeviceFault("the arm was told to stop before it had arrived.")
+            self.q = start + step / steps * (goal - start)
+            if fault is not None and step == 2:
+                fault()
+                deadline_s = self.clock.now_s() + 20  # held here until something stops it
+                while not self.halted.is_set():
+                    guard()
+                    assert self.clock.now_s() < deadline_s
+                    self.clock.sleep(0.002)
+            self.clock.sleep(0.02)
+
+    def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
+        assert timeout_s > 0
+        guard()
+
+    def stop(self) -> None:
+        self.stops += 1
+        self.halted.set()
+
+
+class FakeSensor(ForceTorqueSensor):
+    """Feels 1.2 kg hanging on the arm's flange, and what pushes."""
+
+    def __init__(self, arm: FakeArm) -> None:
+        self.arm = arm
+        self.rng = np.random.default_rng(1)
+        self.push = np.zeros(6)
+        self.noise = NOISE
+        self.failure: DriverError | None = None
+        self.stuck = False
+        self.heals = False
+        self.collecting: Callable[[], None] = lambda: None
+        self._newest = np.zeros(6)
+        self._seq = 0
+        self.events: tuple[tuple[int, str], ...] = ()
+
+    def open(self) -> None:
+        if self.heals:
+            self.failure, self.stuck = None, False
+
+    def close(self) -> None:
+        pass
+
+    def identify(self) -> DeviceInfo:
+        return DeviceInfo("fake", "S1", "1")
+
+    def _wrench(self) -> Array:
+        if not self.stuck:
+            self._newest = self._wrenches(1)[0]
+        return self._newest
+
+    def _wrenches(self, n: int) -> Array:
+        R_base_flange, _ = _flange(tuple(self.arm.q.tolist()))
+        force = R_base_flange.T @ [0, 0, -1.2 * 9.81]
+        free = np.add(np.r_[force, np.cross([0.01, 0, 0.06], force)], [1, 2, 3, 0.1, 0.2, 0.3])
+        return free + self.push + self.rng.normal(0, self.noise, (n, 6))
+
+    def collect(self, duration_s: float) -> FtSamples:
+        self.check()
+        n = max(40, int(duration_s * 100))
+        self.collecting()
+        self.arm.clock.sleep(duration_s)
+        self.check()
+        rows = np.array([self._wrench()] * n) if self.stuck else self._wrenches(n)
+        now = self.arm.clock.now_ns()
+        self._seq += n
+        return FtSamples(
+            now - (np.arange(n)[::-1] * 1_000_000).astype(np.int64),
+            np.full(n, np.nan),
+            np.arange(n, dtype=np.int64),
+            np.zeros((n, 0), np.int32),
+            rows,
+            np.zeros(n, np.uint32),
+        )
+
+    def latest(self, *, timeout_s: float) -> FtSamples:
+        assert timeout_s == 0
+        self.check()
+        self._seq += 1
+        return FtSamples(
+            np.array([self.arm.clock.now_ns()]),
+            np.array([np.nan]),
+            np.array([self._seq]),
+            np.zeros((1, 0), np.int32),
+            self._wrench()[None],
+            np.zeros(1, np.uint32),
+        )
+
+    def check(self) -> None:
+        if self.failure is not None:
+            raise self.failure
+
+    def health(self) -> Health:
+        return Health(self._seq, 0, 0, 1000.0, 0.001, events=self.events)
+
+
+@dataclass
+class Scripted:
+    """An operator that agrees to everything, but for what a test says."""
+
+    answers: dict[str, list[str]] = field(default_factory=dict)
+    on_event: Callable[[Event], None] = lambda _: None
+    at_question: list[tuple[str, Callable[[], None]]] = field(default_factory=list)
+    """What happens while a question with these words waits for its answer."""
+    keys: list[Key] = field(default_factory=list)
+    has_keys: bool = True
+    told: list[Event] = field(default_factory=list)
+    asked: list[Question] = field(default_factory=list)
+
+    def tell(self, event: Event) -> None:
+        self.told.append(event)
+        self.on_event(event)
+
+    def ask(self, question: Question) -> str:
+        for words, happen in self.at_question:
+            if words in question.text:
+                happen()
+        self.asked.append(question)
+        for word, answers in self.answers.items():
+            if word in question.text and answers:
+                return answers.pop(0)
+        if "resume" in question.answers:
+            raise Declined("nobody")
+        return question.answers[0]
+
+    def pressed(self) -> Key | None:
+        return self.keys.pop(0) if self.keys else None
+
+    def states(self) -> list[State]:
+        return [event.state for event in self.told if isinstance(event, StateChanged)]
+
+    def of(self, kind: type[Any]) -> list[Any]:
+        return [event for event in self.told if isinstance(event, kind)]
+
+
+class SteppedWatcher(Watcher):
+    """The guards without their thread: they look when the fake clock says so, in the thread of the test."""
+
+    looking = False
+    """Whether what happens now is a look of the guards."""
+    ended = False
+    """As if their thread had ended: set by a test, or by a `SystemExit` in a look."""
+    stop_takes_s = 0.0
+
+    def __enter__(self) -> Self:
+        self._step()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+
+    @property
+    def _has_ended(self) -> bool:
+        return self.ended
+
+    def _step(self) -> None:
+        if self.ended or self._end.is_set():
+            return
+        self.looking = True
+        try:
+            pause_s = self.turn()
+        except SystemExit:
+            self.ended = True
+            return
+        finally:
+            self.looking = False
+        self._fake_clock.at(max(pause_s, 0.001), self._step)
+
+    def _begin_to_stop(self) -> threading.Event:
+        stopped = threading.Event()
+
+        def stop() -> None:
+            self._arm.stop()
+            stopped.set()
+
+        if self.stop_takes_s:
+            self._fake_clock.at(self.stop_takes_s, stop)
+        else:
+            stop()
+        return stopped
+
+    @property
+    def _fake_clock(self) -> FakeClock:
+        assert isinstance(self.clock, FakeClock)
+        return self.clock
+
+
+@lru_cache(maxsize=100)
+def _planned(cell: CellConfig, model: str, q_rad: tuple[float, ...], poses: int) -> Plan:
+    return plan_for(cell, certifier_for(cell, model), np.array(q_rad), poses)
+
+
+def planned_once(cell: CellConfig, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
+    """As `plan_for`, but the same question is answered from memory: planning takes most of a test's time."""
+    return _planned(cell, certifier.arm.name, tuple(q_rad.tolist()), poses)
+
+
+class Lab:
+    """A fake cell and what a test wants of it."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder = folder
+        self.clock = FakeClock()
+        self.arm = FakeArm(self.clock)
+        self.sensor = FakeSensor(self.arm)
+        self.operator = Scripted()
+        self.cell = CellConfig(
+            RobotConfig("fake"),
+            SensorConfig("fake://"),
+            ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),)),
+            WorkcellConfig(measured=True),
+            Sampling(average_s=0.1, noise_record_s=0.0),
+            clock=self.clock,
+        )
+        self.watchers: list[SteppedWatcher] = []
+        """Of each session that came to its tour."""
+        monkeypatch.setattr(guided, "build_arm", lambda _: self.arm)
+        monkeypatch.setattr(guided, "build_sensor", lambda _: self.sensor)
+        monkeypatch.setattr(guided, "plan_for", planned_once)
+        monkeypatch.setattr(guided, "Watcher", self._watcher)
+        monkeypatch.setattr("shutil.which", lambda _: None)
+        monkeypatch.setattr("os.fsync", lambda _: None)  # the disk of whoever runs the tests is slow
+
+    def _watcher(self, *args: Any, **kwargs: Any) -> SteppedWatcher:
+        self.watchers.append(SteppedWatcher(*args, **kwargs))
+        return self.watchers[-1]
+
+    @property
+    def guards_look(self) -> bool:
+        """Whether what happens now happens in a look of the guards."""
+        return any(watcher.looking for watcher in self.watchers)
+
+    def calibrate(self, **options: Any) -> Outcome | None:
+        return guided.calibrate(self.cell, self.operator, Options(self.folder / "runs", poses=6, **options))
+
+    def run(self) -> Run:
+        (folder,) = (self.folder / "runs").iterdir()
+        return Run(folder)
+
+    def stops(self) -> list[int]:
+        return [record.stop for record in self.run().records()]
+
+    def said(self) -> str:
+        return "\n".join(event.words for event in self.operator.of(Noted))
+
+    def taken(self) -> list[int]:
+        return [event.stop for event in self.operator.of(PoseTaken)]
+
+    def holds(self) -> list[tuple[str, ...]]:
+        return [question.answers for question in self.operator.asked if "resume" in question.answers]
+
+    def press(self, *presses: tuple[Key, type[Event], int]) -> None:
+        """Press each key once, when an event of its kind is told of its stop."""
+        left = list(presses)
+
+        def on_event(event: Event) -> None:
+            for one in left:
+                key, kind, stop = one
+                if isinstance(event, kind) and getattr(event, "stop", None) == stop:
+                    left.remove(one)
+                    self.operator.keys.append(key)
+                    return
+
+        self.operator.on_event = on_event
+
+    def push_on_the_way(self, *moves: int) -> None:
+        """Let something be in the way of these moves, and be gone when a person is asked."""
+
+        def push() -> None:
+            self.sensor.push = np.array([150.0, 0, 0, 0, 0, 0])
+
+        def on_event(event: Event) -> None:
+            if isinstance(event, StateChanged) and event.state is State.HOLD:
+                self.sensor.push = np.zeros(6)
+
+        self.arm.at_move |= dict.fromkeys(moves, push)
+        self.operator.on_event = on_event

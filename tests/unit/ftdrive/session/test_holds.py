@@ -1,0 +1,214 @@
+"""What happens while the arm is held, on the fake cell: a person says no, or an emergency stop is pressed meanwhile."""
+
+from collections.abc import Callable
+
+import pytest
+
+from drivers.errors import ConnectError, DeviceFault
+from ftdrive.errors import Declined
+from ftdrive.session.events import GuardTripped, Noted, State, StateChanged
+from ftdrive.session.operator import Key
+from tests.unit.ftdrive.fake_cell import Lab
+
+QUESTIONS = ("Is the tool free", "Is the ball of", "Is the emergency stop in reach")
+
+
+def when_asked(lab: Lab, words: str, do: Callable[[], None]) -> None:
+    """Let something happen each time a question with these words waits for its answer."""
+    lab.operator.at_question.append((words, do))
+
+
+def press_and_release(lab: Lab, mode: str = "robot emergency stop") -> None:
+    """Press the emergency stop for a tenth of a second, in which the guards look at the arm, then release it."""
+    lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode=mode)
+    lab.clock.sleep(0.1)
+    lab.arm.set_status()
+    lab.clock.sleep(0.1)
+
+
+def once(do: Callable[[], None]) -> Callable[[], None]:
+    left = [do]
+    return lambda: left.pop()() if left else None
+
+
+def pause_on_the_way(lab: Lab, move: int) -> None:
+    lab.arm.at_move[move] = lambda: lab.operator.keys.append(Key.PAUSE)
+
+
+def questions(lab: Lab) -> int:
+    """How often each of the three was asked of a person."""
+    times = dict.fromkeys(QUESTIONS, 0)
+    for question in lab.operator.asked:
+        for words in QUESTIONS:
+            times[words] += question.text.startswith(words) and question.assumed is None
+    (number,) = set(times.values())
+    return number
+
+
+def holds(lab: Lab) -> list[str]:
+    return [event.words for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
+
+
+# ---------------------------------------------------------------------------------------------------- a person says no
+
+
+@pytest.mark.parametrize("answer", ["resume", "skip"])
+def test_a_way_that_is_not_confirmed_leads_back_to_the_hold(answer: str, lab: Lab) -> None:
+    pause_on_the_way(lab, 4)
+    lab.operator.answers["Type resume"] = ["resume", answer]
+    lab.operator.answers["the way to pose 4"] = ["no"]
+    moves: list[int] = []
+    when_asked(lab, "Type resume", lambda: moves.append(len(lab.arm.moves)))
+    assert lab.calibrate() is not None
+    assert moves == [4, 4]
+    first, second = holds(lab)
+    assert first == "paused by a person"
+    assert second.startswith("not confirmed: The arm goes the way to pose 4")
+    assert lab.operator.of(GuardTripped) == []
+    assert lab.stops() == [1, 2, 3, *([4] if answer == "resume" else []), 5, 6, 7]
+
+
+def test_who_does_not_confirm_a_way_can_end_it_there_and_keeps_the_poses(lab: Lab) -> None:
+    pause_on_the_way(lab, 4)
+    lab.operator.answers["Type resume"] = ["resume", "quit"]
+    lab.operator.answers["the way to pose 4"] = ["no"]
+    with pytest.raises(Declined, match="not confirmed: The arm goes the way to pose 4"):
+        lab.calibrate()
+    assert len(lab.arm.moves) == 4
+    assert lab.stops() == [1, 2, 3]
+    assert f"--resume {lab.run().folder}" in lab.operator.of(Noted)[-1].words
+
+
+def test_the_way_back_that_is_not_confirmed_is_not_gone_but_offered_again(lab: Lab) -> None:
+    lab.push_on_the_way(4)
+    lab.operator.answers["Type resume"] = ["back", "resume"]
+    lab.operator.answers["the way back to pose 3"] = ["no"]
+    assert lab.calibrate() is not None
+    assert len(holds(lab)) == 2
+    assert all("back" in answers for answers in lab.holds())
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_a_tour_that_may_not_begin_yet_is_held_at_its_first_pose(lab: Lab) -> None:
+    lab.operator.answers["Begin?"] = ["no"]
+    lab.operator.answers["Type resume"] = ["resume"]
+    assert lab.calibrate() is not None
+    assert [words.startswith("not confirmed: The arm stands at the first pose") for words in holds(lab)] == [True]
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+
+
+@pytest.mark.parametrize("words", [*QUESTIONS, "Type MOVE"])
+def test_a_no_before_the_first_motion_ends_the_session(words: str, lab: Lab) -> None:
+    lab.operator.answers[words] = ["no"]
+    with pytest.raises(Declined):
+        lab.calibrate()
+    assert holds(lab) == []
+    assert lab.arm.moves == []
+
+
+# ------------------------------------------------------------------------------- an emergency stop is pressed meanwhile
+
+
+@pytest.mark.parametrize("mode", ["robot emergency stop", "system emergency stop", "safeguard stop", "protective stop"])
+@pytest.mark.parametrize("held", ["by a pause", "for a contact"])
+def test_an_emergency_stop_that_is_pressed_in_a_hold_brings_the_questions_again(mode: str, held: str, lab: Lab) -> None:
+    if held == "by a pause":
+        pause_on_the_way(lab, 4)
+    else:
+        lab.push_on_the_way(4)
+    lab.operator.answers["Type resume"] = ["resume"]
+    when_asked(lab, "Type resume", once(lambda: press_and_release(lab, mode)))
+    assert lab.calibrate() is not None
+    counts = mode != "protective stop"
+    assert questions(lab) == 1 + counts
+    rows = [event.hazard for event in lab.operator.of(GuardTripped)]
+    assert rows == [14] * (held == "for a contact") + [11] * counts
+    assert len(lab.arm.moves) == 8
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_the_questions_come_until_they_are_all_answered_with_yes(lab: Lab) -> None:
+    pause_on_the_way(lab, 4)
+    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    lab.operator.answers["Is the emergency stop in reach"] = ["yes", "no"]
+    when_asked(lab, "Type resume", once(lambda: press_and_release(lab)))
+    assert lab.calibrate() is not None
+    assert questions(lab) == 3
+    assert [event.hazard for event in lab.operator.of(GuardTripped)] == [11]
+    assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet: not confirmed")]) == 1
+
+
+def test_an_emergency_stop_that_is_still_pressed_is_refused_and_asked_about_once_released(lab: Lab) -> None:
+    pause_on_the_way(lab, 4)
+    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    pressed_then_not = iter([{"fault": DeviceFault("a stop"), "safety_mode": "robot emergency stop"}, {}])
+    when_asked(lab, "Type resume", lambda: lab.arm.set_status(**next(pressed_then_not)))
+    assert lab.calibrate() is not None
+    (refused,) = [event.words for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
+    assert "safety: a stop" in refused
+    assert questions(lab) == 2
+    assert len(lab.arm.moves) == 8
+
+
+@pytest.mark.parametrize("words", ["Is the tool free", "the way to pose 4"])
+def test_an_emergency_stop_that_is_pressed_at_a_question_counts_too(words: str, lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode="safeguard stop")
+    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    when_asked(lab, "Type resume", lab.arm.set_status)
+    moves: list[int] = []
+
+    def press() -> None:
+        if lab.arm.moves:
+            moves.append(len(lab.arm.moves))
+            if len(moves) == 1:
+                press_and_release(lab)
+
+    when_asked(lab, words, press)
+    assert lab.calibrate() is not None
+    assert moves == [4, 4]
+    assert questions(lab) == 3
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_an_emergency_stop_between_two_steps_holds_the_arm_where_it_stands(lab: Lab) -> None:
+    lab.operator.answers["Type resume"] = ["resume"]
+    when_asked(lab, "Pose 4 of 7", once(lambda: press_and_release(lab)))
+    moves: list[int] = []
+    when_asked(lab, "Type resume", lambda: moves.append(len(lab.arm.moves)))
+    assert lab.calibrate(mode="step") is not None
+    assert moves == [3]
+    assert holds(lab) == ["the arm stopped: a stop"]
+    assert [event.hazard for event in lab.operator.of(GuardTripped)] == [11]
+    assert questions(lab) == 2
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+
+
+def test_who_resumes_an_arm_that_nobody_could_see_is_asked_again(lab: Lab) -> None:
+    pause_on_the_way(lab, 4)
+    lab.operator.answers["Type resume"] = ["resume"]
+
+    def out_of_sight() -> None:
+        def unseen() -> None:
+            raise ConnectError("the arm is not open")
+
+        lab.arm.at_look = unseen
+        lab.clock.sleep(1.1)
+        lab.arm.at_look = lambda: None
+
+    when_asked(lab, "Type resume", once(out_of_sight))
+    assert lab.calibrate() is not None
+    assert questions(lab) == 2
+    assert [event for event in lab.operator.of(Noted) if "out of sight" in event.words]
+    assert lab.operator.of(GuardTripped) == []
+
+
+@pytest.mark.parametrize("words", QUESTIONS)
+def test_an_emergency_stop_at_the_first_questions_brings_them_again(words: str, lab: Lab) -> None:
+    lab.operator.answers["Type resume"] = ["resume"]
+    when_asked(lab, words, once(lambda: press_and_release(lab)))
+    held_at: list[int] = []
+    when_asked(lab, "Type resume", lambda: held_at.append(len(lab.arm.moves)))
+    assert lab.calibrate() is not None
+    assert held_at == [0]
+    assert questions(lab) == 2
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]

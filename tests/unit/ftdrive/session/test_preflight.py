@@ -1,0 +1,281 @@
+"""What is checked before anything moves, on the fake cell: each finding is refused with its words."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from drivers.errors import DeviceFault, StreamBroken
+from drivers.interfaces import ArmState
+from ftdrive import checks
+from ftdrive.config import ToolConfig, WorkcellConfig
+from ftdrive.diagnosis import SLOWEST_SLIDER, check_speed
+from ftdrive.errors import NotAccepted
+from ftdrive.session import guided, preflight
+from ftdrive.session.events import Checked, Noted
+from ftdrive.session.guards import Limits
+from tests.unit.ftdrive.fake_cell import Lab
+
+
+def refuse(lab: Lab, words: str) -> None:
+    with pytest.raises(NotAccepted, match=words):
+        lab.calibrate()
+    assert lab.arm.moves == []
+    assert lab.operator.asked == []
+
+
+def test_a_workcell_nobody_measured_is_refused(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, workcell=WorkcellConfig())
+    refuse(lab, "measured = true")
+
+
+@pytest.mark.parametrize(
+    ("different", "words"),
+    [
+        ({"fault": DeviceFault("protective stop", "clear it"), "safety_mode": "protective stop"}, "protective stop"),
+        ({"payload_kg": 0.0}, "told of no payload"),
+        (
+            {"p_flange_payload_m": (0.0, 0.0, -0.15)},
+            r"centre at \(0, 0, -150\) mm from the flange, where the tool is not",
+        ),
+        ({"p_flange_payload_m": (0.3, 0.0, 0.05)}, r"centre at \(300, 0, 50\) mm"),
+    ],
+)
+def test_a_controller_that_is_not_ready_is_refused(different: dict[str, Any], words: str, lab: Lab) -> None:
+    lab.arm.set_status(**different)
+    refuse(lab, words)
+
+
+def test_a_tour_that_would_wind_up_the_cable_is_refused(lab: Lab, tmp_path: Path) -> None:
+    lab.arm.q[5] = np.radians(-90)
+    made_there = tmp_path / "there.json"
+    assert lab.calibrate(dry_run=True, output=made_there) is None
+    assert "wrist 3 stands at -90°" in next(e.words for e in lab.operator.of(Checked) if e.name == "cable")
+    lab.arm.q[5] = np.radians(160)
+    lab.operator.told.clear()
+    refuse_plan = pytest.raises(NotAccepted, match=r"wrist 3 stands at 160°.*jog it to between -?\d+° and -?\d+°")
+    with refuse_plan:
+        lab.calibrate(plan=made_there)
+    assert lab.arm.moves == []
+
+
+def test_a_payload_that_is_not_that_of_the_tool_is_refused(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=3.0))
+    refuse(lab, "1.50 kg, sensor and tool are 3.00 kg")
+
+
+@pytest.mark.parametrize(
+    ("range_N", "range_Nm", "share", "passes"),
+    [
+        (40.0, 10.0, 74, True),  # 2 · 1.5 kg · 9.81 m/s² = 29.4 N
+        (35.0, 10.0, 84, False),
+        (200.0, 8.0, 74, True),  # on the 0.2 m of the tool: 5.9 N·m
+        (200.0, 7.0, 84, False),
+    ],
+)
+def test_a_tool_too_heavy_or_too_long_for_the_sensor_is_refused(
+    range_N: float, range_Nm: float, share: int, passes: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits = np.array([200.0, range_N, 200, 20, 20, range_Nm])
+    monkeypatch.setattr(guided, "_range_of", lambda _: limits)
+    lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=1.5))
+    words = f"twice the tool's weight is {share} % of the sensor's range"
+    if passes:
+        assert lab.calibrate(dry_run=True) is None
+        assert words in next(event.words for event in lab.operator.of(Checked) if event.name == "load")
+    else:
+        refuse(lab, f"{words}: take a larger sensor")
+
+
+def test_a_speed_slider_that_doctor_calls_too_low_is_refused(lab: Lab) -> None:
+    lab.arm.set_status(speed_slider=SLOWEST_SLIDER)
+    assert lab.calibrate(dry_run=True) is None
+    lab.arm.set_status(speed_slider=SLOWEST_SLIDER - 0.01)
+    assert check_speed(lab.arm.status()).state == "failed"
+    refuse(lab, "slider: speed slider at 4%.*raise the speed slider at the pendant")
+
+
+def test_a_pose_the_controller_forbids_is_refused(lab: Lab) -> None:
+    assert lab.calibrate(dry_run=True) is None
+    lab.arm.forbidden = lab.arm.q.round(12)
+    lab.arm.within_safety_limits = lambda q_rad: q_rad[4] < 2.0  # type: ignore[method-assign]  # this arm only
+    refuse(lab, "safety limits forbid")
+
+
+def test_another_model_or_tcp_is_refused(lab: Lab) -> None:
+    right = lab.arm.state
+
+    def elsewhere() -> ArmState:
+        state = right()
+        return replace(state, p_base_flange_m=np.add(state.p_base_flange_m, [0, 0, 0.02]))
+
+    lab.arm.state = elsewhere  # type: ignore[method-assign]  # this arm only
+    refuse(lab, "check the model and the active TCP")
+
+
+def test_another_arm_than_the_one_that_is_meant_is_refused(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, serial="A1"))
+    assert lab.calibrate(dry_run=True) is None
+    lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, serial="B2"))
+    refuse(lab, r"the arm at fake has serial A1, \[robot\] serial says B2")
+
+
+def test_a_stuck_sensor_is_refused(lab: Lab) -> None:
+    lab.sensor.stuck = True
+    refuse(lab, "did not change")
+
+
+def test_a_sensor_that_stumbles_once_is_opened_again(lab: Lab) -> None:
+    def stumble() -> None:
+        lab.sensor.collecting = lambda: None
+        raise StreamBroken("a write took too long")
+
+    lab.sensor.collecting = stumble
+    assert lab.calibrate(dry_run=True) is None
+    assert "trying once more" in " ".join(event.words for event in lab.operator.of(Noted))
+    lab.sensor.failure = StreamBroken("gone for good")
+    with pytest.raises(StreamBroken):
+        lab.calibrate(dry_run=True)
+
+
+def test_a_folder_that_cannot_be_written_is_refused(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(**_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checks, "TemporaryFile", full)
+    refuse(lab, "No space left")
+
+
+def test_a_plan_for_another_tool_is_refused(lab: Lab) -> None:
+    lab.calibrate()
+    plan = lab.run().plan_path
+    lab.arm.moves.clear()
+    lab.operator.asked.clear()
+    lab.cell = replace(lab.cell, tool=ToolConfig(cylinders_mm=((0.0, 210.0, 100.0),)))
+    with pytest.raises(NotAccepted, match="another tool"):
+        lab.calibrate(plan=plan)
+    assert lab.arm.moves == []
+
+
+@pytest.mark.parametrize("dry_run", [True, False])
+@pytest.mark.parametrize("program", ["playing", "paused"])
+def test_a_program_of_somebody_else_is_refused_before_anything_is_done(
+    program: str, dry_run: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lab.arm, "program_told", lambda: "PLAYING pick.urp")
+    lab.arm.program = program
+    words = r"a program is on the controller \(PLAYING pick\.urp\) .* stop it at the pendant, then start again"
+    with pytest.raises(NotAccepted, match=words):
+        lab.calibrate(dry_run=dry_run)
+    assert (lab.arm.opened, lab.arm.moves, lab.operator.asked) == (1, [], [])
+
+
+def test_what_a_killed_session_left_behind_is_waited_for(lab: Lab) -> None:
+    lab.arm.program = "playing"
+    lab.clock.at(0.3, lambda: setattr(lab.arm, "program", "stopping"))
+    lab.clock.at(1.4, lambda: setattr(lab.arm, "program", "stopped"))
+    assert lab.calibrate(dry_run=True) is None
+
+
+def test_a_program_that_goes_on_is_none_that_was_left_behind(lab: Lab) -> None:
+    lab.arm.program = "playing"
+    lab.clock.at(1.6, lambda: setattr(lab.arm, "program", "stopped"))
+    with pytest.raises(NotAccepted):
+        lab.calibrate(dry_run=True)
+
+
+def test_a_computer_that_stalls_does_not_refuse_a_program_that_has_ended_meanwhile(lab: Lab) -> None:
+    def stall() -> None:
+        lab.clock.stall(5.0)
+        lab.arm.program = "stopped"
+
+    lab.arm.program = "playing"
+    lab.clock.at(0.01, stall)
+    assert lab.calibrate(dry_run=True) is None
+
+
+def test_a_dry_run_takes_no_control_and_says_what_it_left_out(lab: Lab) -> None:
+    assert lab.calibrate(dry_run=True) is None
+    assert (lab.arm.opened, lab.arm.asked_limits) == (1, 0)
+    assert "safety limits are not asked for" in lab.said()
+
+
+def test_control_is_taken_when_all_else_is_well(lab: Lab) -> None:
+    lab.arm.set_status(payload_kg=0.0)
+    refuse(lab, "told of no payload")
+    assert (lab.arm.opened, lab.arm.asked_limits) == (1, 0)
+
+
+def test_an_old_controller_is_controlled_from_the_start_for_it_tells_no_poses_before(lab: Lab) -> None:
+    lab.arm.set_status(tcp_offset=None)
+    right = lab.arm.state
+
+    def state() -> ArmState:
+        assert lab.arm.control
+        return right()
+
+    lab.arm.state = state  # type: ignore[method-assign]  # this arm only
+    lab.calibrate()
+    assert lab.stops()[-1] == 7
+
+
+def test_local_control_is_refused_in_a_dry_run_too(lab: Lab) -> None:
+    lab.arm.remote = False
+    with pytest.raises(NotAccepted, match="remote: local control: press Local"):
+        lab.calibrate(dry_run=True)
+    lab.arm.remote = None
+    assert lab.calibrate(dry_run=True) is None
+
+
+def link(lab: Lab, *, old: bool, late_s: Callable[[int], float]) -> Checked:
+    """Check an arm that answers each question after so long; `old`: its program is asked for the TCP, twice a time."""
+    lab.arm.set_status(tcp_offset=None if old else (0.0,) * 6)
+    looks = count()
+
+    def late() -> ArmState:
+        lab.clock.sleep(late_s(next(looks)))
+        return right()
+
+    right, lab.arm.answers_s = lab.arm.state, 0.0
+    lab.arm.state = late  # type: ignore[method-assign]  # this arm only
+    return preflight.check_link(cast("preflight.Before", SimpleNamespace(arm=lab.arm, cell=lab.cell, limits=Limits())))
+
+
+@pytest.mark.parametrize(("old", "limit_s"), [(False, 0.02), (True, 0.06)])
+def test_an_arm_that_answers_late_is_refused(old: bool, limit_s: float, lab: Lab) -> None:
+    assert link(lab, old=old, late_s=lambda _: 0.9 * limit_s).passed
+    found = link(lab, old=old, late_s=lambda _: 1.1 * limit_s)
+    assert not found.passed
+    assert f"{1e3 * limit_s:.0f} ms" in found.words
+
+
+def test_a_link_with_gaps_is_refused(lab: Lab) -> None:
+    assert link(lab, old=False, late_s=lambda look: 0.09 if look % 5 == 4 else 0.008).passed
+    assert not link(lab, old=False, late_s=lambda look: 0.11 if look % 5 == 4 else 0.008).passed
+
+
+def test_a_link_is_refused_only_where_it_is_late_in_three_half_seconds(lab: Lab) -> None:
+    begin_s = lab.clock.now_s()
+    assert link(lab, old=False, late_s=lambda _: 0.03 if lab.clock.now_s() < begin_s + 0.9 else 0.008).passed
+    begin_s = lab.clock.now_s()
+    assert not link(lab, old=False, late_s=lambda _: 0.03 if lab.clock.now_s() < begin_s + 1.4 else 0.008).passed
+
+
+@pytest.mark.parametrize("granted", [True, False])
+def test_the_computer_is_kept_awake_by_a_process_that_ends_with_our_end_of_its_pipe(
+    granted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inhibit, ended = tmp_path / "systemd-inhibit", tmp_path / "ended"
+    inhibit.write_text(f"#!/bin/sh\n{'cat' if granted else 'exit 1'}\necho by itself > {ended}\n")
+    inhibit.chmod(0o755)
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("shutil.which", lambda _: str(inhibit))
+    with preflight.awake() as words:
+        assert words.startswith("this computer is kept awake") == granted
+        assert not ended.exists()
+    assert ended.exists() == granted

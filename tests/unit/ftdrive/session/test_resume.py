@@ -1,0 +1,505 @@
+"""Keys, and how a run goes on, on the fake cell: pause, stop, skip, redo, --resume, by hand."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.routine import DriftCheck
+from drivers.errors import DeviceFault
+from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
+from ftdrive.config import ToolConfig
+from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
+from ftdrive.planning.constant_tour import constant_tour
+from ftdrive.planning.plan import Plan
+from ftdrive.report import drift_in_words
+from ftdrive.session import guided, machine
+from ftdrive.session.events import (
+    Checked,
+    Estimated,
+    Event,
+    GuardTripped,
+    Noted,
+    PoseTaken,
+    RunOpened,
+    State,
+    StateChanged,
+)
+from ftdrive.session.operator import Key
+from ftdrive.session.running import faces
+from tests.unit.ftdrive.fake_cell import Lab
+
+
+def test_pause_holds_the_arm_on_its_way_and_goes_on_or_ends(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
+    lab.operator.answers["Type resume to go on"] = ["resume"]
+    lab.calibrate()
+    assert lab.operator.states().count(State.HOLD) == 1
+    assert lab.operator.of(GuardTripped) == []
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+    lab.arm.moves.clear()
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
+    lab.operator.answers["Type resume to go on"] = ["quit"]
+    with pytest.raises(Declined, match="paused by a person"):
+        lab.calibrate()
+
+
+def test_stop_ends_the_session_without_a_question_and_says_how_to_go_on(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined, match="stopped by a person"):
+        lab.calibrate()
+    assert lab.arm.halted.is_set()
+    assert State.HOLD not in lab.operator.states()
+    assert "resume" not in lab.operator.asked[-1].text
+    assert lab.stops() == [1, 2]
+    assert f"--resume {lab.run().folder}" in lab.operator.of(Noted)[-1].words
+
+
+def test_skip_on_the_way_stops_the_arm_and_goes_round_that_pose(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.SKIP)
+    lab.calibrate()
+    assert lab.taken() == [1, 2, 3, 5, 6, 7]
+    assert lab.arm.stops == 1
+    fourth = np.array(Plan.load(lab.run().plan_path).steps[3].q_rad)
+    assert [np.abs(goal - fourth).max() < 1e-9 for goal, *_ in lab.arm.moves].count(True) == 1  # the one broken off
+    assert [question for question in lab.operator.asked if "the way to pose 5" in question.text]
+    assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
+    assert State.HOLD not in lab.operator.states()
+    assert "skipped: pose 4, the arm goes on to pose 5" in lab.said()
+
+
+def test_skip_while_a_pose_is_measured_skips_that_one(lab: Lab) -> None:
+    def skip() -> None:
+        if len(lab.arm.moves) == 4 and not skipped:
+            skipped.append(True)
+            lab.operator.keys.append(Key.SKIP)
+
+    skipped: list[bool] = []
+    lab.sensor.collecting = skip
+    lab.calibrate()
+    assert lab.taken() == [1, 2, 3, 5, 6, 7]
+    assert not [question for question in lab.operator.asked if "the way to pose 5" in question.text]
+    assert len(lab.arm.moves) == 7
+
+
+def test_skip_with_no_pose_under_way_skips_none(lab: Lab) -> None:
+    lab.press((Key.SKIP, PoseTaken, 4), (Key.KEEP, StateChanged, 5))
+    lab.calibrate()
+    assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
+    assert "none is under way" in lab.said()
+
+
+def test_keep_has_nothing_to_do_in_a_tour_and_says_so(lab: Lab) -> None:
+    lab.press((Key.KEEP, PoseTaken, 3))
+    lab.calibrate()
+    assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
+    assert lab.said().count("a pose is kept by itself; r takes it again") == 1
+
+
+def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> None:
+    def redo() -> None:
+        if len(lab.arm.moves) == 8 and not again:
+            again.append(True)
+            lab.operator.keys.append(Key.REDO)
+
+    again: list[bool] = []
+    lab.sensor.collecting = redo  # while pose 6 is measured: pose 5 is the last that was shown
+    lab.press((Key.REDO, PoseTaken, 1), (Key.REDO, StateChanged, 4))  # while the arm stands, and on its way
+    lab.calibrate()
+    assert lab.taken() == [1, 1, 2, 3, 3, 4, 5, 5, 6, 7]
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+    assert "the arm ends its move, then goes back to pose 3" in lab.said()
+    ways = [question.text for question in lab.operator.asked if "the way to pose" in question.text]
+    assert len(ways) == 1  # the first approach: back and forth it goes along the plan's own moves
+
+
+def test_redo_before_any_pose_or_twice_does_nothing_more(lab: Lab) -> None:
+    def twice(event: Event) -> None:
+        if isinstance(event, StateChanged) and event.state is State.APPROACH:
+            lab.operator.keys.append(Key.REDO)
+        if isinstance(event, PoseTaken) and lab.taken() == [1, 2]:
+            lab.operator.keys.extend([Key.REDO, Key.REDO])
+
+    lab.operator.on_event = twice
+    lab.calibrate()
+    assert lab.taken() == [1, 2, 2, 3, 4, 5, 6, 7]
+    assert "no pose yet" in lab.said()
+    assert "pose 2 is being taken again already" in lab.said()
+
+
+def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> None:
+    def skip() -> None:
+        if len(lab.arm.moves) == 3 and len(lab.taken()) == 3 and not skipped:
+            skipped.append(True)
+            lab.operator.keys.append(Key.SKIP)
+
+    skipped: list[bool] = []
+    lab.sensor.collecting = skip
+    lab.press((Key.REDO, PoseTaken, 3))
+    outcome = lab.calibrate()
+    assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
+    assert "pose 3 stays as it was taken" in lab.said()
+    assert outcome is not None
+    assert outcome.result.n_poses == 6
+    assert [event.poses for event in lab.operator.of(Estimated)][:5] == [1, 2, 3, 3, 4]
+
+
+def test_skip_of_the_first_pose_while_it_is_taken_again_keeps_it_and_names_the_return(lab: Lab) -> None:
+    lab.operator.answers["Pose 2 of 7"] = ["r"]
+    lab.operator.answers["Pose 1 of 7"] = ["", "s"]
+    outcome = lab.calibrate(mode="step")
+    assert lab.taken() == [1, 2, 3, 4, 5, 6]
+    assert "pose 1 stays as it was taken" in lab.said()
+    assert "skipped: the return to pose 1, the arm goes on to pose 2; --resume takes what was skipped" in lab.said()
+    assert outcome is not None
+    assert outcome.result.n_poses == 6
+    assert outcome.drift is None
+    lab.operator.told.clear()
+    outcome = lab.calibrate(resume=lab.run().folder)
+    assert lab.taken() == [7]
+    assert outcome is not None
+    assert outcome.drift is not None
+
+
+def test_a_pose_of_a_run_that_redo_names_stays_when_it_is_skipped(lab: Lab) -> None:
+    lab.calibrate()
+    lab.operator.told.clear()
+    lab.operator.answers["Pose 3 of 7"] = ["s"]
+    outcome = lab.calibrate(resume=lab.run().folder, redo=(3,), mode="step")
+    assert lab.taken() == []
+    assert "pose 3 stays as it was taken" in lab.said()
+    assert "skipped" not in lab.said()
+    assert [event.poses for event in lab.operator.of(Estimated)][-1] == 6
+    assert outcome is not None
+    assert outcome.result.n_poses == 6
+
+
+def test_a_first_pose_that_is_taken_anew_after_its_return_gives_the_drift_between_the_two(lab: Lab) -> None:
+    lab.calibrate()
+    lab.sensor.push = np.array([0.5, 0, 0, 0, 0, 0])
+    outcome = lab.calibrate(resume=lab.run().folder, redo=(1,))
+    assert lab.taken()[-1] == 1
+    assert outcome is not None
+    assert outcome.result.n_poses == 6
+    drift = outcome.drift
+    assert drift is not None
+    assert -60 < drift.elapsed_s < 0
+    assert drift.change[0] == pytest.approx(-0.5, abs=0.05)  # per time it rises all the same
+    words, bad = drift_in_words(drift)
+    assert bad
+    assert words.startswith(f"first pose, taken anew {-drift.elapsed_s:.0f} s after the return to it, 0.")
+
+
+@pytest.mark.parametrize(("elapsed_s", "when"), [(300.0, "again after 300 s"), (-300.0, "anew 300 s after the return")])
+def test_the_rate_of_a_drift_is_the_same_whichever_was_first(elapsed_s: float, when: str) -> None:
+    words, bad = drift_in_words(DriftCheck(np.array([0.5, 0, 0, 0, 0, 0]), np.full(6, 0.01), elapsed_s))
+    assert bad
+    assert when in words
+    assert words.endswith("away: 0.1 N/min")
+
+
+def test_a_way_past_a_skipped_pose_is_told_and_confirmed_by_a_person(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.calibrate()  # trusted from here on
+    lab.operator.asked.clear()
+    lab.operator.answers["Pose 3 of 7"] = ["s"] * 2
+    lab.calibrate(mode="step")
+    monkeypatch.setattr(machine, "_NEAR_RAD", np.pi)
+    lab.calibrate(mode="step")
+    ways = [question for question in lab.operator.asked if "the way to pose 4" in question.text]
+    assert ["skipped pose 3" in question.text for question in ways] == [False, True]
+    assert [question.assumed for question in ways] == ["yes", None]
+
+
+def test_what_would_help_most_is_not_told_where_the_plan_chooses(lab: Lab) -> None:
+    lab.calibrate()
+    assert {event.hint for event in lab.operator.of(Estimated)} == {""}
+
+
+def test_a_hold_tells_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.arm.set_status(
+        fault=DeviceFault("protective stop", "…"), safety_mode="protective stop"
+    )
+    lab.operator.answers["Type resume when it is mended"] = ["quit"]
+    with pytest.raises(DeviceFault):
+        lab.calibrate()
+    (hold,) = [event for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
+    assert str(lab.folder) not in hold.words + lab.operator.asked[-1].text
+    assert "protective stop" in hold.words
+    assert "3 poses are kept" in lab.operator.asked[-1].text
+
+
+def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined):
+        lab.calibrate()
+    run = lab.run()
+    lab.operator.told.clear()
+    outcome = lab.calibrate(resume=run.folder)
+    assert outcome is not None
+    assert outcome.run.folder == run.folder
+    assert [event.stop for event in lab.operator.of(PoseTaken)] == [4, 5, 6, 7]
+    assert len((run.folder / "events.ndjson").read_text().splitlines()) > len(lab.operator.told)
+    first = run.calibration_path.read_bytes()
+    lab.operator.told.clear()
+    assert lab.calibrate(resume=run.folder, redo=(3,)) is not None
+    assert [event.stop for event in lab.operator.of(PoseTaken)] == [3]
+    assert run.calibration_path.name == "calibration-2.json"
+    assert (run.folder / "calibration.json").read_bytes() == first
+
+
+@pytest.mark.parametrize(
+    ("begun", "asked", "in_steps"), [("step", "auto", True), ("auto", "step", True), ("auto", "auto", False)]
+)
+def test_a_run_goes_on_in_its_own_mode_or_in_steps(begun: str, asked: str, in_steps: bool, lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined):
+        lab.calibrate(mode=begun)
+    lab.operator.asked.clear()
+    lab.calibrate(resume=lab.run().folder, mode=asked)
+    steps = [question.text.split(",")[0] for question in lab.operator.asked if "Enter" in question.text]
+    assert steps == [f"Pose {stop} of 7" for stop in (4, 5, 6, 7) if in_steps]
+
+
+def test_a_resumed_run_is_open_with_its_poses_before_anything_is_checked(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
+    lab.operator.answers["Type resume"] = ["quit"]
+    with pytest.raises(Declined):
+        lab.calibrate()
+    run = lab.run()
+    lab.operator.told.clear()
+    assert lab.calibrate(resume=run.folder, dry_run=True) is None
+    kinds = [type(event) for event in lab.operator.told]
+    assert kinds.count(RunOpened) == 1
+    assert kinds.index(RunOpened) < kinds.index(Checked)
+    before = lab.operator.told[: kinds.index(Checked)]
+    assert [event.poses for event in before if isinstance(event, Estimated)] == [1, 2, 3]
+
+
+def test_a_run_is_not_gone_on_with_another_tool(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
+    lab.operator.answers["Type resume"] = ["quit"]
+    with pytest.raises(Declined):
+        lab.calibrate()
+    lab.arm.moves.clear()
+    lab.cell = replace(lab.cell, tool=ToolConfig(cylinders_mm=((0.0, 210.0, 100.0),)))
+    for options in ({}, {"redo": (1,)}):
+        with pytest.raises(NotAccepted, match="another tool"):
+            lab.calibrate(resume=lab.run().folder, **options)
+    assert lab.arm.moves == []
+
+
+def broken_off(lab: Lab, url: str = "fake://", **facts: Any) -> Path:
+    """Begin a run and stop it at its third move."""
+    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, url=url))
+    tells(lab, facts=facts)
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined):
+        lab.calibrate()
+    lab.arm.moves.clear()
+    return lab.run().folder
+
+
+def tells(lab: Lab, model: str = "fake", serial: str = "S1", facts: dict[str, Any] | None = None) -> None:
+    """Let the sensor say who it is."""
+    known = {name: Fact(value, "device") for name, value in (facts or {}).items()}
+    lab.sensor.identify = lambda: DeviceInfo(model, serial, "1", known)  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "cure"),
+    [
+        (("Robotiq FT 300", NOT_REPORTED), ("UR wrist", NOT_REPORTED), "serial=… in its address"),
+        (("Robotiq FT 300", "1"), ("UR wrist", "1"), "connect that of the run, or make a new run"),
+        (("Robotiq FT 300", NOT_REPORTED), ("Robotiq FT 300", "1"), "serial=… in its address"),
+        (("Robotiq FT 300", NOT_REPORTED), ("Robotiq FT 300", NOT_REPORTED), ""),
+    ],
+)
+def test_a_sensor_without_a_serial_number_is_the_same_where_its_model_is(
+    then: tuple[str, str], now: tuple[str, str], cure: str, lab: Lab
+) -> None:
+    folder = broken_off(lab)
+    header = folder / "run.json"
+    header.write_text(header.read_text().replace('"fake"', f'"{then[0]}"').replace('"S1"', f'"{then[1]}"'))
+    tells(lab, *now)
+    if not cure:
+        assert lab.calibrate(resume=folder) is not None
+        return
+    with pytest.raises(PlanRefused, match=f"{then[0]}, serial {then[1]}, connected is {now[0]}.*{cure}"):
+        lab.calibrate(resume=folder)
+    assert lab.arm.moves == []
+
+
+def test_an_arm_without_a_serial_number_is_the_same_where_its_model_is(lab: Lab) -> None:
+    lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
+    folder = broken_off(lab)
+    lab.arm.identify = lambda: DeviceInfo("UR7e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
+    with pytest.raises(PlanRefused, match="the arm UR5e, serial not reported, connected is UR7e"):
+        lab.calibrate(resume=folder)
+    lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
+    assert lab.calibrate(resume=folder) is not None
+
+
+def test_a_run_is_not_gone_on_with_the_other_sign(lab: Lab) -> None:
+    folder = broken_off(lab)
+    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, sign=-1))
+    with pytest.raises(PlanRefused, match=r"\[sensor\] sign was 1 and is -1: set it back, or make a new run"):
+        lab.calibrate(resume=folder)
+    assert lab.arm.moves == []
+    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, sign=1))
+    assert lab.calibrate(resume=folder) is not None
+
+
+@pytest.mark.parametrize(
+    ("url", "facts", "changed"),
+    [
+        ("ati-can://can0?slot=2", {}, "option slot was 0 and is 2"),
+        ("ati-serial:///dev/ttyUSB0?calibration=2", {}, "option calibration was 1 and is 2"),
+        ("ati-can://can0", {"counts_per_N": 200.0}, "counts_per_N was 100.0 and is 200.0"),
+        ("ati-can://can0", {"counts_per_Nm": 200.0}, "counts_per_Nm was 1000.0 and is 200.0"),
+        ("ati-can://can0", {"range": (99.0,) * 6}, "range was"),
+        ("ati-can:///dev/ttyACM0?interface=slcan&slot=0x0&recover=1&bitrate=250000", {}, ""),
+    ],
+)
+def test_a_run_is_not_gone_on_where_the_numbers_mean_something_else(
+    url: str, facts: dict[str, Any], changed: str, lab: Lab
+) -> None:
+    begun = {"counts_per_N": 100.0, "counts_per_Nm": 1000.0, "range": (300.0,) * 6}
+    folder = broken_off(lab, "ati-can://can0", **begun)
+    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, url=url))
+    tells(lab, facts=begun | facts)
+    if not changed:
+        assert lab.calibrate(resume=folder) is not None
+        return
+    with pytest.raises(PlanRefused, match=changed):
+        lab.calibrate(resume=folder)
+    assert lab.arm.moves == []
+
+
+# ----------------------------------------------------------------------------------------------------------- by hand
+
+
+@pytest.mark.parametrize("mode", ["manual", "listen"])
+def test_a_run_by_hand_goes_on_by_hand(mode: str, lab: Lab) -> None:
+    lab.operator.keys = [Key.STOP]
+    with pytest.raises(Declined, match="ended before the first pose"):
+        lab.calibrate(mode=mode)
+    run = lab.run()
+    assert not lab.arm.control
+    for asked in ("auto", mode):
+        lab.operator.told.clear()
+        lab.operator.keys = [Key.STOP]
+        with pytest.raises(Declined, match="ended before the first pose"):
+            lab.calibrate(resume=run.folder, mode=asked)
+        assert len(lab.operator.of(RunOpened)) == 1
+    assert not lab.arm.control
+    assert (run.folder / "run.json").exists()
+    with pytest.raises(ConfigError, match=f"with --{mode} and can only go on like that: leave out --step"):
+        lab.calibrate(resume=run.folder, mode="step")
+    with pytest.raises(ConfigError, match="leave out --redo"):
+        lab.calibrate(resume=run.folder, redo=(1,))
+
+
+def by_hand(lab: Lab, at_pose: Callable[[int], None] = lambda _: None) -> None:
+    """Let somebody take the arm on after each pose; nobody has keys."""
+    poses, clock_s, state = constant_tour(lab.arm.q), count(step=0.6), lab.arm.state
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, PoseTaken):
+            at_pose(event.stop)
+            lab.arm.q = poses[event.stop]
+
+    lab.arm.state = lambda: replace(state(), t_device_s=next(clock_s))  # type: ignore[method-assign]
+    lab.operator.has_keys, lab.operator.on_event = False, on_event
+
+
+def test_by_hand_and_without_keys_the_session_ends_with_a_calibration(lab: Lab) -> None:
+    by_hand(lab)
+    outcome = lab.calibrate(mode="manual")
+    assert outcome is not None
+    assert 6 <= outcome.result.n_poses < 24
+    assert outcome.run.calibration_path.exists()
+
+
+def test_by_hand_on_a_wall_a_pose_is_shown_on_the_face_where_it_counts(lab: Lab) -> None:
+    def at_pose(stop: int) -> None:
+        if stop == 4:  # from here on the fit would tell how the base leans
+            raise KeyboardInterrupt
+
+    lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting="wall"))
+    by_hand(lab, at_pose)
+    with pytest.raises(KeyboardInterrupt):
+        lab.calibrate(mode="manual")
+    shown = np.array([event.gravity_flange for event in lab.operator.of(PoseTaken)])
+    counted = [event.faces for event in lab.operator.of(Estimated)]
+    assert counted == [faces(shown[:poses]) for poses in (1, 2, 3)]
+
+
+def test_a_session_that_is_interrupted_says_how_to_solve_what_is_there(lab: Lab) -> None:
+    def at_pose(stop: int) -> None:
+        if stop == 3:
+            raise KeyboardInterrupt
+
+    by_hand(lab, at_pose)
+    with pytest.raises(KeyboardInterrupt):
+        lab.calibrate(mode="manual")
+    words = lab.operator.of(Noted)[-1].words
+    assert words.endswith(f"or solve them with {lab.run().solve_command}")
+    assert lab.run().stops() == [1, 2, 3]
+
+
+def test_a_run_along_a_plan_does_not_go_on_by_hand(lab: Lab) -> None:
+    lab.calibrate()
+    with pytest.raises(ConfigError, match="along a plan"):
+        lab.calibrate(resume=lab.run().folder, mode="listen")
+
+
+@pytest.mark.parametrize("option", [{"dry_run": True}, {"fast": True}, {"plan": Path("plan.json")}])
+def test_by_hand_nothing_is_planned_or_moved(option: dict[str, Any], lab: Lab) -> None:
+    with pytest.raises(ConfigError, match="leave out --" + next(iter(option)).replace("_", "-")):
+        lab.calibrate(mode="manual", **option)
+    assert not (lab.folder / "runs").exists()
+
+
+def test_options_that_cannot_be_used_are_told_before_anything_opens(lab: Lab) -> None:
+    lab.calibrate()
+    opened, run = lab.arm.opened, lab.run()
+    with pytest.raises(ConfigError, match="name the run with --resume"):
+        lab.calibrate(redo=(3,))
+    with pytest.raises(ConfigError, match="pose 8 cannot be taken again: the run has poses 1 to 7"):
+        lab.calibrate(resume=run.folder, redo=(7, 8))
+    damaged = lab.folder / "damaged.json"
+    damaged.write_text(run.plan_path.read_text().replace('"clearance_m"', '"clearance"', 1))
+    with pytest.raises(PlanRefused):
+        lab.calibrate(plan=damaged)
+    assert lab.arm.opened == opened
+
+
+def test_a_cell_that_cannot_be_built_is_told_before_its_sensor_opens(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: object) -> None:
+        raise ConfigError("[robot] driver")
+
+    def opened() -> None:
+        raise AssertionError("opened")
+
+    monkeypatch.setattr(guided, "build_arm", refuse)
+    monkeypatch.setattr(lab.sensor, "open", opened)
+    with pytest.raises(ConfigError, match="driver"):
+        lab.calibrate()
+
+
+def test_a_run_of_another_sensor_is_not_gone_on_with(lab: Lab) -> None:
+    lab.calibrate()
+    lab.sensor.identify = lambda: DeviceInfo("fake", "S2", "1")  # type: ignore[method-assign]
+    with pytest.raises(PlanRefused, match="serial S1, connected is fake, serial S2"):
+        lab.calibrate(resume=lab.run().folder)
+
+
+def test_what_the_sensor_went_through_is_written_down(lab: Lab) -> None:
+    lab.sensor.events = ((17, "connected again"),)
+    lab.calibrate()
+    told = [event for event in lab.operator.of(Noted) if "connected again" in event.words]
+    assert len(told) == 1

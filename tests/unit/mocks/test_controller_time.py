@@ -1,0 +1,194 @@
+"""The controller's cycles and samples follow the cell's clock, whatever the computer does."""
+
+import selectors
+import socket
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from mocks.clock import DEBT_NS, LEAD_NS, CellClock
+from mocks.kinematics import MODELS, vector6
+from mocks.station import free_hosts
+from mocks.ur.modes import Runtime
+from mocks.ur.robot import Robot, RobotSettings
+from mocks.ur.script import Upload
+from mocks.ur.server import BACKLOG_LIMIT_S, RtdeClient, UrServer
+from mocks.world import Truth, World
+from tests.unit.mocks.real_time import RealTime
+
+HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
+SLEEPING = Upload("other", "def other():\n  sleep(1000)\nend\n", secondary=False)
+
+
+class Waiting(selectors.SelectSelector):
+    """Waits no longer than it takes for the test's clock to move on."""
+
+    def __init__(self, real: RealTime) -> None:
+        super().__init__()
+        self._real = real
+        self.longest_s = 0.0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        assert timeout is not None
+        self.longest_s = max(self.longest_s, timeout)
+        self._real.pass_s(timeout)
+        return super().select(0)
+
+
+class Controller:
+    """A controller with its ports, on a clock of the test's."""
+
+    def __init__(self, time_scale: float = 1.0, polyscope: tuple[int, int, int] = (5, 15, 0)) -> None:
+        self.real = RealTime()
+        self.clock = CellClock(self.real)
+        world = World(Truth.drawn(0), MODELS["UR5e"], HOME, clock=self.clock)
+        self.robot = Robot(world, RobotSettings(time_scale=time_scale, polyscope=polyscope))
+        self.selector = Waiting(self.real)
+        self.server = self._listen()
+
+    def _listen(self) -> UrServer:
+        for host in free_hosts():
+            try:
+                return UrServer(self.robot, host, self.selector)
+            except OSError:
+                continue
+        raise OSError("no free loopback address")
+
+    def run(self, duration_s: float, then: Callable[[], bool] = lambda: False) -> None:
+        """Serve for so long in the cell's time, or until `then()`."""
+        end_ns = self.clock.now_ns() + round(duration_s * 1e9)
+        self.server.run(lambda: then() or self.clock.now_ns() >= end_ns)
+
+
+@pytest.fixture
+def controller() -> Iterator[Controller]:
+    with running() as controller:
+        yield controller
+
+
+@contextmanager
+def running(time_scale: float = 1.0, polyscope: tuple[int, int, int] = (5, 15, 0)) -> Iterator[Controller]:
+    controller = Controller(time_scale, polyscope)
+    try:
+        yield controller
+    finally:
+        controller.server.close()
+        controller.clock.close()
+
+
+@pytest.mark.parametrize(
+    ("time_scale", "polyscope", "rate_Hz"), [(1.0, (5, 15, 0), 500), (20.0, (5, 15, 0), 500), (20.0, (3, 15, 0), 125)]
+)
+def test_the_wires_keep_the_time_of_the_cell_and_the_arm_a_multiple(
+    time_scale: float, polyscope: tuple[int, int, int], rate_Hz: int
+) -> None:
+    with running(time_scale, polyscope) as controller:
+        begun_s = controller.robot.timestamp_s
+        controller.run(2.0)
+        assert controller.robot.cycle == pytest.approx(2.0 * rate_Hz, abs=6)
+        assert controller.robot.timestamp_s - begun_s == pytest.approx(2.0 * time_scale, abs=6 / rate_Hz * time_scale)
+        assert controller.selector.longest_s <= 0.005
+
+
+def test_the_clock_of_a_fast_arm_with_a_sensor_of_its_own_is_that_of_the_cell() -> None:
+    with running(time_scale=20.0) as controller:
+        controller.robot.wrist_sensor = controller.robot.world.measure
+        begun_s = controller.robot.timestamp_s
+        controller.run(2.0)
+        assert controller.robot.timestamp_s - begun_s == pytest.approx(2.0, abs=0.012)
+
+
+def test_a_stall_of_the_computer_costs_no_cycle_and_makes_none_up() -> None:
+    with running() as controller:
+        controller.run(0.5)
+        cycles, begun_ns = controller.robot.cycle, controller.clock.now_ns()
+        stalls = iter([0.0, 2.0, 0.0])
+
+        def stall() -> bool:
+            controller.real.pass_s(next(stalls, 0.0))
+            return False
+
+        real_ns = controller.real.ns
+        controller.run(0.5, then=stall)
+        assert controller.real.ns - real_ns == pytest.approx(2.5e9 - DEBT_NS, abs=2 * LEAD_NS)
+        took_s = (controller.clock.now_ns() - begun_ns) * 1e-9
+        assert controller.robot.cycle - cycles == pytest.approx(500 * took_s, abs=6)
+
+
+def start_guarded_program(controller: Controller) -> None:
+    controller.robot.upload(SLEEPING)
+    controller.run(0.2)
+    assert controller.robot.runtime == Runtime.PLAYING
+    controller.robot.set_watchdog("input_int_register_0", 10.0)
+
+
+def test_the_watchdog_bites_in_the_time_of_the_cell() -> None:
+    with running(time_scale=20.0) as controller:
+        start_guarded_program(controller)
+        begun_s = controller.clock.now_s()
+        controller.run(1.0, then=lambda: controller.robot.runtime == Runtime.STOPPED)
+        assert controller.clock.now_s() - begun_s == pytest.approx(0.1, abs=0.015)
+        assert "watchdog" in controller.robot.events[-1].why
+
+
+def test_the_watchdog_is_content_as_long_as_its_input_is_written_and_the_computer_stalls() -> None:
+    with running() as controller:
+        start_guarded_program(controller)
+        for _ in range(10):
+            controller.real.pass_s(2.0)
+            controller.run(0.08)
+            controller.robot.write_inputs({"input_int_register_0": 0})
+        assert controller.robot.runtime == Runtime.PLAYING
+        controller.run(0.12)
+        assert "watchdog" in controller.robot.events[-1].why
+
+
+def test_a_frozen_controller_lives_through_no_cycle_and_reads_nothing(controller: Controller) -> None:
+    with socket.create_connection((controller.server.host, 29999), 10.0) as client:
+        controller.run(0.1)
+        assert client.recv(100).startswith(b"Connected")
+        controller.server.frozen = True
+        cycle = controller.robot.cycle
+        client.sendall(b"robotmode\n")
+        turns = iter(range(20))
+
+        def turn() -> bool:
+            controller.real.pass_s(0.005)
+            return next(turns, None) is None
+
+        controller.run(10.0, then=turn)
+        assert controller.robot.cycle == cycle
+        controller.server.frozen = False
+        controller.run(0.1)
+        assert client.recv(100) == b"Robotmode: RUNNING\n"
+        assert controller.robot.cycle == pytest.approx(cycle + 50, abs=6), "the time it was frozen is not made up for"
+
+
+def test_a_client_that_never_reads_is_disconnected_in_the_end(controller: Controller) -> None:
+    """Whole samples are left out as long as it lags; only one that reads nothing for long is given up."""
+    with socket.create_connection((controller.server.host, 30004), 10.0) as client:
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        controller.run(0.1)
+        (server_side,) = controller.server._clients
+        assert isinstance(server_side, RtdeClient)
+        server_side._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        payload = struct.pack(">d", 500.0) + b",".join([b"actual_q"] * 40)
+        client.sendall(struct.pack(">HB", 3 + len(payload), ord("O")) + payload + b"\x00\x03S")
+        controller.run(60.0, then=lambda: server_side.lagging)
+        assert server_side.lagging
+        waiting, begun_s = len(server_side._out), controller.clock.now_s()
+        controller.run(0.9 * BACKLOG_LIMIT_S)
+        assert server_side.open
+        assert len(server_side._out) <= waiting, "nothing is queued behind a sample that was not taken"
+        controller.run(10 * BACKLOG_LIMIT_S, then=lambda: not server_side.open)
+        assert not server_side.open
+        assert controller.clock.now_s() - begun_s >= BACKLOG_LIMIT_S
+
+
+def test_the_diary_is_in_the_time_of_the_cell(controller: Controller) -> None:
+    controller.real.pass_s(5.0)
+    controller.robot.note("operator", "slider")
+    assert controller.robot.events[-1].t_host_ns == controller.clock.now_ns()

@@ -1,0 +1,95 @@
+"""What goes wrong between a sensor and its client: probabilities, and delays in the cell's time."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mocks.clock import CellClock
+from mocks.faults import Faults, FaultyWire
+from mocks.slcan import CanFrame
+from tests.unit.mocks.real_time import RealTime
+
+CLOCK = CellClock(RealTime())
+"""Of the tests in which no time passes."""
+LATER_S = CLOCK.now_s() + 1e6
+"""Whatever is on its way has arrived."""
+
+
+def sent(faults: Faults, frames: list[bytes], *, stream: bool = False, seed: int = 1) -> list[bytes]:
+    wire: FaultyWire[bytes] = FaultyWire(faults, CLOCK, seed)
+    wire.put(frames, stream=stream)
+    return wire.due(LATER_S)
+
+
+@given(st.lists(st.binary(), max_size=20), st.booleans())
+def test_without_faults_everything_arrives_as_it_is(frames: list[bytes], stream: bool) -> None:
+    assert sent(Faults(), frames, stream=stream) == frames
+
+
+NUMBERED = [i.to_bytes(2, "big") for i in range(1000)]
+
+
+def test_certain_faults() -> None:
+    assert sent(Faults(drop=1), NUMBERED) == []
+    assert sent(Faults(stall=True), NUMBERED) == []
+    assert sent(Faults(duplicate=1), NUMBERED[:2]) == [NUMBERED[0], NUMBERED[0], NUMBERED[1], NUMBERED[1]]
+    assert sent(Faults(swap=1), NUMBERED[:4]) == [NUMBERED[i] for i in (1, 0, 3, 2)]
+    assert sent(Faults(swap=1), NUMBERED[:3]) == [NUMBERED[i] for i in (1, 0, 2)], "an answer keeps nothing back"
+    assert all(
+        len(a) == len(b) == sum(x == y for x, y in zip(a, b, strict=True)) + 1
+        for a, b in zip(sent(Faults(corrupt=1), NUMBERED), NUMBERED, strict=True)
+    )
+    assert {len(frame) for frame in sent(Faults(byte_slip=1), NUMBERED)} == {1}
+
+
+def test_a_stream_keeps_a_frame_back_until_the_next_one() -> None:
+    faults = Faults(swap=1)
+    wire: FaultyWire[bytes] = FaultyWire(faults, CLOCK)
+    wire.put([b"1"], stream=True)
+    assert wire.due(LATER_S) == []
+    faults.swap = 0
+    wire.put([b"2"], stream=True)
+    assert wire.due(LATER_S) == [b"2", b"1"]
+
+
+@pytest.mark.parametrize(("faults", "low", "high"), [(Faults(drop=0.1), 850, 950), (Faults(duplicate=0.1), 1050, 1150)])
+def test_chances_are_as_told_and_seeded(faults: Faults, low: int, high: int) -> None:
+    assert low < len(sent(faults, NUMBERED)) < high
+    assert sent(faults, NUMBERED, seed=5) == sent(faults, NUMBERED, seed=5) != sent(faults, NUMBERED, seed=6)
+
+
+def test_foreign_frames_precede_and_can_frames_stay_whole() -> None:
+    alien, own = CanFrame(0x7FF), CanFrame(1, b"12345678")
+    wire = FaultyWire(Faults(foreign=1, corrupt=1, byte_slip=1), CLOCK, foreign=lambda _rng: alien)
+    wire.put([own, own])
+    assert wire.due(LATER_S) == [alien, own, alien, own]
+
+
+def test_delay_and_jitter_keep_the_order() -> None:
+    wire: FaultyWire[bytes] = FaultyWire(Faults(delay_s=0.5, jitter_s=0.1), CLOCK)
+    wire.put(NUMBERED[:10])
+    wire.put(NUMBERED[10:20])
+    now_s = CLOCK.now_s()
+    wait_s = wire.wait_s(now_s)
+    assert wait_s is not None
+    assert 0.45 < wait_s < 0.6
+    arrivals = [wire.due(now_s + t) for t in (0.4, 0.52, 0.61)]
+    assert arrivals[0] == []
+    assert arrivals[1] + arrivals[2] == NUMBERED[:20]
+    assert wire.wait_s(now_s) is None
+
+
+def test_jitter_does_not_add_up_in_a_stream() -> None:
+    """A frame every millisecond with up to 20 ms of jitter: none is ever later than 20 ms, and some are late."""
+    real = RealTime()
+    clock = CellClock(real)
+    wire: FaultyWire[bytes] = FaultyWire(Faults(jitter_s=0.02), clock)
+    waits_s = []
+    for number in range(2000):
+        wire.put([b"%d" % number])
+        wire.due(clock.now_s())
+        waits_s.append(wire.wait_s(clock.now_s()) or 0.0)
+        real.pass_s(0.001)
+    assert 0.005 < max(waits_s) <= 0.02
+    real.pass_s(0.02)
+    assert len(wire.due(clock.now_s())) <= 20

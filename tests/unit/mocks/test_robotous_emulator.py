@@ -1,0 +1,206 @@
+"""The Robotous emulator without a wire: packets, samples, commands."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from mocks.robotous import Model, RobotousCanNode, RobotousSensor, RobotousSerialBox, fields, packet, sample_field
+
+WRENCH = np.array([10, -5, 20, 1, -0.5, 0.05])
+SAMPLE = "0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000"
+
+
+def command(text: str) -> bytes:
+    return bytes.fromhex(text).ljust(8, b"\0")
+
+
+class Readings:
+    def __init__(self) -> None:
+        self.wrench: NDArray[np.float64] = WRENCH
+        self.made = 0
+
+    def __call__(self, count: int) -> NDArray[np.float64]:
+        self.made += count
+        return np.tile(self.wrench, (count, 1))
+
+
+@pytest.fixture
+def readings() -> Readings:
+    return Readings()
+
+
+@pytest.fixture
+def sensor(readings: Readings) -> RobotousSerialBox:
+    sensor = RobotousSerialBox(readings)
+    sensor.boot()
+    return sensor
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        "55 0B 00 00 00 00 00 00 00 0B AA",
+        "55 0C 00 00 00 00 00 00 00 0C AA",
+        "55 11 01 00 00 00 00 00 00 12 AA",
+        "55 0F 08 00 00 00 00 00 00 17 AA",
+        "55 0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000 3F AA",
+    ],
+)
+def test_documented_packets(frame: str) -> None:
+    data = bytes.fromhex(frame)
+    assert packet(data[1:-2]) == data
+
+
+def test_documented_sample(sensor: RobotousSensor) -> None:
+    assert sample_field(0x0B, [500, -250, 1000, 2000, -1000, 100], 0) == bytes.fromhex(SAMPLE)
+    assert sensor.samples(2) == [bytes.fromhex(SAMPLE)] * 2
+    assert sensor.execute(command("0A")) == [b"\x0a" + bytes.fromhex(SAMPLE)[1:]]
+
+
+def test_divisors_of_the_large_models(sensor: RobotousSensor) -> None:
+    sensor.model = Model("RFT80-6A01", 50, 1000, (500,) * 3 + (20,) * 3)
+    assert sensor.samples(1)[0].hex().upper() == "0B01F4FF0603E803E8FE0C003200" + "0000"
+
+
+@given(st.lists(st.tuples(st.binary(max_size=30), st.binary(min_size=8, max_size=8)), max_size=5), st.data())
+def test_packets_are_found_between_garbage_in_any_pieces(
+    pieces: list[tuple[bytes, bytes]], data: st.DataObject
+) -> None:
+    garbage_without_start = [(bytes(b for b in garbage if b != 0x55), field) for garbage, field in pieces]
+    stream = b"".join(garbage + packet(field) for garbage, field in garbage_without_start)
+    received = bytearray()
+    found = []
+    while stream:
+        size = data.draw(st.integers(1, 40))
+        received += stream[:size]
+        stream = stream[size:]
+        found += fields(received)
+    assert found == [field for _, field in pieces]
+    assert not received
+
+
+def test_damaged_packets_are_skipped_and_the_next_one_found() -> None:
+    good = packet(command("0A"))
+    wrong_sum, wrong_end = bytearray(good), bytearray(good)
+    wrong_sum[-2] ^= 1
+    wrong_end[-1] ^= 1
+    stray_start = b"\x55" + good
+    received = bytearray(wrong_sum + wrong_end + stray_start)
+    assert fields(received) == [command("0A")]
+
+
+@pytest.mark.parametrize(
+    ("request_", "response"),
+    [
+        ("01", b"\x01RFT60-HA01\0\0\0\0\0"),
+        ("02", b"\x02A60HA00123\0\0\0\0\0"),
+        ("03", b"\x03VER 1.7\0\0\0\0\0\0\0\0"),
+        ("05", bytes.fromhex("05 64 01 02 64 01 02") + bytes(9)),
+        ("07", bytes.fromhex("07 00 00") + bytes(13)),
+        ("09", bytes.fromhex("09 00 00") + bytes(13)),
+        ("10", bytes.fromhex("10 00") + bytes(14)),
+        ("12", bytes.fromhex("12") + bytes(15)),
+        ("06 01", bytes.fromhex("06 01 00") + bytes(13)),
+        ("06 06", bytes.fromhex("06 00 02") + bytes(13)),
+        ("08 01 0E", bytes.fromhex("08 01 00") + bytes(13)),
+        ("08 01 0F", bytes.fromhex("08 00 02") + bytes(13)),
+        ("08 02 00", bytes.fromhex("08 00 02") + bytes(13)),
+        ("0F 08", bytes.fromhex("0F 01 00") + bytes(13)),
+        ("0F 09", bytes.fromhex("0F 00 02") + bytes(13)),
+        ("04 10 11 12", bytes.fromhex("04 00 01") + bytes(13)),
+    ],
+)
+def test_commands(sensor: RobotousSensor, request_: str, response: bytes) -> None:
+    assert sensor.execute(command(request_)) == [response]
+
+
+@pytest.mark.parametrize("request_", ["00", "0B", "0C", "0D", "0E", "11 01", "11 00", "11 02", "13", "55", "FF"])
+def test_commands_without_reply(sensor: RobotousSensor, request_: str) -> None:
+    assert sensor.execute(command(request_)) == []
+
+
+@pytest.mark.parametrize(("code", "rate_hz"), list(enumerate([200, 10, 20, 50, 100, 200, 333, 500, 1000])))
+def test_rates(code: int, rate_hz: int, sensor: RobotousSensor) -> None:
+    sensor.execute(command(f"0F {code:02X}"))
+    assert sensor.execute(command("10"))[0][1] == code
+    if rate_hz < 1000:
+        assert sensor.rate_hz == rate_hz
+        return
+    assert sensor.rate_hz == pytest.approx(115_200 / 190), "no more than the line carries"
+    sensor.execute(command("06 01"))
+    sensor.boot()
+    assert sensor.rate_hz == rate_hz
+
+
+def test_settings_read_back_and_those_of_the_line_wait_for_a_reboot(sensor: RobotousSensor) -> None:
+    sensor.execute(command("06 01"))
+    sensor.execute(command("08 01 05"))
+    assert sensor.execute(command("07"))[0][:3] == bytes.fromhex("07 00 01")
+    assert sensor.execute(command("09"))[0][:3] == bytes.fromhex("09 01 05")
+    sensor.boot()
+    assert sensor.execute(command("07"))[0][:3] == bytes.fromhex("07 01 01")
+
+
+def test_can_node_sets_identifiers_but_no_baud_rate(readings: Readings) -> None:
+    node = RobotousCanNode(readings)
+    node.boot()
+    assert node.execute(command("06 01"))[0][:3] == bytes.fromhex("06 00 01")
+    assert node.execute(command("04 10 10 12"))[0][:3] == bytes.fromhex("04 00 02")
+    assert node.execute(command("04 10 11 12"))[0][:3] == bytes.fromhex("04 01 00")
+    assert node.execute(command("05"))[0][:7] == bytes.fromhex("05 64 01 02 10 11 12")
+    node.boot()
+    assert node.execute(command("05"))[0][:7] == bytes.fromhex("05 10 11 12 10 11 12")
+
+
+def test_while_streaming_only_stop_and_bias_are_taken(sensor: RobotousSerialBox) -> None:
+    sensor.execute(command("0B"))
+    for code in range(0x14):
+        if code != 0x0C:
+            assert sensor.execute(bytes([code, 1]).ljust(8, b"\0")) == []
+    assert sensor.streaming
+    assert sensor.rate_code == 0
+    assert sensor.samples(1)[0][1:13] == bytes(12), "the bias was taken"
+    sensor.execute(command("0C"))
+    assert not sensor.streaming
+
+
+def test_bias_is_taken_lifted_and_lost(sensor: RobotousSensor, readings: Readings) -> None:
+    sensor.execute(command("11 01"))
+    readings.wrench = 2 * WRENCH
+    assert sensor.samples(1) == [bytes.fromhex(SAMPLE)]
+    sensor.execute(command("11 00"))
+    readings.wrench = WRENCH
+    assert sensor.samples(1) == [bytes.fromhex(SAMPLE)]
+    sensor.execute(command("11 01"))
+    sensor.boot()
+    assert sensor.samples(1) == [bytes.fromhex(SAMPLE)]
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_overload_bits_and_counts(sensor: RobotousSensor, readings: Readings, axis: int) -> None:
+    for wrench in (WRENCH, WRENCH + 210 * np.eye(6)[axis], WRENCH - 400 * np.eye(6)[axis], WRENCH):
+        readings.wrench = wrench
+        loaded = wrench is not WRENCH
+        assert [field[13] for field in sensor.samples(3)] == [loaded * (0x20 >> axis)] * 3
+    assert list(sensor.execute(command("12"))[0][1:7]) == [int(i == axis) for i in range(6)]
+
+
+def test_saturated_axis_and_overload_knob(sensor: RobotousSensor) -> None:
+    sensor.saturated_axis = 2
+    sensor.overload = 0x01
+    field = sensor.samples(1)[0]
+    assert field[5:7] == b"\x7f\xff"
+    assert field[13] == 0x09
+
+
+def test_readings_are_clipped_not_wrapped(sensor: RobotousSensor, readings: Readings) -> None:
+    readings.wrench = np.array([1000, -1000, 0, 0, 0, 0.0])
+    assert sensor.samples(1)[0][1:5] == b"\x7f\xff\x80\x00"
+
+
+def test_one_reading_per_sample(sensor: RobotousSensor, readings: Readings) -> None:
+    sensor.samples(7)
+    sensor.execute(command("0A"))
+    assert readings.made == 8

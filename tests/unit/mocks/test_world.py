@@ -1,0 +1,224 @@
+"""The shared truth: sign of a wrench, frames, bias, noise, and what a seed draws."""
+
+import math
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mocks.clock import CellClock
+from mocks.disturbances import Cable, Drift, Push
+from mocks.kinematics import MODELS, Vector6, forward, inverse, matrix_of, vector6
+from mocks.world import Truth, World
+from tests.unit.mocks.real_time import RealTime
+
+DH = MODELS["UR5e"]
+POSTURE = vector6(np.radians([45, -100, 60, -50, 90, 45]))
+
+
+def plain(**changes: object) -> Truth:
+    """One kilogram 50 mm below the sensor, sensor axes = flange axes, no bias, no noise."""
+    truth = Truth(
+        mass_kg=1.0,
+        p_sensor_com_m=np.array([0.0, 0.0, 0.05]),
+        R_flange_sensor=np.eye(3),
+        tilt_alpha_rad=0.0,
+        tilt_beta_rad=0.0,
+        force_bias_N=np.zeros(3),
+        torque_bias_Nm=np.zeros(3),
+        noise_force_N=0.0,
+        noise_torque_Nm=0.0,
+        g_m_s2=9.81,
+    )
+    return replace(truth, **changes)  # type: ignore[arg-type]  # field names and values come from the tests below
+
+
+def reach(rotation_vector: list[float]) -> Vector6:
+    q = inverse(DH, matrix_of([-0.3, -0.4, 0.4, *rotation_vector]), POSTURE)
+    assert q is not None
+    return q
+
+
+def test_one_kilogram_under_a_sensor_that_points_down_reads_plus_9_81() -> None:
+    world = World(plain(), DH, reach([math.pi, 0.0, 0.0]))
+    np.testing.assert_allclose(world.true_wrench(), [0, 0, 9.81, 0, 0, 0], atol=1e-9)
+
+
+def test_one_kilogram_on_a_sensor_that_points_up_reads_minus_9_81() -> None:
+    world = World(plain(), DH, reach([0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(world.true_wrench(), [0, 0, -9.81, 0, 0, 0], atol=1e-9)
+
+
+def test_a_weight_at_the_end_of_a_horizontal_lever_turns_the_sensor() -> None:
+    # sensor z along base x: weight along sensor x or y, 50 mm away along z
+    world = World(plain(), DH, reach([0.0, math.pi / 2, 0.0]))
+    # rotation about base y by 90 degrees: sensor x points along base -z, so the weight is along +x
+    np.testing.assert_allclose(world.true_wrench(), [9.81, 0, 0, 0, 0.05 * 9.81, 0], atol=1e-9)
+
+
+def test_the_model_of_the_papers_holds_in_any_posture() -> None:
+    truth = Truth.drawn(11, "wall")
+    world = World(truth, DH, POSTURE)
+    R_base_flange = forward(DH, POSTURE)[:3, :3]
+    force = truth.R_flange_sensor.T @ R_base_flange.T @ truth.gravity_force_base_N + truth.force_bias_N
+    torque = np.cross(truth.p_sensor_com_m, force - truth.force_bias_N) + truth.torque_bias_Nm
+    np.testing.assert_allclose(world.true_wrench(), [*force, *torque], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("alpha_deg", "beta_deg", "down"),
+    [(0, 0, [0, 0, -1]), (0, 90, [-1, 0, 0]), (0, 180, [0, 0, 1]), (90, 0, [0, 1, 0]), (-90, 0, [0, -1, 0])],
+)
+def test_tilt_turns_gravity_in_base(alpha_deg: float, beta_deg: float, down: list[float]) -> None:
+    truth = plain(tilt_alpha_rad=math.radians(alpha_deg), tilt_beta_rad=math.radians(beta_deg))
+    np.testing.assert_allclose(truth.gravity_force_base_N, 9.81 * np.array(down), atol=1e-12)
+
+
+def test_readings_are_noisy_around_the_truth() -> None:
+    truth = plain(noise_force_N=0.05, noise_torque_Nm=0.002, force_bias_N=np.array([1.0, 2.0, 3.0]))
+    world = World(truth, DH, POSTURE, seed=5)
+    readings = world.measure(20_000)
+    assert readings.shape == (20_000, 6)
+    np.testing.assert_allclose(readings.mean(axis=0), world.true_wrench(), atol=0.002)
+    np.testing.assert_allclose(readings.std(axis=0), [0.05] * 3 + [0.002] * 3, rtol=0.05)
+    np.testing.assert_array_equal(World(truth, DH, POSTURE, seed=5).measure(3), readings[:3])
+
+
+def test_a_push_adds_to_the_reading_until_it_ends() -> None:
+    world = World(plain(), DH, POSTURE)
+    before = world.true_wrench()
+    world.touch("push", Push(np.array([1, -2, 3, 0.1, 0.2, -0.3]), in_sensor=True))
+    np.testing.assert_allclose(world.true_wrench() - before, [1, -2, 3, 0.1, 0.2, -0.3])
+    world.touch("push", None)
+    np.testing.assert_allclose(world.true_wrench(), before)
+
+
+def test_bias_drifts_with_time() -> None:
+    real = RealTime()
+    truth = plain(force_drift_N_min=np.array([0.6, 0, 0]), torque_drift_Nm_min=np.array([0, 0, 0.01]))
+    world = World(truth, DH, POSTURE, clock=CellClock(real))
+    before = world.true_wrench()
+    real.pass_s(30.0)
+    np.testing.assert_allclose(world.true_wrench() - before, [0.3, 0, 0, 0, 0, 0.005], atol=1e-9)
+
+
+TURNED = vector6([*POSTURE[:5], POSTURE[5] + 0.7])
+
+
+def test_a_push_in_base_axes_stays_there_while_the_arm_turns_and_ends_in_time() -> None:
+    real = RealTime()
+    world = World(plain(), DH, POSTURE, clock=CellClock(real))
+    world.touch("push", Push(np.array([0, 0, -9.81, 0, 0, 0.5]), until_s=world.now_s + 2.0))
+    for q in (POSTURE, TURNED):
+        world.q = q
+        R_base_sensor = forward(DH, q)[:3, :3] @ world.truth.R_flange_sensor
+        felt = world.contact_wrench()
+        np.testing.assert_allclose(R_base_sensor @ felt[:3], [0, 0, -9.81], atol=1e-12)
+        np.testing.assert_allclose(R_base_sensor @ felt[3:], [0, 0, 0.5], atol=1e-12)
+    real.pass_s(2.0)
+    assert not world.contact_wrench().any()
+
+
+def test_several_things_touch_the_tool_at_a_time() -> None:
+    world = World(plain(), DH, POSTURE)
+    world.touch("push", Push(np.array([1.0, 0, 0, 0, 0, 0]), in_sensor=True))
+    world.touch("bump", Push(np.array([0, 2.0, 0, 0, 0, 0]), in_sensor=True))
+    np.testing.assert_allclose(world.contact_wrench(), [1, 2, 0, 0, 0, 0])
+    world.touch("push", None)
+    np.testing.assert_allclose(world.contact_wrench(), [0, 2, 0, 0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("beyond_deg", "angle_deg", "degrees"), [(30, 40, 10), (30, 20, 0), (-30, -50, 20), (-30, 0, 0)]
+)
+def test_a_cable_pulls_in_proportion_beyond_an_angle(beyond_deg: float, angle_deg: float, degrees: float) -> None:
+    world = World(plain(), DH, vector6([*POSTURE[:5], math.radians(angle_deg)]))
+    lever = np.array([0.1, 0, 0])
+    world.touch("cable", Cable(np.array([0, 0.2, 0]), lever, joint=5, beyond_rad=math.radians(beyond_deg)))
+    felt = world.contact_wrench()
+    assert np.linalg.norm(felt[:3]) == pytest.approx(0.2 * degrees)
+    np.testing.assert_allclose(felt[3:], np.cross(lever, felt[:3]), atol=1e-12)
+
+
+def test_a_cable_pulls_in_some_orientations() -> None:
+    world = World(plain(), DH, POSTURE)
+    z_base = (forward(DH, POSTURE)[:3, :3] @ world.truth.R_flange_sensor)[:, 2]
+    for towards, pull_N in ((z_base, 5.0), (-z_base, 0.0)):
+        cable = Cable(np.array([3.0, 0, 4.0]), np.zeros(3), towards=towards, within_rad=0.5)
+        world.touch("cable", cable)
+        assert np.linalg.norm(world.contact_wrench()) == pytest.approx(pull_N)
+    world.touch("cable", Cable(np.array([3.0, 0, 4.0]), np.zeros(3)))
+    assert np.linalg.norm(world.contact_wrench()) == pytest.approx(5.0), "always taut"
+
+
+def test_a_drift_is_linear_and_ends_at_its_total() -> None:
+    real = RealTime()
+    world = World(plain(), DH, POSTURE, clock=CellClock(real))
+    before = world.true_wrench()
+    world.drifts += (Drift(np.array([0.5, 0, 0, 0, 0, 0.02]), world.now_s, 10.0),)
+    for later_s, share in ((0, 0.0), (5, 0.5), (5, 1.0), (50, 1.0)):
+        real.pass_s(later_s)
+        change = world.true_wrench() - before
+        np.testing.assert_allclose(change, [0.5 * share, 0, 0, 0, 0, 0.02 * share], atol=1e-9)
+
+
+def test_a_shifted_payload_is_the_new_truth() -> None:
+    world = World(plain(), DH, POSTURE)
+    before = world.load_wrench()
+    world.shift_payload(2 * world.truth.mass_kg, None)
+    np.testing.assert_allclose(world.load_wrench(), 2 * before)
+    world.shift_payload(None, np.zeros(3))
+    np.testing.assert_allclose(world.load_wrench(), [*(2 * before[:3]), 0, 0, 0], atol=1e-12)
+
+
+def test_a_frozen_sensor_repeats_itself_until_it_measures_again() -> None:
+    world = World(Truth.drawn(1), DH, POSTURE)
+    world.read_always(world.measure(1)[0])
+    frozen = world.measure(50)
+    world.q = TURNED
+    assert (world.measure(50) == frozen[0]).all()
+    world.read_always(None)
+    assert len(np.unique(world.measure(50), axis=0)) == 50
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_seed_draws_a_plausible_cell(seed: int) -> None:
+    truth = Truth.drawn(seed)
+    assert 0.5 <= truth.mass_kg <= 2.5
+    distance = np.linalg.norm(truth.p_sensor_com_m)
+    assert 0.030 <= distance <= 0.100
+    assert truth.p_sensor_com_m[2] > 0.7 * distance
+    np.testing.assert_allclose(truth.R_flange_sensor @ truth.R_flange_sensor.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(truth.R_flange_sensor) > 0
+    assert math.degrees(math.acos(truth.R_flange_sensor[2, 2])) <= 3.0
+    assert math.degrees(math.hypot(truth.tilt_alpha_rad, truth.tilt_beta_rad)) <= 2.0
+    assert np.abs(truth.force_bias_N).max() <= 15
+    assert np.abs(truth.torque_bias_Nm).max() <= 1
+    assert truth.to_json() == Truth.drawn(seed).to_json()
+    assert truth.to_json() != Truth.drawn(seed + 1).to_json()
+
+
+def test_readers_in_other_threads_never_see_half_a_posture() -> None:
+    """Wrench magnitude is the same in all postures; a mixed one would differ."""
+    world = World(plain(), DH, POSTURE)
+    postures = [vector6(q) for q in np.random.default_rng(0).uniform(-2, 2, (50, 6))]
+    wrong: list[float] = []
+    ended = threading.Event()
+
+    def read() -> None:
+        while not ended.is_set():
+            wrench = world.measure(1)[0]
+            if not np.allclose(np.cross([0, 0, 0.05], wrench[:3]), wrench[3:], atol=1e-9):
+                wrong.append(float(wrench[0]))
+
+    readers = [threading.Thread(target=read) for _ in range(2)]
+    for reader in readers:
+        reader.start()
+    for _ in range(40):
+        for q in postures:
+            world.q = q
+    ended.set()
+    for reader in readers:
+        reader.join()
+    assert wrong == []

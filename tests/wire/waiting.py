@@ -1,0 +1,23 @@
+"""How patiently the tests of emulators wait: for conditions, never for a time."""
+
+import time
+from collections.abc import Callable
+
+import serial
+
+LIMIT_S = 30.0
+"""Whatever must happen has happened by then, on a busy machine too."""
+
+
+def wait_until(condition: Callable[[], bool], limit_s: float = LIMIT_S) -> None:
+    deadline_s = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < deadline_s, "the condition never came true"
+        time.sleep(0.002)
+
+
+def read_to(port: serial.Serial, answer: bytes) -> bytes:
+    """Read up to an answer and return what came before it."""
+    data = port.read_until(answer)
+    assert data.endswith(answer), data[-100:]
+    return data[: -len(answer)]
