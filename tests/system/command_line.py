@@ -49,7 +49,7 @@ class CommandLine:
 
     def keep_time_of(self, station: Station) -> None:
         """Have the commands keep the time of a station, as the computer's may be too fast for it."""
-        self._clock = station.endpoints.get("clock")
+        self._clock = station.endpoints["clock"]
 
     def run(self, *arguments: str | Path, typed: str = "") -> CompletedProcess[str]:
         """Run it in this process to its end: a process of its own would only import the same modules again."""

@@ -152,6 +152,7 @@ def watch(station: Station, run: Run, *, listen: bool, commit: Callable[[PoseRec
                 commit or run.commit,
                 down_base=np.array([0.0, 0.0, -1.0]),
                 listen=listen,
+                clock=cell.clock,
             )
             assert mover.plays  # it was we who found the end
 
