@@ -4,6 +4,7 @@ import importlib
 import logging
 import signal
 import sys
+from collections.abc import Sequence
 from errno import ENOSPC
 from io import StringIO
 
@@ -115,9 +116,14 @@ def main() -> int:
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.default_int_handler)
+    return run(sys.argv[1:])
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command line without the program's name; errors are printed, the exit code is returned."""
     try:
         _siblings.check()
-        return int(cli.main(prog_name="ftdrive", standalone_mode=False) or 0)
+        return int(cli.main(list(arguments), prog_name="ftdrive", standalone_mode=False) or 0)
     except click.ClickException as error:
         from ftdrive.talk import in_whole_words
 

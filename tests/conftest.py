@@ -21,6 +21,13 @@ os.environ["XDG_STATE_HOME"] = _state.name
 for _name in [name for name in os.environ if name.startswith("FTDRIVE_") and name != "FTDRIVE_REAL_DATA"]:
     del os.environ[_name]
 
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep the byte code of the processes that tests start, which would each compile numpy and scipy again."""
+    if os.environ.pop("PYTHONDONTWRITEBYTECODE", None) and config.cache is not None:
+        os.environ["PYTHONPYCACHEPREFIX"] = str(config.cache.mkdir("bytecode"))
+
+
 settings.register_profile("ftdrive", deadline=None, derandomize=True, max_examples=60)
 settings.load_profile("ftdrive")
 

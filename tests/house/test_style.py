@@ -3,7 +3,6 @@
 import re
 import subprocess
 import sys
-import time
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -39,7 +38,7 @@ def test_every_command_and_option_is_in_the_readme() -> None:
         for parameter in command.params:
             if isinstance(parameter, click.Option):
                 longest = max(parameter.opts, key=len)
-                assert re.search(rf"{longest}\b", rows), f"{longest} is not in the README's table for {name}"
+                assert re.search(rf"{longest}\b", rows), f"{longest} missing in the README: {name}"
 
     look(cli, "ftdrive")
 
@@ -57,7 +56,7 @@ def test_every_dependency_is_bounded_and_has_its_reason() -> None:
     assert all("<" in line for line in required)
 
 
-def test_help_is_fast_and_opens_nothing() -> None:
+def test_help_imports_nothing_heavy_and_opens_nothing() -> None:
     code = (
         "import sys, socket\n"
         "socket.socket = None\n"
@@ -67,8 +66,6 @@ def test_help_is_fast_and_opens_nothing() -> None:
         "heavy = {'numpy', 'scipy', 'rich', 'can', 'serial', 'rtde_control'} & sys.modules.keys()\n"
         "sys.exit(f'help imports {heavy}' if heavy else 0)\n"
     )
-    start = time.perf_counter()
     outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert outcome.returncode == 0, outcome.stderr
     assert "demo" in outcome.stdout
-    assert time.perf_counter() - start < 30  # hung, not slow

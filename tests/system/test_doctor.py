@@ -3,26 +3,16 @@
 import json
 import re
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from ftdrive.cli import cli
-from ftdrive.config import CellConfig
 from ftdrive.simulation import Station
-
-
-class CommandLine(Protocol):
-    folder: Path
-
-    def start(self, *arguments: str | Path) -> subprocess.Popen[str]: ...
-    def run(self, *arguments: str | Path, typed: str = "") -> subprocess.CompletedProcess[str]: ...
-    def json(self, *arguments: str | Path, typed: str = "") -> dict[str, Any]: ...
-
+from tests.system.command_line import CommandLine, listen_for
 
 NAMED = {
     *("robot.reachable", "robot.identity", "robot.remote", "robot.safety", "robot.program", "robot.flange"),
@@ -33,15 +23,21 @@ NAMED = {
 }
 
 
-@pytest.fixture
+def ill_station() -> Station:
+    """Start a cell that the test may harm."""
+    return Station("serial", ["--seed", "3", "--time-scale", "1"])
+
+
+@pytest.fixture(scope="module")
 def station() -> Iterator[Station]:
-    with Station("serial", ["--seed", "3", "--time-scale", "1"]) as station:
+    """A healthy cell for all tests; whoever pushes it lets it go."""
+    with ill_station() as station:
         yield station
 
 
 @pytest.fixture
-def cell(station: Station, write_config: Callable[[CellConfig], Path]) -> Path:
-    return write_config(station.cell)
+def cell(station: Station, ftdrive: CommandLine) -> Path:
+    return ftdrive.connect(station)
 
 
 def checks_of(outcome: subprocess.CompletedProcess[str]) -> dict[str, dict[str, Any]]:
@@ -59,66 +55,73 @@ def test_a_healthy_cell(ftdrive: CommandLine) -> None:
     assert answer["push"]["base"]["force_N"] == pytest.approx([15, 0, 0], abs=0.2)
     assert np.linalg.norm(answer["push"]["sensor"]["force_N"]) == pytest.approx(15, abs=0.2)
     assert not any(ftdrive.folder.iterdir())  # it only looked
-    assert checks["robot.payload"]["found"] == "payload 0.50 kg at (0, 0, 60) mm from the flange"
-    assert re.fullmatch(r"127\.[0-9.]+ answers in [0-9]+\.[0-9] ms", checks["robot.reachable"]["found"])
+    assert "0.50 kg at (0, 0, 60) mm" in checks["robot.payload"]["found"]
+    assert re.search(r"\b127\.[0-9.]+ .* [0-9]+\.[0-9] ms\b", checks["robot.reachable"]["found"])
 
 
-def test_a_stopped_arm_in_local_control(station: Station, cell: Path, ftdrive: CommandLine) -> None:
-    station.control(do="protective-stop")
-    station.control(do="remote-control", on=False)
-    before = station.control(do="state")["q_rad"]
-    outcome = ftdrive.run("doctor", "--config", cell, "--json")
+def test_a_stopped_arm_in_local_control(ftdrive: CommandLine) -> None:
+    with ill_station() as station:
+        station.control(do="protective-stop")
+        station.control(do="remote-control", on=False)
+        before = station.control(do="state")["q_rad"]
+        outcome = ftdrive.run("doctor", "--config", ftdrive.connect(station), "--json")
+        after = station.control(do="state")
     assert outcome.returncode == 7
     checks = checks_of(outcome)
     assert checks["robot.safety"]["state"] == "failed"
     assert "protective stop" in checks["robot.safety"]["found"]
-    assert "clear it at the pendant" in checks["robot.safety"]["fix"]
+    assert "pendant" in checks["robot.safety"]["fix"]
     assert checks["robot.remote"]["state"] == "failed"
     assert "Remote Control" in checks["robot.remote"]["fix"]
     assert checks["noise.level"]["state"] == "ok"  # the sensor does not mind
     assert "robot.safety" in outcome.stderr
-    after = station.control(do="state")
     assert after["q_rad"] == before
     assert after["safety_mode"] == "PROTECTIVE_STOP"
     assert after["bad_inputs"] == []
 
 
-def test_an_arm_that_cannot_be_controlled(station: Station, cell: Path, ftdrive: CommandLine) -> None:
-    station.control(do="claim-registers", range="lower")
-    station.control(do="slider", fraction=0.02)
-    station.control(do="listen", what="script", on=False)
-    checks = checks_of(ftdrive.run("doctor", "--config", cell, "--json"))
+def test_an_arm_that_cannot_be_controlled(ftdrive: CommandLine) -> None:
+    with ill_station() as station:
+        station.control(do="claim-registers", range="lower")
+        station.control(do="slider", fraction=0.02)
+        station.control(do="listen", what="script", on=False)
+        checks = checks_of(ftdrive.run("doctor", "--config", ftdrive.connect(station), "--json"))
+        bad_inputs = station.control(do="state")["bad_inputs"]
     failed = {name: check["fix"] for name, check in checks.items() if check["state"] == "failed"}
     assert failed.keys() == {"robot.registers", "robot.speed", "robot.programs"}
     assert "EtherNet/IP" in failed["robot.registers"]
     assert "speed slider" in failed["robot.speed"]
     assert "real-time client interface" in failed["robot.programs"]
-    assert station.control(do="state")["bad_inputs"] == []
+    assert bad_inputs == []
+
+
+slow = partial(pytest.param, marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize(
     ("polyscope", "request_", "found", "fix"),
     [
-        ("5.4.0", None, "to the question for its model", 'write model = "ur5e" under [robot]'),
-        ("10.7.0", None, "PolyScope X", "PolyScope 5 or the CB3 generation is needed"),
-        ("5.15.0", {"do": "silent", "what": "dashboard"}, "did not answer", "enable the dashboard server"),
-        ("5.15.0", {"do": "listen", "what": "dashboard", "on": False}, "dashboard", "enable the dashboard server"),
-        ("5.15.0", {"do": "listen", "what": "rtde", "on": False}, "refused", "enable RTDE"),
+        ("5.4.0", None, "model", 'model = "ur5e" under [robot]'),
+        ("10.7.0", None, "PolyScope X", "PolyScope 5"),
+        slow("5.15.0", {"do": "silent", "what": "dashboard"}, "did not answer", "enable the dashboard server"),
+        slow("5.15.0", {"do": "listen", "what": "dashboard", "on": False}, "dashboard", "enable the dashboard server"),
+        slow("5.15.0", {"do": "listen", "what": "rtde", "on": False}, "refused", "enable RTDE"),
         ("5.15.0", {"do": "silent", "what": "rtde"}, "did not answer", "finished starting"),
     ],
+    ids=["no model", "PolyScope X", "silent dashboard", "no dashboard", "no RTDE", "silent RTDE"],
 )
 def test_each_way_not_to_reach_an_arm_has_its_own_cure(
-    polyscope: str, request_: dict[str, Any] | None, found: str, fix: str, tmp_path: Path
+    polyscope: str, request_: dict[str, Any] | None, found: str, fix: str, ftdrive: CommandLine
 ) -> None:
     with Station("serial", ["--time-scale", "1", "--polyscope", polyscope]) as station:
         if request_ is not None:
             station.control(**request_)
-        host, url = station.cell.robot.host, station.cell.sensor.url
-        arguments = ["doctor", "--robot", host, "--sensor", url, "--runs", str(tmp_path), "--json"]
-        checks = {check["name"]: check for check in json.loads(CliRunner().invoke(cli, arguments).stdout)["checks"]}
+        ftdrive.keep_time_of(station)
+        arguments = ["doctor", "--robot", station.cell.robot.host, "--sensor", station.cell.sensor.url, "--json"]
+        checks = checks_of(ftdrive.run(*arguments))
         if polyscope == "5.4.0":
-            named = json.loads(CliRunner().invoke(cli, [*arguments, "--model", "ur5e"]).stdout)["checks"]
-            assert all(check["state"] != "failed" for check in named)
+            named = checks_of(ftdrive.run(*arguments, "--model", "ur5e"))
+            assert all(check["state"] != "failed" for check in named.values())
     assert checks["robot.reachable"]["state"] == "failed"
     assert found in checks["robot.reachable"]["found"]
     assert fix in checks["robot.reachable"]["fix"]
@@ -133,13 +136,13 @@ def test_an_unplugged_sensor(station: Station, cell: Path, ftdrive: CommandLine)
     assert outcome.returncode == 7
     assert "the port does not open" in outcome.stdout
     assert "fix: plug it in" in outcome.stdout
-    assert "✔ remote control on" in outcome.stdout
+    assert "✔ remote control" in outcome.stdout
     assert "sensor.identity, permissions.port" in outcome.stderr
 
 
-def test_an_arm_that_is_not_there(station: Station, ftdrive: CommandLine) -> None:
-    url = station.cell.sensor.url
-    outcome = ftdrive.run("doctor", "--robot", "no-such-arm.invalid", "--sensor", url, "--json")
+def test_an_arm_that_is_not_there(station: Station, cell: Path, ftdrive: CommandLine) -> None:
+    cell.write_text(cell.read_text().replace(station.cell.robot.host, "no-such-arm.invalid"))
+    outcome = ftdrive.run("doctor", "--config", cell, "--json")
     assert outcome.returncode == 7
     checks = checks_of(outcome)
     assert checks["robot.reachable"]["state"] == "failed"
@@ -149,13 +152,10 @@ def test_an_arm_that_is_not_there(station: Station, ftdrive: CommandLine) -> Non
 
 def test_a_person_pushes(station: Station, cell: Path, ftdrive: CommandLine) -> None:
     process = ftdrive.start("doctor", "--config", cell, "--push", "--json")
-    assert process.stderr is not None
-    said = ""
-    while "press Enter" not in said:
-        said += (letter := process.stderr.read(1))
-        assert letter, said
+    listen_for(process, "press Enter")
     station.control(do="push", wrench=[0, 0, -20, 0, 0, 0])
-    out, err = process.communicate("\n", timeout=60)
+    out, err = process.communicate("\n")
+    station.control(do="push", wrench=[0.0] * 6)
     assert process.returncode == 0, err
     pushed = json.loads(out)["push"]
     assert pushed["sensor"]["axis"] == "-Z"
@@ -211,13 +211,13 @@ def test_a_place_that_cannot_be_asked_does_not_take_the_answers_of_the_others(
     assert (gone["url"], there["url"], wrong["url"]) == (None, url, None)
     assert up in gone["error"]
     assert there["error"] is None
-    assert "ftp://x is no place to ask" in wrong["error"]
+    assert "ftp://x" in wrong["error"]
     assert up in outcome.stderr
     assert "Traceback" not in outcome.stderr
     shown = ftdrive.run("devices", *places[2:])
     assert shown.returncode == 2
     assert url in shown.stdout
-    assert "probed  ftp://x   could not be asked: ftp://x is no place" in shown.stdout
+    assert "probed  ftp://x   could not be asked: " in shown.stdout
 
 
 def test_a_sensor_that_is_configured_otherwise_gets_the_cure_its_driver_names(
@@ -226,8 +226,9 @@ def test_a_sensor_that_is_configured_otherwise_gets_the_cure_its_driver_names(
     cell.write_text(cell.read_text().replace(station.cell.sensor.url, f"{station.cell.sensor.url}?serial=WRONG"))
     identity = checks_of(ftdrive.run("doctor", "--config", cell, "--json"))["sensor.identity"]
     assert identity["state"] == "failed"
-    assert identity["found"].endswith("serial number FT12345 answers, WRONG is configured")
-    assert identity["fix"] == "check the address, or its option serial"
+    assert "FT12345" in identity["found"]
+    assert "WRONG" in identity["found"]
+    assert "option serial" in identity["fix"]
 
 
 def test_transcript_of_a_sensor(ftdrive: CommandLine) -> None:
@@ -246,7 +247,7 @@ def test_the_transcript_of_a_simulated_play_is_not_said_to_be_saved(ftdrive: Com
     assert "Saved" not in played.stderr
     refused = ftdrive.run("transcript", "record", "--simulate", "-o", "nope/sensor.jsonl", "--duration", "0.1")
     assert refused.returncode == 2
-    assert "the folder nope does not exist" in refused.stderr
+    assert "nope" in refused.stderr
     assert "Saved" not in refused.stderr
 
 

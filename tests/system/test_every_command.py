@@ -6,19 +6,15 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from subprocess import CompletedProcess
-from typing import Any, Protocol
+from typing import Any
 
 import click
 import pytest
 from click.testing import CliRunner
 
-from ftdrive.cli import cli, main
+from ftdrive.cli import cli, run
 from ftdrive.errors import ConfigError
-
-
-class CommandLine(Protocol):
-    def run(self, *arguments: str | Path, typed: str = "") -> CompletedProcess[str]: ...
+from tests.system.command_line import CommandLine
 
 
 def names(command: click.Command, path: tuple[str, ...] = ()) -> Iterator[str]:
@@ -33,8 +29,6 @@ def names(command: click.Command, path: tuple[str, ...] = ()) -> Iterator[str]:
         yield from names(child, (*path, name))
 
 
-STREAM_FAILED = 4
-
 NEEDED: Mapping[str, tuple[str, ...]] = {
     "init": ("--yes", "--height", "33", "--tool", "0:60:90"),
     "calibrate": ("--minimal", "--yes"),
@@ -44,10 +38,12 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
 }
 """What a command cannot do without; any other must work with --simulate and --json alone."""
 
+MARKS = dict.fromkeys(("live", "replay", "solve"), pytest.mark.slow)
+"""Each of them calibrates an emulated cell first. So does demo, which is run and looked at in test_demo.py."""
+
 SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     "calibrate": lambda told: told["verdict"] != "rejected",
     "config show": lambda told: told["config"]["robot"]["model"] == "UR5e" and told["config"]["workcell"]["measured"],
-    "demo": lambda told: told["result"]["verdict"] == "good",
     "devices": lambda told: len(told["serial"]) == 2,
     "doctor": lambda told: all(check["state"] != "failed" for check in told["checks"]),
     "export plan": lambda told: told["text"].startswith("# ftdrive.targets/1") and told["file"] is None,
@@ -71,10 +67,8 @@ def test_help_fits_into_80_columns(command: str) -> None:
 def test_a_wrong_option_is_told_in_whole_words(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("signal.signal", lambda *_: None)
     monkeypatch.setattr("os.get_terminal_size", lambda *_: os.terminal_size((80, 24)))
-    monkeypatch.setattr(sys, "argv", ["ftdrive", "solve", "--method", "x"])
-    assert main() == 2
+    assert run(["solve", "--method", "x"]) == 2
     told = capfd.readouterr().err
     assert "'carlson-iterative'" in told
     assert max(map(len, told.splitlines())) <= 80
@@ -106,10 +100,9 @@ def test_a_full_disk_and_a_reader_that_is_gone_are_no_crash() -> None:
     command = [sys.executable, "-m", "ftdrive", "config", "show", "--json"]
     with Path("/dev/full").open("w") as full:
         outcome = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    assert (outcome.returncode, outcome.stderr) == (
-        6,
-        "error: No space left on device: make room where the output goes\n",
-    )
+    assert outcome.returncode == 6
+    assert outcome.stderr.startswith("error: No space left on device")
+    assert outcome.stderr.count("\n") == 1
     reader, writer = os.pipe()
     os.close(reader)
     outcome = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
@@ -117,14 +110,15 @@ def test_a_full_disk_and_a_reader_that_is_gone_are_no_crash() -> None:
     assert (outcome.returncode, outcome.stderr) == (1, "")
 
 
-@pytest.mark.parametrize("command", list(names(cli)))
-def test_every_command_works_with_simulate_and_json(command: str, ftdrive: CommandLine) -> None:
-    arguments = (*command.split(), *NEEDED.get(command, ()), "--simulate", "--json")
-    outcome = ftdrive.run(*arguments)
-    if outcome.returncode == STREAM_FAILED:  # where much else runs, an emulated sensor may get no time for 0.3 s
-        outcome = ftdrive.run(*arguments)
+@pytest.mark.parametrize(
+    "command", [pytest.param(name, marks=MARKS.get(name, ())) for name in names(cli) if name != "demo"]
+)
+def test_every_command_works_with_simulate_and_json(
+    command: str, ftdrive: CommandLine, capfd: pytest.CaptureFixture[str]
+) -> None:
+    outcome = ftdrive.run(*command.split(), *NEEDED.get(command, ()), "--simulate", "--json")
     assert outcome.returncode == 0, outcome.stderr
-    assert "Exception" not in outcome.stderr
+    assert "Exception" not in outcome.stderr + capfd.readouterr().err
     *events, answer = map(json.loads, outcome.stdout.splitlines())
     assert bool(events) == (command == "calibrate")  # it tells what happens too, one object a line
     assert answer["schema_version"] == 1
@@ -155,7 +149,7 @@ def test_the_sensor_that_is_named_is_emulated(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("doctor", "--simulate", "--sensor", "bota:///dev/nope"), "bota:///dev/nope is no emulated sensor"),
+        (("doctor", "--simulate", "--sensor", "bota:///dev/nope"), "bota:///dev/nope"),
         (("doctor", "--simulate", "--robot", "10.0.0.2"), "--robot does not go with --simulate"),
         (("solve", "--simulate", "."), "DATASET does not go with --simulate"),
         (("solve", "--sensor", "emulated://bota", "."), "--sensor goes only with --simulate"),

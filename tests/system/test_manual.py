@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from calib import solve
 from calib.routine import PoseRecord, TourPose, dataset_from, drift_check
-from drivers.errors import DriverError, StreamBroken
+from drivers.errors import StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, RobotArm
 from ftdrive import simulation
 from ftdrive.cli import cli
@@ -43,10 +43,10 @@ class Mover:
 
     def _run(self) -> None:
         for stop in self._stops:
-            self._arm.move_to([float(angle) for angle in stop.q_rad], timeout_s=10, guard=lambda: None)
-            if not self._taken.acquire(timeout=10) or self._over.is_set():
+            self._arm.move_to([float(angle) for angle in stop.q_rad], timeout_s=60, guard=lambda: None)
+            if not self._taken.acquire(timeout=60) or self._over.is_set():
                 return
-        self._over.wait(10)
+        self._over.wait(60)
 
     @property
     def plays(self) -> bool:
@@ -62,7 +62,7 @@ class Mover:
     def __exit__(self, *_: object) -> None:
         self._over.set()
         self._taken.release()
-        self._thread.join(15)
+        self._thread.join(90)
 
 
 class Spectator:
@@ -152,10 +152,12 @@ def watch(station: Station, run: Run, *, listen: bool, commit: Callable[[PoseRec
                 commit or run.commit,
                 down_base=np.array([0.0, 0.0, -1.0]),
                 listen=listen,
+                clock=cell.clock,
             )
             assert mover.plays  # it was we who found the end
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("listen", [True, False])
 def test_watching_finds_the_truth(station: Station, listen: bool, tmp_path: Path) -> None:
     run = Run.create(tmp_path, "manual", {})
@@ -187,6 +189,7 @@ def test_a_lost_sensor_ends_it_with_the_poses_on_disk(station: Station, tmp_path
     assert len(run.records()) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["manual", "listen"])
 def test_somebody_in_the_emulated_cell_brings_it_to_its_end(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -195,8 +198,6 @@ def test_somebody_in_the_emulated_cell_brings_it_to_its_end(
     monkeypatch.setattr(simulation, "MOVED_BY", {mode: ({**request, "rest_s": 1.2}, words)})  # in a hurry
     arguments = ["calibrate", "--simulate", f"--{mode}", "--runs", str(tmp_path), "--json"]
     outcome = CliRunner().invoke(cli, arguments)
-    if isinstance(outcome.exception, DriverError):  # where much else runs, an emulated sensor may get no time for 0.3 s
-        outcome = CliRunner().invoke(cli, arguments)
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)
     assert words in outcome.stderr
     told = json.loads(outcome.stdout.splitlines()[-1])

@@ -132,7 +132,7 @@ def test_what_cannot_be_used_is_said_in_a_sentence(arguments: list[str], said: s
 
 
 def test_no_way_is_exit_code_7() -> None:
-    error = run(*UR5E, "--plane", "-1:0:0:-130", "--plane", "1:0:0:-130").exception
+    error = run(*UR5E, "--minimal", "--plane", "0:0:-1:-300").exception  # a ceiling that low
     assert error is not None
     assert exit_code(error) == 7
 

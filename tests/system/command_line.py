@@ -1,0 +1,138 @@
+"""The command line as a user runs it: in this process where that makes no difference, else in one of its own."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from ftdrive import cli
+from ftdrive.config import FORMAT
+from ftdrive.simulation import Station
+from ftdrive.talk import talk
+from tests.system.cell_time import keep_time_of
+
+_LONG_S = 90
+"""What takes so long hangs; no computer is that busy."""
+
+
+class CommandLine:
+    """Runs `ftdrive` in a folder of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._environment = {"COLUMNS": "200", "XDG_STATE_HOME": str(folder / "state")}
+        self._clock: str | None = None
+        self._started: list[subprocess.Popen[str]] = []
+
+    def connect(self, station: Station) -> Path:
+        """Write the file that describes the cell of a station, as a user would; commands then keep its time."""
+        self.keep_time_of(station)
+        cell, path = station.cell, self.folder / "cell.toml"
+        path.write_text(
+            f'format = "{FORMAT}"\n'
+            f'[robot]\nhost = "{cell.robot.host}"\nmodel = "{cell.robot.model}"\n'
+            f"speed_deg_s = {cell.robot.speed_deg_s}\nacceleration_deg_s2 = {cell.robot.acceleration_deg_s2}\n"
+            f'[sensor]\nurl = "{cell.sensor.url}"\n'
+            f"[tool]\ncylinders_mm = {[list(row) for row in cell.tool.cylinders_mm]}\n"
+            f'[workcell]\nmounting = "{cell.workcell.mounting}"\nmeasured = true\n'
+            f"[sampling]\naverage_s = {cell.sampling.average_s}\n"
+        )
+        return path
+
+    def keep_time_of(self, station: Station) -> None:
+        """Have the commands keep the time of a station, as the computer's may be too fast for it."""
+        self._clock = station.endpoints["clock"]
+
+    def run(self, *arguments: str | Path, typed: str = "") -> CompletedProcess[str]:
+        """Run it in this process to its end: a process of its own would only import the same modules again."""
+        runner = CliRunner()
+        with pytest.MonkeyPatch.context() as here, runner.isolation(typed, self._environment) as (out, err, _):
+            here.chdir(self.folder)
+            here.setattr(talk, "quiet", False)
+            if self._clock is not None:
+                keep_time_of(self._clock, here.setattr)
+            try:
+                code = cli.run([*map(str, arguments)])
+            except SystemExit as ended:
+                code = int(ended.code or 0)
+            sys.stdout.flush()
+            sys.stderr.flush()
+            return CompletedProcess(arguments, code, out.getvalue().decode(), err.getvalue().decode())
+
+    def json(self, *arguments: str | Path, typed: str = "") -> dict[str, Any]:
+        """Run it with --json; return its answer, the last line where it prints events before."""
+        outcome = self.run(*arguments, "--json", typed=typed)
+        assert outcome.returncode == 0, outcome.stderr
+        answer: dict[str, Any] = json.loads(outcome.stdout.splitlines()[-1])
+        return answer
+
+    def start(self, *arguments: str | Path) -> subprocess.Popen[str]:
+        """Start it as a process: for signals, and for what happens while it runs."""
+        program = (
+            ["-m", "ftdrive"] if self._clock is None else [str(Path(__file__).with_name("cell_time.py")), self._clock]
+        )
+        process = subprocess.Popen(
+            [sys.executable, *program, *map(str, arguments)],
+            cwd=self.folder,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | self._environment,
+        )
+        self._started.append(process)
+        return process
+
+    def end(self) -> None:
+        """End what a failed test has left running."""
+        for process in self._started:
+            process.kill()
+            process.communicate()
+
+    def wait_for_poses(self, process: subprocess.Popen[str], count: int) -> None:
+        """Return when so many poses are on disk."""
+        wait_until(lambda: len(self.poses()) >= count, process)
+
+    def poses(self) -> list[Path]:
+        """Return the poses on disk, of the only run in the folder."""
+        return sorted(self.folder.glob("runs/*/poses/*.npz"))
+
+
+def say(process: subprocess.Popen[str], words: str) -> None:
+    """Type into a process."""
+    assert process.stdin is not None
+    process.stdin.write(words)
+    process.stdin.flush()
+
+
+def listen_for(process: subprocess.Popen[str], words: str) -> str:
+    """Read what a process prints for people until it has said this."""
+    assert process.stderr is not None
+    said = ""
+    while words not in said:
+        said += (letter := process.stderr.read(1))
+        assert letter, said
+    return said
+
+
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str] | None = None) -> None:
+    """Look again and again, as long as the process lives."""
+    deadline_s = time.monotonic() + _LONG_S
+    while not condition():
+        assert process is None or process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline_s, "it never happens"
+        time.sleep(0.02)
+
+
+def end_of(process: subprocess.Popen[str], typed: str = "") -> tuple[int, str]:
+    """Return the exit code and what was printed for people since."""
+    _, said = process.communicate(typed or None, timeout=_LONG_S)
+    return process.returncode, said
