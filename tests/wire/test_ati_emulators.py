@@ -288,8 +288,9 @@ def test_can_host_that_never_reads_costs_frames_not_memory(node: AtiCanNode) -> 
         readings, asked = Counted(), 0
         node.measure = readings
         while not node.dropped_frames:
-            asked += port.write(b"t2000\r" * 50) // len("t2000\r")
+            port.write(b"t2000\r" * 50)
             port.flush()
+            asked += 50
         wait_until(lambda: readings.calls == asked)
         assert len(node._answers) + len(node._unsent) < 40_000, "the answers to one read of 4096 bytes"
         stuck = drain(port)
