@@ -77,7 +77,7 @@ class Bus:
 
 
 @pytest.fixture
-def start() -> Iterator[Callable[..., str]]:
+def start(cell_time: Any) -> Iterator[Callable[..., str]]:
     devices = []
     rng = np.random.default_rng(0)
 
@@ -85,7 +85,7 @@ def start() -> Iterator[Callable[..., str]]:
         return rng.normal(size=(n, 6)) + 3
 
     def run(kind: Any, **options: Any) -> str:
-        devices.append(kind(measure, seed=1, **options))
+        devices.append(kind(measure, seed=1, clock=cell_time.of_devices, **options))
         return str(devices[-1].start())
 
     yield run
@@ -124,28 +124,37 @@ def start() -> Iterator[Callable[..., str]]:
     ],
 )
 def test_a_sensor_shows_itself_and_its_address_works(
-    start: Callable[..., str], kind: Any, options: dict[str, Any], bitrate: int, base: int, url: str, what: str
+    start: Callable[..., str],
+    cell_time: Any,
+    kind: Any,
+    options: dict[str, Any],
+    bitrate: int,
+    base: int,
+    url: str,
+    what: str,
 ) -> None:
     port = start(kind, **options)
-    (answer,) = probe_can(port, interface="slcan", bitrate=bitrate, base=base)
+    (answer,) = probe_can(port, interface="slcan", clock=cell_time.of_drivers, bitrate=bitrate, base=base)
     assert (answer.url, answer.what) == (url.format(port), what)
     assert answer.url is not None
-    with sensor_from_url(answer.url) as sensor:
+    with sensor_from_url(answer.url, clock=cell_time.of_drivers) as sensor:
         assert len(sensor.collect(0.2).seq)
 
 
-def test_the_address_of_an_adapter_with_a_strange_name_works(start: Callable[..., str], tmp_path: Path) -> None:
+def test_the_address_of_an_adapter_with_a_strange_name_works(
+    start: Callable[..., str], cell_time: Any, tmp_path: Path
+) -> None:
     port = tmp_path / "my adapter #1?50%20"
     port.symlink_to(start(AtiCanNode))
-    (answer,) = probe_can(str(port), interface="slcan", bitrate=250_000)
+    (answer,) = probe_can(str(port), interface="slcan", clock=cell_time.of_drivers, bitrate=250_000)
     assert answer.url is not None
-    with sensor_from_url(answer.url) as sensor:
+    with sensor_from_url(answer.url, clock=cell_time.of_drivers) as sensor:
         assert len(sensor.collect(0.2).seq)
 
 
-def test_a_sensor_elsewhere_is_not_found(start: Callable[..., str]) -> None:
-    assert probe_can(start(AtiCanNode, base=0x7F), interface="slcan", bitrate=250_000) == []
-    assert probe_can(start(RobotousCanNode), interface="slcan", bitrate=500_000) == []
+def test_a_sensor_elsewhere_is_not_found(start: Callable[..., str], cell_time: Any) -> None:
+    assert probe_can(start(AtiCanNode, base=0x7F), interface="slcan", clock=cell_time.of_drivers, bitrate=250_000) == []
+    assert probe_can(start(RobotousCanNode), interface="slcan", clock=cell_time.of_drivers, bitrate=500_000) == []
 
 
 @pytest.mark.parametrize(
@@ -219,16 +228,16 @@ def test_a_bus_that_does_not_open() -> None:
         probe_can(bus.path, interface="slcan", bitrate=300_000)
 
 
-def test_an_adapter_that_another_program_reads_is_left_alone(start: Callable[..., str]) -> None:
+def test_an_adapter_that_another_program_reads_is_left_alone(start: Callable[..., str], cell_time: Any) -> None:
     port = start(AtiCanNode)
-    with sensor_from_url(f"ati-can://{port}?interface=slcan") as sensor:
+    with sensor_from_url(f"ati-can://{port}?interface=slcan", clock=cell_time.of_drivers) as sensor:
         with pytest.raises(PortInUse, match=f"in use by another program; end it, `fuser -v {port}` names it"):
-            probe_can(port, interface="slcan", bitrate=250_000)
+            probe_can(port, interface="slcan", clock=cell_time.of_drivers, bitrate=250_000)
         with pytest.raises(serial.SerialException):
             serial.Serial(port, exclusive=True)
         assert len(sensor.collect(0.2))
         assert sensor.health().stale == sensor.health().lost == 0
     with serial.Serial(port, exclusive=True), pytest.raises(PortInUse):
-        probe_can(port, interface="slcan", bitrate=250_000)
-    (answer,) = probe_can(port, interface="slcan", bitrate=250_000)
+        probe_can(port, interface="slcan", clock=cell_time.of_drivers, bitrate=250_000)
+    (answer,) = probe_can(port, interface="slcan", clock=cell_time.of_drivers, bitrate=250_000)
     assert answer.url
