@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 
 from drivers._stream import StreamingSensor
+from drivers.clock import Clock
 from drivers.registry import sensor_from_url
 from drivers.ur.arm import UrArm
 from drivers.ur.timing import UrTiming
 from ftdrive.emulated_clock import EmulatedClock
+from mocks.clock import CellClock
 from tests.wire.station_process import StationProcess
 
 TIME_SCALE = 10
@@ -113,8 +115,9 @@ WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])
 NOISE = np.array([0.03] * 3 + [0.001] * 3)
 
 PROGRAM = """
-import json, sys
+import json, sys, threading, time
 import numpy as np
+from mocks.clock import CellClock
 from mocks.ati_can import AtiCanNode
 from mocks.ati_serial import AtiSerialBox
 from mocks.bota import BotaBox
@@ -130,12 +133,19 @@ kinds = {"ati-can": AtiCanNode, "ati-serial": AtiSerialBox, "robotous-can": Robo
          "robotous-serial": RobotousSerialBox, "robotiq-ft300": RobotiqBox, "ati-netft": NetFtBox}
 parts = {"faults": Faults, "model": Model, "calibration": Calibration}
 devices = []
+clock = CellClock()
+def tick():
+    while True:
+        clock.now_ns()
+        time.sleep(0.001)
+threading.Thread(target=tick, daemon=True).start()
+print(json.dumps(clock.path), flush=True)
 for line in sys.stdin:
     word, argument, options = json.loads(line)
     if word == "start":
         options = {key: parts[key](**value) if key in parts else tuple(value) if isinstance(value, list) else value
                    for key, value in options.items()}
-        devices.append(kinds[argument](measure, seed=2, **options))
+        devices.append(kinds[argument](measure, seed=2, clock=clock, **options))
         print(json.dumps([len(devices) - 1, devices[-1].start()]), flush=True)
     elif word == "faults":
         for key, value in options.items():
@@ -174,13 +184,42 @@ KINDS = {
 }
 
 
+class CellTime:
+    """Time of an emulated cell that lives in this process."""
+
+    def __init__(self) -> None:
+        self.of_devices = CellClock()
+        self.of_drivers = EmulatedClock(self.of_devices.path)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._tick)
+        self._thread.start()
+
+    def _tick(self) -> None:
+        while not self._ended.wait(0.001):
+            self.of_devices.now_ns()
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join()
+        self.of_devices.close()
+
+
+@pytest.fixture
+def cell_time() -> Iterator[CellTime]:
+    """The clocks of emulated sensors and of their drivers, where both are in the test's process."""
+    with closing(CellTime()) as cell_time:
+        yield cell_time
+
+
 class Laboratory:
-    """Emulated sensors in one child process."""
+    """Emulated sensors in one child process, and the time of their cell."""
 
     def __init__(self) -> None:
         arguments = [sys.executable, "-c", PROGRAM, json.dumps(WRENCH.tolist()), json.dumps(NOISE.tolist())]
         self.process = subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._lock = threading.Lock()
+        assert self.process.stdout
+        self.clock = EmulatedClock(json.loads(self.process.stdout.readline()))
 
     def tell(self, word: str, argument: str | int, options: dict[str, Any] | None = None) -> str:
         assert self.process.stdin
@@ -200,16 +239,21 @@ class Emulator:
     def __init__(self, laboratory: Laboratory, scheme: str, options: dict[str, Any]) -> None:
         self.kind = KINDS[scheme]
         self.laboratory = laboratory
+        self.clock = laboratory.clock
+        self._sensors: list[StreamingSensor] = []
         self._number, self.endpoint = json.loads(laboratory.tell("start", scheme, self.kind.options | options))
 
-    def sensor(self, options: str = "", sign: int = 1) -> StreamingSensor:
+    def sensor(self, options: str = "", sign: int = 1, clock: Clock | None = None) -> StreamingSensor:
+        """Make a driver of it, in the cell's time unless another clock is given; it is closed with the emulator."""
         where, ports = self.endpoint, []
         if isinstance(where, dict):
             ports = [f"{key}={where[key]}" for key in ("rdt_port", "http_port")]
             where = where["host"]
         query = "&".join(filter(None, [self.kind.query, *ports, options]))
-        sensor = sensor_from_url(f"{self.kind.scheme}://{where}?{query}".rstrip("?"), sign=sign)
+        url = f"{self.kind.scheme}://{where}?{query}".rstrip("?")
+        sensor = sensor_from_url(url, sign=sign, clock=clock or self.clock)
         assert isinstance(sensor, StreamingSensor)
+        self._sensors.append(sensor)
         return sensor
 
     def faults(self, **options: Any) -> None:
@@ -222,6 +266,8 @@ class Emulator:
         assert self.laboratory.tell("reset", self._number) == "done"
 
     def stop(self) -> None:
+        for sensor in self._sensors:
+            sensor.close()
         assert self.laboratory.tell("stop", self._number) == "done"
 
 
