@@ -322,7 +322,8 @@ def test_a_repeat_once_the_poses_are_enough_names_the_key_that_finishes() -> Non
     outcome = Outcome(dwells(UP, near, DOWN, LEFT, RIGHT, FRONT, BACK, near), keys={40.0: Key.KEEP})
     told = [words for words in outcome.person.words().splitlines() if words.startswith("This is pose 1 again")]
     left_out = "This is pose 1 again, 5° from it: it is left out."
-    assert told == [f"{left_out} Turn the tool further.", f"{left_out} Press k to finish"]
+    assert [words.startswith(left_out) for words in told] == [True, True]
+    assert ["Press k" in words for words in told] == [False, True]
 
 
 def test_a_quarter_turn_about_gravity_is_no_repeat() -> None:
@@ -336,7 +337,8 @@ def test_keep_ends_it_when_the_poses_are_enough_and_not_before() -> None:
     assert words.count("press k to finish") == 1
     moves = [event.words for event in outcome.person.told if isinstance(event, StateChanged) and event.words]
     move_on = "move on to another orientation"
-    assert moves == [move_on] * 5 + [f"press k to finish{move_on}"]  # the screen says so all the time
+    assert moves[:5] == [move_on] * 5
+    assert "press k" in moves[5]  # the screen says so all the time
     assert outcome.person.told[-1].to_dict()["words"] == "Finished: 6 poses are kept."
     assert outcome.cell.now_s == pytest.approx(32.0, abs=0.2)
 
@@ -346,7 +348,8 @@ def test_stop_ends_it_at_any_time_and_says_what_is_missing() -> None:
     last = outcome.person.told[-1]
     assert isinstance(last, Noted)
     assert last.warning
-    assert last.words == "Stopped: 1 pose is kept"
+    assert last.words.startswith("Stopped: 1 pose is kept")
+    assert "amber" in last.words
 
 
 TILTED = [Rotation.from_euler("xyz", angles, degrees=True) for angles in ((45, 0, 0), (0, 45, 0))]
@@ -472,7 +475,7 @@ def test_a_hand_on_the_tool_is_named_and_the_pose_taken_again() -> None:
     assert outcome.stops == [1, 2, 3]
     assert all(record.steady for record in outcome.kept)
     words = outcome.person.words()
-    assert re.search(r"fy scatters by 1\.\d N", words)
+    assert re.search(r"fy scatters by 1\.\d N, .* 0\.0[45]", words)
     assert "Let go of" in words
     assert [event.attempts for event in outcome.person.told if isinstance(event, PoseTaken)] == [1, 2, 1]
     assert np.abs(outcome.kept[1].mean.mean[1] - BIAS[1]) < 0.05  # without the hand
@@ -561,7 +564,9 @@ def test_only_standstills_of_the_running_program_count_and_the_last_though_it_ha
 def test_a_program_that_ends_where_it_has_been_ends_it() -> None:
     outcome = Outcome(dwells(UP, DOWN, UP), listen=True, says=lambda t: status("playing" if t < 10 else "stopped"))
     assert outcome.stops == [1, 2]
-    assert "pose 1 again, 0°\nThe program has ended" in outcome.person.words()
+    *_, left_out, ended = outcome.person.words().splitlines()
+    assert "pose 1 again, 0°" in left_out
+    assert ended.startswith("The program has ended")
     assert outcome.cell.now_s < 13
 
 
