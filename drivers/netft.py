@@ -300,7 +300,9 @@ class NetFtSensor(StreamingSensor):
                 client.start()
             except pynetft.NetFTError as exc:
                 raise self._untold(exc) from exc
-            arrived = any(client.wait_for_first_sample(min(s, _WAIT_S)) for s in self._clock.looks(_SILENCE_S))
+            arrived = any(
+                client.wait_for_first_sample(min(s, self._clock.poll_s)) for s in self._clock.looks(_SILENCE_S)
+            )
             self._arrived_ns = self._clock.now_ns()
             health = client.health()
             if health.sensor_configuration is None:

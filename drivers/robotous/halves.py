@@ -32,9 +32,12 @@ class Halves:
     ----------
     period_s : float
         Between two samples; NaN for replies, which come when they are asked for.
+    late_s : float
+        By how much the sensor itself may be late, as an emulated one is on a busy computer. A shorter lack is then no
+        loss, so two neighbouring losses are not noticed.
     """
 
-    def __init__(self, period_s: float = math.nan) -> None:
+    def __init__(self, period_s: float = math.nan, late_s: float = 0.0) -> None:
         self.silence_s = _SILENCE_S if math.isnan(period_s) else min(_SILENCE_S, period_s / 2)
         """How long nothing must come for `silence` to be called."""
         self.lost = 0
@@ -42,6 +45,7 @@ class Halves:
         self.quiet = True
         """Whether nothing came since a silence."""
         self._period_ns = period_s * 1e9
+        self._late_ns = late_s * 1e9
         self._number = 0
         self._clock_ns: float | None = None
         """When the field `_number` came."""
@@ -94,7 +98,8 @@ class Halves:
         if self._clock_ns is None:
             return True
         # there cannot be too many: it is the clock that was set late
-        return self._waiting[-1].t_host_ns - self._clock_ns < (len(self._waiting) + _LATE) * self._period_ns
+        due_ns = (len(self._waiting) + _LATE) * self._period_ns + self._late_ns
+        return self._waiting[-1].t_host_ns - self._clock_ns < due_ns
 
     def _believe(self) -> list[Field]:
         fields, self._waiting, self._doubtful = self._waiting, [], 0

@@ -39,7 +39,6 @@ FREQUENCY_HZ: Final = 125.0
 """The full rate of the CB3 generation; e-Series arms send every fourth cycle."""
 _WAITED_S: Final = (0.002, 0.1)
 """The reader waits 8 ms for a sample that has just been taken. What has piled up comes without waiting."""
-_READ_S: Final = 0.02
 _MODEL_POSITION_M: Final = 0.005
 _MODEL_ANGLE_RAD: Final = radians(0.5)
 
@@ -194,7 +193,7 @@ class Reader:
     def _follow(self) -> bool:
         """Read the next sample; whether to go on. What ends the stream is raised at the next look."""
         try:
-            outputs = dict(zip(self._names, self._stream.read(_READ_S), strict=True))
+            outputs = dict(zip(self._names, self._stream.read(self._clock.poll_s), strict=True))
         except TimeoutError:
             self._clock.now_ns()  # an emulated cell waits for this thread
             return True

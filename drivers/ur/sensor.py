@@ -94,7 +94,7 @@ class UrWristSensor(StreamingSensor):
         if stream is None:
             raise StreamBroken(f"{self.name}: closed")
         try:
-            (t_device_s,), raw = stream.read(0.05)
+            (t_device_s,), raw = stream.read(self._clock.poll_s)
         except TimeoutError:
             return NOTHING
         except (OSError, StreamBroken) as exc:

@@ -1,90 +1,76 @@
 """The emulated UR controller and the emulated sensors, as the tests of their drivers use them."""
 
 import json
-import select
-import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from math import radians
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from drivers._stream import StreamingSensor
+from drivers.clock import Clock
 from drivers.registry import sensor_from_url
 from drivers.ur.arm import UrArm
+from drivers.ur.timing import UrTiming
+from ftdrive.emulated_clock import EmulatedClock
+from tests.wire.station_process import StationProcess
 
-ROOT = Path(__file__).parents[2]
+TIME_SCALE = 10
+"""The arm lives so many times faster: a protective stop can be unlocked after 5 s of its time."""
+SPEED_RAD_S, ACCELERATION_RAD_S2 = radians(60) / TIME_SCALE, radians(200) / TIME_SCALE
 
 
-class Station:
-    """The emulator's process and its control lines."""
+class Station(StationProcess):
+    """The emulator's process, its control lines and its clock."""
 
-    def __init__(self, *options: str) -> None:
-        command = [sys.executable, "-m", "mocks", "station", "--sensor", "none", *options]
-        self.process = subprocess.Popen(
-            command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
-        self.host: str = self._line()["arm"]["host"]
-
-    def _line(self) -> dict[str, Any]:
-        assert self.process.stdout
-        assert select.select([self.process.stdout], [], [], 20)[0], "the station says nothing"
-        answer: dict[str, Any] = json.loads(self.process.stdout.readline())
-        assert "error" not in answer, answer
-        return answer
-
-    def do(self, verb: str, /, **how: object) -> dict[str, Any]:
-        assert self.process.stdin
-        self.process.stdin.write(json.dumps({"do": verb} | how) + "\n")
-        self.process.stdin.flush()
-        return self._line()
-
-    def wait_for(self, condition: Callable[[dict[str, Any]], bool], within_s: float = 2.0) -> None:
-        deadline = time.monotonic() + within_s
-        while not condition(state := self.do("state")):
-            assert time.monotonic() < deadline, state
-            time.sleep(0.01)
+    def start(self) -> None:
+        super().start()
+        self.clock = EmulatedClock(self.hello["clock"])
 
     def dashboard(self, command: str) -> str:
         """Ask as another client does."""
-        with socket.create_connection((self.host, 29999), timeout=2) as sock, sock.makefile("rw") as lines:
+        with self.connect(29999) as sock, sock.makefile("rw") as lines:
             lines.readline()
             lines.write(command + "\n")
             lines.flush()
             return lines.readline().strip()
 
-    def as_new(self) -> bool:
+    def arm(self, **how: Any) -> UrArm:
+        """Make an arm that lives by the clock of this cell, if nothing else is said."""
+        given: dict[str, Any] = {"clock": self.clock, "timing": UrTiming.emulated(), **how}
+        return UrArm(self.host, speed_rad_s=SPEED_RAD_S, acceleration_rad_s2=ACCELERATION_RAD_S2, **given)
+
+    def is_as_new(self) -> bool:
         if self.process.poll() is not None:
             return False
-        state = self.do("state")
+        state = self.ask("state")
         return bool(
             (state["safety_mode"], state["robot_mode"], state["remote_control"]) == ("NORMAL", "RUNNING", True)
+            and (state["runtime_state"], state["speed_fraction"]) == ("STOPPED", 1.0)
             and not any(state["tcp_offset"])
         )
 
-    def close(self) -> None:
-        self.process.kill()
-        self.process.communicate()
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    item.stash[FAILED] = item.stash.get(FAILED, False) or report.failed
+    return report
+
+
+FAILED = pytest.StashKey[bool]()
 
 
 @pytest.fixture(scope="module")
 def start_station() -> Iterator[Callable[..., Station]]:
-    stations: list[Station] = []
-
-    def start(*options: str) -> Station:
-        stations.append(Station(*options))
-        return stations[-1]
-
-    yield start
-    for station in stations:
-        station.close()
+    with ExitStack() as stations:
+        yield lambda *options: stations.enter_context(Station(*options))
 
 
 @pytest.fixture(scope="module")
@@ -94,28 +80,25 @@ def kept() -> list[Station]:
 
 
 @pytest.fixture
-def station(kept: list[Station], start_station: Callable[..., Station]) -> Iterator[Station]:
-    if not kept or not kept[0].as_new():
-        kept[:] = [start_station()]
-    yield kept[0]
-    if kept[0].process.poll() is None:
-        assert kept[0].do("state")["bad_inputs"] == []
+def station(
+    kept: list[Station], start_station: Callable[..., Station], request: pytest.FixtureRequest
+) -> Iterator[Station]:
+    """Give a station whose arm stands and has no program; one that a test has failed with is not used again."""
+    if not kept or not kept[0].is_as_new():
+        kept[:] = [start_station("--time-scale", str(TIME_SCALE))]
+    station = kept[0]
+    yield station
+    if request.node.stash.get(FAILED, False):
+        station.kill()
+    elif station.process.poll() is None:
+        assert station.ask("state")["bad_inputs"] == []
 
 
 @pytest.fixture
 def new_arm(station: Station) -> Iterator[Callable[..., UrArm]]:
     """Make arms at the station, and close them after the test."""
-    arms: list[UrArm] = []
-
-    def make(host: str = station.host, model: str | None = None) -> UrArm:
-        arms.append(UrArm(host, model=model, speed_rad_s=radians(60), acceleration_rad_s2=radians(200)))
-        return arms[-1]
-
-    yield make
-    for arm in arms:
-        t0 = time.monotonic()
-        arm.close()
-        assert time.monotonic() - t0 < 1.5
+    with ExitStack() as arms:
+        yield lambda **how: arms.enter_context(closing(station.arm(**how)))
 
 
 @pytest.fixture
@@ -131,8 +114,9 @@ WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])
 NOISE = np.array([0.03] * 3 + [0.001] * 3)
 
 PROGRAM = """
-import json, sys
+import json, sys, threading, time
 import numpy as np
+from mocks.clock import CellClock
 from mocks.ati_can import AtiCanNode
 from mocks.ati_serial import AtiSerialBox
 from mocks.bota import BotaBox
@@ -148,12 +132,19 @@ kinds = {"ati-can": AtiCanNode, "ati-serial": AtiSerialBox, "robotous-can": Robo
          "robotous-serial": RobotousSerialBox, "robotiq-ft300": RobotiqBox, "ati-netft": NetFtBox}
 parts = {"faults": Faults, "model": Model, "calibration": Calibration}
 devices = []
+clock = CellClock()
+def tick():
+    while True:
+        clock.now_ns()
+        time.sleep(0.001)
+threading.Thread(target=tick, daemon=True).start()
+print(json.dumps(clock.path), flush=True)
 for line in sys.stdin:
     word, argument, options = json.loads(line)
     if word == "start":
         options = {key: parts[key](**value) if key in parts else tuple(value) if isinstance(value, list) else value
                    for key, value in options.items()}
-        devices.append(kinds[argument](measure, seed=2, **options))
+        devices.append(kinds[argument](measure, seed=2, clock=clock, **options))
         print(json.dumps([len(devices) - 1, devices[-1].start()]), flush=True)
     elif word == "faults":
         for key, value in options.items():
@@ -193,12 +184,14 @@ KINDS = {
 
 
 class Laboratory:
-    """Emulated sensors in one child process."""
+    """Emulated sensors in one child process, and the time of their cell."""
 
     def __init__(self) -> None:
         arguments = [sys.executable, "-c", PROGRAM, json.dumps(WRENCH.tolist()), json.dumps(NOISE.tolist())]
         self.process = subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._lock = threading.Lock()
+        assert self.process.stdout
+        self.clock = EmulatedClock(json.loads(self.process.stdout.readline()))
 
     def tell(self, word: str, argument: str | int, options: dict[str, Any] | None = None) -> str:
         assert self.process.stdin
@@ -218,16 +211,21 @@ class Emulator:
     def __init__(self, laboratory: Laboratory, scheme: str, options: dict[str, Any]) -> None:
         self.kind = KINDS[scheme]
         self.laboratory = laboratory
+        self.clock = laboratory.clock
+        self._sensors: list[StreamingSensor] = []
         self._number, self.endpoint = json.loads(laboratory.tell("start", scheme, self.kind.options | options))
 
-    def sensor(self, options: str = "", sign: int = 1) -> StreamingSensor:
+    def sensor(self, options: str = "", sign: int = 1, clock: Clock | None = None) -> StreamingSensor:
+        """Make a driver of it, in the cell's time unless another clock is given; it is closed with the emulator."""
         where, ports = self.endpoint, []
         if isinstance(where, dict):
             ports = [f"{key}={where[key]}" for key in ("rdt_port", "http_port")]
             where = where["host"]
         query = "&".join(filter(None, [self.kind.query, *ports, options]))
-        sensor = sensor_from_url(f"{self.kind.scheme}://{where}?{query}".rstrip("?"), sign=sign)
+        url = f"{self.kind.scheme}://{where}?{query}".rstrip("?")
+        sensor = sensor_from_url(url, sign=sign, clock=clock or self.clock)
         assert isinstance(sensor, StreamingSensor)
+        self._sensors.append(sensor)
         return sensor
 
     def faults(self, **options: Any) -> None:
@@ -240,6 +238,8 @@ class Emulator:
         assert self.laboratory.tell("reset", self._number) == "done"
 
     def stop(self) -> None:
+        for sensor in self._sensors:
+            sensor.close()
         assert self.laboratory.tell("stop", self._number) == "done"
 
 

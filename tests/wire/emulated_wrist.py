@@ -8,12 +8,12 @@ import selectors
 import socket
 import struct
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import TypeVar
 
+from mocks.clock import CellClock
 from mocks.faults import Faults
 from mocks.kinematics import MODELS, ZERO6, Array
 from mocks.station import free_hosts
@@ -31,8 +31,17 @@ RESET = struct.pack("ii", 1, 0)
 class EmulatedWrist:
     """A controller and the wire to it, with the methods of an emulated sensor; of `faults`, delay and stall apply."""
 
-    def __init__(self, measure: Callable[[int], Array], *, seed: int, faults: Faults, host: str | None = None) -> None:
+    def __init__(
+        self,
+        measure: Callable[[int], Array],
+        *,
+        seed: int,
+        faults: Faults,
+        host: str | None = None,
+        clock: CellClock | None = None,
+    ) -> None:
         self.faults = faults
+        self._clock = clock or CellClock()
         self._measure = measure
         self._rng = random.Random(seed)
         self._host = host
@@ -41,7 +50,7 @@ class EmulatedWrist:
 
     def start(self) -> dict[str, str]:
         """Listen; the address at which clients find the controller."""
-        self._controller = Controller(self._measure)
+        self._controller = Controller(self._measure, self._clock)
         self._listener = first_that_works(
             lambda host: socket.create_server((host, RTDE_PORT)), [self._host] if self._host else wire_hosts()
         )
@@ -52,7 +61,7 @@ class EmulatedWrist:
     def reset(self) -> None:
         """Restart the controller: it hangs up, and its clock begins anew."""
         self._controller.stop()
-        self._controller = Controller(self._measure)
+        self._controller = Controller(self._measure, self._clock)
 
     def unplug(self) -> None:
         """Reset all connections and refuse new ones. May come twice."""
@@ -83,7 +92,7 @@ class EmulatedWrist:
     def _carry(self, client: socket.socket, server: socket.socket) -> None:
         """Carry bytes both ways until one side hangs up: late and in pieces to the client."""
         late: deque[tuple[float, bytes]] = deque()
-        with client, server, selectors.DefaultSelector() as selector, suppress(OSError):
+        with client, server, selectors.DefaultSelector() as selector, suppress(OSError), self._clock.keeping_up():
             for side in (client, server):
                 selector.register(side, selectors.EVENT_READ)
             while not self._ended.is_set():
@@ -95,8 +104,9 @@ class EmulatedWrist:
                         server.sendall(data)
                     else:
                         cut = self._rng.randrange(len(data) + 1)
-                        late += [(time.monotonic() + self.faults.delay_s, part) for part in (data[:cut], data[cut:])]
-                while late and late[0][0] <= time.monotonic() and not self.faults.stall:
+                        late += [(self._clock.now_s() + self.faults.delay_s, part) for part in (data[:cut], data[cut:])]
+                self._clock.now_ns()
+                while late and late[0][0] <= self._clock.now_s() and not self.faults.stall:
                     client.sendall(late.popleft()[1])
             client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
 
@@ -104,8 +114,8 @@ class EmulatedWrist:
 class Controller:
     """A running controller, with readings of the test's making."""
 
-    def __init__(self, measure: Callable[[int], Array]) -> None:
-        robot = Robot(World(Truth.drawn(1), MODELS["UR5e"], ZERO6), RobotSettings())
+    def __init__(self, measure: Callable[[int], Array], clock: CellClock) -> None:
+        robot = Robot(World(Truth.drawn(1), MODELS["UR5e"], ZERO6, clock=clock), RobotSettings())
         robot.wrist_sensor = measure
         selector = selectors.SelectSelector()
         self._server = first_that_works(lambda host: UrServer(robot, host, selector), free_hosts())

@@ -132,7 +132,7 @@ def test_a_slow_sensor_is_averaged_for_longer(rate_Hz: int, averages_s: list[flo
 def test_a_sensor_that_is_too_slow_ends_the_tour() -> None:
     cell = Cell()
     cell.rate_Hz = 9
-    with pytest.raises(TooFewSamples, match=r"18 samples in 2\.0 s, at least 20"):
+    with pytest.raises(TooFewSamples, match=r"18 samples in 2\.0 s"):
         take(cell)
     assert cell.log == ["still", "collect 0.5", "collect 1.0", "collect 2.0"]
 

@@ -40,7 +40,7 @@ def test_the_workcell_is_counted_and_what_cannot_be_is_named() -> None:
     wrong = replace(cell, workcell=config.WorkcellConfig(planes_mm=((1, 0, 0, 800),)))
     found = checks.check_workcell(wrong, "UR5e")
     assert (found.name, found.state) == ("workcell.measured", "failed")
-    assert "wrong side of the plane [1, 0, 0, 800]" in found.found
+    assert "[1, 0, 0, 800]" in found.found
     assert str(found.fix).startswith("give [-1, 0, 0, -800]")
 
 
@@ -211,7 +211,7 @@ def test_what_an_address_says(url: str, port: str | None, interface: str | None)
 
 
 def test_what_is_no_address_is_a_mistake_of_the_user() -> None:
-    with pytest.raises(ConfigError, match=r"ati-can://\[can0: Invalid IPv6 URL; write it like ati-can://can0"):
+    with pytest.raises(ConfigError, match=r"write it like ati-can://can0"):
         SensorAddress.of("ati-can://[can0")
 
 

@@ -86,11 +86,11 @@ def test_a_port_without_more_is_a_serial_sensor(asked: list[Any], tmp_path: Path
 @pytest.mark.parametrize(
     ("place", "words"),
     [
-        ("slcan:///dev/null", "at which bit rate.* disturbs the bus; .*slcan:///dev/ttyACM0.bitrate=250000"),
+        ("slcan:///dev/null", "at which bit rate.*slcan:///dev/ttyACM0.bitrate=250000"),
         ("slcan://", "is no place to ask"),
-        ("ati-can://can0", "is no place to ask: give a serial port, can0"),
+        ("ati-can://can0", "is no place to ask"),
         ("slcan:///dev/null?bitrate=fast", "must be a whole number"),
-        ("can0?rate=1000", "unknown option rate; known: base, bitrate"),
+        ("can0?rate=1000", "option rate; known: base, bitrate"),
         ("can0?base=0x80", "allowed are 0 to 127"),
     ],
 )
@@ -124,9 +124,9 @@ def test_an_interface_that_cannot_be_asked(can0: Path, asked: list[Any]) -> None
 @pytest.mark.parametrize(
     ("answers", "words"),
     [
-        ([], "no known sensor answers on can0: is it powered"),
-        ([REFUSED], "no known sensor answers on can0: a Robotous was not asked"),
-        ([FOUND, Answer("robotous-can://can0", "R")], "2 sensors answer on can0: choose one, ati-can.* or robotous"),
+        ([], "answers on can0: is it powered"),
+        ([REFUSED], "a Robotous was not asked"),
+        ([FOUND, Answer("robotous-can://can0", "R")], "choose one, ati-can.* or robotous"),
     ],
 )
 def test_only_one_sensor_is_the_sensor(answers: list[Answer], words: str, monkeypatch: pytest.MonkeyPatch) -> None:

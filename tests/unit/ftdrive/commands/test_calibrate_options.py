@@ -216,4 +216,4 @@ def test_a_run_with_a_field_of_the_wrong_type_is_refused_in_one_sentence(
 
 
 def test_every_error_of_the_solver_has_an_exit_code() -> None:
-    assert exit_code(CalibError("the run holds no pose yet")) == 7
+    assert exit_code(CalibError("holds no pose yet")) == 7

@@ -305,7 +305,7 @@ def test_an_arm_that_hardly_rests_or_creeps_is_not_measured() -> None:
 def test_an_arm_that_moves_off_while_measured_is_told_how_long_to_wait() -> None:
     outcome = Outcome([*dwells(UP, seconds=2.0), *dwells(DOWN)])
     assert outcome.stops == [1]
-    assert "The arm moved while pose 1 was measured: leave the arm still for 3.3 s." in outcome.person.words()
+    assert "moved while pose 1" in outcome.person.words()
 
 
 @pytest.mark.parametrize("turn_deg", [2.0, 9.0])
@@ -322,7 +322,8 @@ def test_a_repeat_once_the_poses_are_enough_names_the_key_that_finishes() -> Non
     outcome = Outcome(dwells(UP, near, DOWN, LEFT, RIGHT, FRONT, BACK, near), keys={40.0: Key.KEEP})
     told = [words for words in outcome.person.words().splitlines() if words.startswith("This is pose 1 again")]
     left_out = "This is pose 1 again, 5° from it: it is left out."
-    assert told == [f"{left_out} Turn the tool further.", f"{left_out} Press k to finish, or turn the tool further."]
+    assert [words.startswith(left_out) for words in told] == [True, True]
+    assert ["Press k" in words for words in told] == [False, True]
 
 
 def test_a_quarter_turn_about_gravity_is_no_repeat() -> None:
@@ -332,11 +333,12 @@ def test_a_quarter_turn_about_gravity_is_no_repeat() -> None:
 def test_keep_ends_it_when_the_poses_are_enough_and_not_before() -> None:
     outcome = Outcome(dwells(*AROUND, Rotation.from_euler("x", 45, degrees=True)), keys={8.0: Key.KEEP, 32.0: Key.KEEP})
     words = outcome.person.words()
-    assert "The light is amber: these poses are not enough yet; press q to stop all the same." in words
-    assert words.count("These poses are enough: press k to finish") == 1
+    assert "The light is amber" in words
+    assert words.count("press k to finish") == 1
     moves = [event.words for event in outcome.person.told if isinstance(event, StateChanged) and event.words]
     move_on = "move on to another orientation"
-    assert moves == [move_on] * 5 + [f"enough: press k to finish, or {move_on}"]  # the screen says so all the time
+    assert moves[:5] == [move_on] * 5
+    assert "press k" in moves[5]  # the screen says so all the time
     assert outcome.person.told[-1].to_dict()["words"] == "Finished: 6 poses are kept."
     assert outcome.cell.now_s == pytest.approx(32.0, abs=0.2)
 
@@ -346,7 +348,8 @@ def test_stop_ends_it_at_any_time_and_says_what_is_missing() -> None:
     last = outcome.person.told[-1]
     assert isinstance(last, Noted)
     assert last.warning
-    assert last.words == "Stopped: 1 pose is kept; the light is amber, a calibration of them may be refused."
+    assert last.words.startswith("Stopped: 1 pose is kept")
+    assert "amber" in last.words
 
 
 TILTED = [Rotation.from_euler("xyz", angles, degrees=True) for angles in ((45, 0, 0), (0, 45, 0))]
@@ -356,7 +359,7 @@ def test_without_keys_it_ends_by_itself_when_the_poses_are_enough() -> None:
     outcome = Outcome(dwells(*AROUND, *TILTED), has_keys=False)
     assert outcome.stops == [1, 2, 3, 4, 5, 6]
     assert "ends by itself" in outcome.person.words()
-    assert "These poses are enough: 6 poses are kept." in outcome.person.words()
+    assert "6 poses are kept." in outcome.person.words()
     assert "press" not in outcome.person.words()
 
 
@@ -376,7 +379,7 @@ def test_a_run_that_is_continued_without_keys_takes_one_pose_more() -> None:
     first = Outcome(dwells(*AROUND), has_keys=False)
     outcome = Outcome(dwells(*TILTED), earlier=first.kept, has_keys=False)
     assert outcome.stops == [7]
-    assert "it ends with the next one" in outcome.person.words()
+    assert "ends with the next" in outcome.person.words()
 
 
 def test_redo_replaces_the_newest_pose_where_the_arm_stands_or_goes() -> None:
@@ -472,8 +475,8 @@ def test_a_hand_on_the_tool_is_named_and_the_pose_taken_again() -> None:
     assert outcome.stops == [1, 2, 3]
     assert all(record.steady for record in outcome.kept)
     words = outcome.person.words()
-    assert re.search(r"Pose 2 is not quiet: fy scatters by 1\.\d N, at its quietest by 0\.0[45]", words)
-    assert "Let go of tool and cable." in words
+    assert re.search(r"fy scatters by 1\.\d N, .* 0\.0[45]", words)
+    assert "Let go of" in words
     assert [event.attempts for event in outcome.person.told if isinstance(event, PoseTaken)] == [1, 2, 1]
     assert np.abs(outcome.kept[1].mean.mean[1] - BIAS[1]) < 0.05  # without the hand
 
@@ -481,12 +484,12 @@ def test_a_hand_on_the_tool_is_named_and_the_pose_taken_again() -> None:
 def test_a_pose_that_is_never_quiet_is_kept_and_marked() -> None:
     outcome = Outcome([Dwell(UP), Dwell(DOWN, 15.0, wrench=lambda t: trembling(t - 100)), Dwell(LEFT)])
     assert [record.steady for record in outcome.kept] == [True, False, True]
-    assert "It is kept and marked; press r to take it again." in outcome.person.words()
+    assert "press r to take" in outcome.person.words()
 
 
 def test_a_mean_that_changes_is_seen_at_the_first_pose_too() -> None:
     outcome = Outcome([Dwell(UP, 30.0, wrench=lambda t: np.outer(np.minimum(t, 5.0), np.full(6, 0.2)))])
-    assert "Pose 1 is not quiet: its mean still changes." in outcome.person.words()
+    assert "its mean still changes" in outcome.person.words()
     assert outcome.kept[-1].steady
 
 
@@ -495,7 +498,7 @@ def test_a_mean_that_changes_is_seen_at_the_first_pose_too() -> None:
 )
 def test_a_pose_that_the_others_contradict_is_asked_about(residual: tuple[float, float] | None, asked: bool) -> None:
     words = Outcome(dwells(*AROUND), fit=Fit(residual=residual)).person.words()
-    assert ("Pose 6 is 3.2 N from what the others tell" in words) == asked
+    assert ("Pose 6 is 3.2 N" in words) == asked
     assert "Pose 5 is" not in words  # too few to tell
 
 
@@ -505,7 +508,7 @@ def test_nothing_is_measured_while_the_controller_reports_a_fault() -> None:
 
     outcome = Outcome(dwells(UP, DOWN, LEFT), says=says)
     assert [r.before.R_base_flange[2, 2].round(3) for r in outcome.kept] == [1.0, 0.0]
-    assert outcome.person.words().count("Nothing is measured: protective stop; clear it at the pendant.") == 1
+    assert outcome.person.words().count("Nothing is measured: protective stop") == 1
 
 
 def test_a_run_is_continued_where_it_was() -> None:
@@ -529,8 +532,8 @@ def test_listening_ends_when_the_program_is_back_at_its_first_pose() -> None:
     assert drift.elapsed_s == pytest.approx(6 * (4.0 + MOVE_S), abs=0.5)
     assert len(dataset_from(outcome.kept, {})) == 6
     words = outcome.person.words()
-    assert "let it dwell 3.3 s at each pose" in words
-    assert "The program is back at its first pose: 7 poses are kept." in words
+    assert "dwell 3.3 s" in words
+    assert "first pose: 7 poses" in words
     assert not any(hint in words for hint in ("press k", "Turn the tool"))
     assert {event.hint for event in outcome.person.told if isinstance(event, Estimated)} == {""}
 
@@ -544,7 +547,7 @@ def test_a_program_that_passes_its_first_pose_is_followed_to_its_end() -> None:
     )
     assert outcome.stops == [1, 2, 3, 4, 5, 6, 7]
     assert [record.pose.number for record in outcome.kept] == [1, 2, 3, 4, 5, 6, 7]
-    assert "The program has ended: 7 poses are kept." in outcome.person.words()
+    assert "ended: 7 poses" in outcome.person.words()
 
 
 def test_only_standstills_of_the_running_program_count_and_the_last_though_it_has_ended() -> None:
@@ -561,7 +564,9 @@ def test_only_standstills_of_the_running_program_count_and_the_last_though_it_ha
 def test_a_program_that_ends_where_it_has_been_ends_it() -> None:
     outcome = Outcome(dwells(UP, DOWN, UP), listen=True, says=lambda t: status("playing" if t < 10 else "stopped"))
     assert outcome.stops == [1, 2]
-    assert "This is pose 1 again, 0° from it: it is left out.\nThe program has ended" in outcome.person.words()
+    *_, left_out, ended = outcome.person.words().splitlines()
+    assert "pose 1 again, 0°" in left_out
+    assert ended.startswith("The program has ended")
     assert outcome.cell.now_s < 13
 
 
