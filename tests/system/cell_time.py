@@ -22,8 +22,8 @@ def keep_time_of(path: str, put: Callable[[object, str, object], None] = setattr
 
     def keeping(read: Callable[..., config.CellConfig]) -> Callable[..., config.CellConfig]:
         @wraps(read)
-        def cell(*arguments: Any) -> config.CellConfig:
-            return replace(read(*arguments), clock=clock)
+        def cell(*arguments: Any, **options: Any) -> config.CellConfig:
+            return replace(read(*arguments, **options), clock=clock)
 
         return cell
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -136,3 +137,13 @@ def end_of(process: subprocess.Popen[str], typed: str = "") -> tuple[int, str]:
     """Return the exit code and what was printed for people since."""
     _, said = process.communicate(typed or None, timeout=_LONG_S)
     return process.returncode, said
+
+
+def assert_demo_found_the_truth(demo: dict[str, Any]) -> None:
+    """Each parameter within its sigmas, the compensation within its prediction."""
+    assert demo["schema_version"] == 1
+    for key, errors in demo["error_in_sigma"].items():
+        assert np.abs(errors).max() < 4, (key, errors)
+    for key, error in demo["compensation_error"].items():
+        assert error < 3 * demo["result"]["predicted_error"][key]
+    assert demo["result"]["verdict"] == "good"

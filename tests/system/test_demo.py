@@ -6,16 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.system.command_line import CommandLine
-
-
-def assert_demo_found_the_truth(demo: dict[str, Any]) -> None:
-    assert demo["schema_version"] == 1
-    for key, errors in demo["error_in_sigma"].items():
-        assert np.abs(errors).max() < 4, (key, errors)
-    for key, error in demo["compensation_error"].items():
-        assert error < 3 * demo["result"]["predicted_error"][key]
-    assert demo["result"]["verdict"] == "good"
+from tests.system.command_line import CommandLine, assert_demo_found_the_truth
 
 
 def test_demo_recovers_the_truth(demo: dict[str, Any]) -> None:

@@ -103,10 +103,10 @@ slow = partial(pytest.param, marks=pytest.mark.slow)
     [
         ("5.4.0", None, "model", 'model = "ur5e" under [robot]'),
         ("10.7.0", None, "PolyScope X", "PolyScope 5"),
-        slow("5.15.0", {"do": "silent", "what": "dashboard"}, "did not answer", "enable the dashboard server"),
+        slow("5.15.0", {"do": "silent", "what": "dashboard"}, "dashboard", "enable the dashboard server"),
         slow("5.15.0", {"do": "listen", "what": "dashboard", "on": False}, "dashboard", "enable the dashboard server"),
         slow("5.15.0", {"do": "listen", "what": "rtde", "on": False}, "refused", "enable RTDE"),
-        ("5.15.0", {"do": "silent", "what": "rtde"}, "did not answer", "finished starting"),
+        slow("5.15.0", {"do": "silent", "what": "rtde"}, "did not answer", "finished starting"),
     ],
     ids=["no model", "PolyScope X", "silent dashboard", "no dashboard", "no RTDE", "silent RTDE"],
 )

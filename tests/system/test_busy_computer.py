@@ -1,0 +1,72 @@
+"""A computer that is busy or stalls makes an emulated cell slow, never wrong."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.system.command_line import CommandLine, assert_demo_found_the_truth
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+LOOPS = 2
+STALL_S = 2.0
+
+
+@contextmanager
+def busy_loops() -> Iterator[None]:
+    """Take all the computing time there is on two cores."""
+    loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(LOOPS)]
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait()
+
+
+def station_of(program: int) -> int:
+    """Find the process of the emulated cell, which the program has started."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = (folder / "stat").read_text().rpartition(")")[2].split()[1]
+            arguments = (folder / "cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue  # ended meanwhile
+        if int(parent) == program and b"mocks" in arguments:
+            return int(folder.name)
+    raise AssertionError("no station was started")
+
+
+def test_a_demo_beside_two_busy_loops_ends_good(ftdrive: CommandLine) -> None:
+    with busy_loops():
+        process = ftdrive.start("demo", "--json")
+        out, err = process.communicate()
+    assert process.returncode == 0, err
+    assert_demo_found_the_truth(json.loads(out))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for the station in /proc")
+@pytest.mark.parametrize("stopped", [("program", "station"), ("program",), ("station",)], ids=" and ".join)
+def test_a_demo_that_is_stopped_for_two_seconds_in_mid_tour_ends_good(
+    stopped: tuple[str, ...], ftdrive: CommandLine
+) -> None:
+    process = ftdrive.start("demo", "--json")
+    ftdrive.wait_for_poses(process, 5)
+    pids = {"program": process.pid, "station": station_of(process.pid)}
+    for name in stopped:
+        os.kill(pids[name], signal.SIGSTOP)
+    time.sleep(STALL_S)
+    assert len(ftdrive.poses()) < 24, "the tour had ended before"
+    for name in reversed(stopped):
+        os.kill(pids[name], signal.SIGCONT)
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    assert_demo_found_the_truth(json.loads(out))
