@@ -343,13 +343,15 @@ class UrArm(RobotArm):
         return bool(ended)
 
     def _check_arrival(self, look: Sample, q: list[float]) -> None:
-        # The end may be told by one connection a cycle before the set-points come by the other.
-        end = look if _near(look.target_q_rad, q) else self._reading().look()
-        if not _near(end.target_q_rad, q):
-            raise self._fault() or DeviceFault(
-                f"the move ended at {_degrees(end.target_q_rad)} instead of {_degrees(q)}",
-                "see the pendant for what ended it",
-            )
+        # The control process may report the end before the last set-points come by the other connection.
+        deadline_s = self._clock.now_s() + self._timing.reason_s
+        while not _near(look.target_q_rad, q):
+            if self._clock.now_s() > deadline_s:
+                raise self._fault() or DeviceFault(
+                    f"the move ended at {_degrees(look.target_q_rad)} instead of {_degrees(q)}",
+                    "see the pendant for what ended it",
+                )
+            look = self._reading().look()
 
     def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
         """Return when the joints have been at rest long enough for the structure to stop ringing.
