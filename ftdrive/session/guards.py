@@ -79,7 +79,7 @@ class Limits:
 
     @classmethod
     def emulated(cls) -> Self:
-        """Limits of an emulated cell: its clock leads each who follows it by 10 ms, and waits for no control process."""
+        """Limits of an emulated cell, whose clock leads each follower by 10 ms and waits for no control process."""
         return cls(link_usual_s=0.05, stalled_s=60.0)
 
 
