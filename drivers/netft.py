@@ -2,7 +2,7 @@
 
 Ref: ATI, "Net F/T User Manual" 9620-05-Net FT, and "Ethernet Axia" 9610-05-Ethernet Axia: RDT, netftapi2.xml and
 netftcalapi.xml, as in public drivers; OptoForce, "Ethernet Converter" manual, version 2.0.
-Checked on hardware: no. Verified against: tests/unit/test_netft.py and the emulator (tests/wire).
+Checked on hardware: no. Verified against: tests/unit/drivers/test_netft.py and the emulator (tests/wire).
 
 pynetft discovers the scale, keeps the socket drained and says why a stream has ended. It could also set the software
 bias; this driver never does.
@@ -300,9 +300,8 @@ class NetFtSensor(StreamingSensor):
                 client.start()
             except pynetft.NetFTError as exc:
                 raise self._untold(exc) from exc
-            arrived = any(
-                client.wait_for_first_sample(min(s, self._clock.poll_s)) for s in self._clock.looks(_SILENCE_S)
-            )
+            looks = self._clock.looks(_SILENCE_S)
+            arrived = any(client.wait_for_first_sample(min(left_s, self._clock.poll_s)) for left_s in looks)
             self._arrived_ns = self._clock.now_ns()
             health = client.health()
             if health.sensor_configuration is None:

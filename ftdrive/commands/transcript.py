@@ -1,7 +1,6 @@
 """`ftdrive transcript`: the bytes of a sensor's wire into a file, and back to the driver."""
 
 import math
-import time
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -78,15 +77,16 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
             f"{sensor} is neither on a serial port or a CAN bus nor an ati-netft: only these can be recorded; capture "
             "others with Wireshark"
         )
-    device = _sensor(url, sensor_clock(sensor))
+    clock = sensor_clock(sensor)
+    device = _sensor(url, clock)
     header = {
         "url": url,
         "duration_s": duration_s,
         "utc": datetime.now(UTC).isoformat(),
-        "t_ns": time.monotonic_ns(),  # of the same moment as `utc`: the anchor of all lines
+        "t_ns": clock.now_ns(),  # of the same moment as `utc`: the anchor of all lines
         "versions": versions(),
     }
-    writer = Writer(path, header)
+    writer = Writer(path, header, clock)
     seen: dict[str, Any] = {"error": INTERRUPTED}
     try:
         with recording(writer), device:

@@ -79,8 +79,8 @@ class Limits:
 
     @classmethod
     def emulated(cls) -> Self:
-        """Limits of an emulated cell: the same, but that its clock leads those who follow it by 10 ms each."""
-        return cls(link_usual_s=0.05)
+        """Limits of an emulated cell, whose clock leads each follower by 10 ms and waits for no control process."""
+        return cls(link_usual_s=0.05, stalled_s=60.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

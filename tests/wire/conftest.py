@@ -19,6 +19,7 @@ from drivers.registry import sensor_from_url
 from drivers.ur.arm import UrArm
 from drivers.ur.timing import UrTiming
 from ftdrive.emulated_clock import EmulatedClock
+from mocks.clock import CellClock
 from tests.wire.station_process import StationProcess
 
 TIME_SCALE = 10
@@ -181,6 +182,33 @@ KINDS = {
         Kind("ati-netft", "", (1e-6, 1e-6), 1000, 6, "FT12345", {"rdt_port": 0, "rate_hz": 1000}),
     )
 }
+
+
+class CellTime:
+    """Time of an emulated cell that lives in this process."""
+
+    def __init__(self) -> None:
+        self.of_devices = CellClock()
+        self.of_drivers = EmulatedClock(self.of_devices.path)
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._tick)
+        self._thread.start()
+
+    def _tick(self) -> None:
+        while not self._ended.wait(0.001):
+            self.of_devices.now_ns()
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join()
+        self.of_devices.close()
+
+
+@pytest.fixture
+def cell_time() -> Iterator[CellTime]:
+    """The clocks of emulated sensors and of their drivers, where both are in the test's process."""
+    with closing(CellTime()) as cell_time:
+        yield cell_time
 
 
 class Laboratory:

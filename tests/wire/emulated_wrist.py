@@ -105,7 +105,7 @@ class EmulatedWrist:
                     else:
                         cut = self._rng.randrange(len(data) + 1)
                         late += [(self._clock.now_s() + self.faults.delay_s, part) for part in (data[:cut], data[cut:])]
-                self._clock.now_ns()
+                self._clock.follow()
                 while late and late[0][0] <= self._clock.now_s() and not self.faults.stall:
                     client.sendall(late.popleft()[1])
             client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)

@@ -34,11 +34,13 @@ def measure(n: int) -> Any:
         (AtiCanNode, {}, None, None),  # behind an slcan adapter: not a question for a serial port
     ],
 )
-def test_a_sensor_shows_itself(kind: Any, options: dict[str, Any], scheme: str | None, what: str | None) -> None:
-    device = kind(measure, seed=1, **options)
+def test_a_sensor_shows_itself(
+    kind: Any, options: dict[str, Any], scheme: str | None, what: str | None, cell_time: Any
+) -> None:
+    device = kind(measure, seed=1, clock=cell_time.of_devices, **options)
     try:
         port = device.start()
-        answer = probe(port)
+        answer = probe(port, cell_time.of_drivers)
     finally:
         device.stop()
     if scheme is None or what is None:
@@ -50,15 +52,15 @@ def test_a_sensor_shows_itself(kind: Any, options: dict[str, Any], scheme: str |
         assert what in answer.what
 
 
-def test_the_address_of_a_port_with_a_strange_name_works(tmp_path: Path) -> None:
+def test_the_address_of_a_port_with_a_strange_name_works(tmp_path: Path, cell_time: Any) -> None:
     port, rng = tmp_path / "my port #1?50%20", np.random.default_rng(1)
-    box = BotaBox(lambda n: rng.normal(size=(n, 6)), seed=1)
+    box = BotaBox(lambda n: rng.normal(size=(n, 6)), seed=1, clock=cell_time.of_devices)
     try:
         port.symlink_to(box.start())
-        answer = probe(str(port))
+        answer = probe(str(port), cell_time.of_drivers)
         assert answer is not None
         assert answer.url is not None
-        with sensor_from_url(answer.url) as sensor:
+        with sensor_from_url(answer.url, clock=cell_time.of_drivers) as sensor:
             assert len(sensor.collect(0.2).seq)
     finally:
         box.stop()
@@ -67,7 +69,7 @@ def test_the_address_of_a_port_with_a_strange_name_works(tmp_path: Path) -> None
 def test_a_silent_port_is_asked_by_readings_only(monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[bytes | None] = []
 
-    def hear(_port: str, _known: Any, request: bytes | None, _duration_s: float) -> bytes:
+    def hear(_port: str, _known: Any, request: bytes | None, _duration_s: float, _clock: Any) -> bytes:
         heard.append(request)
         return b""
 

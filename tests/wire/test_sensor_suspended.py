@@ -56,6 +56,8 @@ sys.stdin.readline()
 tell(what="health", stale=sensor.health().stale, events=sensor.health().events)
 sensor.close()
 """
+pytestmark = pytest.mark.realtime
+
 BEFORE_PUSH_S, AFTER_PUSH_S = 1.2, 0.4
 """Each more than may count as new; together eight times a collection, and more than a port holds of most streams."""
 

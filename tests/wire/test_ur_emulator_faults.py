@@ -7,7 +7,6 @@ that the emulator is faithful.
 import contextlib
 import json
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -21,82 +20,27 @@ from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.wire.station_process import StationProcess
+from tests.wire.waiting import LIMIT_S
+
 CLIENT = Path(__file__).with_name("ur_emulator_faults_client.py")
-AT_ONCE = 4  # stations and clients side by side: they mostly wait
+AT_ONCE = 2  # stations and clients side by side: they mostly wait
 FAST = ("--time-scale", "20")
-
-
-class Station:
-    """A station process that can be killed and started again on the same address."""
-
-    def __init__(self, *options: str) -> None:
-        self._options = options
-        self.host = ""
-        self.start()
-
-    def start(self) -> None:
-        host = ("--host", self.host) if self.host else ()
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "mocks", "station", "--sensor", "none", *self._options, *host],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=ROOT,
-        )
-        self.host = self._answer()["arm"]["host"]
-
-    def _answer(self) -> dict[str, Any]:
-        assert self.process.stdout is not None
-        answer: dict[str, Any] = json.loads(self.process.stdout.readline())
-        return answer
-
-    def ask(self, **request: Any) -> dict[str, Any]:
-        assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps(request) + "\n")
-        self.process.stdin.flush()
-        answer = self._answer()
-        assert "error" not in answer, answer
-        return answer
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.communicate()
-
-    def wait_for(self, condition: Callable[[dict[str, Any]], bool], timeout_s: float = 5.0) -> dict[str, Any]:
-        end = time.monotonic() + timeout_s
-        while not condition(state := self.ask(do="state")):
-            assert time.monotonic() < end, state
-            time.sleep(0.01)
-        return state
-
-    def events(self, what: str) -> list[dict[str, Any]]:
-        return [event for event in self.ask(do="state")["events"] if event["what"] == what]
-
-    def connect(self, port: int) -> socket.socket:
-        return socket.create_connection((self.host, port), 2.0)
+HANGS_S = 1.5
 
 
 @pytest.fixture
-def start() -> Iterator[Callable[..., Station]]:
+def start() -> Iterator[Callable[..., StationProcess]]:
     """Start stations that end with the test."""
-    stations: list[Station] = []
-
-    def new(*options: str) -> Station:
-        stations.append(Station(*options))
-        return stations[-1]
-
-    yield new
-    for station in stations:
-        station.kill()
+    with contextlib.ExitStack() as stack:
+        yield lambda *options: stack.enter_context(StationProcess(*options))
 
 
 @pytest.fixture(scope="module")
-def station() -> Iterator[Station]:
+def station() -> Iterator[StationProcess]:
     """One for all tests that leave it as they found it."""
-    shared = Station()
-    yield shared
-    shared.kill()
+    with StationProcess() as shared:
+        yield shared
 
 
 @dataclass
@@ -108,8 +52,11 @@ class Played:
     talk: str = ""
 
 
-def play(scenario: str, station: Station, limit_s: float = 20.0) -> Played:
-    """Run a scenario of ur_emulator_faults_client.py in its own process and do what it asks for."""
+def play(scenario: str, station: StationProcess, *, hangs: bool = False) -> Played:
+    """Run a scenario of ur_emulator_faults_client.py in its own process and do what it asks for.
+
+    It is killed when it takes far too long, or when it `hangs` after the fact that it has begun.
+    """
     pytest.importorskip("rtde_control")
     client = subprocess.Popen(
         [sys.executable, str(CLIENT), scenario, station.host],
@@ -127,13 +74,17 @@ def play(scenario: str, station: Station, limit_s: float = 20.0) -> Played:
         late.set()
         client.kill()
 
-    alarm = threading.Timer(limit_s, end)
+    alarm = threading.Timer(3 * LIMIT_S, end)
     alarm.start()
     played = Played()
     try:
         for line in client.stdout:
             if line.startswith("@fact "):
                 played.facts |= json.loads(line[6:])
+                if hangs and played.facts == {"begun": True}:
+                    alarm.cancel()
+                    alarm = threading.Timer(HANGS_S, end)
+                    alarm.start()
             elif line.startswith("@ask "):
                 answer = _serve(station, json.loads(line[5:]))
                 with contextlib.suppress(BrokenPipeError):
@@ -150,11 +101,11 @@ def play(scenario: str, station: Station, limit_s: float = 20.0) -> Played:
             with contextlib.suppress(BrokenPipeError):
                 pipe.close()
     if station.process.poll() is None:
-        assert station.ask(do="state")["bad_inputs"] == []
+        assert station.ask("state")["bad_inputs"] == []
     return played
 
 
-def _serve(station: Station, request: dict[str, Any]) -> dict[str, Any]:
+def _serve(station: StationProcess, request: dict[str, Any]) -> dict[str, Any]:
     if request["do"] == "kill":
         station.kill()
     elif request["do"] == "restart":
@@ -164,7 +115,7 @@ def _serve(station: Station, request: dict[str, Any]) -> dict[str, Any]:
     return {}
 
 
-def play_all(start: Callable[..., Station], *scenarios: str) -> dict[str, Played]:
+def play_all(start: Callable[..., StationProcess], *scenarios: str) -> dict[str, Played]:
     """Several scenarios side by side, each with a station of its own."""
     with ThreadPoolExecutor(AT_ONCE) as pool:
         return dict(zip(scenarios, pool.map(lambda name: play(name, start()), scenarios), strict=True))
@@ -174,14 +125,14 @@ def play_all(start: Callable[..., Station], *scenarios: str) -> dict[str, Played
 
 
 @pytest.mark.parametrize(("what", "ports"), [("rtde", [30004]), ("dashboard", [29999]), ("script", [30002, 30003])])
-def test_ports_close_and_open_one_by_one(station: Station, what: str, ports: list[int]) -> None:
-    known = len(station.ask(do="state")["events"])
+def test_ports_close_and_open_one_by_one(station: StationProcess, what: str, ports: list[int]) -> None:
+    known = len(station.ask("state")["events"])
     with station.connect(ports[0]) as before:
         station.wait_for(
             lambda state: any((e["by"], e["what"]) == (what, "connected") for e in state["events"][known:])
         )
-        station.ask(do="listen", what=what, on=False)
-        station.ask(do="listen", what=what, on=False)
+        station.ask("listen", what=what, on=False)
+        station.ask("listen", what=what, on=False)
         for port in (29999, 30002, 30003, 30004):
             if port in ports:
                 with pytest.raises(ConnectionRefusedError):
@@ -192,81 +143,84 @@ def test_ports_close_and_open_one_by_one(station: Station, what: str, ports: lis
         if what != "dashboard":
             with pytest.raises(TimeoutError):
                 before.recv(1)  # still connected, nothing to say
-        station.ask(do="listen", what=what, on=True)
+        station.ask("listen", what=what, on=True)
         for port in ports:
             station.connect(port).close()
 
 
-def test_a_silent_dashboard_accepts_and_answers_later(station: Station) -> None:
+def test_a_silent_dashboard_accepts_and_answers_later(station: StationProcess) -> None:
     with station.connect(29999) as old:
         assert old.makefile("rb").readline().startswith(b"Connected")
-        station.ask(do="silent", what="dashboard", on=True)
+        station.ask("silent", what="dashboard", on=True)
         old.sendall(b"robotmode\n")
         with station.connect(29999) as new:
             for client in (old, new):
                 client.settimeout(0.05)
                 with pytest.raises(TimeoutError):
                     client.recv(1)
-            station.ask(do="silent", what="dashboard", on=False)
+            station.ask("silent", what="dashboard", on=False)
             for client, line in (
                 (old, b"Robotmode: RUNNING\n"),
                 (new, b"Connected: Universal Robots Dashboard Server\n"),
             ):
-                client.settimeout(2.0)
+                client.settimeout(LIMIT_S)
                 assert client.recv(100) == line
 
 
 @pytest.mark.parametrize("answers", [True, False])
-def test_silent_rtde_stops_streaming_and_answers_only_if_asked_to(station: Station, answers: bool) -> None:
+def test_silent_rtde_stops_streaming_and_answers_only_if_asked_to(station: StationProcess, answers: bool) -> None:
     with station.connect(30004) as client:
         client.sendall(struct.pack(">HB", 20, ord("O")) + struct.pack(">d", 500.0) + b"timestamp"[:9])
         assert client.recv(100)[2:4] == b"O\x01"
         client.sendall(b"\x00\x03S")
         assert client.recv(4) == b"\x00\x04S\x01"
         assert client.recv(100)[2:3] == b"U"
-        station.ask(do="silent", what="rtde", on=True, answers=answers)
+        station.ask("silent", what="rtde", on=True, answers=answers)
         client.settimeout(0.1)
         with contextlib.suppress(TimeoutError):
             while client.recv(1000):
                 pass  # what was on its way
         client.sendall(b"\x00\x03v")
         if answers:
+            client.settimeout(LIMIT_S)
             assert client.recv(100)[2:3] == b"v"
+            client.settimeout(0.1)
         with pytest.raises(TimeoutError):
             client.recv(100)
-        station.ask(do="silent", what="rtde", on=False)
-        client.settimeout(2.0)
+        station.ask("silent", what="rtde", on=False)
+        client.settimeout(LIMIT_S)
         assert client.recv(100)[2:3] == (b"U" if answers else b"v")
 
 
-def test_connections_come_and_go_in_the_diary(start: Callable[..., Station]) -> None:
+def test_connections_come_and_go_in_the_diary(start: Callable[..., StationProcess]) -> None:
     station = start()
     with station.connect(30004) as client:
         station.wait_for(lambda state: [e["what"] for e in state["events"]] == ["connected"])
-        before = time.monotonic_ns()
-        assert station.ask(do="drop", what="rtde", reset=True)["connections"] == 1
+        before_ns = station.ask("state")["t_host_ns"]
+        assert station.ask("drop", what="rtde", reset=True)["connections"] == 1
         with pytest.raises(ConnectionResetError):
             client.recv(1)
-    drop, gone = station.ask(do="state", since=1)["events"]
+    drop, gone = (state := station.ask("state", since=1))["events"]
     assert (drop["by"], drop["what"], drop["reset"]) == ("network", "drop rtde", True)
     assert (gone["by"], gone["what"]) == ("rtde", "disconnected")
-    assert before < drop["t_host_ns"] <= gone["t_host_ns"] < time.monotonic_ns()
+    assert before_ns <= drop["t_host_ns"] <= gone["t_host_ns"] <= state["t_host_ns"]
 
 
-def test_any_mode_can_be_asked_for(start: Callable[..., Station]) -> None:
+def test_any_mode_can_be_asked_for(start: Callable[..., StationProcess]) -> None:
     station = start()
     for number, name in ((2, "REDUCED"), (4, "RECOVERY"), (5, "SAFEGUARD_STOP"), (1, "NORMAL"), (3, "PROTECTIVE_STOP")):
-        assert station.ask(do="mode", safety=number)["safety_mode"] == name
-        assert station.ask(do="state")["robot_mode"] == "RUNNING"
-    assert station.ask(do="mode", safety=9) == {"done": "mode", "robot_mode": "POWER_OFF", "safety_mode": "FAULT"}
+        assert station.ask("mode", safety=number)["safety_mode"] == name
+        assert station.ask("state")["robot_mode"] == "RUNNING"
+    assert station.ask("mode", safety=9) == {"done": "mode", "robot_mode": "POWER_OFF", "safety_mode": "FAULT"}
     for number, name in ((-1, "NO_CONTROLLER"), (5, "IDLE"), (7, "RUNNING")):
-        assert station.ask(do="mode", robot=number)["robot_mode"] == name
+        assert station.ask("mode", robot=number)["robot_mode"] == name
 
 
 # -- the unmodified ur_rtde: the link ---------------------------------------------------------------------------------
 
 
-def test_the_server_goes_away(start: Callable[..., Station]) -> None:
+@pytest.mark.slow
+def test_the_server_goes_away(start: Callable[..., StationProcess]) -> None:
     played = play_all(start, "killed", "killed_moving", "command_after_loss")
     assert played["killed"].facts == {
         "receive_lost": True,
@@ -280,30 +234,38 @@ def test_the_server_goes_away(start: Callable[..., Station]) -> None:
     assert played["killed_moving"].facts == {
         "moving": True,
         "receive_lost": True,
-        "returns_after_the_kill": False,
-        "returns_after_the_restart": False,
+        "hangs_after_the_kill": True,
+        "hangs_after_the_restart": True,
     }
     assert played["command_after_loss"].facts == {"connected": False, "hangs": True}
 
 
-def test_the_link_is_cut(start: Callable[..., Station]) -> None:
-    stations = {name: start() for name in ("dropped_moving", "dropped_idle", "dropped_without_dashboard")}
-    with ThreadPoolExecutor(AT_ONCE) as pool:
-        played = {name: pool.submit(play, name, station) for name, station in stations.items()}
-    moving = played["dropped_moving"].result().facts
-    assert moving.pop("after_s") < 1.0
-    # it polls for the loss once per millisecond: on a busy machine the reconnection is faster, and the call hangs
-    assert (moving.pop("ended"), moving.pop("returned")) in ((True, False), (False, None))
-    assert moving == {"moving": True, "lost": True, "robot_finishes": True}
-    idle = played["dropped_idle"].result()
-    assert idle.facts["lost"]
-    crashed = idle.ended == -signal.SIGSEGV
-    assert crashed or idle.facts["survived"]
-    assert crashed or len(stations["dropped_idle"].events("program rtde_control")) >= 3  # uploads again and again
-    assert played["dropped_without_dashboard"].result().facts == {"lost": True, "back": True, "moves": True}
+@pytest.mark.slow
+def test_the_link_is_cut(start: Callable[..., StationProcess]) -> None:
+    played = play_all(start, "dropped_moving", "dropped_without_dashboard")
+    assert played["dropped_moving"].facts == {"moving": True, "lost": True, "robot_finishes": True, "hangs": True}
+    assert played["dropped_without_dashboard"].facts == {"lost": True, "back": True, "moves": True}
 
 
-def test_the_samples_stay_away(start: Callable[..., Station]) -> None:
+@pytest.mark.slow
+def test_the_samples_stay_away(start: Callable[..., StationProcess]) -> None:
+    played = play_all(start, "frozen", "silent")
+    silent, frozen = played["silent"].facts, played["frozen"].facts
+    silent.pop("after_s"), frozen.pop("after_s")
+    assert silent == {
+        "moving": True,
+        "ended": True,
+        "returned": False,
+        "receive_lost": True,
+        "control_says_connected": True,
+        "program_runs": False,
+    }
+    assert frozen == {"moving": True, "receive_lost": True, "hangs": True, "receive_back": True}
+
+
+@pytest.mark.realtime
+def test_the_samples_stay_away_for_two_and_a_half_seconds(start: Callable[..., StationProcess]) -> None:
+    """The limit is ur_rtde's own."""
     played = play_all(start, "frozen", "silent", "briefly_silent")
     assert played["briefly_silent"].facts == {
         "moving": True,
@@ -312,29 +274,15 @@ def test_the_samples_stay_away(start: Callable[..., Station]) -> None:
         "ended": True,
         "returned": True,
     }
-    silent = played["silent"]
-    assert 2.4 < silent.facts.pop("after_s") < 3.5
-    assert silent.facts.pop("survived", True)  # or the client has crashed
-    assert silent.ended in (0, -signal.SIGSEGV)
-    expected = {
-        "moving": True,
-        "ended": True,
-        "returned": False,
-        "receive_lost": True,
-        "control_says_connected": True,
-        "program_runs": False,
-        "receive_back": True,
-    }
-    assert {name: silent.facts.get(name, expected["receive_back"]) for name in expected} == expected
-    frozen = played["frozen"].facts
-    assert 2.4 < frozen.pop("after_s") < 3.5
-    assert frozen == {"moving": True, "receive_lost": True, "returns": False, "receive_back": True}
+    assert 2.4 < played["silent"].facts["after_s"] < 3.5
+    assert 2.4 < played["frozen"].facts["after_s"] < 3.5
 
 
 # -- the unmodified ur_rtde: program, safety, power -------------------------------------------------------------------
 
 
-def test_whatever_ends_or_holds_the_program_ends_the_blocking_move(start: Callable[..., Station]) -> None:
+@pytest.mark.slow
+def test_whatever_ends_or_holds_the_program_ends_the_blocking_move(start: Callable[..., StationProcess]) -> None:
     station = start(*FAST)
     facts = play("broken_program", station).facts
     assert facts.pop("moving")
@@ -350,7 +298,6 @@ def test_whatever_ends_or_holds_the_program_ends_the_blocking_move(start: Callab
     assert list(facts) == list(states)
     for verb, fact in facts.items():
         assert [fact["ended"], fact["returned"]] == [True, False], verb
-        assert fact["after_s"] < 1.0, verb
         assert fact["state"] == states[verb], verb
         assert fact["next"] == [False, False, "getTCPOffset() function did not succeed!"], verb
     assert station.events("play") == []
@@ -358,7 +305,8 @@ def test_whatever_ends_or_holds_the_program_ends_the_blocking_move(start: Callab
     assert {e["by"] for e in station.events("stop")} == {"dashboard", "another dashboard client"}
 
 
-def test_a_foreign_program_ends_the_move_and_then_looks_like_ours(station: Station) -> None:
+@pytest.mark.slow
+def test_a_foreign_program_ends_the_move_and_then_looks_like_ours(station: StationProcess) -> None:
     facts = play("foreign_program", station).facts
     assert facts == {
         "moving": True,
@@ -366,19 +314,21 @@ def test_a_foreign_program_ends_the_move_and_then_looks_like_ours(station: Stati
         "returned": False,
         "seems_to_run": True,
         "stands": True,
-        "answered": False,
+        "hangs": True,
         "moves": False,
     }
     assert [e["accepted"] for e in station.events("command 1")][-2:] == [True, False]
-    station.ask(do="dashboard-stop")
+    station.ask("dashboard-stop")
 
 
-def test_a_stop_waits_for_a_blocking_move(station: Station) -> None:
+@pytest.mark.slow
+def test_a_stop_waits_for_a_blocking_move(station: StationProcess) -> None:
     played = play("stop_of_a_blocking_move", station)
     assert played.facts == {"moving": True, "arrived": True, "ended": True}
 
 
-def test_a_protective_stop_leaves_the_operation_running(start: Callable[..., Station]) -> None:
+@pytest.mark.slow
+def test_a_protective_stop_leaves_the_operation_running(start: Callable[..., StationProcess]) -> None:
     played = play("protective_stop_of_an_async_move", start(*FAST))
     assert played.facts == {"still_running": True, "stands_after_unlock": True, "play": True, "goes_on": True}
 
@@ -386,14 +336,18 @@ def test_a_protective_stop_leaves_the_operation_running(start: Callable[..., Sta
 # -- the unmodified ur_rtde: who has the arm --------------------------------------------------------------------------
 
 
-def test_registers_of_a_fieldbus(start: Callable[..., Station]) -> None:
+@pytest.mark.slow
+def test_registers_of_a_fieldbus(start: Callable[..., StationProcess]) -> None:
     facts = play("registers", start()).facts
     for name in ("lower", "io", "upper"):
         assert "already in use" in facts.pop(name), name
     assert facts == {"upper_works": True, "free": None}
 
 
-def test_a_robot_whose_client_died_finishes_its_move_and_keeps_the_program(start: Callable[..., Station]) -> None:
+@pytest.mark.slow
+def test_a_robot_whose_client_died_finishes_its_move(
+    start: Callable[..., StationProcess],
+) -> None:
     station = start(*FAST)
     played = play("die_in_async_move", station)
     assert played.ended == -signal.SIGKILL
@@ -402,37 +356,40 @@ def test_a_robot_whose_client_died_finishes_its_move_and_keeps_the_program(start
     assert (state["runtime_state"], state["program"]) == ("PLAYING", "rtde_control")
 
 
-def test_a_watchdog_stops_the_arm_of_a_dead_client(start: Callable[..., Station]) -> None:
+@pytest.mark.slow
+def test_a_watchdog_stops_the_arm_of_a_dead_client(start: Callable[..., StationProcess]) -> None:
     station = start()
-    played = play("die_under_watchdog", station)
+    assert play("die_under_watchdog", station).facts == {"died": True}
     station.wait_for(lambda state: state["runtime_state"] == "STOPPED" and not state["moving"])
     (stopped,) = station.events("stopped rtde_control")
     assert "watchdog" in stopped["why"]
-    assert 0.1 < (stopped["t_host_ns"] - played.facts["died_ns"]) * 1e-9 < 1.0
     assert station.events("stands")[-1]["t_host_ns"] > stopped["t_host_ns"]
 
 
-def test_a_new_client_ends_an_asynchronous_move_at_once(start: Callable[..., Station]) -> None:
+@pytest.mark.slow
+def test_a_new_client_ends_an_asynchronous_move_at_once(start: Callable[..., StationProcess]) -> None:
     station = start()
     goal = play("die_in_async_move", station).facts["goal"]
-    facts = play("constructor", station).facts
-    assert facts["error"] is None
-    assert facts["seconds"] < 1.0
-    assert station.ask(do="state")["q_rad"][5] < goal[5] - 0.3
+    assert play("constructor", station).facts == {"begun": True, "error": None}
+    assert station.ask("state")["q_rad"][5] < goal[5] - 0.3
 
 
+@pytest.mark.slow
 def test_a_new_client_hangs_behind_a_blocking_move_until_somebody_stops_the_program(
-    start: Callable[..., Station],
+    start: Callable[..., StationProcess],
 ) -> None:
     station = start()
     goal = pytest.approx(play("die_in_blocking_move", station).facts["goal"], abs=1e-3)
+    known = len(station.ask("state")["events"])
     with ThreadPoolExecutor(1) as pool:
         constructor = pool.submit(play, "constructor", station)
+        station.wait_for_event("connected", since=known)
+        assert station.ask("state")["moving"]
         station.wait_for(lambda state: bool(state["q_rad"] == goal))
-        time.sleep(1.0)  # that it does not end has no condition to wait for
+        time.sleep(HANGS_S)  # that it does not end has no condition to wait for
         assert not constructor.done()
-        station.ask(do="dashboard-stop")
-        assert constructor.result().facts["error"] is None
+        station.ask("dashboard-stop")
+        assert constructor.result().facts == {"begun": True, "error": None}
 
 
 CONSTRUCTORS: dict[str, tuple[dict[str, Any], str | None]] = {
@@ -447,35 +404,36 @@ CONSTRUCTORS: dict[str, tuple[dict[str, Any], str | None]] = {
 """What is wrong, and the error; None where the constructor hangs."""
 
 
-def test_constructors(start: Callable[..., Station]) -> None:
+@pytest.mark.slow
+def test_constructors(start: Callable[..., StationProcess]) -> None:
     def construct(name: str) -> Played:
         fault, error = CONSTRUCTORS[name]
         station = start()
         station.ask(**fault)
-        return play("constructor", station, 10.0 if error else 1.5)
+        return play("constructor", station, hangs=error is None)
 
     with ThreadPoolExecutor(AT_ONCE) as pool:
         for (name, (_fault, error)), played in zip(
             CONSTRUCTORS.items(), pool.map(construct, CONSTRUCTORS), strict=True
         ):
             if error is None:
-                assert (played.ended, played.facts) == (None, {}), name
+                assert (played.ended, played.facts) == (None, {"begun": True}), name
             else:
                 assert error in played.facts["error"], name
 
 
 # -- the unmodified ur_rtde: versions and settings --------------------------------------------------------------------
 
-GENERATIONS = ("3.15", "5.4", "5.9", "5.10", "5.15", "5.23", "5.26")
+GENERATIONS = ("3.15", "5.4", "5.10", "5.26")
 
 
-def test_every_generation(start: Callable[..., Station]) -> None:
+@pytest.mark.slow
+def test_every_generation(start: Callable[..., StationProcess]) -> None:
     with ThreadPoolExecutor(AT_ONCE) as pool:
         results = pool.map(lambda version: play("generation", start("--polyscope", version)), GENERATIONS)
         for version, played in zip(GENERATIONS, results, strict=True):
             facts = played.facts
             assert facts.pop("version").startswith(version)
-            assert facts.pop("period_s") == pytest.approx(0.008 if version == "3.15" else 0.002), version
             model = facts.pop("model")
             assert ("could not understand" in model) if version == "5.4" else (model == "UR5"), version
             assert (facts.pop("serial") is None) == (version not in ("3.15", "5.4"))
@@ -484,12 +442,13 @@ def test_every_generation(start: Callable[..., Station]) -> None:
             assert len(facts) == 10, version
 
 
-def test_variables_only_one_side_knows(station: Station, start: Callable[..., Station]) -> None:
+@pytest.mark.slow
+def test_variables_only_one_side_knows(station: StationProcess, start: Callable[..., StationProcess]) -> None:
     assert play("variables", station).facts == {"shifted": True}
     assert "[tcp_offset]" in play("variables_refused", start("--no-tcp-offset")).facts["error"]
 
 
-def test_local_control_is_remembered_by_a_connection(station: Station) -> None:
+def test_local_control_is_remembered_by_a_connection(station: StationProcess) -> None:
     facts = play("local_control", station).facts
     assert "Remote Control" in facts["stop"]
     assert "enable remote control" in facts["constructor"]
@@ -498,11 +457,12 @@ def test_local_control_is_remembered_by_a_connection(station: Station) -> None:
     assert facts["reconnected"] is None
 
 
-def test_slider_and_limiter(station: Station) -> None:
+@pytest.mark.slow
+def test_slider_and_limiter(station: StationProcess) -> None:
     played = play("slider", station)
-    station.ask(do="dashboard-stop")
-    station.ask(do="slider", fraction=1.0)
-    station.ask(do="speed-scaling", fraction=1.0)
+    station.ask("dashboard-stop")
+    station.ask("slider", fraction=1.0)
+    station.ask("speed-scaling", fraction=1.0)
     assert played.facts == {
         "quarter": True,
         "fraction": 0.25,

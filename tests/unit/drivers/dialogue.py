@@ -27,10 +27,12 @@ class Stream:
     chunks: Iterable[Any]
     period_s: float = 1e-3
     reply: Any = None
+    has_end: bool = True
+    """Else the next turn does not end it: it is another device that sends."""
 
     @classmethod
-    def of(cls, chunk: Any, period_s: float = 1e-3, reply: Any = None) -> Self:
-        return cls(repeat(chunk), period_s, reply)
+    def of(cls, chunk: Any, period_s: float = 1e-3, reply: Any = None, *, has_end: bool = True) -> Self:
+        return cls(repeat(chunk), period_s, reply, has_end)
 
 
 class _Wire(Generic[T]):
@@ -91,7 +93,8 @@ class _Wire(Generic[T]):
             self.clock.at(due_s - self.clock.now_s(), send)
 
         def send() -> None:
-            if number == self._streams and (chunk := next(chunks, None)):
+            is_on = number == self._streams or not stream.has_end
+            if is_on and (chunk := next(chunks, None)):
                 self._arrived += [*self.once, *(chunk if isinstance(chunk, list) else [chunk])]
                 self.once.clear()
                 schedule()

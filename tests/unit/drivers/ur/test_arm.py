@@ -482,6 +482,26 @@ def test_closing_takes_a_second_and_a_half_at_most(
     assert not control.alive
 
 
+def test_a_controller_that_comes_back_is_still_stopped(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    with pytest.raises(DeviceTimeout):
+        move(arm, controller, After(clock, 0.3, setting(controller, silent=True, dashboard_late_s=1.0)))
+    assert "dashboard stop" not in controller.did
+    clock.advance(1.0)
+    assert controller.did[-1] == "dashboard stop"
+
+
+def test_an_old_attempt_to_stop_does_not_end_the_next_move(
+    arm: UrArm, controller: Controller, clock: FakeClock
+) -> None:
+    with pytest.raises(DeviceTimeout):
+        move(arm, controller, After(clock, 0.3, setting(controller, silent=True, dashboard_late_s=1.0)))
+    setting(controller, silent=False, dashboard_late_s=None, program=1)()  # another client has stopped it
+    arm.open(control=True)
+    move(arm, controller)
+    clock.advance(1.0)
+    assert "dashboard stop" not in controller.did
+
+
 # ---------------------------------------------------------------------- an emulated cell
 
 
