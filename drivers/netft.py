@@ -2,7 +2,7 @@
 
 Ref: ATI, "Net F/T User Manual" 9620-05-Net FT, and "Ethernet Axia" 9610-05-Ethernet Axia: RDT, netftapi2.xml and
 netftcalapi.xml, as in public drivers; OptoForce, "Ethernet Converter" manual, version 2.0.
-Checked on hardware: no. Verified against: tests/unit/test_netft.py and the emulator (tests/wire).
+Checked on hardware: no. Verified against: tests/unit/drivers/test_netft.py and the emulator (tests/wire).
 
 pynetft discovers the scale, keeps the socket drained and says why a stream has ended. It could also set the software
 bias; this driver never does.

@@ -67,6 +67,7 @@ class Player:
         with self._clock.keeping_up():
             self._t = self._clock.now_s()
             while not self._ended.is_set():
+                self._clock.now_ns()  # an emulated cell waits for it
                 wait_s = min(self._clock.poll_s, max(0.0, self._play()))
                 readable, _, _ = select.select([self._far], [], [], wait_s)
                 if readable:

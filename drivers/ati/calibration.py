@@ -2,7 +2,7 @@
 
 Ref: ATI 9610-05-1030 revision 04: wrench counts are matrix (rows Fx..Tz, columns G0..G5) times gauges; force and torque
 are counts divided by counts per unit. Unit codes are shared by NETCANOEM, Digital F/T, Axia and Net F/T.
-Checked on hardware: no. Verified against: tests/unit/test_ati_calibration.py.
+Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_calibration.py.
 """
 
 from collections.abc import Mapping

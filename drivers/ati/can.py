@@ -1,7 +1,7 @@
 """ATI NETCANOEM force/torque sensor over CAN.
 
 Ref: ATI Industrial Automation, "F/T CAN Bus and Serial Bus Network Interface for OEM", 9610-05-1030 revision 04.
-Checked on hardware: no. Verified against: tests/unit/test_ati_codec.py and the emulator (tests/wire).
+Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_codec.py and the emulator (tests/wire).
 
 The sensor is polled; it has no stream, no clock and no bias command. It keeps sending data in critical error, does not
 report saturation, and falls back to calibration slot 0 after every reset: all three are judged here.

@@ -1,7 +1,7 @@
 """ATI NETCANOEM over CAN: commands, replies and status, as pure functions on bytes.
 
 Ref: ATI Industrial Automation, "F/T CAN Bus and Serial Bus Network Interface for OEM", 9610-05-1030 revision 04.
-Checked on hardware: no. Verified against: tests/unit/test_ati_codec.py.
+Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_codec.py.
 
 A decoder returns a value or raises `ProtocolError`, never anything else. All multi-byte numbers are big-endian.
 """

@@ -1,7 +1,7 @@
 """ATI Digital F/T over RS-485: Modbus RTU frames, the calibration block and the 13-byte stream, as pure functions.
 
 Ref: ATI "Digital F/T" Modbus interface (sections 8.1, 8.3, 8.4 of 9620-05-Digital FT, as cited by public drivers).
-Checked on hardware: no. Verified against: tests/unit/test_ati_modbus.py.
+Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_modbus.py.
 
 A decoder returns a value or raises `ProtocolError`, never anything else. Registers are big-endian, high word first.
 """

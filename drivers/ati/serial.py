@@ -1,7 +1,7 @@
 """ATI Digital F/T and NETCANOEM force/torque sensors over RS-485.
 
 Ref: ATI "Digital F/T" Modbus interface (sections 8.1, 8.3, 8.4 of 9620-05-Digital FT, as cited by public drivers).
-Checked on hardware: no. Verified against: tests/unit/test_ati_modbus.py and the emulator (tests/wire).
+Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_modbus.py and the emulator (tests/wire).
 
 Modbus RTU for set-up, then a bare stream of 13-byte records at 7 kHz which only a jamming sequence stops, and which
 outlives the program that started it. Gauge gains and offsets are volatile and are written at every start.

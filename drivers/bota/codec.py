@@ -1,7 +1,7 @@
 """Bota SensONE and Rokubi: the 37-byte stream frame and the set-up commands, as pure functions on bytes.
 
 Ref: Bota Systems, serial interface of SensONE and Rokubi, as in the vendor's example programs.
-Checked on hardware: no. Verified against: tests/unit/test_bota_codec.py.
+Checked on hardware: no. Verified against: tests/unit/drivers/bota/test_codec.py.
 
 A decoder returns a value or raises `ProtocolError`, never anything else. All numbers are little-endian.
 """

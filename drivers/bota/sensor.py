@@ -1,7 +1,7 @@
 """Bota SensONE or Rokubi force/torque sensor on a serial port.
 
 Ref: Bota Systems, serial interface of SensONE and Rokubi, as in the vendor's example programs.
-Checked on hardware: no. Verified against: tests/unit/test_bota_codec.py and the emulator (tests/wire).
+Checked on hardware: no. Verified against: tests/unit/drivers/bota/test_codec.py and the emulator (tests/wire).
 
 The sensor streams from power-up for ever. The driver listens, and sends something only when it was asked to configure;
 closing leaves the stream running. The text a sensor prints when it boots is not waited for: it may have been hours ago.

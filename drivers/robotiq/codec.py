@@ -2,7 +2,7 @@
 
 Ref: Robotiq, "FT 300 Force Torque Sensor" instruction manual, control over Modbus RTU; the layout of serial number and
 firmware as in Robotiq's own C driver.
-Checked on hardware: no. Verified against: tests/unit/test_robotiq_codec.py.
+Checked on hardware: no. Verified against: tests/unit/drivers/robotiq/test_codec.py.
 
 A decoder returns a value or raises `ProtocolError`, never anything else. Registers are big-endian, the stream is
 little-endian.

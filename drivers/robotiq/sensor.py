@@ -1,7 +1,7 @@
 """Robotiq FT 300 and FT 300-S force/torque sensor on a serial port.
 
 Ref: Robotiq, "FT 300 Force Torque Sensor" instruction manual, control over Modbus RTU and data stream.
-Checked on hardware: no. Verified against: tests/unit/test_robotiq_codec.py and the emulator (tests/wire).
+Checked on hardware: no. Verified against: tests/unit/drivers/robotiq/test_codec.py and the emulator (tests/wire).
 
 Modbus RTU for set-up, then a bare stream at 100 Hz which only 50 bytes of 0xFF end, and which may already run when the
 sensor has booted. The sensor has no zero command: what others call zeroing is done on the host.

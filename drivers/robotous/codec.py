@@ -4,7 +4,7 @@ A command is a field of 8 bytes, a reply or sample one of 16; byte 0 is the comm
 UART puts each into a frame. All multi-byte numbers are big-endian.
 
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7, communication protocol.
-Checked on hardware: no. Verified against: tests/unit/test_robotous_codec.py.
+Checked on hardware: no. Verified against: tests/unit/drivers/robotous/test_codec.py.
 
 A decoder returns a value or raises `ProtocolError`, never anything else.
 """

@@ -1,7 +1,7 @@
 """Robotous RFT force/torque sensor, whatever the wire.
 
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7.
-Checked on hardware: no. Verified against: tests/unit/test_robotous_codec.py and the emulator (tests/wire).
+Checked on hardware: no. Verified against: tests/unit/drivers/robotous/test_codec.py and the emulator (tests/wire).
 
 While it streams the sensor hears only stop and bias, so an answer to any other question proves that it has stopped. It
 has a bias command; this driver never sends it.

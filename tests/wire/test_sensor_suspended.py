@@ -56,6 +56,8 @@ sys.stdin.readline()
 tell(what="health", stale=sensor.health().stale, events=sensor.health().events)
 sensor.close()
 """
+pytestmark = pytest.mark.realtime
+
 BEFORE_PUSH_S, AFTER_PUSH_S = 1.2, 0.4
 """Each more than may count as new; together eight times a collection, and more than a port holds of most streams."""
 
@@ -146,4 +148,4 @@ def test_nothing_old_after_a_pause(name: str) -> None:
     assert collected[-1] > 0.3 * rows
     assert {line["error"] for line in later if "error" in line} <= {"DeviceTimeout"}
     assert health["stale"] >= 1
-    assert any("what had piled up is thrown away" in what for _, what in health["events"])
+    assert any("thrown away" in what for _, what in health["events"])
