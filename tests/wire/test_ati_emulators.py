@@ -341,10 +341,11 @@ class SerialClient:
         return self.port.read(reply_bytes)
 
     def is_silent_to(self, request: bytes) -> bool:
-        self.port.timeout = 0.03
-        silent = self.ask(request, 1) == b""
+        before_s, self.port.timeout = self.box._last_byte_s, 0.03
+        self.port.write(request)
+        wait_until(lambda: self.box._last_byte_s > before_s and not self.box._burst)  # it came, and a pause after it
+        silent = self.port.read(1) == b""
         self.port.timeout = LIMIT_S
-        wait_until(lambda: not self.box._burst)  # the pause has ended what was no frame
         return silent
 
     def records(self, count: int) -> NDArray[np.uint8]:

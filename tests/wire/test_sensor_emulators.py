@@ -268,7 +268,9 @@ def test_robotiq_needs_the_whole_stop_sequence() -> None:
         port.write(b"\xff" * 49 + b"\0" + b"\xff" * 49)
         assert port.read(160) == FT300_FRAME * 10
         port.write(b"\xff" * 300)
-        wait_until(lambda: not box.streaming and not box._burst)  # after a pause, what is more than 50 is forgotten
+        wait_until(lambda: not box.streaming)
+        later_s = box.clock.now_s() + 0.05  # its thread has done whole turns by then
+        wait_until(lambda: box.clock.now_s() > later_s and not box._burst)  # what is more than 50 is forgotten
         port.write(FT300_START)
         rest = read_to(port, FT300_STARTED)
         assert rest == FT300_FRAME * (len(rest) // 16)
