@@ -98,7 +98,10 @@ def serial_beside_an_arm(laboratory: Laboratory, folder: Path, seconds: float) -
         ExitStack() as plugs,
     ):
         emulators = [
-            Emulator(laboratory, "ati-serial", folder / "serial", clock=REAL),
+            emulators = [
+                Emulator(laboratory, "ati-serial", folder / "serial", clock=REAL),
+                Emulator(controller, "ur-ft", folder, clock=REAL),
+            ]
             Emulator(controller, "ur-ft", folder, clock=REAL),
         ]
         for emulator in emulators:
