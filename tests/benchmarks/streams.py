@@ -94,7 +94,7 @@ def serial_beside_an_arm(laboratory: Laboratory, folder: Path, seconds: float) -
     """Collect the 7 kHz stream and 500 Hz of RTDE while an arm is looked at, on one core."""
     with (
         closing(Laboratory()) as controller,  # a process of its own
-        closing(Station()) as station,
+        Station() as station,
         ExitStack() as plugs,
     ):
         emulators = [

@@ -81,8 +81,8 @@ def new_arm(host: str) -> UrArm:
 
 def stands(station: Station, since_s: float, goal_rad: float) -> tuple[float, str]:
     """Wait until the arm stands; tell how long after `since_s` that was, and whether its move was over."""
-    station.wait_for(lambda state: not state["moving"], within_s=5)
-    state = station.do("state")
+    station.wait_for(lambda state: not state["moving"])
+    state = station.ask("state")
     t_ns = [event["t_host_ns"] for event in state["events"] if event["what"] == "stands"][-1]
     arrived = abs(state["q_rad"][5] - goal_rad) < 0.01
     return t_ns * 1e-9 - since_s, "finishes its move" if arrived else "stopped"
@@ -98,7 +98,7 @@ def usable(arm: UrArm) -> float:
 
 def befall(do: Do, cure: Act, *, later_s: float = 0.0, frozen: bool = False) -> Row:
     """Let it happen in a move, and cure it `later_s` after it was told and the arm stands."""
-    with closing(Station()) as station, closing(new_arm(station.host)) as arm:
+    with Station() as station, closing(new_arm(station.host)) as arm:
         arm.open(control=True)
         q = away(arm)
         provoke = Once(lambda: do(station, arm), wait_until_moving(arm))
@@ -119,14 +119,13 @@ def controller_restarted() -> Row:
     with ExitStack() as successor:
 
         def start(station: Station) -> None:
-            successor.enter_context(closing(Station("--host", station.host)))
+            successor.enter_context(Station("--host", station.host))
 
         return befall(of_the_cell(kill), start, frozen=True)
 
 
 def kill(station: Station) -> None:
-    station.process.kill()
-    station.process.wait()
+    station.kill()
 
 
 def signal_child(number: signal.Signals) -> Do:
@@ -139,8 +138,8 @@ def signal_child(number: signal.Signals) -> Do:
 
 def application(number: signal.Signals, *, child_too: bool = False, at_once: bool = False) -> Row:
     """Signal a program of ours in a move, and its child; another one follows when the arm stands, or at once."""
-    with closing(Station()) as station, closing(new_arm(station.host)) as arm:
-        q0 = station.do("state")["q_rad"][5]
+    with Station() as station, closing(new_arm(station.host)) as arm:
+        q0 = station.ask("state")["q_rad"][5]
         process = subprocess.Popen(
             [sys.executable, "-c", APPLICATION, station.host, str(SPEED_RAD_S)],
             stdout=subprocess.PIPE,
@@ -150,7 +149,7 @@ def application(number: signal.Signals, *, child_too: bool = False, at_once: boo
         assert process.stdout is not None
         pids = [process.pid, int(process.stdout.readline())]
         try:
-            station.wait_for(lambda state: abs(state["q_rad"][5] - q0) > 0.1, within_s=20)
+            station.wait_for(lambda state: abs(state["q_rad"][5] - q0) > 0.1)
             begin = time.monotonic()
             for pid in pids[: 1 + child_too]:
                 os.kill(pid, number)
@@ -159,7 +158,7 @@ def application(number: signal.Signals, *, child_too: bool = False, at_once: boo
             stood = stands(station, begin, q0 + (-STEP_RAD if q0 > 0.5 else STEP_RAD))
             os.kill(process.pid, signal.SIGKILL)
             if child_too:
-                station.do("dashboard-stop")  # the operator: no start ends a program it does not know
+                station.ask("dashboard-stop")  # the operator: no start ends a program it does not know
             return Row(nan, *stood, usable(arm))
         finally:
             for pid in pids:
@@ -169,18 +168,18 @@ def application(number: signal.Signals, *, child_too: bool = False, at_once: boo
 
 
 def closed_while_frozen() -> Row:
-    with closing(Station()) as station, closing(new_arm(station.host)) as arm:
+    with Station() as station, closing(new_arm(station.host)) as arm:
         arm.open(control=True)
-        station.do("freeze", on=True)
+        station.ask("freeze", on=True)
         begin = time.monotonic()
         arm.close()
         closed_s = time.monotonic() - begin
-        station.do("freeze", on=False)
+        station.ask("freeze", on=False)
         return Row(nan, closed_s, "closed", usable(arm))
 
 
 def second_client() -> Row:
-    with closing(Station()) as station, closing(new_arm(station.host)) as arm:
+    with Station() as station, closing(new_arm(station.host)) as arm:
         arm.open(control=True)
         begin = time.monotonic()
         with suppress(ConnectError):
@@ -192,15 +191,15 @@ def second_client() -> Row:
 
 def program_of_others() -> Row:
     """Begin beside a program of somebody else; tell when that is refused."""
-    with closing(Station()) as station, closing(new_arm(station.host)) as arm:
-        station.do("foreign-program", seconds=1000)
+    with Station() as station, closing(new_arm(station.host)) as arm:
+        station.ask("foreign-program", seconds=1000)
         station.wait_for(lambda state: state["runtime_state"] == "PLAYING")
         begin = time.monotonic()
         with suppress(ConnectError):
             arm.open(control=True)
             raise AssertionError("a program of somebody else was ended")
         refused_s = time.monotonic() - begin
-        station.do("dashboard-stop")
+        station.ask("dashboard-stop")
         return Row(nan, refused_s, "it is refused", usable(arm))
 
 

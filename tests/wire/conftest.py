@@ -44,8 +44,8 @@ class Station(StationProcess):
 
     def arm(self, **how: Any) -> UrArm:
         """Make an arm that lives by the clock of this cell, if nothing else is said."""
-        how = {"clock": self.clock, "timing": UrTiming.emulated()} | how
-        return UrArm(self.host, speed_rad_s=SPEED_RAD_S, acceleration_rad_s2=ACCELERATION_RAD_S2, **how)
+        given: dict[str, Any] = {"clock": self.clock, "timing": UrTiming.emulated(), **how}
+        return UrArm(self.host, speed_rad_s=SPEED_RAD_S, acceleration_rad_s2=ACCELERATION_RAD_S2, **given)
 
     def is_as_new(self) -> bool:
         if self.process.poll() is not None:

@@ -1,7 +1,6 @@
 """An exported program on the emulated controller, which reads URScript by itself."""
 
 import re
-import socket
 from collections.abc import Callable
 from math import degrees, radians
 from typing import Any
@@ -16,8 +15,10 @@ from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
 from ftdrive.planning.scene import Scene
+from tests.wire.conftest import Station
 
 SCRIPT_PORT = 30003
+DWELL_S = 1.0
 
 
 @pytest.fixture(scope="module")
@@ -27,16 +28,16 @@ def plan() -> Plan:
 
 
 @pytest.fixture
-def start(plan: Plan, start_station: Callable[..., Any]) -> Callable[[float], Any]:
+def start(plan: Plan, start_station: Callable[..., Station]) -> Callable[[float], Station]:
     """Start a controller whose arm is this far from the first pose, and send it the program."""
 
-    def start(away_deg: float) -> Any:
+    def start(away_deg: float) -> Station:
         q_deg = [degrees(angle) for angle in plan.steps[0].q_rad]
         q_deg[5] += away_deg
         station = start_station("--time-scale", "20", "--start-q-deg", ",".join(f"{angle:.3f}" for angle in q_deg))
-        with socket.create_connection((station.host, SCRIPT_PORT), timeout=2) as sock:
-            sock.sendall(program(plan, dwell_s=1.0).encode("ascii"))
-        station.wait_for(lambda state: state["popup"] is not None, 5.0)
+        with station.connect(SCRIPT_PORT) as sock:
+            sock.sendall(program(plan, dwell_s=DWELL_S).encode("ascii"))
+        station.wait_for(lambda state: state["popup"] is not None)
         return station
 
     return start
@@ -46,40 +47,35 @@ def events(state: dict[str, Any], what: str) -> list[str]:
     return [event["why"] for event in state["events"] if event["what"] == what]
 
 
-def test_it_asks_and_then_visits_every_pose_at_rest(plan: Plan, start: Callable[[float], Any]) -> None:
+def test_it_asks_and_then_visits_every_pose_at_rest(plan: Plan, start: Callable[[float], Station]) -> None:
     station = start(25.0)
-    asked = station.do("state")
+    asked = station.ask("state")
     assert "Keep a ball of 0.35 m" in asked["popup"]
     assert not asked["moving"]
     assert asked["q_rad"][5] == pytest.approx(plan.steps[0].q_rad[5] + radians(25), abs=1e-3)
 
-    assert station.do("close-popup")["accepted"]
-    rests: dict[int, list[float]] = {}
-
-    def done(state: dict[str, Any]) -> bool:
-        poses = [words for words in events(state, "textmsg") if ": pose " in words]
-        if poses and not state["moving"]:
-            rests.setdefault(len(poses), state["q_rad"])
-        return bool(state["runtime_state"] == "STOPPED")
-
-    station.wait_for(done, 30.0)
-    said = [words for words in events(station.do("state"), "textmsg") if ": pose " in words]
-    numbers = [step.number for step in plan.steps]
-    assert [int(re.findall(r"R(\d\d)", words)[0]) for words in said] == [*numbers, numbers[0]]
-    goals = [*(step.q_rad for step in plan.steps), plan.steps[0].q_rad]
-    assert len(rests) > len(goals) // 2  # a rest of 1 s lasts 50 ms here: we may miss some
-    for i, q_rad in rests.items():
-        np.testing.assert_allclose(q_rad, goals[i - 1], atol=2e-3)
-    assert "The tour is complete." in events(station.do("state"), "popup")
+    assert station.ask("close-popup")["accepted"]
+    state = station.wait_for(lambda state: state["runtime_state"] == "STOPPED")
+    diary = [event for event in state["events"] if event["what"] in ("moves", "stands") or ": pose " in event["why"]]
+    steps = [*plan.steps, plan.steps[0]]
+    assert [event["what"] for event in diary] == ["moves", "textmsg", "stands"] * len(steps)
+    for step, said, stands in zip(steps, diary[1::3], diary[2::3], strict=True):
+        assert re.findall(r"R(\d\d)", said["why"])[0] == f"{step.number:02}"
+        np.testing.assert_allclose(stands["q_rad"], step.q_rad, atol=2e-3)
+    for stands, moves in zip(diary[2:-1:3], diary[3::3], strict=True):
+        assert moves["t_robot_s"] - stands["t_robot_s"] == pytest.approx(DWELL_S, abs=0.1)
+    assert "The tour is complete." in events(state, "popup")
 
 
 @pytest.mark.parametrize("away_deg", [35.0, -35.0])
-def test_far_from_the_first_pose_it_moves_nothing(plan: Plan, start: Callable[[float], Any], away_deg: float) -> None:
+def test_far_from_the_first_pose_it_moves_nothing(
+    plan: Plan, start: Callable[[float], Station], away_deg: float
+) -> None:
     station = start(away_deg)
-    station.do("close-popup")
-    station.wait_for(lambda state: "jog all joints" in (state["popup"] or ""), 5.0)
-    station.do("close-popup")
-    station.wait_for(lambda state: state["runtime_state"] == "STOPPED", 5.0)
-    state = station.do("state")
+    station.ask("close-popup")
+    station.wait_for(lambda state: "jog all joints" in (state["popup"] or ""))
+    station.ask("close-popup")
+    station.wait_for(lambda state: state["runtime_state"] == "STOPPED")
+    state = station.ask("state")
     assert state["q_rad"][5] == pytest.approx(plan.steps[0].q_rad[5] + radians(away_deg), abs=1e-3)
     assert not any(": pose " in words for words in events(state, "textmsg"))
