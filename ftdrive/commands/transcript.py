@@ -121,7 +121,9 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     A recording that was broken off is played as far as it goes.
     """
     check_simulate(simulate, real={"FILE": file}, emulated={"--sensor": sensor})
+    clock: Clock = REAL
     if simulate:
+        clock = sensor_clock(_emulated(sensor))
         with TemporaryDirectory(prefix="ftdrive-") as folder:
             path = Path(folder) / "sensor.jsonl"
             _record(_emulated(sensor), path, 1.0, kept=False)
@@ -130,9 +132,9 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
         told = Transcript.load(file)
     else:
         raise ConfigError("which transcript? Give its FILE, or --simulate")
-    player = Player(told)
+    player = Player(told, clock)
     with player as port:
-        device = _sensor(told.url_at(port))
+        device = _sensor(told.url_at(port), clock)
         duration_s = float(told.header["duration_s"])
         try:
             with device:
@@ -158,7 +160,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
         talk.print(f" The recording was broken off: {duration_s:.3g} s of {told.header['duration_s']:g} s were played.")
 
 
-def _sensor(url: str, clock: Clock = REAL) -> ForceTorqueSensor:
+def _sensor(url: str, clock: Clock) -> ForceTorqueSensor:
     try:
         return sensor_from_url(url, clock=clock)
     except BadUrl as error:
