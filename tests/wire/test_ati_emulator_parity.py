@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mocks import ati_serial
 from mocks.ati_serial import AtiSerialBox
 from mocks.robotiq import RobotiqBox
-from tests.wire.waiting import LIMIT_S, read_to, wait_until
+from tests.wire.waiting import LIMIT_S, drain, read_to, wait_until
 
 READ_STATUS = bytes.fromhex("0A 03 00 1D 00 01 15 77")
 STATUS_OK = bytes.fromhex("0A 03 02 00 00 1D 85")
@@ -45,6 +45,7 @@ def jam(box: AtiSerialBox, port: serial.Serial) -> None:
     faults, box.faults.corrupt = box.faults.corrupt, 0.0
     port.write(JAM)
     wait_until(lambda: not box.streaming and not box._burst)
+    drain(port)
     port.write(READ_STATUS)
     read_to(port, STATUS_OK)
     box.faults.corrupt = faults

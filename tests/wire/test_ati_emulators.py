@@ -16,7 +16,7 @@ from mocks.ati_can import AtiCanNode
 from mocks.ati_gauges import REFERENCE
 from mocks.ati_serial import JAM_PAUSE_S, AtiSerialBox, calibration_block
 from mocks.modbus import with_crc
-from tests.wire.waiting import LIMIT_S, read_to, wait_until
+from tests.wire.waiting import LIMIT_S, drain, read_to, wait_until
 
 V1 = np.array([-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608])
 V2 = np.array([10, -5, 20, 0.5, -0.25, 0.1])
@@ -36,6 +36,17 @@ UNPLUGGED = (serial.SerialException, can.CanError, OSError, termios.error)
 
 def constant(wrench: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]]:
     return lambda n: np.tile(wrench, (n, 1))
+
+
+class Counted:
+    """Readings of V1, and how often one was asked for."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, count: int) -> NDArray[np.float64]:
+        self.calls += 1
+        return constant(V1)(count)
 
 
 # ---------------------------------------------------------------- CAN
@@ -219,19 +230,13 @@ def test_can_lost_doubled_and_swapped_frames(node: AtiCanNode, client: CanClient
     node.faults.duplicate, node.faults.drop = 0.0, 1.0
     client.bus.send(frame("200#"))
     assert client.bus.recv(0.05) is None
-    asked, heard = 0, []
-
-    def measure(count: int) -> NDArray[np.float64]:
-        nonlocal asked
-        asked += 1
-        return constant(V1)(count)
-
-    node.measure = measure
+    readings, heard = Counted(), []
+    node.measure = readings
     for wanted in range(50, 201, 50):
         node.faults.drop = 0.3
         for _ in range(50):
             client.bus.send(frame("200#"))
-        wait_until(lambda wanted=wanted: asked == wanted)  # type: ignore[misc]
+        wait_until(lambda wanted=wanted: readings.calls == wanted)  # type: ignore[misc]
         node.faults.drop = 0.0
         client.bus.send(frame("205#"))
         while (message := client.collect(1)[0]).arbitration_id != 0x205:
@@ -280,15 +285,15 @@ def test_can_client_may_leave_and_come_back(node: AtiCanNode) -> None:
 def test_can_host_that_never_reads_costs_frames_not_memory(node: AtiCanNode) -> None:
     with serial.Serial(node.start(), timeout=LIMIT_S) as port:
         port.write(b"S5\rO\r")
+        readings, asked = Counted(), 0
+        node.measure = readings
         while not node.dropped_frames:
             port.write(b"t2000\r" * 50)
             port.flush()
+            asked += 50
+        wait_until(lambda: readings.calls == asked)
         assert len(node._answers) + len(node._unsent) < 40_000, "the answers to one read of 4096 bytes"
-        port.timeout = 0.1
-        stuck = b""
-        while some := port.read(4096):
-            stuck += some
-        port.timeout = LIMIT_S
+        stuck = drain(port)
         port.write(b"t20F0\r")
         lines = (stuck + read_to(port, b"t20F403080002\r")).split(b"\r")
         assert set(lines) == {b"", b"z", b"t200800000064012C01F4", b"t2016FF38FE70FDA8"}
@@ -336,10 +341,11 @@ class SerialClient:
         return self.port.read(reply_bytes)
 
     def is_silent_to(self, request: bytes) -> bool:
-        self.port.timeout = 0.03
-        silent = self.ask(request, 1) == b""
+        before_s, self.port.timeout = self.box._last_byte_s, 0.03
+        self.port.write(request)
+        wait_until(lambda: self.box._last_byte_s > before_s and not self.box._burst)  # it came, and a pause after it
+        silent = self.port.read(1) == b""
         self.port.timeout = LIMIT_S
-        wait_until(lambda: not self.box._burst)  # the pause has ended what was no frame
         return silent
 
     def records(self, count: int) -> NDArray[np.uint8]:
@@ -349,6 +355,7 @@ class SerialClient:
         """Jam, wait for the pause after it, and throw away what was on its way."""
         self.port.write(JAM)
         wait_until(lambda: not self.box.streaming and not self.box._burst)
+        drain(self.port)
         self.port.write(READ_STATUS)
         status = with_crc(struct.pack(">3BH", 0x0A, 3, 2, self.box.status))
         read_to(self.port, status)

@@ -401,7 +401,7 @@ def test_program(fresh: StationProcess) -> None:
     assert [out["remote"], out["mode"], out["safety"]] == [True, "Robotmode: RUNNING", "Safetymode: NORMAL"]
     assert out["running_before"] is False
     assert out["state"] == "PLAYING rtde_control"
-    assert out["stopped"] == [False, "STOPPED", 1]
+    assert out["stopped"] == [False, "STOPPED", True]
     assert out["command_when_stopped"] is False
     for name in ("reupload", "alive", "kicked", "watchdog_bites", "arm_stands", "short_of_goal", "again"):
         assert out[name] is True, name

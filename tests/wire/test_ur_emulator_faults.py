@@ -7,6 +7,7 @@ that the emulator is faithful.
 import contextlib
 import json
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from typing import Any
 
 import pytest
 
+from mocks.ur import rtde
 from tests.wire.station_process import StationProcess
 from tests.wire.waiting import LIMIT_S
 
@@ -167,6 +169,14 @@ def test_a_silent_dashboard_accepts_and_answers_later(station: StationProcess) -
                 assert client.recv(100) == line
 
 
+def kinds(client: socket.socket) -> Iterator[str]:
+    """Yield the kinds of RTDE packages as they arrive."""
+    buffer = bytearray()
+    while True:
+        yield from (chr(kind) for kind, _payload in rtde.take_packages(buffer))
+        buffer += client.recv(4096)
+
+
 @pytest.mark.parametrize("answers", [True, False])
 def test_silent_rtde_stops_streaming_and_answers_only_if_asked_to(station: StationProcess, answers: bool) -> None:
     with station.connect(30004) as client:
@@ -189,7 +199,7 @@ def test_silent_rtde_stops_streaming_and_answers_only_if_asked_to(station: Stati
             client.recv(100)
         station.ask("silent", what="rtde", on=False)
         client.settimeout(LIMIT_S)
-        assert client.recv(100)[2:3] == (b"U" if answers else b"v")
+        assert ("U" if answers else "v") in kinds(client), "what was asked in the silence is answered"
 
 
 def test_connections_come_and_go_in_the_diary(start: Callable[..., StationProcess]) -> None:

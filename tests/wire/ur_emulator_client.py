@@ -79,6 +79,7 @@ def moves(host: str) -> dict[str, Any]:
     pose = r.getActualTCPPose()
     pose[2] -= 0.05
     out["moveL"] = c.moveL(pose, 0.25, 1.2)
+    some_cycles(r)
     out["moveL_error_m"] = max(abs(a - b) for a, b in zip(r.getActualTCPPose()[:3], pose[:3], strict=True))
     out["moveJ_IK"] = c.moveJ_IK(pose, 1.0, 2.0)
 
@@ -176,7 +177,7 @@ def program(host: str) -> dict[str, Any]:
     r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
     out["state"] = d.programState()
     c.stopScript()
-    out["stopped"] = [c.isProgramRunning(), d.programState().split()[0], r.getRuntimeState()]
+    out["stopped"] = [c.isProgramRunning(), d.programState().split()[0], wait_for(lambda: r.getRuntimeState() == 1)]
     out["command_when_stopped"] = c.setPayload(1.0, [0.0, 0.0, 0.1])
     out["reupload"] = c.reuploadScript() and wait_for(c.isProgramRunning)
     out["alive"] = wait_for(c.isSteady)

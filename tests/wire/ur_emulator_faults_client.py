@@ -240,7 +240,7 @@ def stop_of_a_blocking_move(host: str) -> None:
     r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
     move = Move(r, c, 0.15, 0.2)
     c.stopJ(2.0)
-    tell(arrived=abs(r.getActualQ()[5] - move.goal[5]) < 1e-3, ended=move.ends())
+    tell(arrived=wait_for(lambda: abs(r.getActualQ()[5] - move.goal[5]) < 1e-3), ended=move.ends())
 
 
 def protective_stop_of_an_async_move(host: str) -> None:

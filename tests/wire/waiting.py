@@ -16,6 +16,21 @@ def wait_until(condition: Callable[[], bool], limit_s: float = LIMIT_S) -> None:
         time.sleep(0.002)
 
 
+def drain(port: serial.Serial, quiet_s: float = 0.05) -> bytes:
+    """Read what was on its way from a device that sends nothing more: a full terminal would lose its next answer.
+
+    The port's time-out stays as it is, as pyserial sets all flags of the terminal anew with it.
+    """
+    data = b""
+    deadline_s = time.monotonic() + quiet_s
+    while time.monotonic() < deadline_s:
+        if port.in_waiting:
+            data += port.read(port.in_waiting)
+            deadline_s = time.monotonic() + quiet_s
+        time.sleep(0.002)
+    return data
+
+
 def read_to(port: serial.Serial, answer: bytes) -> bytes:
     """Read up to an answer and return what came before it."""
     data = port.read_until(answer)
