@@ -16,6 +16,8 @@ LINK_ERRORS = (OSError, termios.error)
 """What a vanished serial port raises; `termios.error` is not an `OSError`."""
 
 _WRITE_S = 0.2
+_PATIENCE_S = 30.0
+"""In place of it where the cell is emulated: that its far side is starved is no loss."""
 _DRAIN_BYTES = 416
 """5 ms of the quickest sensor."""
 
@@ -78,7 +80,7 @@ class SerialPort:
                 self._baud,
                 parity=serial.PARITY_EVEN if self._even_parity and not emulated else serial.PARITY_NONE,
                 timeout=self._read_s,
-                write_timeout=_WRITE_S,
+                write_timeout=_PATIENCE_S if self._clock.emulated else _WRITE_S,
                 exclusive=True,
             )
             self._marks = Unmarker() if self._even_parity and ask_for_marks(self._port) else None

@@ -81,7 +81,7 @@ def probe_can(
 
 
 def _hear(bus: CanBus, clock: Clock) -> list[Frame]:
-    return [frame for left_s in clock.looks(_LISTEN_S) if (frame := bus.look(left_s))]
+    return [frame for left_s in clock.looks(_LISTEN_S) if (frame := bus.look(min(left_s, clock.poll_s)))]
 
 
 def _look(known: _Known, heard: Sequence[Frame], bus: CanBus, clock: Clock) -> Answer | None:
@@ -169,7 +169,7 @@ def _ask(bus: CanBus, clock: Clock, identifier: int, data: bytes, parts: Mapping
     bus.send(identifier, data)
     frames: list[Frame] = []
     for left_s in clock.looks(_REPLY_S):
-        frame = bus.look(left_s)
+        frame = bus.look(min(left_s, clock.poll_s))
         if frame and len(frame[1]) == parts.get(frame[0]):
             frames.append(frame)
             if replies := _messages(frames, parts):

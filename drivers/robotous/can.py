@@ -91,7 +91,7 @@ class CanLink:
 
         The cell's time stands still meanwhile, so there is an end of it.
         """
-        frame = self._bus.look(_WAIT_S)
+        frame = self._bus.look(self.clock.poll_s)
         now_ns = self.clock.now_ns()
         while frame:
             self._heard_ns = now_ns

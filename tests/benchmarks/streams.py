@@ -32,6 +32,7 @@ import pytest
 import serial
 
 from drivers.ati import modbus
+from drivers.clock import REAL
 from drivers.errors import DriverError
 from drivers.interfaces import FtSamples
 from drivers.ur.arm import UrArm
@@ -41,6 +42,7 @@ from tests.wire.test_sensor_faults import (
     HEALTHY,
     KINDS,
     SCRIPT,
+    UNASKED,
     Emulator,
     Laboratory,
     Watched,
@@ -95,7 +97,13 @@ def serial_beside_an_arm(laboratory: Laboratory, folder: Path, seconds: float) -
         Station() as station,
         ExitStack() as plugs,
     ):
-        emulators = [Emulator(laboratory, "ati-serial", folder / "serial"), Emulator(controller, "ur-ft", folder)]
+        emulators = [
+            emulators = [
+                Emulator(laboratory, "ati-serial", folder / "serial", clock=REAL),
+                Emulator(controller, "ur-ft", folder, clock=REAL),
+            ]
+            Emulator(controller, "ur-ft", folder, clock=REAL),
+        ]
         for emulator in emulators:
             plugs.callback(emulator.unplug)
         with (
@@ -163,7 +171,7 @@ def bare_can_rate(path: str, seconds: float) -> float:
 
 def can_against_ceiling(laboratory: Laboratory, folder: Path, latency_s: float) -> bool:
     """Compare the driver with the bare client, turn by turn."""
-    emulator = Emulator(laboratory, "ati-can", folder / "can")
+    emulator = Emulator(laboratory, "ati-can", folder / "can", clock=REAL)
     emulator.faults(delay_s=latency_s)
     ours, bare = [], []
     try:
@@ -240,7 +248,7 @@ def endure(emulator: Emulator, fault: str, samples: int) -> Counter[str]:
         with closing(sensor):
             watched = Watched(sensor)
             emulator.faults(**chances(emulator.kind.scheme, fault))
-            count.update(type(error).__name__ for error in suffer(sensor, PIECE_S * 5))
+            count.update(type(error).__name__ for error in suffer(sensor, REAL, PIECE_S * 5))
             emulator.faults(**HEALTHY)
             time.sleep(0.05)  # what was delayed belongs to this stream
         count["received"] += len(watched.samples())
@@ -271,13 +279,11 @@ def all_faults(laboratory: Laboratory, folder: Path, scheme: str, samples: int, 
     """Let every fault befall one kind of sensor and compare each sample with the truth."""
     passed = True
     lasting = {fault: partial(endure, fault=fault) for fault in SCRIPT if applies(scheme, fault)}
-    ending = {
-        fault: partial(repeat, fault=fault, cycles=cycles) for fault in CYCLES if starts(scheme, fault) is not None
-    }
+    ending = {fault: partial(repeat, fault=fault, cycles=cycles) for fault in CYCLES if (scheme, fault) not in UNASKED}
     for fault, suffered in (lasting | ending).items():
         size = crew(scheme, fault)
         emulators = [
-            Emulator(laboratory, scheme, folder / f"{scheme}-{fault}-{number}", starts(scheme, fault))
+            Emulator(laboratory, scheme, folder / f"{scheme}-{fault}-{number}", starts(scheme, fault), REAL)
             for number in range(size)
         ]
         with ThreadPoolExecutor(size) as pool:

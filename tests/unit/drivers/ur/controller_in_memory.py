@@ -121,9 +121,14 @@ class Controller:
                 sample = self.sample()
                 self._sent.append([sample[name] for name in OUTPUTS if name not in self.unknown])
             if not self.held_back:
-                for _ in range(max(1, len(self._sent))):
-                    reader._follow()
+                receive(max(1, len(self._sent) // 2))
+                if self._sent:  # a backlog is read in no time, and somebody may look on the way
+                    self.clock.at(1e-4, lambda: receive(len(self._sent)))
             self.clock.at(CYCLE_S, cycle)
+
+        def receive(n: int) -> None:
+            for _ in range(n):
+                reader._follow()
 
         self.clock.at(CYCLE_S, cycle)
 

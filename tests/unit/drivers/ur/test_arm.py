@@ -441,6 +441,16 @@ def test_a_move_that_was_told_to_stop_says_so(
     with pytest.raises(DeviceFault, match="told to stop"):
         move(arm, controller)
     assert controller.goal_rad is None
+    if not trouble:
+        move(arm, controller)  # it is still ours
+
+
+def test_a_stop_just_before_a_move_ends_it(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    where = controller.q_rad[5]
+    with pytest.raises(DeviceFault, match="told to stop"):
+        move(arm, controller, After(clock, 0.0, arm.stop))
+    assert controller.goal_rad is None
+    assert controller.q_rad[5] == pytest.approx(where, abs=0.05)
 
 
 def test_a_guard_says_why_it_has_stopped_the_arm(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
@@ -480,6 +490,7 @@ def test_closing_takes_a_second_and_a_half_at_most(
     arm.close()
     assert clock.now_s() - begin_s <= longest_s < 1.5
     assert not control.alive
+    assert ("dashboard stop" in controller.did) == (trouble == {"hanging": {"quit"}})  # another program is left alone
 
 
 def test_a_controller_that_comes_back_is_still_stopped(arm: UrArm, controller: Controller, clock: FakeClock) -> None:

@@ -222,7 +222,7 @@ def test_a_flange_that_does_not_fit_the_joints_is_refused(
 
 def test_a_controller_that_lacks_what_is_needed_is_refused(controller: Controller) -> None:
     controller.unknown = {"runtime_state", "payload", "payload_cog", "tcp_offset"}  # not the three younger ones
-    with pytest.raises(ConnectError, match="does not tell runtime_state over RTDE"):
+    with pytest.raises(ConnectError, match="runtime_state over RTDE"):
         ReaderInMemory(controller, "UR5e")
 
 
