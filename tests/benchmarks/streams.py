@@ -98,10 +98,7 @@ def serial_beside_an_arm(laboratory: Laboratory, folder: Path, seconds: float) -
         ExitStack() as plugs,
     ):
         emulators = [
-            emulators = [
-                Emulator(laboratory, "ati-serial", folder / "serial", clock=REAL),
-                Emulator(controller, "ur-ft", folder, clock=REAL),
-            ]
+            Emulator(laboratory, "ati-serial", folder / "serial", clock=REAL),
             Emulator(controller, "ur-ft", folder, clock=REAL),
         ]
         for emulator in emulators:
