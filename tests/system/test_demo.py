@@ -13,11 +13,6 @@ def test_demo_recovers_the_truth(demo: dict[str, Any]) -> None:
     assert_demo_found_the_truth(demo)
 
 
-@pytest.mark.slow
-def test_demo_recovers_another_truth_with_a_serial_sensor(ftdrive: CommandLine) -> None:
-    assert_demo_found_the_truth(ftdrive.json("demo", "--sensor", "serial", "--seed", "1"))
-
-
 def test_the_run_of_a_demo_is_replayed_to_the_same_result(demo: dict[str, Any], ftdrive: CommandLine) -> None:
     again = ftdrive.json("replay", demo["run"])  # compares with the saved calibration itself
     assert again["R_flange_sensor"] == demo["result"]["R_flange_sensor"]

@@ -15,8 +15,8 @@ ANSWERS = "yes\nyes\nyes\nMOVE\nyes\n"
 
 
 @pytest.fixture
-def station(request: pytest.FixtureRequest) -> Iterator[Station]:
-    with Station(getattr(request, "param", "serial"), ["--seed", "3"]) as station:
+def station() -> Iterator[Station]:
+    with Station("serial", ["--seed", "3"]) as station:
         yield station
 
 
@@ -46,7 +46,6 @@ def test_ctrl_c_stops_the_arm_and_keeps_the_poses(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("station", ["can", "serial"], indirect=True)
 def test_unplugged_sensor_stops_the_arm_and_keeps_the_poses(
     station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine
 ) -> None:

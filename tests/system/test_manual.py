@@ -79,24 +79,22 @@ class Spectator:
 
 
 class Person:
-    """Lets the mover go on after each pose, and presses k when `enough` were taken."""
+    """Lets the mover go on after each pose."""
 
     has_keys = True
 
-    def __init__(self, taken: Callable[[], None], enough: int | None) -> None:
-        self._taken, self._enough = taken, enough
-        self.poses = 0
+    def __init__(self, taken: Callable[[], None]) -> None:
+        self._taken = taken
 
     def tell(self, event: Event) -> None:
         if isinstance(event, PoseTaken):
-            self.poses += 1
             self._taken()
 
     def ask(self, question: Question) -> str:
         raise AssertionError(question)
 
     def pressed(self) -> Key | None:
-        return Key.KEEP if self.poses == self._enough else None
+        return None
 
 
 class Fit:
@@ -128,7 +126,7 @@ def station() -> Iterator[Station]:
         yield station
 
 
-def watch(station: Station, run: Run, *, listen: bool, commit: Callable[[PoseRecord], None] | None = None) -> None:
+def watch(station: Station, run: Run, *, commit: Callable[[PoseRecord], None] | None = None) -> None:
     """Collect while the other client takes the arm through some poses and back to the first."""
     cell = station.cell
     with closing(build_arm(cell)) as theirs, closing(build_arm(cell)) as ours, build_sensor(cell) as sensor:
@@ -138,9 +136,9 @@ def watch(station: Station, run: Run, *, listen: bool, commit: Callable[[PoseRec
             TourPose(number, q)
             for number, q in zip(NUMBERS, constant_tour(ours.state().q_rad), strict=True)
             if number in QUICK
-        ][: 12 if listen else 8]
+        ]
         mover = Mover(theirs, [*tour, tour[0]])
-        person = Person(mover.measured, None if listen else len(tour))
+        person = Person(mover.measured)
         with mover:
             arm = Spectator(ours, mover)
             collect_manually(
@@ -151,29 +149,27 @@ def watch(station: Station, run: Run, *, listen: bool, commit: Callable[[PoseRec
                 Fit().add,
                 commit or run.commit,
                 down_base=np.array([0.0, 0.0, -1.0]),
-                listen=listen,
+                listen=True,
                 clock=cell.clock,
             )
             assert mover.plays  # it was we who found the end
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("listen", [True, False])
-def test_watching_finds_the_truth(station: Station, listen: bool, tmp_path: Path) -> None:
+def test_watching_finds_the_truth(station: Station, tmp_path: Path) -> None:
     run = Run.create(tmp_path, "manual", {})
-    watch(station, run, listen=listen)
+    watch(station, run)
     records = run.records()
     assert all(record.steady for record in records)
-    assert [record.stop for record in records] == list(range(1, 14 if listen else 9))
+    assert [record.stop for record in records] == list(range(1, 14))
     dataset = dataset_from(records, {})
-    assert len(dataset) == (12 if listen else 8)
+    assert len(dataset) == 12
     result = solve(dataset)
     for name, errors in errors_in_sigma(result, station.truth).items():
         assert np.abs(errors).max() < 4, name
     drift = drift_check(records)
-    assert (drift is not None) == listen
-    if drift is not None:
-        assert np.all(np.abs(drift.change) < 4.5 * drift.sigma)
+    assert drift is not None
+    assert np.all(np.abs(drift.change) < 4.5 * drift.sigma)
 
 
 def test_a_lost_sensor_ends_it_with_the_poses_on_disk(station: Station, tmp_path: Path) -> None:
@@ -185,7 +181,7 @@ def test_a_lost_sensor_ends_it_with_the_poses_on_disk(station: Station, tmp_path
             station.control(do="unplug", device="sensor")
 
     with pytest.raises(StreamBroken):
-        watch(station, run, listen=True, commit=commit)
+        watch(station, run, commit=commit)
     assert len(run.records()) == 2
 
 
