@@ -116,7 +116,7 @@ def test_a_file_gives_back_the_same_numbers(
     A = rng.normal(size=(5, 6, 6)) * 10.0 ** rng.uniform(-6, 3)
     data = CalibrationDataset(
         Rotation.random(5, rng=rng).as_matrix().round(decimals),
-        rng.normal(size=(5, 6)) * 10.0 ** rng.uniform(-9, 9),
+        rng.uniform(-1, 1, size=(5, 6)) * 10.0 ** rng.uniform(-9, 9),  # what a dataset accepts
         A @ np.swapaxes(A, 1, 2) + np.eye(6) if measured else None,
         rng.integers(0, 10_000, 5),
         np.where(rng.random(5) < 0.3, np.nan, rng.random(5)),
