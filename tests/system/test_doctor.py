@@ -151,6 +151,7 @@ def test_an_arm_that_is_not_there(station: Station, cell: Path, ftdrive: Command
     assert checks["sensor.rate"]["state"] != "skipped"
 
 
+@pytest.mark.slow
 def test_a_person_pushes(station: Station, cell: Path, ftdrive: CommandLine) -> None:
     process = ftdrive.start("doctor", "--config", cell, "--push", "--json")
     listen_for(process, "press Enter")
@@ -174,6 +175,7 @@ def test_nobody_pushes(cell: Path, ftdrive: CommandLine) -> None:
     assert "standard input is closed" in checks["push.sign"]["found"]
 
 
+@pytest.mark.slow
 def test_devices_of_this_computer_and_of_an_emulated_cell(station: Station, ftdrive: CommandLine) -> None:
     url = station.cell.sensor.url
     own = ftdrive.json("devices", "--probe", url.removeprefix("ati-serial://"))
@@ -186,6 +188,7 @@ def test_devices_of_this_computer_and_of_an_emulated_cell(station: Station, ftdr
     assert all(port.keys() == told for port in (*own["serial"], *emulated["serial"]))
 
 
+@pytest.mark.slow
 def test_devices_asks_serial_port_and_can_bus_where_it_is_told_to(ftdrive: CommandLine) -> None:
     with Station("both", ["--time-scale", "1"]) as station:
         port, can = station.endpoints["sensors"]["serial"]["port"], station.endpoints["sensors"]["can"]
@@ -200,6 +203,7 @@ def test_devices_asks_serial_port_and_can_bus_where_it_is_told_to(ftdrive: Comma
         assert f" probed  {bus}&base=0x7F   no known sensor answers\n" in shown
 
 
+@pytest.mark.slow
 def test_a_place_that_cannot_be_asked_does_not_take_the_answers_of_the_others(
     station: Station, ftdrive: CommandLine
 ) -> None:

@@ -208,6 +208,7 @@ def test_simulated(tmp_path: Path) -> None:
     assert "Next: ftdrive doctor --simulate" in outcome.stderr
 
 
+@pytest.mark.slow
 def test_in_a_terminal(station: Station) -> None:
     """Every question is read on the screen before it is answered."""
     leader, follower = pty.openpty()

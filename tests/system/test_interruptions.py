@@ -76,9 +76,10 @@ def test_killed_station_is_a_lost_stream(station: Station, tour: subprocess.Pope
 
 @pytest.mark.parametrize(
     ("typed", "options"),
-    [("yes\nyes\nyes\nmove\n", ()), pytest.param("", ("--yes",), marks=pytest.mark.slow)],
+    [("yes\nyes\nyes\nmove\n", ()), ("", ("--yes",))],
     ids=["another word", "--yes"],
 )
+@pytest.mark.slow
 def test_without_the_typed_word_nothing_moves(
     typed: str, options: tuple[str, ...], station: Station, ftdrive: CommandLine
 ) -> None:

@@ -163,6 +163,7 @@ def test_after_a_protective_stop_and_a_frozen_sensor_the_operator_goes_on(
     assert 15 in trips[1:]
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_goes_on_and_finds_the_truth(
     station: Station, config: Path, ftdrive: CommandLine
 ) -> None:

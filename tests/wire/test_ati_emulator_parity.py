@@ -153,16 +153,16 @@ def test_a_wrong_byte_is_found_by_its_sum_or_by_its_mark(
     monkeypatch.setattr(ati_serial, "stream_records", records_of_noise)
     ask_for_marks(port)
     assert ask(port, START, 5) == STARTED
-    box.faults.corrupt = 0.05
+    box.faults.corrupt = 0.5
     records, bad = unmarked_records(port, 7_000)
     jam(box, port)
     number = {record: i for i, record in enumerate(made)}
     right, is_marked = sums_are_right(records), bad.any(axis=1)
     accepted = [number[record.tobytes()] for record in records[right & ~is_marked]]
     assert accepted == sorted(set(accepted)), "each was made, none comes twice, and in this order"
-    assert 0.94 < len(accepted) / len(records) < 0.96
+    assert 0.45 < len(accepted) / len(records) < 0.55
     assert (bad.sum(axis=1) <= 1).all()
-    assert 0.4 < is_marked.sum() / (len(records) - len(accepted)) < 0.6
+    assert 0.45 < is_marked.sum() / (len(records) - len(accepted)) < 0.55
     hidden = [record for record in records[right & is_marked] if record.tobytes() not in number]
     assert hidden, "the sum alone would have passed wrong records"
 

@@ -47,6 +47,7 @@ def events(state: dict[str, Any], what: str) -> list[str]:
     return [event["why"] for event in state["events"] if event["what"] == what]
 
 
+@pytest.mark.slow
 def test_it_asks_and_then_visits_every_pose_at_rest(plan: Plan, start: Callable[[float], Station]) -> None:
     station = start(25.0)
     asked = station.ask("state")

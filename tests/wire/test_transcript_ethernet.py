@@ -101,6 +101,7 @@ def test_the_driver_sees_in_the_transcript_what_it_saw_on_the_wire(url: str, tmp
     assert len(played) > 50
 
 
+@pytest.mark.slow
 def test_a_sensor_that_fails_leaves_a_transcript_that_fails_alike(tmp_path: Path, started: Any, clock: Clock) -> None:
     box, url = started(rdt_enabled=False)
     writer = Writer(tmp_path / "dead.jsonl", {"url": url, "duration_s": 1.0}, clock)

@@ -46,6 +46,7 @@ def test_a_clear_way_is_one_straight_move_at_the_slow_speed() -> None:
     assert approach.speed_rad_s[0] <= np.radians(30)
 
 
+@pytest.mark.slow
 def test_ways_through_a_crowded_cell_are_clear_where_sampled() -> None:
     rng = np.random.default_rng(2)
     detours = 0

@@ -233,7 +233,8 @@ def test_margins_are_kept_exactly() -> None:
         assert Certifier(arm, Scene(), margins).free([STANDS])[0] is np.bool_(expected)
 
 
-@pytest.mark.parametrize("model", ["UR3e", pytest.param("UR20", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["UR3e", "UR20"])
 def test_stated_clearance_is_not_above_the_distance_of_points_on_the_surfaces(model: str) -> None:
     arm = ArmModel(model, TOOLS[3])
     poses = constant_tour(STANDS)

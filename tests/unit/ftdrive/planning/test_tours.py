@@ -123,6 +123,7 @@ def test_poses_that_cannot_tell_everything_are_no_plan() -> None:
         plan_cone(certifier, poses=6, half_angle_rad=1e-6, speeds=Speeds(), guess=guess_of(certifier))
 
 
+@pytest.mark.slow
 def test_free_box_tour_keeps_the_flange_in_its_box_and_the_moves_clear() -> None:
     certifier = certifier_of("UR3e")
     centre = np.array([0.283, 0.283, 0.3])
