@@ -68,6 +68,13 @@ class Clock(ABC):
         """
         return nullcontext()
 
+    def away(self) -> AbstractContextManager[object]:
+        """Mark a block whose thread waits for something that does not call this clock, such as a web server's answer.
+
+        An emulated cell's time does not wait for the thread meanwhile, although it keeps up before and after.
+        """
+        return nullcontext()
+
 
 class RealClock(Clock):
     """The computer's monotonic clock."""

@@ -358,7 +358,8 @@ class NetFtSensor(StreamingSensor):
     def _read_page(self, path: str) -> bytes:
         """Ask for what pynetft does not: serial number of the calibration in use, rate, range."""
         try:
-            with closing(http.client.HTTPConnection(self._host, self._http_port, timeout=self._http_s)) as connection:
+            page = http.client.HTTPConnection(self._host, self._http_port, timeout=self._http_s)
+            with self._clock.away(), closing(page) as connection:
                 connection.request("GET", path)
                 return connection.getresponse().read(65536)
         except (OSError, ValueError, http.client.HTTPException) as exc:

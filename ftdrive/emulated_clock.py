@@ -19,6 +19,7 @@ _SLICE_S: Final = 0.005
 """A thread that keeps up looks at the clock this often while it waits."""
 _SUSPECT_S: Final = 0.25
 """When the time has stood still for so long, it is checked whether the station has ended."""
+_NEVER_NS: Final = 2**62
 _claiming = threading.Lock()
 
 
@@ -89,6 +90,15 @@ class EmulatedClock(Clock):
         finally:
             self._own.slot = None
             self._page[slot] = 0
+
+    @contextmanager
+    def away(self) -> Iterator[None]:
+        """Let the time go on without this thread."""
+        self._follow(_NEVER_NS)
+        try:
+            yield
+        finally:
+            self.now_ns()
 
     @property
     def _slot(self) -> int | None:

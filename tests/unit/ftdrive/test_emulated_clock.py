@@ -69,6 +69,17 @@ def test_the_end_of_an_inner_block_does_not_end_the_outer_one(cell: CellClock, c
         assert cell.now_ns() == seen + LEAD_NS
 
 
+def test_the_cell_does_not_wait_for_a_thread_that_is_away(cell: CellClock, clock: EmulatedClock) -> None:
+    with clock.keeping_up():
+        with clock.away():
+            seen = cell.now_ns()
+            time.sleep(0.05)
+            assert cell.now_ns() > seen + LEAD_NS
+        seen = clock.now_ns()
+        time.sleep(0.05)
+        assert cell.now_ns() == seen + LEAD_NS
+
+
 def test_two_threads_have_two_slots(cell: CellClock, clock: EmulatedClock) -> None:
     begun, end = threading.Event(), threading.Event()
 
