@@ -81,6 +81,7 @@ def test_a_stopped_arm_in_local_control(ftdrive: CommandLine) -> None:
     assert after["bad_inputs"] == []
 
 
+@pytest.mark.slow
 def test_an_arm_that_cannot_be_controlled(ftdrive: CommandLine) -> None:
     with ill_station() as station:
         station.control(do="claim-registers", range="lower")
@@ -165,6 +166,7 @@ def test_a_person_pushes(station: Station, cell: Path, ftdrive: CommandLine) -> 
     assert pushed["base"] is None  # nobody has told how the sensor is mounted
 
 
+@pytest.mark.slow
 def test_nobody_pushes(cell: Path, ftdrive: CommandLine) -> None:
     outcome = ftdrive.run("doctor", "--config", cell, "--push", "--json")  # with an empty standard input
     assert outcome.returncode == 0, outcome.stderr

@@ -112,7 +112,14 @@ def test_a_full_disk_and_a_reader_that_is_gone_are_no_crash() -> None:
     assert (outcome.returncode, outcome.stderr) == (1, "")
 
 
-@pytest.mark.parametrize("command", [name for name in names(cli) if name not in ("demo", "live", *REHEARSED)])
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name == "calibrate" else name
+        for name in names(cli)
+        if name not in ("demo", "live", *REHEARSED)
+    ],
+)
 def test_every_command_works_with_simulate_and_json(
     command: str, ftdrive: CommandLine, capfd: pytest.CaptureFixture[str]
 ) -> None:

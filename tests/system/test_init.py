@@ -151,6 +151,7 @@ def test_a_folder_that_is_not_there_is_told_before_anything_is_asked(tmp_path: P
     assert "create it first" in str(error)
 
 
+@pytest.mark.slow
 def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
     answers = ["127.99.99.9", station.cell.robot.host, "ati-nonsense://x", serial_port(station)]
     answers += ["high", "3300", "33", "", ""]

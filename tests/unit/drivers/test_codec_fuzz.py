@@ -7,7 +7,7 @@ from tests.benchmarks.fuzz import Target, fuzz, targets
 
 @pytest.mark.parametrize("target", targets(), ids=lambda target: target.name)
 def test_only_documented_exceptions(target: Target) -> None:
-    outcome = fuzz(target, 400, seed=2, batch=100)
+    outcome = fuzz(target, 200, seed=2, batch=100)
     assert outcome.passed, outcome
     assert outcome.refused < outcome.inputs  # some golden frames stay as they are
 

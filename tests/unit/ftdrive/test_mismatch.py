@@ -181,6 +181,7 @@ def test_the_mass_of_the_sensor_counts(payload_kg: float, sensor_kg: float | Non
     assert any("payload" in one for one in hints(outcome.result, outcome.run.records())) is told_off
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_the_mass_of_the_sensor_as_it_is_known_now(lab: Lab) -> None:
     lab.arm.set_status(payload_kg=2.8)
     lab.calibrate()
@@ -198,6 +199,7 @@ def test_a_controller_that_does_not_tell_its_payload_is_not_compared(lab: Lab) -
     assert "PolyScope" not in lab.said()
 
 
+@pytest.mark.slow
 def test_a_payload_that_was_corrected_before_the_run_goes_on_is_no_longer_told(lab: Lab) -> None:
     lab.arm.set_status(payload_kg=2.5)
     outcome = lab.calibrate()

@@ -41,7 +41,7 @@ def tilted(*, measured: bool = True) -> CalibrationDataset:
     return CalibrationDataset(R24, wrench, cov, np.zeros(24, np.int64), np.full(24, np.nan))
 
 
-@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("method", ["carlson-cayley", "ml"])
 def test_the_headline_promises_no_error_that_the_residuals_refute(method: Method, measured: bool) -> None:
     known = Known(mass_kg=0.5, gravity_direction_base=(0, 0, -1))  # a base that is not level

@@ -47,6 +47,7 @@ direction = st.tuples(coordinate, coordinate, coordinate).map(np.array).filter(l
 size = st.floats(0.02, 0.2)
 
 
+@pytest.mark.slow
 @given(st.tuples(coordinate, coordinate, coordinate), direction, size, size, direction, size, size)
 def test_separation_is_close_below_the_distance_of_the_surfaces(
     centre: tuple[float, float, float], axis: Array, l1: float, r1: float, other: Array, l2: float, r2: float
