@@ -175,7 +175,8 @@ def _values(value: Any, key: str) -> Array:
 def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, Array]:
     """Errors of the estimates, each divided by its standard deviation.
 
-    That of the rotation is the small rotation about the flange axes that leads from the truth to the estimate.
+    That of the rotation is the small rotation about the flange axes that leads from the truth to the estimate; that of
+    an angle is at most half a turn.
     """
     data = result.to_dict()
     errors = {}
@@ -184,6 +185,8 @@ def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict
             error = Rotation.from_matrix(result.R_flange_sensor @ np.transpose(truth[key])).as_rotvec()
         else:
             error = np.atleast_1d(np.subtract(data[key], truth[key]))
+            if key.endswith("_rad"):
+                error = np.remainder(error + np.pi, 2 * np.pi) - np.pi  # a ceiling is at both +180 and -180 degrees
         errors[key] = error / np.atleast_1d(data["sigma"][key])
     return errors
 

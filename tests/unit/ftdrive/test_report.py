@@ -20,7 +20,7 @@ from calib.yu import SPECIAL_R_flange_base
 from ftdrive.commands.solve import solve as solve_command
 from ftdrive.errors import ConfigError
 from ftdrive.hints import hints
-from ftdrive.report import error_in_words, print_comparison, print_result
+from ftdrive.report import error_in_words, errors_in_sigma, print_comparison, print_result
 from ftdrive.talk import talk
 from tests.unit.ftdrive.fake_cell import Lab
 
@@ -39,6 +39,13 @@ def tilted(*, measured: bool = True) -> CalibrationDataset:
     wrench = predict(TILTED, R24) + np.random.default_rng(3).normal(size=(24, 6)) * SIGMA
     cov = np.tile(np.diag(SIGMA**2), (24, 1, 1)) if measured else None
     return CalibrationDataset(R24, wrench, cov, np.zeros(24, np.int64), np.full(24, np.nan))
+
+
+def test_the_error_of_an_angle_does_not_count_whole_turns() -> None:
+    result = solve(tilted())
+    truth = result.to_dict()
+    truth["tilt_beta_rad"] += 2 * np.pi - 2 * truth["sigma"]["tilt_beta_rad"]
+    np.testing.assert_allclose(errors_in_sigma(result, truth)["tilt_beta_rad"], 2)
 
 
 @pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
