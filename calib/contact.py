@@ -1,7 +1,7 @@
 """Is something touching the tool? A test that knows how well the calibration knows the free tool."""
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri as chi2_isf
 
 from calib.model import Array, Parameters, jacobian, predict
 
@@ -50,4 +50,4 @@ def contact_chi2(
 
 def contact_threshold(false_alarm_rate: float = 0.01) -> float:
     """Limit for `contact_chi2` that a free tool breaks at this rate."""
-    return float(stats.chi2.isf(false_alarm_rate, 6))
+    return float(chi2_isf(6, false_alarm_rate))

@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
-from scipy.stats import f as f_distribution
+from scipy.special import chdtri as chi2_isf
+from scipy.special import fdtri as f_ppf
 
 from calib.covariance import Noise, summed_products
 from calib.descent import MAX_STEPS, Descent, Equations, Minimum, column_scale
@@ -53,7 +53,7 @@ LIGHT_TAIL = 0.6  # the median of squared distances relative to their mean, in u
 LARGE_ROTATION_RAD = np.deg2rad(1.0)  # few kinematics are worse
 WORST_ROTATION_RAD = np.deg2rad(3.0)  # none is
 LARGE_WHITE = 3.0  # times the measured variance
-MEDIAN_DISTANCE = float(chi2_distribution.median(6))
+MEDIAN_DISTANCE = float(chi2_isf(6, 0.5))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -309,7 +309,7 @@ class _Problem:
 
     def _fits(self, everything: _Explanation) -> bool:
         """Tell whether the measured noise explains chi2."""
-        return everything.minima[0].chi2 < float(chi2_distribution.isf(SUSPICIOUS, self._dof(everything.kept)))
+        return everything.minima[0].chi2 < float(chi2_isf(self._dof(everything.kept), SUSPICIOUS))
 
     # Explanations
 
@@ -360,7 +360,7 @@ class _Problem:
         if self.n < FEWEST_TO_REJECT_FROM:
             return False
         tail = float(np.median(distances)) / MEDIAN_DISTANCE / (float(distances.mean()) / 6)
-        return bool(distances.max() > chi2_distribution.isf(2 * SUSPICIOUS / self.n, 6)) or tail < LIGHT_TAIL
+        return bool(distances.max() > chi2_isf(6, 2 * SUSPICIOUS / self.n)) or tail < LIGHT_TAIL
 
     def _agreeing(
         self, weights: Array, starts: list[Parameters], distances: Array, *, scaled: bool
@@ -437,7 +437,7 @@ class _Problem:
     def _membership(self, kept: Kept, distances: Array, readmitted: Kept, at: Point) -> Kept:
         """Reject the poses that stand out, the worst first; take back those that do not any more, once."""
         estimated = any(c.kind == "white" for c in at.components)
-        inside = 6 * float(f_distribution.isf(1e-3, 6, self._dof(kept))) if estimated else FARTHEST
+        inside = 6 * float(f_ppf(6, self._dof(kept), 1 - 1e-3)) if estimated else FARTHEST
         worst = float(distances[kept].max())
         out = kept & (distances > max(FARTHEST, worst / 4)) & ~readmitted
         after = (kept & ~out) | (~kept & (distances < inside))

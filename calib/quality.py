@@ -7,7 +7,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy.special import chdtrc as chi2_sf
+from scipy.special import chdtri as chi2_isf
+from scipy.special import ndtr as normal_cdf
 
 from calib.changes import lasting_change
 from calib.evidence import Evidence, standardized
@@ -122,7 +124,7 @@ def judge(
     noise_factor, chi2_p = None, None
     if np.isfinite(fit.measured_chi2):
         noise_factor = float(np.sqrt(fit.measured_chi2 / fit.dof))
-        chi2_p = float(stats.chi2.sf(fit.measured_chi2, fit.dof))
+        chi2_p = float(chi2_sf(fit.dof, fit.measured_chi2))
         if chi2_p < SURE:
             good = noise_factor <= NOISE_FACTOR and largest <= NOISY_SHARE
             (notes if good else usable).append(_noise_reason(fit, noise_factor))
@@ -144,7 +146,7 @@ def judge(
             "the sensor warm up and mix the order of the poses"
         )
     typical = float(np.median(residual_sigma[used] ** 2))
-    if n >= RECOMMENDED_POSES and residual_sigma[worst] ** 2 > stats.chi2.isf(SURE / n, 6) / 6 * max(typical, 1.0):
+    if n >= RECOMMENDED_POSES and residual_sigma[worst] ** 2 > chi2_isf(6, SURE / n) / 6 * max(typical, 1.0):
         notes.append(f"pose {worst + 1} is out of line, {residual_sigma[worst]:.1f} sigma: consider repeating it")
     if sensible:
         notes += _plausibility_notes(parameters, fit.covariance, up_in_base, farthest_com_m)
@@ -182,7 +184,7 @@ def successive_correlation(standardized: Array, t_s: Array | None = None) -> tup
         standardized = standardized[np.argsort(t_s, kind="stable")]
     products = np.einsum("ni,ni->n", standardized[:-1], standardized[1:])
     correlation = float(products.mean() / (np.mean(standardized**2) * 6 or 1.0))
-    return correlation, float(stats.norm.sf(correlation * np.sqrt(6 * len(products))))
+    return correlation, float(normal_cdf(-correlation * np.sqrt(6 * len(products))))
 
 
 def strong_correlations(covariance: Array, least: float = CORRELATED) -> tuple[tuple[str, str, float], ...]:
@@ -331,7 +333,7 @@ def _second_solution_reasons(fit: Evidence) -> list[str]:
 def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
     """Rows that were left out, or that the others predict badly."""
     typical = max(float(np.median(residual_sigma[used] ** 2)), 1.0)
-    limit = stats.chi2.isf(SURE / len(residual_sigma), 6) / 6 * typical
+    limit = chi2_isf(6, SURE / len(residual_sigma)) / 6 * typical
     return np.flatnonzero(~used | (residual_sigma**2 > limit)).tolist()
 
 

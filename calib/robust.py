@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri as chi2_isf
 
 from calib.gram import Statistics, coefficients
 from calib.model import Array, Parameters
@@ -17,7 +17,7 @@ Kept = NDArray[np.bool_]
 Solver = Callable[[Statistics, Parameters, int], Parameters]
 """Goes down from a start, at most so many steps."""
 
-FARTHEST = float(chi2.isf(1e-3, 6))
+FARTHEST = float(chi2_isf(6, 1e-3))
 """Squared distance, in noise, beyond which a pose is rejected: 22.5."""
 FEWEST_TO_REJECT_FROM = 8
 """With fewer poses, one that disagrees with the others and others that disagree with it look alike."""

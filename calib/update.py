@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri as chi2_isf
 
 from calib.errors import BadDataset, NotObservable
 from calib.model import Array, Parameters, jacobian, predict, read_only, skew
@@ -172,7 +172,7 @@ def tare(
     residual = wrench - predict(old, R_base_flange)
     J = jacobian(old, R_base_flange)
     drift = np.diag(np.repeat([drift_N**2, drift_Nm**2], 3))
-    limit = float(chi2_distribution.isf(FALSE_ALARMS, 6))
+    limit = float(chi2_isf(6, FALSE_ALARMS))
     for i in range(n):
         innovation = wrench_cov[i] + J[i] @ calibration.covariance @ J[i].T + drift
         distance = float(residual[i] @ np.linalg.solve(innovation, residual[i]))
@@ -202,7 +202,7 @@ def tare(
     estimated[BIASES, np.arange(6)] = 1.0
     left = (residual - change).ravel()
     update = _update(new, calibration.covariance, estimated @ G, kept, K, S, noise, left, 6 * n - 6)
-    if update.dof and update.chi2 > chi2_distribution.isf(FALSE_ALARMS, update.dof):
+    if update.dof and update.chi2 > chi2_isf(update.dof, FALSE_ALARMS):
         raise BadDataset(
             f"the {n} poses do not agree on one bias (chi2 {update.chi2:.0f} for {update.dof} degrees of freedom): "
             "something touches the tool in one of them, or the payload has changed."
