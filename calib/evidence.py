@@ -7,7 +7,11 @@ from typing import Protocol
 
 import numpy as np
 
+from calib.covariance import Noise, summed_products
+from calib.descent import column_scale
 from calib.model import Array, Parameters, jacobian, predict
+from calib.response import Response
+from calib.variance import left_out
 
 
 class Evidence(Protocol):
@@ -54,6 +58,10 @@ class Evidence(Protocol):
         """Standard deviations of what was found beyond the measured noise, by name with unit."""
 
     @property
+    def response(self) -> Response | None:
+        """Gain and cross-talk of the sensor, where they were found."""
+
+    @property
     def residuals(self) -> Array:
         """(n, 6) measured minus predicted."""
 
@@ -81,6 +89,7 @@ class IndependentFit:
     weights: Array
     second_basin_chi2: float | None = None
     components: Mapping[str, float] = field(default_factory=dict)
+    response: Response | None = None
 
     @cached_property
     def residuals(self) -> Array:
@@ -141,16 +150,12 @@ def leave_one_out(
     covariance : array, shape (n, 6, 6)
         Of these. Very large where the others determine nothing.
     """
-    used = np.ones(len(residuals)) if weights is None else weights
-    L = np.linalg.cholesky(wrench_cov)
-    J = np.linalg.solve(L, jacobian)
-    information = np.einsum("n,nki,nkj->ij", used, J, J)
-    explained = J @ np.linalg.pinv(information, hermitian=True) @ np.swapaxes(J, 1, 2)
-    shrinking = np.where(used > 0, 1.0, 0.0)[:, None, None] * explained
-    free, V = np.linalg.eigh(np.eye(6) - shrinking)
-    M = V / np.maximum(free, 1e-12)[:, None] @ np.swapaxes(V, 1, 2)
-    left_out = (L @ M @ np.linalg.solve(L, residuals[..., None]))[..., 0]
-    return np.asarray(left_out), np.asarray(L @ (M + explained - shrinking) @ np.swapaxes(L, 1, 2))
+    noise = Noise(wrench_cov, kept=None if weights is None else weights > 0)
+    WJ = noise.solve(jacobian)
+    information = summed_products(jacobian, WJ)
+    scale = column_scale(information)
+    C = np.asarray(np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)) / np.outer(scale, scale)
+    return left_out(noise, WJ, noise.solve(residuals[..., None])[..., 0], C)
 
 
 def standardized(residuals: Array, covariance: Array) -> Array:

@@ -14,7 +14,8 @@ from scipy.special import ndtr as normal_cdf
 from calib.changes import lasting_change
 from calib.evidence import Evidence, standardized
 from calib.identifiability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
-from calib.model import PARAMETER_NAMES, UP_IN_BASE, Array, Parameters, jacobian
+from calib.model import PARAMETER_NAMES, UP_IN_BASE, Array, Parameters
+from calib.response import Response, predicted_covariance
 from calib.so3 import force_cost, given_rotation, minima
 from calib.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
@@ -140,6 +141,8 @@ def judge(
         usable.append(f"there are only {n} poses: {RECOMMENDED_POSES} or more can be checked against each other")
     usable += _indispensable_reasons(fit, used, weight_N)
 
+    if fit.response is not None:
+        notes.append(f"{fit.response.in_words()}: the calibration corrects this for its own weight")
     if lag1_p < SURE:
         notes.append(
             f"successive poses have similar residuals (correlation {lag1:.2f}): most likely the bias drifted, so let "
@@ -197,13 +200,13 @@ def strong_correlations(covariance: Array, least: float = CORRELATED) -> tuple[t
     return tuple((PARAMETER_NAMES[i], PARAMETER_NAMES[j], value) for value, i, j in strong)
 
 
-def expected_error(parameters: Parameters, covariance: Array) -> tuple[float, float]:
+def expected_error(parameters: Parameters, covariance: Array, response: Response | None = None) -> tuple[float, float]:
     """Root mean square error of the predicted wrench over all orientations, N and N·m.
 
     It is of second degree in the orientation, so its mean over the rotations of the cube is the mean over all.
     """
-    J = jacobian(parameters, np.swapaxes(SPECIAL_R_flange_base, 1, 2))
-    variance = np.einsum("nki,ij,nkj->k", J, covariance, J) / len(J)
+    over = predicted_covariance(parameters, covariance, response, np.swapaxes(SPECIAL_R_flange_base, 1, 2))
+    variance = np.diagonal(over, axis1=1, axis2=2).mean(axis=0)
     return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
 
 
@@ -382,7 +385,7 @@ def _shares(
     """
     lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
     left_out = _rms(fit.left_out_residuals[used, :3]), _rms(fit.left_out_residuals[used, 3:])
-    expected = expected_error(fit.parameters, fit.covariance)
+    expected = expected_error(fit.parameters, fit.covariance, fit.response)
     kinds = (
         ("force", 0, weight_N, "N", "the weight"),
         ("torque", 1, weight_N * lever_m, "N·m", f"the weight at {lever_m:.2g} m"),

@@ -96,10 +96,14 @@ def solve(
     evidence: Evidence = best
     if estimator:
         parameters = estimator(dataset.wrench)
-        noise = best.wrench_cov if wrench_cov is None else wrench_cov
+        noise = wrench_cov
+        if noise is None:  # what a method cannot explain is noise to it
+            residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
+            square = (residuals**2).reshape(-1, 2, 3).mean(axis=(0, 2)) * 6 * len(dataset) / best.dof
+            noise = np.broadcast_to(np.diag(np.repeat(np.maximum(square, 1e-24), 3)), (len(dataset), 6, 6))
         evidence = IndependentFit(
             parameters,
-            _simulated_covariance(estimator, parameters, dataset.R_base_flange, best.wrench_cov),
+            _simulated_covariance(estimator, parameters, dataset.R_base_flange, noise),
             dataset.R_base_flange,
             dataset.wrench,
             noise,
@@ -141,6 +145,7 @@ def solve(
         weights=evidence.weights,
         components=evidence.components,
         drift=None if drifted is None else DriftResult(drifted.change, drifted.sigma),
+        response=evidence.response,
         second_basin_chi2=best.second_basin_chi2,
         quality={
             "loo_force_rms_N": quality.loo_force_rms_N,

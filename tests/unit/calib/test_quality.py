@@ -394,7 +394,7 @@ def test_a_real_session_is_usable_and_one_with_drift_is_never_good(real_data: Pa
         verdict, reasons = solved(dataset.R_base_flange, dataset.wrench)
         assert verdict in verdicts
         assert not any(word in reasons for word in ("disagree", "reaction", "inverted"))
-        assert "the force residual is" in reasons
+        assert ("the force residual is" in reasons) == (name != "agimus_mini45_b")
 
 
 def test_a_real_session_read_with_wrong_signs_is_found_out(real_data: Path) -> None:
