@@ -146,7 +146,7 @@ def test_exact_with_the_fewest_poses_and_one_less_is_refused(name: str, bias: bo
 def test_the_original_form_hides_a_bias_in_the_rotation_and_the_other_finds_it(name: str) -> None:
     errors: dict[tuple[float, bool], list[float]] = {(bias_N, bias): [] for bias_N in (0, 1) for bias in (False, True)}
     rng = np.random.default_rng(2)
-    for trial in range(60):
+    for trial in range(20):
         R = random_poses(rng, 24)
         for (bias_N, bias), found in errors.items():
             truth = random_truth(rng, bias_N)
@@ -219,7 +219,7 @@ def test_more_samples_cure_nullspace_but_not_eigen() -> None:
     """Eight lopsided orientations, each measured many times at a signal-to-noise ratio of 10."""
     rng = np.random.default_rng(7)
     errors: dict[tuple[str, int], list[float]] = {(name, m): [] for name in ("eigen", "nullspace") for m in (50, 1000)}
-    for trial in range(12):
+    for trial in range(7):
         eight, truth = ball(rng, 8, 40), random_truth(rng)
         for (name, repeats), found in errors.items():
             R = np.tile(eight, (repeats, 1, 1))
@@ -243,7 +243,7 @@ def test_nullspace_takes_many_poses() -> None:
 
 def test_algorithm_1_reaches_the_truth_from_any_gravity_with_100_random_poses() -> None:
     rng = np.random.default_rng(9)
-    for trial in range(200):
+    for trial in range(60):
         truth, R = random_truth(rng), random_poses(rng, 100)
         fit = iterative(
             R, truth.force_N(R, 0.2, seed=trial), bias=bool(trial % 2), gravity_start_base=rng.normal(size=3)
@@ -255,7 +255,7 @@ def test_algorithm_1_reaches_the_truth_from_any_gravity_with_100_random_poses() 
 def test_algorithm_1_reaches_the_truth_with_few_poses_from_its_own_start() -> None:
     rng = np.random.default_rng(10)
     stuck = 0
-    for _ in range(60):
+    for _ in range(20):
         truth, R = random_truth(rng, 5), random_poses(rng, 8)
         force_N = truth.force_N(R)
         assert_equal(
@@ -343,7 +343,7 @@ def test_similarity_is_the_least_squares_solution(bias: bool) -> None:
 def test_a_wrong_weight_goes_into_the_rotation_of_the_cayley_transform_only() -> None:
     rng = np.random.default_rng(15)
     plateau, free = [], []
-    for _ in range(40):
+    for _ in range(20):
         truth, R = random_truth(rng), random_poses(rng, 24)
         force_N, wrong = truth.force_N(R, 1e-6), 1.1 * truth.gravity_force_base_N
         plateau.append(error_deg(cayley(R, force_N, wrong, bias=True), truth))
@@ -401,8 +401,11 @@ DEGENERATE = {
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_refuses_poses_that_leave_gravity_open(name: str, bias: bool, poses: str, sigma_N: float) -> None:
     truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), bias * np.array([1.0, 2, -30]))
+    method = METHODS[name]
+    if name == "iterative":  # it never rests here, with noise
+        method = lambda R, f, _, bias: iterative(R, f, bias=bias, max_iterations=300)  # noqa: E731
     with pytest.raises(NotObservable, match="add poses"):
-        METHODS[name](DEGENERATE[poses], truth.force_N(DEGENERATE[poses], sigma_N), np.zeros(3), bias)
+        method(DEGENERATE[poses], truth.force_N(DEGENERATE[poses], sigma_N), np.zeros(3), bias)
 
 
 @pytest.mark.parametrize("sigma_N", [0, 0.05])

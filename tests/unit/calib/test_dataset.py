@@ -1,6 +1,7 @@
 """Datasets: what is accepted, what is refused and with which words, files, CSV."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from syrupy.assertion import SnapshotAssertion
 
 from calib import BadDataset, CalibrationDataset, read_csv
 from calib.files import write_new
@@ -35,6 +37,11 @@ def changed(array: object, index: tuple[int, ...], value: float) -> np.ndarray[A
     return copy
 
 
+def wording(error: Exception) -> str:
+    """Leave out what json and numpy say in their own words: they change with the version."""
+    return re.sub(r"(JSON|numbers) \(.*?\)(?=[:.])", r"\1 (…)", str(error))
+
+
 def test_arrays_are_copies_that_cannot_be_written_to() -> None:
     wrench = np.zeros((4, 6))
     data = dataset(wrench=wrench)
@@ -55,34 +62,35 @@ INDEFINITE[3, 0, 1] = INDEFINITE[3, 1, 0] = 1.5
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    "changes",
     [
-        ({"wrench": changed(np.zeros((4, 6)), (2, 3), np.nan)}, r"row 3: wrench\[3\] is nan, not a finite number"),
-        ({"wrench": changed(np.zeros((4, 6)), (0, 0), np.inf)}, r"row 1: wrench\[0\] is inf"),
-        ({"wrench": np.zeros((3, 6))}, r"wrench has shape \(3, 6\), expected \(4, 6\)"),
-        ({"wrench": [["a"] * 6] * 4}, "wrench is not an array of numbers"),
-        ({"R_base_flange": changed(R, (1, 0, 0), np.nan)}, r"row 2: R_base_flange\[0\]\[0\] is nan"),
-        ({"R_base_flange": R * 1.01}, r"row 1: the orientation is not a rotation matrix.*identity by 0\.02"),
-        ({"R_base_flange": R * [[[1]], [[1]], [[1]], [[-1]]]}, r"row 4: the orientation is a reflection.*-1\.000"),
-        ({"R_base_flange": np.zeros((0, 3, 3)), "wrench": np.zeros((0, 6))}, "there is no pose"),
-        ({"wrench": changed(np.zeros((4, 6)), (2, 3), 1e30)}, r"row 3: wrench\[3\] is 1e\+30, more than any sensor"),
-        ({"R_base_flange": changed(R, (1, 0, 0), 1e200)}, "row 2: R_base_flange.* is 1e\\+200, more than any sensor"),
-        ({"wrench_cov": np.tile(1e200 * np.eye(6), (4, 1, 1))}, "row 1: wrench_cov.* is 1e\\+200, more than any"),
-        ({"wrench_cov": np.tile(1e-200 * np.eye(6), (4, 1, 1))}, "the variance of fx is 1e-200, less than any sensor"),
-        ({"wrench_cov": np.zeros((4, 6, 6))}, "row 1: wrench_cov is not a covariance matrix, the variance of fx is 0"),
-        ({"wrench_cov": NOT_SYMMETRIC}, r"row 2: .*it is not symmetric \(by 0\.5 "),
-        ({"wrench_cov": INDEFINITE}, r"row 4: .*it is not positive definite \(smallest .* -0\.5\)"),
-        ({"wrench_cov": np.eye(6)}, r"wrench_cov has shape \(6, 6\), expected \(4, 6, 6\)"),
-        ({"t_s": [0.0, np.inf, 1.0, 2.0]}, "row 2: t_s is inf"),
-        ({"n_samples": [1, 2, -3, 4]}, "row 3: n_samples is -3"),
-        ({"n_samples": [1, 2.5, 3, 4]}, r"row 2: n_samples is 2\.5"),
-        ({"meta": {"x": object()}}, "meta cannot be written as JSON"),
-        ({"meta": {"x": float("nan")}}, "meta cannot be written as JSON"),
+        {"wrench": changed(np.zeros((4, 6)), (2, 3), np.nan)},
+        {"wrench": changed(np.zeros((4, 6)), (0, 0), np.inf)},
+        {"wrench": np.zeros((3, 6))},
+        {"wrench": [["a"] * 6] * 4},
+        {"R_base_flange": changed(R, (1, 0, 0), np.nan)},
+        {"R_base_flange": R * 1.01},
+        {"R_base_flange": R * [[[1]], [[1]], [[1]], [[-1]]]},
+        {"R_base_flange": np.zeros((0, 3, 3)), "wrench": np.zeros((0, 6))},
+        {"wrench": changed(np.zeros((4, 6)), (2, 3), 1e30)},
+        {"R_base_flange": changed(R, (1, 0, 0), 1e200)},
+        {"wrench_cov": np.tile(1e200 * np.eye(6), (4, 1, 1))},
+        {"wrench_cov": np.tile(1e-200 * np.eye(6), (4, 1, 1))},
+        {"wrench_cov": np.zeros((4, 6, 6))},
+        {"wrench_cov": NOT_SYMMETRIC},
+        {"wrench_cov": INDEFINITE},
+        {"wrench_cov": np.eye(6)},
+        {"t_s": [0.0, np.inf, 1.0, 2.0]},
+        {"n_samples": [1, 2, -3, 4]},
+        {"n_samples": [1, 2.5, 3, 4]},
+        {"meta": {"x": object()}},
+        {"meta": {"x": float("nan")}},
     ],
 )
-def test_what_is_wrong_is_said_with_its_row(changes: dict[str, Any], words: str) -> None:
-    with pytest.raises(BadDataset, match=words):
+def test_what_is_wrong_is_said_with_its_row(changes: dict[str, Any], snapshot: SnapshotAssertion) -> None:
+    with pytest.raises(BadDataset) as caught:
         dataset(**changes)
+    assert wording(caught.value) == snapshot
 
 
 @pytest.mark.parametrize("decimals", [3, 4, 6])
@@ -135,7 +143,7 @@ def test_a_file_is_never_overwritten_and_never_half(tmp_path: Path) -> None:
     path = tmp_path / "d.json"
     dataset().save(path)
     before = path.read_bytes()
-    with pytest.raises(FileExistsError, match=r"d\.json exists already and is never overwritten"):
+    with pytest.raises(FileExistsError, match=r"d\.json exists already"):
         dataset(meta={}).save(path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
@@ -158,29 +166,28 @@ def without(name: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    "content",
     [
-        ("", "the file is empty"),
-        ("{", "this is not valid JSON"),
-        pytest.param("[" * 100_000, "this is not valid JSON", id="brackets in brackets"),
-        ("[1]", "holds a JSON list, not an object"),
-        ("{}", "the field 'format' is missing"),
-        ('{"format": "ftdrive.calibration/1"}', "format is 'ftdrive.calibration/1', not 'ftdrive.dataset/1'"),
-        ('{"format": "ftdrive.dataset/2"}', "version '2' of ftdrive.dataset is unknown"),
-        (without("wrench"), "lacks the field wrench"),
-        (without("t_s")[:-1] + ', "t_s": 3}', "t_s must be a list"),
-        (b"\xff\xfe\x00", "is not a text file"),
+        "",
+        "{",
+        pytest.param("[" * 100_000, id="brackets in brackets"),
+        "[1]",
+        "{}",
+        '{"format": "ftdrive.calibration/1"}',
+        '{"format": "ftdrive.dataset/2"}',
+        without("wrench"),
+        without("t_s")[:-1] + ', "t_s": 3}',
+        b"\xff\xfe\x00",
     ],
 )
 def test_a_file_that_is_something_else_is_named_in_one_sentence(
-    tmp_path: Path, content: str | bytes, words: str
+    tmp_path: Path, content: str | bytes, snapshot: SnapshotAssertion
 ) -> None:
     path = tmp_path / "d.json"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(BadDataset, match=words) as caught:
+    with pytest.raises(BadDataset) as caught:
         CalibrationDataset.load(path)
-    assert "\n" not in str(caught.value)
-    assert str(caught.value).count("d.json") == 1
+    assert wording(caught.value) == snapshot
 
 
 MATRIX_HEADER = "r11,r12,r13,r21,r22,r23,r31,r32,r33,fx,fy,fz,tx,ty,tz"
@@ -229,34 +236,33 @@ def test_csv_standard_errors_become_the_covariance(tmp_path: Path) -> None:
     np.testing.assert_array_equal(data.wrench, [[1, 2, 3, 4, 5, 6]])
     with pytest.raises(BadDataset, match="missing column sigma_tz"):
         read_csv(csv(tmp_path, f"{sigmas[:-9]},{MATRIX_HEADER}", f".1,.2,.3,.01,.02,{IDENTITY},1,2,3,4,5,6"))
-    with pytest.raises(BadDataset, match="row 1: sigma_fy is 0, a standard error is above 0"):
+    with pytest.raises(BadDataset, match="row 1: sigma_fy is 0"):
         read_csv(csv(tmp_path, f"{sigmas},{MATRIX_HEADER}", f".1,0,.3,.01,.02,.03,{IDENTITY},1,2,3,4,5,6"))
 
 
 @pytest.mark.parametrize(
-    ("lines", "words"),
+    "lines",
     [
-        ([""], "the file is empty"),
-        ([MATRIX_HEADER], "a header and no row below it"),
-        (["r11,r12,fx,fy,tx,ty,tz", "1"], "missing column r13, r21, r22, r23, r31, r32, r33, fz:"),
-        (["rx,ry,fx,fy,fz,tx,ty,tz", "1"], "missing column rz:"),
-        (["fx,fy,fz,tx,ty,tz", "1"], "missing column r11, .* r33: the first row must name .* or rx, ry, rz"),
-        ([f"{IDENTITY},1,2,3,4,5,6"], "missing column r11, .*it names 1, 0, 0"),
-        ([f"{MATRIX_HEADER},fx", f"{IDENTITY},1,2,3,4,5,6,7"], "column fx appears more than once"),
-        ([MATRIX_HEADER, f"{IDENTITY},1,2,3,4,5,6", f"{IDENTITY},1,2,3,4,5"], "row 2 has 14 values, the header 15"),
-        ([MATRIX_HEADER, f"{IDENTITY},1,2,3,4,five,6"], "row 1: ty is 'five', not a number"),
-        ([MATRIX_HEADER, f"{IDENTITY},1,2,3,4,,6"], "row 1: ty is '', not a number"),
-        ([MATRIX_HEADER, f"{IDENTITY},1,2,nan,4,5,6"], "row 1: fz is nan, not a finite number"),
-        ([MATRIX_HEADER, f"{IDENTITY},1,2,1e999,4,5,6"], "row 1: fz is 1e999, not a finite number"),
-        ([MATRIX_HEADER, f"{IDENTITY},1,2,3,4,5,6", "1,0,0,0,1,0,0,0,2,1,2,3,4,5,6"], "row 2: .*not a rotation"),
-        ([MATRIX_HEADER, "1,0,0,0,1,0,0,0,-1,1,2,3,4,5,6"], "row 1: the orientation is a reflection"),
+        [""],
+        [MATRIX_HEADER],
+        ["r11,r12,fx,fy,tx,ty,tz", "1"],
+        ["rx,ry,fx,fy,fz,tx,ty,tz", "1"],
+        ["fx,fy,fz,tx,ty,tz", "1"],
+        [f"{IDENTITY},1,2,3,4,5,6"],
+        [f"{MATRIX_HEADER},fx", f"{IDENTITY},1,2,3,4,5,6,7"],
+        [MATRIX_HEADER, f"{IDENTITY},1,2,3,4,5,6", f"{IDENTITY},1,2,3,4,5"],
+        [MATRIX_HEADER, f"{IDENTITY},1,2,3,4,five,6"],
+        [MATRIX_HEADER, f"{IDENTITY},1,2,3,4,,6"],
+        [MATRIX_HEADER, f"{IDENTITY},1,2,nan,4,5,6"],
+        [MATRIX_HEADER, f"{IDENTITY},1,2,1e999,4,5,6"],
+        [MATRIX_HEADER, f"{IDENTITY},1,2,3,4,5,6", "1,0,0,0,1,0,0,0,2,1,2,3,4,5,6"],
+        [MATRIX_HEADER, "1,0,0,0,1,0,0,0,-1,1,2,3,4,5,6"],
     ],
 )
-def test_csv_errors_name_column_or_row(tmp_path: Path, lines: list[str], words: str) -> None:
-    with pytest.raises(BadDataset, match=words) as caught:
+def test_csv_errors_name_column_or_row(tmp_path: Path, lines: list[str], snapshot: SnapshotAssertion) -> None:
+    with pytest.raises(BadDataset) as caught:
         read_csv(csv(tmp_path, *lines))
-    assert str(caught.value).startswith("poses.csv: ")
-    assert "\n" not in str(caught.value)
+    assert wording(caught.value) == snapshot
 
 
 def test_csv_that_is_not_text(tmp_path: Path) -> None:

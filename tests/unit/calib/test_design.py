@@ -6,6 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, solve
@@ -18,6 +19,7 @@ from calib.design import (
     Guess,
     TOOL_DOWN_R_base_flange,
     efficiency,
+    information,
     optimised,
     predicted_sigma,
     second_basin,
@@ -128,10 +130,10 @@ def test_published_table_of_fixed_sets(numbers: tuple[int, ...], figures: list[f
     ("degrees", "figures"),
     [
         (120, [1.23, 1.7, 0.126, 0.084, 0.0102, 0.0177, 0.13]),
-        (90, [1.55, 2.6, 0.131, 0.084, 0.0104, 0.0183, 0.14]),
-        (60, [2.8, 6.3, 0.167, 0.087, 0.0131, 0.0250, 0.17]),
+        pytest.param(90, [1.55, 2.6, 0.131, 0.084, 0.0104, 0.0183, 0.14], marks=pytest.mark.slow),
+        pytest.param(60, [2.8, 6.3, 0.167, 0.087, 0.0131, 0.0250, 0.17], marks=pytest.mark.slow),
         (45, [4.1, 11, 0.220, 0.093, 0.0177, 0.0347, 0.22]),
-        (30, [6.3, 24, 0.325, 0.105, 0.0285, 0.0535, 0.32]),
+        pytest.param(30, [6.3, 24, 0.325, 0.105, 0.0285, 0.0535, 0.32], marks=pytest.mark.slow),
         (15, [13, 82, 0.64, 0.11, 0.060, 0.109, 0.62]),
     ],
 )
@@ -192,6 +194,12 @@ def test_a_guess_of_nothing_is_refused(name: str) -> None:
         replace(GUESS, **{name: 0.0})
     with pytest.raises(ValueError, match="walk_force_N is -1"):
         replace(GUESS, walk_force_N=-1.0)
+
+
+@pytest.mark.parametrize(("com_m", "lever_m"), [(0.0, 0.04), (0.03, 0.04), (0.05, 0.05)])
+def test_the_lever_is_that_of_the_tool_or_of_the_noise(com_m: float, lever_m: float) -> None:
+    guess = Guess(2.0, 0.1, 0.004, p_sensor_com_m=(0, -com_m, 0), g_m_s2=10.0)
+    assert_allclose(guess.scale, np.repeat([1, 20, 20, lever_m, 20 * lever_m], 3))
 
 
 def test_a_centre_of_mass_near_the_sensor_is_observable() -> None:
@@ -289,7 +297,7 @@ def test_optimised_sets(
 def test_random_sets_have_the_published_efficiency() -> None:
     rng = np.random.default_rng(0)
     for n, median in ((6, 0.72), (8, 0.82), (12, 0.88), (24, 0.95)):
-        A = [efficiency(Rotation.random(n, rng=rng).as_matrix(), GUESS).A for _ in range(400)]
+        A = [efficiency(Rotation.random(n, rng=rng).as_matrix(), GUESS).A for _ in range(100)]
         assert_allclose(np.median(A), median, atol=0.03)
 
 
@@ -391,7 +399,7 @@ def test_next_poses_improve_the_prediction_and_open_the_gap(half_angle_deg: int)
 
 def test_next_pose_is_the_best_by_brute_force() -> None:
     rng = np.random.default_rng(2)
-    R, candidates = optimised(8)[:5], Rotation.random(60, rng=rng).as_matrix()
+    R, candidates = optimised(8)[:5], Rotation.random(20, rng=rng).as_matrix()
     ranked, rms = next_pose(R, candidates, GUESS, least_gap=0.0)
     predictions = [predicted_sigma(np.concatenate([R, c[None]]), GUESS) for c in candidates]
     cost = [(p.force_rms_N / 0.2) ** 2 + (p.torque_rms_Nm / 0.005) ** 2 for p in predictions]
@@ -411,6 +419,21 @@ def test_published_greedy_against_random() -> None:
     assert_allclose(rms[0], 0.0788, rtol=0.03)
 
 
+def test_no_random_order_is_better_than_the_chosen_one() -> None:
+    guess = Guess(20 / 9.80665, 0.02, 0.0005, walk_force_N=0.07, walk_torque_Nm=0.00175)
+    rng, six = np.random.default_rng(6), special(SUBSET_6)
+
+    def variance(index: NDArray[np.integer]) -> float:
+        J = whitened_jacobian(six[index], guess)
+        return float(np.trace(np.linalg.inv(information(J, guess))[:6, :6]))
+
+    best = order(six, guess)
+    assert sorted(best.tolist()) == list(range(6))
+    others = [variance(rng.permutation(6)) for _ in range(60)]
+    assert variance(best) <= min(others) < 0.9 * np.median(others)
+
+
+@pytest.mark.slow
 def test_order_keeps_a_wandering_bias_apart() -> None:
     guess = Guess(20 / 9.80665, 0.02, 0.0005, walk_force_N=0.07, walk_torque_Nm=0.00175)
 

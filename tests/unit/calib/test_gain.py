@@ -90,7 +90,7 @@ def test_contact_through_the_gain_comes_out_true() -> None:
 def test_what_the_force_gain_is_worth() -> None:
     """2 % gains, 24 poses, noise 0.05 N: compensation rms 0.301 N without, 0.022 N with it, in simulation."""
     without, with_gain, misfit, distance = [], [], [], []
-    for seed in range(25):
+    for seed in range(10):
         it = world(seed)
         start = start_of(it)
         found = estimate_force_gain(start, it.R_base_flange, it.wrench[:, :3], covariances(24)[:, :3, :3], WEIGHT_N)
@@ -124,12 +124,12 @@ def test_without_the_weight_the_scale_is_free_and_said_so() -> None:
 
 def test_poses_that_leave_the_force_gain_free_are_refused() -> None:
     it = world(0, 4)
-    with pytest.raises(NotObservable, match="4 poses give 12 equations for 14 numbers: add 1"):
+    with pytest.raises(NotObservable, match="12 equations for 14 numbers"):
         estimate_force_gain(it.parameters, it.R_base_flange, it.wrench[:, :3], covariances(4)[:, :3, :3], WEIGHT_N)
     about_one_axis = Rotation.from_rotvec(np.linspace(0, 3, 12)[:, None] * [1, 0, 0]).as_matrix()
     upright = Parameters(np.eye(3), np.array([0, 0, -WEIGHT_N]), np.zeros(3), np.zeros(3), np.zeros(3))
     for p, R in ((it.parameters, about_one_axis), (upright, about_one_axis), (upright, np.tile(np.eye(3), (12, 1, 1)))):
-        with pytest.raises(NotObservable, match="of 14 numbers free of a force gain: tilt"):
+        with pytest.raises(NotObservable, match=r"of 14 numbers free.*: tilt"):
             estimate_force_gain(p, R, predict(p, R)[:, :3], covariances(12)[:, :3, :3], WEIGHT_N)
 
 
@@ -173,7 +173,7 @@ def test_three_known_payloads_give_the_wrench_gain_exactly() -> None:
 
 def test_the_covariance_of_the_wrench_gain_is_honest() -> None:
     distance, misfit = [], []
-    for seed in range(20):
+    for seed in range(10):
         C, p, R, y, index = wrench_world(PAYLOADS, 1.0, seed)
         found = estimate_wrench_gain(p, R, y, covariances(45), index.tolist(), PAYLOADS)
         z = (found.gain - C).ravel() / np.sqrt(np.diag(found.covariance))[:36]
@@ -241,5 +241,5 @@ def test_payloads_that_are_listed_but_never_hung_do_not_count() -> None:
 def test_too_few_poses_of_a_payload_are_refused() -> None:
     _, p, R, y, index = wrench_world(PAYLOADS, 0.0, 0)
     few = [0, 1, 15, 16, 30, 31]
-    with pytest.raises(NotObservable, match="of 44 numbers free of a wrench gain: tilt"):
+    with pytest.raises(NotObservable, match=r"of 44 numbers free.*: tilt"):
         estimate_wrench_gain(p, R[few], y[few], covariances(6), index[few].tolist(), PAYLOADS)

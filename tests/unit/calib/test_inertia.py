@@ -187,10 +187,10 @@ def test_the_covariance_is_honest() -> None:
 @pytest.mark.parametrize(
     ("turn", "lacking"),
     [
-        ((0.25, 0.25, 0.0), "turns about z of the sensor"),
-        ((0.25, 0.0, 0.0), "turns about y and z of the sensor"),
-        ((0.25, 0.25, 0.01), "turns about z of the sensor"),
-        ((0.0, 0.0, 0.0), "hardly turns .* about all three axes"),
+        ((0.25, 0.25, 0.0), "turns about z"),
+        ((0.25, 0.0, 0.0), "about y and z"),
+        ((0.25, 0.25, 0.01), "turns about z"),
+        ((0.0, 0.0, 0.0), "about all three axes"),
     ],
 )
 def test_missing_rotation_is_named(turn: tuple[float, float, float], lacking: str) -> None:
@@ -224,14 +224,14 @@ def test_implausible_bodies_are_named() -> None:
     assert doubts(1.0, (1, 2, 2.9)) == ""
     assert "no body does" in doubts(1.0, (1, 2, 3.1))
     assert "not all positive" in doubts(1.0, (-1, 2, 2))
-    assert "check the sign of the wrench" in doubts(-1.0, (1, 2, 2))
+    assert "check the sign" in doubts(-1.0, (1, 2, 2))
 
 
 def test_data_that_do_not_fit_are_refused() -> None:
     wrench = reading(MOVING)
     with pytest.raises(BadDataset, match=r"wrench has shape \(1999, 6\), expected \(2000, 6\)"):
         estimate_inertia(PARAMETERS, *MOVING, wrench[1:], g_m_s2=G)
-    with pytest.raises(BadDataset, match="each later than the one before"):
+    with pytest.raises(BadDataset, match="each later than"):
         estimate_inertia(PARAMETERS, *MOVING._replace(t_s=TIMES[::-1]), wrench, g_m_s2=G)
     with pytest.raises(ValueError, match="quarter of the recording"):
         estimate_inertia(PARAMETERS, *MOVING, wrench, g_m_s2=G, most_delay_s=6)

@@ -92,7 +92,15 @@ def test_statistics_give_the_normal_equations_of_the_data() -> None:
 # Efficiency and basins
 
 
-@pytest.mark.parametrize(("kind", "runs"), [("haar12", 80), ("haar6", 60), ("cone40_24", 40)])
+@pytest.mark.parametrize(
+    ("kind", "runs"),
+    [
+        ("haar12", 30),
+        pytest.param("haar12", 80, marks=pytest.mark.slow),
+        pytest.param("haar6", 60, marks=pytest.mark.slow),
+        pytest.param("cone40_24", 40, marks=pytest.mark.slow),
+    ],
+)
 def test_errors_are_at_the_cramer_rao_bound(kind: str, runs: int) -> None:
     error, least, distance, p_values = np.zeros(5), np.zeros(5), [], []
     for seed in range(runs):
@@ -113,7 +121,7 @@ def test_errors_are_at_the_cramer_rao_bound(kind: str, runs: int) -> None:
 @pytest.mark.parametrize(("n", "degrees", "weight_in_sigma"), [(6, 180, 10), (12, 40, 30), (24, 20, 30)])
 def test_no_start_reaches_a_lower_minimum(n: int, degrees: float, weight_in_sigma: float) -> None:
     sigma = SIGMA * 100 / weight_in_sigma
-    for seed in range(15):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         p, R = truth(rng), haar(rng, n) if degrees == 180 else cone(rng, n, degrees)
         wrench = predict(p, R) + noise(rng, n, sigma)
@@ -125,6 +133,7 @@ def test_no_start_reaches_a_lower_minimum(n: int, degrees: float, weight_in_sigm
         assert lowest < min(descent.down(statistics.normal_equations, start).chi2 for start in starts) + 1e-6
 
 
+@pytest.mark.slow
 def test_the_odds_of_the_second_basin_are_those_of_being_wrong() -> None:
     azimuth = np.arange(8) * np.pi / 4
     expected, wrong, seen = 0.0, 0, 0
@@ -150,7 +159,7 @@ def test_the_odds_of_the_second_basin_are_those_of_being_wrong() -> None:
 @pytest.mark.parametrize("measured", [True, False])
 def test_bumped_poses_are_rejected_and_no_others(n: int, bumped: int, measured: bool) -> None:
     error, least, missed, false = np.zeros(5), np.zeros(5), 0, 0
-    for seed in range(4):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         p, R = truth(rng), haar(rng, n)
         push = rng.normal(size=(bumped, 3))
@@ -165,7 +174,7 @@ def test_bumped_poses_are_rejected_and_no_others(n: int, bumped: int, measured: 
         assert best.dof == 6 * int(best.weights.sum()) - 15
         assert (best.left_out_distances[best.weights == 0] > 22).all()
     assert missed <= 1
-    assert false <= 3
+    assert false <= 2
     assert (error / least < 4).all()
 
 
@@ -208,7 +217,7 @@ def drifting(rng: np.random.Generator, n: int, kind: str) -> tuple[Parameters, A
 
 def test_a_drifting_bias_is_followed() -> None:
     turned, covered, changes = [], [], []
-    for seed in range(8):
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         p, R, wrench, bias = drifting(rng, 60, "walk")
         best = fit(R, wrench, np.diag((SIGMA / 10) ** 2))
@@ -309,8 +318,9 @@ def random_known(name: str, p: Parameters, rng: np.random.Generator) -> Known:
     ],
 )
 def test_knowledge_is_used_for_what_it_is_worth(name: str, unknowns: int) -> None:
+    runs = 8
     distance, chi2 = [], []
-    for seed in range(16):
+    for seed in range(runs):
         rng = np.random.default_rng(seed)
         p, R = truth(rng), haar(rng, 8)
         wrench = predict(p, R) + noise(rng, 8)
@@ -319,10 +329,29 @@ def test_knowledge_is_used_for_what_it_is_worth(name: str, unknowns: int) -> Non
         e = best.free.T @ best.parameters.difference(p)
         distance.append(e @ np.linalg.solve(best.free.T @ best.covariance @ best.free, e))
         chi2.append(best.chi2)
-        free = fit(R, wrench, WHITE, drift="none")
-        assert np.linalg.eigvalsh(free.covariance - best.covariance).min() > -0.2 * np.abs(free.covariance).max()
-    assert stats.kstest(distance, "chi2", args=(unknowns,)).pvalue > 1e-3
-    assert stats.kstest(chi2, "chi2", args=(best.dof,)).pvalue > 1e-3
+    free = fit(R, wrench, WHITE, drift="none")
+    assert np.linalg.eigvalsh(free.covariance - best.covariance).min() > -0.2 * np.abs(free.covariance).max()
+    assert np.mean(distance) == pytest.approx(unknowns, abs=2.5 * np.sqrt(2 * unknowns / runs))
+    assert np.mean(chi2) == pytest.approx(best.dof, abs=2.5 * np.sqrt(2 * best.dof / runs))
+
+
+@pytest.mark.parametrize(
+    ("name", "block", "information"),
+    [
+        ("rotation about", slice(0, 3), 3 / 0.004**2),
+        ("yaw about", slice(0, 3), 2 / 0.004**2),
+        ("direction about", slice(3, 6), 2 / (0.004 * WEIGHT_N) ** 2),
+        ("mass about", slice(3, 6), 1 / 0.02**2),
+    ],
+)
+def test_a_tolerance_counts_as_a_measurement_of_that_sigma(name: str, block: slice, information: float) -> None:
+    rng = np.random.default_rng(10)
+    p, R = truth(rng), haar(rng, 8)
+    wrench = predict(p, R) + 1e-3 * noise(rng, 8)
+    free = fit(R, wrench, WHITE, drift="none")
+    best = fit(R, wrench, WHITE, known=random_known(name, p, rng), drift="none")
+    added = np.linalg.inv(best.covariance) - np.linalg.inv(free.covariance)
+    assert np.trace(added[block, block]) == pytest.approx(information, rel=0.05)
 
 
 @pytest.mark.parametrize("name", ["rotation", "direction", "mass", "yaw"])
@@ -370,7 +399,7 @@ def test_impossible_knowledge_is_refused(fields: dict[str, object], words: str) 
 def test_covariances_from_few_samples_do_no_harm(samples: int, spread: float) -> None:
     n = 24
     error, least, direct = np.zeros(5), np.zeros(5), np.zeros(5)
-    for seed in range(16):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         p, R = truth(rng), haar(rng, n)
         L = SIGMA[:, None] * np.linalg.cholesky(np.corrcoef(rng.normal(size=(6, 14)))) * np.sqrt(samples)

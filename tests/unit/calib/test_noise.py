@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from calib import BadDataset, is_stationary, mean_and_covariance
 from calib.model import Array
-from calib.noise import QUIET, is_quiet, noise_level, restless_channels
+from calib.noise import is_quiet, noise_level, restless_channels
 
 
 def noise(rng: np.random.Generator, N: int, rho: Array) -> Array:
@@ -17,47 +17,65 @@ def noise(rng: np.random.Generator, N: int, rho: Array) -> Array:
     return np.column_stack([lfilter([np.sqrt(1 - r**2)], [1, -r], white[:, c])[300:] for c, r in enumerate(rho)])
 
 
-@pytest.mark.parametrize("N", [400, 1500, 7000])
-@pytest.mark.parametrize("rho", [[0.0] * 6, [0.5] * 6, [0.9] * 6, [0, 0.5, 0.9, 0, 0.9, 0.5]])
+MIXED = [0, 0.5, 0.9, 0, 0.9, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("N", "rho"),
+    [
+        *((N, rho) for N in (400, 1500) for rho in ([0.0] * 6, [0.5] * 6, [0.9] * 6, MIXED)),
+        (7000, MIXED),
+        (1500, [-0.5] * 6),
+    ],
+)
 def test_the_mean_lies_where_its_covariance_says(N: int, rho: list[float]) -> None:
     rng = np.random.default_rng(N)
-    z = []
-    for _ in range(250 if N < 5000 else 100):
+    lag = np.arange(1, N)
+    variance = np.array([1 + 2 * np.sum((1 - lag / N) * r**lag) for r in rho]) / N
+    z, ratio = [], []
+    for _ in range(100 if N < 5000 else 40):
         pose = mean_and_covariance(5.0 + noise(rng, N, np.array(rho)))
         z.append((pose.mean - 5.0) / np.sqrt(np.diag(pose.covariance)))
+        ratio.append(np.diag(pose.covariance) / variance)
+    assert 0.98 < np.mean(ratio) < 1.12  # a little on the safe side
     coverage = np.mean(np.abs(z) < 1.96)
     hard = N == 400 and max(rho) == 0.9  # 21 independent samples: the spread itself is known to 30 %
     assert (0.88 if hard else 0.92) < coverage < 0.98
 
 
-def test_white_noise_is_not_inflated() -> None:
+def test_the_worst_channel_says_what_a_dwell_is_worth() -> None:
     rng = np.random.default_rng(0)
-    ratio = [np.diag(mean_and_covariance(rng.normal(size=(400, 6))).covariance) * 400 for _ in range(300)]
-    assert 0.95 < np.mean(ratio) < 1.12
-    assert 0.95 < np.mean(np.sqrt(ratio)) < 1.06
     assert 200 < mean_and_covariance(rng.normal(size=(400, 6))).n_effective < 450
+    worth = mean_and_covariance(noise(rng, 20_000, np.array(MIXED))).n_effective
+    assert worth == pytest.approx(20_000 * (1 - 0.9) / (1 + 0.9), rel=0.2)
 
 
-def test_correlation_between_channels_is_kept() -> None:
+@pytest.mark.parametrize("rho", [0.0, 0.8])
+def test_correlation_between_channels_is_kept(rho: float) -> None:
+    """Of channels as unlike in size as newtons and newton metres, in the samples and in their mean."""
+    sigma = np.repeat([0.3, 0.004], 3)
+    mixing = np.eye(6)
+    mixing[4, [0, 4]] = 0.8, 0.6
     rng = np.random.default_rng(1)
-    mixing = np.linalg.cholesky(np.array([[1, 0.8], [0.8, 1]]))
-    samples = rng.normal(size=(5000, 6))
-    samples[:, [0, 4]] = samples[:, [0, 4]] @ mixing.T
-    C = mean_and_covariance(samples).covariance
-    assert C[0, 4] / np.sqrt(C[0, 0] * C[4, 4]) == pytest.approx(0.8, abs=0.02)
-    np.testing.assert_array_equal(C, C.T)
+    found = [mean_and_covariance(noise(rng, 500, np.full(6, rho)) @ mixing.T * sigma) for _ in range(150)]
+    correlations = [C[0, 4] / np.sqrt(C[0, 0] * C[4, 4]) for C in (pose.covariance for pose in found)]
+    assert np.median(correlations) == pytest.approx(0.8, abs=0.02)
+    difference = np.array([1, 0, 0, 0, -1, 0]) / sigma  # of which correlation takes most of the spread away
+    z = [difference @ pose.mean / np.sqrt(difference @ pose.covariance @ difference) for pose in found]
+    assert np.std(z) == pytest.approx(1, abs=0.2)
+    np.testing.assert_array_equal(found[0].covariance, found[0].covariance.T)
 
 
 @pytest.mark.parametrize("sigma", [0.25, 0.4, 0.7, 1.5])
 def test_averaging_cannot_see_through_coarse_steps(sigma: float) -> None:
     rng = np.random.default_rng(2)
     z = []
-    for _ in range(150):
+    for _ in range(60):
         true = rng.uniform(-5, 5, 6)
         pose = mean_and_covariance(np.round(true + sigma * rng.normal(size=(400, 6))))
         z.append((pose.mean - true) / np.sqrt(np.diag(pose.covariance)))
     assert np.mean(np.abs(z) < 1.96) > 0.92
-    if sigma > 1:
+    if sigma > 0.5:
         assert np.std(z) > 0.9  # and fine steps cost nothing
 
 
@@ -73,6 +91,7 @@ def test_a_channel_that_never_moves_or_copies_another_leaves_a_usable_covariance
     np.testing.assert_allclose(np.sqrt(np.diag(silent)), [1e-3] * 3 + [2.5e-5] * 3)
 
 
+@pytest.mark.realtime
 def test_seven_seconds_of_a_2_kHz_sensor_take_milliseconds() -> None:
     samples = np.random.default_rng(4).normal(size=(14_000, 6))
     best = float("inf")
@@ -80,15 +99,14 @@ def test_seven_seconds_of_a_2_kHz_sensor_take_milliseconds() -> None:
         start = time.perf_counter()
         mean_and_covariance(samples)
         best = min(best, time.perf_counter() - start)
-    assert best < 0.05  # 5 ms on an idle machine; loose, because tests share theirs
+    assert best < 0.05  # 5 ms on an idle machine
 
 
-@pytest.mark.parametrize(("N", "rho"), [(400, 0.0), (400, 0.5), (1500, 0.0), (1500, 0.5), (1500, 0.9), (7000, 0.9)])
+@pytest.mark.parametrize(("N", "rho"), [(400, 0.0), (400, 0.5), (1500, 0.9)])
 def test_quiet_dwells_pass(N: int, rho: float) -> None:
     rng = np.random.default_rng(N)
-    dwells = 1500 if N < 1000 else 600
-    failures = sum(not is_stationary(noise(rng, N, np.full(6, rho))) for _ in range(dwells))
-    assert failures / dwells < 0.01
+    failures = sum(not is_stationary(noise(rng, N, np.full(6, rho))) for _ in range(300))
+    assert failures / 300 < 0.01  # with 3 standard errors 4 % and more would fail
 
 
 @pytest.mark.parametrize("N", [400, 7000])
@@ -97,10 +115,10 @@ def test_a_drift_or_a_decay_of_any_channel_fails(N: int) -> None:
     t = np.linspace(0, 1, N)
     standard_error = 1 / np.sqrt(N)
     for channel in range(6):
-        for disturbance in (t, t > 0.5, np.exp(-t / 0.4)):
+        for disturbance in (60 * t, 20 * (t > 0.5), 120 * np.exp(-t / 0.4)):  # a third less is sometimes missed
             samples = rng.normal(size=(N, 6))
             assert is_stationary(samples)
-            samples[:, channel] += 150 * standard_error * disturbance
+            samples[:, channel] += standard_error * disturbance
             assert not is_stationary(samples)
 
 
@@ -118,30 +136,12 @@ def filtered(rng: np.random.Generator, seconds: float, corner_Hz: float) -> Arra
     return samples
 
 
-@pytest.mark.parametrize("corner_Hz", [1e9, 20, 10, 5])
+@pytest.mark.parametrize("corner_Hz", [1e9, 5])
 def test_a_sensor_left_alone_is_quiet(corner_Hz: float) -> None:
     rng = np.random.default_rng(17)
     level = noise_level(filtered(rng, 20, corner_Hz), 1000)
-    alarms = np.mean([not is_quiet(filtered(rng, 2, corner_Hz), level) for _ in range(600)])
-    assert alarms < 0.015
-
-
-def test_three_standard_errors_would_reject_too_many_quiet_dwells() -> None:
-    """Why the threshold is wider than that."""
-    rng = np.random.default_rng(18)
-
-    def alarms(threshold: float, corner_Hz: float) -> float:
-        found = 0
-        for _ in range(500):
-            halves = filtered(rng, 2, corner_Hz).reshape(2, 10, 50, 6).mean(axis=2)
-            error = np.sqrt(halves.var(axis=1, ddof=1).sum(axis=0) / 10)
-            found += bool((np.abs(np.diff(halves.mean(axis=1), axis=0)[0]) > threshold * error).any())
-        return found / 500
-
-    assert alarms(3, 1e9) > 0.02
-    assert alarms(3, 5) > 0.08
-    assert alarms(QUIET, 1e9) < 0.01
-    assert alarms(QUIET, 5) < 0.02
+    alarms = np.mean([not is_quiet(filtered(rng, 2, corner_Hz), level) for _ in range(300)])
+    assert alarms < 0.015  # with a threshold of 3 standard errors 4 % and 13 %
 
 
 @pytest.mark.parametrize(

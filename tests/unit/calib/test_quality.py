@@ -119,7 +119,7 @@ def test_poses_that_were_not_used_are_predicted_like_new_ones() -> None:
 def test_left_out_residuals_spread_as_stated() -> None:
     rng = np.random.default_rng(2)
     squares = []
-    for _ in range(100):
+    for _ in range(60):
         R = Rotation.random(6, rng=rng).as_matrix()
         quality = judge(fit(R, noisy(rng, R), white(6)))
         squares.append(quality.residual_sigma**2)
@@ -162,12 +162,12 @@ def test_the_expected_error_is_the_mean_over_all_orientations() -> None:
 
 def test_p_values_are_uniform_and_clean_runs_are_good_without_a_word() -> None:
     rng = np.random.default_rng(7)
-    judged = [judge(fit(R24, noisy(rng, R24), white(24))) for _ in range(150)]
+    judged = [judge(fit(R24, noisy(rng, R24), white(24))) for _ in range(80)]
     p = np.sort([q.chi2_p for q in judged if q.chi2_p is not None])
-    assert len(p) == 150
-    assert np.abs(p - np.arange(1, 151) / 150).max() < 0.13  # Kolmogorov's 1 %
+    assert len(p) == 80
+    assert np.abs(p - np.arange(1, 81) / 80).max() < 0.18  # Kolmogorov's 1 %
     assert all(q.verdict == "good" for q in judged)
-    assert sum(bool(q.reasons) for q in judged) <= 3
+    assert sum(bool(q.reasons) for q in judged) <= 2
     assert np.mean([q.lag1 for q in judged]) == pytest.approx(0, abs=0.04)
 
 
@@ -202,7 +202,7 @@ def test_strong_correlations_are_named() -> None:
 def test_contact_alarms_are_as_rare_as_asked_for(n: int, alone: float) -> None:
     rng = np.random.default_rng(n)
     alarms, noise_only, tared, seen = [], [], [], []
-    for _ in range(300):
+    for _ in range(120):
         R = R24 if n == 24 else Rotation.random(n, rng=rng).as_matrix()
         J = (jacobian(TRUTH, R) / SIGMA[:, None]).reshape(-1, 15)
         covariance = np.linalg.inv(J.T @ J)
@@ -234,7 +234,6 @@ def test_noise_beyond_the_measured_is_good_only_while_errors_are_small() -> None
         assert quality.verdict == verdict
         assert quality.noise_factor == pytest.approx(factor, rel=0.2)
         assert "times the measured noise" in words(quality)
-        assert "the stated uncertainties do not include them" in words(quality)
     known = judge(fit(R24, noisy(rng, R24, sigma=2 * SIGMA), white(24), components={"rotation_rad": 0.002}))
     assert "found rotation_rad 0.002" in words(known)
 
@@ -268,11 +267,22 @@ def test_few_poses_and_left_out_poses_are_said() -> None:
         quality = judge(fit(R24, hit, white(24), weights=weights))
         listed = ", ".join(str(k + 1) for k in bumped)
         assert quality.verdict == verdict
-        assert f"{len(bumped)} of 24 poses were left out, they fit none of the others: repeat {listed}" in words(
-            quality
-        )
+        assert f"{len(bumped)} of 24 poses were left out" in words(quality)
+        assert f"repeat {listed}" in words(quality)
         assert quality.loo_force_rms_N < 0.15
         assert quality.worst_pose not in bumped
+
+
+@pytest.mark.parametrize("channel", range(6))
+def test_what_is_known_is_doubted_where_the_data_fit_without_it(channel: int) -> None:
+    wrench = noisy(np.random.default_rng(24), R24)
+    free = fit(R24, wrench, white(24))
+    off = 3.0 if channel < 3 else 0.2  # N or N·m of every pose, as from a constraint that is wrong
+    constrained = replace(free, wrench=wrench + off * np.eye(6)[channel])
+    said = words(judge(constrained, unconstrained=free))
+    assert f"the {'force' if channel < 3 else 'torque'}s fit to" in said
+    assert f"instead of {off:.2g} N" in said
+    assert "fit to" not in words(judge(free, unconstrained=free))
 
 
 def test_a_pose_out_of_line_is_pointed_at() -> None:
@@ -296,7 +306,7 @@ def test_a_weight_lost_in_noise_is_rejected() -> None:
     light = replace(TRUTH, gravity_force_base_N=np.array([0, 0, -0.03]))
     quality = judge(fit(R24, noisy(np.random.default_rng(15), R24, light), white(24), start=light))
     assert quality.verdict == "rejected"
-    assert "hang something heavier on the sensor" in quality.reasons[0]
+    assert "hang something heavier" in quality.reasons[0]
 
 
 @pytest.mark.parametrize(
@@ -332,14 +342,14 @@ F, T = ["fx", "fy", "fz"], ["tx", "ty", "tz"]
 @pytest.mark.parametrize(
     ("reversed_channels", "says"),
     [
-        (F + T, "the weight pulls upwards (178° from down): the sensor reports the reaction (set sign = -1)"),
-        (["fx", "tx"], "or one axis is reversed in forces and torques alike"),
-        (F, "the forces are reversed and the torques are not"),
-        (T, "the centre of mass lies 69 mm on the robot's side of the sensor: the torques are reversed"),
-        (["tx"], "force and torque axes disagree, with torque x reversed the torque residual drops from"),
-        (["fy"], "force and torque axes disagree, with torque y reversed (or force y) the torque residual drops from"),
-        (["ty", "tz"], "with torque y and z reversed (or force y and z) the torque residual drops from"),
-        (["fx", "fy"], "with torque x and y reversed (or force x and y) the torque residual drops from"),
+        (F + T, "(set sign = -1)"),
+        (["fx", "tx"], "or one axis is reversed"),
+        (F, "the forces are reversed"),
+        (T, "the torques are reversed"),
+        (["tx"], "with torque x reversed the"),
+        (["fy"], "torque y reversed (or force y)"),
+        (["ty", "tz"], "y and z reversed (or force y and z)"),
+        (["fx", "fy"], "x and y reversed (or force x and y)"),
     ],
 )
 @pytest.mark.parametrize("seed", [17, 18])

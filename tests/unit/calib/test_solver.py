@@ -16,7 +16,8 @@ from calib.compare import compare
 from calib.errors import BadDataset
 from calib.known import Known
 from calib.ml import fit
-from calib.model import STANDARD_GRAVITY_M_S2, Array, jacobian, predict
+from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, jacobian, predict
+from calib.published import published
 from calib.result import Method
 from calib.yu import SPECIAL_R_flange_base
 
@@ -32,6 +33,12 @@ TRUTH = Parameters(
     np.array([0.01, -0.02, -0.07]),
     np.array([0.1, 0.2, -0.3]),
 )
+
+
+@pytest.fixture(autouse=True)
+def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The uncertainty of closed forms is simulated: a few runs are enough where it is not judged."""
+    monkeypatch.setattr("calib.solver.SIMULATIONS", 20)
 
 
 def dataset(R_base_flange: Array, wrench: Array, cov: Array | None = None) -> CalibrationDataset:
@@ -98,41 +105,49 @@ def test_any_mounting_is_found_from_any_orientations(n: int) -> None:
         assert result.chi2 < 1e-15
 
 
-@pytest.mark.parametrize(("orientations", "seed"), [("24", 1), ("7", 2)])
-def test_the_covariance_is_honest(orientations: str, seed: int) -> None:
+@pytest.mark.parametrize(
+    ("orientations", "seed", "runs"),
+    [
+        ("24", 1, 40),
+        pytest.param("24", 1, 150, marks=pytest.mark.slow),
+        pytest.param("7", 2, 150, marks=pytest.mark.slow),
+    ],
+)
+def test_the_covariance_is_honest(orientations: str, seed: int, runs: int) -> None:
     rng = np.random.default_rng(seed)
     R = R24 if orientations == "24" else Rotation.random(7, rng=rng).as_matrix()
     cov = uneven(rng, len(R))
     distance, chi2, squared, stated = [], [], np.zeros(15), np.zeros(15)
-    for _ in range(150):
+    for _ in range(runs):
         result = solve(dataset(R, noisy(rng, R, cov), cov))
         error = result.parameters.difference(TRUTH)
         distance.append(error @ np.linalg.solve(result.covariance, error))
         chi2.append(result.chi2)
-        squared += error**2 / 150
-        stated += np.diag(result.covariance) / 150
+        squared += error**2 / runs
+        stated += np.diag(result.covariance) / runs
+    assert np.mean(distance) == pytest.approx(15, abs=2.5 * np.sqrt(30 / runs))
+    assert np.mean(chi2) == pytest.approx(result.dof, abs=2.5 * np.sqrt(2 * result.dof / runs))
     assert stats.kstest(distance, "chi2", args=(15,)).pvalue > 1e-3
     assert stats.kstest(chi2, "chi2", args=(result.dof,)).pvalue > 1e-3
     # Efficient: the mean square error of every block is the Cramer-Rao bound at the truth.
     J = np.linalg.inv(np.linalg.cholesky(cov)) @ jacobian(TRUTH, R)
     bound = np.diag(np.linalg.inv(np.einsum("nki,nkj->ij", J, J))).reshape(5, 3).sum(axis=1)
-    np.testing.assert_allclose(squared.reshape(5, 3).sum(axis=1) / bound, 1, atol=0.25)
+    np.testing.assert_allclose(squared.reshape(5, 3).sum(axis=1) / bound, 1, atol=3 * np.sqrt(2 / 3 / runs))
     # Seven poses now and then seem to show more than the measured noise; that can only widen what is stated.
     widened = 0.05 if orientations == "24" else 0.1
     np.testing.assert_allclose(stated.reshape(5, 3).sum(axis=1) / bound, 1, atol=widened)
 
 
 @pytest.mark.parametrize("method", ["srom", "lrom"])
-def test_sigmas_of_the_closed_forms_are_their_own(method: Method) -> None:
+def test_sigmas_of_the_closed_forms_are_their_own(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
     rng = np.random.default_rng(3)
     cov = white(24, 4 * SIGMA)
-    squared, stated = np.zeros(15), np.zeros(15)
-    for _ in range(16):
-        result = solve(dataset(R24, noisy(rng, R24, cov), cov), method)
-        squared += result.parameters.difference(TRUTH) ** 2 / 16
-        stated += np.diag(result.covariance) / 16
+    stated = np.diag(solve(dataset(R24, noisy(rng, R24, cov), cov), method).covariance)
+    estimate = published(method, R24, gravity_direction_base=-UP_IN_BASE)
+    squared = np.mean([estimate(noisy(rng, R24, cov)).difference(TRUTH) ** 2 for _ in range(100)], axis=0)
     ratio = squared.reshape(5, 3).sum(axis=1) / stated.reshape(5, 3).sum(axis=1)
-    np.testing.assert_allclose(ratio, 1, atol=0.5)
+    np.testing.assert_allclose(ratio, 1, atol=0.3)
     best = np.diag(solve(dataset(R24, noisy(rng, R24, cov), cov)).covariance)
     assert stated[:3].sum() > 2 * best[:3].sum()  # torques tell ML more about the rotation
 
@@ -140,7 +155,7 @@ def test_sigmas_of_the_closed_forms_are_their_own(method: Method) -> None:
 def test_noise_is_estimated_from_the_residuals_when_nobody_measured_it() -> None:
     rng = np.random.default_rng(4)
     stated = []
-    for _ in range(30):
+    for _ in range(12):
         R = Rotation.random(8, rng=rng).as_matrix()
         best = fit(R, noisy(rng, R, white(8)), None)
         stated.append(np.sqrt(np.diag(best.wrench_cov[0]))[[0, 3]])
@@ -180,17 +195,17 @@ def spin(axis: str, tilt_deg: float, n: int = 8) -> Array:
 @pytest.mark.parametrize(
     ("R", "method", "words"),
     [
-        (R24[:3], "ml", "3 poses are too few, at least 4 are needed: add 1, better 3"),
-        (R24[:4], "lrom", "4 poses are too few, at least 5 are needed: add 1, better 2"),
-        (np.tile(R24[:1], (9, 1, 1)), "ml", "all 9 poses have the same orientation: turn and tilt"),
-        (np.tile(R24[:3], (3, 1, 1)), "ml", "the 9 poses have only 3 different orientations, at least 4"),
+        (R24[:3], "ml", "3 poses are too few.* 4 .* add 1"),
+        (R24[:4], "lrom", "4 poses are too few.* 5 .* add 1"),
+        (np.tile(R24[:1], (9, 1, 1)), "ml", "9 poses have the same orientation"),
+        (np.tile(R24[:3], (3, 1, 1)), "ml", "9 poses have only 3 different"),
         (
             spin("z", 150.0),
             "ml",
-            "only the last joint was turned: .* is mixed with .*; add",
+            "the last joint .* is mixed",
         ),
-        (spin("x", 0.0), "ml", "the tool was turned about the flange's x axis only: .* is mixed with"),
-        (R24[:23], "srom", "SROM needs its 24 orientations once each: missing 24. Use LROM or ML"),
+        (spin("x", 0.0), "ml", "about the flange's x axis only: .* mixed"),
+        (R24[:23], "srom", "24 orientations .*: missing 24. Use LROM"),
     ],
 )
 def test_what_the_poses_cannot_tell_is_refused_in_words(R: Array, method: Method, words: str, measured: bool) -> None:
@@ -200,9 +215,9 @@ def test_what_the_poses_cannot_tell_is_refused_in_words(R: Array, method: Method
 
 
 def test_a_sensor_that_feels_nothing_is_refused() -> None:
-    with pytest.raises(NotObservable, match="the force is the same in all poses"):
+    with pytest.raises(NotObservable, match="force is the same"):
         solve(dataset(R24, np.tile([1.0, 2, 3, 0, 0, 0], (24, 1))))
-    with pytest.raises(NotObservable, match="the force is the same in all poses"):
+    with pytest.raises(NotObservable, match="force is the same"):
         solve(dataset(R24, 1e-160 * predict(TRUTH, R24)))
 
 
@@ -221,8 +236,13 @@ def test_a_walk_is_looked_for_where_there_is_nothing_to_see(measured: bool) -> N
     no_lever = replace(TRUTH, p_sensor_com_m=np.zeros(3), torque_bias_Nm=np.zeros(3))
     rng = np.random.default_rng(4)
     pushed = predict(no_lever, R) + rng.normal(size=(8, 6)) * SIGMA * [1, 1, 1, 0, 0, 0]  # torques are exactly 0
-    for wrench in (predict(TRUTH, R), pushed):
-        solve(dataset(R, wrench, white(8) if measured else None), drift="random-walk")
+    for truth, wrench in ((TRUTH, predict(TRUTH, R)), (no_lever, pushed)):
+        result = solve(dataset(R, wrench, white(8) if measured else None), drift="random-walk")
+        error = np.abs(truth.difference(result.parameters))
+        assert (error < 4 * np.sqrt(np.diag(result.covariance)) + 1e-12).all()
+        assert result.components.get("walk_force_N", 0.0) < SIGMA[0] / 100
+        assert result.components.get("walk_torque_Nm", 0.0) < SIGMA[3] / 100
+        assert result.drift is None or (np.abs(result.drift.change) < result.drift.sigma).all()
 
 
 def test_rounding_is_no_evidence_of_inverted_orientations() -> None:
@@ -252,7 +272,7 @@ def test_knowledge_makes_poor_poses_enough() -> None:
     R = spin("z", 150.0)
     wrench = noisy(np.random.default_rng(12), R, white(8))
     data = dataset(R, wrench, white(8))
-    with pytest.raises(NotObservable, match="only the last joint was turned"):
+    with pytest.raises(NotObservable, match="the last joint"):
         solve(data)
     known = Known(
         gravity_direction_base=TRUTH.gravity_force_base_N,
@@ -262,7 +282,7 @@ def test_knowledge_makes_poor_poses_enough() -> None:
     assert np.linalg.norm(error[:3]) < 0.05
     with pytest.raises(NotObservable, match="the poses leave 1 of 12"):
         solve(data, known=Known(R_flange_sensor=TRUTH.R_flange_sensor))
-    with pytest.raises(ValueError, match="lrom cannot use what is known before"):
+    with pytest.raises(ValueError, match="lrom cannot use"):
         solve(data, "lrom", known=known)
 
 
@@ -326,7 +346,7 @@ def test_verdicts_give_their_reason() -> None:
 
     verdict, reasons = verdict_of(wrench, cov=white(24, SIGMA / 20))
     assert verdict == "usable"
-    assert re.search(r"residuals are (1[7-9]|2[0-3])\.\d times the measured noise", reasons)
+    assert re.search(r"(1[7-9]|2[0-3])\.\d times the measured noise", reasons)
 
     bumps = (
         wrench + 0.4 * np.eye(24, 6) @ np.diag([1.0, 1, 1, 0, 0, 0]) + rng.normal(size=(24, 6)) * ([0.3] * 3 + [0] * 3)
@@ -357,7 +377,7 @@ def test_nothing_on_the_sensor_is_never_a_calibration() -> None:
         R = Rotation.random(12, rng=rng).as_matrix()
         verdict, reasons = verdict_of(rng.normal(size=(12, 6)) * SIGMA + [1, 2, 3, 0, 0, 0], R, white(12))
         assert verdict in ("rejected", "refused")
-        assert "hang something heavier on the sensor" in reasons
+        assert "hang something heavier" in reasons
 
 
 def test_what_is_known_to_be_down_depends_on_the_mounting() -> None:
@@ -380,7 +400,7 @@ def test_poses_of_one_tilt_are_refused_because_up_and_down_look_alike() -> None:
     azimuth = np.arange(8) * np.pi / 4
     lean = np.deg2rad(40) * np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
     R = (Rotation.from_rotvec(lean) * Rotation.from_euler("x", 180, degrees=True)).as_matrix()
-    with pytest.raises(NotObservable, match=r"at one angle to gravity, 40° .* add a pose"):
+    with pytest.raises(NotObservable, match=r"one angle to gravity, 40°"):
         solve(dataset(R, predict(level, R), white(8)))
 
 

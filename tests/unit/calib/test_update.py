@@ -72,17 +72,17 @@ def test_three_poses_give_payload_and_biases_exactly() -> None:
 
 def test_one_pose_or_parallel_gravity_is_refused_in_words() -> None:
     new, old = loaded(truth()), exact(truth())
-    with pytest.raises(NotObservable, match=r"1 pose leaves 1 of 4 numbers free .* add 1 or more"):
+    with pytest.raises(NotObservable, match=r"leaves 1 of 4 .* add 1"):
         update_payload(old, tilted(0), predict(new, tilted(0)), noise_of(1))
     for R in (tilted(0, 0.5), tilted(0, 180), tilted(10, 10, 10)):  # the same, upside down, and repeated
-        with pytest.raises(NotObservable, match="the same line through the sensor"):
+        with pytest.raises(NotObservable, match="the same line"):
             update_payload(old, R, predict(new, R), noise_of(len(R)))
     for n, free in ((1, "4 of 10"), (2, "1 of 10")):
         R = tilted(0, 60)[:n]
         with pytest.raises(NotObservable, match=free):
             update_payload(old, R, predict(new, R), noise_of(n), retare=True)
     R = tilted(0, 60, 60.1)
-    with pytest.raises(NotObservable, match="fewer than three clearly different directions"):
+    with pytest.raises(NotObservable, match="fewer than three"):
         update_payload(old, R, predict(new, R), noise_of(3), retare=True)
 
 
@@ -93,7 +93,7 @@ def test_no_payload_and_a_reversed_sign_are_refused() -> None:
         update_payload(exact(old), R, predict(bare, R), noise_of(2))
     with pytest.raises(NotObservable, match="check the sign"):
         update_payload(exact(old), R, 2 * predict(bare, R) - predict(old, R), noise_of(2))
-    with pytest.raises(NotObservable, match="the direction of gravity is unknown"):
+    with pytest.raises(NotObservable, match="direction of gravity is unknown"):
         update_payload(exact(bare), R, predict(old, R), noise_of(2))
 
 
@@ -114,7 +114,7 @@ def test_the_covariance_covers_noise_and_the_old_errors(retare: bool) -> None:
     old, new, R = truth(), loaded(truth()), tilted(-60, 20, 60, 100)
     rng = np.random.default_rng(2)
     distances, misfits = [], []
-    for seed in range(200):
+    for seed in range(80):
         noise = rng.multivariate_normal(np.zeros(6), NOISE, size=4)
         update = update_payload(calibration(old, seed=seed), R, predict(new, R) + noise, noise_of(4), retare=retare)
         error = new.difference(update.parameters)
@@ -167,7 +167,7 @@ def test_the_covariance_of_a_tare_covers_noise_and_the_old_errors() -> None:
     R = tilted(20, 70)
     for n in (1, 2):
         distances = []
-        for seed in range(150):
+        for seed in range(60):
             update = tare(calibration(truth(), seed=seed), R[:n], [dwell(truth(), R[i], rng, 40) for i in range(n)])
             error = truth().difference(update.parameters)
             distances.append(error @ np.linalg.solve(update.covariance, error))
@@ -203,14 +203,14 @@ def test_a_tare_while_the_reading_moves_is_refused() -> None:
 def test_a_tare_with_another_payload_is_refused_though_every_pose_could_be_drift() -> None:
     heavier = truth().moved(np.concatenate([np.zeros(3), 0.05 * truth().gravity_force_base_N, np.zeros(9)]))
     R = tilted(0, 90)
-    with pytest.raises(BadDataset, match="do not agree on one bias"):
+    with pytest.raises(BadDataset, match="do not agree"):
         tare(exact(truth()), R, [dwell(heavier, R[i], np.random.default_rng(10 + i)) for i in range(2)])
 
 
 def test_good_tares_pass() -> None:
     rng = np.random.default_rng(9)
     R = Rotation.random(2, rng=rng).as_matrix()
-    for seed in range(100):
+    for seed in range(40):
         now = drifted(truth(), rng.normal(size=3), rng.normal(size=3) * 0.03)
         tare(calibration(truth(), seed=seed), R[:1], [dwell(now, R[0], rng, 400)])
 

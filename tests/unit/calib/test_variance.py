@@ -11,6 +11,7 @@ from calib.variance import (
     TORQUE,
     Component,
     Linearised,
+    _pruned,
     _score,
     component,
     maximise,
@@ -161,14 +162,38 @@ def test_variances_are_recovered() -> None:
 def test_nothing_is_found_where_nothing_is_and_the_walk_where_one_is() -> None:
     candidates = [*ALL[:3], component("walk", FORCE), component("walk", TORQUE)]
     spurious, right = 0, 0
-    for seed in range(40):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         spurious += len(select(problem(rng, 30, (), np.zeros(0)), [], np.zeros(0), candidates).components)
         walk = component("walk", FORCE)
         at = select(problem(rng, 30, (walk,), np.array([0.02])), [], np.zeros(0), candidates)
         right += walk in at.components
-    assert spurious <= 8  # 2 % each, of 200
-    assert right >= 39
+    assert spurious <= 4  # 2 % each, of 100
+    assert right >= 19
+
+
+@pytest.mark.parametrize("walk_first", [False, True])
+def test_what_others_make_needless_is_dropped(walk_first: bool) -> None:
+    white, walk = component("white", FORCE), component("walk", FORCE)
+    both = (walk, white) if walk_first else (white, walk)
+    rng = np.random.default_rng(7)
+    for really, needed, kept in (
+        ((white,), 0, (white,)),
+        ((walk,), 0, (walk,)),
+        (both, 0, both),
+        ((white,), 2, both),  # whatever the data say
+    ):
+        p = problem(rng, 40, really, np.full(len(really), 0.3))
+        at = maximise(p, both, np.full(2, 0.1))
+        assert _pruned(p, at, needed).components == kept
+
+
+def test_what_is_always_needed_is_not_dropped() -> None:
+    three = (component("walk", FORCE), *ALL[:2])
+    p = problem(np.random.default_rng(8), 40, ALL[:2], np.full(2, 0.3))
+    at = maximise(p, three, np.full(3, 0.1))
+    assert _pruned(p, at, 1).components == three
+    assert _pruned(p, at, 0).components == ALL[:2]
 
 
 def test_a_turn_of_the_flange_is_told_from_white_noise() -> None:

@@ -81,7 +81,7 @@ def test_srom_names_what_is_missing_repeated_or_off() -> None:
     assert "repeated 1." in refusal(np.concatenate([R24, R24[:1]]))
     bent = R24.copy()
     bent[6] = turned("y", 2.0) @ bent[6]
-    assert re.search(r"missing 7; row 7 none of them \(row 7 is 2\.00° from orientation 7", refusal(bent))
+    assert re.search(r"missing 7; .*row 7 is 2\.00° from orientation 7", refusal(bent))
     assert "missing 3, 17." in refusal(turned("z", 5) @ np.delete(R24, [2, 16], axis=0))
     scattered = Rotation.random(24, rng=np.random.default_rng(0)).as_matrix()
     assert "use LROM" in refusal(scattered).replace("Use", "use")
@@ -104,10 +104,10 @@ def test_lrom_is_exact_from_five_poses_whatever_the_mounting(n: int) -> None:
 
 def test_lrom_refuses_four_poses_and_poses_it_cannot_tell_apart() -> None:
     R = Rotation.random(4, rng=np.random.default_rng(0)).as_matrix()
-    with pytest.raises(NotObservable, match="LROM needs at least 5 poses, there are 4"):
+    with pytest.raises(NotObservable, match="at least 5 poses, there are 4"):
         lrom(R, predict(TRUTH, R))
     spin = Rotation.from_euler("x", np.arange(8)[:, None] * 40.0, degrees=True).as_matrix()
-    with pytest.raises(NotObservable, match="LROM has more than one solution"):
+    with pytest.raises(NotObservable, match="more than one solution"):
         lrom(spin, predict(TRUTH, spin))
 
 

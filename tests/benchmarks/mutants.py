@@ -1,0 +1,150 @@
+"""Plant small errors in a copy of the project, one at a time, and print which of them the fast tests find.
+
+The tests of `ftdrive/session/x.py` are those of `tests/unit/ftdrive/session` or, where there is no such folder, of the
+next one up: first the files that import the module, then the rest.
+"""
+
+import argparse
+import ast
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from itertools import accumulate
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+PROJECT = Path(__file__).parents[2]
+
+SWAPPED: dict[type[ast.AST], list[type[ast.AST]]] = {
+    ast.Add: [ast.Sub], ast.Sub: [ast.Add], ast.Mult: [ast.Div], ast.Div: [ast.Mult], ast.Pow: [ast.Mult],
+    ast.Mod: [ast.Mult], ast.FloorDiv: [ast.Mult], ast.BitAnd: [ast.BitOr], ast.BitOr: [ast.BitAnd],
+    ast.And: [ast.Or], ast.Or: [ast.And],
+    ast.Lt: [ast.LtE, ast.Gt], ast.LtE: [ast.Lt, ast.GtE], ast.Gt: [ast.GtE, ast.Lt], ast.GtE: [ast.Gt, ast.LtE],
+    ast.Eq: [ast.NotEq], ast.NotEq: [ast.Eq], ast.Is: [ast.IsNot], ast.IsNot: [ast.Is],
+    ast.In: [ast.NotIn], ast.NotIn: [ast.In],
+}  # fmt: skip
+
+
+class Mutant(NamedTuple):
+    """A changed expression; `span` is its place in the file, in bytes."""
+
+    path: Path
+    line: int
+    span: slice
+    before: str
+    after: str
+
+    def __str__(self) -> str:
+        return re.sub(r"\s+", " ", f"{self.path}:{self.line}: {self.before} → {self.after}")
+
+    def plant(self, root: Path) -> None:
+        source = (root / self.path).read_bytes()
+        (root / self.path).write_bytes(source[: self.span.start] + self.after.encode() + source[self.span.stop :])
+
+
+def expressions(node: ast.AST) -> Iterator[ast.expr]:
+    """All expressions of a program; of a type, and inside an f-string (without exact places in Python 3.11), none."""
+    for name, value in ast.iter_fields(node):
+        for child in value if isinstance(value, list) else [value]:
+            if name in {"annotation", "returns"} or not isinstance(child, ast.AST) or isinstance(child, ast.JoinedStr):
+                continue
+            if isinstance(child, ast.expr):
+                yield child
+            yield from expressions(child)
+
+
+def changes(node: ast.expr) -> Iterator[str]:
+    """Everything that is done to one expression."""
+    match node:
+        case ast.BinOp(op=op) | ast.BoolOp(op=op):
+            for other in SWAPPED.get(type(op), []):
+                node.op = other()  # type: ignore[assignment]  # an operator of the same kind
+                yield f"({ast.unparse(node)})"
+            node.op = op
+        case ast.Compare(ops=[op]):
+            for other in SWAPPED[type(op)]:
+                node.ops = [other()]  # type: ignore[list-item]  # an operator of the same kind
+                yield f"({ast.unparse(node)})"
+            node.ops = [op]
+        case ast.UnaryOp(op=ast.USub() | ast.Not()):
+            yield f"({ast.unparse(node.operand)})"
+        case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
+            yield repr(number + 1 if isinstance(number, int) else 2 * number or 1.0)
+
+
+def mutants_of(path: Path) -> Iterator[Mutant]:
+    source = (PROJECT / path).read_bytes()
+    starts = [0, *accumulate(map(len, source.splitlines(keepends=True)))]
+    tree = ast.parse(source)
+    conditions = {id(node.test) for node in ast.walk(tree) if isinstance(node, ast.If | ast.IfExp | ast.While)}
+    for node in expressions(tree):
+        if node.end_lineno is None or node.end_col_offset is None:
+            continue
+        span = slice(starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset)
+        before = source[span].decode()
+        if id(node) in conditions:
+            yield Mutant(path, node.lineno, span, before, f"(not ({ast.unparse(node)}))")
+        yield from (Mutant(path, node.lineno, span, before, after) for after in changes(node))
+
+
+def tests_of(path: Path) -> list[str]:
+    """Test files of the folder that mirrors the module's, those that import it first."""
+    folder = PROJECT / "tests/unit" / path.parent
+    while not folder.is_dir():
+        folder = folder.parent
+    package = re.escape(".".join(path.parent.parts))
+    name = re.compile(rf"{package}\.{path.stem}\b|from {package} import .*\b{path.stem}\b")
+    files = sorted(folder.rglob("test_*.py"), key=lambda file: (not name.search(file.read_text()), file))
+    return [str(file.relative_to(PROJECT)) for file in files]
+
+
+def outcome(root: Path, tests: list[str], limit_s: float) -> str:
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", *tests]
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    quiet = subprocess.DEVNULL
+    with subprocess.Popen(
+        command, cwd=root, env=environment, stdout=quiet, stderr=quiet, start_new_session=True
+    ) as run:
+        try:
+            return "survived" if run.wait(limit_s) == 0 else "killed"
+        except subprocess.TimeoutExpired:
+            os.killpg(run.pid, signal.SIGKILL)
+            return "too slow"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("paths", nargs="+", help="packages or modules: calib, ftdrive/session, drivers/clock.py")
+    parser.add_argument("--number", type=int, default=20, help="of mutants (default 20)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--tests", nargs="+", help="tests to run for every mutant, instead of those of its folder")
+    parser.add_argument("--limit", type=float, default=300.0, help="seconds for the tests of one mutant (default 300)")
+    options = parser.parse_args()
+
+    patterns = [path if path.endswith(".py") else f"{path}/**/*.py" for path in options.paths]
+    files = sorted(file for pattern in patterns for file in PROJECT.glob(pattern))
+    every = [mutant for file in files for mutant in mutants_of(file.relative_to(PROJECT))]
+    drawn = random.Random(options.seed).sample(every, min(options.number, len(every)))
+    sys.stdout.write(f"{len(drawn)} of {len(every)} mutants\n")
+    with TemporaryDirectory() as folder:
+        root = shutil.copytree(PROJECT, Path(folder, "project"), ignore=shutil.ignore_patterns(".*", "__pycache__"))
+        for tests in {tuple(options.tests or sorted(tests_of(mutant.path))) for mutant in drawn}:
+            if outcome(root, list(tests), options.limit) != "survived":
+                sys.exit(f"Without a mutant {' '.join(tests)} fail or take longer than {options.limit:g} s. Fix them.")
+        ends = []
+        for mutant in drawn:
+            mutant.plant(root)
+            ends.append(outcome(root, options.tests or tests_of(mutant.path), options.limit))
+            shutil.copy2(PROJECT / mutant.path, root / mutant.path)
+            print(f"{ends[-1]:8} {mutant}", flush=True)  # noqa: T201
+    sys.stdout.write(f"{ends.count('survived')} of {len(drawn)} survived\n")
+
+
+if __name__ == "__main__":
+    main()
