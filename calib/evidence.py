@@ -14,6 +14,18 @@ from calib.response import Response
 from calib.variance import left_out
 
 
+class Drifted(Protocol):
+    """How the bias moved."""
+
+    @property
+    def change(self) -> Array:
+        """(6,) from the first pose to the last."""
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) standard deviation of that."""
+
+
 class Evidence(Protocol):
     """What is judged: estimates and how they fit. Left-out poses count nowhere but in arrays with n rows."""
 
@@ -58,6 +70,10 @@ class Evidence(Protocol):
         """Standard deviations of what was found beyond the measured noise, by name with unit."""
 
     @property
+    def drift(self) -> Drifted | None:
+        """How the bias moved, where it did."""
+
+    @property
     def response(self) -> Response | None:
         """Gain and cross-talk of the sensor, where they were found."""
 
@@ -90,6 +106,7 @@ class IndependentFit:
     second_basin_chi2: float | None = None
     components: Mapping[str, float] = field(default_factory=dict)
     response: Response | None = None
+    drift: Drifted | None = None
 
     @cached_property
     def residuals(self) -> Array:
@@ -159,12 +176,5 @@ def leave_one_out(
 
 
 def standardized(residuals: Array, covariance: Array) -> Array:
-    """Divide residuals (n, 6) by the symmetric root of their covariance (n, 6, 6): independent, of unit variance.
-
-    Directions in which a pose cannot be predicted at all, where the covariance is huge and not exact, count nothing.
-    """
-    sigma = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)))
-    correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
-    values, V = np.linalg.eigh((correlation + np.swapaxes(correlation, 1, 2)) / 2)
-    along = np.einsum("nij,ni->nj", V, residuals / sigma) / np.sqrt(np.maximum(values, 1e-12))
-    return np.asarray(np.einsum("nij,nj->ni", V, along))
+    """Divide residuals (n, 6) by a root of their covariance (n, 6, 6): independent, of unit variance."""
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), residuals[..., None])[..., 0])

@@ -11,6 +11,7 @@ from calib.dataset import CalibrationDataset
 from calib.descent import column_scale
 from calib.errors import NotObservable
 from calib.evidence import Evidence, IndependentFit
+from calib.faults import faults
 from calib.identifiability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
 from calib.known import Known
 from calib.ml import RANK_TOLERANCE, Drift, Fit, fit
@@ -83,16 +84,21 @@ def solve(
     if wrench_cov is not None:
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
     # The fit also tells whether the poses are enough, and how large the noise is where it was not measured.
-    best = fit(
-        dataset.R_base_flange,
-        dataset.wrench,
-        wrench_cov,
-        t_s=dataset.t_s,
-        drift=drift,
-        known=None if estimator else known,
-        g_m_s2=g_m_s2,
-    )
-    _require_determined(dataset.R_base_flange, best, known)
+    try:
+        best = fit(
+            dataset.R_base_flange,
+            dataset.wrench,
+            wrench_cov,
+            t_s=dataset.t_s,
+            drift=drift,
+            known=None if estimator else known,
+            g_m_s2=g_m_s2,
+        )
+        _require_determined(dataset.R_base_flange, best, known)
+    except NotObservable as exc:
+        if mixed_up := faults(dataset.R_base_flange, dataset.wrench, up_in_base):
+            raise NotObservable(f"{mixed_up[0]}.") from exc
+        raise
     evidence: Evidence = best
     if estimator:
         parameters = estimator(dataset.wrench)

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib import Parameters, ml, read_csv
 from calib.known import Constraints, Known
@@ -23,6 +24,8 @@ from calib.yu import lrom
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.accuracy import Lab, Row, band, laboratory, most
 from tests.benchmarks.scenarios import Array
+
+Rows = NDArray[np.intp]
 
 DRIFT_N, ORIENTATION_RAD = 0.07, np.deg2rad(0.05)
 NOISE = sim.sigma(400)
@@ -86,7 +89,7 @@ def recordings(lab: Lab) -> Iterator[Row]:
                 yield most(f"{name}, {split}: z of the mass", abs(mass_z), 1.3 * 1.96, 1)
 
 
-def splits(n: int) -> dict[str, tuple[Array, Array]]:
+def splits(n: int) -> dict[str, tuple[Rows, Rows]]:
     rows = np.arange(n)
     return {"odd/even": (rows[::2], rows[1::2]), "first/second half": (rows[: n // 2], rows[n // 2 :])}
 
