@@ -78,6 +78,10 @@ class Evidence(Protocol):
         """Gain and cross-talk of the sensor, where they were found."""
 
     @property
+    def gain_sigma(self) -> float:
+        """Standard deviation of the entries of the gain, as far as the data leave room for it."""
+
+    @property
     def residuals(self) -> Array:
         """(n, 6) measured minus predicted."""
 
@@ -107,6 +111,7 @@ class IndependentFit:
     components: Mapping[str, float] = field(default_factory=dict)
     response: Response | None = None
     drift: Drifted | None = None
+    gain_sigma: float = 0.0
 
     @cached_property
     def residuals(self) -> Array:

@@ -173,6 +173,18 @@ class Fit:
         coefficients[which] = variance * np.tensordot(u, T, 2)
         return Response(coefficients, total)
 
+    @cached_property
+    def gain_sigma(self) -> float:
+        """Standard deviation of the entries of the gain: as found, else what the data leave room for, by moments."""
+        if "gain" in self.components or len(self.weights) < FEW_POSES_FOR_RESPONSE:
+            return self.components.get("gain", 0.0)
+        T = response_columns(self.parameters, self.R_base_flange[self.order])[..., :5]
+        WJ, u = self._weighted
+        JWT, Tu = summed_products(WJ, T), np.tensordot(u, T, 2)
+        M = summed_products(T, self.noise.solve(T)) - JWT.T @ self.covariance @ JWT
+        excess = float(Tu @ np.linalg.lstsq(M, Tu, rcond=1e-9)[0]) - len(M)
+        return float(np.sqrt(max(excess, 0.0) / np.trace(M)))
+
     @property
     def left_out_residuals(self) -> Array:
         """(n, 6) measured minus what all other poses predict for this one, drift and correlation included."""

@@ -21,7 +21,20 @@ from calib.yu import weight_and_tilt
 
 FORMAT = "ftdrive.calibration/1"
 
-LATER = ("p_value", "measured_sigma", "weights", "components", "drift", "response", "second_basin_chi2", "quality")
+COMMON_GAIN = float(np.sqrt(5 / 3 / 3))
+"""Sigma of the mean of three gains over that of one; five numbers tell that one, hence 5/3 as for Student's t."""
+
+LATER = (
+    "p_value",
+    "measured_sigma",
+    "weights",
+    "components",
+    "drift",
+    "response",
+    "gain_sigma",
+    "second_basin_chi2",
+    "quality",
+)
 """Fields that the first files of this format do not have."""
 
 Method = Literal[
@@ -93,6 +106,8 @@ class CalibrationResult:
     """None: no drift was found, or none was looked for."""
     response: Response | None = None
     """Gain and cross-talk of the sensor; None: none were found, or none were looked for."""
+    gain_sigma: float = 0.0
+    """Standard deviation of the entries of the gain, as far as the data leave room for it."""
     second_basin_chi2: float | None = None
     """How much worse the second best solution fits, under the noise model; None: there is no other."""
     quality: Mapping[str, JSON] = field(default_factory=dict)
@@ -201,11 +216,12 @@ class CalibrationResult:
     def sigma(self) -> Mapping[str, Array | float]:
         """One standard deviation of every quantity, by its name; `R_flange_sensor`: (3,) rad about the flange axes.
 
-        Weight and mass include the gain common to all axes, which no orientation shows: about as large as the others.
+        Weight and mass include the gain common to all axes, which no orientation shows.
         """
         std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, self.covariance[3:6, 3:6])
-        weight = float(np.hypot(weight, self.components.get("gain", 0.0) * self.weight_N))
+        if weight > 1e-9 * self.weight_N:  # not exactly known
+            weight = float(np.hypot(weight, COMMON_GAIN * self.gain_sigma * self.weight_N))
         return {
             "R_flange_sensor": std[0:3],
             "gravity_force_base_N": std[3:6],
@@ -304,6 +320,7 @@ class CalibrationResult:
             if self.drift is None
             else {"change": self.drift.change.tolist(), "sigma": self.drift.sigma.tolist()},
             "response": None if self.response is None else self.response.to_dict(),
+            "gain_sigma": self.gain_sigma,
             "weights": None if self.weights is None else self.weights.tolist(),
             "rejected_poses": list(self.rejected_poses),
             "second_basin_chi2": self.second_basin_chi2,

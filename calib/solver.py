@@ -152,6 +152,7 @@ def solve(
         components=evidence.components,
         drift=None if drifted is None else DriftResult(drifted.change, drifted.sigma),
         response=evidence.response,
+        gain_sigma=evidence.gain_sigma,
         second_basin_chi2=best.second_basin_chi2,
         quality={
             "loo_force_rms_N": quality.loo_force_rms_N,

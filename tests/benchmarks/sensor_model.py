@@ -19,6 +19,7 @@ from calib import Parameters, ml, read_csv
 from calib.known import Constraints, Known
 from calib.model import STANDARD_GRAVITY_M_S2, predict
 from calib.response import CROSS_TALK_M, GAIN, Response, predicted_covariance
+from calib.result import COMMON_GAIN
 from calib.variance import FORCE, RESPONSE, ROTATION, TORQUE, component
 from calib.yu import lrom
 from tests.benchmarks import scenarios as sim
@@ -140,7 +141,7 @@ def sensor_run(
         "covered": np.mean(np.abs(e) < 1.96 * sigma, axis=0),
         "gain": "gain" in components,
         "cross_talk": "cross_talk" in components,
-        "mass": (weight_N - sim.WEIGHT_N) / np.hypot(own, components.get("gain", 0.0) * weight_N),
+        "mass": (weight_N - sim.WEIGHT_N) / np.hypot(own, COMMON_GAIN * fit.gain_sigma * weight_N),
         "rejected": np.mean(fit.weights == 0),
     }
     for split, (a, b) in splits(n).items():
