@@ -2,12 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calib.covariance import summed_products
+from calib.descent import column_scale
 from calib.model import Array, Parameters, jacobian
 
+MOST_POSITIONS = 1000
+"""Of a change that are tried at first; then all near the best one."""
 FEWEST_ON_A_SIDE = 3
 """Poses before and after."""
 CLEARLY = 0.5
@@ -83,35 +88,58 @@ def lasting_change(
     sigma = np.asarray(sigma, dtype=np.float64)
     y = residuals / sigma
     J = jacobian(parameters, R_base_flange) / sigma[:, None]
-    everything = np.ones(n, bool)
-
-    def fit(columns: Array, rows: NDArray[np.bool_] = everything) -> tuple[float, Array]:
-        """Mean square misfit per degree of freedom, and the estimates of the added columns."""
-        X = np.concatenate([J, columns], axis=2)[rows].reshape(6 * int(rows.sum()), -1)
-        scale = np.linalg.norm(X, axis=0)
-        scale[scale == 0] = 1.0
-        x, *_ = np.linalg.lstsq(X / scale, y[rows].ravel(), rcond=1e-10)
-        left = y[rows].ravel() - X / scale @ x
-        return float(left @ left) / max(len(X) - X.shape[1], 1), (x / scale)[15:]
-
     ramp = ((t_s - t_s.mean()) / (np.ptp(t_s) or 1.0))[:, None, None] * (np.eye(6) / sigma[:, None])
-    others = [fit(np.zeros((n, 6, 0)))[0], fit(ramp)[0]]
-    used = everything.copy()
+    others = [_misfit(J, y), _misfit(np.concatenate([J, ramp], axis=2), y)]
+    used = np.ones(n, bool)
     used[list(suspect)] = False
     at_one_end = np.count_nonzero(np.diff(used)) == 1 and np.count_nonzero(~used) >= FEWEST_ON_A_SIDE
     if not at_one_end and not used.all() and used.sum() > FEWEST_ON_A_SIDE:
-        others.append(fit(np.zeros((n, 6, 0)), used)[0])
+        others.append(_misfit(J[used], y[used]))
 
-    changes = _changes(parameters)
-    found = []
-    for position in range(FEWEST_ON_A_SIDE, n - FEWEST_ON_A_SIDE + 1):
-        after = (np.arange(n) >= position)[:, None, None]
-        for what, directions in changes.items():
-            misfit, step = fit(J @ directions * after)
-            criterion = 6 * n * np.log(misfit) + directions.shape[1] * np.log(6 * n)
-            found.append(Change(what, position, step, misfit, float(criterion)))
-    best = min(found, key=lambda change: change.criterion)
+    positions = np.arange(FEWEST_ON_A_SIDE, n - FEWEST_ON_A_SIDE + 1)
+    step = -(-len(positions) // MOST_POSITIONS)
+    best = _best_change(parameters, J, y, positions[::step])
+    if step > 1:
+        near = np.abs(positions - best.position) < step
+        best = _best_change(parameters, J, y, positions[near])
     return best if max(best.misfit, 1.0) < CLEARLY * min(others) else None
+
+
+def _misfit(X: Array, y: Array) -> float:
+    """Mean square of what the columns (n, 6, m) leave of y (n, 6), per degree of freedom."""
+    X, y = X.reshape(-1, X.shape[2]), y.ravel()
+    scale = np.linalg.norm(X, axis=0)
+    scale[scale == 0] = 1.0
+    left = y - X / scale @ np.linalg.lstsq(X / scale, y, rcond=1e-10)[0]
+    return float(left @ left) / max(len(X) - X.shape[1], 1)
+
+
+def _best_change(parameters: Parameters, J: Array, y: Array, positions: NDArray[np.intp]) -> Change:
+    """Find the likeliest change at one of these positions, ascending; all sums over poses are cumulative."""
+    n = len(y)
+    parts = [slice(first, last) for first, last in pairwise([0, *positions, n])]
+    information = np.array([summed_products(J[part], J[part]) for part in parts])
+    moment = np.array([summed_products(J[part], y[part][..., None])[:, 0] for part in parts])
+    scale = column_scale(information.sum(axis=0))
+    information, moment = information / np.outer(scale, scale), moment / scale
+    after, moment_after = (np.cumsum(x[:0:-1], axis=0)[::-1] for x in (information, moment))
+    inverse = np.linalg.pinv(information.sum(axis=0), rcond=1e-12, hermitian=True)
+    rest = float((y**2).sum() - moment.sum(axis=0) @ inverse @ moment.sum(axis=0))
+    # What the change sees when the parameters have made good what they can.
+    seen = after - after @ inverse @ after
+    asked = moment_after - after @ (inverse @ moment.sum(axis=0))
+    found = []
+    for what, directions in _changes(parameters).items():
+        D = directions * scale[:, None]
+        gain = np.linalg.pinv(D.T @ seen @ D, rcond=1e-10, hermitian=True)
+        x = (gain @ (asked @ D)[..., None])[..., 0]
+        size = directions.shape[1]
+        misfit = (rest - np.sum(x * (asked @ D), axis=1)) / max(6 * n - 15 - size, 1)
+        misfit = np.maximum(misfit, 1e-12 * rest / n)
+        criterion = 6 * n * np.log(misfit) + size * np.log(6 * n)
+        k = int(np.argmin(criterion))
+        found.append(Change(what, int(positions[k]), x[k], float(misfit[k]), float(criterion[k])))
+    return min(found, key=lambda change: change.criterion)
 
 
 def _changes(parameters: Parameters) -> dict[str, Array]:

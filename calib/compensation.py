@@ -16,6 +16,7 @@ from numpy.typing import DTypeLike, NDArray
 from scipy.linalg import cython_blas
 
 from calib.model import Parameters, skew
+from calib.response import Response
 
 Reals = NDArray[np.floating[Any]]
 
@@ -30,6 +31,8 @@ class Compensator:
     parameters : Parameters
     dtype : float64 (default) or float32
         Of the arithmetic and of the result. float32 halves the memory traffic and costs about 1e-7 of the wrench.
+    response : Response, optional
+        Gain and cross-talk of the sensor.
 
     Attributes
     ----------
@@ -43,12 +46,16 @@ class Compensator:
     Nothing is written after construction: threads may share one.
     """
 
-    def __init__(self, parameters: Parameters, dtype: DTypeLike = np.float64) -> None:
+    def __init__(
+        self, parameters: Parameters, dtype: DTypeLike = np.float64, *, response: Response | None = None
+    ) -> None:
         self.dtype: np.dtype[Any] = np.dtype(dtype)
         if self.dtype not in (np.float64, np.float32):
             raise TypeError(f"dtype is {self.dtype}, expected float64 or float32")
         by_force = np.einsum("i,jk->kij", parameters.gravity_force_base_N, parameters.R_flange_sensor).reshape(3, 9)
         matrix = np.concatenate([by_force, skew(parameters.p_sensor_com_m) @ by_force])
+        if response is not None:
+            matrix += np.concatenate([response.force_gain, response.cross_talk_m]) @ by_force
         offset = np.concatenate([parameters.force_bias_N, parameters.torque_bias_Nm])
         self.matrix: Reals = matrix.astype(self.dtype)
         self.offset: Reals = offset.astype(self.dtype)

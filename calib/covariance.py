@@ -1,6 +1,6 @@
 """The noise of a whole session: every pose its own, and a bias that drifts from pose to pose.
 
-    V = blockdiag(D_i) + S (K (x) I6) S + slopes,    S = diag(walk)
+    V = blockdiag(D_i) + S (K (x) I6) S + slopes + effects,    S = diag(walk)
 
 K is the covariance of a random walk less its mean over the poses, so that "the bias" is the mean bias: the
 pseudo-inverse of the path's stiffness matrix. That one is tridiagonal, so with Woodbury's identity all is O(n).
@@ -9,11 +9,13 @@ pseudo-inverse of the path's stiffness matrix. That one is tridiagonal, so with 
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from calib.model import Array
 
 SHORTEST_STEP = 1e-3  # in mean intervals: two poses at the same time have nearly the same bias
+FAINT = 1e-9  # weight of a rejected pose: too little to count, enough for the others to predict it
 
 
 class Noise:
@@ -29,17 +31,31 @@ class Noise:
         Standard deviation of the change of each channel's bias over one unit of time.
     slope : array, shape (6,), or None
         Standard deviation of each channel's linear change over the session; infinite = unknown.
+    effects : tuple of array, shapes (n, 6, k) and (k,), or None
+        What acts on all poses at once, and the variances with which it does.
+    kept : bool array, shape (n,), or None
+        The poses that count. The others are as good as deleted: a walk sees a longer interval.
     """
 
     def __init__(
-        self, D: Array, time: Array | None = None, walk: Array | None = None, slope: Array | None = None
+        self,
+        D: Array,
+        time: Array | None = None,
+        walk: Array | None = None,
+        slope: Array | None = None,
+        effects: tuple[Array, Array] | None = None,
+        kept: NDArray[np.bool_] | None = None,
     ) -> None:
         self.D = D
         self.n = len(D)
         common = D.strides[0] == 0
         self.W = np.broadcast_to(np.linalg.inv(D[:1]), D.shape) if common else np.linalg.inv(D)
-        logdet = np.linalg.slogdet(D[:1] if common else D)[1]
-        self._logdet = float(logdet.sum()) * (self.n if common else 1)
+        self.kept = np.ones(self.n, bool) if kept is None else kept
+        logdet = np.broadcast_to(np.linalg.slogdet(D[:1] if common else D)[1], self.n)
+        if not self.kept.all():
+            self.W = self.W * np.where(self.kept, 1.0, FAINT)[:, None, None]
+            logdet = logdet[self.kept]
+        self._logdet = float(logdet.sum())
         self._low_rank: list[tuple[Array, Array]] = []
         self._walking = np.zeros(0, np.intp)
         if time is not None and walk is not None and walk.any():
@@ -47,7 +63,10 @@ class Noise:
             self._s = walk[self._walking]
             self._add_walk(steps(time)[1:])
         if time is not None and slope is not None and slope.any():
-            self._add_slopes(time, slope)
+            sloping = np.flatnonzero(slope)
+            self._add_effects(centred(time)[:, None, None] * np.eye(6)[:, sloping], slope[sloping] ** 2)
+        if effects is not None:
+            self._add_effects(*effects)
 
     def _add_walk(self, dt: Array) -> None:
         """Factorise M = K^+ + S W S, unknowns ordered by pose, then channel; then keep the mean of the walk at zero."""
@@ -72,14 +91,11 @@ class Noise:
         self._logdet += 2 * float(np.log(self._cholesky[-1]).sum()) + float(np.linalg.slogdet(mean)[1])
         self._logdet += k * (float(np.log(dt).sum()) - 2 * float(np.log(n)))
 
-    def _add_slopes(self, time: Array, slope: Array) -> None:
-        sloping = np.flatnonzero(slope)
-        T = centred(time)[:, None, None] * np.eye(6)[:, sloping]
+    def _add_effects(self, T: Array, variance: Array) -> None:
         Q = self.solve(T)
-        core = np.diag(1 / slope[sloping] ** 2) + np.einsum("nik,nil->kl", T, Q)
-        self._low_rank.append((Q, -np.linalg.inv(core)))
-        self._logdet += float(np.linalg.slogdet(core)[1])
-        self._logdet += 2 * float(np.log(slope[sloping][np.isfinite(slope[sloping])]).sum())
+        core = np.diag(1 / variance) + summed_products(T, Q)
+        self._low_rank.append((Q, -np.asarray(np.linalg.inv(core), dtype=np.float64)))
+        self._logdet += float(np.linalg.slogdet(core)[1]) + float(np.log(variance[np.isfinite(variance)]).sum())
 
     def _solve_walk(self, X: Array) -> Array:
         """Give M^-1 X for X (n, k, m)."""

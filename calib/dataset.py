@@ -25,6 +25,7 @@ LEAST_VARIANCE = 1e-18  # N² or (N·m)²: a sensor of 1 nN; with much less, pro
 SIGMA_COLUMNS = tuple(f"sigma_{name}" for name in CHANNELS)
 MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
 VECTOR_COLUMNS = ("rx", "ry", "rz")
+LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +205,11 @@ def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
     if sigma is not None:
         for i, j in np.argwhere(sigma <= 0):
             raise BadDataset(f"row {i + 1}: {SIGMA_COLUMNS[j]} is {sigma[i, j]:g}, a standard error is above 0.")
+    if vector and (longest := float(np.linalg.norm(table[:, :k], axis=1).max())) > LONGEST_VECTOR_RAD:
+        raise BadDataset(
+            f"{path.name}: a rotation vector is {longest:.0f} rad long, more than 2π: rx, ry, rz look like degrees, "
+            "convert them to rad"
+        )
     R = Rotation.from_rotvec(table[:, :k]).as_matrix() if vector else table[:, :k].reshape(-1, 3, 3)
     return CalibrationDataset(
         R_base_flange=np.swapaxes(R, 1, 2) if orientation == "R_flange_base" else R,

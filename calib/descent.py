@@ -85,10 +85,14 @@ class Descent:
         """Sort, and leave out those that ended in the same minimum."""
         found: list[Minimum] = []
         for end in sorted(ends, key=lambda end: end.chi2):
-            R = end.parameters.R_flange_sensor
-            if all(angle_between(R, other.parameters.R_flange_sensor) > SAME_ROTATION_RAD for other in found):
+            if not any(Descent.same(end.parameters, other.parameters) for other in found):
                 found.append(end)
         return found
+
+    @staticmethod
+    def same(p: Parameters, q: Parameters) -> bool:
+        """Tell whether two points belong to one minimum."""
+        return bool(angle_between(p.R_flange_sensor, q.R_flange_sensor) <= SAME_ROTATION_RAD)
 
     def normal_equations(self, equations: Equations, p: Parameters) -> tuple[Array, Array, float]:
         """Add what was known before."""

@@ -7,7 +7,23 @@ from typing import Protocol
 
 import numpy as np
 
+from calib.covariance import Noise, summed_products
+from calib.descent import column_scale
 from calib.model import Array, Parameters, jacobian, predict
+from calib.response import Response
+from calib.variance import left_out
+
+
+class Drifted(Protocol):
+    """How the bias moved."""
+
+    @property
+    def change(self) -> Array:
+        """(6,) from the first pose to the last."""
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) standard deviation of that."""
 
 
 class Evidence(Protocol):
@@ -54,6 +70,18 @@ class Evidence(Protocol):
         """Standard deviations of what was found beyond the measured noise, by name with unit."""
 
     @property
+    def drift(self) -> Drifted | None:
+        """How the bias moved, where it did."""
+
+    @property
+    def response(self) -> Response | None:
+        """Gain and cross-talk of the sensor, where they were found."""
+
+    @property
+    def gain_sigma(self) -> float:
+        """Standard deviation of the entries of the gain, as far as the data leave room for it."""
+
+    @property
     def residuals(self) -> Array:
         """(n, 6) measured minus predicted."""
 
@@ -81,6 +109,9 @@ class IndependentFit:
     weights: Array
     second_basin_chi2: float | None = None
     components: Mapping[str, float] = field(default_factory=dict)
+    response: Response | None = None
+    drift: Drifted | None = None
+    gain_sigma: float = 0.0
 
     @cached_property
     def residuals(self) -> Array:
@@ -141,25 +172,14 @@ def leave_one_out(
     covariance : array, shape (n, 6, 6)
         Of these. Very large where the others determine nothing.
     """
-    used = np.ones(len(residuals)) if weights is None else weights
-    L = np.linalg.cholesky(wrench_cov)
-    J = np.linalg.solve(L, jacobian)
-    information = np.einsum("n,nki,nkj->ij", used, J, J)
-    explained = J @ np.linalg.pinv(information, hermitian=True) @ np.swapaxes(J, 1, 2)
-    shrinking = np.where(used > 0, 1.0, 0.0)[:, None, None] * explained
-    free, V = np.linalg.eigh(np.eye(6) - shrinking)
-    M = V / np.maximum(free, 1e-12)[:, None] @ np.swapaxes(V, 1, 2)
-    left_out = (L @ M @ np.linalg.solve(L, residuals[..., None]))[..., 0]
-    return np.asarray(left_out), np.asarray(L @ (M + explained - shrinking) @ np.swapaxes(L, 1, 2))
+    noise = Noise(wrench_cov, kept=None if weights is None else weights > 0)
+    WJ = noise.solve(jacobian)
+    information = summed_products(jacobian, WJ)
+    scale = column_scale(information)
+    C = np.asarray(np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)) / np.outer(scale, scale)
+    return left_out(noise, WJ, noise.solve(residuals[..., None])[..., 0], C)
 
 
 def standardized(residuals: Array, covariance: Array) -> Array:
-    """Divide residuals (n, 6) by the symmetric root of their covariance (n, 6, 6): independent, of unit variance.
-
-    Directions in which a pose cannot be predicted at all, where the covariance is huge and not exact, count nothing.
-    """
-    sigma = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)))
-    correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
-    values, V = np.linalg.eigh((correlation + np.swapaxes(correlation, 1, 2)) / 2)
-    along = np.einsum("nij,ni->nj", V, residuals / sigma) / np.sqrt(np.maximum(values, 1e-12))
-    return np.asarray(np.einsum("nij,nj->ni", V, along))
+    """Divide residuals (n, 6) by a root of their covariance (n, 6, 6): independent, of unit variance."""
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), residuals[..., None])[..., 0])

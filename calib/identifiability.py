@@ -347,4 +347,4 @@ def _worth(R_base_flange: Array, parameters: Parameters) -> float:
     gravity_flange = parameters.gravity_force_base_N @ R_base_flange
     spread = np.linalg.svd(gravity_flange - gravity_flange.mean(axis=0), compute_uv=False)
     spread = spread / float(np.linalg.norm(parameters.gravity_force_base_N))
-    return float(np.log(np.linalg.eigvalsh(information) + 1e-3).sum() + 4 * np.log(spread + 1e-3).sum())
+    return float(np.log(np.maximum(np.linalg.eigvalsh(information), 0) + 1e-3).sum() + 4 * np.log(spread + 1e-3).sum())

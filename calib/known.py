@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from calib.faults import force_unit
 from calib.model import Array, Parameters, is_rotation, read_only
 
 
@@ -69,7 +70,9 @@ class Known:
             along = found.gravity_force_base_N / (weight_N or 1.0)
             mass_kg, sigma_kg = weight_N / g_m_s2, float(np.sqrt(along @ covariance[3:6, 3:6] @ along)) / g_m_s2
             if abs(mass_kg - self.mass_kg) > sigmas * np.hypot(sigma_kg, self.mass_tolerance_kg):
-                words.append(f"mass {self.mass_kg:g} kg, they say {_with_sigma(mass_kg, sigma_kg)} kg")
+                unit = force_unit(self.mass_kg / mass_kg) if mass_kg else None
+                why = f", as if the forces were in {unit}" if unit else ""
+                words.append(f"mass {self.mass_kg:g} kg, they say {_with_sigma(mass_kg, sigma_kg)} kg{why}")
         if self.gravity_direction_base is not None:
             direction = np.asarray(self.gravity_direction_base)
             turn = _turn(direction, _unit(found.gravity_force_base_N))

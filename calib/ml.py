@@ -1,7 +1,8 @@
 """Maximum likelihood: joint weighted least squares of forces and torques, under the noise the data show.
 
-From all minima of the force equations down to the minima of the joint cost; when the residuals or the restricted
-likelihood ask for it, without the poses that belong to none, and with drift, more noise, or inexact orientations.
+There is one objective: the restricted likelihood at the best parameters, less what each component of the noise and each
+rejected pose must bring. From all minima of the force equations down to the minima of the joint cost; then parameters,
+variances, components and rejected poses in turn, until nothing changes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,9 +21,11 @@ from calib.errors import NotObservable
 from calib.gram import Statistics, features
 from calib.known import Constraints, Known
 from calib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict
-from calib.robust import FARTHEST, FEWEST_TO_REJECT_FROM, Kept, agreeing_poses, fewest_kept
+from calib.response import SIZE, Response, response_columns
+from calib.robust import FALSE_REJECTION, FARTHEST, FEWEST_TO_REJECT_FROM, Kept, agreeing_poses, fewest_kept
 from calib.variance import (
     FORCE,
+    RESPONSE,
     ROTATION,
     TORQUE,
     WORTH_A_TRY,
@@ -30,11 +33,12 @@ from calib.variance import (
     Linearised,
     Point,
     component,
+    left_out,
     maximise,
     noise_of,
-    point,
     predicted_gains,
     select,
+    squared_length,
     with_slopes_instead,
 )
 
@@ -42,17 +46,16 @@ Drift = Literal["auto", "none", "linear", "random-walk"]
 
 RANK_TOLERANCE = 1e-9
 LEVER_M = 0.025  # usual ratio of torque noise to force noise
-LEVER_BOUNDS_M = (1e-3, 1.0)  # what any sensor has
 FEW_POSES = 6  # fewer cannot tell force noise from torque noise: the usual ratio is taken
+FEW_POSES_FOR_RESPONSE = 7  # fewer cannot tell gain and cross-talk from noise
 FEW_POSES_WITHOUT_NOISE = 12  # fewer cannot tell drift from noise that nobody measured
 POSES_FOR_EACH_AXIS = 50  # fewer cannot tell the drift of one axis from that of another of its group
 MANY_POSES = 20_000  # from here on single poses are looked at only when chi2 or `drift` asks for it
-FLOOR = 0.03  # of the residuals: white noise that is surely there when nobody measured it
+FLOOR = 1e-3  # of the residuals: white noise that is surely there when nobody measured it
 SUSPICIOUS = 0.01  # p-value below which more than the measured noise is looked for
 LIGHT_TAIL = 0.6  # the median of squared distances relative to their mean, in units of what Gaussian noise has
-LARGE_ROTATION_RAD = np.deg2rad(1.0)  # few kinematics are worse
-WORST_ROTATION_RAD = np.deg2rad(3.0)  # none is
-LARGE_WHITE = 3.0  # times the measured variance
+ROUNDS = 12  # of the outer loop; it ends after two or three
+SETTLED = 1e-4  # squared step, in standard deviations of the estimates
 MEDIAN_DISTANCE = float(chi2_isf(6, 0.5))
 
 
@@ -99,6 +102,8 @@ class Fit:
     """(n, 3, 3)"""
     wrench: Array
     """(n, 6)"""
+    effects: tuple[NDArray[np.intp], Array]
+    """Which of the 11 numbers of gain and cross-talk were estimated (k,), and their variances (k,)."""
 
     @cached_property
     def covariance(self) -> Array:
@@ -108,11 +113,9 @@ class Fit:
 
     @property
     def wrench_cov(self) -> Array:
-        """(n, 6, 6) noise of each pose by itself, without drift; of rejected poses that of the others."""
+        """(n, 6, 6) noise of each pose by itself, without drift."""
         cov = np.empty_like(self.noise.D)
         cov[self.order] = self.noise.D
-        rejected = self.weights == 0
-        cov[rejected] = cov[~rejected].mean(axis=0)
         return cov
 
     @property
@@ -130,7 +133,12 @@ class Fit:
 
     @cached_property
     def residuals(self) -> Array:
-        """(n, 6) measured minus `predict(parameters)`: the plain model, without drift."""
+        """(n, 6) measured minus predicted, gain and cross-talk included, drift not."""
+        added = 0.0 if self.response is None else self.response.wrench(self.parameters, self.R_base_flange)
+        return np.asarray(self._plain_residuals - added)
+
+    @cached_property
+    def _plain_residuals(self) -> Array:
         return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange))
 
     @cached_property
@@ -138,38 +146,62 @@ class Fit:
         """(n, 6, 15) derivative of the prediction."""
         return jacobian(self.parameters, self.R_base_flange)
 
+    @cached_property
+    def _weighted(self) -> tuple[Array, Array]:
+        """Inverse noise times Jacobian (n, 6, 15) and times residuals (n, 6), poses by time."""
+        J, r = self.jacobian[self.order], self._plain_residuals[self.order]
+        WX = self.noise.solve(np.concatenate([J, r[..., None]], axis=2))
+        return WX[..., :15], WX[..., 15]
+
+    @cached_property
+    def response(self) -> Response | None:
+        """Gain and cross-talk of the sensor, best linear prediction; None where none was found."""
+        which, variance = self.effects
+        if not which.size:
+            return None
+        T = response_columns(self.parameters, self.R_base_flange[self.order])[..., which]
+        WJ, u = self._weighted
+        JWT = summed_products(WJ, T)
+        C, total = self.covariance, np.zeros((15 + SIZE, 15 + SIZE))
+        own = 15 + which
+        total[:15, :15] = C
+        total[:15, own] = -C @ JWT * variance
+        total[own, :15] = total[:15, own].T
+        TPT = summed_products(T, self.noise.solve(T)) - JWT.T @ C @ JWT
+        total[np.ix_(own, own)] = np.diag(variance) - variance[:, None] * TPT * variance
+        coefficients = np.zeros(SIZE)
+        coefficients[which] = variance * np.tensordot(u, T, 2)
+        return Response(coefficients, total)
+
+    @cached_property
+    def gain_sigma(self) -> float:
+        """Standard deviation of the entries of the gain: as found, else what the data leave room for, by moments."""
+        if "gain" in self.components or len(self.weights) < FEW_POSES_FOR_RESPONSE:
+            return self.components.get("gain", 0.0)
+        T = response_columns(self.parameters, self.R_base_flange[self.order])[..., :5]
+        WJ, u = self._weighted
+        JWT, Tu = summed_products(WJ, T), np.tensordot(u, T, 2)
+        M = summed_products(T, self.noise.solve(T)) - JWT.T @ self.covariance @ JWT
+        excess = float(Tu @ np.linalg.lstsq(M, Tu, rcond=1e-9)[0]) - len(M)
+        return float(np.sqrt(max(excess, 0.0) / np.trace(M)))
+
     @property
     def left_out_residuals(self) -> Array:
-        """(n, 6) measured minus what all other poses predict for this one, drift and correlation included.
-
-        The exact leave-one-out of the linearised model: `P_kk^-1 (P y)_k`, `P = W - W J C J' W`, W the inverse noise.
-        """
+        """(n, 6) measured minus what all other poses predict for this one, drift and correlation included."""
         return self._left_out[0]
 
     @property
     def left_out_cov(self) -> Array:
-        """(n, 6, 6) covariance of these, `P_kk^-1`: noise of the pose and uncertainty of its prediction."""
+        """(n, 6, 6) covariance of these: noise of the pose and uncertainty of its prediction."""
         return self._left_out[1]
 
     @cached_property
     def _left_out(self) -> tuple[Array, Array]:
-        order = self.order
-        J, r = self.jacobian[order], self.residuals[order]
-        WX = self.noise.solve(np.concatenate([J, r[..., None]], axis=2))
-        WJ = WX[..., :15]
-        P = self.noise.blocks - WJ @ self.covariance @ np.swapaxes(WJ, 1, 2)
         # With a prior the best parameters leave some of J' W r.
-        e, cov = np.empty_like(r), np.linalg.inv(P)
-        e[order] = (cov @ WX[..., 15:])[..., 0]
-        S = np.empty_like(cov)
-        S[order] = cov
-        rejected = self.weights == 0
-        if rejected.any():
-            # The fit sees them with a huge covariance, which keeps them out.
-            D = np.empty_like(self.noise.D)
-            D[order] = self.noise.D
-            S[rejected] += self.wrench_cov[rejected] - D[rejected]
-        return e, S
+        e, S = left_out(self.noise, *self._weighted, self.covariance)
+        unsorted = np.empty_like(self.order)
+        unsorted[self.order] = np.arange(len(self.order))
+        return e[unsorted], S[unsorted]
 
     @cached_property
     def standardized_residuals(self) -> Array:
@@ -224,14 +256,14 @@ def fit(
 class _Explanation:
     """One way to explain the data: which poses belong together, and what acts on them."""
 
-    minima: list[Minimum]
+    parameters: Parameters
     kept: Kept
-    cov: Array
-    """(n, 6, 6) measured noise of each pose, or what is surely there when nobody measured it."""
     components: tuple[Component, ...] = ()
     theta: Array = field(default_factory=lambda: np.zeros(0))
     criterion: float = np.inf
-    """-2 log restricted likelihood; a rejected pose costs what one at the limit of rejection would."""
+    """-2 log restricted likelihood, plus what each component and each rejected pose must bring."""
+    noticed: bool = False
+    """Whether bumped poses may be hidden in it."""
 
 
 class _Problem:
@@ -259,23 +291,32 @@ class _Problem:
         common = cov.ndim == 2
         self.cov = np.broadcast_to(cov, (self.n, 6, 6)) if common else cov if ordered else cov[self.order]
         self.descent = Descent(self.R, self.wrench, constraints)
+        self.everything = np.ones(self.n, bool)
 
     def solve(self) -> Fit:
         weights = _inverses(self.cov if self.measured else np.broadcast_to(_white(1.0, LEVER_M), self.cov.shape))
-        everything = _Explanation(self.descent.minima(weights), np.ones(self.n, bool), self.cov)
-        best = everything.minima[0]
-        if self._lacks_rank(best):
-            return self._fit(everything, best.chi2)
-        if self._exact(best.parameters):
-            exact = self.descent.minima(_inverses(self.cov))
-            return self._fit(replace(everything, minima=exact), exact[0].chi2)
-        static_chi2 = best.chi2
-        if self.measured and self.n > MANY_POSES and self.drift == "none" and self._fits(everything):
-            return self._fit(everything, static_chi2)  # a pose that could do harm among so many would show in chi2
-        chosen = self._chosen(everything, weights)
-        if self.measured and not chosen.kept.all():
-            static_chi2 = self.descent.minima(weights * chosen.kept[:, None, None])[0].chi2
-        return self._fit(chosen, static_chi2)
+        minima = self.descent.minima(weights)
+        plain = _Explanation(minima[0].parameters, self.everything)
+        if self._lacks_rank(minima[0]):
+            return self._fit(plain, minima, minima[0].chi2)
+        if self._exact(minima[0].parameters):
+            minima = self.descent.minima(_inverses(self.cov))
+            return self._fit(plain, minima, minima[0].chi2)
+        if not self.measured:
+            self.cov = self._least_noise(minima[0].parameters)
+        if self._is_quiet(minima[0]):
+            return self._fit(plain, minima, minima[0].chi2)
+        chosen = min(self._explanations(minima, weights), key=lambda e: e.criterion)
+        static = minima if chosen.kept.all() else self.descent.minima(weights * chosen.kept[:, None, None])
+        for _ in range(len(static)):
+            found = self._with_all_minima(chosen, static)
+            if self.descent.same(found[0].parameters, chosen.parameters):
+                break
+            other = self._explained(found[0].parameters, chosen.kept)
+            if other.criterion > chosen.criterion:
+                break
+            chosen = other
+        return self._fit(chosen, found, static[0].chi2)
 
     def _dof(self, kept: Kept) -> int:
         return 6 * int(kept.sum()) - 15 + self.constraints.dof - (6 if self.drift == "linear" else 0)
@@ -298,64 +339,48 @@ class _Problem:
         residuals = self.wrench - predict(p, self.R)
         return float(np.abs(residuals[:, :3]).max()) < 100 * self._least()[0]
 
-    def _least_noise(self, p: Parameters, kept: Kept) -> Array:
-        """Give the measured noise, or a share of the residuals, so that a random walk never explains them all."""
-        if self.measured:
-            return self.cov
-        e = (self.wrench - predict(p, self.R))[kept]
+    def _least_noise(self, p: Parameters) -> Array:
+        """Give a small share of the residuals, so that a random walk never explains them all."""
+        e = self.wrench - predict(p, self.R)
         force_N, torque_Nm = (FLOOR * float(np.sqrt(np.mean(e[:, c] ** 2))) for c in (slice(0, 3), slice(3, 6)))
-        force_N = max(force_N, torque_Nm / LEVER_BOUNDS_M[1])
-        return np.broadcast_to(_white(force_N, max(torque_Nm, LEVER_BOUNDS_M[0] * force_N)), self.cov.shape)
-
-    def _fits(self, everything: _Explanation) -> bool:
-        """Tell whether the measured noise explains chi2."""
-        return everything.minima[0].chi2 < float(chi2_isf(self._dof(everything.kept), SUSPICIOUS))
+        least_N, least_Nm = self._least()
+        return np.broadcast_to(_white(max(force_N, least_N), max(torque_Nm, least_Nm)), self.cov.shape)
 
     # Explanations
 
-    def _chosen(self, everything: _Explanation, weights: Array) -> _Explanation:
-        """Take the likeliest explanation; the plain one unless something speaks against it."""
-        p = everything.minima[0].parameters
-        always = self._always()
-        problem = self._linearised(p, everything.kept, self._least_noise(p, everything.kept))
-        at = maximise(problem, always, self._start(problem, always))
-        plain = self.measured and not always and self.drift != "linear"
-        quiet = plain and self._fits(everything)
-        distances = self._distances(problem, at)
-        reject = self._may_reject(distances)
-        candidates = self._candidates()
-        if (
-            quiet
-            and not reject
-            and not (candidates and predicted_gains(problem, at, candidates)[0].max() > WORTH_A_TRY)
-        ):
-            return everything
-        found = [self._explained(p, everything.kept)]
-        if self._masks_outliers(found[0], reject):
-            starts = [m.parameters for m in everything.minima]
+    def _is_quiet(self, best: Minimum) -> bool:
+        """Tell whether the measured noise explains everything, so that nothing more would be found."""
+        always, candidates = self._always(), self._candidates()
+        if not self.measured or always or self.drift == "linear":
+            return False
+        if best.chi2 > float(chi2_isf(self._dof(self.everything), SUSPICIOUS)):
+            return False
+        if self.n > MANY_POSES and self.drift == "none":
+            return True  # a pose that could do harm among so many would show in chi2
+        problem = self._linearised(best.parameters, self.everything)
+        at = maximise(problem, (), np.zeros(0))
+        if self._stand_out(squared_length(*at.left_out())):
+            return False
+        return not candidates or bool(predicted_gains(problem, at, candidates)[0].max() < WORTH_A_TRY)
+
+    def _explanations(self, minima: list[Minimum], weights: Array) -> list[_Explanation]:
+        """Explain the data with all poses; and, where these may hide bumped ones, with those that agree."""
+        p = minima[0].parameters
+        found = [self._explained(p, self.everything)]
+        if found[0].noticed:
+            starts = [m.parameters for m in minima]
+            problem, always = self._linearised(p, self.everything), self._always()
+            at = maximise(problem, always, self._start(problem, always))
             if not self.measured:
                 weights = np.asarray(at.noise.W, dtype=np.float64)
+            distances = squared_length(*at.left_out())
             for scaled in (False, True):
                 robust = self._agreeing(weights, starts, distances, scaled=scaled)
                 if robust is not None:
                     found.append(self._explained(*robust))
-        if all(e.criterion == np.inf for e in found):
-            found = [self._explained(p, everything.kept, may_reject=False)]
-        return self._with_all_minima(min(found, key=lambda e: e.criterion), everything, weights)
+        return found
 
-    def _masks_outliers(self, e: _Explanation, suspected: bool) -> bool:
-        """Tell whether noise may have been blamed for what a few bumped poses did."""
-        if self.n < FEWEST_TO_REJECT_FROM:
-            return False
-        if self._may_reject(self._distances_of(e)):
-            return True
-        found = {c.name: v for c, v in zip(e.components, e.theta, strict=True)}
-        measured = np.diagonal(self.cov, axis1=1, axis2=2).mean(axis=0)
-        white = max(found.get("white_force_N", 0.0) / measured[0], found.get("white_torque_Nm", 0.0) / measured[3])
-        inexact = found.get(ROTATION.name, 0.0) > LARGE_ROTATION_RAD**2
-        return suspected and (inexact or (self.measured and white > LARGE_WHITE))
-
-    def _may_reject(self, distances: Array) -> bool:
+    def _stand_out(self, distances: Array) -> bool:
         """Tell whether poses stand out, or so many of them that none does."""
         if self.n < FEWEST_TO_REJECT_FROM:
             return False
@@ -387,90 +412,59 @@ class _Problem:
                 break
         return found
 
-    def _explained(self, p: Parameters, kept: Kept, *, may_reject: bool = True) -> _Explanation:
-        """Alternate between parameters, variance components and rejection until they agree."""
-        always = self._always()
-        readmitted = np.zeros(self.n, bool)
-        choose = True
-        cov = self._least_noise(p, kept)
-        for _ in range(12):
-            problem = self._linearised(p, kept, cov)
-            if choose:
-                at = self._selected(problem, always)
-                if self.drift == "auto":
-                    at = with_slopes_instead(problem, at, len(always))
-            else:
-                at = maximise(problem, at.components, at.theta)
-            distances = self._distances(problem, at)
-            criterion = self._criterion(problem, at)
-            p = self._moved(p, at.step)
-            before = kept
-            if may_reject:
-                kept = self._membership(kept, distances, readmitted, at)
-            readmitted |= kept & ~before
-            choose = bool((kept != before).any())
-            if not choose and float(at.step @ np.linalg.solve(at.C, at.step)) < 1e-4:
+    def _explained(self, p: Parameters, kept: Kept) -> _Explanation:
+        """Improve parameters, variances, components and rejected poses in turn, until nothing changes."""
+        always, candidates = self._always(), self._candidates()
+        problem = self._linearised(p, kept)
+        components, theta = tuple(always), self._start(problem, always)
+        best = _Explanation(p, kept)
+        for _ in range(ROUNDS):
+            at = select(problem, components, theta, candidates, len(always))
+            if self.drift == "auto":
+                at = with_slopes_instead(problem, at, len(always))
+            p, problem, at = self._settled(p, kept, at)
+            distances = squared_length(*at.left_out())
+            criterion = self._criterion(at, distances)
+            if criterion > best.criterion - 1e-3:
                 break
-        if not self.measured and not before.all() and self._white_is_gone(at, cov):
-            criterion = np.inf  # rejecting until the rest fits exactly explains nothing
-        return _Explanation([Minimum(p, np.nan, np.zeros((15, 15)))], before, cov, at.components, at.theta, criterion)
+            noise_found = {c.kind for c in at.components[len(always) :]} - {"walk", "slope"}
+            noticed = self.n >= FEWEST_TO_REJECT_FROM and (bool(noise_found) or self._stand_out(distances))
+            best = _Explanation(p, kept, at.components, at.theta, criterion, noticed)
+            components, theta = at.components, at.theta
+            kept = self._membership(kept, distances, at)
+            if not (kept == best.kept).all():
+                problem = self._linearised(p, kept)
+        return best
 
-    @staticmethod
-    def _white_is_gone(at: Point, cov: Array) -> bool:
-        floor = cov[0, [0, 3], [0, 3]]
-        white = [value for c, value in zip(at.components, at.theta, strict=True) if c.kind == "white"]
-        return any(value < least for value, least in zip(white, floor, strict=False))
+    def _settled(self, p: Parameters, kept: Kept, at: Point) -> tuple[Parameters, Linearised, Point]:
+        """Go down with the noise as it is and estimate its variances again, until they agree."""
+        for _ in range(ROUNDS):
+            p = self.descent.down(self._equations(at.noise), p).parameters
+            problem = self._linearised(p, kept)
+            at = maximise(problem, at.components, at.theta)
+            if float(at.step @ np.linalg.solve(at.C, at.step)) < SETTLED:
+                break
+        return p, problem, at
 
-    def _selected(self, problem: Linearised, always: list[Component]) -> Point:
-        start, candidates = self._start(problem, always), self._candidates()
-        at = select(problem, always, start, candidates)
-        found = dict(zip(at.components, at.theta, strict=True))
-        if found.get(ROTATION, 0.0) > WORST_ROTATION_RAD**2:  # something else, which no orientation error explains
-            at = select(problem, always, start, [c for c in candidates if c is not ROTATION])
-        return at
-
-    def _moved(self, p: Parameters, step: Array) -> Parameters:
-        if not self.constraints.any:
-            return p.moved(step)
-        return self.constraints.satisfied(p.moved(self.constraints.free(p) @ step))
-
-    def _membership(self, kept: Kept, distances: Array, readmitted: Kept, at: Point) -> Kept:
-        """Reject the poses that stand out, the worst first; take back those that do not any more, once."""
-        estimated = any(c.kind == "white" for c in at.components)
-        inside = 6 * float(f_ppf(6, self._dof(kept), 1 - 1e-3)) if estimated else FARTHEST
-        worst = float(distances[kept].max())
-        out = kept & (distances > max(FARTHEST, worst / 4)) & ~readmitted
-        after = (kept & ~out) | (~kept & (distances < inside))
+    def _membership(self, kept: Kept, distances: Array, at: Point) -> Kept:
+        """Reject the poses that stand out, the worst first; take back those that do not any more."""
+        limit = self._limit(at)
+        out = kept & (distances > max(limit, float(distances[kept].max()) / 4))
+        after = (kept & ~out) | (~kept & (distances < limit))
         return after if after.sum() >= fewest_kept(self.n) else kept
 
-    def _distances(self, problem: Linearised, at: Point) -> Array:
-        """Squared leave-one-out residuals (n,) in units of their covariance."""
-        P = at.noise.blocks - at.WJ @ at.C @ np.swapaxes(at.WJ, 1, 2)
-        S = np.asarray(np.linalg.inv(P), dtype=np.float64)
-        e = (S @ at.u[..., None])[..., 0]
-        self._replace_far(problem, at, S)
-        return np.asarray((np.linalg.solve(S, e[..., None])[..., 0] * e).sum(axis=1))
+    def _limit(self, at: Point) -> float:
+        """Squared distance of a good pose that one in a thousand exceeds."""
+        estimated = any(c.kind == "white" for c in at.components)
+        return 6 * float(f_ppf(6, self._dof(at.noise.kept), 1 - FALSE_REJECTION)) if estimated else FARTHEST
 
-    @staticmethod
-    def _replace_far(problem: Linearised, at: Point, S: Array) -> None:
-        """Give rejected poses the noise of the others in place of the huge one that keeps them out."""
-        rejected = ~problem.kept
+    def _criterion(self, at: Point, distances: Array) -> float:
+        """A rejected pose has noise of its own size. At the limit it costs what it would if it counted."""
+        value, rejected, limit = -2 * at.worth, ~at.noise.kept, self._limit(at)
         if rejected.any():
-            S[rejected] += at.noise.D[problem.kept].mean(axis=0) - at.noise.D[rejected]
-
-    def _distances_of(self, e: _Explanation) -> Array:
-        problem = self._linearised(e.minima[0].parameters, e.kept, e.cov)
-        return self._distances(problem, point(problem, e.components, e.theta))
-
-    def _criterion(self, problem: Linearised, at: Point) -> float:
-        rejected = ~problem.kept
-        value = -2 * at.loglik
-        if rejected.any():
-            P = at.noise.blocks - at.WJ @ at.C @ np.swapaxes(at.WJ, 1, 2)
-            S = np.asarray(np.linalg.inv(P), dtype=np.float64)
-            self._replace_far(problem, at, S)
-            far = np.linalg.slogdet(at.noise.D[rejected])[1].sum()
-            value += float(np.linalg.slogdet(S[rejected])[1].sum() - far) + FARTHEST * int(rejected.sum())
+            far = np.maximum(distances[rejected], limit)
+            value += float(np.linalg.slogdet(at.left_out()[1][rejected])[1].sum())
+            value += float(np.sum(limit + 6 * np.log(far / limit)))
         return value
 
     def _start(self, problem: Linearised, components: Sequence[Component]) -> Array:
@@ -480,23 +474,21 @@ class _Problem:
         scale = [np.mean(size[:, np.array(c.share) > 0]) for c in components]
         return np.array([s / (10 * self.n if c.kind == "walk" else 1) for c, s in zip(components, scale, strict=True)])
 
-    def _with_all_minima(self, e: _Explanation, everything: _Explanation, weights: Array) -> _Explanation:
+    def _with_all_minima(self, e: _Explanation, others: list[Minimum]) -> list[Minimum]:
         """Find the minima again, under the noise of the explanation."""
-        p = e.minima[0].parameters
-        others = everything.minima if e.kept.all() else self.descent.minima(weights * e.kept[:, None, None])
-        logdet = self._noise(e, p).logdet
+        logdet = self._noise(e, e.parameters).logdet
         ends = []
-        for start in (p, *(minimum.parameters for minimum in others)):
+        for start in (e.parameters, *(minimum.parameters for minimum in others)):
             q = start
-            for _ in range(3 if ROTATION in e.components else 1):  # its noise depends on the parameters
-                noise = self._noise(e, q)
+            for _ in range(3 if {"rotation", "gain", "cross_talk"} & {c.kind for c in e.components} else 1):
+                noise = self._noise(e, q)  # which depends on the parameters
                 end = self.descent.down(self._equations(noise), q)
                 q = end.parameters
             ends.append(replace(end, chi2=end.chi2 + noise.logdet - logdet))
-        return replace(e, minima=self.descent.distinct(ends))
+        return self.descent.distinct(ends)
 
     def _noise(self, e: _Explanation, p: Parameters) -> Noise:
-        return noise_of(self._linearised(p, e.kept, e.cov), e.components, e.theta)
+        return noise_of(self._linearised(p, e.kept), e.components, e.theta)
 
     def _equations(self, noise: Noise) -> Equations:
         """Weighted least squares for any noise."""
@@ -508,56 +500,74 @@ class _Problem:
 
         return equations
 
-    def _fit(self, e: _Explanation, static_chi2: float) -> Fit:
-        best = e.minima[0]
+    def _fit(self, e: _Explanation, minima: list[Minimum], static_chi2: float) -> Fit:
+        best = minima[0]
         if not best.settled:
             weight_N = np.linalg.norm(best.parameters.gravity_force_base_N)
             raise NotObservable(
                 f"the fit has not settled in {MAX_STEPS} steps, at a weight of {weight_N:.2g} N: "
                 "hang something heavier on the sensor, or add poses with other orientations."
             )
-        if not e.components and e.kept.all() and self.drift != "linear":
-            noise = Noise(self.cov)
-        else:
-            noise = self._noise(e, best.parameters)
+        plain = not e.components and e.kept.all() and self.drift != "linear"
+        noise = Noise(self.cov) if plain else self._noise(e, best.parameters)
         weights = np.empty(self.n)
         weights[self.order] = e.kept
         drifts = self.drift == "linear" or any(c.kind in ("walk", "slope") for c in e.components)
+        found = dict(zip(e.components, e.theta, strict=True))
+        variance = np.repeat([found.get(c, 0.0) for c in RESPONSE], [5, 6])
+        effects = np.flatnonzero(variance), variance[variance > 0]
         return Fit(
             parameters=best.parameters,
             information=best.information,
             free=self.constraints.free(best.parameters),
-            minima=tuple(e.minima),
+            minima=tuple(minima),
             chi2=best.chi2,
             dof=self._dof(e.kept),
             measured_chi2=static_chi2 if self.measured else float("nan"),
             weights=weights,
-            components={c.name: float(np.sqrt(v)) for c, v in zip(e.components, e.theta, strict=True)},
-            drift=self._drift(best, noise) if drifts else None,
+            components={c.name: self._deviation(c, v) for c, v in found.items()},
+            drift=self._drift(best, noise, effects) if drifts else None,
             noise=noise,
             order=self.order,
             R_base_flange=self.given[0],
             wrench=self.given[1],
+            effects=effects,
         )
 
-    def _drift(self, best: Minimum, noise: Noise) -> DriftEstimate:
+    def _deviation(self, c: Component, variance: float) -> float:
+        """Standard deviation that the fit used: white noise that nobody measured includes its least."""
+        least = 0.0 if self.measured or c.kind != "white" else self.cov[0][np.argmax(c.share), np.argmax(c.share)]
+        return float(np.sqrt(variance + least))
+
+    def _drift(self, best: Minimum, noise: Noise, effects: tuple[NDArray[np.intp], Array]) -> DriftEstimate:
         """Best linear prediction of the bias at every pose, and the error of its change."""
         J, r = jacobian(best.parameters, self.R), self.wrench - predict(best.parameters, self.R)
+        T = response_columns(best.parameters, self.R)[..., effects[0]]
+
+        def not_drift(X: Array) -> Array:
+            """Multiply by the covariance of all but the drift."""
+            Y = noise.D @ X
+            return np.asarray(Y + T @ (effects[1][:, None] * summed_products(T, X)) if T.size else Y)
+
+        sorted_bias = r - not_drift(noise.solve(r[..., None]))[..., 0]
+        if not noise.kept.all():
+            at, seen = self.time[noise.kept], sorted_bias[noise.kept]
+            sorted_bias = np.stack([np.interp(self.time, at, channel) for channel in seen.T], axis=1)
         bias = np.empty((self.n, 6))
-        bias[self.order] = r - (noise.D @ noise.solve(r[..., None]))[..., 0]
-        ends = [0, -1]
+        bias[self.order] = sorted_bias
+        ends = np.flatnonzero(noise.kept)[[0, -1]]
         select_ends = np.zeros((self.n, 6, 6))
         select_ends[ends] = [-np.eye(6), np.eye(6)]
         Z = self.constraints.free(best.parameters)
         C = Z @ _inverse(Z.T @ best.information @ Z) @ Z.T
-        Y = noise.D @ select_ends
+        Y = not_drift(select_ends)
         WY = noise.solve(Y)
-        E = np.einsum("nik,nil->kl", select_ends, J) - np.einsum("nik,nil->kl", WY, J)
-        cov = np.einsum("nik,nil->kl", select_ends, Y) - np.einsum("nik,nil->kl", Y, WY) + E @ C @ E.T
-        change = bias[self.order[-1]] - bias[self.order[0]]
+        E = summed_products(select_ends, J) - summed_products(WY, J)
+        cov = summed_products(select_ends, Y) - summed_products(Y, WY) + E @ C @ E.T
+        change = sorted_bias[ends[1]] - sorted_bias[ends[0]]
         return DriftEstimate(change, np.sqrt(np.maximum(np.diag(cov), 0.0)), bias)
 
-    def _linearised(self, p: Parameters, kept: Kept, cov: Array) -> Linearised:
+    def _linearised(self, p: Parameters, kept: Kept) -> Linearised:
         J = jacobian(p, self.R)
         turn = J[..., :3]
         r = self.wrench - predict(p, self.R)
@@ -567,7 +577,7 @@ class _Problem:
             Z = self.constraints.free(p)
             J, H, g = J @ Z, Z.T @ A.T @ A @ Z, Z.T @ A.T @ residual
         slope = np.full(6, np.inf) if self.drift == "linear" else None
-        return Linearised(J, r, (H, g), turn, cov, self.time, kept, slope)
+        return Linearised(J, r, (H, g), turn, self.cov, self.time, kept, slope, response_columns(p, self.R))
 
     def _groups(self) -> list[range]:
         return [range(c, c + 1) for c in range(6)] if self.n >= POSES_FOR_EACH_AXIS else [FORCE, TORQUE]
@@ -583,11 +593,12 @@ class _Problem:
         return always
 
     def _candidates(self) -> list[Component]:
-        if self.n < (FEW_POSES if self.measured else FEW_POSES_WITHOUT_NOISE):
-            return []
-        white = [component("white", FORCE), component("white", TORQUE)] if self.measured else []
-        walks = [component("walk", group) for group in self._groups()] if self.drift == "auto" else []
-        return [*white, ROTATION, *walks]
+        found = list(RESPONSE) if self.n >= FEW_POSES_FOR_RESPONSE else []
+        if self.n >= (FEW_POSES if self.measured else FEW_POSES_WITHOUT_NOISE):
+            white = [component("white", FORCE), component("white", TORQUE)] if self.measured else []
+            walks = [component("walk", group) for group in self._groups()] if self.drift == "auto" else []
+            found += [*white, ROTATION, *walks]
+        return found
 
 
 def _white(sigma_N: float, sigma_Nm: float) -> Array:

@@ -12,11 +12,12 @@ from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtr as normal_cdf
 
 from calib.changes import lasting_change
-from calib.evidence import Evidence, standardized
+from calib.evidence import Drifted, Evidence, standardized
+from calib.faults import COLLAPSE, broken_channels, constant_weight, faults, torque_units
 from calib.identifiability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
-from calib.model import PARAMETER_NAMES, UP_IN_BASE, Array, Parameters, jacobian
-from calib.so3 import force_cost, given_rotation, minima
-from calib.yu import SPECIAL_R_flange_base, com_and_torque_bias
+from calib.model import PARAMETER_NAMES, UP_IN_BASE, Array, Parameters
+from calib.response import Response, predicted_covariance
+from calib.yu import SPECIAL_R_flange_base
 
 Verdict = Literal["good", "usable", "rejected"]
 
@@ -34,12 +35,12 @@ USUAL_LEVER_M = 0.1
 NOTED_TILT_DEG, REVERSED_TILT_DEG = 10.0, 135.0
 INSIDE_M = 0.01
 """A centre of mass may lie this far on the robot's side of the sensor origin: adapter plates do."""
+NOISELESS = 1e-6
+"""Simulated without noise: equal readings are no copies."""
 CORRELATED = 0.9
 FEW_LEFT_OUT = 0.1
 SURE = 1e-3
 """Probability of a false remark."""
-COLLAPSE = 0.4
-"""An explanation is one if the residual drops to this share."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,7 +113,10 @@ def judge(
     largest = shares[0][1]
 
     inexact = [words for words, share in shares if share > USABLE_SHARE]
-    explanation = disagreeing_axes(fit.R_base_flange[used], fit.wrench[used], up_in_base) if inexact else []
+    few = n >= (1 - FEW_LEFT_OUT) * len(used)
+    explanation = [] if few and not inexact else _faults(fit, used, t_s, up_in_base)
+    if fit.chi2 > NOISELESS * fit.dof:
+        rejected += broken_channels(fit.wrench, fit.R_base_flange)
     rejected += explanation + _weight_reasons(fit, weight_N) + _second_solution_reasons(fit)
     _com_reasons(parameters, farthest_com_m, rejected, usable)
     (rejected if largest > REJECTED_SHARE else usable).extend(inexact)
@@ -120,7 +124,7 @@ def judge(
         usable += _contradiction_reasons(fit, unconstrained)
     sensible = not explanation and largest < SENSELESS_SHARE
     if sensible:
-        usable += reversed_signs(parameters, fit.covariance, up_in_base)
+        usable += reversed_signs(parameters, fit.covariance, up_in_base, farthest_com_m)
     noise_factor, chi2_p = None, None
     if np.isfinite(fit.measured_chi2):
         noise_factor = float(np.sqrt(fit.measured_chi2 / fit.dof))
@@ -128,10 +132,11 @@ def judge(
         if chi2_p < SURE:
             good = noise_factor <= NOISE_FACTOR and largest <= NOISY_SHARE
             (notes if good else usable).append(_noise_reason(fit, noise_factor))
+    changed: list[str] = []
     if measured_sigma is not None and chi2_p is not None and (chi2_p < SURE or not used.all()):
-        rejected += _change_reasons(fit, residual_sigma, measured_sigma, t_s)
+        changed = _change_reasons(fit, residual_sigma, measured_sigma, t_s)
+        rejected += changed
     if not used.all():
-        few = n >= (1 - FEW_LEFT_OUT) * len(used)
         listed = ", ".join(str(k + 1) for k in np.flatnonzero(~used))
         (notes if few else usable).append(
             f"{len(used) - n} of {len(used)} poses were left out, they fit none of the others: repeat {listed}"
@@ -140,6 +145,8 @@ def judge(
         usable.append(f"there are only {n} poses: {RECOMMENDED_POSES} or more can be checked against each other")
     usable += _indispensable_reasons(fit, used, weight_N)
 
+    if fit.response is not None:
+        notes.append(f"{fit.response.in_words()}: the calibration corrects this for its own weight")
     if lag1_p < SURE:
         notes.append(
             f"successive poses have similar residuals (correlation {lag1:.2f}): most likely the bias drifted, so let "
@@ -149,9 +156,15 @@ def judge(
     if n >= RECOMMENDED_POSES and residual_sigma[worst] ** 2 > chi2_isf(6, SURE / n) / 6 * max(typical, 1.0):
         notes.append(f"pose {worst + 1} is out of line, {residual_sigma[worst]:.1f} sigma: consider repeating it")
     if sensible:
-        notes += _plausibility_notes(parameters, fit.covariance, up_in_base, farthest_com_m)
+        notes += _tilt_notes(parameters, up_in_base)
     if chi2_p is None:
         notes.append("the noise was not measured but estimated from the residuals: chi2 says nothing about the fit")
+    drifted = _drift_reasons(fit.drift)
+    matters = fit.drift is not None and _drift_share(fit.drift.change, weight_N) > USABLE_SHARE
+    if drifted and matters and not explanation and not changed:
+        (rejected or usable)[:0] = drifted  # before what it causes
+    else:
+        notes += drifted
     if contradicted and (chi2_p is None or chi2_p < SURE):
         known = "; ".join(contradicted)
         cause = f"what was given as known does not agree with the data: {known}: correct it, or leave it out"
@@ -168,6 +181,13 @@ def judge(
         lag1=lag1,
         correlations=strong_correlations(fit.covariance),
     )
+
+
+def _faults(fit: Evidence, used: NDArray[np.bool_], t_s: Array | None, up_in_base: ArrayLike) -> list[str]:
+    """Look for faults in all poses, and where there are none in those that were used."""
+    order = np.arange(len(used)) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
+    found = faults(fit.R_base_flange[order], fit.wrench[order], up_in_base)
+    return found if found or used.all() else faults(fit.R_base_flange[used], fit.wrench[used], up_in_base)
 
 
 def successive_correlation(standardized: Array, t_s: Array | None = None) -> tuple[float, float]:
@@ -197,70 +217,32 @@ def strong_correlations(covariance: Array, least: float = CORRELATED) -> tuple[t
     return tuple((PARAMETER_NAMES[i], PARAMETER_NAMES[j], value) for value, i, j in strong)
 
 
-def expected_error(parameters: Parameters, covariance: Array) -> tuple[float, float]:
+def expected_error(parameters: Parameters, covariance: Array, response: Response | None = None) -> tuple[float, float]:
     """Root mean square error of the predicted wrench over all orientations, N and N·m.
 
     It is of second degree in the orientation, so its mean over the rotations of the cube is the mean over all.
     """
-    J = jacobian(parameters, np.swapaxes(SPECIAL_R_flange_base, 1, 2))
-    variance = np.einsum("nki,ij,nkj->k", J, covariance, J) / len(J)
+    over = predicted_covariance(parameters, covariance, response, np.swapaxes(SPECIAL_R_flange_base, 1, 2))
+    variance = np.diagonal(over, axis1=1, axis2=2).mean(axis=0)
     return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
 
 
-def disagreeing_axes(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[str]:
-    """Find out whether inverted orientations, or torque axes that disagree with the force axes, explain a bad fit.
-
-    Forces are fitted alone, then torques to them by linear least squares, as read and with axes reversed. Reversing all
-    three axes of torque or of force only moves the centre of mass to the other side, which `reversed_signs` sees.
-
-    Parameters
-    ----------
-    R_base_flange : array, shape (n, 3, 3)
-    wrench : array, shape (n, 6)
-    up_in_base : array_like, shape (3,)
-        Where up should be.
-    """
-    n, force_N, torque_Nm = len(wrench), wrench[:, :3], wrench[:, 3:]
-    if n < RECOMMENDED_POSES:
-        return []
-    found = []
-    best = minima(force_cost(R_base_flange, force_N, np.ones(n)))[0]
-    inverted = minima(force_cost(np.swapaxes(R_base_flange, 1, 2), force_N, np.ones(n)))[0]
-    rounding = 1e-12 * float(np.sum(force_N**2))
-    if inverted.cost + rounding < COLLAPSE**2 * best.cost:
-        found.append(
-            f"the orientations look inverted, with their transposes the force residual drops from "
-            f"{np.sqrt(best.cost / n):.2g} to {np.sqrt(max(inverted.cost, 0) / n):.2g} N: "
-            "state that they map base to flange"
-        )
-    F_b, _ = given_rotation(best.R, R_base_flange, force_N, np.ones(n))
-    weight_sensor_N = (F_b @ R_base_flange) @ best.R.T
-    fits = []
-    for flipped in ("", "x", "y", "z"):
-        signs = np.array([-1.0 if axis in flipped else 1.0 for axis in "xyz"])
-        P, T0 = com_and_torque_bias(weight_sensor_N, torque_Nm * signs)
-        if P @ best.R[:, 2] < 0:  # the tool hangs outside the flange, so it must have been the other axes
-            signs, P, T0 = -signs, -P, -T0
-        rms = _rms(torque_Nm * signs - np.cross(P, weight_sensor_N) - T0)
-        fits.append((rms, signs))
-    (rms, signs), as_read = min(fits, key=lambda fit: fit[0]), fits[0][0]
-    if rms < COLLAPSE * as_read:
-        axes = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
-        up = F_b @ np.asarray(up_in_base) > 0
-        other = f" (or force {axes})" if up == (np.prod(signs) < 0) else ""
-        found.append(
-            f"force and torque axes disagree, with torque {axes} reversed{other} the torque residual drops from "
-            f"{as_read:.2g} to {rms:.2g} N·m: check the wiring of the axes or the sensor's matrix"
-        )
-    return found
-
-
-def reversed_signs(parameters: Parameters, covariance: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[str]:
-    """Say what a weight that pulls upwards means."""
-    angle_deg = _tilt_deg(parameters, up_in_base)
+def reversed_signs(
+    parameters: Parameters,
+    covariance: Array,
+    up_in_base: ArrayLike = UP_IN_BASE,
+    farthest_com_m: float = FARTHEST_COM_M,
+) -> list[str]:
+    """Say what a weight that pulls upwards means, and a centre of mass on the robot's side of the sensor."""
+    angle_deg, inside_m = _tilt_deg(parameters, up_in_base), _inside_m(parameters, covariance)
     if angle_deg < REVERSED_TILT_DEG:
-        return []
-    if _inside_m(parameters, covariance):
+        if not 0 < inside_m <= farthest_com_m:
+            return []
+        return [
+            f"the centre of mass lies {1e3 * inside_m:.0f} mm on the robot's side of the sensor: the torques are "
+            "reversed, unless the tool reaches back that far"
+        ]
+    if inside_m:
         return [
             f"the weight pulls upwards ({angle_deg:.0f}° from down) and the centre of mass lies on the robot's side of "
             "the sensor: the forces are reversed and the torques are not"
@@ -271,23 +253,31 @@ def reversed_signs(parameters: Parameters, covariance: Array, up_in_base: ArrayL
     ]
 
 
-def _plausibility_notes(
-    parameters: Parameters, covariance: Array, up_in_base: ArrayLike, farthest_com_m: float
-) -> list[str]:
-    notes = []
-    angle_deg, inside_m = _tilt_deg(parameters, up_in_base), _inside_m(parameters, covariance)
-    if NOTED_TILT_DEG < angle_deg < REVERSED_TILT_DEG:
-        x, y, z = parameters.gravity_force_base_N / np.linalg.norm(parameters.gravity_force_base_N)
-        notes.append(
-            f"gravity is {angle_deg:.0f}° off, along ({x:.2f}, {y:.2f}, {z:.2f}) in base: right for a robot on a "
-            "wall or a slope, otherwise check the base frame and the orientations"
-        )
-    if 0 < inside_m <= farthest_com_m and angle_deg < REVERSED_TILT_DEG:
-        notes.append(
-            f"the centre of mass lies {1e3 * inside_m:.0f} mm on the robot's side of the sensor: the torques are "
-            "reversed, unless the tool reaches back that far"
-        )
-    return notes
+def _tilt_notes(parameters: Parameters, up_in_base: ArrayLike) -> list[str]:
+    angle_deg = _tilt_deg(parameters, up_in_base)
+    if not NOTED_TILT_DEG < angle_deg < REVERSED_TILT_DEG:
+        return []
+    x, y, z = parameters.gravity_force_base_N / np.linalg.norm(parameters.gravity_force_base_N)
+    return [
+        f"gravity is {angle_deg:.0f}° off, along ({x:.2f}, {y:.2f}, {z:.2f}) in base: right for a robot on a "
+        "wall or a slope, otherwise check the base frame and the orientations"
+    ]
+
+
+def _drift_share(change: Array, weight_N: float) -> float:
+    """Drift of the force relative to the weight, or of the torque to the weight at the usual lever."""
+    sizes = np.linalg.norm(change[:3]), np.linalg.norm(change[3:]) / USUAL_LEVER_M
+    return float(max(sizes) / weight_N) if weight_N else float("inf")
+
+
+def _drift_reasons(drift: Drifted | None) -> list[str]:
+    if drift is None or not (np.abs(drift.change) > 3 * drift.sigma).any():
+        return []
+    force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
+    return [
+        f"the bias drifted by {force_N:.2g} N and {torque_Nm:.2g} N·m from the first pose to the last: let the sensor "
+        "warm up and calibrate again"
+    ]
 
 
 def _tilt_deg(parameters: Parameters, up_in_base: ArrayLike) -> float:
@@ -311,6 +301,8 @@ def _weight_reasons(fit: Evidence, weight_N: float) -> list[str]:
     sigma_N = np.sqrt(max(variance, 0.0))  # below 0 is rounding of a weight that is exactly known
     if weight_N > SIGNIFICANT_SIGMAS * sigma_N:
         return []
+    if given_in_base := constant_weight(fit.wrench):
+        return given_in_base
     return [
         f"the weight, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty of {sigma_N:.2g} N: "
         "hang something heavier on the sensor, or record longer and in more orientations"
@@ -361,8 +353,8 @@ def _change_reasons(fit: Evidence, residual_sigma: Array, measured_sigma: Array,
 def _com_reasons(parameters: Parameters, farthest_com_m: float, rejected: list[str], usable: list[str]) -> None:
     com_m = float(np.linalg.norm(parameters.p_sensor_com_m))
     if com_m > farthest_com_m:
-        millimetres = com_m > 1.0 and com_m / 1e3 <= farthest_com_m
-        advice = "the torques are in N·mm, not N·m" if millimetres else "check the units of force and torque"
+        units = torque_units(com_m)
+        advice = f"the torques are in {' or '.join(units)}, not N·m" if units else "check the units of force and torque"
         rejected.append(
             f"the centre of mass lies {com_m:.2f} m from the sensor, farther than {farthest_com_m:g} m: {advice}"
         )
@@ -382,7 +374,7 @@ def _shares(
     """
     lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
     left_out = _rms(fit.left_out_residuals[used, :3]), _rms(fit.left_out_residuals[used, 3:])
-    expected = expected_error(fit.parameters, fit.covariance)
+    expected = expected_error(fit.parameters, fit.covariance, fit.response)
     kinds = (
         ("force", 0, weight_N, "N", "the weight"),
         ("torque", 1, weight_N * lever_m, "N·m", f"the weight at {lever_m:.2g} m"),

@@ -14,13 +14,27 @@ from scipy.special import expit
 from calib.compensation import Compensator
 from calib.errors import BadCalibration
 from calib.files import JSON, check_format, read_object, write_new
-from calib.model import PARAMETER_NAMES, Array, Parameters, is_rotation, jacobian, read_only
+from calib.model import PARAMETER_NAMES, Array, Parameters, is_rotation, read_only
 from calib.quality import Verdict, expected_error
+from calib.response import Response, predicted_covariance
 from calib.yu import weight_and_tilt
 
 FORMAT = "ftdrive.calibration/1"
 
-LATER = ("p_value", "measured_sigma", "weights", "components", "drift", "second_basin_chi2", "quality")
+COMMON_GAIN = float(np.sqrt(5 / 3 / 3))
+"""Sigma of the mean of three gains over that of one; five numbers tell that one, hence 5/3 as for Student's t."""
+
+LATER = (
+    "p_value",
+    "measured_sigma",
+    "weights",
+    "components",
+    "drift",
+    "response",
+    "gain_sigma",
+    "second_basin_chi2",
+    "quality",
+)
 """Fields that the first files of this format do not have."""
 
 Method = Literal[
@@ -64,7 +78,7 @@ class CalibrationResult:
     covariance: Array
     """(15, 15) of the error coordinates `PARAMETER_NAMES`, from the noise and from what `components` add to it."""
     residuals: Array
-    """(n, 6) measured minus predicted wrench, N and N·m, in the sensor frame: of the plain model, without drift."""
+    """(n, 6) measured minus predicted wrench, N and N·m, in the sensor frame: `response` included, drift not."""
     chi2: float
     """Least squares of the residuals of the poses that count, weighted by the measured noise alone: without drift or
     `components`. When nobody measured the noise, weighted by what was estimated from them."""
@@ -86,9 +100,14 @@ class CalibrationResult:
     components: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations of what the residuals show, by name and unit: beyond the measured noise, or all of the noise
     when nobody measured it. `walk_…` is the random walk of the bias per mean interval between poses, `slope_…` its
-    linear change over the session, `rotation_rad` the error of each pose's orientation per axis."""
+    linear change over the session, `rotation_rad` the error of each pose's orientation per axis, `gain` and
+    `cross_talk` the size of the entries of `response`, relative and relative to a lever of 50 mm."""
     drift: DriftResult | None = None
     """None: no drift was found, or none was looked for."""
+    response: Response | None = None
+    """Gain and cross-talk of the sensor; None: none were found, or none were looked for."""
+    gain_sigma: float = 0.0
+    """Standard deviation of the entries of the gain, as far as the data leave room for it."""
     second_basin_chi2: float | None = None
     """How much worse the second best solution fits, under the noise model; None: there is no other."""
     quality: Mapping[str, JSON] = field(default_factory=dict)
@@ -116,6 +135,9 @@ class CalibrationResult:
                 object.__setattr__(self, name, value)
         if isinstance(self.drift, Mapping):
             object.__setattr__(self, "drift", DriftResult(self.drift["change"], self.drift["sigma"]))
+        if isinstance(self.response, Mapping):
+            given = self.response
+            object.__setattr__(self, "response", Response(given["coefficients"], given["covariance"]))
         object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
         object.__setattr__(self, "reasons", tuple(self.reasons))
         for name in ("provenance", "quality"):
@@ -192,9 +214,14 @@ class CalibrationResult:
 
     @property
     def sigma(self) -> Mapping[str, Array | float]:
-        """One standard deviation of every quantity, by its name; `R_flange_sensor`: (3,) rad about the flange axes."""
+        """One standard deviation of every quantity, by its name; `R_flange_sensor`: (3,) rad about the flange axes.
+
+        Weight and mass include the gain common to all axes, which no orientation shows.
+        """
         std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, self.covariance[3:6, 3:6])
+        if weight > 1e-9 * self.weight_N:  # not exactly known
+            weight = float(np.hypot(weight, COMMON_GAIN * self.gain_sigma * self.weight_N))
         return {
             "R_flange_sensor": std[0:3],
             "gravity_force_base_N": std[3:6],
@@ -207,7 +234,7 @@ class CalibrationResult:
             "tilt_beta_rad": beta,
         }
 
-    def compensate(self, wrench: Array, R_base_flange: Array) -> Array:
+    def compensate(self, wrench: Array, R_base_flange: Array, *, response: bool = True) -> Array:
         """Remove weight and bias: what is left is contact.
 
         Parameters
@@ -215,21 +242,25 @@ class CalibrationResult:
         wrench : array, shape (6,) or (n, 6)
             As measured, N and N·m, in the sensor frame.
         R_base_flange : array, shape (3, 3) or (n, 3, 3)
+        response : bool
+            Whether gain and cross-talk of the sensor are applied to the weight. False: as a program does that knows
+            only mounting, weight, centre of mass and bias.
 
         Returns
         -------
         array, same shape as `wrench`
             Contact wrench on the sensor, in the sensor frame, about the sensor origin.
         """
-        return np.asarray(self.compensator(wrench, R_base_flange), dtype=np.float64)
+        compensator = self.compensator if response else Compensator(self.parameters)
+        return np.asarray(compensator(wrench, R_base_flange), dtype=np.float64)
 
     @cached_property
     def compensator(self) -> Compensator:
         """The same for those in a hurry: one sample, into a buffer, or a million at once."""
-        return Compensator(self.parameters)
+        return Compensator(self.parameters, response=self.response)
 
     def wrench_covariance(self, R_base_flange: Array) -> Array:
-        """Covariance of the predicted wrench that the uncertainty of the parameters causes.
+        """Covariance of the predicted wrench that the uncertainty of the estimates causes.
 
         Parameters
         ----------
@@ -239,12 +270,12 @@ class CalibrationResult:
         -------
         array, shape (..., 6, 6)
         """
-        J = jacobian(self.parameters, np.asarray(R_base_flange, dtype=np.float64))
-        return np.asarray(J @ self.covariance @ np.swapaxes(J, -1, -2))
+        R = np.asarray(R_base_flange, dtype=np.float64)
+        return predicted_covariance(self.parameters, self.covariance, self.response, R)
 
     def predicted_error(self) -> tuple[float, float]:
         """Root mean square error of `compensate` over all orientations, N and N·m, as far as noise explains it."""
-        return expected_error(self.parameters, self.covariance)
+        return expected_error(self.parameters, self.covariance, self.response)
 
     def residual_summary(self) -> dict[str, float]:
         """Root mean square and largest norm of the force and torque residuals over the poses."""
@@ -288,6 +319,8 @@ class CalibrationResult:
             "drift": None
             if self.drift is None
             else {"change": self.drift.change.tolist(), "sigma": self.drift.sigma.tolist()},
+            "response": None if self.response is None else self.response.to_dict(),
+            "gain_sigma": self.gain_sigma,
             "weights": None if self.weights is None else self.weights.tolist(),
             "rejected_poses": list(self.rejected_poses),
             "second_basin_chi2": self.second_basin_chi2,

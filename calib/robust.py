@@ -17,7 +17,9 @@ Kept = NDArray[np.bool_]
 Solver = Callable[[Statistics, Parameters, int], Parameters]
 """Goes down from a start, at most so many steps."""
 
-FARTHEST = float(chi2_isf(6, 1e-3))
+FALSE_REJECTION = 1e-3
+"""Share of good poses that are rejected."""
+FARTHEST = float(chi2_isf(6, FALSE_REJECTION))
 """Squared distance, in noise, beyond which a pose is rejected: 22.5."""
 FEWEST_TO_REJECT_FROM = 8
 """With fewer poses, one that disagrees with the others and others that disagree with it look alike."""

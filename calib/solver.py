@@ -11,6 +11,7 @@ from calib.dataset import CalibrationDataset
 from calib.descent import column_scale
 from calib.errors import NotObservable
 from calib.evidence import Evidence, IndependentFit
+from calib.faults import faults
 from calib.identifiability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
 from calib.known import Known
 from calib.ml import RANK_TOLERANCE, Drift, Fit, fit
@@ -83,23 +84,32 @@ def solve(
     if wrench_cov is not None:
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
     # The fit also tells whether the poses are enough, and how large the noise is where it was not measured.
-    best = fit(
-        dataset.R_base_flange,
-        dataset.wrench,
-        wrench_cov,
-        t_s=dataset.t_s,
-        drift=drift,
-        known=None if estimator else known,
-        g_m_s2=g_m_s2,
-    )
-    _require_determined(dataset.R_base_flange, best, known)
+    try:
+        best = fit(
+            dataset.R_base_flange,
+            dataset.wrench,
+            wrench_cov,
+            t_s=dataset.t_s,
+            drift=drift,
+            known=None if estimator else known,
+            g_m_s2=g_m_s2,
+        )
+        _require_determined(dataset.R_base_flange, best, known)
+    except NotObservable as exc:
+        if mixed_up := faults(dataset.R_base_flange, dataset.wrench, up_in_base):
+            raise NotObservable(f"{mixed_up[0]}.") from exc
+        raise
     evidence: Evidence = best
     if estimator:
         parameters = estimator(dataset.wrench)
-        noise = best.wrench_cov if wrench_cov is None else wrench_cov
+        noise = wrench_cov
+        if noise is None:  # what a method cannot explain is noise to it
+            residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
+            square = (residuals**2).reshape(-1, 2, 3).mean(axis=(0, 2)) * 6 * len(dataset) / best.dof
+            noise = np.broadcast_to(np.diag(np.repeat(np.maximum(square, 1e-24), 3)), (len(dataset), 6, 6))
         evidence = IndependentFit(
             parameters,
-            _simulated_covariance(estimator, parameters, dataset.R_base_flange, best.wrench_cov),
+            _simulated_covariance(estimator, parameters, dataset.R_base_flange, noise),
             dataset.R_base_flange,
             dataset.wrench,
             noise,
@@ -141,6 +151,8 @@ def solve(
         weights=evidence.weights,
         components=evidence.components,
         drift=None if drifted is None else DriftResult(drifted.change, drifted.sigma),
+        response=evidence.response,
+        gain_sigma=evidence.gain_sigma,
         second_basin_chi2=best.second_basin_chi2,
         quality={
             "loo_force_rms_N": quality.loo_force_rms_N,

@@ -15,14 +15,17 @@ from calib.covariance import Noise, centred, summed_products, walk_square, walk_
 from calib.model import Array
 
 GAIN = 2.0
-"""A component stays when it raises the restricted log-likelihood by more than this."""
+"""A component stays when it raises the restricted log-likelihood by more than this: 2 % come in by chance."""
+GAIN_OF_RESPONSE = 3.0
+"""The same for gain and cross-talk of the sensor, whose 5 and 6 numbers come in by chance in 0.4 %."""
 SURE = 20.0  # a gain or loss that no other component makes good
 WORTH_A_TRY = 1.0  # gain predicted from slope and curvature at zero
 NEGLIGIBLE = 1e-4  # of the white noise: where slope and curvature "at zero" are taken
-FAR = 1e12  # a rejected pose counts as this much noisier
+LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2}
+"""Variances that no arm or sensor in working order exceeds: what asks for more is something else."""
 _AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
 
-Kind = Literal["white", "walk", "slope", "rotation"]
+Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +37,11 @@ class Component:
     share: tuple[float, ...]
     """(6,) by which the variance is multiplied in each channel."""
 
+    @property
+    def needed(self) -> float:
+        """The gain in log-likelihood that it must bring."""
+        return GAIN_OF_RESPONSE if self.kind in ("gain", "cross_talk") else GAIN
+
 
 def component(kind: Kind, channels: Sequence[int]) -> Component:
     """Name a component of one channel or of a group of three."""
@@ -43,6 +51,7 @@ def component(kind: Kind, channels: Sequence[int]) -> Component:
 
 FORCE, TORQUE = range(3), range(3, 6)
 ROTATION = Component("rotation_rad", "rotation", (0.0,) * 6)
+RESPONSE = tuple(Component(kind, kind, (0.0,) * 6) for kind in ("gain", "cross_talk"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +74,16 @@ class Linearised:
     """(n,)"""
     slope: Array | None
     """(6,) as in `Noise`, for linear drift that is part of the model."""
+    response: Array
+    """(n, 6, 11) derivative by gain and cross-talk of the sensor."""
+
+    def columns(self, c: Component) -> Array | None:
+        """(n, 6, k) derivative by what acts on all poses at once; None for what acts on each by itself."""
+        if c.kind == "slope":
+            return np.asarray(centred(self.time)[:, None, None] * np.eye(6)[:, np.flatnonzero(c.share)])
+        if c.kind == "gain":
+            return self.response[..., :5]
+        return self.response[..., 5:] if c.kind == "cross_talk" else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +102,50 @@ class Point:
     step: Array
     """(m,) from where the problem was linearised to the best parameters."""
     loglik: float
+
+    @property
+    def worth(self) -> float:
+        """The log-likelihood less what each component must bring."""
+        return self.loglik - sum(c.needed for c in self.components)
+
+    def left_out(self) -> tuple[Array, Array]:
+        """Residual (n, 6) of each pose when all others predict it, and its covariance (n, 6, 6)."""
+        return left_out(self.noise, self.WJ, self.u, self.C)
+
+
+def left_out(noise: Noise, WJ: Array, u: Array, C: Array) -> tuple[Array, Array]:
+    """Predict every pose from all others, drift and correlation included, without fitting again.
+
+    The exact leave-one-out of the linear model, and the prediction of poses that do not count: `P_kk^-1 (P y)_k` with
+    `P = W - W J C J' W`, W the inverse noise.
+
+    Parameters
+    ----------
+    noise : Noise
+    WJ : array, shape (n, 6, m)
+    u : array, shape (n, 6)
+        Inverse noise times the residuals.
+    C : array, shape (m, m)
+
+    Returns
+    -------
+    residuals : array, shape (n, 6)
+    covariance : array, shape (n, 6, 6)
+        Noise of the pose and uncertainty of its prediction: very large where the others determine nothing.
+    """
+    P = noise.blocks - WJ @ C @ np.swapaxes(WJ, 1, 2)
+    rejected = ~noise.kept
+    P[~rejected] += 1e-10 * noise.W[~rejected]  # however badly the others determine it
+    S = np.linalg.inv(P)
+    e = (S @ u[..., None])[..., 0]
+    if rejected.any():
+        S[rejected] -= np.linalg.inv(noise.W[rejected]) - noise.D[rejected]
+    return np.asarray(e), np.asarray(S + np.swapaxes(S, 1, 2)) / 2
+
+
+def squared_length(e: Array, S: Array) -> Array:
+    """Square residuals (n, 6) in units of their covariance (n, 6, 6)."""
+    return np.asarray((np.linalg.solve(S, e[..., None])[..., 0] * e).sum(axis=1))
 
 
 def point(problem: Linearised, components: Sequence[Component], theta: Array) -> Point:
@@ -106,20 +169,22 @@ def point(problem: Linearised, components: Sequence[Component], theta: Array) ->
 
 def noise_of(problem: Linearised, components: Sequence[Component], theta: Array) -> Noise:
     """Give the covariance with these variances."""
-    D = problem.D.copy() if components or not problem.kept.all() else problem.D
-    variances = {kind: np.zeros(6) for kind in ("white", "walk", "slope")}
+    D, walk, slope = problem.D, np.zeros(6), problem.slope
+    effects = []
     for c, value in zip(components, theta, strict=True):
-        if c.kind == "rotation":
-            D += value * problem.turn @ np.swapaxes(problem.turn, 1, 2)
+        columns = problem.columns(c)
+        if columns is not None:
+            effects.append((columns, np.full(columns.shape[2], value)))
+        elif c.kind == "walk":
+            walk += value * np.array(c.share)
+        elif c.kind == "rotation":
+            D = D + value * problem.turn @ np.swapaxes(problem.turn, 1, 2)
         else:
-            variances[c.kind] += value * np.array(c.share)
-    if variances["white"].any():
-        D[:, range(6), range(6)] += variances["white"]
-    if not problem.kept.all():
-        typical = D[problem.kept].mean(axis=0)
-        D[~problem.kept] = FAR * np.diag(np.diag(typical))
-    slope = problem.slope if problem.slope is not None else np.sqrt(variances["slope"])
-    return Noise(D, problem.time, np.sqrt(variances["walk"]), slope)
+            white = value * np.diag(c.share)
+            D = D + white if D.strides[0] else np.broadcast_to(D[0] + white, D.shape)
+    joined = [np.concatenate(parts, axis=-1) for parts in zip(*effects, strict=True)]
+    together = (joined[0], joined[1]) if joined else None
+    return Noise(D, problem.time, np.sqrt(walk), slope, together, problem.kept)
 
 
 def _score(problem: Linearised, at: Point) -> tuple[Array, Array]:
@@ -127,33 +192,35 @@ def _score(problem: Linearised, at: Point) -> tuple[Array, Array]:
     u, WJ, C, noise = at.u, at.WJ, at.C, at.noise
     WJC = WJ @ C
     P = noise.blocks - WJC @ np.swapaxes(WJ, 1, 2)
-    t = centred(problem.time)
+    of_all = {c: T for c in at.components if (T := problem.columns(c)) is not None}
+    PT = {c: noise.solve(T) - WJC @ summed_products(WJ, T) for c, T in of_all.items()}
+    kept = int(problem.kept.sum())
     slope, Vu = [], []
     for c, theta in zip(at.components, at.theta, strict=True):
         share = np.array(c.share)
-        if c.kind == "white":
+        if c in of_all:
+            T = of_all[c]
+            along = np.tensordot(u, T, 2)
+            square, trace = float(along @ along), float(np.vdot(T, PT[c]))
+            Vu.append(theta * (T @ along))
+        elif c.kind == "white":
             square, trace = float((u**2).sum(axis=0) @ share), float(np.einsum("ncc,c->", P, share))
             Vu.append(theta * share * u)
         elif c.kind == "rotation":
             turned = (u[:, None] @ problem.turn)[:, 0]
             square, trace = float((turned**2).sum()), float(np.vdot(problem.turn, P @ problem.turn))
             Vu.append(theta * (problem.turn @ turned[..., None])[..., 0])
-        elif c.kind == "walk":
-            square = float(walk_square(problem.time, u) @ share)
-            # K P = (V - D) P, and V P = 1 - J C J' W.
-            own = np.flatnonzero(share)
-            explained = np.einsum("nck,nck->c", problem.J[:, own], WJC[:, own])
-            white = np.einsum("ncd,ndc->c", noise.D[:, own], P[:, :, own])
-            trace = float(np.sum(len(u) - explained - white)) / theta
-            Vu.append(theta * share * walk_times(problem.time, u))
         else:
-            T = t[:, None, None] * np.eye(6)
-            PT = noise.solve(T)
-            JWT = np.einsum("nik,nil->kl", WJ, T)
-            tPt = np.einsum("nic,nic->c", T, PT) - np.einsum("kc,kl,lc->c", JWT, C, JWT)
-            along = t @ u
-            square, trace = float(along**2 @ share), float(tPt @ share)
-            Vu.append(theta * share * np.outer(t, along))
+            square = float(walk_square(problem.time, u) @ share)
+            # K P = (V - D - effects) P, and V P = 1 - J C J' W.
+            own = np.flatnonzero(share)
+            others = np.einsum("nck,nck->", problem.J[:, own], WJC[:, own])
+            others += np.einsum("ncd,ndc->", noise.D[:, own], P[:, :, own])
+            for other, value in zip(at.components, at.theta, strict=True):
+                if other in of_all:
+                    others += value * np.vdot(of_all[other][:, own], PT[other][:, own])
+            trace = (kept * len(own) - float(others)) / theta
+            Vu.append(theta * share * walk_times(problem.time, u))
         slope.append(theta * (square - trace) / 2)
     X = np.stack(Vu, axis=-1)
     WX = noise.solve(X)
@@ -164,10 +231,11 @@ def _score(problem: Linearised, at: Point) -> tuple[Array, Array]:
 
 def maximise(problem: Linearised, components: Sequence[Component], theta: Array) -> Point:
     """Climb to the best variances from these (k,), all positive."""
-    best = point(problem, components, theta)
     if not components:
-        return best
-    least = 1e-3 * NEGLIGIBLE * np.array([_unit(problem, best, c) for c in components])
+        return point(problem, components, theta)
+    most = np.array([LARGEST.get(c.kind, np.inf) for c in components])
+    best = point(problem, components, np.minimum(theta, most))
+    least = np.minimum(1e-3 * NEGLIGIBLE * np.array([_unit(problem, best, c) for c in components]), most)
     caution = 1e-3
     for _ in range(60):
         slope, information = _score(problem, best)
@@ -175,7 +243,7 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array)
         while caution < 1e6:
             damped = information + np.diag(caution * (np.diag(information) + 1e-3))
             step = np.clip(np.linalg.solve(damped, slope), -2.5, 2.5)
-            trial = point(problem, components, np.maximum(best.theta * np.exp(step), least))
+            trial = point(problem, components, np.clip(best.theta * np.exp(step), least, most))
             gained = trial.loglik - best.loglik
             if gained >= 0 or np.abs(step).max() < 1e-4:
                 break
@@ -190,10 +258,29 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array)
     return best
 
 
-def select(problem: Linearised, always: Sequence[Component], theta: Array, candidates: Sequence[Component]) -> Point:
-    """Add the candidates that the data ask for, one by one, then drop those that others make needless."""
-    best = maximise(problem, always, theta)
-    waiting = list(candidates)
+def select(
+    problem: Linearised,
+    components: Sequence[Component],
+    theta: Array,
+    candidates: Sequence[Component],
+    needed: int | None = None,
+) -> Point:
+    """Add the candidates that the data ask for, one by one, then drop those that others make needless.
+
+    Parameters
+    ----------
+    problem : Linearised
+    components : sequence of Component
+        To start from.
+    theta : array, shape (k,)
+        Their variances.
+    candidates : sequence of Component
+    needed : int, optional
+        How many of the components, the first, are part of the model; by default all.
+    """
+    needed = len(components) if needed is None else needed
+    best = _pruned(problem, maximise(problem, components, theta), needed)
+    waiting = [c for c in candidates if c not in best.components]
     while waiting:
         gains, start = predicted_gains(problem, best, waiting)
         k = int(np.argmax(gains))
@@ -205,10 +292,11 @@ def select(problem: Linearised, always: Sequence[Component], theta: Array, candi
         trial = maximise(
             problem, [*best.components, *(waiting[i] for i in together)], np.append(best.theta, start[together])
         )
-        waiting = [c for i, c in enumerate(waiting) if i not in together]
-        if trial.loglik > best.loglik + GAIN:
+        too_large = any(v >= LARGEST.get(c.kind, np.inf) for c, v in zip(trial.components, trial.theta, strict=True))
+        if trial.loglik > best.loglik + waiting[k].needed and not too_large:
             best = trial
-    return _pruned(problem, best, len(always))
+        waiting = [c for i, c in enumerate(waiting) if i not in together]
+    return _pruned(problem, best, needed)
 
 
 def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
@@ -229,49 +317,43 @@ def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
 
 
 def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
+    """Drop what is not worth its place, one at a time."""
     k = needed
-    while needed < len(best.components) - 1 and k < len(best.components):
+    while k < len(best.components):
         rest = [i for i in range(len(best.components)) if i != k]
-        if best.components[k].kind == "walk" and _loss(problem, best, rest) > SURE:
-            k += 1
-            continue
-        without = maximise(problem, [best.components[i] for i in rest], best.theta[rest])
-        if without.loglik > best.loglik - GAIN:
+        components, theta = [best.components[i] for i in rest], best.theta[rest]
+        without = point(problem, components, theta)  # the others can make good a part of what is lost
+        if best.loglik - without.loglik < SURE:
+            without = maximise(problem, components, theta)
+        if without.worth > best.worth:
             best, k = without, needed
         else:
             k += 1
     return best
 
 
-def _loss(problem: Linearised, best: Point, rest: list[int]) -> float:
-    """How much worse it gets with only the rest of the components, the others as they are."""
-    return best.loglik - point(problem, [best.components[i] for i in rest], best.theta[rest]).loglik
-
-
 def predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Component]) -> tuple[Array, Array]:
     """Gain in log-likelihood that each candidate alone promises, and where to start climbing."""
-    small = NEGLIGIBLE * np.array([_unit(problem, best, c) for c in waiting])
-    at = point(problem, [*best.components, *waiting], np.concatenate([best.theta, small]))
+    unit = np.array([_unit(problem, best, c) for c in waiting])
+    at = point(problem, [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * unit]))
     slope, information = _score(problem, at)
     k = len(best.components)
-    curvature = np.diag(information)[k:]
-    known = information[:k, k:]
+    curvature, slope_k = np.diag(information)[k:], slope[k:]
     if k:
-        curvature = curvature - np.einsum("ki,ki->i", known, np.linalg.lstsq(information[:k, :k], known)[0])
-        slope_k = slope[k:] - known.T @ np.linalg.lstsq(information[:k, :k], slope[:k])[0]
-    else:
-        slope_k = slope
-    safe = np.maximum(curvature, 1e-300)
-    gains = np.where(slope_k > 0, slope_k**2 / (2 * safe), 0.0)
-    return gains, small / NEGLIGIBLE
+        known = np.linalg.lstsq(information[:k, :k], np.column_stack([information[:k, k:], slope[:k]]))[0]
+        curvature = curvature - np.einsum("ki,ki->i", information[:k, k:], known[:, :-1])
+        slope_k = slope_k - information[:k, k:].T @ known[:, -1]
+    gains = np.where(slope_k > 0, slope_k**2 / (2 * np.maximum(curvature, 1e-300)), 0.0)
+    return gains, unit
 
 
 def _unit(problem: Linearised, best: Point, c: Component) -> float:
     """Variance at which a component is about as large as the white noise."""
     variance = np.diagonal(best.noise.D[problem.kept], axis1=1, axis2=2).mean(axis=0)
     n = int(problem.kept.sum())
-    if c.kind == "rotation":
-        size = (problem.turn[problem.kept] ** 2).mean(axis=(0, 2))
-        return float(1 / np.max(size / variance))
+    columns = problem.columns(c) if c.kind != "slope" else None
+    if columns is not None or c.kind == "rotation":
+        columns = problem.turn if columns is None else np.sqrt(n) * columns
+        return float(1 / np.max((columns[problem.kept] ** 2).mean(axis=(0, 2)) / variance))
     share = np.array(c.share)
     return float((variance * share).sum() / share.sum()) / (n if c.kind == "walk" else 1)

@@ -12,10 +12,10 @@ from calib import CalibrationDataset, Parameters, solve
 from calib.contact import contact_chi2, contact_threshold
 from calib.dataset import read_csv
 from calib.evidence import IndependentFit, leave_one_out, standardized
+from calib.faults import faults
 from calib.model import Array, jacobian, predict
 from calib.quality import (
     Quality,
-    disagreeing_axes,
     expected_error,
     judge,
     strong_correlations,
@@ -347,7 +347,7 @@ F, T = ["fx", "fy", "fz"], ["tx", "ty", "tz"]
         (F, "the forces are reversed"),
         (T, "the torques are reversed"),
         (["tx"], "with torque x reversed the"),
-        (["fy"], "torque y reversed (or force y)"),
+        (["fy"], "force y reversed"),
         (["ty", "tz"], "y and z reversed (or force y and z)"),
         (["fx", "fy"], "x and y reversed (or force x and y)"),
     ],
@@ -369,7 +369,7 @@ def test_nothing_is_suspected_of_a_sound_sensor() -> None:
     for sigma in (SIGMA, 10 * SIGMA, 40 * SIGMA):
         R = Rotation.random(12, rng=rng).as_matrix()
         wrench = noisy(rng, R, sigma=sigma)
-        assert disagreeing_axes(R, wrench) == []
+        assert faults(R, wrench) == []
         assert not any(word in solved(R, wrench)[1] for word in ("reversed", "reaction", "inverted", "N·mm"))
 
 
@@ -386,7 +386,7 @@ def test_wrong_units_of_torque_are_found_out() -> None:
         (1e3, "rejected", "the centre of mass lies 73.5"),
         (1e3, "rejected", "the torques are in N·mm, not N·m"),
         (1e-3, "usable", "the centre of mass lies only 0.074 mm from the sensor"),
-        (10, "rejected", "farther than 0.5 m: check the units of force and torque"),
+        (10, "rejected", "farther than 0.5 m: the torques are in lbf·in"),
     ):
         got, reasons = solved(R24, wrench * np.repeat([1, factor], 3))
         assert got == verdict
@@ -404,7 +404,7 @@ def test_a_real_session_is_usable_and_one_with_drift_is_never_good(real_data: Pa
         verdict, reasons = solved(dataset.R_base_flange, dataset.wrench)
         assert verdict in verdicts
         assert not any(word in reasons for word in ("disagree", "reaction", "inverted"))
-        assert "the force residual is" in reasons
+        assert ("the force residual is" in reasons) == (name != "agimus_mini45_b")
 
 
 def test_a_real_session_read_with_wrong_signs_is_found_out(real_data: Path) -> None:

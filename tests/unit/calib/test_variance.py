@@ -96,13 +96,13 @@ ALL = (
     component("walk", FORCE),
     component("walk", [5]),
 )
-THETA = np.array([0.3, 0.2, 0.05, 0.4, 0.1])
+THETA = np.array([0.3, 0.2, 0.05 / 400, 0.4, 0.1])
 
 
 def problem(rng: np.random.Generator, n: int, components: tuple[Component, ...], theta: Array) -> Linearised:
     J = rng.normal(size=(n, 6, 8))
     J[:, :, :6] = np.eye(6)  # biases are always free
-    turn = rng.normal(size=(n, 6, 3))
+    turn = 20 * rng.normal(size=(n, 6, 3))  # as large as a small turn makes it
     time = np.arange(n, dtype=float)
     D = np.tile(np.eye(6) * 0.04, (n, 1, 1))
     V = D.copy()
@@ -116,7 +116,9 @@ def problem(rng: np.random.Generator, n: int, components: tuple[Component, ...],
             walk += np.sqrt(v) * np.array(c.share)
     r = (np.linalg.cholesky(V) @ rng.normal(size=(n, 6, 1)))[..., 0]
     r += np.cumsum(rng.normal(size=(n, 6)) * walk, axis=0)
-    return Linearised(J, r, (np.zeros((8, 8)), np.zeros(8)), turn, D, time, np.ones(n, bool), None)
+    return Linearised(
+        J, r, (np.zeros((8, 8)), np.zeros(8)), turn, D, time, np.ones(n, bool), None, np.zeros((n, 6, 11))
+    )
 
 
 @pytest.mark.parametrize("components", [ALL, (*ALL[:3], component("slope", FORCE), component("slope", TORQUE))])
@@ -144,7 +146,7 @@ def test_the_restricted_likelihood_is_that_of_error_contrasts() -> None:
         return float(-0.5 * (np.linalg.slogdet(C)[1] + y @ np.linalg.solve(C, y)))
 
     components = (ALL[0], ALL[2], ALL[3])
-    thetas = np.exp(rng.normal(size=(4, 3)))
+    thetas = np.exp(rng.normal(size=(4, 3))) / [1, 400, 1]
     ours = [point(p, components, theta).loglik for theta in thetas]
     np.testing.assert_allclose(np.diff(ours), np.diff([exact(theta) for theta in thetas]), atol=1e-8)
 
@@ -153,7 +155,7 @@ def test_variances_are_recovered() -> None:
     found = []
     for seed in range(10):
         p = problem(np.random.default_rng(seed), 100, ALL, THETA)
-        found.append(maximise(p, ALL, np.full(5, 0.1)).theta)
+        found.append(maximise(p, ALL, 0.1 / np.array([1, 1, 400, 1, 1])).theta)
     np.testing.assert_allclose(np.median(found, axis=0), THETA, rtol=0.25)
 
 
@@ -196,7 +198,7 @@ def test_what_is_always_needed_is_not_dropped() -> None:
 
 def test_a_turn_of_the_flange_is_told_from_white_noise() -> None:
     rng = np.random.default_rng(8)
-    turned = problem(rng, 40, (ROTATION,), np.array([0.3]))
+    turned = problem(rng, 40, (ROTATION,), np.array([0.3 / 400]))
     assert select(turned, [], np.zeros(0), list(ALL[:3])).components == (ROTATION,)
     white = problem(rng, 40, ALL[:1], np.array([0.3]))
     assert select(white, [], np.zeros(0), list(ALL[:3])).components == ALL[:1]

@@ -1,0 +1,235 @@
+"""How well sensors of inexact calibration are predicted, and whether stated uncertainties hold on real data.
+
+    FTDRIVE_REAL_DATA=… uv run python tests/benchmarks/sensor_model.py [--quick] [--only PART]
+
+Prints one row per figure: name, figure, target, pass or FAIL; the exit code is the number of rows that failed.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import Parameters, ml, read_csv
+from calib.known import Constraints, Known
+from calib.model import STANDARD_GRAVITY_M_S2, predict
+from calib.response import CROSS_TALK_M, GAIN, Response, predicted_covariance
+from calib.result import COMMON_GAIN
+from calib.variance import FORCE, RESPONSE, ROTATION, TORQUE, component
+from calib.yu import lrom
+from tests.benchmarks import scenarios as sim
+from tests.benchmarks.accuracy import Lab, Row, band, laboratory, most
+from tests.benchmarks.scenarios import Array
+
+Rows = NDArray[np.intp]
+
+DRIFT_N, ORIENTATION_RAD = 0.07, np.deg2rad(0.05)
+NOISE = sim.sigma(400)
+
+
+def response_of(parameters: Parameters, response: Response | None) -> tuple[Array, Array]:
+    """Linear response (6, 9) to the orientation, and bias (6,)."""
+    theta = np.stack([predict(parameters, E) for E in np.eye(9).reshape(9, 3, 3)], axis=1)
+    bias = predict(parameters, np.zeros((3, 3)))
+    if response is not None:
+        theta = theta + np.stack([response.wrench(parameters, E) for E in np.eye(9).reshape(9, 3, 3)], axis=1)
+    return theta - bias[:, None], bias
+
+
+def predicted(fit: ml.Fit, R: Array) -> Array:
+    """Wrench (n, 6) at orientations (n, 3, 3)."""
+    theta, bias = response_of(fit.parameters, fit.response)
+    return np.asarray(R.reshape(-1, 9) @ theta.T + bias)
+
+
+# Recordings
+
+
+def held_out(R: Array, wrench: Array, method: str) -> Array:
+    """Measured minus predicted (n, 6), each pose left out once."""
+    n, errors = len(R), np.empty((len(R), 6))
+    for i in range(n):
+        kept = np.flatnonzero(np.arange(n) != i)
+        at = R[i : i + 1]
+        if method == "LROM":
+            errors[i] = wrench[i] - predict(lrom(R[kept], wrench[kept]), at)[0]
+        elif method == "10-parameter LS":
+            errors[i] = wrench[i] - predict(sim.ten_parameters(R[kept], wrench[kept]), at)[0]
+        else:
+            fit = ml.fit(R[kept], wrench[kept], t_s=kept.astype(np.float64))
+            errors[i] = wrench[i] - predicted(fit, at)[0]
+            if fit.drift is not None:
+                errors[i] -= [np.interp(i, kept, channel) for channel in fit.drift.bias.T]
+    return errors
+
+
+def recordings(lab: Lab) -> Iterator[Row]:
+    del lab
+    if not (folder := os.environ.get("FTDRIVE_REAL_DATA")):
+        return
+    for name, limits in (("agimus_mini45_b", (0.145, 6.6)), ("foamcutting_2013_06_12", (np.inf, np.inf))):
+        data = read_csv(Path(folder) / name / "poses.csv", orientation="R_flange_base")
+        R, wrench = data.R_base_flange, data.wrench
+        for method in ("10-parameter LS", "LROM", "ml"):
+            e = held_out(R, wrench, method)
+            force, torque = (float(np.sqrt((e[:, c] ** 2).sum(axis=1).mean())) for c in (slice(0, 3), slice(3, 6)))
+            own = method == "ml"
+            yield most(f"{name}, left out, {method}, force", force, limits[0] if own else np.inf, len(R), " N")
+            yield most(
+                f"{name}, left out, {method}, torque", 1e3 * torque, limits[1] if own else np.inf, len(R), " mN·m"
+            )
+        if name.startswith("agimus"):
+            for split, halves in splits(len(R)).items():
+                distance, mass_z = disagreement(*(ml.fit(R[h], wrench[h], t_s=h.astype(float)) for h in halves))
+                yield most(f"{name}, {split}: chi2/dof of 15 parameters", distance, 1.5, 1)
+                yield most(f"{name}, {split}: z of the mass", abs(mass_z), 1.3 * 1.96, 1)
+
+
+def splits(n: int) -> dict[str, tuple[Rows, Rows]]:
+    rows = np.arange(n)
+    return {"odd/even": (rows[::2], rows[1::2]), "first/second half": (rows[: n // 2], rows[n // 2 :])}
+
+
+def disagreement(one: ml.Fit, two: ml.Fit) -> tuple[float, float]:
+    """Squared difference of the parameters in units of its covariance, over 15, and z of the weight.
+
+    The biases are those of different times and not compared where they drift.
+    """
+    d, C = one.parameters.difference(two.parameters), one.covariance + two.covariance
+    keep = np.arange(15) if one.drift is None and two.drift is None else np.r_[0:6, 9:12]
+    d, C = d[keep], C[np.ix_(keep, keep)]
+    b = one.parameters.gravity_force_base_N / np.linalg.norm(one.parameters.gravity_force_base_N)
+    return float(d @ np.linalg.solve(C, d)) / len(keep), float(b @ d[3:6] / np.sqrt(b @ C[3:6, 3:6] @ b))
+
+
+# Simulated sensors
+
+
+def sensor_run(
+    seed: int, n: int, gain: float, cross_talk: float, drift_N: float, *, measured: bool = True, oracle: bool = True
+) -> dict[str, object]:
+    """Calibrate a sensor whose entries of gain and cross-talk are that uncertain."""
+    rng = np.random.default_rng([seed, n])
+    truth, R = sim.tool(rng), sim.poses(f"haar{n}", rng)
+    K = np.tensordot(gain * rng.normal(size=5), GAIN, 1) + gain * rng.normal() / np.sqrt(3) * np.eye(3)
+    S = np.tensordot(cross_talk * rng.normal(size=6), CROSS_TALK_M, 1)
+
+    def read(R: Array) -> Array:
+        u = sim.readings(truth, R)[:, :3] - truth.F0
+        return np.asarray(sim.readings(truth, R) + np.concatenate([u @ K.T, u @ S.T], axis=1))
+
+    path, mean = sim.walk(n, drift_N, rng)
+    wrench = read(R) + path + mean + NOISE * rng.normal(size=(n, 6))
+    reported = sim.with_inexact_orientations(R, ORIENTATION_RAD, rng)
+    cov = np.diag(NOISE**2) if measured else None
+    fit = ml.fit(reported, wrench, cov)
+    elsewhere = sim.poses("haar40", rng)
+    right = read(elsewhere) + mean
+    e = predicted(fit, elsewhere) - right
+    sigma = np.sqrt(np.diagonal(predicted_covariance(fit.parameters, fit.covariance, fit.response, elsewhere), 0, 1, 2))
+    components = dict(fit.components)
+    weight_N = float(np.linalg.norm(fit.parameters.gravity_force_base_N))
+    along = fit.parameters.gravity_force_base_N / weight_N
+    own = np.sqrt(along @ fit.covariance[3:6, 3:6] @ along)
+    record: dict[str, object] = {
+        "square": [np.mean(e[:, :3] ** 2), np.mean(e[:, 3:] ** 2)],
+        "covered": np.mean(np.abs(e) < 1.96 * sigma, axis=0),
+        "gain": "gain" in components,
+        "cross_talk": "cross_talk" in components,
+        "mass": (weight_N - sim.WEIGHT_N) / np.hypot(own, COMMON_GAIN * fit.gain_sigma * weight_N),
+        "rejected": np.mean(fit.weights == 0),
+    }
+    for split, (a, b) in splits(n).items():
+        one, two = (ml.fit(reported[h], wrench[h], cov, t_s=h.astype(float)) for h in (a, b))
+        record[split] = disagreement(one, two)[0]
+    if oracle:
+        fit = informed(reported, wrench, gain, cross_talk, drift_N)
+        e = predicted(fit, elsewhere) - right
+        record["oracle"] = [np.mean(e[:, :3] ** 2), np.mean(e[:, 3:] ** 2)]
+    return record
+
+
+def informed(R: Array, wrench: Array, gain: float, cross_talk: float, drift_N: float) -> ml.Fit:
+    """Fit with the true variances."""
+    problem = ml._Problem(R, wrench, np.diag(NOISE**2), None, "auto", Constraints(Known(), STANDARD_GRAVITY_M_S2))
+    found = [ROTATION, *RESPONSE, component("walk", FORCE), component("walk", TORQUE)]
+    theta = np.array([ORIENTATION_RAD, gain, cross_talk, drift_N, sim.LEVER_M * drift_N]) ** 2
+    minima = problem.descent.minima(ml._inverses(problem.cov))
+    used = [k for k in range(5) if theta[k] > 0]
+    e = ml._Explanation(minima[0].parameters, problem.everything, tuple(found[k] for k in used), theta[used])
+    return problem._fit(e, problem._with_all_minima(e, minima), np.nan)
+
+
+def false_choice(lab: Lab) -> Iterator[Row]:
+    runs = lab.count(600, 60)
+    for n in (24, 12, 8):
+        for measured in (True, False):
+            record = lab.simulate(partial(plain_run, n=n, measured=measured), runs)
+            what = "measured" if measured else "unknown"
+            share = 100 * float(record["chosen"].mean())
+            yield most(f"no gain error, {n} poses, noise {what}: K or S chosen", share, 2, runs, " %")
+
+
+def plain_run(seed: int, n: int, *, measured: bool) -> dict[str, object]:
+    rng = np.random.default_rng([seed, n])
+    truth, R, s = sim.tool(rng), sim.poses(f"haar{n}", rng), sim.sigma(100)
+    wrench = sim.readings(truth, R) + s * rng.normal(size=(n, 6))
+    return {"chosen": ml.fit(R, wrench, np.diag(s**2) if measured else None).response is not None}
+
+
+def oracle(lab: Lab) -> Iterator[Row]:
+    runs = lab.count(300, 30)
+    for n in (24, 12):
+        record = lab.simulate(partial(sensor_run, n=n, gain=0.01, cross_talk=0.01, drift_N=DRIFT_N), runs)
+        ratio = np.sqrt(record["square"].mean(axis=0) / record["oracle"].mean(axis=0))
+        for k, what in enumerate(("force", "torque")):
+            yield most(f"gain and cross-talk 1 %, drift, {n} poses: {what} rms over an oracle's", ratio[k], 1.1, runs)
+            covered = float(record["covered"][:, 3 * k : 3 * k + 3].mean())
+            yield band(f"  95 % intervals of the predicted {what}", covered, 0.92, 0.97, runs)
+
+
+def halves(lab: Lab) -> Iterator[Row]:
+    runs = lab.count(200, 20)
+    for gain in (0.003, 0.01, 0.02):
+        for drift_N in (0.0, DRIFT_N):
+            worker = partial(sensor_run, n=24, gain=gain, cross_talk=gain, drift_N=drift_N, oracle=False)
+            record = lab.simulate(worker, runs)
+            name = f"gain and cross-talk {100 * gain:g} %, drift {drift_N:g} N"
+            for split in splits(2):
+                value = float(record[split].mean())
+                yield most(f"{name}: {split} disagree, chi2/dof", value, 1.5, runs)
+            yield most(f"{name}: rms z of the mass", float(np.sqrt(np.mean(record["mass"] ** 2))), 1.3, runs)
+
+
+PARTS: dict[str, Callable[[Lab], Iterator[Row]]] = {
+    "recordings": recordings,
+    "false": false_choice,
+    "oracle": oracle,
+    "halves": halves,
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Sensors of inexact calibration.")
+    parser.add_argument("--quick", action="store_true", help="few runs")
+    parser.add_argument("--only", choices=PARTS, action="append", help="one part; may be repeated")
+    options = parser.parse_args()
+    failed = 0
+    write = partial(print, flush=True)
+    pool, lab = laboratory(quick=options.quick)
+    with pool:
+        for name in options.only or PARTS:
+            for row in PARTS[name](lab):
+                failed += not row.passed
+                mark = "pass" if row.passed else "FAIL"
+                write(f"{row.name:75} {row.figure:>16}   {row.target:16} {mark} {row.runs:6}")
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

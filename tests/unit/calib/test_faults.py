@@ -1,0 +1,122 @@
+"""What was mixed up is named, and undoing it helps."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import BadDataset, CalibrationDataset, CalibrationResult, NotObservable, Parameters, read_csv, solve
+from calib.known import Known
+from calib.model import Array, predict
+
+SIGMA = np.repeat([0.05, 0.00125], 3)
+SWAP = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])
+CYCLE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+
+
+def session(seed: int, n: int = 12) -> tuple[Parameters, Array, Array]:
+    rng = np.random.default_rng(seed)
+    mount = Rotation.random(rng=rng).as_matrix()
+    com = mount.T @ [0.015, -0.01, 0.08]  # outside the flange
+    p = Parameters(mount, np.array([0.3, -0.2, -20.0]), 5 * rng.normal(size=3), com, 0.3 * rng.normal(size=3))
+    R = np.asarray(Rotation.random(n, rng=rng).as_matrix())
+    return p, R, np.asarray(predict(p, R) + SIGMA * rng.normal(size=(n, 6)))
+
+
+def first(R: Array, wrench: Array, known: Known | None = None) -> str:
+    """Give the first reason, or the refusal."""
+    try:
+        result = solved(R, wrench, known)
+    except NotObservable as exc:
+        return str(exc)
+    assert result.verdict != "good"
+    return result.reasons[0]
+
+
+def solved(R: Array, wrench: Array, known: Known | None = None) -> CalibrationResult:
+    n = len(R)
+    return solve(CalibrationDataset(R, wrench, None, np.zeros(n, np.int64), np.arange(float(n))), known=known)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("shift", "says"), [(1, "(w, x, y, z) that were read"), (-1, "(x, y, z, w) that were read")])
+def test_the_order_of_quaternions_is_named_and_not_called_inverted(shift: int, says: str, seed: int) -> None:
+    p, R, wrench = session(seed)
+    quaternions = Rotation.from_matrix(R).as_quat()
+    reason = first(Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix(), wrench)
+    assert says in reason
+    assert "inverted" not in reason
+    assert solved(R, wrench).mass_kg == pytest.approx(np.linalg.norm(p.gravity_force_base_N) / 9.80665, rel=0.01)
+
+
+@pytest.mark.parametrize("by", [1, -1])
+def test_a_wrench_of_the_neighbouring_pose_is_named(by: int) -> None:
+    _, R, wrench = session(3)
+    R, wrench = (R[1:], wrench[:-1]) if by > 0 else (R[:-1], wrench[1:])
+    assert f"that of the pose {'before' if by > 0 else 'after'} it" in first(R, wrench)
+
+
+@pytest.mark.parametrize("Q", [SWAP, CYCLE])
+@pytest.mark.parametrize("group", ["force", "torque"])
+def test_axes_that_disagree_are_named_with_their_order(Q: Array, group: str) -> None:
+    _, R, wrench = session(4)
+    part = slice(0, 3) if group == "force" else slice(3, 6)
+    wrench[:, part] = wrench[:, part] @ Q.T
+    reason = first(R, wrench)
+    assert "axes disagree" in reason
+    order = "(y, x, z)" if Q is SWAP else "(z, x, y)"
+    assert f"{group} x, y, z taken from {order}" in reason
+
+
+def test_a_wrench_in_base_axes_is_named() -> None:
+    p, R, wrench = session(5)
+    turned = R @ p.R_flange_sensor
+    in_base = np.concatenate([np.einsum("nij,nj->ni", turned, part) for part in (wrench[:, :3], wrench[:, 3:])], axis=1)
+    assert "base axes" in first(R, in_base)
+    unbiased = predict(p, R) - np.concatenate([p.force_bias_N, p.torque_bias_Nm])
+    in_base = np.concatenate([np.einsum("nij,nj->ni", turned, part) for part in np.hsplit(unbiased, 2)], axis=1)
+    assert "base axes" in first(R, in_base + SIGMA * np.random.default_rng(1).normal(size=in_base.shape))
+
+
+def test_a_channel_that_is_stuck_and_rows_that_were_copied_are_named() -> None:
+    _, R, wrench = session(6)
+    rows = np.append(np.arange(12), 3)
+    assert "poses 4, 13 have identical wrenches and orientations" in first(R[rows], wrench[rows])
+    wrench[:, 4] = wrench[0, 4]
+    assert "ty reads the same in all poses" in first(R, wrench)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(4.4482216, "lbf"), (9.80665, "kgf")])
+def test_a_force_in_other_units_is_named_where_the_mass_is_known(factor: float, unit: str) -> None:
+    p, R, wrench = session(7)
+    mass_kg = float(np.linalg.norm(p.gravity_force_base_N)) / 9.80665
+    reason = first(R, wrench / factor, Known(mass_kg=mass_kg, mass_tolerance_kg=0.01))
+    assert f"forces were in {unit}" in reason
+
+
+def test_reversed_torques_are_usable_at_best() -> None:
+    _, R, wrench = session(8)
+    wrench[:, 3:] *= -1
+    assert "torques are reversed" in first(R, wrench)
+
+
+def test_a_drift_is_named_with_its_size() -> None:
+    _, R, wrench = session(9, 24)
+    wrench[:, 2] += np.linspace(-1, 1, 24)
+    assert "the bias drifted by 2" in first(R, wrench)
+
+
+def test_rotation_vectors_in_degrees_are_refused(tmp_path: Path) -> None:
+    rows = "\n".join(f"{90 - k},{k},0,1,2,3,4,5,6" for k in range(6))
+    (tmp_path / "poses.csv").write_text(f"rx,ry,rz,fx,fy,fz,tx,ty,tz\n{rows}\n")
+    with pytest.raises(BadDataset, match="look like degrees"):
+        read_csv(tmp_path / "poses.csv")
+
+
+def test_nothing_is_named_in_sound_sessions() -> None:
+    for seed in range(10, 16):
+        _, R, wrench = session(seed)
+        result = solved(R, wrench)
+        assert result.verdict == "good"
+        assert not any(word in " ".join(result.reasons) for word in ("looks", "look", "disagree", "reversed"))
