@@ -165,7 +165,7 @@ def main() -> int:
                 write(f"{name:28} {n:3} poses, noise {noise:8}  named first {first:4}  good {good:3}"
                       f"  {'pass' if passed else 'FAIL'}{seen}")  # fmt: skip
     if options.sound:
-        wrong = Counter(name for seed in range(options.sound) if (name := sound(seed)))
+        wrong = Counter(cause for seed in range(options.sound) if (cause := sound(seed)))
         passed = sum(wrong.values()) <= 0.01 * options.sound
         failed += not passed
         write(f"sound sessions with a false cause: {dict(wrong)} of {options.sound}  {'pass' if passed else 'FAIL'}")
