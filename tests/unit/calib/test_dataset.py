@@ -175,8 +175,8 @@ def without(name: str) -> str:
         "{}",
         '{"format": "ftdrive.calibration/1"}',
         '{"format": "ftdrive.dataset/2"}',
-        without("wrench"),
-        without("t_s")[:-1] + ', "t_s": 3}',
+        pytest.param(without("wrench"), id="no wrench"),
+        pytest.param(without("t_s")[:-1] + ', "t_s": 3}', id="one time for all"),
         b"\xff\xfe\x00",
     ],
 )
