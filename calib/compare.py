@@ -7,13 +7,13 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.dataset import CalibrationDataset
+from calib.data.dataset import CalibrationDataset
 from calib.errors import BadDataset, NotObservable
 from calib.files import JSON
 from calib.known import Known
-from calib.ml import Drift
+from calib.likelihood.fit import Drift
 from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, predict
-from calib.published import PUBLISHED
+from calib.published.methods import PUBLISHED
 from calib.result import CalibrationResult, Method
 from calib.solver import estimator_of, solve
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.linalg import cython_blas
 
+from calib.likelihood.gain_and_cross_talk import Response
 from calib.model import Parameters, skew
-from calib.response import Response
 
 Reals = NDArray[np.floating[Any]]
 

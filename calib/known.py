@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from calib.faults import force_unit
+from calib.assessment.faults import force_unit
 from calib.model import Array, Parameters, is_rotation, read_only
 
 

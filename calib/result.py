@@ -11,13 +11,13 @@ from typing import Any, Literal, Self
 import numpy as np
 from scipy.special import expit
 
+from calib.assessment.verdict import Verdict, expected_error
 from calib.compensation import Compensator
 from calib.errors import BadCalibration
 from calib.files import JSON, check_format, read_object, write_new
+from calib.likelihood.gain_and_cross_talk import Response, predicted_covariance
 from calib.model import PARAMETER_NAMES, Array, Parameters, is_rotation, read_only
-from calib.quality import Verdict, expected_error
-from calib.response import Response, predicted_covariance
-from calib.yu import weight_and_tilt
+from calib.published.yu import weight_and_tilt
 
 FORMAT = "ftdrive.calibration/1"
 
@@ -204,7 +204,7 @@ class CalibrationResult:
 
     @property
     def tilt_alpha_rad(self) -> float:
-        """First tilt angle of the base, see `calib.yu.weight_and_tilt`."""
+        """First tilt angle of the base, see `calib.published.yu.weight_and_tilt`."""
         return weight_and_tilt(self.gravity_force_base_N)[1]
 
     @property

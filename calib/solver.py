@@ -7,18 +7,18 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.dataset import CalibrationDataset
-from calib.descent import column_scale
+from calib.assessment.cross_validation import Evidence, IndependentFit
+from calib.assessment.faults import faults
+from calib.assessment.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
+from calib.assessment.verdict import SIGNIFICANT_SIGMAS, judge
+from calib.data.dataset import CalibrationDataset
+from calib.data.pooling import pooled_covariance
 from calib.errors import NotObservable
-from calib.evidence import Evidence, IndependentFit
-from calib.faults import faults
-from calib.identifiability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
 from calib.known import Known
-from calib.ml import RANK_TOLERANCE, Drift, Fit, fit
+from calib.likelihood.descent import column_scale
+from calib.likelihood.fit import RANK_TOLERANCE, Drift, Fit, fit
 from calib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, predict
-from calib.pooling import pooled_covariance
-from calib.published import PUBLISHED, Estimator, published
-from calib.quality import SIGNIFICANT_SIGMAS, judge
+from calib.published.methods import PUBLISHED, Estimator, published
 from calib.result import CalibrationResult, DriftResult, Method
 
 SIMULATIONS = 400
@@ -47,7 +47,7 @@ def solve(
     method : Method
         "ml": maximum likelihood, from 4 poses on; "known-rotation", "yaw-only": the same for a sensor whose mounting is
         known (`known`, default: axes of sensor and flange agree), or known but for its turn about the flange z axis.
-        Or, for comparison, one of `calib.published.PUBLISHED`.
+        Or, for comparison, one of `calib.published.methods.PUBLISHED`.
     drift : {"auto", "none", "linear", "random-walk"}
         How the bias may move while the poses are taken: as the data decide, not at all, or surely so. Poses without
         time count as equally spaced in their order.

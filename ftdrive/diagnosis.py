@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import CalibrationResult
-from calib.design import Guess, predicted_sigma, special
-from calib.noise import is_stationary, mean_and_covariance
+from calib.data.dwell_mean import is_stationary, mean_and_covariance
+from calib.poses.information import Guess, predicted_sigma, special
 from drivers.errors import (
     ConnectError,
     DeviceFault,

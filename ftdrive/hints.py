@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import CalibrationResult
-from calib.changes import Change, lasting_change
-from calib.quality import out_of_line
+from calib.assessment.load_shift import Change, lasting_change
+from calib.assessment.verdict import out_of_line
 from calib.routine import MOVED_RAD, PoseRecord, drift_check, is_return, turned_rad
 from ftdrive.mismatch import mismatches
 

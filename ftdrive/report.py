@@ -11,8 +11,8 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult
+from calib.assessment.verdict import SURE
 from calib.compare import Compared
-from calib.quality import SURE
 from calib.routine import DriftCheck, PoseRecord
 from ftdrive.hints import hints, names_of
 from ftdrive.talk import hanging, talk

@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from calib import CalibrationResult
-from calib.noise import LEAST_SAMPLES, PoseMean, mean_and_covariance
+from calib.data.dwell_mean import LEAST_SAMPLES, PoseMean, mean_and_covariance
 from drivers.interfaces import DeviceInfo
 from ftdrive.commands.common import CELL, JSON, check_simulate, read_cell, simulate, stop_unless_accepted, write_json
 from ftdrive.config import CellConfig

@@ -1,7 +1,7 @@
 """A tour through poses chosen for what they tell, from those the wrist reaches: in a cone, or anywhere.
 
-The poses follow the design of `calib.selection`, which keeps the second solution away and the gravity directions out of
-one plane.
+The poses follow the design of `calib.poses.selection`, which keeps the second solution away and the gravity directions
+out of one plane.
 """
 
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from calib.design import Guess, predicted_sigma
-from calib.selection import choose, cone_candidates
+from calib.poses.information import Guess, predicted_sigma
+from calib.poses.selection import choose, cone_candidates
 from drivers.ur.kinematics import Array
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.kinematics import wrist_inverse

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.design import Guess, Prediction, predicted_sigma, special
 from calib.files import check_format, read_object, write_new
+from calib.poses.information import Guess, Prediction, predicted_sigma, special
 from drivers.ur.kinematics import Array
 from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.certify import Certificate, Certifier

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from calib.design import SUBSET_6, T12, Guess, special
+from calib.poses.information import SUBSET_6, T12, Guess, special
 from drivers.ur.kinematics import Array
 from ftdrive.config import USUAL_KG
 from ftdrive.errors import ConfigError, PlanRefused

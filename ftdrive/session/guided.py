@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.allan import averaging_time
-from calib.noise import LEAST_SAMPLES, mean_and_covariance, noise_level
+from calib.data.averaging_time import averaging_time
+from calib.data.dwell_mean import LEAST_SAMPLES, mean_and_covariance, noise_level
 from calib.routine import PoseRecord, Sampling
 from drivers.errors import DriverError
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm

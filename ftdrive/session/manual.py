@@ -11,7 +11,7 @@ from typing import Final, Protocol, TypeVar
 
 import numpy as np
 
-from calib.noise import CHANNELS, LEAST_SAMPLES, is_stationary, restless_channels
+from calib.data.dwell_mean import CHANNELS, LEAST_SAMPLES, is_stationary, restless_channels
 from calib.routine import (
     LONGER,
     MOVED_RAD,

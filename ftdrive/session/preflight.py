@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.noise import LEAST_SAMPLES
+from calib.data.dwell_mean import LEAST_SAMPLES
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.design import predicted_sigma
+from calib.poses.information import predicted_sigma
 from ftdrive.planning.approach import Approach
 from ftdrive.planning.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint

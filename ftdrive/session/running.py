@@ -8,8 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult, NotObservable, solve
-from calib.design import Guess, Prediction, predicted_sigma
-from calib.identifiability import (
+from calib.assessment.observability import (
     ACCEPTED_DELTA_CHI2,
     AMBIGUOUS_GAP,
     LEAST_POSES,
@@ -18,9 +17,10 @@ from calib.identifiability import (
     different_orientations,
 )
 from calib.model import STANDARD_GRAVITY_M_S2
+from calib.poses.information import Guess, Prediction, predicted_sigma
+from calib.poses.selection import next_pose
+from calib.published.yu import weight_and_tilt
 from calib.routine import PoseRecord, dataset_from, is_return
-from calib.selection import next_pose
-from calib.yu import weight_and_tilt
 from ftdrive.config import USUAL_KG
 from ftdrive.mismatch import axes_along
 from ftdrive.session.events import Estimated
@@ -28,7 +28,7 @@ from ftdrive.session.events import Estimated
 Array = NDArray[np.float64]
 
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
-"""As good as gravity directions within 50 to 60 degrees of one another; see `calib.design.Prediction`."""
+"""As good as gravity directions within 50 to 60 degrees of one another; see `calib.poses.information.Prediction`."""
 AMBER = {"cond9": 8.0, "cond_u1": 25.0}
 """As within 30 to 45 degrees."""
 TRUSTED_SHARE = 0.05

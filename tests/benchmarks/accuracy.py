@@ -23,14 +23,16 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, NotObservable, Parameters, ml, read_csv, so3, solve
-from calib.contact import contact_chi2, contact_threshold
-from calib.design import optimised
-from calib.identifiability import AMBIGUOUS_GAP, assess
+from calib import CalibrationDataset, NotObservable, Parameters, read_csv, solve
+from calib.assessment.observability import AMBIGUOUS_GAP, assess
+from calib.extras.contact import contact_chi2, contact_threshold
 from calib.known import Known
+from calib.likelihood import fit as likelihood
+from calib.likelihood import rotation_minima
 from calib.model import UP_IN_BASE
-from calib.published import published
-from calib.yu import SPECIAL_R_flange_base, lrom, srom
+from calib.poses.information import optimised
+from calib.published.methods import published
+from calib.published.yu import SPECIAL_R_flange_base, lrom, srom
 from tests.benchmarks import carlson_figures, speed
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.scenarios import Array, Rng, Truth
@@ -177,7 +179,7 @@ def fit_run(seed: int, name: str, snr: float, starts: int = 0) -> dict[str, obje
     R = SROM_POSES if name == "srom24" else sim.poses(name, rng)
     s = sim.sigma(snr)
     y = sim.readings(truth, R) + s * rng.normal(size=(len(R), 6))
-    fit = ml.fit(R, y, np.diag(s**2))
+    fit = likelihood.fit(R, y, np.diag(s**2))
     e, C = sim.error(truth, fit.parameters), fit.covariance
     R_test = Rotation.random(25, rng=rng).as_matrix()
     free = sim.readings(truth, R_test) + s * rng.normal(size=(25, 6))
@@ -267,10 +269,10 @@ def certificate_run(seed: int, name: str, snr: float) -> dict[str, object]:
     rng = np.random.default_rng(seed)
     truth, R = sim.tool(rng), sim.poses(name, rng)
     force = sim.readings(truth, R)[:, :3] + sim.sigma(snr)[:3] * rng.normal(size=(len(R), 3))
-    Q = so3.force_cost(R, force, np.ones(len(R)))
-    best = so3.minima(Q)[0]
+    Q = rotation_minima.force_cost(R, force, np.ones(len(R)))
+    best = rotation_minima.minima(Q)[0]
     brute = sim.lowest_quadratic(Q, 60, rng)
-    return {"gap": so3.certificate(Q, best.R), "agrees": brute >= best.cost - 1e-9 * np.trace(Q) / 3}
+    return {"gap": rotation_minima.certificate(Q, best.R), "agrees": brute >= best.cost - 1e-9 * np.trace(Q) / 3}
 
 
 def certificates(lab: Lab) -> Iterator[Row]:
@@ -292,7 +294,7 @@ def kinematics_run(seed: int, angle_deg: float) -> dict[str, object]:
     rng = np.random.default_rng(seed)
     truth, R, s, a = sim.tool(rng), sim.poses("haar24", rng), sim.sigma(1000), np.deg2rad(angle_deg)
     y = sim.readings(truth, R) + s * rng.normal(size=(24, 6))
-    fit = ml.fit(sim.with_inexact_orientations(R, a, rng), y, np.diag(s**2))
+    fit = likelihood.fit(sim.with_inexact_orientations(R, a, rng), y, np.diag(s**2))
     turn = sim.derivative(truth, R)[:, :, :3]  # turning a pose is turning the sensor
     C = sim.bound(truth, R, np.diag(s**2) + a**2 * turn @ np.swapaxes(turn, 1, 2))
     return {
@@ -320,7 +322,7 @@ def drift_run(seed: int, q_N: float) -> dict[str, object]:
     y = sim.readings(truth, R) + path + s * rng.normal(size=(60, 6))
     record: dict[str, object] = {}
     for drift in ("auto", "none"):
-        fit = ml.fit(R, y, np.diag(s**2), drift=drift)
+        fit = likelihood.fit(R, y, np.diag(s**2), drift=drift)
         e = sim.error(truth, fit.parameters)
         record[drift] = sim.blocks(e**2)
         record[f"{drift} covered"] = np.abs(e) < 1.959964 * np.sqrt(np.diag(fit.covariance))
@@ -346,7 +348,7 @@ def outlier_run(seed: int, name: str, bumped: int) -> dict[str, object]:
     bad = np.zeros(len(R), bool)
     bad[rng.choice(len(R), bumped, replace=False)] = True
     y[bad] += sim.bumps(bumped, rng)
-    fit = ml.fit(R, y, np.diag(s**2))
+    fit = likelihood.fit(R, y, np.diag(s**2))
     e = sim.error(truth, fit.parameters)
     return {
         "square": sim.blocks(e**2),
@@ -451,7 +453,7 @@ def odds_run(seed: int, name: str, snr: float) -> dict[str, object]:
     rng = np.random.default_rng(seed)
     truth, R, s = sim.tool(rng), sim.poses(name, rng), sim.sigma(snr)
     y = sim.readings(truth, R) + s * rng.normal(size=(len(R), 6))
-    fit = ml.fit(R, y, np.diag(s**2))
+    fit = likelihood.fit(R, y, np.diag(s**2))
     gap = fit.second_basin_chi2
     if gap is None:
         return {"gap": np.inf, "wrong": float(np.linalg.norm(sim.error(truth, fit.parameters)[:3]) > np.pi / 2)}
@@ -496,7 +498,7 @@ def design(lab: Lab) -> Iterator[Row]:
     truth = sim.tool(np.random.default_rng(0))
     R = optimised(8)
     force = sim.readings(truth, R)[:, :3]
-    minima = so3.minima(so3.force_cost(R, force, np.ones(8)))
+    minima = rotation_minima.minima(rotation_minima.force_cost(R, force, np.ones(8)))
     others = [m.cost for m in minima if np.linalg.norm(m.R - truth.R) > 0.1]
     yield band("8-pose design: gap to the second solution", min(others) / (8 * sim.WEIGHT_N**2), 0.5, np.inf, 1)
 
@@ -551,7 +553,7 @@ def yaw_run(seed: int, yaw_deg: float, roll_deg: float) -> dict[str, object]:
     truth, R, s = sim.tool(rng, R=R_se), sim.poses("cone60_24", rng), sim.sigma(100)
     y = sim.readings(truth, R) + s * rng.normal(size=(24, 6))
     knowledge = (None, Known(yaw_only=True), Known(R_flange_sensor=np.eye(3)))
-    fits = [ml.fit(R, y, np.diag(s**2), drift="none", known=known) for known in knowledge]
+    fits = [likelihood.fit(R, y, np.diag(s**2), drift="none", known=known) for known in knowledge]
     return {"force": [sim.prediction_square(truth, fit.parameters)[0] for fit in fits]}
 
 
@@ -585,7 +587,7 @@ def coefficient_run(
         test = Rotation.random(500, rng=rng).as_matrix()
         measured = sim.readings(truth, _off(test, n2, rng))
         R = np.swapaxes(nominal, 1, 2)
-        fits = srom(R, y), ml.fit(R, y, np.eye(6) * n1**2 / 3, drift="none").parameters
+        fits = srom(R, y), likelihood.fit(R, y, np.eye(6) * n1**2 / 3, drift="none").parameters
         for k, p in enumerate(fits):
             worst[i, k] = np.abs(measured - sim.readings(sim.as_truth(p), np.swapaxes(test, 1, 2))).max(axis=0)
     range_N = 2 * weights * np.linalg.norm(YU_WEIGHT_N)
@@ -688,7 +690,7 @@ def _left_out(name: str, R: Array, y: Array, cov: Array | None, time_s: Array, f
     elif name == "SROM":
         estimate = srom(*told)
     else:
-        fit = ml.fit(*told, cov, t_s=time_s[kept])
+        fit = likelihood.fit(*told, cov, t_s=time_s[kept])
         estimate = fit.parameters
         if fit.drift is not None:
             bias = np.stack([np.interp(time_s[fold], time_s[kept], column) for column in fit.drift.bias.T], axis=1)

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib import carlson, carlson_known
 from calib.model import nearest_rotation, skew
+from calib.published import carlson, carlson_known
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from calib.design import (
+from calib.model import Array
+from calib.poses.information import (
     AMBIGUOUS_6,
     SUBSET_6,
     SUBSET_8,
@@ -28,8 +29,7 @@ from calib.design import (
     special,
     whitened_jacobian,
 )
-from calib.model import Array
-from calib.selection import choose, cone_candidates, next_pose, order
+from calib.poses.selection import choose, cone_candidates, next_pose, order
 
 GUESS = Guess(mass_kg=20 / 9.80665, sigma_force_N=0.2, sigma_torque_Nm=0.005)  # weight / sigma 100, lever 25 mm
 FORCES_ONLY = Guess(1.0, 0.05, 0.003, p_sensor_com_m=(0, 0, 0), tilt_alpha_rad=np.deg2rad(3))

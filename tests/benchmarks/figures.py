@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from calib import ml
+from calib.likelihood import fit as likelihood
 from tests.benchmarks import accuracy, carlson_figures
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.accuracy import Lab
@@ -147,7 +147,7 @@ def drift(lab: Lab) -> Figure:
     truth, R = sim.tool(rng), sim.poses(f"haar{n}", rng)
     path, _ = sim.walk(n, q_N, rng)
     y = sim.readings(truth, R) + path + s * rng.normal(size=(n, 6))
-    fit = ml.fit(R, y, np.diag(s**2))
+    fit = likelihood.fit(R, y, np.diag(s**2))
     figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
     bias = np.zeros((n, 6)) if fit.drift is None else fit.drift.bias
     for k, (channel, color) in enumerate(zip(CHANNELS, ("tab:red", "tab:green", "tab:blue"), strict=True)):

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from calib.design import special
+from calib.poses.information import special
 from drivers.ur.kinematics import Array
 from ftdrive.errors import PlanRefused
 from ftdrive.planning.approach import plan_approach

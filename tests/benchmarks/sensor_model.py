@@ -15,13 +15,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import Parameters, ml, read_csv
+from calib import Parameters, read_csv
 from calib.known import Constraints, Known
+from calib.likelihood import fit as likelihood
+from calib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, Response, predicted_covariance
+from calib.likelihood.variance_components import FORCE, RESPONSE, ROTATION, TORQUE, component
 from calib.model import STANDARD_GRAVITY_M_S2, predict
-from calib.response import CROSS_TALK_M, GAIN, Response, predicted_covariance
+from calib.published.yu import lrom
 from calib.result import COMMON_GAIN
-from calib.variance import FORCE, RESPONSE, ROTATION, TORQUE, component
-from calib.yu import lrom
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.accuracy import Lab, Row, band, laboratory, most
 from tests.benchmarks.scenarios import Array
@@ -41,7 +42,7 @@ def response_of(parameters: Parameters, response: Response | None) -> tuple[Arra
     return theta - bias[:, None], bias
 
 
-def predicted(fit: ml.Fit, R: Array) -> Array:
+def predicted(fit: likelihood.Fit, R: Array) -> Array:
     """Wrench (n, 6) at orientations (n, 3, 3)."""
     theta, bias = response_of(fit.parameters, fit.response)
     return np.asarray(R.reshape(-1, 9) @ theta.T + bias)
@@ -61,7 +62,7 @@ def held_out(R: Array, wrench: Array, method: str) -> Array:
         elif method == "10-parameter LS":
             errors[i] = wrench[i] - predict(sim.ten_parameters(R[kept], wrench[kept]), at)[0]
         else:
-            fit = ml.fit(R[kept], wrench[kept], t_s=kept.astype(np.float64))
+            fit = likelihood.fit(R[kept], wrench[kept], t_s=kept.astype(np.float64))
             errors[i] = wrench[i] - predicted(fit, at)[0]
             if fit.drift is not None:
                 errors[i] -= [np.interp(i, kept, channel) for channel in fit.drift.bias.T]
@@ -85,7 +86,7 @@ def recordings(lab: Lab) -> Iterator[Row]:
             )
         if name.startswith("agimus"):
             for split, halves in splits(len(R)).items():
-                distance, mass_z = disagreement(*(ml.fit(R[h], wrench[h], t_s=h.astype(float)) for h in halves))
+                distance, mass_z = disagreement(*(likelihood.fit(R[h], wrench[h], t_s=h.astype(float)) for h in halves))
                 yield most(f"{name}, {split}: chi2/dof of 15 parameters", distance, 1.5, 1)
                 yield most(f"{name}, {split}: z of the mass", abs(mass_z), 1.3 * 1.96, 1)
 
@@ -95,7 +96,7 @@ def splits(n: int) -> dict[str, tuple[Rows, Rows]]:
     return {"odd/even": (rows[::2], rows[1::2]), "first/second half": (rows[: n // 2], rows[n // 2 :])}
 
 
-def disagreement(one: ml.Fit, two: ml.Fit) -> tuple[float, float]:
+def disagreement(one: likelihood.Fit, two: likelihood.Fit) -> tuple[float, float]:
     """Squared difference of the parameters in units of its covariance, over 15, and z of the weight.
 
     The biases are those of different times and not compared where they drift.
@@ -127,7 +128,7 @@ def sensor_run(
     wrench = read(R) + path + mean + NOISE * rng.normal(size=(n, 6))
     reported = sim.with_inexact_orientations(R, ORIENTATION_RAD, rng)
     cov = np.diag(NOISE**2) if measured else None
-    fit = ml.fit(reported, wrench, cov)
+    fit = likelihood.fit(reported, wrench, cov)
     elsewhere = sim.poses("haar40", rng)
     right = read(elsewhere) + mean
     e = predicted(fit, elsewhere) - right
@@ -145,7 +146,7 @@ def sensor_run(
         "rejected": np.mean(fit.weights == 0),
     }
     for split, (a, b) in splits(n).items():
-        one, two = (ml.fit(reported[h], wrench[h], cov, t_s=h.astype(float)) for h in (a, b))
+        one, two = (likelihood.fit(reported[h], wrench[h], cov, t_s=h.astype(float)) for h in (a, b))
         record[split] = disagreement(one, two)[0]
     if oracle:
         fit = informed(reported, wrench, gain, cross_talk, drift_N)
@@ -154,14 +155,16 @@ def sensor_run(
     return record
 
 
-def informed(R: Array, wrench: Array, gain: float, cross_talk: float, drift_N: float) -> ml.Fit:
+def informed(R: Array, wrench: Array, gain: float, cross_talk: float, drift_N: float) -> likelihood.Fit:
     """Fit with the true variances."""
-    problem = ml._Problem(R, wrench, np.diag(NOISE**2), None, "auto", Constraints(Known(), STANDARD_GRAVITY_M_S2))
+    problem = likelihood._Problem(
+        R, wrench, np.diag(NOISE**2), None, "auto", Constraints(Known(), STANDARD_GRAVITY_M_S2)
+    )
     found = [ROTATION, *RESPONSE, component("walk", FORCE), component("walk", TORQUE)]
     theta = np.array([ORIENTATION_RAD, gain, cross_talk, drift_N, sim.LEVER_M * drift_N]) ** 2
-    minima = problem.descent.minima(ml._inverses(problem.cov))
+    minima = problem.descent.minima(likelihood._inverses(problem.cov))
     used = [k for k in range(5) if theta[k] > 0]
-    e = ml._Explanation(minima[0].parameters, problem.everything, tuple(found[k] for k in used), theta[used])
+    e = likelihood._Explanation(minima[0].parameters, problem.everything, tuple(found[k] for k in used), theta[used])
     return problem._fit(e, problem._with_all_minima(e, minima), np.nan)
 
 
@@ -179,7 +182,7 @@ def plain_run(seed: int, n: int, *, measured: bool) -> dict[str, object]:
     rng = np.random.default_rng([seed, n])
     truth, R, s = sim.tool(rng), sim.poses(f"haar{n}", rng), sim.sigma(100)
     wrench = sim.readings(truth, R) + s * rng.normal(size=(n, 6))
-    return {"chosen": ml.fit(R, wrench, np.diag(s**2) if measured else None).response is not None}
+    return {"chosen": likelihood.fit(R, wrench, np.diag(s**2) if measured else None).response is not None}
 
 
 def oracle(lab: Lab) -> Iterator[Row]:

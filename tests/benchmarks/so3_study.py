@@ -1,4 +1,4 @@
-"""How many starts `calib.so3.minima` needs, how tight its certificate is, and how long both take.
+"""Starts that `rotation_minima.minima` needs, tightness of its certificate, and the duration of both.
 
 Run `OPENBLAS_NUM_THREADS=1 python tests/benchmarks/so3_study.py [problems]`; the 16000 of the default take 15 minutes.
 """
@@ -17,7 +17,7 @@ from rich.table import Table
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from calib import so3
+from calib.likelihood import rotation_minima
 
 Array = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ def calibration(R_base_flange: Array, snr: float, rng: np.random.Generator) -> A
     """Q of simulated forces: random mount and bias, base level within a few degrees, weight 1 N."""
     gravity = np.array([*np.deg2rad(2) * rng.normal(size=2), -1])
     force = R_base_flange.swapaxes(1, 2) @ gravity @ Rotation.random(rng=rng).as_matrix() + rng.normal(size=3)
-    return so3.force_cost(R_base_flange, force + rng.normal(size=force.shape) / snr, np.ones(len(force)))
+    return rotation_minima.force_cost(R_base_flange, force + rng.normal(size=force.shape) / snr, np.ones(len(force)))
 
 
 def tie(name: str, rng: np.random.Generator) -> Array:
@@ -112,10 +112,10 @@ def starts_needed(cases: list[tuple[str, Array]]) -> Table:
     number: dict[str, int] = defaultdict(int)
     most: dict[str, int] = defaultdict(int)
     for name, Q in cases:
-        quartic, _ = so3._quartic(Q)
+        quartic, _ = rotation_minima._quartic(Q)
         random = rng.normal(size=(RANDOM_STARTS, 4))
-        runs = {n: so3._descend(quartic, so3._super_fibonacci(n)) for n in STARTS}
-        runs[0] = so3._descend(quartic, random / np.linalg.norm(random, axis=1, keepdims=True))
+        runs = {n: rotation_minima._descend(quartic, rotation_minima._super_fibonacci(n)) for n in STARTS}
+        runs[0] = rotation_minima._descend(quartic, random / np.linalg.norm(random, axis=1, keepdims=True))
         q, cost, curvature = (np.concatenate(x) for x in zip(*runs.values(), strict=True))
         best = cost.min()
         isolated: list[int] = []
@@ -144,12 +144,12 @@ def certificates(cases: list[tuple[str, Array]]) -> Table:
     at_best: dict[str, list[float]] = defaultdict(list)
     at_other: dict[str, list[float]] = defaultdict(list)
     for name, Q in cases:
-        best, *others = so3.minima(Q)
-        at_best[name].append(so3.certificate(Q, best.R))
+        best, *others = rotation_minima.minima(Q)
+        at_best[name].append(rotation_minima.certificate(Q, best.R))
         for other in others[-1:]:
             excess = (other.cost - best.cost) / (np.trace(Q) / 3)
             if excess > 1e-6:
-                at_other[name].append(so3.certificate(Q, other.R) / excess)
+                at_other[name].append(rotation_minima.certificate(Q, other.R) / excess)
     table = Table("problems", "n", "proved (<= 1e-8)", "largest gap", "median gap", "gap / excess of a worse minimum")
     for name, gaps in at_best.items():
         ratio = at_other[name]
@@ -181,9 +181,9 @@ def timings(cases: list[tuple[str, Array]]) -> Table:
         return float(np.median(took)) / 1e6
 
     Qs = [Q for name, Q in cases if name in SETS][:400]
-    best = [so3.minima(Q)[0].R for Q in Qs]
-    minima_ms = median_ms(partial(so3.minima, Q) for Q in Qs)
-    certificate_ms = median_ms(partial(so3.certificate, Q, R) for Q, R in zip(Qs, best, strict=True))
+    best = [rotation_minima.minima(Q)[0].R for Q in Qs]
+    minima_ms = median_ms(partial(rotation_minima.minima, Q) for Q in Qs)
+    certificate_ms = median_ms(partial(rotation_minima.certificate, Q, R) for Q, R in zip(Qs, best, strict=True))
     peer_ms = median_ms(partial(peer, Q, 24) for Q in Qs[:10])
     table = Table("step", "median ms", "times minima")
     table.add_row("minima", f"{minima_ms:.2f}", "1")
@@ -192,7 +192,7 @@ def timings(cases: list[tuple[str, Array]]) -> Table:
     rng = np.random.default_rng(0)
     for n in (24, 10_000, 1_000_000):
         R, force, w = Rotation.random(n, rng=rng).as_matrix(), rng.normal(size=(n, 3)), np.ones(n)
-        took = median_ms([partial(so3.force_cost, R, force, w)] * 5)
+        took = median_ms([partial(rotation_minima.force_cost, R, force, w)] * 5)
         table.add_row(f"force_cost, {n} poses", f"{took:.2f}", f"{took / minima_ms:.2f}")
     return table
 

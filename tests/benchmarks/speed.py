@@ -20,7 +20,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, ml, solve
+from calib import CalibrationDataset, solve
+from calib.likelihood import fit as likelihood
 from tests.benchmarks import scenarios as sim
 
 MANY = 1_000_000
@@ -82,7 +83,9 @@ def many_poses(repeats: int) -> Iterator[Figure]:
     source = np.ones(R.size + y.size)
     copy = np.empty_like(source)
     cov = np.diag(s**2)
-    whole, plain = best_seconds(repeats, lambda: ml.fit(R, y, cov, drift="none"), lambda: np.copyto(copy, source))
+    whole, plain = best_seconds(
+        repeats, lambda: likelihood.fit(R, y, cov, drift="none"), lambda: np.copyto(copy, source)
+    )
     yield Figure("10⁶ poses, covariance given, no drift", f"{1e3 * whole:.0f} ms", "<= 60 ms", whole <= 60e-3, repeats)
     ratio = whole / plain
     yield Figure("  over np.copyto of the same bytes", f"{ratio:.1f}", "<= 8", ratio <= 8, repeats)

@@ -15,11 +15,11 @@ from calib import CalibrationDataset, CalibrationResult, NotObservable, Paramete
 from calib.compare import compare
 from calib.errors import BadDataset
 from calib.known import Known
-from calib.ml import fit
+from calib.likelihood.fit import fit
 from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, jacobian, predict
-from calib.published import published
+from calib.published.methods import published
+from calib.published.yu import SPECIAL_R_flange_base
 from calib.result import Method
-from calib.yu import SPECIAL_R_flange_base
 
 METHODS: tuple[Method, ...] = ("ml", "srom", "lrom")
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)

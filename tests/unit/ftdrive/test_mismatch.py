@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, CalibrationResult, Parameters, solve
-from calib.design import special
 from calib.model import predict
+from calib.poses.information import special
 from ftdrive.config import SensorConfig, ToolConfig
 from ftdrive.hints import hints
 from ftdrive.mismatch import LEAN_DEG, lean_in_words, mismatches, payload_in_words

@@ -15,8 +15,8 @@ from calib import CalibrationDataset, Known, Parameters, solve
 from calib.compare import Compared, compare
 from calib.errors import NotObservable
 from calib.model import predict
+from calib.published.yu import SPECIAL_R_flange_base
 from calib.result import Method
-from calib.yu import SPECIAL_R_flange_base
 from ftdrive.commands.solve import solve as solve_command
 from ftdrive.errors import ConfigError
 from ftdrive.hints import hints

@@ -12,9 +12,9 @@ from click.testing import CliRunner
 from rich.console import Console
 
 from calib import CalibrationDataset, CalibrationResult, Known, Parameters, solve
+from calib.data.dwell_mean import LEAST_SAMPLES, PoseMean
 from calib.model import predict
-from calib.noise import LEAST_SAMPLES, PoseMean
-from calib.yu import SPECIAL_R_flange_base
+from calib.published.yu import SPECIAL_R_flange_base
 from drivers.interfaces import Health
 from ftdrive.commands import live
 from ftdrive.report import likely_error

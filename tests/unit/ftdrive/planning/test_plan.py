@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.design import special
+from calib.poses.information import special
 from drivers.ur.kinematics import Array
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.arm_model import SHAPES, ArmModel, Cylinder

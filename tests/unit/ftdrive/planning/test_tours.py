@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from calib.design import T12, special
+from calib.poses.information import T12, special
 from drivers.ur.kinematics import MODELS
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.arm_model import ArmModel, Cylinder

@@ -1,0 +1,185 @@
+"""What a judgement looks at: a fit, and how well each pose is predicted by all others."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from calib.likelihood.descent import column_scale
+from calib.likelihood.gain_and_cross_talk import Response
+from calib.likelihood.session_noise import Noise, summed_products
+from calib.likelihood.variance_components import left_out
+from calib.model import Array, Parameters, jacobian, predict
+
+
+class Drifted(Protocol):
+    """How the bias moved."""
+
+    @property
+    def change(self) -> Array:
+        """(6,) from the first pose to the last."""
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) standard deviation of that."""
+
+
+class Evidence(Protocol):
+    """What is judged: estimates and how they fit. Left-out poses count nowhere but in arrays with n rows."""
+
+    @property
+    def parameters(self) -> Parameters:
+        """Estimates."""
+
+    @property
+    def covariance(self) -> Array:
+        """(15, 15) of the error coordinates; zero along what is exactly known."""
+
+    @property
+    def R_base_flange(self) -> Array:
+        """(n, 3, 3)."""
+
+    @property
+    def wrench(self) -> Array:
+        """(n, 6) N and N·m, as measured."""
+
+    @property
+    def weights(self) -> Array:
+        """(n,) 1 = used, 0 = left out because it fits none of the others."""
+
+    @property
+    def chi2(self) -> float:
+        """Residuals squared, weighted by the noise model."""
+
+    @property
+    def dof(self) -> int:
+        """Of chi2."""
+
+    @property
+    def measured_chi2(self) -> float:
+        """Weighted by the measured noise alone; NaN when nobody measured it."""
+
+    @property
+    def second_basin_chi2(self) -> float | None:
+        """How much larger chi2 is at the best other solution; None if there is none."""
+
+    @property
+    def components(self) -> Mapping[str, float]:
+        """Standard deviations of what was found beyond the measured noise, by name with unit."""
+
+    @property
+    def drift(self) -> Drifted | None:
+        """How the bias moved, where it did."""
+
+    @property
+    def response(self) -> Response | None:
+        """Gain and cross-talk of the sensor, where they were found."""
+
+    @property
+    def gain_sigma(self) -> float:
+        """Standard deviation of the entries of the gain, as far as the data leave room for it."""
+
+    @property
+    def residuals(self) -> Array:
+        """(n, 6) measured minus predicted."""
+
+    @property
+    def left_out_residuals(self) -> Array:
+        """(n, 6) measured minus what all other poses predict."""
+
+    @property
+    def left_out_cov(self) -> Array:
+        """(n, 6, 6) covariance of these."""
+
+
+@dataclass(frozen=True, eq=False)
+class IndependentFit:
+    """A fit to poses with independent noise, for methods that do not cross-validate themselves."""
+
+    parameters: Parameters
+    covariance: Array
+    R_base_flange: Array
+    wrench: Array
+    wrench_cov: Array
+    """(n, 6, 6)"""
+    measured: bool
+    """Whether `wrench_cov` was measured, not estimated from the residuals."""
+    weights: Array
+    second_basin_chi2: float | None = None
+    components: Mapping[str, float] = field(default_factory=dict)
+    response: Response | None = None
+    drift: Drifted | None = None
+    gain_sigma: float = 0.0
+
+    @cached_property
+    def residuals(self) -> Array:
+        """(n, 6) measured minus predicted."""
+        return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange))
+
+    @cached_property
+    def chi2(self) -> float:
+        """Of the used poses."""
+        r = self.residuals[..., None]
+        return float(self.weights @ np.sum(r * np.linalg.solve(self.wrench_cov, r), axis=(1, 2)))
+
+    @property
+    def measured_chi2(self) -> float:
+        """The same, if the noise was measured."""
+        return self.chi2 if self.measured else float("nan")
+
+    @property
+    def dof(self) -> int:
+        """Of chi2."""
+        return 6 * int(self.weights.sum()) - 15
+
+    @property
+    def left_out_residuals(self) -> Array:
+        """(n, 6) measured minus what all other poses predict."""
+        return self._left_out[0]
+
+    @property
+    def left_out_cov(self) -> Array:
+        """(n, 6, 6) covariance of these."""
+        return self._left_out[1]
+
+    @cached_property
+    def _left_out(self) -> tuple[Array, Array]:
+        J = jacobian(self.parameters, self.R_base_flange)
+        return leave_one_out(self.residuals, J, self.wrench_cov, self.weights)
+
+
+def leave_one_out(
+    residuals: Array, jacobian: Array, wrench_cov: Array, weights: Array | None = None
+) -> tuple[Array, Array]:
+    """Predict every pose from all others without fitting again: (I - H_kk)^-1 r_k, exact for a linear model.
+
+    Parameters
+    ----------
+    residuals : array, shape (n, 6)
+        Of the fit to all poses.
+    jacobian : array, shape (n, 6, p)
+    wrench_cov : array, shape (n, 6, 6)
+        Noise, independent between poses.
+    weights : array, shape (n,), optional
+        0 for poses that the fit did not use; 1 for the others and by default.
+
+    Returns
+    -------
+    left_out : array, shape (n, 6)
+        Measured minus what the other poses predict.
+    covariance : array, shape (n, 6, 6)
+        Of these. Very large where the others determine nothing.
+    """
+    noise = Noise(wrench_cov, kept=None if weights is None else weights > 0)
+    WJ = noise.solve(jacobian)
+    information = summed_products(jacobian, WJ)
+    scale = column_scale(information)
+    C = np.asarray(np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)) / np.outer(scale, scale)
+    return left_out(noise, WJ, noise.solve(residuals[..., None])[..., 0], C)
+
+
+def standardized(residuals: Array, covariance: Array) -> Array:
+    """Divide residuals (n, 6) by a root of their covariance (n, 6, 6): independent, of unit variance."""
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), residuals[..., None])[..., 0])

@@ -1,0 +1,430 @@
+"""What a fit is worth, in plain words: how well it predicts, whether it is plausible, and what looks reversed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtrc as chi2_sf
+from scipy.special import chdtri as chi2_isf
+from scipy.special import ndtr as normal_cdf
+
+from calib.assessment.cross_validation import Drifted, Evidence, standardized
+from calib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, torque_units
+from calib.assessment.load_shift import lasting_change
+from calib.assessment.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
+from calib.likelihood.gain_and_cross_talk import Response, predicted_covariance
+from calib.model import PARAMETER_NAMES, UP_IN_BASE, Array, Parameters
+from calib.published.yu import SPECIAL_R_flange_base
+
+Verdict = Literal["good", "usable", "rejected"]
+
+SIGNIFICANT_SIGMAS = 5.0
+FARTHEST_COM_M = 0.5
+NEAREST_COM_M = 5e-4
+NOISE_FACTOR = 3.0
+USABLE_SHARE, REJECTED_SHARE = 0.02, 0.10
+SENSELESS_SHARE = 0.5
+"""With residuals of half the weight, neither gravity nor centre of mass mean anything."""
+NOISY_SHARE = 0.01
+"""The cross-validated error allowed to a good result whose residuals exceed the measured noise."""
+USUAL_LEVER_M = 0.1
+"""Torque errors are compared with the weight at this lever, or at the centre of mass where that is farther."""
+NOTED_TILT_DEG, REVERSED_TILT_DEG = 10.0, 135.0
+INSIDE_M = 0.01
+"""A centre of mass may lie this far on the robot's side of the sensor origin: adapter plates do."""
+NOISELESS = 1e-6
+"""Simulated without noise: equal readings are no copies."""
+CORRELATED = 0.9
+FEW_LEFT_OUT = 0.1
+SURE = 1e-3
+"""Probability of a false remark."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quality:
+    """The judgement on a fit."""
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    """What made it worse than good, most important first; then what else is worth knowing."""
+    chi2_p: float | None
+    """Probability of a worse chi2 if the measured noise were all there is; None when nobody measured it."""
+    noise_factor: float | None
+    """Residuals over measured noise; None when nobody measured it."""
+    loo_force_rms_N: float
+    """Cross-validated: root mean square error in predicting each used pose from all others."""
+    loo_torque_rms_Nm: float
+    worst_pose: int
+    """Row of the pose that the others predict worst."""
+    residual_sigma: Array
+    """(n,) left-out residual of each pose, root mean square over the channels, in standard deviations: 1 expected."""
+    lag1: float
+    """Correlation of the residuals of successive used poses; near 0 without drift."""
+    correlations: tuple[tuple[str, str, float], ...]
+    """Pairs of parameters that are correlated by more than 0.9, strongest first."""
+
+
+def judge(
+    fit: Evidence,
+    *,
+    t_s: Array | None = None,
+    measured_sigma: Array | None = None,
+    farthest_com_m: float = FARTHEST_COM_M,
+    up_in_base: ArrayLike = UP_IN_BASE,
+    unconstrained: Evidence | None = None,
+    contradicted: Sequence[str] = (),
+) -> Quality:
+    """Judge a fit.
+
+    Errors count relative to the weight, torques at a lever: the residual, the error in predicting left-out poses, which
+    few poses cannot make look small, and the error expected over all orientations. Up to three times the measured noise
+    is good if they stay below 1 %: orientations and cables always add something to the noise of a good sensor.
+
+    Parameters
+    ----------
+    fit : Evidence
+    t_s : array, shape (n,), optional
+        When each pose was measured; the order of rows counts where it is missing or not finite.
+    measured_sigma : array, shape (6,), optional
+        Noise of a pose, as measured. With it, a load that shifted in mid-run is found.
+    farthest_com_m : float
+        How far from the sensor the centre of mass of the tool can be.
+    up_in_base : array_like, shape (3,)
+        Where up should be, in base: +z for a robot on a table.
+    unconstrained : Evidence, optional
+        The best fit to the same poses with nothing taken as known, where `fit` is another.
+    contradicted : sequence of str
+        What was taken as known and that fit contradicts, as `Known.contradictions` has it.
+    """
+    rejected: list[str] = []
+    usable: list[str] = []
+    notes: list[str] = []
+    parameters, used = fit.parameters, fit.weights > 0.5
+    n = int(used.sum())
+    weight_N = float(np.linalg.norm(parameters.gravity_force_base_N))
+    residuals = standardized(fit.left_out_residuals, fit.left_out_cov)
+    residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
+    worst = int(np.argmax(np.where(used, residual_sigma, -1.0)))
+    lag1, lag1_p = successive_correlation(residuals[used], None if t_s is None else t_s[used])
+    shares, cross_validated = _shares(fit, used, weight_N)
+    largest = shares[0][1]
+
+    inexact = [words for words, share in shares if share > USABLE_SHARE]
+    few = n >= (1 - FEW_LEFT_OUT) * len(used)
+    explanation = [] if few and not inexact else _faults(fit, used, t_s, up_in_base)
+    if fit.chi2 > NOISELESS * fit.dof:
+        rejected += broken_channels(fit.wrench, fit.R_base_flange)
+    rejected += explanation + _weight_reasons(fit, weight_N) + _second_solution_reasons(fit)
+    _com_reasons(parameters, farthest_com_m, rejected, usable)
+    (rejected if largest > REJECTED_SHARE else usable).extend(inexact)
+    if unconstrained is not None and largest > NOISY_SHARE and not contradicted:
+        usable += _contradiction_reasons(fit, unconstrained)
+    sensible = not explanation and largest < SENSELESS_SHARE
+    if sensible:
+        usable += reversed_signs(parameters, fit.covariance, up_in_base, farthest_com_m)
+    noise_factor, chi2_p = None, None
+    if np.isfinite(fit.measured_chi2):
+        noise_factor = float(np.sqrt(fit.measured_chi2 / fit.dof))
+        chi2_p = float(chi2_sf(fit.dof, fit.measured_chi2))
+        if chi2_p < SURE:
+            good = noise_factor <= NOISE_FACTOR and largest <= NOISY_SHARE
+            (notes if good else usable).append(_noise_reason(fit, noise_factor))
+    changed: list[str] = []
+    if measured_sigma is not None and chi2_p is not None and (chi2_p < SURE or not used.all()):
+        changed = _change_reasons(fit, residual_sigma, measured_sigma, t_s)
+        rejected += changed
+    if not used.all():
+        listed = ", ".join(str(k + 1) for k in np.flatnonzero(~used))
+        (notes if few else usable).append(
+            f"{len(used) - n} of {len(used)} poses were left out, they fit none of the others: repeat {listed}"
+        )
+    if n < RECOMMENDED_POSES:
+        usable.append(f"there are only {n} poses: {RECOMMENDED_POSES} or more can be checked against each other")
+    usable += _indispensable_reasons(fit, used, weight_N)
+
+    if fit.response is not None:
+        notes.append(f"{fit.response.in_words()}: the calibration corrects this for its own weight")
+    if lag1_p < SURE:
+        notes.append(
+            f"successive poses have similar residuals (correlation {lag1:.2f}): most likely the bias drifted, so let "
+            "the sensor warm up and mix the order of the poses"
+        )
+    typical = float(np.median(residual_sigma[used] ** 2))
+    if n >= RECOMMENDED_POSES and residual_sigma[worst] ** 2 > chi2_isf(6, SURE / n) / 6 * max(typical, 1.0):
+        notes.append(f"pose {worst + 1} is out of line, {residual_sigma[worst]:.1f} sigma: consider repeating it")
+    if sensible:
+        notes += _tilt_notes(parameters, up_in_base)
+    if chi2_p is None:
+        notes.append("the noise was not measured but estimated from the residuals: chi2 says nothing about the fit")
+    drifted = _drift_reasons(fit.drift)
+    matters = fit.drift is not None and _drift_share(fit.drift.change, weight_N) > USABLE_SHARE
+    if drifted and matters and not explanation and not changed:
+        (rejected or usable)[:0] = drifted  # before what it causes
+    else:
+        notes += drifted
+    if contradicted and (chi2_p is None or chi2_p < SURE):
+        known = "; ".join(contradicted)
+        cause = f"what was given as known does not agree with the data: {known}: correct it, or leave it out"
+        (rejected or usable or notes).insert(0, cause)  # before what it causes
+    return Quality(
+        verdict="rejected" if rejected else "usable" if usable else "good",
+        reasons=(*rejected, *usable, *notes),
+        chi2_p=chi2_p,
+        noise_factor=noise_factor,
+        loo_force_rms_N=cross_validated[0],
+        loo_torque_rms_Nm=cross_validated[1],
+        worst_pose=worst,
+        residual_sigma=residual_sigma,
+        lag1=lag1,
+        correlations=strong_correlations(fit.covariance),
+    )
+
+
+def _faults(fit: Evidence, used: NDArray[np.bool_], t_s: Array | None, up_in_base: ArrayLike) -> list[str]:
+    """Look for faults in all poses, and where there are none in those that were used."""
+    order = np.arange(len(used)) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
+    found = faults(fit.R_base_flange[order], fit.wrench[order], up_in_base)
+    return found if found or used.all() else faults(fit.R_base_flange[used], fit.wrench[used], up_in_base)
+
+
+def successive_correlation(standardized: Array, t_s: Array | None = None) -> tuple[float, float]:
+    """Correlation of the residuals of successive poses, and the probability of a larger one by chance.
+
+    Parameters
+    ----------
+    standardized : array, shape (n, 6)
+        Residuals with unit variance.
+    t_s : array, shape (n,), optional
+        Order of the poses; rows in order if missing or not finite.
+    """
+    if t_s is not None and np.isfinite(t_s).all():
+        standardized = standardized[np.argsort(t_s, kind="stable")]
+    products = np.einsum("ni,ni->n", standardized[:-1], standardized[1:])
+    correlation = float(products.mean() / (np.mean(standardized**2) * 6 or 1.0))
+    return correlation, float(normal_cdf(-correlation * np.sqrt(6 * len(products))))
+
+
+def strong_correlations(covariance: Array, least: float = CORRELATED) -> tuple[tuple[str, str, float], ...]:
+    """Name the pairs of parameters whose estimates are correlated by more than `least`, strongest first."""
+    sigma = np.sqrt(np.diag(covariance))
+    sigma[sigma == 0] = 1.0  # exactly known
+    correlation = covariance / np.outer(sigma, sigma)
+    pairs = [(float(correlation[i, j]), i, j) for i, j in combinations(range(len(sigma)), 2)]
+    strong = sorted((pair for pair in pairs if abs(pair[0]) > least), key=lambda pair: -abs(pair[0]))
+    return tuple((PARAMETER_NAMES[i], PARAMETER_NAMES[j], value) for value, i, j in strong)
+
+
+def expected_error(parameters: Parameters, covariance: Array, response: Response | None = None) -> tuple[float, float]:
+    """Root mean square error of the predicted wrench over all orientations, N and N·m.
+
+    It is of second degree in the orientation, so its mean over the rotations of the cube is the mean over all.
+    """
+    over = predicted_covariance(parameters, covariance, response, np.swapaxes(SPECIAL_R_flange_base, 1, 2))
+    variance = np.diagonal(over, axis1=1, axis2=2).mean(axis=0)
+    return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
+
+
+def reversed_signs(
+    parameters: Parameters,
+    covariance: Array,
+    up_in_base: ArrayLike = UP_IN_BASE,
+    farthest_com_m: float = FARTHEST_COM_M,
+) -> list[str]:
+    """Say what a weight that pulls upwards means, and a centre of mass on the robot's side of the sensor."""
+    angle_deg, inside_m = _tilt_deg(parameters, up_in_base), _inside_m(parameters, covariance)
+    if angle_deg < REVERSED_TILT_DEG:
+        if not 0 < inside_m <= farthest_com_m:
+            return []
+        return [
+            f"the centre of mass lies {1e3 * inside_m:.0f} mm on the robot's side of the sensor: the torques are "
+            "reversed, unless the tool reaches back that far"
+        ]
+    if inside_m:
+        return [
+            f"the weight pulls upwards ({angle_deg:.0f}° from down) and the centre of mass lies on the robot's side of "
+            "the sensor: the forces are reversed and the torques are not"
+        ]
+    return [
+        f"the weight pulls upwards ({angle_deg:.0f}° from down): the sensor reports the reaction (set sign = -1), or "
+        "one axis is reversed in forces and torques alike, or the robot hangs from the ceiling"
+    ]
+
+
+def _tilt_notes(parameters: Parameters, up_in_base: ArrayLike) -> list[str]:
+    angle_deg = _tilt_deg(parameters, up_in_base)
+    if not NOTED_TILT_DEG < angle_deg < REVERSED_TILT_DEG:
+        return []
+    x, y, z = parameters.gravity_force_base_N / np.linalg.norm(parameters.gravity_force_base_N)
+    return [
+        f"gravity is {angle_deg:.0f}° off, along ({x:.2f}, {y:.2f}, {z:.2f}) in base: right for a robot on a "
+        "wall or a slope, otherwise check the base frame and the orientations"
+    ]
+
+
+def _drift_share(change: Array, weight_N: float) -> float:
+    """Drift of the force relative to the weight, or of the torque to the weight at the usual lever."""
+    sizes = np.linalg.norm(change[:3]), np.linalg.norm(change[3:]) / USUAL_LEVER_M
+    return float(max(sizes) / weight_N) if weight_N else float("inf")
+
+
+def _drift_reasons(drift: Drifted | None) -> list[str]:
+    if drift is None or not (np.abs(drift.change) > 3 * drift.sigma).any():
+        return []
+    force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
+    return [
+        f"the bias drifted by {force_N:.2g} N and {torque_Nm:.2g} N·m from the first pose to the last: let the sensor "
+        "warm up and calibrate again"
+    ]
+
+
+def _tilt_deg(parameters: Parameters, up_in_base: ArrayLike) -> float:
+    """Angle between the weight and where down should be."""
+    up, F_b = np.asarray(up_in_base, dtype=np.float64), parameters.gravity_force_base_N
+    cosine = -float(F_b @ up) / float(np.linalg.norm(F_b) * np.linalg.norm(up) or 1.0)
+    return float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def _inside_m(parameters: Parameters, covariance: Array) -> float:
+    """How far the centre of mass lies behind the sensor as seen from outside; 0 where it is not sure."""
+    outwards = parameters.R_flange_sensor[2]  # flange z in the sensor frame
+    inside_m = -float(outwards @ parameters.p_sensor_com_m)
+    sigma_m = float(np.sqrt(outwards @ covariance[9:12, 9:12] @ outwards))
+    return inside_m if inside_m > max(INSIDE_M, 3 * sigma_m) else 0.0
+
+
+def _weight_reasons(fit: Evidence, weight_N: float) -> list[str]:
+    along = fit.parameters.gravity_force_base_N / (weight_N or 1.0)
+    variance = float(along @ fit.covariance[3:6, 3:6] @ along)
+    sigma_N = np.sqrt(max(variance, 0.0))  # below 0 is rounding of a weight that is exactly known
+    if weight_N > SIGNIFICANT_SIGMAS * sigma_N:
+        return []
+    if given_in_base := constant_weight(fit.wrench):
+        return given_in_base
+    return [
+        f"the weight, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty of {sigma_N:.2g} N: "
+        "hang something heavier on the sensor, or record longer and in more orientations"
+    ]
+
+
+def _second_solution_reasons(fit: Evidence) -> list[str]:
+    if fit.second_basin_chi2 is None:
+        return []
+    delta = fit.second_basin_chi2 / max(1.0, fit.chi2 / fit.dof)
+    if delta >= ACCEPTED_DELTA_CHI2:
+        return []
+    odds = 100 * wrong_basin_probability(max(delta, 0.0))
+    return [
+        "a quite different mounting of the sensor explains the data almost as well "
+        f"(it is the right one with {odds:.2g} %): add poses with another angle between the tool and the vertical"
+    ]
+
+
+def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
+    """Rows that were left out, or that the others predict badly."""
+    typical = max(float(np.median(residual_sigma[used] ** 2)), 1.0)
+    limit = chi2_isf(6, SURE / len(residual_sigma)) / 6 * typical
+    return np.flatnonzero(~used | (residual_sigma**2 > limit)).tolist()
+
+
+def _change_reasons(fit: Evidence, residual_sigma: Array, measured_sigma: Array, t_s: Array | None) -> list[str]:
+    """Refuse poses of two different loads. White noise cannot stand for that: half the poses are off the same way.
+
+    Where all poses before the change were left out, the rest tells of the load as it is now.
+    """
+    n, used = len(fit.wrench), fit.weights > 0.5
+    times = np.arange(n, dtype=np.float64) if t_s is None or not np.isfinite(t_s).all() else t_s
+    order = np.argsort(times, kind="stable")
+    change = lasting_change(
+        fit.parameters,
+        fit.R_base_flange[order],
+        fit.residuals[order],
+        measured_sigma,
+        times[order],
+        np.flatnonzero(np.isin(order, out_of_line(residual_sigma, used))).tolist(),
+    )
+    if change is None or not change.of_the_tool or not used[order[: change.position]].any():
+        return []
+    return [f"the poses do not belong to one tool: {change.in_words(f'pose {order[change.position] + 1}')}"]
+
+
+def _com_reasons(parameters: Parameters, farthest_com_m: float, rejected: list[str], usable: list[str]) -> None:
+    com_m = float(np.linalg.norm(parameters.p_sensor_com_m))
+    if com_m > farthest_com_m:
+        units = torque_units(com_m)
+        advice = f"the torques are in {' or '.join(units)}, not N·m" if units else "check the units of force and torque"
+        rejected.append(
+            f"the centre of mass lies {com_m:.2f} m from the sensor, farther than {farthest_com_m:g} m: {advice}"
+        )
+    elif com_m < NEAREST_COM_M:
+        usable.append(
+            f"the centre of mass lies only {1e3 * com_m:.2g} mm from the sensor: torques 1000 times too small, or "
+            "forces in mN, would look like this: check the units"
+        )
+
+
+def _shares(
+    fit: Evidence, used: NDArray[np.bool_], weight_N: float
+) -> tuple[list[tuple[str, float]], tuple[float, float]]:
+    """Errors relative to the weight with the sentence for each, larger of force and torque first, and the left-out rms.
+
+    Of residual, left-out and expected error the first is named that breaks the highest limit.
+    """
+    lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
+    left_out = _rms(fit.left_out_residuals[used, :3]), _rms(fit.left_out_residuals[used, 3:])
+    expected = expected_error(fit.parameters, fit.covariance, fit.response)
+    kinds = (
+        ("force", 0, weight_N, "N", "the weight"),
+        ("torque", 1, weight_N * lever_m, "N·m", f"the weight at {lever_m:.2g} m"),
+    )
+    shares = []
+    for kind, k, scale, unit, of in kinds:
+        errors = (
+            (f"the {kind} residual", _rms(fit.residuals[used, 3 * k : 3 * k + 3])),
+            (f"the cross-validated {kind} error", left_out[k]),
+            (f"the expected {kind} error over all orientations", expected[k]),
+        )
+        limits = [sum(error > limit * scale for limit in (USABLE_SHARE, REJECTED_SHARE)) for _, error in errors]
+        what, error = errors[int(np.argmax(limits))] if max(limits) else max(errors, key=lambda pair: pair[1])
+        share = error / scale if scale else float("inf")
+        limit = REJECTED_SHARE if share > REJECTED_SHARE else USABLE_SHARE
+        shares.append(
+            (f"{what} is {100 * share:.1f} % of {of} ({error:.2g} {unit}), more than {100 * limit:g} %", share)
+        )
+    return sorted(shares, key=lambda pair: -pair[1]), left_out
+
+
+def _contradiction_reasons(fit: Evidence, unconstrained: Evidence) -> list[str]:
+    used = unconstrained.weights > 0.5
+    return [
+        f"with nothing taken as known the {kind}s fit to {best:.2g} {unit} instead of {ours:.2g} {unit} (method ml): "
+        "check the mass and the level base, if they were taken as known"
+        for kind, unit, columns in (("force", "N", slice(0, 3)), ("torque", "N·m", slice(3, 6)))
+        for ours, best in [(_rms(fit.residuals[used, columns]), _rms(unconstrained.residuals[used, columns]))]
+        if best < COLLAPSE * ours
+    ][:1]
+
+
+def _noise_reason(fit: Evidence, noise_factor: float) -> str:
+    found = ", ".join(f"{name} {value:.2g}" for name, value in fit.components.items() if value > 0)
+    included = f": found {found}" if found else ", and the stated uncertainties do not include them"
+    return (
+        f"residuals are {noise_factor:.1f} times the measured noise: drift, cables, contact or inexact orientations "
+        f"add to it{included}"
+    )
+
+
+def _indispensable_reasons(fit: Evidence, used: NDArray[np.bool_], weight_N: float) -> list[str]:
+    uncertain = np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > weight_N**2
+    rows = np.flatnonzero(uncertain & used)
+    if not 0 < rows.size <= used.sum() / 2:
+        return []
+    listed = ", ".join(str(k + 1) for k in rows)
+    return [f"pose {listed} cannot be checked, without it the others do not determine everything: add poses like it"]
+
+
+def _rms(vectors: Array) -> float:
+    """Root mean square of the lengths of (n, 3) vectors."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))

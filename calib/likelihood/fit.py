@@ -1,0 +1,626 @@
+"""Maximum likelihood: joint weighted least squares of forces and torques, under the noise the data show.
+
+There is one objective: the restricted likelihood at the best parameters, less what each component of the noise and each
+rejected pose must bring. From all minima of the force equations down to the minima of the joint cost; then parameters,
+variances, components and rejected poses in turn, until nothing changes.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri as chi2_isf
+from scipy.special import fdtri as f_ppf
+
+from calib.errors import NotObservable
+from calib.known import Constraints, Known
+from calib.likelihood.descent import MAX_STEPS, Descent, Equations, Minimum, column_scale
+from calib.likelihood.gain_and_cross_talk import SIZE, Response, response_columns
+from calib.likelihood.outliers import (
+    FALSE_REJECTION,
+    FARTHEST,
+    FEWEST_TO_REJECT_FROM,
+    Kept,
+    agreeing_poses,
+    fewest_kept,
+)
+from calib.likelihood.session_noise import Noise, summed_products
+from calib.likelihood.sufficient_statistics import Statistics, features
+from calib.likelihood.variance_components import (
+    FORCE,
+    RESPONSE,
+    ROTATION,
+    TORQUE,
+    WORTH_A_TRY,
+    Component,
+    Linearised,
+    Point,
+    component,
+    left_out,
+    maximise,
+    noise_of,
+    predicted_gains,
+    select,
+    squared_length,
+    with_slopes_instead,
+)
+from calib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict
+
+Drift = Literal["auto", "none", "linear", "random-walk"]
+
+RANK_TOLERANCE = 1e-9
+LEVER_M = 0.025  # usual ratio of torque noise to force noise
+FEW_POSES = 6  # fewer cannot tell force noise from torque noise: the usual ratio is taken
+FEW_POSES_FOR_RESPONSE = 7  # fewer cannot tell gain and cross-talk from noise
+FEW_POSES_WITHOUT_NOISE = 12  # fewer cannot tell drift from noise that nobody measured
+POSES_FOR_EACH_AXIS = 50  # fewer cannot tell the drift of one axis from that of another of its group
+MANY_POSES = 20_000  # from here on single poses are looked at only when chi2 or `drift` asks for it
+FLOOR = 1e-3  # of the residuals: white noise that is surely there when nobody measured it
+SUSPICIOUS = 0.01  # p-value below which more than the measured noise is looked for
+LIGHT_TAIL = 0.6  # the median of squared distances relative to their mean, in units of what Gaussian noise has
+ROUNDS = 12  # of the outer loop; it ends after two or three
+SETTLED = 1e-4  # squared step, in standard deviations of the estimates
+MEDIAN_DISTANCE = float(chi2_isf(6, 0.5))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriftEstimate:
+    """How the bias moved."""
+
+    change: Array
+    """(6,) bias at the last pose minus bias at the first, N and N·m."""
+    sigma: Array
+    """(6,) standard deviation of that."""
+    bias: Array
+    """(n, 6) bias of each pose minus the mean bias, in the order of the poses given."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Estimates and everything needed to judge them. Rejected poses count nowhere but in arrays with n rows."""
+
+    parameters: Parameters
+    """With drift the biases are the mean over the poses."""
+    information: Array
+    """(15, 15) Fisher information of the error coordinates `PARAMETER_NAMES`, priors included."""
+    free: Array
+    """(15, m) orthonormal basis of what is not exactly known: the identity without a `Known`."""
+    minima: tuple[Minimum, ...]
+    """By ascending chi2, R_flange_sensor at least 1° apart; the first is the answer."""
+    chi2: float
+    """Under the noise model: measured or estimated white noise plus `components`. About dof by construction."""
+    dof: int
+    measured_chi2: float
+    """The same poses, best fit without drift, weighted by the measured noise alone; NaN when nobody measured it."""
+    weights: Array
+    """(n,) 1 = used, 0 = rejected because it fits none of what the others tell."""
+    components: Mapping[str, float]
+    """Standard deviations of what was found, by name and unit: beyond the measured noise, or all of the noise when
+    nobody measured it. A `walk` is per mean interval between poses, a `slope` per session."""
+    drift: DriftEstimate | None
+    noise: Noise
+    """Covariance of all wrenches under the noise model, poses in the order of `order`."""
+    order: NDArray[np.intp]
+    """(n,) row numbers by time."""
+    R_base_flange: Array
+    """(n, 3, 3)"""
+    wrench: Array
+    """(n, 6)"""
+    effects: tuple[NDArray[np.intp], Array]
+    """Which of the 11 numbers of gain and cross-talk were estimated (k,), and their variances (k,)."""
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(15, 15) zero along what is exactly known; without meaning where the information lacks rank."""
+        Z = self.free
+        return np.asarray(Z @ _inverse(Z.T @ self.information @ Z) @ Z.T)
+
+    @property
+    def wrench_cov(self) -> Array:
+        """(n, 6, 6) noise of each pose by itself, without drift."""
+        cov = np.empty_like(self.noise.D)
+        cov[self.order] = self.noise.D
+        return cov
+
+    @property
+    def second_basin_chi2(self) -> float | None:
+        """How much worse the second best minimum fits: it is right with the odds exp(-half of this). None: no other.
+
+        Where white noise was estimated from the same residuals a larger one makes up for part of the difference.
+        """
+        if len(self.minima) == 1:
+            return None
+        best, second = self.minima[0].chi2, self.minima[1].chi2
+        if any(name.startswith("white") for name in self.components):
+            return float(self.dof * np.log(second / best))
+        return second - best
+
+    @cached_property
+    def residuals(self) -> Array:
+        """(n, 6) measured minus predicted, gain and cross-talk included, drift not."""
+        added = 0.0 if self.response is None else self.response.wrench(self.parameters, self.R_base_flange)
+        return np.asarray(self._plain_residuals - added)
+
+    @cached_property
+    def _plain_residuals(self) -> Array:
+        return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange))
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """(n, 6, 15) derivative of the prediction."""
+        return jacobian(self.parameters, self.R_base_flange)
+
+    @cached_property
+    def _weighted(self) -> tuple[Array, Array]:
+        """Inverse noise times Jacobian (n, 6, 15) and times residuals (n, 6), poses by time."""
+        J, r = self.jacobian[self.order], self._plain_residuals[self.order]
+        WX = self.noise.solve(np.concatenate([J, r[..., None]], axis=2))
+        return WX[..., :15], WX[..., 15]
+
+    @cached_property
+    def response(self) -> Response | None:
+        """Gain and cross-talk of the sensor, best linear prediction; None where none was found."""
+        which, variance = self.effects
+        if not which.size:
+            return None
+        T = response_columns(self.parameters, self.R_base_flange[self.order])[..., which]
+        WJ, u = self._weighted
+        JWT = summed_products(WJ, T)
+        C, total = self.covariance, np.zeros((15 + SIZE, 15 + SIZE))
+        own = 15 + which
+        total[:15, :15] = C
+        total[:15, own] = -C @ JWT * variance
+        total[own, :15] = total[:15, own].T
+        TPT = summed_products(T, self.noise.solve(T)) - JWT.T @ C @ JWT
+        total[np.ix_(own, own)] = np.diag(variance) - variance[:, None] * TPT * variance
+        coefficients = np.zeros(SIZE)
+        coefficients[which] = variance * np.tensordot(u, T, 2)
+        return Response(coefficients, total)
+
+    @cached_property
+    def gain_sigma(self) -> float:
+        """Standard deviation of the entries of the gain: as found, else what the data leave room for, by moments."""
+        if "gain" in self.components or len(self.weights) < FEW_POSES_FOR_RESPONSE:
+            return self.components.get("gain", 0.0)
+        T = response_columns(self.parameters, self.R_base_flange[self.order])[..., :5]
+        WJ, u = self._weighted
+        JWT, Tu = summed_products(WJ, T), np.tensordot(u, T, 2)
+        M = summed_products(T, self.noise.solve(T)) - JWT.T @ self.covariance @ JWT
+        excess = float(Tu @ np.linalg.lstsq(M, Tu, rcond=1e-9)[0]) - len(M)
+        return float(np.sqrt(max(excess, 0.0) / np.trace(M)))
+
+    @property
+    def left_out_residuals(self) -> Array:
+        """(n, 6) measured minus what all other poses predict for this one, drift and correlation included."""
+        return self._left_out[0]
+
+    @property
+    def left_out_cov(self) -> Array:
+        """(n, 6, 6) covariance of these: noise of the pose and uncertainty of its prediction."""
+        return self._left_out[1]
+
+    @cached_property
+    def _left_out(self) -> tuple[Array, Array]:
+        # With a prior the best parameters leave some of J' W r.
+        e, S = left_out(self.noise, *self._weighted, self.covariance)
+        unsorted = np.empty_like(self.order)
+        unsorted[self.order] = np.arange(len(self.order))
+        return e[unsorted], S[unsorted]
+
+    @cached_property
+    def standardized_residuals(self) -> Array:
+        """(n, 6) `left_out_residuals` whitened by `left_out_cov`: independent within a pose, standard deviation 1."""
+        L = np.linalg.cholesky(self.left_out_cov)
+        return np.asarray(np.linalg.solve(L, self.left_out_residuals[..., None])[..., 0])
+
+    @cached_property
+    def left_out_distances(self) -> Array:
+        """(n,) squared length of `standardized_residuals`: chi-square with 6 degrees of freedom for a good pose."""
+        return np.asarray((self.standardized_residuals**2).sum(axis=1))
+
+
+def fit(
+    R_base_flange: Array,
+    wrench: Array,
+    wrench_cov: Array | None = None,
+    *,
+    t_s: Array | None = None,
+    drift: Drift = "auto",
+    known: Known | None = None,
+    g_m_s2: float = STANDARD_GRAVITY_M_S2,
+) -> Fit:
+    """Fit all 15 parameters and, as far as the data ask for it, the noise.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+        Rotations, not checked again.
+    wrench : array, shape (n, 6)
+        N and N·m, in the sensor frame.
+    wrench_cov : array, shape (n, 6, 6) or (6, 6), or None
+        Covariance of each pose's wrench, or of all of them. Without it one standard deviation for all forces and one
+        for all torques are estimated; from fewer than six poses a single one for both.
+    t_s : array, shape (n,), optional
+        When each pose was taken; without it, or with NaN in it, their order counts.
+    drift : {"auto", "none", "linear", "random-walk"}
+        How the bias may move: as the restricted likelihood decides, not at all, or surely so.
+    known : Known, optional
+    g_m_s2 : float
+        Only to turn a known mass into a weight.
+
+    Raises
+    ------
+    NotObservable
+        The lowest point reached is not a minimum. Poor information is not refused here: see `Fit.information`.
+    """
+    return _Problem(R_base_flange, wrench, wrench_cov, t_s, drift, Constraints(known or Known(), g_m_s2)).solve()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Explanation:
+    """One way to explain the data: which poses belong together, and what acts on them."""
+
+    parameters: Parameters
+    kept: Kept
+    components: tuple[Component, ...] = ()
+    theta: Array = field(default_factory=lambda: np.zeros(0))
+    criterion: float = np.inf
+    """-2 log restricted likelihood, plus what each component and each rejected pose must bring."""
+    noticed: bool = False
+    """Whether bumped poses may be hidden in it."""
+
+
+class _Problem:
+    def __init__(
+        self,
+        R_base_flange: Array,
+        wrench: Array,
+        wrench_cov: Array | None,
+        t_s: Array | None,
+        drift: Drift,
+        constraints: Constraints,
+    ) -> None:
+        self.n = len(wrench)
+        self.given = R_base_flange, wrench
+        self.drift, self.constraints = drift, constraints
+        self.measured = wrench_cov is not None
+        self.order = np.arange(self.n)
+        self.time = np.arange(self.n, dtype=np.float64)
+        if t_s is not None and not np.isnan(t_s).any() and np.ptp(t_s) > 0:
+            self.order = np.argsort(t_s, kind="stable")
+            self.time = (t_s[self.order] - t_s.min()) * (self.n - 1) / np.ptp(t_s)
+        ordered = bool((self.order[1:] > self.order[:-1]).all())
+        self.R, self.wrench = (x if ordered else x[self.order] for x in self.given)
+        cov = _white(*self._least()) if wrench_cov is None else np.asarray(wrench_cov, dtype=np.float64)
+        common = cov.ndim == 2
+        self.cov = np.broadcast_to(cov, (self.n, 6, 6)) if common else cov if ordered else cov[self.order]
+        self.descent = Descent(self.R, self.wrench, constraints)
+        self.everything = np.ones(self.n, bool)
+
+    def solve(self) -> Fit:
+        weights = _inverses(self.cov if self.measured else np.broadcast_to(_white(1.0, LEVER_M), self.cov.shape))
+        minima = self.descent.minima(weights)
+        plain = _Explanation(minima[0].parameters, self.everything)
+        if self._lacks_rank(minima[0]):
+            return self._fit(plain, minima, minima[0].chi2)
+        if self._exact(minima[0].parameters):
+            minima = self.descent.minima(_inverses(self.cov))
+            return self._fit(plain, minima, minima[0].chi2)
+        if not self.measured:
+            self.cov = self._least_noise(minima[0].parameters)
+        if self._is_quiet(minima[0]):
+            return self._fit(plain, minima, minima[0].chi2)
+        chosen = min(self._explanations(minima, weights), key=lambda e: e.criterion)
+        static = minima if chosen.kept.all() else self.descent.minima(weights * chosen.kept[:, None, None])
+        for _ in range(len(static)):
+            found = self._with_all_minima(chosen, static)
+            if self.descent.same(found[0].parameters, chosen.parameters):
+                break
+            other = self._explained(found[0].parameters, chosen.kept)
+            if other.criterion > chosen.criterion:
+                break
+            chosen = other
+        return self._fit(chosen, found, static[0].chi2)
+
+    def _dof(self, kept: Kept) -> int:
+        return 6 * int(kept.sum()) - 15 + self.constraints.dof - (6 if self.drift == "linear" else 0)
+
+    def _lacks_rank(self, minimum: Minimum) -> bool:
+        Z = self.constraints.free(minimum.parameters)
+        H = Z.T @ minimum.information @ Z
+        scale = column_scale(H)
+        eigenvalues = np.linalg.eigvalsh(H / np.outer(scale, scale))
+        return bool(eigenvalues[0] < RANK_TOLERANCE * eigenvalues[-1]) or self._dof(np.ones(self.n, bool)) <= 0
+
+    def _least(self) -> tuple[float, float]:
+        """Noise of data that have none: their rounding."""
+        least_N = 1e-12 * float(np.abs(self.wrench[:, :3]).max())
+        return least_N, LEVER_M * least_N
+
+    def _exact(self, p: Parameters) -> bool:
+        if self.measured:
+            return False
+        residuals = self.wrench - predict(p, self.R)
+        return float(np.abs(residuals[:, :3]).max()) < 100 * self._least()[0]
+
+    def _least_noise(self, p: Parameters) -> Array:
+        """Give a small share of the residuals, so that a random walk never explains them all."""
+        e = self.wrench - predict(p, self.R)
+        force_N, torque_Nm = (FLOOR * float(np.sqrt(np.mean(e[:, c] ** 2))) for c in (slice(0, 3), slice(3, 6)))
+        least_N, least_Nm = self._least()
+        return np.broadcast_to(_white(max(force_N, least_N), max(torque_Nm, least_Nm)), self.cov.shape)
+
+    # Explanations
+
+    def _is_quiet(self, best: Minimum) -> bool:
+        """Tell whether the measured noise explains everything, so that nothing more would be found."""
+        always, candidates = self._always(), self._candidates()
+        if not self.measured or always or self.drift == "linear":
+            return False
+        if best.chi2 > float(chi2_isf(self._dof(self.everything), SUSPICIOUS)):
+            return False
+        if self.n > MANY_POSES and self.drift == "none":
+            return True  # a pose that could do harm among so many would show in chi2
+        problem = self._linearised(best.parameters, self.everything)
+        at = maximise(problem, (), np.zeros(0))
+        if self._stand_out(squared_length(*at.left_out())):
+            return False
+        return not candidates or bool(predicted_gains(problem, at, candidates)[0].max() < WORTH_A_TRY)
+
+    def _explanations(self, minima: list[Minimum], weights: Array) -> list[_Explanation]:
+        """Explain the data with all poses; and, where these may hide bumped ones, with those that agree."""
+        p = minima[0].parameters
+        found = [self._explained(p, self.everything)]
+        if found[0].noticed:
+            starts = [m.parameters for m in minima]
+            problem, always = self._linearised(p, self.everything), self._always()
+            at = maximise(problem, always, self._start(problem, always))
+            if not self.measured:
+                weights = np.asarray(at.noise.W, dtype=np.float64)
+            distances = squared_length(*at.left_out())
+            for scaled in (False, True):
+                robust = self._agreeing(weights, starts, distances, scaled=scaled)
+                if robust is not None:
+                    found.append(self._explained(*robust))
+        return found
+
+    def _stand_out(self, distances: Array) -> bool:
+        """Tell whether poses stand out, or so many of them that none does."""
+        if self.n < FEWEST_TO_REJECT_FROM:
+            return False
+        tail = float(np.median(distances)) / MEDIAN_DISTANCE / (float(distances.mean()) / 6)
+        return bool(distances.max() > chi2_isf(6, 2 * SUSPICIOUS / self.n)) or tail < LIGHT_TAIL
+
+    def _agreeing(
+        self, weights: Array, starts: list[Parameters], distances: Array, *, scaled: bool
+    ) -> tuple[Parameters, Kept] | None:
+        """Find poses that agree within the noise, or within one that fits half of all poses."""
+        phi = features(self.R)
+
+        def down(statistics: Statistics, p: Parameters, steps: int) -> Parameters:
+            return self.descent.down(statistics.normal_equations, p, steps).parameters
+
+        if not scaled:
+            return agreeing_poses(phi, self.wrench, weights, starts, down) if self.measured else None
+        scale = float(np.median(distances)) / MEDIAN_DISTANCE
+        found = None
+        for _ in range(4):
+            robust = agreeing_poses(phi, self.wrench, weights / scale, starts, down)
+            if robust is None:
+                break
+            found = robust
+            e = self.wrench - predict(robust[0], self.R)
+            d2 = np.einsum("ni,nij,nj->n", e, weights, e, optimize=True)
+            before, scale = scale, float(np.median(d2)) / MEDIAN_DISTANCE * self.n / (self.n - 2.5)
+            if scale > 0.7 * before:
+                break
+        return found
+
+    def _explained(self, p: Parameters, kept: Kept) -> _Explanation:
+        """Improve parameters, variances, components and rejected poses in turn, until nothing changes."""
+        always, candidates = self._always(), self._candidates()
+        problem = self._linearised(p, kept)
+        components, theta = tuple(always), self._start(problem, always)
+        best = _Explanation(p, kept)
+        for _ in range(ROUNDS):
+            at = select(problem, components, theta, candidates, len(always))
+            if self.drift == "auto":
+                at = with_slopes_instead(problem, at, len(always))
+            p, problem, at = self._settled(p, kept, at)
+            distances = squared_length(*at.left_out())
+            criterion = self._criterion(at, distances)
+            if criterion > best.criterion - 1e-3:
+                break
+            noise_found = {c.kind for c in at.components[len(always) :]} - {"walk", "slope"}
+            noticed = self.n >= FEWEST_TO_REJECT_FROM and (bool(noise_found) or self._stand_out(distances))
+            best = _Explanation(p, kept, at.components, at.theta, criterion, noticed)
+            components, theta = at.components, at.theta
+            kept = self._membership(kept, distances, at)
+            if not (kept == best.kept).all():
+                problem = self._linearised(p, kept)
+        return best
+
+    def _settled(self, p: Parameters, kept: Kept, at: Point) -> tuple[Parameters, Linearised, Point]:
+        """Go down with the noise as it is and estimate its variances again, until they agree."""
+        for _ in range(ROUNDS):
+            p = self.descent.down(self._equations(at.noise), p).parameters
+            problem = self._linearised(p, kept)
+            at = maximise(problem, at.components, at.theta)
+            if float(at.step @ np.linalg.solve(at.C, at.step)) < SETTLED:
+                break
+        return p, problem, at
+
+    def _membership(self, kept: Kept, distances: Array, at: Point) -> Kept:
+        """Reject the poses that stand out, the worst first; take back those that do not any more."""
+        limit = self._limit(at)
+        out = kept & (distances > max(limit, float(distances[kept].max()) / 4))
+        after = (kept & ~out) | (~kept & (distances < limit))
+        return after if after.sum() >= fewest_kept(self.n) else kept
+
+    def _limit(self, at: Point) -> float:
+        """Squared distance of a good pose that one in a thousand exceeds."""
+        estimated = any(c.kind == "white" for c in at.components)
+        return 6 * float(f_ppf(6, self._dof(at.noise.kept), 1 - FALSE_REJECTION)) if estimated else FARTHEST
+
+    def _criterion(self, at: Point, distances: Array) -> float:
+        """A rejected pose has noise of its own size. At the limit it costs what it would if it counted."""
+        value, rejected, limit = -2 * at.worth, ~at.noise.kept, self._limit(at)
+        if rejected.any():
+            far = np.maximum(distances[rejected], limit)
+            value += float(np.linalg.slogdet(at.left_out()[1][rejected])[1].sum())
+            value += float(np.sum(limit + 6 * np.log(far / limit)))
+        return value
+
+    def _start(self, problem: Linearised, components: Sequence[Component]) -> Array:
+        """Give variances to start from: the mean square residual of the group, or its noise where that is more."""
+        noise = np.diagonal(problem.D, axis1=1, axis2=2)
+        size = np.maximum(problem.r**2, noise)[problem.kept]
+        scale = [np.mean(size[:, np.array(c.share) > 0]) for c in components]
+        return np.array([s / (10 * self.n if c.kind == "walk" else 1) for c, s in zip(components, scale, strict=True)])
+
+    def _with_all_minima(self, e: _Explanation, others: list[Minimum]) -> list[Minimum]:
+        """Find the minima again, under the noise of the explanation."""
+        logdet = self._noise(e, e.parameters).logdet
+        ends = []
+        for start in (e.parameters, *(minimum.parameters for minimum in others)):
+            q = start
+            for _ in range(3 if {"rotation", "gain", "cross_talk"} & {c.kind for c in e.components} else 1):
+                noise = self._noise(e, q)  # which depends on the parameters
+                end = self.descent.down(self._equations(noise), q)
+                q = end.parameters
+            ends.append(replace(end, chi2=end.chi2 + noise.logdet - logdet))
+        return self.descent.distinct(ends)
+
+    def _noise(self, e: _Explanation, p: Parameters) -> Noise:
+        return noise_of(self._linearised(p, e.kept), e.components, e.theta)
+
+    def _equations(self, noise: Noise) -> Equations:
+        """Weighted least squares for any noise."""
+
+        def equations(p: Parameters) -> tuple[Array, Array, float]:
+            X = np.concatenate([jacobian(p, self.R), (self.wrench - predict(p, self.R))[..., None]], axis=2)
+            G = summed_products(X, noise.solve(X))
+            return G[:15, :15], G[:15, 15], float(G[15, 15])
+
+        return equations
+
+    def _fit(self, e: _Explanation, minima: list[Minimum], static_chi2: float) -> Fit:
+        best = minima[0]
+        if not best.settled:
+            weight_N = np.linalg.norm(best.parameters.gravity_force_base_N)
+            raise NotObservable(
+                f"the fit has not settled in {MAX_STEPS} steps, at a weight of {weight_N:.2g} N: "
+                "hang something heavier on the sensor, or add poses with other orientations."
+            )
+        plain = not e.components and e.kept.all() and self.drift != "linear"
+        noise = Noise(self.cov) if plain else self._noise(e, best.parameters)
+        weights = np.empty(self.n)
+        weights[self.order] = e.kept
+        drifts = self.drift == "linear" or any(c.kind in ("walk", "slope") for c in e.components)
+        found = dict(zip(e.components, e.theta, strict=True))
+        variance = np.repeat([found.get(c, 0.0) for c in RESPONSE], [5, 6])
+        effects = np.flatnonzero(variance), variance[variance > 0]
+        return Fit(
+            parameters=best.parameters,
+            information=best.information,
+            free=self.constraints.free(best.parameters),
+            minima=tuple(minima),
+            chi2=best.chi2,
+            dof=self._dof(e.kept),
+            measured_chi2=static_chi2 if self.measured else float("nan"),
+            weights=weights,
+            components={c.name: self._deviation(c, v) for c, v in found.items()},
+            drift=self._drift(best, noise, effects) if drifts else None,
+            noise=noise,
+            order=self.order,
+            R_base_flange=self.given[0],
+            wrench=self.given[1],
+            effects=effects,
+        )
+
+    def _deviation(self, c: Component, variance: float) -> float:
+        """Standard deviation that the fit used: white noise that nobody measured includes its least."""
+        least = 0.0 if self.measured or c.kind != "white" else self.cov[0][np.argmax(c.share), np.argmax(c.share)]
+        return float(np.sqrt(variance + least))
+
+    def _drift(self, best: Minimum, noise: Noise, effects: tuple[NDArray[np.intp], Array]) -> DriftEstimate:
+        """Best linear prediction of the bias at every pose, and the error of its change."""
+        J, r = jacobian(best.parameters, self.R), self.wrench - predict(best.parameters, self.R)
+        T = response_columns(best.parameters, self.R)[..., effects[0]]
+
+        def not_drift(X: Array) -> Array:
+            """Multiply by the covariance of all but the drift."""
+            Y = noise.D @ X
+            return np.asarray(Y + T @ (effects[1][:, None] * summed_products(T, X)) if T.size else Y)
+
+        sorted_bias = r - not_drift(noise.solve(r[..., None]))[..., 0]
+        if not noise.kept.all():
+            at, seen = self.time[noise.kept], sorted_bias[noise.kept]
+            sorted_bias = np.stack([np.interp(self.time, at, channel) for channel in seen.T], axis=1)
+        bias = np.empty((self.n, 6))
+        bias[self.order] = sorted_bias
+        ends = np.flatnonzero(noise.kept)[[0, -1]]
+        select_ends = np.zeros((self.n, 6, 6))
+        select_ends[ends] = [-np.eye(6), np.eye(6)]
+        Z = self.constraints.free(best.parameters)
+        C = Z @ _inverse(Z.T @ best.information @ Z) @ Z.T
+        Y = not_drift(select_ends)
+        WY = noise.solve(Y)
+        E = summed_products(select_ends, J) - summed_products(WY, J)
+        cov = summed_products(select_ends, Y) - summed_products(Y, WY) + E @ C @ E.T
+        change = sorted_bias[ends[1]] - sorted_bias[ends[0]]
+        return DriftEstimate(change, np.sqrt(np.maximum(np.diag(cov), 0.0)), bias)
+
+    def _linearised(self, p: Parameters, kept: Kept) -> Linearised:
+        J = jacobian(p, self.R)
+        turn = J[..., :3]
+        r = self.wrench - predict(p, self.R)
+        H, g = np.zeros((15, 15)), np.zeros(15)
+        if self.constraints.any:
+            A, residual = self.constraints.measurements(p)
+            Z = self.constraints.free(p)
+            J, H, g = J @ Z, Z.T @ A.T @ A @ Z, Z.T @ A.T @ residual
+        slope = np.full(6, np.inf) if self.drift == "linear" else None
+        return Linearised(J, r, (H, g), turn, self.cov, self.time, kept, slope, response_columns(p, self.R))
+
+    def _groups(self) -> list[range]:
+        return [range(c, c + 1) for c in range(6)] if self.n >= POSES_FOR_EACH_AXIS else [FORCE, TORQUE]
+
+    def _always(self) -> list[Component]:
+        always = []
+        if not self.measured and self.n < FEW_POSES:
+            always = [Component("white_force_N", "white", (1.0, 1.0, 1.0, *[LEVER_M**2] * 3))]
+        elif not self.measured:
+            always = [component("white", FORCE), component("white", TORQUE)]
+        if self.drift == "random-walk":
+            always += [component("walk", group) for group in (FORCE, TORQUE)]
+        return always
+
+    def _candidates(self) -> list[Component]:
+        found = list(RESPONSE) if self.n >= FEW_POSES_FOR_RESPONSE else []
+        if self.n >= (FEW_POSES if self.measured else FEW_POSES_WITHOUT_NOISE):
+            white = [component("white", FORCE), component("white", TORQUE)] if self.measured else []
+            walks = [component("walk", group) for group in self._groups()] if self.drift == "auto" else []
+            found += [*white, ROTATION, *walks]
+        return found
+
+
+def _white(sigma_N: float, sigma_Nm: float) -> Array:
+    return np.diag(np.repeat([sigma_N**2, sigma_Nm**2], 3))
+
+
+def _inverses(cov: Array) -> Array:
+    """Invert (n, 6, 6) matrices, once when they are all the same."""
+    if cov.strides[0] == 0:
+        return np.broadcast_to(np.linalg.inv(cov[:1]), cov.shape)
+    return np.asarray(np.linalg.inv(cov))
+
+
+def _inverse(information: Array) -> Array:
+    scale = column_scale(information)
+    value, vector = np.linalg.eigh(information / np.outer(scale, scale))
+    value = np.maximum(value, 1e-14 * value[-1])
+    return np.asarray(vector / value @ vector.T / np.outer(scale, scale))

@@ -1,0 +1,359 @@
+"""Variance components by restricted maximum likelihood: what acts on the wrenches beyond the measured noise.
+
+Restricted likelihood (Patterson, Thompson 1971) allows for the parameters fitted to the same data. It is maximised over
+the logarithms of the variances with average information (Gilmour, Thompson, Cullis 1995), all in O(n).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.likelihood.session_noise import Noise, centred, summed_products, walk_square, walk_times
+from calib.model import Array
+
+GAIN = 2.0
+"""A component stays when it raises the restricted log-likelihood by more than this: 2 % come in by chance."""
+GAIN_OF_RESPONSE = 3.0
+"""The same for gain and cross-talk of the sensor, whose 5 and 6 numbers come in by chance in 0.4 %."""
+SURE = 20.0  # a gain or loss that no other component makes good
+WORTH_A_TRY = 1.0  # gain predicted from slope and curvature at zero
+NEGLIGIBLE = 1e-4  # of the white noise: where slope and curvature "at zero" are taken
+LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2}
+"""Variances that no arm or sensor in working order exceeds: what asks for more is something else."""
+_AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
+
+Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk"]
+
+
+@dataclass(frozen=True, slots=True)
+class Component:
+    """One unknown variance, common to some channels."""
+
+    name: str
+    kind: Kind
+    share: tuple[float, ...]
+    """(6,) by which the variance is multiplied in each channel."""
+
+    @property
+    def needed(self) -> float:
+        """The gain in log-likelihood that it must bring."""
+        return GAIN_OF_RESPONSE if self.kind in ("gain", "cross_talk") else GAIN
+
+
+def component(kind: Kind, channels: Sequence[int]) -> Component:
+    """Name a component of one channel or of a group of three."""
+    what = _AXES[channels[0]] if len(channels) == 1 else "force_N" if channels[0] == 0 else "torque_Nm"
+    return Component(f"{kind}_{what}", kind, tuple(float(c in channels) for c in range(6)))
+
+
+FORCE, TORQUE = range(3), range(3, 6)
+ROTATION = Component("rotation_rad", "rotation", (0.0,) * 6)
+RESPONSE = tuple(Component(kind, kind, (0.0,) * 6) for kind in ("gain", "cross_talk"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearised:
+    """The estimation problem near its solution."""
+
+    J: Array
+    """(n, 6, m) derivative by the free parameters."""
+    r: Array
+    """(n, 6)"""
+    prior: tuple[Array, Array]
+    """Information (m, m) and right-hand side (m,) of what was known before."""
+    turn: Array
+    """(n, 6, 3) derivative by the orientation of each pose."""
+    D: Array
+    """(n, 6, 6) measured noise of each pose, or what is surely there when nobody measured it."""
+    time: Array
+    """(n,) ascending, in mean intervals."""
+    kept: NDArray[np.bool_]
+    """(n,)"""
+    slope: Array | None
+    """(6,) as in `Noise`, for linear drift that is part of the model."""
+    response: Array
+    """(n, 6, 11) derivative by gain and cross-talk of the sensor."""
+
+    def columns(self, c: Component) -> Array | None:
+        """(n, 6, k) derivative by what acts on all poses at once; None for what acts on each by itself."""
+        if c.kind == "slope":
+            return np.asarray(centred(self.time)[:, None, None] * np.eye(6)[:, np.flatnonzero(c.share)])
+        if c.kind == "gain":
+            return self.response[..., :5]
+        return self.response[..., 5:] if c.kind == "cross_talk" else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Point:
+    """Restricted likelihood for given variances, and what it was made from."""
+
+    components: tuple[Component, ...]
+    theta: Array
+    noise: Noise
+    WJ: Array
+    """(n, 6, m) inverse covariance times derivative."""
+    u: Array
+    """(n, 6) inverse covariance times residuals of the best parameters."""
+    C: Array
+    """(m, m) covariance of the free parameters."""
+    step: Array
+    """(m,) from where the problem was linearised to the best parameters."""
+    loglik: float
+
+    @property
+    def worth(self) -> float:
+        """The log-likelihood less what each component must bring."""
+        return self.loglik - sum(c.needed for c in self.components)
+
+    def left_out(self) -> tuple[Array, Array]:
+        """Residual (n, 6) of each pose when all others predict it, and its covariance (n, 6, 6)."""
+        return left_out(self.noise, self.WJ, self.u, self.C)
+
+
+def left_out(noise: Noise, WJ: Array, u: Array, C: Array) -> tuple[Array, Array]:
+    """Predict every pose from all others, drift and correlation included, without fitting again.
+
+    The exact leave-one-out of the linear model, and the prediction of poses that do not count: `P_kk^-1 (P y)_k` with
+    `P = W - W J C J' W`, W the inverse noise.
+
+    Parameters
+    ----------
+    noise : Noise
+    WJ : array, shape (n, 6, m)
+    u : array, shape (n, 6)
+        Inverse noise times the residuals.
+    C : array, shape (m, m)
+
+    Returns
+    -------
+    residuals : array, shape (n, 6)
+    covariance : array, shape (n, 6, 6)
+        Noise of the pose and uncertainty of its prediction: very large where the others determine nothing.
+    """
+    P = noise.blocks - WJ @ C @ np.swapaxes(WJ, 1, 2)
+    rejected = ~noise.kept
+    P[~rejected] += 1e-10 * noise.W[~rejected]  # however badly the others determine it
+    S = np.linalg.inv(P)
+    e = (S @ u[..., None])[..., 0]
+    if rejected.any():
+        S[rejected] -= np.linalg.inv(noise.W[rejected]) - noise.D[rejected]
+    return np.asarray(e), np.asarray(S + np.swapaxes(S, 1, 2)) / 2
+
+
+def squared_length(e: Array, S: Array) -> Array:
+    """Square residuals (n, 6) in units of their covariance (n, 6, 6)."""
+    return np.asarray((np.linalg.solve(S, e[..., None])[..., 0] * e).sum(axis=1))
+
+
+def point(problem: Linearised, components: Sequence[Component], theta: Array) -> Point:
+    """Evaluate the restricted likelihood."""
+    noise = noise_of(problem, components, theta)
+    m = problem.J.shape[2]
+    X = np.concatenate([problem.J, problem.r[..., None]], axis=2)
+    WX = noise.solve(X)
+    G = summed_products(X, WX)
+    H, g = G[:m, :m] + problem.prior[0], G[:m, m] + problem.prior[1]
+    scale = np.sqrt(np.diag(H))
+    value, vector = np.linalg.eigh(H / np.outer(scale, scale))
+    value = np.maximum(value, 1e-14 * value[-1])
+    root = vector / np.sqrt(value) / scale[:, None]
+    C = root @ root.T
+    step = C @ g
+    logdet = noise.logdet + float(np.log(value).sum() + 2 * np.log(scale).sum())
+    loglik = -0.5 * (logdet + float(G[m, m] - g @ step))
+    return Point(tuple(components), theta, noise, WX[..., :m], WX[..., m] - WX[..., :m] @ step, C, step, loglik)
+
+
+def noise_of(problem: Linearised, components: Sequence[Component], theta: Array) -> Noise:
+    """Give the covariance with these variances."""
+    D, walk, slope = problem.D, np.zeros(6), problem.slope
+    effects = []
+    for c, value in zip(components, theta, strict=True):
+        columns = problem.columns(c)
+        if columns is not None:
+            effects.append((columns, np.full(columns.shape[2], value)))
+        elif c.kind == "walk":
+            walk += value * np.array(c.share)
+        elif c.kind == "rotation":
+            D = D + value * problem.turn @ np.swapaxes(problem.turn, 1, 2)
+        else:
+            white = value * np.diag(c.share)
+            D = D + white if D.strides[0] else np.broadcast_to(D[0] + white, D.shape)
+    joined = [np.concatenate(parts, axis=-1) for parts in zip(*effects, strict=True)]
+    together = (joined[0], joined[1]) if joined else None
+    return Noise(D, problem.time, np.sqrt(walk), slope, together, problem.kept)
+
+
+def _score(problem: Linearised, at: Point) -> tuple[Array, Array]:
+    """Derivative (k,) of the restricted log-likelihood by the log variances, and average information (k, k)."""
+    u, WJ, C, noise = at.u, at.WJ, at.C, at.noise
+    WJC = WJ @ C
+    P = noise.blocks - WJC @ np.swapaxes(WJ, 1, 2)
+    of_all = {c: T for c in at.components if (T := problem.columns(c)) is not None}
+    PT = {c: noise.solve(T) - WJC @ summed_products(WJ, T) for c, T in of_all.items()}
+    kept = int(problem.kept.sum())
+    slope, Vu = [], []
+    for c, theta in zip(at.components, at.theta, strict=True):
+        share = np.array(c.share)
+        if c in of_all:
+            T = of_all[c]
+            along = np.tensordot(u, T, 2)
+            square, trace = float(along @ along), float(np.vdot(T, PT[c]))
+            Vu.append(theta * (T @ along))
+        elif c.kind == "white":
+            square, trace = float((u**2).sum(axis=0) @ share), float(np.einsum("ncc,c->", P, share))
+            Vu.append(theta * share * u)
+        elif c.kind == "rotation":
+            turned = (u[:, None] @ problem.turn)[:, 0]
+            square, trace = float((turned**2).sum()), float(np.vdot(problem.turn, P @ problem.turn))
+            Vu.append(theta * (problem.turn @ turned[..., None])[..., 0])
+        else:
+            square = float(walk_square(problem.time, u) @ share)
+            # K P = (V - D - effects) P, and V P = 1 - J C J' W.
+            own = np.flatnonzero(share)
+            others = np.einsum("nck,nck->", problem.J[:, own], WJC[:, own])
+            others += np.einsum("ncd,ndc->", noise.D[:, own], P[:, :, own])
+            for other, value in zip(at.components, at.theta, strict=True):
+                if other in of_all:
+                    others += value * np.vdot(of_all[other][:, own], PT[other][:, own])
+            trace = (kept * len(own) - float(others)) / theta
+            Vu.append(theta * share * walk_times(problem.time, u))
+        slope.append(theta * (square - trace) / 2)
+    X = np.stack(Vu, axis=-1)
+    WX = noise.solve(X)
+    JWX = summed_products(WJ, X)
+    information = (summed_products(X, WX) - JWX.T @ C @ JWX) / 2
+    return np.array(slope), np.asarray(information)
+
+
+def maximise(problem: Linearised, components: Sequence[Component], theta: Array) -> Point:
+    """Climb to the best variances from these (k,), all positive."""
+    if not components:
+        return point(problem, components, theta)
+    most = np.array([LARGEST.get(c.kind, np.inf) for c in components])
+    best = point(problem, components, np.minimum(theta, most))
+    least = np.minimum(1e-3 * NEGLIGIBLE * np.array([_unit(problem, best, c) for c in components]), most)
+    caution = 1e-3
+    for _ in range(60):
+        slope, information = _score(problem, best)
+        gained = 0.0
+        while caution < 1e6:
+            damped = information + np.diag(caution * (np.diag(information) + 1e-3))
+            step = np.clip(np.linalg.solve(damped, slope), -2.5, 2.5)
+            trial = point(problem, components, np.clip(best.theta * np.exp(step), least, most))
+            gained = trial.loglik - best.loglik
+            if gained >= 0 or np.abs(step).max() < 1e-4:
+                break
+            caution *= 10
+        if gained > 0:
+            best, caution = trial, max(caution / 10, 1e-6)
+        if (gained < 1e-3 and np.abs(step).max() < 0.05) or gained < 1e-6:
+            break
+        # What sinks without changing the likelihood has left: it will be dropped.
+        if gained < 1e-2 and (slope < 0.05).all():
+            break
+    return best
+
+
+def select(
+    problem: Linearised,
+    components: Sequence[Component],
+    theta: Array,
+    candidates: Sequence[Component],
+    needed: int | None = None,
+) -> Point:
+    """Add the candidates that the data ask for, one by one, then drop those that others make needless.
+
+    Parameters
+    ----------
+    problem : Linearised
+    components : sequence of Component
+        To start from.
+    theta : array, shape (k,)
+        Their variances.
+    candidates : sequence of Component
+    needed : int, optional
+        How many of the components, the first, are part of the model; by default all.
+    """
+    needed = len(components) if needed is None else needed
+    best = _pruned(problem, maximise(problem, components, theta), needed)
+    waiting = [c for c in candidates if c not in best.components]
+    while waiting:
+        gains, start = predicted_gains(problem, best, waiting)
+        k = int(np.argmax(gains))
+        if gains[k] < WORTH_A_TRY:
+            break
+        # Walks that are as good as certain come in together: each channel has its own.
+        certain = gains > SURE if waiting[k].kind == "walk" else np.zeros(len(gains), bool)
+        together = [i for i, c in enumerate(waiting) if i == k or (c.kind == "walk" and certain[i])]
+        trial = maximise(
+            problem, [*best.components, *(waiting[i] for i in together)], np.append(best.theta, start[together])
+        )
+        too_large = any(v >= LARGEST.get(c.kind, np.inf) for c, v in zip(trial.components, trial.theta, strict=True))
+        if trial.loglik > best.loglik + waiting[k].needed and not too_large:
+            best = trial
+        waiting = [c for i, c in enumerate(waiting) if i not in together]
+    return _pruned(problem, best, needed)
+
+
+def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
+    """Try a linear drift of the same groups in place of random walks; keep what is likelier."""
+    walks = [k for k, c in enumerate(best.components) if c.kind == "walk"]
+    if not walks:
+        return best
+    rest = [k for k in range(len(best.components)) if k not in walks]
+    groups = [g for g in (FORCE, TORQUE) if any(best.components[k].share[c] for k in walks for c in g)]
+    slopes = [component("slope", group) for group in groups]
+    start = [
+        len(problem.r) * max(best.theta[k] for k in walks if any(best.components[k].share[c] for c in g))
+        for g in groups
+    ]
+    components = [*(best.components[k] for k in rest), *slopes]
+    trial = maximise(problem, components, np.append(best.theta[rest], start))
+    return _pruned(problem, trial, needed) if trial.loglik > best.loglik else best
+
+
+def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
+    """Drop what is not worth its place, one at a time."""
+    k = needed
+    while k < len(best.components):
+        rest = [i for i in range(len(best.components)) if i != k]
+        components, theta = [best.components[i] for i in rest], best.theta[rest]
+        without = point(problem, components, theta)  # the others can make good a part of what is lost
+        if best.loglik - without.loglik < SURE:
+            without = maximise(problem, components, theta)
+        if without.worth > best.worth:
+            best, k = without, needed
+        else:
+            k += 1
+    return best
+
+
+def predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Component]) -> tuple[Array, Array]:
+    """Gain in log-likelihood that each candidate alone promises, and where to start climbing."""
+    unit = np.array([_unit(problem, best, c) for c in waiting])
+    at = point(problem, [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * unit]))
+    slope, information = _score(problem, at)
+    k = len(best.components)
+    curvature, slope_k = np.diag(information)[k:], slope[k:]
+    if k:
+        known = np.linalg.lstsq(information[:k, :k], np.column_stack([information[:k, k:], slope[:k]]))[0]
+        curvature = curvature - np.einsum("ki,ki->i", information[:k, k:], known[:, :-1])
+        slope_k = slope_k - information[:k, k:].T @ known[:, -1]
+    gains = np.where(slope_k > 0, slope_k**2 / (2 * np.maximum(curvature, 1e-300)), 0.0)
+    return gains, unit
+
+
+def _unit(problem: Linearised, best: Point, c: Component) -> float:
+    """Variance at which a component is about as large as the white noise."""
+    variance = np.diagonal(best.noise.D[problem.kept], axis1=1, axis2=2).mean(axis=0)
+    n = int(problem.kept.sum())
+    columns = problem.columns(c) if c.kind != "slope" else None
+    if columns is not None or c.kind == "rotation":
+        columns = problem.turn if columns is None else np.sqrt(n) * columns
+        return float(1 / np.max((columns[problem.kept] ** 2).mean(axis=(0, 2)) / variance))
+    share = np.array(c.share)
+    return float((variance * share).sum() / share.sum()) / (n if c.kind == "walk" else 1)

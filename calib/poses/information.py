@@ -1,0 +1,343 @@
+"""What a set of poses will be worth, before anything has moved, and sets that are known to be good.
+
+The Fisher information of the model depends on the orientations, on a guess of the tool and on the noise, not on any
+reading. Designs hardly depend on the guess; predictions in newtons and radians do. Which poses to take from those an
+arm can reach is the matter of `calib.poses.selection`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from calib.assessment.observability import second_minimum
+from calib.likelihood.rotation_minima import given_rotation
+from calib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict, read_only, skew
+from calib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
+
+OBSERVABLE = 1e-9
+"""Smallest eigenvalue of the scaled information, as a share of the largest, that still counts."""
+
+TOOL_DOWN_R_base_flange = np.diag([1.0, -1.0, -1.0])
+
+T12 = (1, 2, 5, 6, 11, 12, 15, 16, 17, 18, 21, 22)
+"""Numbers of the tetrahedral subgroup of the paper's 24 orientations: per pose as good as all 24, for every tool."""
+SUBSET_12 = (2, 4, 5, 7, 10, 12, 13, 15, 18, 20, 21, 23)
+"""A-optimal for the forces; with torques 0.96 to 1 of `T12`, depending on where the centre of mass lies."""
+SUBSET_8 = (2, 3, 6, 8, 17, 19, 22, 23)
+"""As good as eight of the 24 can be: second-basin gap 0.5."""
+SUBSET_6 = (9, 10, 16, 19, 21, 22)
+"""Nearly the best six of the 24 that have one solution, second-basin gap 0.28; `optimised(6)` is better."""
+AMBIGUOUS_6 = (4, 6, 9, 15, 18, 23)
+"""A-optimal for the forces, but another mounting of the sensor explains them exactly (gap 0): do not use."""
+
+# Found by tests/benchmarks/design_table.py --optimise; rotation vectors in rad of R_base_flange, tool down first.
+_OPTIMISED: Mapping[int, tuple[tuple[float, float, float], ...]] = {
+    6: (
+        (3.141593, 0.000000, 0.000000),
+        (-0.435672, 1.905989, -1.760305),
+        (-1.130622, -1.904908, -1.547113),
+        (0.914169, -0.138790, -1.156033),
+        (-0.774574, 1.437738, 1.067425),
+        (0.000059, -0.860257, 1.088217),
+    ),
+    8: (
+        (3.141593, 0.000000, 0.000000),
+        (0.001302, 3.140850, -0.006137),
+        (1.010150, -0.991248, 1.652328),
+        (-1.184080, 0.401703, 0.653962),
+        (0.490081, 1.439710, -2.023385),
+        (0.793096, -1.522294, -2.392674),
+        (1.096127, 0.574306, 0.209976),
+        (-0.909292, -0.925868, -1.044533),
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Guess:
+    """What is expected of tool, noise and base. Angles and offsets as in a calibration file."""
+
+    mass_kg: float
+    """Of all that hangs on the measuring side."""
+    sigma_force_N: float
+    """Standard deviation of one axis in the mean of one pose."""
+    sigma_torque_Nm: float
+    p_sensor_com_m: ArrayLike = (0.0, 0.0, 0.08)
+    R_flange_sensor: ArrayLike = field(default_factory=lambda: np.eye(3))
+    tilt_alpha_rad: float = 0.0
+    tilt_beta_rad: float = 0.0
+    walk_force_N: float = 0.0
+    """Standard deviation of how far each axis of the force bias wanders from one pose to the next."""
+    walk_torque_Nm: float = 0.0
+    g_m_s2: float = STANDARD_GRAVITY_M_S2
+
+    def __post_init__(self) -> None:
+        for name in ("mass_kg", "sigma_force_N", "sigma_torque_Nm", "g_m_s2"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}, expected a guess above zero")
+        for name in ("walk_force_N", "walk_torque_Nm"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"{name} is {value}, expected zero or more")
+
+    @property
+    def weight_N(self) -> float:
+        """Mass times gravity."""
+        return self.mass_kg * self.g_m_s2
+
+    @property
+    def parameters(self) -> Parameters:
+        """The guess as parameters, without bias: information does not depend on it."""
+        alpha, beta = self.tilt_alpha_rad, self.tilt_beta_rad
+        down = -np.array([np.cos(alpha) * np.sin(beta), -np.sin(alpha), np.cos(alpha) * np.cos(beta)])
+        R_flange_sensor = np.asarray(self.R_flange_sensor, dtype=np.float64)
+        p_sensor_com_m = np.asarray(self.p_sensor_com_m, dtype=np.float64)
+        return Parameters(R_flange_sensor, self.weight_N * down, np.zeros(3), p_sensor_com_m, np.zeros(3))
+
+    @property
+    def scale(self) -> Array:
+        """(15,) units that make the error coordinates comparable: 1 rad, weight, weight, lever, weight times lever.
+
+        The lever is |P|, or the ratio of torque to force noise where that is longer.
+        """
+        lever_m = max(float(np.linalg.norm(self.p_sensor_com_m)), self.sigma_torque_Nm / self.sigma_force_N)
+        return np.repeat([1.0, self.weight_N, self.weight_N, lever_m, self.weight_N * lever_m], 3)
+
+    @property
+    def wrench_sigma(self) -> Array:
+        """(6,) standard deviations, N and N·m."""
+        return np.repeat([self.sigma_force_N, self.sigma_torque_Nm], 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """What a calibration from given poses will reach, as far as noise explains it."""
+
+    n_poses: int
+    sigma: Mapping[str, Array | float]
+    """One standard deviation under the names of `CalibrationResult.sigma`; infinite where the poses do not tell."""
+    force_rms_N: float
+    """Error of the compensation (norm), root mean square over all orientations."""
+    torque_rms_Nm: float
+    cond9: float
+    """Condition of the nine force parameters' equations: 1.22 at best, above 4 fair, above 8 poor."""
+    cond_u1: float
+    """Condition of gravity directions beside a constant, which LROM needs: 1.7 at best, above 8 fair, above 25 poor."""
+    second_basin_gap: float
+    """See `second_basin_gap`."""
+
+
+class Efficiency(NamedTuple):
+    """Information per pose relative to the 24 special orientations: 1 is the best possible."""
+
+    D: float
+    """From the determinant of the information, per parameter."""
+    A: float
+    """From the trace of the covariance in the units of `Guess.scale`."""
+    I_F: float
+    """From the mean square error of force compensation over all orientations."""
+    I_T: float
+    """The same of torque."""
+
+
+def special(numbers: Sequence[int]) -> Array:
+    """Give the orientations R_base_flange (n, 3, 3) of these numbers, 1 to 24, of the paper (Yu, eq. 14)."""
+    return np.swapaxes(SPECIAL_R_flange_base[np.asarray(numbers) - 1], 1, 2)
+
+
+def optimised(n: int) -> Array:
+    """Give n orientations R_base_flange (n, 3, 3), n = 6 or 8, nearly as good per pose as the special 24.
+
+    They have the least mean of inverse efficiencies for centres of mass in all directions. The first has the tool
+    straight down. Turning the whole set about the vertical, or by one rotation of the flange, keeps its worth.
+    """
+    if n not in _OPTIMISED:
+        raise ValueError(f"there is no stored set of {n} poses: take {' or '.join(map(str, _OPTIMISED))}, or `choose`")
+    return Rotation.from_rotvec(_OPTIMISED[n]).as_matrix()
+
+
+def whitened_jacobian(R_base_flange: Array, guess: Guess) -> Array:
+    """Jacobian (n, 6, 15) in noise standard deviations per unit of `Guess.scale`: its square is the information."""
+    return np.asarray(jacobian(guess.parameters, R_base_flange) * guess.scale / guess.wrench_sigma[:, None])
+
+
+def information(J: Array, guess: Guess) -> Array:
+    """Fisher information (15, 15) of a whitened Jacobian (n, 6, 15) whose rows are in the order of measuring.
+
+    With a wandering bias the bias parameters are those at the last pose.
+    """
+    n = len(J)
+    before_last = np.arange(n)[::-1]
+    halves = []
+    walks = guess.walk_force_N / guess.sigma_force_N, guess.walk_torque_Nm / guess.sigma_torque_Nm
+    for walk, rows in zip(walks, (J[:, :3], J[:, 3:]), strict=True):
+        flat = rows.reshape(n, 3 * J.shape[2])
+        if walk:
+            noise = np.eye(n) + walk**2 * np.minimum.outer(before_last, before_last)
+            flat = np.linalg.solve(np.linalg.cholesky(noise), flat)
+        halves.append(flat.reshape(-1, J.shape[2]))
+    stacked = np.concatenate(halves)
+    return np.asarray(stacked.T @ stacked)
+
+
+def predicted_sigma(R_base_flange: Array, guess: Guess, t_s: ArrayLike | None = None) -> Prediction:
+    """Predict the uncertainty of a calibration from its poses (Cramér-Rao bound of the joint model).
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+        In the order of measuring, which matters where the guess lets the bias wander.
+    guess : Guess
+    t_s : array_like, shape (n,), optional
+        When the poses are taken: a linear drift of all six channels is then estimated too, and biases are those at
+        the mean time.
+
+    Returns
+    -------
+    Prediction
+    """
+    R_base_flange = np.asarray(R_base_flange, dtype=np.float64)
+    J = whitened_jacobian(R_base_flange, guess)
+    if t_s is not None:
+        J = np.concatenate([J, _drift_columns(t_s)], axis=2)
+    H = information(J, guess)
+    if t_s is not None:
+        H = H[:15, :15] - H[:15, 15:] @ np.linalg.pinv(H[15:, 15:], hermitian=True) @ H[15:, :15]
+    variance = _Variance(H, guess.scale)
+
+    std = np.sqrt(variance(np.eye(15)))
+    weight, alpha, beta = np.sqrt(variance(_weight_and_tilt_rows(guess))).tolist()
+    everywhere = jacobian(guess.parameters, special(range(1, 25)))
+    force, torque = (variance(everywhere[:, k].reshape(-1, 15)).sum() / 24 for k in (slice(3), slice(3, 6)))
+    u = predict(guess.parameters, R_base_flange)[:, :3] / guess.weight_N
+    return Prediction(
+        n_poses=len(R_base_flange),
+        sigma={
+            "R_flange_sensor": read_only(std[0:3]),
+            "gravity_force_base_N": read_only(std[3:6]),
+            "force_bias_N": read_only(std[6:9]),
+            "p_sensor_com_m": read_only(std[9:12]),
+            "torque_bias_Nm": read_only(std[12:15]),
+            "weight_N": weight,
+            "mass_kg": weight / guess.g_m_s2,
+            "tilt_alpha_rad": min(alpha, float(np.pi)),
+            "tilt_beta_rad": min(beta, float(np.pi)),
+        },
+        force_rms_N=float(np.sqrt(force)),
+        torque_rms_Nm=float(np.sqrt(torque)),
+        cond9=_condition(force_rows(R_base_flange, guess).reshape(-1, 9)),
+        cond_u1=_condition(np.column_stack([u, np.ones(len(u))])),
+        second_basin_gap=second_basin_gap(R_base_flange, guess),
+    )
+
+
+def efficiency(R_base_flange: Array, guess: Guess) -> Efficiency:
+    """Compare the information per pose with that of the 24 special orientations.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+        A set that determines all parameters.
+    guess : Guess
+        Its noise only matters through the ratio of torque to force noise.
+    """
+    own, best = (_per_pose(R, guess) for R in (np.asarray(R_base_flange, dtype=np.float64), special(range(1, 25))))
+    return Efficiency(*(b / o for o, b in zip(own, best, strict=True)))
+
+
+def _per_pose(R_base_flange: Array, guess: Guess) -> tuple[float, float, float, float]:
+    """Give the variances whose inverses are D, A, I_F and I_T, for the information of one average pose."""
+    J = whitened_jacobian(R_base_flange, guess)
+    covariance = np.linalg.inv(np.einsum("nki,nkj->ij", J, J) / len(J))
+    _, log_det = np.linalg.slogdet(covariance)
+    force, torque = (float(np.sum(covariance * M)) for M in prediction_weights(special(range(1, 25)), guess))
+    return float(np.exp(log_det / 15)), float(np.trace(covariance)), force, torque
+
+
+def prediction_weights(R_base_flange: Array, guess: Guess) -> tuple[Array, Array]:
+    """Matrices (15, 15) whose sum with a covariance is the mean square error over these orientations.
+
+    In the units of `Guess.scale`; of force, in sigma_force_N², and of torque, in sigma_torque_Nm².
+    """
+    J = whitened_jacobian(R_base_flange, guess)
+    force, torque = (np.einsum("nki,nkj->ij", rows, rows) / len(J) for rows in (J[:, :3], J[:, 3:]))
+    return force, torque
+
+
+def second_basin_gap(R_base_flange: Array, guess: Guess) -> float:
+    """Say how clearly the forces decide between the true mounting and the best other one.
+
+    Fit exact forces of the guessed tool with every rotation: the gap is the lowest residual sum of squares of a second
+    minimum, divided by n weight². 8/9 for the special 24, below 0.05 weak, 0 exactly ambiguous (all tool axes at one
+    angle to the vertical, or too few poses). The second solution's chi2 is larger by gap n (weight / sigma_force_N)².
+    """
+    return second_basin(R_base_flange, guess)[0]
+
+
+def second_basin(R_base_flange: Array, guess: Guess) -> tuple[float, Parameters | None]:
+    """Give the gap of `second_basin_gap` and the other solution, None where there is not just one; infinite if none."""
+    if len(R_base_flange) < 3:
+        return 0.0, None  # there is a continuum of solutions
+    gap, other = second_minimum(R_base_flange, guess.parameters)
+    if other is None:
+        return gap, None
+    wrench, R = predict(guess.parameters, R_base_flange), other.R
+    gravity_N, bias_N = given_rotation(R, R_base_flange, wrench[:, :3], np.ones(len(wrench)))
+    com_m, torque_bias_Nm = com_and_torque_bias(gravity_N @ R_base_flange @ R.T, wrench[:, 3:])
+    return gap, Parameters(R.T, gravity_N, bias_N, com_m, torque_bias_Nm)
+
+
+def force_rows(R_base_flange: Array, guess: Guess) -> Array:
+    """Force equations (n, 3, 9) of rotation, weight and bias per weight: [-R [g]x, R A, 1]."""
+    return np.asarray((jacobian(guess.parameters, R_base_flange) * guess.scale / guess.weight_N)[:, :3, :9])
+
+
+class _Variance:
+    """Variances of linear functions of the error coordinates; infinite where the information has no answer."""
+
+    def __init__(self, information: Array, scale: Array) -> None:
+        eigenvalues, V = np.linalg.eigh(information)
+        observable = eigenvalues > OBSERVABLE * eigenvalues[-1]
+        self._scale = scale
+        self._root = V[:, observable] / np.sqrt(eigenvalues[observable])
+        self._null = V[:, ~observable]
+
+    def __call__(self, rows: Array) -> Array:
+        """(k,) variances of rows (k, 15) times the error."""
+        scaled = rows * self._scale
+        blind = ((scaled @ self._null) ** 2).sum(axis=1) > OBSERVABLE * (scaled**2).sum(axis=1)
+        return np.where(blind, np.inf, ((scaled @ self._root) ** 2).sum(axis=1))
+
+
+def _drift_columns(t_s: ArrayLike) -> Array:
+    """Derivative (n, 6, 6) of the whitened wrench by a linear drift of each channel; zero without passing of time."""
+    t = np.asarray(t_s, dtype=np.float64)
+    since = t - t.mean()
+    return np.asarray(np.multiply.outer(since / (np.abs(since).max() or 1.0), np.eye(6)))
+
+
+def _weight_and_tilt_rows(guess: Guess) -> Array:
+    """Derivatives (3, 15) of weight, alpha and beta by the error coordinates."""
+    F_b = guess.parameters.gravity_force_base_N
+    turn = skew(F_b / guess.weight_N**2)  # of a small rotation of F_b: cross(F_b, dF_b) / weight²
+    alpha, beta = guess.tilt_alpha_rad, guess.tilt_beta_rad
+    axis_of_alpha = np.array([np.cos(beta), 0.0, -np.sin(beta)])
+    rows = np.zeros((3, 15))
+    rows[0, 3:6] = F_b / guess.weight_N
+    rows[1, 3:6] = axis_of_alpha @ turn
+    rows[2, 3:6] = np.array([0.0, 1.0, 0.0]) @ turn / max(np.cos(alpha) ** 2, OBSERVABLE)
+    return rows
+
+
+def _condition(M: Array) -> float:
+    """Condition number; infinite where a column is not determined."""
+    singular = np.linalg.svd(M, compute_uv=False)
+    columns = M.shape[1]
+    if len(singular) < columns or singular[-1] <= OBSERVABLE * singular[0]:
+        return float("inf")
+    return float(singular[0] / singular[-1])

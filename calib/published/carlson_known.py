@@ -1,0 +1,195 @@
+"""Carlson's methods for a known gravity vector, from forces alone, and Umeyama's solution of the same problem.
+
+F. Bagge Carlson, "On the Calibration of Force/Torque Sensors in Robotics", 2019, section 2. Letters and the two forms,
+without and with a bias, are those of `calib.published.carlson`; a bias that the form without bias does not know has
+the same effect here (Cayley transform: 22 deg when the bias is as large as the weight).
+
+"Known" means exact: when the base is tilted by 2 deg more than assumed, the result is wrong and nothing shows it.
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.errors import BadDataset, NotObservable
+from calib.model import nearest_rotation, skew
+from calib.published.carlson import (
+    Array,
+    ForceEquations,
+    ForceFit,
+    force_equations,
+    require_weight,
+    spanned_dimensions,
+)
+
+
+def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Array, *, bias: bool) -> ForceFit:
+    """Weight and rotation by convex relaxation, gravity known in direction (eq. 3 and appendix A).
+
+    The linear unknown is the matrix `X / weight`, nine free numbers, with `(X / weight) f_i = A_i d`. (Eq. 3 calls it
+    mR; it is (1/m) R_TF^S, and R_TF^S is the inverse of the R_S^TF of eq. 1.) The noise of the regressor f shrinks it
+    by a symmetric factor, which the projection on SO(3) removes; the weight is then the least-squares one given X.
+    Consistent, but `similarity` is better when the tool cannot be turned all ways.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+    force_N : array, shape (n, 3)
+        Sensor axes.
+    gravity_direction_base : array, shape (3,)
+        Down, in base axes, of any length.
+    bias : bool
+        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+
+    Raises
+    ------
+    NotObservable
+        Fewer than 3 poses (4 with bias), or gravity that does not change along all three flange axes.
+    BadDataset
+        The forces point against the given gravity.
+    """
+    down = _direction(gravity_direction_base)
+    eq = force_equations(R_base_flange, force_N, bias=bias, method="the relaxation", min_poses=3)
+    a = eq.A @ down
+    _require_usable(eq, a, 3)
+    R_sensor_flange = nearest_rotation(np.asarray(np.linalg.lstsq(eq.f, a)[0], dtype=np.float64))
+    weight_N = _weight(eq.f, a, R_sensor_flange)
+    return eq.fit(R_sensor_flange.T, weight_N * down)
+
+
+def cayley(
+    R_base_flange: Array, force_N: Array, gravity_force_base_N: Array, *, bias: bool, total: bool = True
+) -> ForceFit:
+    """Rotation by the Cayley transform, gravity known with the weight (eqs. 6-11).
+
+    The transform fails for rotations by 180 deg and is poor near them, so it is applied after each of four turns of
+    the flange axes (by 0, and by 180 deg about x, y and z) and the best fit is kept; `cayley_rotation` is the published
+    one. An error of the weight goes into the rotation: 10 % leave |dR|_F^2 at 1e-5 however small the noise.
+    `relaxation` and `similarity` need no weight.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+    force_N : array, shape (n, 3)
+        Sensor axes.
+    gravity_force_base_N : array, shape (3,)
+        Weight of what hangs on the sensor, in base axes; returned as given.
+    bias : bool
+        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+    total : bool
+        Total least squares, as the paper recommends, or ordinary.
+
+    Raises
+    ------
+    NotObservable
+        Fewer than 2 poses (3 with bias), or gravity that changes along one flange axis only.
+    BadDataset
+        The forces point against the given gravity.
+    """
+    gravity = np.array(gravity_force_base_N, dtype=np.float64)
+    down = _direction(gravity)
+    eq = force_equations(R_base_flange, force_N, bias=bias, method="the Cayley transform", min_poses=2)
+    a = eq.A @ gravity
+    _require_usable(eq, eq.A @ down, 2)
+    turns = [np.diag(signs) for signs in ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))]
+    candidates = [cayley_rotation(eq.f, a @ turn, total=total) @ turn for turn in turns]
+    R_sensor_flange = min(candidates, key=lambda R: float(np.sum((eq.f - a @ R.T) ** 2)))
+    return eq.fit(R_sensor_flange.T, gravity)
+
+
+def cayley_rotation(f: Array, a: Array, *, total: bool) -> Array:
+    """Rotation R with `f_i = R a_i` by one Cayley transform, as published (eqs. 7-11).
+
+    `R = (I + <s>)^-1 (I - <s>)` makes the problem linear in s: `<f_i + a_i> s = f_i - a_i`. (Eq. 11 has the opposite
+    right-hand side because `<a> b = <b> a` lacks a sign; as printed it gives the transpose.) The noise of f is in the
+    regressor too, hence total least squares: the least singular vector of `[<f + a>, a - f]` is (s, 1) times a factor.
+    Either way (-s, 1) is the quaternion of R, scalar last, up to its length.
+
+    Parameters
+    ----------
+    f, a : array, shape (n, 3)
+        With a bias, both less their means.
+    total : bool
+        Total or ordinary least squares; noise makes the latter's s too small.
+
+    Returns
+    -------
+    array, shape (3, 3)
+    """
+    regressor = skew(f + a).reshape(-1, 3)
+    target = (f - a).ravel()
+    if total:
+        s = np.linalg.svd(np.column_stack([regressor, -target]), full_matrices=False)[2][-1]
+    else:
+        s = np.append(np.linalg.lstsq(regressor, target)[0], 1)
+    return Rotation.from_quat([*-s[:3], s[3]]).as_matrix()
+
+
+def similarity(R_base_flange: Array, force_N: Array, gravity_direction_base: Array, *, bias: bool) -> ForceFit:
+    """Weight and rotation, gravity known in direction, as the similarity between the directions `A_i d` and forces f_i.
+
+    S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE PAMI 13(4),
+    1991, eqs. 39-42. Not in Carlson's paper and better: the exact least-squares solution for rotation, weight and bias.
+    With the tool within 40 deg of straight down its mean square error of R is the smallest possible (0.95-1.02 times
+    the bound), that of `relaxation` 4 to 6 times as large, and that of the total least squares with a bias column in
+    Carlson's Robotlib 6 to 4000 times, depending on the mass it is told and on the size of the bias.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+    force_N : array, shape (n, 3)
+        Sensor axes.
+    gravity_direction_base : array, shape (3,)
+        Down, in base axes, of any length.
+    bias : bool
+        Estimate the force bias too, or take it to be zero (see the module).
+
+    Raises
+    ------
+    NotObservable
+        Fewer than 2 poses (3 with bias), or gravity that changes along one flange axis only.
+    BadDataset
+        The forces point against the given gravity.
+    """
+    down = _direction(gravity_direction_base)
+    eq = force_equations(R_base_flange, force_N, bias=bias, method="the similarity solution", min_poses=2)
+    a = eq.A @ down
+    _require_usable(eq, a, 2)
+    R_sensor_flange = nearest_rotation(eq.f.T @ a)
+    weight_N = _weight(eq.f, a, R_sensor_flange)
+    return eq.fit(R_sensor_flange.T, weight_N * down)
+
+
+def _weight(f: Array, a: Array, R_sensor_flange: Array) -> float:
+    """Least-squares factor from R a_i to f_i."""
+    return float(np.sum(f * (a @ R_sensor_flange.T)) / np.sum(a**2))
+
+
+def _direction(vector: Array) -> Array:
+    length = np.linalg.norm(vector)
+    if not length > 0:
+        raise ValueError(f"a gravity direction must have a length, got {vector}")
+    return np.asarray(vector / length)
+
+
+def _require_usable(eq: ForceEquations, a: Array, needed: int) -> None:
+    """The spread is judged on the known directions a (n, 3): noise of the forces would hide a degenerate pose set."""
+    spanned = spanned_dimensions(a, len(a) ** 0.5)
+    if spanned < needed:
+        raise NotObservable(
+            f"gravity changes along only {spanned} of the {needed} flange axes needed: add poses that tilt the tool "
+            "about another axis"
+        )
+    require_weight(eq)
+    _require_pull_downwards(eq.f, a)
+
+
+def _require_pull_downwards(f: Array, a: Array) -> None:
+    """No rotation may explain the forces f (n, 3) much better with gravity -a than the best one does with a (n, 3)."""
+    residual, reversed_residual = (
+        float(np.sum((f - _weight(f, side, R) * side @ R.T) ** 2))
+        for side, R in ((a, nearest_rotation(f.T @ a)), (-a, nearest_rotation(-f.T @ a)))
+    )
+    if residual > 4 * reversed_residual + 1e-12 * float(np.sum(f**2)):
+        raise BadDataset(
+            "the forces point against the given gravity: check the sign of the sensor and how the base is mounted"
+        )

@@ -1,0 +1,79 @@
+"""A load that shifts in mid-run: found, told, and refused where poses of both loads were used."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationDataset, CalibrationResult, solve
+from calib.model import Parameters, predict
+from calib.published.yu import SPECIAL_R_flange_base
+
+Array = NDArray[np.float64]
+
+ORIENTATIONS = np.swapaxes(SPECIAL_R_flange_base, 1, 2)[np.random.default_rng(0).permutation(24)]
+SIGMA = np.repeat([0.002, 1e-4], 3)
+TOOL = Parameters(
+    R_flange_sensor=Rotation.from_euler("z", 30, degrees=True).as_matrix(),
+    gravity_force_base_N=np.array([0.1, -0.2, -12.0]),
+    force_bias_N=np.array([3.0, -2.0, 5.0]),
+    p_sensor_com_m=np.array([0.004, -0.003, 0.06]),
+    torque_bias_Nm=np.array([0.2, 0.1, -0.3]),
+)
+SHIFTED = replace(TOOL, p_sensor_com_m=TOOL.p_sensor_com_m + np.array([0.001, 0.002, 0]))
+LIGHTER = replace(TOOL, gravity_force_base_N=0.97 * TOOL.gravity_force_base_N)
+TARED = replace(TOOL, force_bias_N=TOOL.force_bias_N - 0.3)
+
+
+def session(after: Parameters, position: int, seed: int, rows: NDArray[np.int64] | None = None) -> CalibrationResult:
+    """24 poses, of which those from a place on are of another tool; `rows` tells where each stands in the dataset."""
+    wrench = predict(TOOL, ORIENTATIONS)
+    wrench[position:] = predict(after, ORIENTATIONS[position:])
+    wrench += np.random.default_rng(seed).normal(0, SIGMA, wrench.shape)
+    order = np.arange(24) if rows is None else rows
+    dataset = CalibrationDataset(
+        R_base_flange=ORIENTATIONS[order],
+        wrench=wrench[order],
+        wrench_cov=np.broadcast_to(np.diag(SIGMA**2), (24, 6, 6)),
+        n_samples=np.full(24, 200),
+        t_s=np.arange(24.0)[order] * 3,
+    )
+    return solve(dataset)
+
+
+def sigmas(result: CalibrationResult, truth: Parameters) -> Array:
+    return np.asarray(result.parameters.difference(truth) / np.sqrt(np.diag(result.covariance)))
+
+
+@pytest.mark.parametrize("position", [10, 12, 17, 21])
+@pytest.mark.parametrize(("after", "what"), [(SHIFTED, "centre of mass"), (LIGHTER, "the load weighs 0.36 N less")])
+def test_poses_of_two_loads_are_refused(after: Parameters, what: str, position: int) -> None:
+    result = session(after, position, seed=position)
+    assert result.verdict == "rejected"
+    assert f"from pose {position + 1} on" in result.reasons[0]
+    assert what in result.reasons[0]
+
+
+@pytest.mark.parametrize("after", [SHIFTED, LIGHTER])
+def test_the_load_as_it_is_now_is_kept_where_the_others_were_left_out(after: Parameters) -> None:
+    result = session(after, 3, seed=1)
+    assert result.verdict == "usable"
+    assert np.abs(sigmas(result, after)).max() < 4
+
+
+def test_poses_count_as_they_were_taken_not_as_they_stand() -> None:
+    rows = np.random.default_rng(3).permutation(24)
+    result = session(LIGHTER, 12, seed=2, rows=rows)
+    assert result.verdict == "rejected"
+    assert f"from pose {np.flatnonzero(rows == 12)[0] + 1} on" in result.reasons[0]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("after", [TOOL, TARED])
+def test_a_quiet_run_and_one_that_was_tared_are_not_refused(after: Parameters, seed: int) -> None:
+    result = session(after, 12, seed)
+    assert result.verdict != "rejected"
+    sure = [0, 1, 2, 3, 4, 5, 9, 10, 11]  # the bias is that of no single moment
+    assert np.abs(sigmas(result, TOOL)[sure]).max() < 4.5

@@ -1,0 +1,415 @@
+"""The judgement: cross-validation that is exact, chances that are as stated, and every reason where it is true."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationDataset, Parameters, solve
+from calib.assessment.cross_validation import IndependentFit, leave_one_out, standardized
+from calib.assessment.faults import faults
+from calib.assessment.verdict import (
+    Quality,
+    expected_error,
+    judge,
+    strong_correlations,
+    successive_correlation,
+)
+from calib.data.dataset import read_csv
+from calib.extras.contact import contact_chi2, contact_threshold
+from calib.model import Array, jacobian, predict
+from calib.published.yu import SPECIAL_R_flange_base
+
+R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+SIGMA = np.repeat([0.05, 0.05 * 0.025], 3)
+TRUTH = Parameters(
+    Rotation.from_euler("ZYX", [105, 2, 179], degrees=True).as_matrix(),
+    np.array([0.6, -0.4, -20.0]),
+    np.array([3.0, -5.0, 8.0]),
+    np.array([0.01, -0.02, -0.07]),
+    np.array([0.1, 0.2, -0.3]),
+)
+
+
+def white(n: int, sigma: Array = SIGMA) -> Array:
+    return np.tile(np.diag(sigma**2), (n, 1, 1))
+
+
+def gauss_newton(R: Array, wrench: Array, cov: Array, start: Parameters = TRUTH) -> Parameters:
+    """An estimator of the test's own: plain Gauss-Newton from close by."""
+    whiten = np.linalg.inv(np.linalg.cholesky(cov))
+    for _ in range(30):
+        J = (whiten @ jacobian(start, R)).reshape(-1, 15)
+        e = (whiten @ (wrench - predict(start, R))[..., None]).ravel()
+        start = start.moved(np.asarray(np.linalg.solve(J.T @ J, J.T @ e)))
+    return start
+
+
+def fit(
+    R: Array,
+    wrench: Array,
+    cov: Array | None = None,
+    *,
+    start: Parameters = TRUTH,
+    second: float | None = None,
+    weights: Array | None = None,
+    components: Mapping[str, float] | None = None,
+) -> IndependentFit:
+    n, noise = len(R), white(len(R)) if cov is None else cov
+    weights = np.ones(n) if weights is None else weights
+    used = weights > 0
+    parameters = gauss_newton(R[used], wrench[used], noise[used], start)
+    if cov is None:  # one scale from the residuals
+        noise = noise * float(np.sum(((wrench - predict(parameters, R)) / SIGMA) ** 2) / (6 * n - 15))
+    J = jacobian(parameters, R[used])
+    information = np.einsum("nki,nkl,nlj->ij", J, np.linalg.inv(noise[used]), J)
+    covariance = np.asarray(np.linalg.inv(information))
+    return IndependentFit(parameters, covariance, R, wrench, noise, cov is not None, weights, second, components or {})
+
+
+def noisy(rng: np.random.Generator, R: Array, truth: Parameters = TRUTH, sigma: Array = SIGMA) -> Array:
+    return np.asarray(predict(truth, R) + rng.normal(size=(len(R), 6)) * sigma)
+
+
+def words(quality: Quality) -> str:
+    return " | ".join(quality.reasons)
+
+
+# Cross-validation
+
+
+def test_left_out_residuals_are_those_of_real_refits() -> None:
+    rng = np.random.default_rng(1)
+    R = Rotation.random(8, rng=rng).as_matrix()
+    A = rng.normal(size=(8, 6, 9))
+    cov = SIGMA[:, None] * SIGMA * (A @ np.swapaxes(A, 1, 2)) / 9e4  # correlated, uneven, small: the model is linear
+    wrench = predict(TRUTH, R) + (np.linalg.cholesky(cov) @ rng.normal(size=(8, 6, 1)))[..., 0]
+    best = gauss_newton(R, wrench, cov)
+    left_out, left_out_cov = leave_one_out(wrench - predict(best, R), jacobian(best, R), cov)
+    for k in range(8):
+        others = np.arange(8) != k
+        refit = gauss_newton(R[others], wrench[others], cov[others])
+        error = wrench[k] - predict(refit, R[k])
+        sigma = np.sqrt(np.diag(left_out_cov[k]))
+        np.testing.assert_allclose(left_out[k] / sigma, error / sigma, atol=1e-3)
+        np.testing.assert_allclose(left_out[k], error, atol=1e-4 * float(np.linalg.norm(error)))
+        J = (np.linalg.inv(np.linalg.cholesky(cov[others])) @ jacobian(refit, R[others])).reshape(-1, 15)
+        J_k = jacobian(refit, R[k])
+        np.testing.assert_allclose(
+            left_out_cov[k] / np.outer(sigma, sigma),
+            (cov[k] + J_k @ np.linalg.inv(J.T @ J) @ J_k.T) / np.outer(sigma, sigma),
+            atol=1e-3,
+        )
+
+
+def test_poses_that_were_not_used_are_predicted_like_new_ones() -> None:
+    rng = np.random.default_rng(23)
+    weights = np.where(np.arange(24) < 8, 0.0, 1.0)
+    squares = []
+    for _ in range(50):
+        f = fit(R24, noisy(rng, R24), white(24), weights=weights)
+        np.testing.assert_allclose(f.left_out_residuals[:8], f.residuals[:8], atol=1e-12)
+        squares.append(standardized(f.left_out_residuals, f.left_out_cov)[:8] ** 2)
+    assert np.mean(squares) == pytest.approx(1, abs=0.1)
+
+
+def test_left_out_residuals_spread_as_stated() -> None:
+    rng = np.random.default_rng(2)
+    squares = []
+    for _ in range(60):
+        R = Rotation.random(6, rng=rng).as_matrix()
+        quality = judge(fit(R, noisy(rng, R), white(6)))
+        squares.append(quality.residual_sigma**2)
+    assert np.mean(squares) == pytest.approx(1, abs=0.05)
+
+
+def test_the_cross_validated_error_predicts_new_poses_where_the_residual_flatters() -> None:
+    rng = np.random.default_rng(3)
+    left_out, residual, new = [], [], []
+    for _ in range(60):
+        R, fresh = Rotation.random(6, rng=rng).as_matrix(), Rotation.random(50, rng=rng).as_matrix()
+        f = fit(R, noisy(rng, R), white(6))
+        left_out.append(judge(f).loo_force_rms_N)
+        residual.append(np.sqrt(np.mean(np.sum(f.residuals[:, :3] ** 2, axis=1))))
+        error = noisy(rng, fresh) - predict(f.parameters, fresh)
+        new.append(np.sqrt(np.mean(np.sum(error[:, :3] ** 2, axis=1))))
+    assert np.median(residual) < 0.75 * np.median(new)
+    assert 1.0 < np.median(left_out) / np.median(new) < 1.4  # from five poses, not six
+
+
+def test_a_pose_that_nothing_checks_is_named() -> None:
+    spin = Rotation.from_euler("y", 150, degrees=True) * Rotation.from_euler("z", np.arange(9)[:, None] * 0.7)
+    R = np.concatenate([spin.as_matrix(), Rotation.from_euler("x", [[100.0]], degrees=True).as_matrix()])
+    quality = judge(fit(R, noisy(np.random.default_rng(4), R), white(10)))
+    assert "pose 10 cannot be checked" in words(quality)
+    assert quality.verdict != "good"
+
+
+def test_the_expected_error_is_the_mean_over_all_orientations() -> None:
+    f = fit(R24[:9], noisy(np.random.default_rng(5), R24[:9]), white(9))
+    J = jacobian(f.parameters, Rotation.random(20000, rng=np.random.default_rng(6)).as_matrix())
+    variance = np.einsum("nki,ij,nkj->k", J, f.covariance, J) / len(J)
+    force_N, torque_Nm = expected_error(f.parameters, f.covariance)
+    assert force_N == pytest.approx(np.sqrt(variance[:3].sum()), rel=0.02)
+    assert torque_Nm == pytest.approx(np.sqrt(variance[3:].sum()), rel=0.02)
+
+
+# Statistics
+
+
+def test_p_values_are_uniform_and_clean_runs_are_good_without_a_word() -> None:
+    rng = np.random.default_rng(7)
+    judged = [judge(fit(R24, noisy(rng, R24), white(24))) for _ in range(80)]
+    p = np.sort([q.chi2_p for q in judged if q.chi2_p is not None])
+    assert len(p) == 80
+    assert np.abs(p - np.arange(1, 81) / 80).max() < 0.18  # Kolmogorov's 1 %
+    assert all(q.verdict == "good" for q in judged)
+    assert sum(bool(q.reasons) for q in judged) <= 2
+    assert np.mean([q.lag1 for q in judged]) == pytest.approx(0, abs=0.04)
+
+
+def test_drift_shows_between_successive_poses_in_time_not_in_rows() -> None:
+    rng = np.random.default_rng(8)
+    drift = np.linspace(0, 1.0, 24)[:, None] * [0, 0, 1.0, 0, 0, 0]
+    wrench = noisy(rng, R24) + drift
+    quality = judge(fit(R24, wrench, white(24)))
+    assert quality.lag1 > 0.25
+    assert "successive poses have similar residuals" in words(quality)
+    order = rng.permutation(24)
+    shuffled = fit(R24[order], wrench[order], white(24))
+    assert judge(shuffled, t_s=order.astype(float)).lag1 == pytest.approx(quality.lag1, abs=1e-6)
+    assert judge(shuffled).lag1 < 0.2
+    assert judge(shuffled, t_s=np.full(24, np.nan)).lag1 == judge(shuffled).lag1
+
+
+def test_correlation_of_successive_poses_has_its_chance() -> None:
+    rng = np.random.default_rng(9)
+    p = [successive_correlation(rng.normal(size=(24, 6)))[1] for _ in range(2000)]
+    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.015)
+    assert successive_correlation(np.tile(rng.normal(size=6), (9, 1)))[0] == pytest.approx(1)
+
+
+def test_strong_correlations_are_named() -> None:
+    covariance = np.eye(15)
+    covariance[5, 8] = covariance[8, 5] = -0.95
+    assert strong_correlations(covariance) == (("gravity_force_base_N.z", "force_bias_N.z", -0.95),)
+
+
+@pytest.mark.parametrize(("n", "alone"), [(24, 0.014), (6, 0.10)])
+def test_contact_alarms_are_as_rare_as_asked_for(n: int, alone: float) -> None:
+    rng = np.random.default_rng(n)
+    alarms, noise_only, tared, seen = [], [], [], []
+    for _ in range(120):
+        R = R24 if n == 24 else Rotation.random(n, rng=rng).as_matrix()
+        J = (jacobian(TRUTH, R) / SIGMA[:, None]).reshape(-1, 15)
+        covariance = np.linalg.inv(J.T @ J)
+        found = TRUTH.moved(np.linalg.cholesky(covariance) @ rng.normal(size=15))
+        there = Rotation.random(120, rng=rng).as_matrix()
+        wrench, noise = noisy(rng, there), np.diag(SIGMA**2)
+        limit = contact_threshold(0.01)
+        alarms.append(contact_chi2(wrench, there, found, covariance, noise) > limit)
+        noise_only.append(contact_chi2(wrench, there, found, 0 * covariance, noise) > limit)
+        tare = wrench[:60] + 1.0, there[:60]  # any constant bias cancels
+        tared.append(contact_chi2(wrench[60:] + 1.0, there[60:], found, covariance, noise, tare=tare) > limit)
+        push = 12 * SIGMA * np.array([0, 0, 1, 0, 0, 0])
+        seen.append(contact_chi2(wrench + push, there, found, covariance, noise) > limit)
+    assert 0.007 < np.mean(alarms) < 0.014
+    assert 0.007 < np.mean(tared) < 0.014
+    assert np.mean(noise_only) > alone
+    assert np.mean(seen) > 0.95
+
+
+# Reasons
+
+
+def test_noise_beyond_the_measured_is_good_only_while_errors_are_small() -> None:
+    rng = np.random.default_rng(10)
+    small, large = 0.04, 0.25  # N at 20 N: with three axes 0.3 % and 2.2 %
+    for sigma_N, factor, verdict in ((small, 2.0, "good"), (small, 5.0, "usable"), (large, 2.0, "usable")):
+        sigma = np.repeat([sigma_N, 0.025 * sigma_N], 3)
+        quality = judge(fit(R24, noisy(rng, R24, sigma=sigma), white(24, sigma / factor), components={}))
+        assert quality.verdict == verdict
+        assert quality.noise_factor == pytest.approx(factor, rel=0.2)
+        assert "times the measured noise" in words(quality)
+    known = judge(fit(R24, noisy(rng, R24, sigma=2 * SIGMA), white(24), components={"rotation_rad": 0.002}))
+    assert "found rotation_rad 0.002" in words(known)
+
+
+def test_errors_are_stated_relative_to_the_weight() -> None:
+    rng = np.random.default_rng(11)
+    usable = judge(fit(R24, noisy(rng, R24, sigma=np.repeat([0.4, 0.01], 3))))
+    assert usable.verdict == "usable"
+    assert "the force residual is 2.8 %" in usable.reasons[0]
+    assert "more than 2 %" in usable.reasons[0]
+    assert "torque" not in words(usable)
+    sigma = np.repeat([0.05, 0.2], 3)
+    rejected = judge(fit(R24, noisy(rng, R24, sigma=sigma), white(24, sigma)))
+    assert rejected.verdict == "rejected"
+    assert "the torque residual is 1" in rejected.reasons[0]
+    assert "more than 10 %" in rejected.reasons[0]
+
+
+def test_few_poses_and_left_out_poses_are_said() -> None:
+    rng = np.random.default_rng(12)
+    five = R24[[0, 6, 10, 15, 21]]
+    quality = judge(fit(five, noisy(rng, five), white(5)))
+    assert (quality.verdict, "only 5 poses" in words(quality)) == ("usable", True)
+
+    wrench = noisy(rng, R24)
+    for bumped, verdict in (([4, 9], "good"), ([4, 9, 11, 20], "usable")):
+        hit = wrench.copy()
+        hit[bumped, 2] += 5
+        weights = np.ones(24)
+        weights[bumped] = 0
+        quality = judge(fit(R24, hit, white(24), weights=weights))
+        listed = ", ".join(str(k + 1) for k in bumped)
+        assert quality.verdict == verdict
+        assert f"{len(bumped)} of 24 poses were left out" in words(quality)
+        assert f"repeat {listed}" in words(quality)
+        assert quality.loo_force_rms_N < 0.15
+        assert quality.worst_pose not in bumped
+
+
+@pytest.mark.parametrize("channel", range(6))
+def test_what_is_known_is_doubted_where_the_data_fit_without_it(channel: int) -> None:
+    wrench = noisy(np.random.default_rng(24), R24)
+    free = fit(R24, wrench, white(24))
+    off = 3.0 if channel < 3 else 0.2  # N or N·m of every pose, as from a constraint that is wrong
+    constrained = replace(free, wrench=wrench + off * np.eye(6)[channel])
+    said = words(judge(constrained, unconstrained=free))
+    assert f"the {'force' if channel < 3 else 'torque'}s fit to" in said
+    assert f"instead of {off:.2g} N" in said
+    assert "fit to" not in words(judge(free, unconstrained=free))
+
+
+def test_a_pose_out_of_line_is_pointed_at() -> None:
+    wrench = noisy(np.random.default_rng(13), R24)
+    wrench[12, 0] += 0.5
+    quality = judge(fit(R24, wrench, white(24)))
+    assert quality.worst_pose == 12
+    assert "pose 13 is out of line" in words(quality)
+
+
+def test_a_second_solution_is_given_its_odds() -> None:
+    wrench = noisy(np.random.default_rng(14), R24)
+    quality = judge(fit(R24, wrench, white(24), second=2.0))
+    assert quality.verdict == "rejected"
+    assert "a quite different mounting" in quality.reasons[0]
+    assert "the right one with 27 %" in quality.reasons[0]
+    assert judge(fit(R24, wrench, white(24), second=13.0)).verdict == "good"
+
+
+def test_a_weight_lost_in_noise_is_rejected() -> None:
+    light = replace(TRUTH, gravity_force_base_N=np.array([0, 0, -0.03]))
+    quality = judge(fit(R24, noisy(np.random.default_rng(15), R24, light), white(24), start=light))
+    assert quality.verdict == "rejected"
+    assert "hang something heavier" in quality.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("F_b", "up", "tilt"),
+    [
+        ([-20.0, 0, 0], [0, 0, 1], "gravity is 90° off, along (-1.00"),
+        ([0, -5.0, -19.0], [0, 0, 1], "gravity is 15° off, along ("),
+        ([0, -0.5, -20.0], [0, 0, 1], ""),
+        ([0, 0, 20.0], [0, 0, -1], ""),
+        ([-20.0, 0, 0], [1, 0, 0], ""),
+    ],
+)
+def test_a_tilted_base_is_noted(F_b: list[float], up: list[float], tilt: str) -> None:
+    truth = replace(TRUTH, gravity_force_base_N=np.array(F_b))
+    quality = judge(fit(R24, noisy(np.random.default_rng(16), R24, truth), white(24), start=truth), up_in_base=up)
+    assert quality.verdict == "good"
+    assert tilt in words(quality)
+    assert bool(tilt) == bool(quality.reasons)
+
+
+# Signs, axes and units: what a wrongly wired sensor reads, solved without knowing better.
+
+
+def solved(R: Array, wrench: Array) -> tuple[str, str]:
+    n = len(R)
+    result = solve(CalibrationDataset(R, wrench, None, np.zeros(n, np.int64), np.full(n, np.nan)))
+    return result.verdict, " | ".join(result.reasons)
+
+
+F, T = ["fx", "fy", "fz"], ["tx", "ty", "tz"]
+
+
+@pytest.mark.parametrize(
+    ("reversed_channels", "says"),
+    [
+        (F + T, "(set sign = -1)"),
+        (["fx", "tx"], "or one axis is reversed"),
+        (F, "the forces are reversed"),
+        (T, "the torques are reversed"),
+        (["tx"], "with torque x reversed the"),
+        (["fy"], "force y reversed"),
+        (["ty", "tz"], "y and z reversed (or force y and z)"),
+        (["fx", "fy"], "x and y reversed (or force x and y)"),
+    ],
+)
+@pytest.mark.parametrize("seed", [17, 18])
+def test_reversed_channels_are_found_out(reversed_channels: list[str], says: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    R = Rotation.random(18, rng=rng).as_matrix()
+    signs = [-1.0 if channel in reversed_channels else 1.0 for channel in F + T]
+    verdict, reasons = solved(R, noisy(rng, R) * signs)
+    assert says in reasons
+    if "disagree" in reasons:
+        assert verdict == "rejected"
+        assert reasons.startswith("force and torque axes disagree")
+
+
+def test_nothing_is_suspected_of_a_sound_sensor() -> None:
+    rng = np.random.default_rng(19)
+    for sigma in (SIGMA, 10 * SIGMA, 40 * SIGMA):
+        R = Rotation.random(12, rng=rng).as_matrix()
+        wrench = noisy(rng, R, sigma=sigma)
+        assert faults(R, wrench) == []
+        assert not any(word in solved(R, wrench)[1] for word in ("reversed", "reaction", "inverted", "N·mm"))
+
+
+def test_inverted_orientations_are_found_out() -> None:
+    R = Rotation.random(10, rng=np.random.default_rng(20)).as_matrix()
+    verdict, reasons = solved(np.swapaxes(R, 1, 2), noisy(np.random.default_rng(21), R))
+    assert verdict == "rejected"
+    assert reasons.startswith("the orientations look inverted")
+
+
+def test_wrong_units_of_torque_are_found_out() -> None:
+    wrench = noisy(np.random.default_rng(22), R24)
+    for factor, verdict, says in (
+        (1e3, "rejected", "the centre of mass lies 73.5"),
+        (1e3, "rejected", "the torques are in N·mm, not N·m"),
+        (1e-3, "usable", "the centre of mass lies only 0.074 mm from the sensor"),
+        (10, "rejected", "farther than 0.5 m: the torques are in lbf·in"),
+    ):
+        got, reasons = solved(R24, wrench * np.repeat([1, factor], 3))
+        assert got == verdict
+        assert says in reasons
+    far = judge(fit(R24, wrench, white(24)), farthest_com_m=0.05)
+    assert (far.verdict, "farther than 0.05 m" in words(far)) == ("rejected", True)
+
+
+# Real sessions
+
+
+def test_a_real_session_is_usable_and_one_with_drift_is_never_good(real_data: Path) -> None:
+    for name, verdicts in (("agimus_mini45_b", ("good", "usable")), ("foamcutting_2013_06_12", ("rejected",))):
+        dataset = read_csv(real_data / name / "poses.csv", "R_flange_base")
+        verdict, reasons = solved(dataset.R_base_flange, dataset.wrench)
+        assert verdict in verdicts
+        assert not any(word in reasons for word in ("disagree", "reaction", "inverted"))
+        assert ("the force residual is" in reasons) == (name != "agimus_mini45_b")
+
+
+def test_a_real_session_read_with_wrong_signs_is_found_out(real_data: Path) -> None:
+    dataset = read_csv(real_data / "agimus_mini45_b" / "poses.csv", "R_flange_base")
+    R, wrench = dataset.R_base_flange, dataset.wrench
+    assert "set sign = -1" in solved(R, -wrench)[1]
+    assert "torque x reversed" in solved(R, wrench * [1, 1, 1, -1, 1, 1])[1]
+    assert "the orientations look inverted" in solved(np.swapaxes(R, 1, 2), wrench)[1]

@@ -1,0 +1,202 @@
+"""The covariance of a dwell's mean tells the truth, and quiet dwells pass as quiet."""
+
+import time
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from calib import BadDataset, is_stationary, mean_and_covariance
+from calib.data.dwell_mean import is_quiet, noise_level, restless_channels
+from calib.model import Array
+
+
+def noise(rng: np.random.Generator, N: int, rho: Array) -> Array:
+    """AR(1) of unit variance, one rho for each of the six channels."""
+    white = rng.normal(size=(N + 300, 6))
+    return np.column_stack([lfilter([np.sqrt(1 - r**2)], [1, -r], white[:, c])[300:] for c, r in enumerate(rho)])
+
+
+MIXED = [0, 0.5, 0.9, 0, 0.9, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("N", "rho"),
+    [
+        *((N, rho) for N in (400, 1500) for rho in ([0.0] * 6, [0.5] * 6, [0.9] * 6, MIXED)),
+        (7000, MIXED),
+        (1500, [-0.5] * 6),
+    ],
+)
+def test_the_mean_lies_where_its_covariance_says(N: int, rho: list[float]) -> None:
+    rng = np.random.default_rng(N)
+    lag = np.arange(1, N)
+    variance = np.array([1 + 2 * np.sum((1 - lag / N) * r**lag) for r in rho]) / N
+    z, ratio = [], []
+    for _ in range(100 if N < 5000 else 40):
+        pose = mean_and_covariance(5.0 + noise(rng, N, np.array(rho)))
+        z.append((pose.mean - 5.0) / np.sqrt(np.diag(pose.covariance)))
+        ratio.append(np.diag(pose.covariance) / variance)
+    assert 0.98 < np.mean(ratio) < 1.12  # a little on the safe side
+    coverage = np.mean(np.abs(z) < 1.96)
+    hard = N == 400 and max(rho) == 0.9  # 21 independent samples: the spread itself is known to 30 %
+    assert (0.88 if hard else 0.92) < coverage < 0.98
+
+
+def test_the_worst_channel_says_what_a_dwell_is_worth() -> None:
+    rng = np.random.default_rng(0)
+    assert 200 < mean_and_covariance(rng.normal(size=(400, 6))).n_effective < 450
+    worth = mean_and_covariance(noise(rng, 20_000, np.array(MIXED))).n_effective
+    assert worth == pytest.approx(20_000 * (1 - 0.9) / (1 + 0.9), rel=0.2)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.8])
+def test_correlation_between_channels_is_kept(rho: float) -> None:
+    """Of channels as unlike in size as newtons and newton metres, in the samples and in their mean."""
+    sigma = np.repeat([0.3, 0.004], 3)
+    mixing = np.eye(6)
+    mixing[4, [0, 4]] = 0.8, 0.6
+    rng = np.random.default_rng(1)
+    found = [mean_and_covariance(noise(rng, 500, np.full(6, rho)) @ mixing.T * sigma) for _ in range(150)]
+    correlations = [C[0, 4] / np.sqrt(C[0, 0] * C[4, 4]) for C in (pose.covariance for pose in found)]
+    assert np.median(correlations) == pytest.approx(0.8, abs=0.02)
+    difference = np.array([1, 0, 0, 0, -1, 0]) / sigma  # of which correlation takes most of the spread away
+    z = [difference @ pose.mean / np.sqrt(difference @ pose.covariance @ difference) for pose in found]
+    assert np.std(z) == pytest.approx(1, abs=0.2)
+    np.testing.assert_array_equal(found[0].covariance, found[0].covariance.T)
+
+
+@pytest.mark.parametrize("sigma", [0.25, 0.4, 0.7, 1.5])
+def test_averaging_cannot_see_through_coarse_steps(sigma: float) -> None:
+    rng = np.random.default_rng(2)
+    z = []
+    for _ in range(60):
+        true = rng.uniform(-5, 5, 6)
+        pose = mean_and_covariance(np.round(true + sigma * rng.normal(size=(400, 6))))
+        z.append((pose.mean - true) / np.sqrt(np.diag(pose.covariance)))
+    assert np.mean(np.abs(z) < 1.96) > 0.92
+    if sigma > 0.5:
+        assert np.std(z) > 0.9  # and fine steps cost nothing
+
+
+def test_a_channel_that_never_moves_or_copies_another_leaves_a_usable_covariance() -> None:
+    rng = np.random.default_rng(3)
+    samples = rng.normal(size=(200, 6)) * [0.1, 0.1, 0.1, 0.002, 0.002, 0.002] + 3.3
+    samples[:, 1] = 3.3
+    samples[:, 5] = samples[:, 4]
+    C = mean_and_covariance(samples).covariance
+    assert np.linalg.eigvalsh(C).min() > 0
+    assert C[1, 1] == max(C[0, 0], C[2, 2])  # no more trust than its neighbours earn
+    silent = mean_and_covariance(np.full((50, 6), 0.1)).covariance
+    np.testing.assert_allclose(np.sqrt(np.diag(silent)), [1e-3] * 3 + [2.5e-5] * 3)
+
+
+@pytest.mark.realtime
+def test_seven_seconds_of_a_2_kHz_sensor_take_milliseconds() -> None:
+    samples = np.random.default_rng(4).normal(size=(14_000, 6))
+    best = float("inf")
+    for _ in range(5):
+        start = time.perf_counter()
+        mean_and_covariance(samples)
+        best = min(best, time.perf_counter() - start)
+    assert best < 0.05  # 5 ms on an idle machine
+
+
+@pytest.mark.parametrize(("N", "rho"), [(400, 0.0), (400, 0.5), (1500, 0.9)])
+def test_quiet_dwells_pass(N: int, rho: float) -> None:
+    rng = np.random.default_rng(N)
+    failures = sum(not is_stationary(noise(rng, N, np.full(6, rho))) for _ in range(300))
+    assert failures / 300 < 0.01  # with 3 standard errors 4 % and more would fail
+
+
+@pytest.mark.parametrize("N", [400, 7000])
+def test_a_drift_or_a_decay_of_any_channel_fails(N: int) -> None:
+    rng = np.random.default_rng(5)
+    t = np.linspace(0, 1, N)
+    standard_error = 1 / np.sqrt(N)
+    for channel in range(6):
+        for disturbance in (60 * t, 20 * (t > 0.5), 120 * np.exp(-t / 0.4)):  # a third less is sometimes missed
+            samples = rng.normal(size=(N, 6))
+            assert is_stationary(samples)
+            samples[:, channel] += standard_error * disturbance
+            assert not is_stationary(samples)
+
+
+def test_constant_channels_are_quiet_and_a_step_between_constants_is_not() -> None:
+    samples = np.full((100, 6), 0.1)
+    assert is_stationary(samples)
+    samples[50:, 3] = 0.2
+    assert not is_stationary(samples)
+
+
+def filtered(rng: np.random.Generator, seconds: float, corner_Hz: float) -> Array:
+    """White noise of a 500 Hz sensor behind a low-pass of first order; the beginning is forgotten."""
+    keep = np.exp(-2 * np.pi * corner_Hz / 500)
+    samples: Array = lfilter([1 - keep], [1, -keep], rng.normal(size=(int(500 * (seconds + 2)), 6)), axis=0)[1000:]
+    return samples
+
+
+@pytest.mark.parametrize("corner_Hz", [1e9, 5])
+def test_a_sensor_left_alone_is_quiet(corner_Hz: float) -> None:
+    rng = np.random.default_rng(17)
+    level = noise_level(filtered(rng, 20, corner_Hz), 1000)
+    alarms = np.mean([not is_quiet(filtered(rng, 2, corner_Hz), level) for _ in range(300)])
+    assert alarms < 0.015  # with a threshold of 3 standard errors 4 % and 13 %
+
+
+@pytest.mark.parametrize(
+    "disturbance",
+    [
+        4 * np.sin(2 * np.pi * 7 * np.arange(1000) / 500),  # vibration
+        np.where(np.arange(1000) // 50 == 4, 15.0, 0.0),  # a jolt of a tenth of a second
+        6 * np.sin(2 * np.pi * np.arange(1000) / 1000) ** 2 * np.sin(np.arange(1000) / 20),  # a hand
+    ],
+)
+def test_what_stationary_halves_hide_is_not_quiet(disturbance: Array) -> None:
+    rng = np.random.default_rng(19)
+    level = noise_level(rng.normal(size=(10_000, 6)), 1000)
+    for channel in range(6):
+        samples = rng.normal(size=(1000, 6))
+        assert is_quiet(samples, level)
+        samples[:, channel] += disturbance
+        assert is_stationary(samples)
+        assert not is_quiet(samples, level)
+        assert np.flatnonzero(restless_channels(samples, level)).tolist() == [channel]
+
+
+def test_the_noise_level_ignores_a_touch_and_a_slow_drift() -> None:
+    rng = np.random.default_rng(20)
+    samples = rng.normal(size=(30_000, 6)) + np.linspace(0, 10, 30_000)[:, None]
+    samples[4000:7000, 2] += 40 * rng.normal(size=3000)
+    np.testing.assert_allclose(noise_level(samples, 1000), 1.0, atol=0.1)
+
+
+def test_a_coarse_sensor_may_flicker_between_two_numbers() -> None:
+    level = noise_level(np.full((1000, 6), 0.3), 100)
+    np.testing.assert_allclose(level, 0, atol=1e-12)
+    samples = np.full((200, 6), 0.3)
+    samples[::7, 4] = 0.4
+    assert is_quiet(samples, level)
+    samples[::14, 4] = 0.2
+    samples[3::14, 4] = 0.6
+    assert not is_quiet(samples, level)
+
+
+@pytest.mark.parametrize("window", [19, 201])
+def test_a_window_must_fit_the_record(window: int) -> None:
+    with pytest.raises(BadDataset, match="record of 200"):
+        noise_level(np.zeros((200, 6)), window)
+
+
+@pytest.mark.parametrize(
+    ("samples", "words"),
+    [
+        (np.zeros((19, 6)), r"shape \(19, 6\), expected \(N, 6\) with N >= 20: record longer"),
+        (np.zeros((50, 3)), r"shape \(50, 3\)"),
+        (np.where(np.arange(300).reshape(50, 6) == 8, np.nan, 0.0), r"sample 2: wrench\[2\] is nan"),
+    ],
+)
+def test_bad_dwells_are_refused(samples: Array, words: str) -> None:
+    for function in (mean_and_covariance, is_stationary):
+        with pytest.raises(BadDataset, match=words):
+            function(samples)

@@ -1,0 +1,223 @@
+"""Another payload and a new tare on an old calibration: exact without noise, honest with it, refused when needed."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import BadDataset, CalibrationDataset, NotObservable, Parameters, solve
+from calib.extras.update import Update, tare, update_payload
+from calib.model import Array, jacobian, predict
+
+NOISE = np.diag(np.repeat([0.05**2, (0.025 * 0.05) ** 2], 3))
+
+
+def truth(weight_N: float = 20.0, seed: int = 0) -> Parameters:
+    rng = np.random.default_rng(seed)
+    gravity = weight_N * Rotation.from_euler("xy", [2, -1], degrees=True).apply([0, 0, -1])
+    R = Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    return Parameters(R, gravity, rng.normal(size=3) * 5, np.array([0.02, -0.01, 0.077]), rng.normal(size=3))
+
+
+def calibration(parameters: Parameters, n: int = 24, seed: int = 1) -> Update:
+    """A calibration from n poses with the noise above: the truth, moved by an error of its covariance."""
+    rng = np.random.default_rng(seed)
+    J = jacobian(parameters, Rotation.random(n, rng=rng).as_matrix())
+    covariance = np.linalg.inv(np.einsum("nki,kl,nlj->ij", J, np.linalg.inv(NOISE), J))
+    return Update(parameters.moved(rng.multivariate_normal(np.zeros(15), covariance)), covariance, 0.0, 0)
+
+
+def exact(parameters: Parameters) -> Update:
+    return Update(parameters, np.zeros((15, 15)), 0.0, 0)
+
+
+def tilted(*degrees: float) -> Array:
+    return np.array([Rotation.from_euler("x", 180 + d, degrees=True).as_matrix() for d in degrees])
+
+
+def loaded(parameters: Parameters) -> Parameters:
+    """The same sensor with 40 % more payload somewhere else."""
+    return Parameters(
+        parameters.R_flange_sensor,
+        1.4 * parameters.gravity_force_base_N,
+        parameters.force_bias_N,
+        np.array([0.03, 0.04, 0.06]),
+        parameters.torque_bias_Nm,
+    )
+
+
+def noise_of(n: int) -> Array:
+    return np.tile(NOISE, (n, 1, 1))
+
+
+def dwell(parameters: Parameters, R_base_flange: Array, rng: np.random.Generator, n: int = 200) -> Array:
+    noise = rng.multivariate_normal(np.zeros(6), NOISE, size=n)
+    return np.asarray(predict(parameters, R_base_flange) + noise)
+
+
+def test_two_tilted_poses_give_the_payload_exactly() -> None:
+    new = loaded(truth())
+    R = tilted(0, 60)
+    update = update_payload(exact(truth()), R, predict(new, R), noise_of(2))
+    np.testing.assert_allclose(new.difference(update.parameters), 0, atol=1e-12)
+    assert update.dof == 8
+
+
+def test_three_poses_give_payload_and_biases_exactly() -> None:
+    new = loaded(truth(seed=5))  # with other biases
+    R = tilted(0, 60, -60)
+    update = update_payload(exact(truth()), R, predict(new, R), noise_of(3), retare=True)
+    np.testing.assert_allclose(new.difference(update.parameters), 0, atol=1e-10)
+    assert update.dof == 8
+
+
+def test_one_pose_or_parallel_gravity_is_refused_in_words() -> None:
+    new, old = loaded(truth()), exact(truth())
+    with pytest.raises(NotObservable, match=r"leaves 1 of 4 .* add 1"):
+        update_payload(old, tilted(0), predict(new, tilted(0)), noise_of(1))
+    for R in (tilted(0, 0.5), tilted(0, 180), tilted(10, 10, 10)):  # the same, upside down, and repeated
+        with pytest.raises(NotObservable, match="the same line"):
+            update_payload(old, R, predict(new, R), noise_of(len(R)))
+    for n, free in ((1, "4 of 10"), (2, "1 of 10")):
+        R = tilted(0, 60)[:n]
+        with pytest.raises(NotObservable, match=free):
+            update_payload(old, R, predict(new, R), noise_of(n), retare=True)
+    R = tilted(0, 60, 60.1)
+    with pytest.raises(NotObservable, match="fewer than three"):
+        update_payload(old, R, predict(new, R), noise_of(3), retare=True)
+
+
+def test_no_payload_and_a_reversed_sign_are_refused() -> None:
+    R, old = tilted(0, 60), truth()
+    bare = Parameters(old.R_flange_sensor, np.zeros(3), old.force_bias_N, np.zeros(3), old.torque_bias_Nm)
+    with pytest.raises(NotObservable, match="is not 5 times its uncertainty"):
+        update_payload(exact(old), R, predict(bare, R), noise_of(2))
+    with pytest.raises(NotObservable, match="check the sign"):
+        update_payload(exact(old), R, 2 * predict(bare, R) - predict(old, R), noise_of(2))
+    with pytest.raises(NotObservable, match="direction of gravity is unknown"):
+        update_payload(exact(bare), R, predict(old, R), noise_of(2))
+
+
+def test_accuracy_of_a_payload_from_two_poses() -> None:
+    """+40 % payload, noise 0.05 N: 0.036 N and 0.135 mm a coordinate in simulation."""
+    new, R = loaded(truth()), tilted(-45, 45)
+    rng = np.random.default_rng(0)
+    noise = rng.multivariate_normal(np.zeros(6), NOISE, size=(300, 2))
+    updates = [update_payload(exact(truth()), R, predict(new, R) + e, noise_of(2)).parameters for e in noise]
+    weights = [np.linalg.norm(p.gravity_force_base_N) for p in updates]
+    com_error_m = np.array([p.p_sensor_com_m - new.p_sensor_com_m for p in updates])
+    assert np.std(weights) == pytest.approx(0.036, rel=0.2)
+    assert 0.05e-3 < np.sqrt(np.mean(com_error_m**2)) < 0.2e-3
+
+
+@pytest.mark.parametrize("retare", [False, True])
+def test_the_covariance_covers_noise_and_the_old_errors(retare: bool) -> None:
+    old, new, R = truth(), loaded(truth()), tilted(-60, 20, 60, 100)
+    rng = np.random.default_rng(2)
+    distances, misfits = [], []
+    for seed in range(80):
+        noise = rng.multivariate_normal(np.zeros(6), NOISE, size=4)
+        update = update_payload(calibration(old, seed=seed), R, predict(new, R) + noise, noise_of(4), retare=retare)
+        error = new.difference(update.parameters)
+        distances.append(error @ np.linalg.solve(update.covariance, error))
+        misfits.append(update.chi2 / update.dof)
+    assert np.mean(distances) == pytest.approx(15, rel=0.1)
+    assert np.mean(misfits) == pytest.approx(1, rel=0.1)
+
+
+def test_updates_can_be_chained_and_keep_what_is_not_updated() -> None:
+    start = calibration(truth())
+    rng = np.random.default_rng(3)
+    R = tilted(0, 60)
+    payload = update_payload(start, R, predict(loaded(truth()), R), noise_of(2))
+    both = tare(payload, R[:1], [dwell(loaded(truth()), R[0], rng)])
+    np.testing.assert_array_equal(both.parameters.R_flange_sensor, start.parameters.R_flange_sensor)
+    np.testing.assert_array_equal(both.parameters.p_sensor_com_m, payload.parameters.p_sensor_com_m)
+    np.testing.assert_allclose(both.covariance[:3, :3], start.covariance[:3, :3], rtol=1e-12)
+    assert np.linalg.eigvalsh(both.covariance).min() > 0
+
+
+def test_a_solved_calibration_can_be_updated() -> None:
+    rng = np.random.default_rng(11)
+    R = Rotation.random(12, rng=rng).as_matrix()
+    wrench = predict(truth(), R) + rng.multivariate_normal(np.zeros(6), NOISE, size=12)
+    result = solve(CalibrationDataset(R, wrench, noise_of(12), np.zeros(12, np.int64), np.full(12, np.nan)))
+    new = loaded(truth())
+    update = update_payload(result, tilted(0, 60), predict(new, tilted(0, 60)), noise_of(2))
+    error = new.difference(update.parameters)
+    assert error @ np.linalg.solve(update.covariance, error) < 40
+    assert tare(result, R[:1], [dwell(truth(), R[0], rng)]).covariance.shape == (15, 15)
+
+
+def drifted(parameters: Parameters, force_N: Array, torque_Nm: Array) -> Parameters:
+    return parameters.moved(np.concatenate([np.zeros(6), force_N, np.zeros(3), torque_Nm]))
+
+
+def test_a_tare_takes_up_drift_in_any_pose() -> None:
+    rng = np.random.default_rng(4)
+    now = drifted(truth(), np.array([0.5, -0.8, 2.0]), np.array([0.01, 0.02, -0.02]))
+    R = tilted(77)
+    update = tare(exact(truth()), R, [dwell(now, R[0], rng)])
+    assert update.dof == 0
+    np.testing.assert_allclose(update.parameters.force_bias_N, now.force_bias_N, atol=5 * 0.05 / np.sqrt(200))
+    np.testing.assert_allclose(update.parameters.torque_bias_Nm, now.torque_bias_Nm, atol=5 * 0.00125 / np.sqrt(200))
+
+
+def test_the_covariance_of_a_tare_covers_noise_and_the_old_errors() -> None:
+    rng = np.random.default_rng(5)
+    R = tilted(20, 70)
+    for n in (1, 2):
+        distances = []
+        for seed in range(60):
+            update = tare(calibration(truth(), seed=seed), R[:n], [dwell(truth(), R[i], rng, 40) for i in range(n)])
+            error = truth().difference(update.parameters)
+            distances.append(error @ np.linalg.solve(update.covariance, error))
+        assert np.mean(distances) == pytest.approx(15, rel=0.15)  # covariances of 40 samples are themselves uncertain
+
+
+def test_a_tare_makes_the_tared_pose_more_certain_than_others() -> None:
+    """What the weight adds wrongly is the same in the tared pose and taken off with the bias."""
+    start = calibration(truth(), n=6)
+    R = tilted(10, 170)
+    update = tare(start, R[:1], [dwell(truth(), R[0], np.random.default_rng(6), 2000)])
+    J = jacobian(update.parameters, R)
+    here, there = np.trace(J @ update.covariance @ np.swapaxes(J, 1, 2), axis1=1, axis2=2)
+    assert here < 0.1 * there
+
+
+@pytest.mark.parametrize("push", [[0, 0, 8, 0, 0, 0], [5, 5, 0, 0, 0, 0], [0, 0, 0, 0, 0.2, 0]])
+def test_a_tare_under_load_is_refused(push: list[float]) -> None:
+    R = tilted(30)
+    reading = dwell(truth(), R[0], np.random.default_rng(7)) + push
+    with pytest.raises(BadDataset, match="more than a tare explains"):
+        tare(exact(truth()), R, [reading])
+
+
+def test_a_tare_while_the_reading_moves_is_refused() -> None:
+    R = tilted(30, 60)
+    still, moving = (dwell(truth(), R[i], np.random.default_rng(8 + i)) for i in range(2))
+    moving[:, 0] += np.linspace(0, 0.2, len(moving))
+    with pytest.raises(BadDataset, match="pose 2: the reading moves"):
+        tare(exact(truth()), R, [still, moving])
+
+
+def test_a_tare_with_another_payload_is_refused_though_every_pose_could_be_drift() -> None:
+    heavier = truth().moved(np.concatenate([np.zeros(3), 0.05 * truth().gravity_force_base_N, np.zeros(9)]))
+    R = tilted(0, 90)
+    with pytest.raises(BadDataset, match="do not agree"):
+        tare(exact(truth()), R, [dwell(heavier, R[i], np.random.default_rng(10 + i)) for i in range(2)])
+
+
+def test_good_tares_pass() -> None:
+    rng = np.random.default_rng(9)
+    R = Rotation.random(2, rng=rng).as_matrix()
+    for seed in range(40):
+        now = drifted(truth(), rng.normal(size=3), rng.normal(size=3) * 0.03)
+        tare(calibration(truth(), seed=seed), R[:1], [dwell(now, R[0], rng, 400)])
+
+
+def test_shapes_that_do_not_fit_are_refused() -> None:
+    R = tilted(0, 60)
+    with pytest.raises(BadDataset, match=r"wrench_cov has shape \(6, 6\), expected \(2, 6, 6\)"):
+        update_payload(exact(truth()), R, predict(truth(), R), NOISE)
+    with pytest.raises(BadDataset, match="R_base_flange"):
+        tare(exact(truth()), R, [dwell(truth(), R[0], np.random.default_rng(0))])

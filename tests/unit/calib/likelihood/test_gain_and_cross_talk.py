@@ -1,0 +1,154 @@
+"""Gain and cross-talk of the sensor: found where they are, applied, kept in the file."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationDataset, CalibrationResult, Parameters, solve
+from calib.likelihood.fit import Fit, fit
+from calib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, LEVER_M, Response, response_columns
+from calib.model import Array, gravity_wrench, predict
+
+SIGMA = np.repeat([0.05, 0.00125], 3)
+WHITE = np.diag(SIGMA**2)
+WEIGHT_N = 20.0
+
+
+def truth(rng: np.random.Generator) -> Parameters:
+    com = rng.normal(size=3)
+    return Parameters(
+        Rotation.random(rng=rng).as_matrix(),
+        np.array([0.3, -0.2, -WEIGHT_N]),
+        5 * rng.normal(size=3),
+        0.08 * com / np.linalg.norm(com),
+        0.3 * rng.normal(size=3),
+    )
+
+
+def session(
+    rng: np.random.Generator, n: int, gain: float, cross_talk: float
+) -> tuple[Parameters, Array, Array, Array, Array]:
+    """Simulate n poses read by a sensor with errors of that size in every entry of its matrix."""
+    p, R = truth(rng), np.asarray(Rotation.random(n, rng=rng).as_matrix())
+    M, L = gain * rng.normal(size=(3, 3)), cross_talk * LEVER_M * rng.normal(size=(3, 3))
+    return p, R, read(p, R, M, L) + SIGMA * rng.normal(size=(n, 6)), M, L
+
+
+def read(p: Parameters, R: Array, M: Array, L: Array) -> Array:
+    u = gravity_wrench(p, R)[:, :3]
+    return np.asarray(predict(p, R) + np.concatenate([u @ M.T, u @ L.T], axis=1))
+
+
+def predicted(best: Fit, R: Array) -> Array:
+    added = 0.0 if best.response is None else best.response.wrench(best.parameters, R)
+    return np.asarray(predict(best.parameters, R) + added)
+
+
+def test_columns_are_the_derivative_of_the_response() -> None:
+    rng = np.random.default_rng(0)
+    p, R, x = truth(rng), Rotation.random(3, rng=rng).as_matrix(), rng.normal(size=11)
+    M, L = np.tensordot(x[:5], GAIN, 1), np.tensordot(x[5:], CROSS_TALK_M, 1)
+    assert np.trace(M) == pytest.approx(0)
+    np.testing.assert_allclose(M, M.T)
+    np.testing.assert_allclose(L, L.T)
+    np.testing.assert_allclose(response_columns(p, R) @ x, read(p, R, M, L) - predict(p, R), atol=1e-12)
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_sensor_of_wrong_gain_is_predicted_as_well_as_by_an_oracle(measured: bool) -> None:
+    ours, plain = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        p, R, wrench, M, L = session(rng, 24, 0.02, 0.02)
+        best = fit(R, wrench, WHITE if measured else None)
+        assert best.response is not None
+        elsewhere = Rotation.random(50, rng=rng).as_matrix()
+        right = read(p, elsewhere, M, L)
+        ours.append(np.mean((predicted(best, elsewhere) - right) ** 2, axis=0))
+        plain.append(np.mean((predict(best.parameters, elsewhere) - right) ** 2, axis=0))
+    force, torque = (np.sqrt(np.mean(np.array(ours)[:, c])) for c in (slice(0, 3), slice(3, 6)))
+    assert force < SIGMA[0]  # of a pose; 14 numbers from 24 poses
+    assert torque < SIGMA[5]
+    assert np.sqrt(np.mean(plain)) > 3 * np.sqrt(np.mean(ours))
+
+
+def test_the_error_of_the_prediction_is_as_stated() -> None:
+    distances = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        p, R, wrench, M, L = session(rng, 12, 0.02, 0.02)
+        result = solve(CalibrationDataset(R, wrench, np.tile(WHITE, (12, 1, 1)), np.zeros(12, int), np.arange(12.0)))
+        elsewhere = Rotation.random(1, rng=rng).as_matrix()
+        e = result.compensate(read(p, elsewhere, M, L), elsewhere)[0]
+        distances.append(e @ np.linalg.solve(result.wrench_covariance(elsewhere)[0], e))
+    assert 4 < np.mean(distances) < 10
+
+
+def test_nothing_is_found_in_a_sensor_without_error() -> None:
+    found = 0
+    for seed in range(60):
+        _, R, wrench, _, _ = session(np.random.default_rng(seed), 24, 0.0, 0.0)
+        found += fit(R, wrench, WHITE).response is not None
+    assert found <= 2
+
+
+def test_six_poses_are_too_few_to_look_for_it() -> None:
+    _, R, wrench, _, _ = session(np.random.default_rng(2), 6, 0.03, 0.03)
+    assert fit(R, wrench, WHITE).response is None
+
+
+def solved(seed: int = 1) -> tuple[CalibrationResult, Array, Array]:
+    _, R, wrench, _, _ = session(np.random.default_rng(seed), 24, 0.02, 0.02)
+    dataset = CalibrationDataset(R, wrench, np.tile(WHITE, (24, 1, 1)), np.full(24, 200), np.arange(24.0))
+    return solve(dataset), R, wrench
+
+
+def test_compensation_applies_it_unless_asked_not_to() -> None:
+    result, R, wrench = solved()
+    assert result.response is not None
+    np.testing.assert_allclose(result.compensate(wrench, R), result.residuals, atol=1e-12)
+    plain = result.compensate(wrench, R, response=False)
+    np.testing.assert_allclose(plain, wrench - predict(result.parameters, R), atol=1e-12)
+    assert np.sqrt(np.mean(plain**2)) > 2 * np.sqrt(np.mean(result.residuals**2))
+
+
+def test_it_is_kept_in_the_file(tmp_path: Path) -> None:
+    result, R, wrench = solved()
+    result.save(tmp_path / "a.json")
+    again = CalibrationResult.load(tmp_path / "a.json")
+    assert result.response is not None
+    assert again.response is not None
+    np.testing.assert_array_equal(again.response.coefficients, result.response.coefficients)
+    np.testing.assert_array_equal(again.compensate(wrench, R), result.compensate(wrench, R))
+    document = json.loads((tmp_path / "a.json").read_text())
+    np.testing.assert_allclose(document["response"]["force_gain"], result.response.force_gain)
+    del document["response"]  # a file from before
+    assert CalibrationResult.from_dict(document).response is None
+
+
+def test_the_mass_is_uncertain_by_the_gain_common_to_all_axes() -> None:
+    z = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        p, R, wrench, _, _ = session(rng, 24, 0.02, 0.0)
+        result = solve(CalibrationDataset(R, wrench, np.tile(WHITE, (24, 1, 1)), np.zeros(24, int), np.arange(24.0)))
+        z.append((result.weight_N - np.linalg.norm(p.gravity_force_base_N)) / result.sigma["weight_N"])
+    assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.3
+
+
+def test_it_is_said_in_words() -> None:
+    coefficients = np.zeros(11)
+    coefficients[1] = -0.03  # low along x and y, high along z
+    words = Response(coefficients, 1e-8 * np.eye(26)).in_words()
+    assert "1.2 % low along x" in words
+    assert "2.4 % high along z" in words
+    result, _, _ = solved()
+    assert any("the sensor reads" in reason for reason in result.reasons)
+
+
+def test_a_damaged_response_is_refused() -> None:
+    with pytest.raises(ValueError, match="coefficients"):
+        Response(np.zeros(10), np.eye(26))

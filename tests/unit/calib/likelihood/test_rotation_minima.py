@@ -1,0 +1,363 @@
+"""All minima over the rotations, checked against least squares, brute force and symmetry; and the proof, on and off."""
+
+from itertools import permutations, product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from calib.errors import BadDataset
+from calib.likelihood import rotation_minima
+
+Array = NDArray[np.float64]
+
+GRAVITY_N = np.array([1.0, 3.0, -40.0])
+BIAS_N = np.array([63.0, 5.0, 21.0])
+HALF_TURNS = [np.diag(d) for d in ((1.0, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
+SIGNED = [np.diag(s)[list(p)] for p in permutations(range(3)) for s in product((1.0, -1.0), repeat=3)]
+CUBE = np.array([R for R in SIGNED if np.linalg.det(R) > 0])
+
+seeds = st.integers(0, 10**6)
+slow = settings(max_examples=25)
+
+
+def forces(R_base_flange: Array, R: Array, noise_N: float = 0.0, seed: int = 0, gravity_N: Array = GRAVITY_N) -> Array:
+    force = R_base_flange.swapaxes(1, 2) @ gravity_N @ R.T + BIAS_N
+    return np.asarray(force + noise_N * np.random.default_rng(seed).normal(size=force.shape))
+
+
+def problem(seed: int, n: int = 12, noise_N: float = 1.0) -> tuple[Array, Array, Array]:
+    """(n, 3, 3) orientations, (n, 3) forces and the true R."""
+    rng = np.random.default_rng(seed)
+    R_base_flange, R = Rotation.random(n, rng=rng).as_matrix(), Rotation.random(rng=rng).as_matrix()
+    return R_base_flange, forces(R_base_flange, R, noise_N, seed), R
+
+
+def wishart(seed: int) -> Array:
+    G = np.random.default_rng(seed).normal(size=(9, 9))
+    return np.asarray(G @ G.T)
+
+
+def cost(Q: Array, R: Array) -> float:
+    return float(R.ravel() @ Q @ R.ravel())
+
+
+def angle(R: Array, other: Array) -> float:
+    return float(np.linalg.norm(Rotation.from_matrix(R.T @ other).as_rotvec()))
+
+
+def nearest(found: list[rotation_minima.Minimum], R: Array) -> float:
+    return min(angle(minimum.R, R) for minimum in found)
+
+
+# The cost
+
+
+@slow
+@given(seeds, st.booleans(), st.integers(3, 9))
+def test_cost_is_that_of_least_squares(seed: int, with_bias: bool, n: int) -> None:
+    R_base_flange, force, _ = problem(seed, n)
+    rng = np.random.default_rng(seed + 1)
+    weights, R = rng.uniform(0.1, 3, n), Rotation.random(rng=rng).as_matrix()
+    Q = rotation_minima.force_cost(R_base_flange, force, weights, with_bias=with_bias)
+    root = np.sqrt(weights)
+    rows = [np.hstack((R @ A.T, np.eye(3)))[:, : 6 if with_bias else 3] for A in R_base_flange]
+    J, y = np.vstack([s * row for s, row in zip(root, rows, strict=True)]), (force * root[:, None]).ravel()
+    unknowns = np.linalg.lstsq(J, y, rcond=None)[0]
+    assert cost(Q, R) == pytest.approx(np.sum((y - J @ unknowns) ** 2), rel=1e-9)
+    gravity, bias = rotation_minima.given_rotation(R, R_base_flange, force, weights, with_bias=with_bias)
+    assert np.concatenate((gravity, bias)) == pytest.approx(np.resize([*unknowns, 0, 0, 0], 6), abs=1e-8)
+    assert np.array_equal(Q, Q.T)
+    assert np.linalg.eigvalsh(Q)[0] > -1e-12 * np.trace(Q)
+
+
+@pytest.mark.parametrize(("n", "tolerance_rad"), [(24, 1e-11), (7, 1e-10), (4, 1e-7)])
+def test_noise_free_data_give_the_truth(n: int, tolerance_rad: float) -> None:
+    for seed in range(10):
+        R_base_flange, force, R = problem(seed, n, noise_N=0)
+        Q = rotation_minima.force_cost(R_base_flange, force, np.ones(n))
+        best, *_ = rotation_minima.minima(Q)
+        assert angle(best.R, R) < tolerance_rad
+        assert rotation_minima.certificate(Q, best.R) <= 1e-8
+        gravity, bias = rotation_minima.given_rotation(best.R, R_base_flange, force, np.ones(n))
+        assert gravity == pytest.approx(GRAVITY_N, abs=1e3 * tolerance_rad)
+        assert bias == pytest.approx(BIAS_N, abs=1e3 * tolerance_rad)
+
+
+def test_a_huge_bias_costs_no_digits() -> None:
+    R_base_flange, force, R = problem(0, noise_N=0)
+    best, *_ = rotation_minima.minima(rotation_minima.force_cost(R_base_flange, force + 1e5, np.ones(12)))
+    assert angle(best.R, R) < 1e-11
+
+
+@pytest.mark.parametrize("with_bias", [True, False])
+def test_sums_of_parts_give_the_same_as_the_data(with_bias: bool) -> None:
+    R_base_flange, force, R = problem(1, 10_000)
+    weights = np.linspace(0, 2, 10_000)
+    gram = sum(
+        (rotation_minima.force_gram(R_base_flange[s], force[s], weights[s]) for s in (slice(0, 9), slice(9, None))),
+        np.zeros((13, 13)),
+    )
+    Q = rotation_minima.force_cost(R_base_flange, force, weights, with_bias=with_bias)
+    assert rotation_minima.force_cost_from_gram(gram, with_bias=with_bias) == pytest.approx(
+        Q, rel=1e-9, abs=1e-9 * np.trace(Q)
+    )
+    kept = weights > 1
+    only = rotation_minima.force_cost(R_base_flange[kept], force[kept], weights[kept], with_bias=with_bias)
+    assert rotation_minima.force_cost(R_base_flange, force, weights * kept, with_bias=with_bias) == pytest.approx(
+        only, rel=1e-9
+    )
+    for ours, same in zip(
+        rotation_minima.given_rotation_from_gram(gram, R, with_bias=with_bias),
+        rotation_minima.given_rotation(R, R_base_flange, force, weights, with_bias=with_bias),
+        strict=True,
+    ):
+        assert ours == pytest.approx(same, abs=1e-9)
+
+
+def test_information_matrices_count_by_their_mean_diagonal() -> None:
+    R_base_flange, force, _ = problem(2)
+    weights = np.linspace(1, 2, 12)
+    exact = rotation_minima.force_cost(R_base_flange, force, weights)
+    assert rotation_minima.force_cost(R_base_flange, force, weights[:, None, None] * np.eye(3)) == pytest.approx(exact)
+    assert rotation_minima.force_cost(
+        R_base_flange, force, weights[:, None, None] * np.diag([0.5, 1, 1.5])
+    ) == pytest.approx(exact)
+
+
+def test_undetermined_gravity_is_the_shortest() -> None:
+    R_base_flange, force, R = problem(3, 1, noise_N=0)
+    gravity, bias = rotation_minima.given_rotation(R, R_base_flange, force, np.ones(1))
+    assert gravity == pytest.approx(np.zeros(3))
+    assert bias == pytest.approx(force[0])
+
+
+@pytest.mark.parametrize(
+    ("poses", "force", "weights", "told"),
+    [
+        (np.zeros((3, 3)), np.zeros((3, 3)), np.ones(3), "must be"),
+        (CUBE[:5], np.zeros((4, 3)), np.ones(4), "must be"),
+        (CUBE[:2], np.zeros((2, 3)), np.ones(3), "must be"),
+        (CUBE[:2], np.array([[0, 0, 1.0], [0, np.nan, 0]]), np.ones(2), r"rows \[1\] of 2"),
+        (CUBE[:2], np.zeros((2, 3)), np.array([1, -1.0]), "weights from -1"),
+        (CUBE[:2], np.zeros((2, 3)), np.zeros(2), "some > 0"),
+        (CUBE[:2], np.zeros((2, 3)), np.array([1, np.nan]), "finite"),
+    ],
+)
+def test_bad_data_are_refused(poses: Array, force: Array, weights: Array, told: str) -> None:
+    with pytest.raises(BadDataset, match=told):
+        rotation_minima.force_cost(poses, force, weights)
+    with pytest.raises(BadDataset, match=told):
+        rotation_minima.force_gram(poses, force, weights)
+
+
+# The minima
+
+
+@slow
+@given(seeds)
+def test_minima_turn_with_the_frames(seed: int) -> None:
+    R_base_flange, force, _ = problem(seed, 8, noise_N=5)
+    turns = Rotation.random(3, rng=np.random.default_rng(seed + 1)).as_matrix()
+    sensor, flange, base = turns
+    found = rotation_minima.minima(rotation_minima.force_cost(R_base_flange, force, np.ones(8)))
+    turned = rotation_minima.minima(
+        rotation_minima.force_cost(base @ R_base_flange @ flange, force @ sensor.T, np.ones(8))
+    )
+    assert [m.cost for m in turned] == pytest.approx([m.cost for m in found], rel=1e-9)
+    for minimum in found:
+        assert nearest(turned, sensor @ minimum.R @ flange) < 1e-6
+
+
+@slow
+@given(seeds, st.floats(1e-6, 1e6), st.floats(1e-3, 1e3))
+def test_minima_scale_with_units(seed: int, weight: float, unit: float) -> None:
+    R_base_flange, force, _ = problem(seed, 8, noise_N=5)
+    found = rotation_minima.minima(rotation_minima.force_cost(R_base_flange, force, np.ones(8)))
+    scaled = rotation_minima.minima(rotation_minima.force_cost(R_base_flange, unit * force, np.full(8, weight)))
+    assert [m.cost for m in scaled] == pytest.approx([weight * unit**2 * m.cost for m in found], rel=1e-9)
+    assert max(nearest(found, m.R) for m in scaled) < 1e-6
+
+
+@slow
+@given(seeds)
+def test_minima_are_distinct_ascending_and_stationary(seed: int) -> None:
+    Q = wishart(seed)
+    found = rotation_minima.minima(Q)
+    assert found == sorted(found, key=lambda m: m.cost)
+    for i, m in enumerate(found):
+        assert m.cost == pytest.approx(cost(Q, m.R))
+        assert np.linalg.norm(m.R.T @ m.R - np.eye(3)) < 1e-14
+        assert np.linalg.det(m.R) == pytest.approx(1)
+        assert all(angle(m.R, other.R) > 1e-3 for other in found[:i])
+        around = Rotation.from_rotvec(1e-3 * np.vstack((np.eye(3), -np.eye(3)))).as_matrix()
+        assert all(cost(Q, m.R @ near) > m.cost for near in around)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_brute_force_finds_no_other_minimum(seed: int) -> None:
+    Q = wishart(seed)
+    if seed % 2:
+        R_base_flange, force, _ = problem(seed, 6, noise_N=10)
+        Q = rotation_minima.force_cost(R_base_flange, force, np.ones(6))
+    found = rotation_minima.minima(Q)
+    yaw, pitch, roll = np.meshgrid(np.arange(0, 360, 12), np.arange(-90, 91, 12), np.arange(0, 360, 12))
+    grid = Rotation.from_euler("ZYX", np.stack((yaw.ravel(), pitch.ravel(), roll.ravel()), axis=1), degrees=True)
+    r = grid.as_matrix().reshape(-1, 9)
+    costs = np.sum((r @ Q) * r, axis=1)
+    assert costs.min() >= found[0].cost
+    for i in (*np.argsort(costs)[:3], *np.random.default_rng(seed).integers(0, len(r), 9)):
+
+        def polished(v: Array, start: Rotation = grid[int(i)]) -> float:
+            return cost(Q, (start * Rotation.from_rotvec(v)).as_matrix())
+
+        end = minimize(polished, np.zeros(3), tol=1e-10)
+        assert end.fun >= found[0].cost - 1e-12 * np.trace(Q)
+        assert nearest(found, (grid[int(i)] * Rotation.from_rotvec(end.x)).as_matrix()) < 1e-3
+
+
+def test_every_mount_of_the_cube_group_is_found() -> None:
+    for R in CUBE:
+        Q = rotation_minima.force_cost(CUBE, forces(CUBE, R, noise_N=0.1), np.ones(24))
+        best, *_ = rotation_minima.minima(Q)
+        assert angle(best.R, R) < 0.01
+        assert rotation_minima.certificate(Q, best.R) <= 1e-8
+
+
+def test_four_half_turns_leave_four_equal_mounts() -> None:
+    R_base_flange = Rotation.random(rng=np.random.default_rng(0)).as_matrix() @ np.array(HALF_TURNS)
+    R = Rotation.random(rng=np.random.default_rng(1)).as_matrix()
+    Q = rotation_minima.force_cost(R_base_flange, forces(R_base_flange, R, noise_N=1), np.ones(4))
+    found = rotation_minima.minima(Q)
+    assert len(found) == 4
+    assert np.ptp([m.cost for m in found]) < 1e-12 * np.trace(Q)
+    assert max(nearest(found, found[0].R @ D) for D in HALF_TURNS) < 1e-6
+    assert max(rotation_minima.certificate(Q, m.R) for m in found) <= 1e-8
+
+
+def test_constant_tilt_leaves_the_sign_of_gravity_open() -> None:
+    tilt = Rotation.from_rotvec([np.deg2rad(140), 0, 0])
+    turn = Rotation.from_rotvec(np.outer(np.linspace(0, 5, 8), [0, 0, 1]))
+    R_base_flange, R = (turn * tilt * turn.inv()).as_matrix(), Rotation.random(rng=np.random.default_rng(2)).as_matrix()
+    force = forces(R_base_flange, R, gravity_N=np.array([0, 0, -40.0]))
+    best, second, *_ = rotation_minima.minima(rotation_minima.force_cost(R_base_flange, force, np.ones(8)))
+    assert second.cost == pytest.approx(best.cost, abs=1e-9)
+    assert nearest([best, second], R) < 1e-9
+    assert angle(best.R, second.R @ np.diag([-1.0, -1, 1])) < 1e-9
+
+
+def test_three_poses_have_four_or_eight_exact_mounts() -> None:
+    for seed in range(10):
+        R_base_flange, force, R = problem(seed, 3, noise_N=0)
+        Q = rotation_minima.force_cost(R_base_flange, force, np.ones(3))
+        exact = [m for m in rotation_minima.minima(Q) if m.cost < 1e-10 * np.trace(Q)]
+        assert len(exact) in {4, 8}
+        assert nearest(exact, R) < 1e-4
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_minima_come_in_whole_orbits_of_a_symmetry(seed: int) -> None:
+    Q = np.diag(np.random.default_rng(seed).uniform(size=9))  # half turns on either side change nothing
+    found = rotation_minima.minima(Q)
+    assert all(nearest(found, D @ m.R @ E) < 1e-6 for m in found for D in HALF_TURNS for E in HALF_TURNS)
+    assert rotation_minima.certificate(Q, found[0].R) <= 1e-8
+
+
+def yaw_only() -> Array:
+    tilt, turn = Rotation.from_rotvec([2.5, 0, 0]), Rotation.from_rotvec(np.outer(np.arange(5), [0, 0, 1]))
+    R_base_flange = (tilt * turn).as_matrix()
+    return rotation_minima.force_cost(R_base_flange, forces(R_base_flange, np.eye(3), noise_N=0.5), np.ones(5))
+
+
+@pytest.mark.parametrize(
+    "Q",
+    [
+        np.zeros((9, 9)),
+        np.eye(9),
+        np.diag(np.arange(9.0)),  # rows and columns of squared entries add up to 1: constant
+        np.diag([1.0, *[0] * 8]),
+        np.ones((9, 9)),
+        rotation_minima.force_cost(CUBE[:1], np.ones((1, 3)), np.ones(1)),
+        rotation_minima.force_cost(CUBE[:2], np.arange(6.0).reshape(2, 3), np.ones(2)),
+        yaw_only(),
+        1e-100 * wishart(0),
+        1e100 * wishart(0),
+    ],
+    ids=["zero", "identity", "constant", "one entry", "rank one", "1 pose", "2 poses", "yaw only", "tiny", "huge"],
+)
+def test_degenerate_cost_gives_few_representatives(Q: Array) -> None:
+    found = rotation_minima.minima(Q)
+    assert 1 <= len(found) <= 16
+    assert 0 <= rotation_minima.certificate(Q, found[0].R) <= 1e-8
+    assert min(cost(Q, R) for R in Rotation.random(2000, rng=np.random.default_rng(0)).as_matrix()) >= (
+        found[0].cost - 1e-14 * np.trace(Q)
+    )
+
+
+def test_yaw_only_is_a_curve_of_minima() -> None:
+    Q = yaw_only()
+    found = rotation_minima.minima(Q)
+    assert len(found) > 1
+    turned = [cost(Q, found[0].R @ Rotation.from_rotvec([0, 0, a]).as_matrix()) for a in np.linspace(0, 6, 20)]
+    assert np.ptp(turned) < 1e-12 * np.trace(Q)
+
+
+def test_minima_of_no_matrix_are_refused() -> None:
+    for Q in (np.eye(3), np.full((9, 9), np.nan)):
+        with pytest.raises(ValueError, match="9x9 finite"):
+            rotation_minima.minima(Q)
+
+
+# The proof
+
+
+@slow
+@given(seeds)
+def test_gap_is_the_excess_over_the_global_minimum(seed: int) -> None:
+    R_base_flange, force, R = problem(seed, 8, noise_N=8)
+    Q = rotation_minima.force_cost(R_base_flange, force, np.ones(8))
+    best, *others = rotation_minima.minima(Q)
+    assert rotation_minima.certificate(Q, best.R) <= 1e-8
+    for other in (R, *(m.R for m in others)):
+        excess = (cost(Q, other) - best.cost) / (np.trace(Q) / 3)
+        assert rotation_minima.certificate(Q, other) == pytest.approx(excess, abs=1e-8)
+
+
+@slow
+@given(seeds, st.sampled_from([1e-6, 1e-3, 1.0]))
+def test_nothing_false_is_proved(seed: int, away: float) -> None:
+    Q = wishart(seed)
+    best, *_ = rotation_minima.minima(Q)
+    R = best.R @ Rotation.from_rotvec(away * np.array([0.6, 0, 0.8])).as_matrix()
+    assert rotation_minima.certificate(Q, R) >= (cost(Q, R) - best.cost) / (np.trace(Q) / 3)
+
+
+def test_gap_has_no_unit() -> None:
+    Q = wishart(3)
+    assert rotation_minima.certificate(1e-3 * Q, np.eye(3)) == pytest.approx(
+        rotation_minima.certificate(Q, np.eye(3)), abs=1e-9
+    )
+
+
+def test_a_quartic_that_is_no_sum_of_squares_stays_unproved() -> None:
+    """Choi and Lam's form is nonnegative with zeros on the sphere, yet no sum of squares: the gap must not be small."""
+    w, x, y, z = q = np.random.default_rng(0).normal(size=(4, 200))
+    q /= np.linalg.norm(q, axis=0)
+    values = w**4 + (x * y) ** 2 + (y * z) ** 2 + (z * x) ** 2 - 4 * w * x * y * z
+    r = Rotation.from_quat(q.T, scalar_first=True).as_matrix().reshape(-1, 9)
+    products = np.einsum("ki,kj->kij", r, r).reshape(-1, 81)
+    Q = np.linalg.lstsq(products, values, rcond=None)[0].reshape(9, 9)
+    Q = (Q + Q.T) / 2 - np.linalg.eigvalsh(Q + Q.T)[0] / 2 * np.eye(9)
+    found = rotation_minima.minima(Q)
+    assert [m.cost for m in found] == pytest.approx([found[0].cost] * 7)
+    assert rotation_minima.certificate(Q, found[0].R) > 0.01
+
+
+def test_only_rotations_are_judged() -> None:
+    for R in (np.diag([1.0, 1, -1]), 2 * np.eye(3), np.eye(9)):
+        with pytest.raises(ValueError, match="rotation"):
+            rotation_minima.certificate(np.eye(9), R)

@@ -1,0 +1,215 @@
+"""Noise of a session: O(n) algebra against dense matrices, restricted likelihood against its definition."""
+
+import numpy as np
+import pytest
+
+from calib.likelihood.session_noise import Noise, centred, walk_square, walk_times
+from calib.likelihood.variance_components import (
+    FORCE,
+    ROTATION,
+    TORQUE,
+    Component,
+    Linearised,
+    _pruned,
+    _score,
+    component,
+    maximise,
+    point,
+    select,
+    with_slopes_instead,
+)
+from calib.model import Array
+
+N = 15
+
+
+def dense(D: Array, time: Array, walk: Array, slope: Array) -> Array:
+    n = len(D)
+    tau = np.cumsum(np.diff(time, prepend=time[0] - 1))
+    centre = np.eye(n) - 1 / n
+    K = centre @ np.minimum.outer(tau, tau) @ centre
+    V = np.asarray(np.kron(K, np.diag(walk**2)), dtype=np.float64)
+    V += np.kron(np.outer(centred(time), centred(time)), np.diag(slope**2))
+    for i in range(n):
+        V[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += D[i]
+    return np.asarray(V, dtype=np.float64)
+
+
+def covariances(rng: np.random.Generator, n: int = N) -> Array:
+    A = rng.normal(size=(n, 6, 9))
+    return np.asarray(A @ np.swapaxes(A, 1, 2))
+
+
+@pytest.mark.parametrize(
+    ("walk", "slope"),
+    [
+        ([0.3, 0, 0.5, 0.1, 0, 20.0], [0] * 6),
+        ([0] * 6, [0, 1.0, 0, 0, 2.0, 3.0]),
+        ([0.3, 0, 0.5, 0.1, 0, 0.2], [0, 1.0, 0, 0, 2.0, 3.0]),
+        ([1e-4] * 6, [0] * 6),
+    ],
+)
+def test_the_inverse_is_that_of_the_dense_covariance(walk: list[float], slope: list[float]) -> None:
+    rng = np.random.default_rng(1)
+    D, time = covariances(rng), np.cumsum(rng.uniform(0.1, 3, N))
+    noise = Noise(D, time, np.array(walk), np.array(slope))
+    V = dense(D, time, np.array(walk), np.array(slope))
+    inverse = np.linalg.inv(V)
+    X = rng.normal(size=(N, 6, 4))
+    np.testing.assert_allclose(noise.solve(X).reshape(-1, 4), inverse @ X.reshape(-1, 4), atol=1e-9)
+    blocks = [inverse[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(N)]
+    np.testing.assert_allclose(noise.blocks, blocks, atol=1e-9)
+    assert noise.logdet == pytest.approx(np.linalg.slogdet(V)[1], abs=1e-8)
+
+
+def test_an_unknown_slope_is_one_of_infinite_variance() -> None:
+    rng = np.random.default_rng(2)
+    D, time = covariances(rng), np.arange(N, dtype=float)
+    unknown = Noise(D, time, None, np.full(6, np.inf))
+    line = centred(time)[:, None, None] * np.eye(6)
+    np.testing.assert_allclose(unknown.solve(line), 0, atol=1e-12)
+    X = rng.normal(size=(N, 6, 2))
+    np.testing.assert_allclose(unknown.solve(X), Noise(D, time, None, np.full(6, 1e5)).solve(X), atol=1e-7)
+
+
+def test_common_noise_is_inverted_once_for_all_poses() -> None:
+    C = covariances(np.random.default_rng(3), 1)[0]
+    common, each = Noise(np.broadcast_to(C, (N, 6, 6))), Noise(np.tile(C, (N, 1, 1)))
+    assert common.W.strides[0] == 0
+    assert common.logdet == pytest.approx(each.logdet)
+    np.testing.assert_allclose(common.blocks, each.blocks)
+
+
+def test_the_walk_multiplies_as_its_covariance() -> None:
+    rng = np.random.default_rng(4)
+    time, X = np.cumsum(rng.uniform(0.1, 3, N)), rng.normal(size=(N, 2))
+    tau = np.cumsum(np.diff(time, prepend=time[0] - 1))
+    K = np.minimum.outer(tau, tau)
+    np.testing.assert_allclose(walk_times(time, X), K @ X)
+    np.testing.assert_allclose(walk_square(time, X), np.diag(X.T @ K @ X))
+
+
+ALL = (
+    component("white", FORCE),
+    component("white", TORQUE),
+    ROTATION,
+    component("walk", FORCE),
+    component("walk", [5]),
+)
+THETA = np.array([0.3, 0.2, 0.05 / 400, 0.4, 0.1])
+
+
+def problem(rng: np.random.Generator, n: int, components: tuple[Component, ...], theta: Array) -> Linearised:
+    J = rng.normal(size=(n, 6, 8))
+    J[:, :, :6] = np.eye(6)  # biases are always free
+    turn = 20 * rng.normal(size=(n, 6, 3))  # as large as a small turn makes it
+    time = np.arange(n, dtype=float)
+    D = np.tile(np.eye(6) * 0.04, (n, 1, 1))
+    V = D.copy()
+    walk = np.zeros(6)
+    for c, v in zip(components, theta, strict=True):
+        if c.kind == "white":
+            V += v * np.diag(c.share)
+        elif c.kind == "rotation":
+            V += v * turn @ np.swapaxes(turn, 1, 2)
+        else:
+            walk += np.sqrt(v) * np.array(c.share)
+    r = (np.linalg.cholesky(V) @ rng.normal(size=(n, 6, 1)))[..., 0]
+    r += np.cumsum(rng.normal(size=(n, 6)) * walk, axis=0)
+    return Linearised(
+        J, r, (np.zeros((8, 8)), np.zeros(8)), turn, D, time, np.ones(n, bool), None, np.zeros((n, 6, 11))
+    )
+
+
+@pytest.mark.parametrize("components", [ALL, (*ALL[:3], component("slope", FORCE), component("slope", TORQUE))])
+def test_slope_and_curvature_are_those_of_the_restricted_likelihood(components: tuple[Component, ...]) -> None:
+    rng = np.random.default_rng(5)
+    p = problem(rng, N, ALL, THETA)
+    slope, information = _score(p, point(p, components, THETA))
+    h = 1e-4
+    for k in range(len(components)):
+        up, down = (point(p, components, THETA * np.exp(s * h * np.eye(len(components))[k])).loglik for s in (1, -1))
+        assert slope[k] == pytest.approx((up - down) / (2 * h), rel=1e-5, abs=1e-6), components[k].name
+    assert np.linalg.eigvalsh(information).min() > 0
+
+
+def test_the_restricted_likelihood_is_that_of_error_contrasts() -> None:
+    rng = np.random.default_rng(6)
+    p = problem(rng, 8, ALL, THETA)
+    X = p.J.reshape(-1, 8)
+    contrasts = np.linalg.svd(X)[0][:, 8:]
+
+    def exact(theta: Array) -> float:
+        D = p.D + theta[0] * np.diag([1, 1, 1, 0, 0, 0.0]) + theta[1] * p.turn @ np.swapaxes(p.turn, 1, 2)
+        V = dense(D, p.time, np.sqrt(theta[2]) * np.array([1, 1, 1, 0, 0, 0.0]), np.zeros(6))
+        C, y = contrasts.T @ V @ contrasts, contrasts.T @ p.r.ravel()
+        return float(-0.5 * (np.linalg.slogdet(C)[1] + y @ np.linalg.solve(C, y)))
+
+    components = (ALL[0], ALL[2], ALL[3])
+    thetas = np.exp(rng.normal(size=(4, 3))) / [1, 400, 1]
+    ours = [point(p, components, theta).loglik for theta in thetas]
+    np.testing.assert_allclose(np.diff(ours), np.diff([exact(theta) for theta in thetas]), atol=1e-8)
+
+
+def test_variances_are_recovered() -> None:
+    found = []
+    for seed in range(10):
+        p = problem(np.random.default_rng(seed), 100, ALL, THETA)
+        found.append(maximise(p, ALL, 0.1 / np.array([1, 1, 400, 1, 1])).theta)
+    np.testing.assert_allclose(np.median(found, axis=0), THETA, rtol=0.25)
+
+
+def test_nothing_is_found_where_nothing_is_and_the_walk_where_one_is() -> None:
+    candidates = [*ALL[:3], component("walk", FORCE), component("walk", TORQUE)]
+    spurious, right = 0, 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        spurious += len(select(problem(rng, 30, (), np.zeros(0)), [], np.zeros(0), candidates).components)
+        walk = component("walk", FORCE)
+        at = select(problem(rng, 30, (walk,), np.array([0.02])), [], np.zeros(0), candidates)
+        right += walk in at.components
+    assert spurious <= 4  # 2 % each, of 100
+    assert right >= 19
+
+
+@pytest.mark.parametrize("walk_first", [False, True])
+def test_what_others_make_needless_is_dropped(walk_first: bool) -> None:
+    white, walk = component("white", FORCE), component("walk", FORCE)
+    both = (walk, white) if walk_first else (white, walk)
+    rng = np.random.default_rng(7)
+    for really, needed, kept in (
+        ((white,), 0, (white,)),
+        ((walk,), 0, (walk,)),
+        (both, 0, both),
+        ((white,), 2, both),  # whatever the data say
+    ):
+        p = problem(rng, 40, really, np.full(len(really), 0.3))
+        at = maximise(p, both, np.full(2, 0.1))
+        assert _pruned(p, at, needed).components == kept
+
+
+def test_what_is_always_needed_is_not_dropped() -> None:
+    three = (component("walk", FORCE), *ALL[:2])
+    p = problem(np.random.default_rng(8), 40, ALL[:2], np.full(2, 0.3))
+    at = maximise(p, three, np.full(3, 0.1))
+    assert _pruned(p, at, 1).components == three
+    assert _pruned(p, at, 0).components == ALL[:2]
+
+
+def test_a_turn_of_the_flange_is_told_from_white_noise() -> None:
+    rng = np.random.default_rng(8)
+    turned = problem(rng, 40, (ROTATION,), np.array([0.3 / 400]))
+    assert select(turned, [], np.zeros(0), list(ALL[:3])).components == (ROTATION,)
+    white = problem(rng, 40, ALL[:1], np.array([0.3]))
+    assert select(white, [], np.zeros(0), list(ALL[:3])).components == ALL[:1]
+
+
+def test_a_linear_drift_is_preferred_where_it_fits_better() -> None:
+    rng = np.random.default_rng(9)
+    p = problem(rng, 30, (), np.zeros(0))
+    p.r[:, :3] += centred(p.time)[:, None] * [2.0, -1.5, 1.0]
+    at = select(p, [], np.zeros(0), [component("walk", FORCE)])
+    assert [c.kind for c in with_slopes_instead(p, at, 0).components] == ["slope"]
+    q = problem(rng, 30, (component("walk", FORCE),), np.array([0.2]))
+    at = select(q, [], np.zeros(0), [component("walk", FORCE)])
+    assert with_slopes_instead(q, at, 0) is at

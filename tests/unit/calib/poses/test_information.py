@@ -1,0 +1,450 @@
+"""Predicted uncertainty of sets of poses, and their choice, against closed forms, other code and published figures."""
+
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationDataset, solve
+from calib.errors import NotObservable
+from calib.model import Array, angle_between, jacobian, predict
+from calib.poses.information import (
+    AMBIGUOUS_6,
+    SUBSET_6,
+    SUBSET_8,
+    SUBSET_12,
+    T12,
+    Guess,
+    TOOL_DOWN_R_base_flange,
+    efficiency,
+    information,
+    optimised,
+    predicted_sigma,
+    second_basin,
+    second_basin_gap,
+    special,
+    whitened_jacobian,
+)
+from calib.poses.selection import Criterion, choose, cone_candidates, next_pose, order
+from ftdrive.planning.constant_tour import NUMBERS
+
+ALL = special(range(1, 25))
+GUESS = Guess(mass_kg=20 / 9.80665, sigma_force_N=0.2, sigma_torque_Nm=0.005)  # weight / sigma 100, lever 25 mm
+FORCES_ONLY = Guess(1.0, 0.05, 0.003, p_sensor_com_m=(0, 0, 0), tilt_beta_rad=np.deg2rad(3))
+
+
+def norm(value: Array | float) -> float:
+    return float(np.linalg.norm(value))
+
+
+def row(R_base_flange: Array, guess: Guess = FORCES_ONLY) -> list[float]:
+    """cond9, cond[u,1], rotation and tilt in degrees, weight and bias in N, centre of mass in mm."""
+    p = predicted_sigma(R_base_flange, guess)
+    s = p.sigma
+    tilt = np.hypot(s["tilt_alpha_rad"], s["tilt_beta_rad"])
+    return [
+        p.cond9,
+        p.cond_u1,
+        float(np.rad2deg(norm(s["R_flange_sensor"]))),
+        float(np.rad2deg(tilt)),
+        norm(s["weight_N"]),
+        norm(s["force_bias_N"]),
+        1e3 * norm(s["p_sensor_com_m"]),
+    ]
+
+
+def tilted(tilt_deg: float, azimuth_deg: float, spin_deg: float) -> Array:
+    turn = Rotation.from_euler("ZYZ", [azimuth_deg, tilt_deg, spin_deg], degrees=True).as_matrix()
+    return np.asarray(turn @ TOOL_DOWN_R_base_flange)
+
+
+def ball(half_angle_deg: float, m: int, rng: np.random.Generator) -> Array:
+    turns = Rotation.random(200 * m, rng=rng)
+    return np.asarray(turns[turns.magnitude() <= np.deg2rad(half_angle_deg)][:m].as_matrix() @ TOOL_DOWN_R_base_flange)
+
+
+# ---- predictions
+
+
+def test_prediction_is_what_the_solver_states_for_such_data() -> None:
+    rng = np.random.default_rng(1)
+    guess = Guess(
+        mass_kg=1.7,
+        sigma_force_N=0.03,
+        sigma_torque_Nm=0.002,
+        p_sensor_com_m=(0.01, -0.02, 0.06),
+        R_flange_sensor=Rotation.random(rng=rng).as_matrix(),
+        tilt_alpha_rad=0.3,
+        tilt_beta_rad=-0.7,
+    )
+    R = Rotation.random(9, rng=rng).as_matrix()
+    cov = np.tile(np.diag([0.03**2] * 3 + [0.002**2] * 3), (9, 1, 1))
+    result = solve(CalibrationDataset(R, predict(guess.parameters, R), cov, np.full(9, 100), np.arange(9.0)))
+    prediction = predicted_sigma(R, guess)
+    assert prediction.sigma.keys() == result.sigma.keys()
+    for name, sigma in result.sigma.items():
+        assert_allclose(prediction.sigma[name], sigma, rtol=1e-6, err_msg=name)
+    assert_allclose((prediction.force_rms_N, prediction.torque_rms_Nm), result.predicted_error(), rtol=1e-6)
+    assert prediction.n_poses == 9
+
+
+@pytest.mark.parametrize("numbers", [range(1, 25), T12])
+@pytest.mark.parametrize("kappa", [0.0, 1.0, 10.24, 100.0])
+def test_balanced_sets_have_the_closed_form_bound(numbers: tuple[int, ...], kappa: float) -> None:
+    n, weight_N, sigma_N, lever_m = len(numbers), 20.0, 0.2, 0.025
+    com = np.array([0, 0, lever_m * np.sqrt(kappa)])
+    sigma_Nm = sigma_N * lever_m
+    sigma = predicted_sigma(special(numbers), Guess(weight_N / 9.80665, sigma_N, sigma_Nm, p_sensor_com_m=com)).sigma
+    turn = np.array([1 / (1 + kappa / 4), 1 / (1 + kappa / 4), 1 / (1 + kappa)])
+    tilt = 1 / (1 + 2 * kappa / 3)
+    com_var = np.array([(4 + 2 * kappa) / (4 + kappa)] * 2 + [1 + 2 * kappa / 3])
+    assert_allclose(sigma["R_flange_sensor"], np.sqrt(1.5 * turn / n) * sigma_N / weight_N, rtol=1e-9)
+    assert_allclose(sigma["gravity_force_base_N"], np.sqrt(np.array([tilt, tilt, 1]) / n) * sigma_N, rtol=1e-9)
+    assert_allclose(sigma["tilt_beta_rad"], np.sqrt(tilt / n) * sigma_N / weight_N, rtol=1e-9)
+    assert_allclose(sigma["force_bias_N"], sigma_N / np.sqrt(n), rtol=1e-9)
+    assert_allclose(sigma["torque_bias_Nm"], sigma_Nm / np.sqrt(n), rtol=1e-9)
+    assert_allclose(sigma["p_sensor_com_m"], np.sqrt(1.5 * com_var / n) * sigma_Nm / weight_N, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "figures"),
+    [
+        (range(1, 25), [1.22, 1.7, 0.126, 0.084, 0.0102, 0.0177, 0.13]),
+        (SUBSET_12, [1.22, 1.7, 0.179, 0.119, 0.0144, 0.0250, 0.19]),
+        (AMBIGUOUS_6, [1.24, 1.8, 0.253, 0.169, 0.0204, 0.0354, 0.27]),
+        (range(1, 13), [1.7, 2.4, 0.188]),
+        (range(1, 7), [2.0, 20, 0.282]),
+    ],
+    ids=["all", "12", "6", "first 12", "first 6"],
+)
+def test_published_table_of_fixed_sets(numbers: tuple[int, ...], figures: list[float]) -> None:
+    # Two digits of the first two columns were printed, about two and a half of the others.
+    assert_allclose(row(special(numbers))[: len(figures)], figures, rtol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "figures"),
+    [
+        (120, [1.23, 1.7, 0.126, 0.084, 0.0102, 0.0177, 0.13]),
+        pytest.param(90, [1.55, 2.6, 0.131, 0.084, 0.0104, 0.0183, 0.14], marks=pytest.mark.slow),
+        pytest.param(60, [2.8, 6.3, 0.167, 0.087, 0.0131, 0.0250, 0.17], marks=pytest.mark.slow),
+        (45, [4.1, 11, 0.220, 0.093, 0.0177, 0.0347, 0.22]),
+        pytest.param(30, [6.3, 24, 0.325, 0.105, 0.0285, 0.0535, 0.32], marks=pytest.mark.slow),
+        (15, [13, 82, 0.64, 0.11, 0.060, 0.109, 0.62]),
+    ],
+)
+def test_published_table_of_chosen_sets_in_cones(degrees: int, figures: list[float]) -> None:
+    # The candidates behind the published figures are not known: 1200 others give the same within 8 %.
+    candidates = cone_candidates(np.deg2rad(degrees))
+    assert 1000 < len(candidates) < 1500
+    assert_allclose(row(candidates[choose(candidates, 24, FORCES_ONLY, least_gap=0.02)]), figures, rtol=0.08)
+
+
+def test_what_poses_do_not_tell_is_infinite() -> None:
+    none, one = predicted_sigma(np.zeros((0, 3, 3)), GUESS), predicted_sigma(ALL[:1], GUESS)
+    assert np.isinf([norm(none.sigma["mass_kg"]), norm(one.sigma["mass_kg"]), one.force_rms_N]).all()
+    assert np.isinf([one.cond9, one.cond_u1, none.cond9, none.cond_u1]).all()
+    assert one.second_basin_gap == none.second_basin_gap == 0
+    # Turning a level tool about the vertical leaves weight and bias along it mixed.
+    spun = predicted_sigma(np.array([tilted(0, a, 0) for a in (0, 60, 150, 240)]), GUESS)
+    assert np.isinf(np.atleast_1d(spun.sigma["force_bias_N"])[2])
+    assert np.isinf(norm(spun.sigma["mass_kg"]))
+    assert np.isinf(spun.force_rms_N)
+    assert np.isfinite(predicted_sigma(special(SUBSET_8[:4]), GUESS).force_rms_N)
+
+
+def test_linear_drift_costs_little_in_a_good_order_and_nothing_without_time() -> None:
+    tour = special(NUMBERS)
+    guess = replace(FORCES_ONLY, p_sensor_com_m=(0, 0, 0.05))
+    still, drifting = predicted_sigma(tour, guess), predicted_sigma(tour, guess, t_s=np.arange(24) * 5.0)
+    ratio = [norm(drifting.sigma[k]) / norm(still.sigma[k]) for k in ("R_flange_sensor", "weight_N", "force_bias_N")]
+    assert all(1 - 1e-12 <= r < 1.07 for r in ratio), ratio
+    assert max(ratio) > 1.005
+    unmoved = predicted_sigma(tour, guess, t_s=np.full(24, 7.0))
+    assert_allclose(unmoved.sigma["weight_N"], still.sigma["weight_N"], rtol=1e-12)
+    # One half of the orientations first and the other later: drift cannot be told from what differs between them.
+    sorted_ = ALL[np.lexsort((ALL[:, 2, 1], ALL[:, 2, 0]))]
+    bad = predicted_sigma(sorted_, guess, t_s=np.arange(24))
+    assert norm(bad.sigma["R_flange_sensor"]) > 1.2 * norm(still.sigma["R_flange_sensor"])
+
+
+def test_wandering_bias_is_generalised_least_squares() -> None:
+    rng = np.random.default_rng(5)
+    n, guess = 7, Guess(2.0, 0.1, 0.004, walk_force_N=0.3, walk_torque_Nm=0.002)
+    R = Rotation.random(n, rng=rng).as_matrix()
+    # The bias of the last pose is estimated; earlier ones differ from it by the steps in between.
+    steps = np.tril(np.ones((n, n)), -1).T  # pose i lacks steps i … n-2
+    cov = np.zeros((n, 6, n, 6))
+    for k, (white, walk) in enumerate([(0.1, 0.3)] * 3 + [(0.004, 0.002)] * 3):
+        cov[:, k, :, k] = white**2 * np.eye(n) + walk**2 * steps[:, 1:] @ steps[:, 1:].T
+    J = jacobian(guess.parameters, R).reshape(6 * n, 15)
+    expected = np.sqrt(np.diag(np.linalg.inv(J.T @ np.linalg.solve(cov.reshape(6 * n, 6 * n), J))))
+    sigma = predicted_sigma(R, guess).sigma
+    names = ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")
+    assert_allclose(np.concatenate([np.atleast_1d(sigma[name]) for name in names]), expected, rtol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["mass_kg", "sigma_force_N", "sigma_torque_Nm", "g_m_s2"])
+def test_a_guess_of_nothing_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} is 0"):
+        replace(GUESS, **{name: 0.0})
+    with pytest.raises(ValueError, match="walk_force_N is -1"):
+        replace(GUESS, walk_force_N=-1.0)
+
+
+@pytest.mark.parametrize(("com_m", "lever_m"), [(0.0, 0.04), (0.03, 0.04), (0.05, 0.05)])
+def test_the_lever_is_that_of_the_tool_or_of_the_noise(com_m: float, lever_m: float) -> None:
+    guess = Guess(2.0, 0.1, 0.004, p_sensor_com_m=(0, -com_m, 0), g_m_s2=10.0)
+    assert_allclose(guess.scale, np.repeat([1, 20, 20, lever_m, 20 * lever_m], 3))
+
+
+def test_a_centre_of_mass_near_the_sensor_is_observable() -> None:
+    for com_m in (0.0, 1e-7, 1e-3):
+        prediction = predicted_sigma(ALL, replace(GUESS, p_sensor_com_m=(0, 0, com_m)))
+        assert_allclose(prediction.sigma["p_sensor_com_m"], np.sqrt(1.5 / 24) * 0.005 / 20, rtol=1e-3)
+
+
+# ---- the second basin
+
+
+@pytest.mark.parametrize(
+    ("R_base_flange", "gap", "atol"),
+    [
+        (ALL, 8 / 9, 1e-6),
+        (special(T12), 8 / 9, 1e-6),
+        (special(SUBSET_8), 0.50, 1e-6),
+        (special(SUBSET_6), 0.28, 0.005),
+        (special(AMBIGUOUS_6), 0.0, 1e-9),
+        (ALL[:3], 0.0, 1e-9),
+        (np.array([tilted(40, 45 * k, 37 * k) for k in range(8)]), 0.0, 1e-9),
+        # The published 0.024 and 0.049 are for the best spins; these are nearly so.
+        (np.array([tilted(40, 360 / 7 * k, 90 * k) for k in range(7)] + [tilted(0, 0, 0)]), 0.024, 0.001),
+        (
+            np.array([tilted(40, 72 * k, 90 * k) for k in range(5)] + [tilted(0, 0, 40 * k) for k in range(3)]),
+            0.049,
+            0.002,
+        ),
+    ],
+    ids=["all", "T12", "8", "6", "ambiguous 6", "3 poses", "rim", "7 and centre", "5 and 3 centre"],
+)
+def test_published_gaps(R_base_flange: Array, gap: float, atol: float) -> None:
+    assert_allclose(second_basin_gap(R_base_flange, GUESS), gap, atol=atol)
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.3, 0.6])
+def test_the_second_solution_of_an_ambiguous_set_is_not_the_true_one(turn_rad: float) -> None:
+    turned = Rotation.from_rotvec([0, 0, turn_rad]).as_matrix() @ special(AMBIGUOUS_6)
+    gap, other = second_basin(turned, GUESS)
+    assert gap < 1e-9
+    assert other is not None
+    assert angle_between(other.R_flange_sensor, GUESS.parameters.R_flange_sensor) > 0.1
+
+
+def test_the_set_of_six_without_a_gap_is_really_ambiguous() -> None:
+    rng = np.random.default_rng(3)
+    guess = Guess(1.0, 0.05, 0.003, p_sensor_com_m=(0.01, -0.02, 0.07), tilt_alpha_rad=0.05, tilt_beta_rad=0.03)
+    cov = np.tile(np.diag(guess.wrench_sigma**2), (6, 1, 1))
+    verdicts: list[str] = []
+    for R in (special(AMBIGUOUS_6), special(SUBSET_6), optimised(6)):
+        wrench = predict(guess.parameters, R) + guess.wrench_sigma * rng.normal(size=(6, 6))
+        try:
+            verdicts.append(solve(CalibrationDataset(R, wrench, cov, np.full(6, 100), np.arange(6.0))).verdict)
+        except NotObservable:
+            verdicts.append("refused")
+    assert verdicts == ["refused", "good", "good"]
+
+
+# ---- stored sets
+
+
+def test_published_efficiencies_of_subsets() -> None:
+    # Of one tool; the direction of its centre of mass is the one that gives all eight published figures.
+    guess = replace(GUESS, p_sensor_com_m=0.08 * np.array([-0.833, -0.499, 0.241]), tilt_beta_rad=np.deg2rad(2))
+    assert_allclose(efficiency(special(T12), guess), 1, atol=1e-9)
+    assert_allclose(efficiency(special(SUBSET_8), guess), [0.975, 0.977, 0.981, 0.932], atol=0.003)
+    assert_allclose(efficiency(special(SUBSET_6), guess), [0.959, 0.967, 0.964, 0.881], atol=0.003)
+
+
+@pytest.mark.parametrize(
+    ("n", "gap", "mean", "lowest"),
+    [
+        (8, 0.8, (0.995, 0.996, 0.995, 0.985), (0.985, 0.99, 0.99, 0.97)),
+        (6, 0.4, (0.975, 0.98, 0.98, 0.92), (0.95,) * 3),
+    ],
+)
+@pytest.mark.parametrize("tilt_rad", [0.0, 0.1])
+def test_optimised_sets(
+    n: int, gap: float, mean: tuple[float, ...], lowest: tuple[float, ...], tilt_rad: float
+) -> None:
+    R = optimised(n)
+    assert R.shape == (n, 3, 3)
+    assert_allclose(R[0], TOOL_DOWN_R_base_flange, atol=1e-6)
+    rng = np.random.default_rng(n)
+    guesses = [
+        replace(GUESS, p_sensor_com_m=0.08 * d / np.linalg.norm(d), tilt_alpha_rad=tilt_rad)
+        for d in rng.normal(size=(30, 3))
+    ]
+    values = np.array([efficiency(R, guess) for guess in guesses])
+    assert (values.mean(axis=0) > mean).all(), values.mean(axis=0)
+    assert (values.min(axis=0)[: len(lowest)] > lowest).all(), values.min(axis=0)
+    assert second_basin_gap(R, guesses[0]) > gap - 2 * tilt_rad
+
+
+def test_random_sets_have_the_published_efficiency() -> None:
+    rng = np.random.default_rng(0)
+    for n, median in ((6, 0.72), (8, 0.82), (12, 0.88), (24, 0.95)):
+        A = [efficiency(Rotation.random(n, rng=rng).as_matrix(), GUESS).A for _ in range(100)]
+        assert_allclose(np.median(A), median, atol=0.03)
+
+
+def test_a_set_that_is_not_stored_is_refused() -> None:
+    with pytest.raises(ValueError, match="no stored set of 7"):
+        optimised(7)
+
+
+# ---- choice
+
+
+def test_cone_candidates_fill_the_cone() -> None:
+    R = cone_candidates(np.deg2rad(50), spins=6, directions=100)
+    assert_allclose(R @ np.swapaxes(R, 1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
+    tilt = np.rad2deg(np.arccos(np.clip(-R[:, 2, 2], -1, 1)))
+    assert_allclose(tilt[:6], 0, atol=1e-6)
+    assert_allclose(tilt.max(), 50)
+    assert 80 < len(R) / 6 < 130
+    assert len({tuple(r.round(6).ravel()) for r in R}) == len(R)
+    assert_allclose((R[:, :2, 2]).mean(axis=0), 0, atol=1e-9)
+    with pytest.raises(ValueError, match="empty"):
+        cone_candidates(0.0)
+
+
+@pytest.mark.parametrize("criterion", ["parameters", "prediction"])
+@pytest.mark.parametrize("n", [6, 12])
+def test_chosen_poses_beat_random_ones(criterion: Criterion, n: int) -> None:
+    rng = np.random.default_rng(n)
+    candidates = ball(40, 500, rng)
+    chosen = choose(candidates, n, GUESS, criterion=criterion, least_gap=0.02)
+    assert len(set(chosen.tolist())) == n
+    assert_allclose(chosen, choose(candidates, n, GUESS, criterion=criterion, least_gap=0.02))
+    assert second_basin_gap(candidates[chosen], GUESS) >= 0.02
+    mine = efficiency(candidates[chosen], GUESS)
+    others = np.array([efficiency(candidates[rng.choice(500, n, replace=False)], GUESS) for _ in range(100)])
+    assert others[:, 1].max() < mine.A
+    assert others[:, 2].max() < mine.I_F
+    assert 1.5 * np.median(others[:, 1]) < mine.A
+
+
+def test_the_workspace_matters_to_the_prediction_criterion() -> None:
+    rng = np.random.default_rng(0)
+    candidates = ball(60, 400, rng)
+    everywhere = candidates[choose(candidates, 8, GUESS, criterion="prediction")]
+    near = candidates[choose(candidates, 8, GUESS, criterion="prediction", R_workspace=ball(10, 50, rng))]
+
+    def error(R: Array, R_workspace: Array) -> float:
+        J = whitened_jacobian(R, GUESS).reshape(-1, 15)
+        rows = whitened_jacobian(R_workspace, GUESS).reshape(-1, 15)
+        return float(np.sum(rows @ np.linalg.inv(J.T @ J) * rows)) / len(R_workspace)
+
+    assert error(near, ball(10, 50, rng)) < 0.9 * error(everywhere, ball(10, 50, rng))
+    assert error(near, ALL) > error(everywhere, ALL)
+
+
+def test_a_rim_gets_centre_poses() -> None:
+    rim = np.array([tilted(40, a, s) for a in range(0, 360, 15) for s in range(0, 360, 60)])
+    centre = np.array([tilted(0, 0, s) for s in range(0, 360, 60)])
+    candidates = np.concatenate([rim, centre])
+    only_rim = rim[choose(rim, 8, GUESS, criterion="prediction")]
+    assert second_basin_gap(only_rim, GUESS) < 1e-6  # nothing else to choose from, and the gap says so
+    for least_gap in (0.02, 0.045):
+        chosen = choose(candidates, 8, GUESS, criterion="prediction", least_gap=least_gap)
+        assert second_basin_gap(candidates[chosen], GUESS) >= least_gap
+        assert 1 <= np.count_nonzero(chosen >= len(rim)) <= 4
+
+
+def test_impossible_choices_are_refused() -> None:
+    for n in (3, 25):
+        with pytest.raises(ValueError, match=f"cannot choose {n} poses of 24"):
+            choose(ALL, n, GUESS)
+    with pytest.raises(ValueError, match="criterion is 'best'"):
+        choose(ALL, 8, GUESS, criterion=cast(Criterion, "best"))
+    with pytest.raises(ValueError, match="no candidates"):
+        next_pose(ALL, ALL[:0], GUESS)
+
+
+# ---- one after the other
+
+
+@pytest.mark.parametrize("half_angle_deg", [180, 40, 20])
+def test_next_poses_improve_the_prediction_and_open_the_gap(half_angle_deg: int) -> None:
+    candidates = cone_candidates(np.deg2rad(half_angle_deg), spins=6, directions=40)
+    R = np.zeros((0, 3, 3))
+    sigmas, gaps = [], []
+    for _ in range(12):
+        ranked, rms = next_pose(R, candidates, GUESS, least_gap=0.02)
+        assert sorted(ranked.tolist()) == list(range(len(candidates)))
+        R = np.concatenate([R, candidates[ranked[:1]]])
+        prediction = predicted_sigma(R, GUESS)
+        if len(R) >= 4:
+            assert_allclose(rms[0], prediction.force_rms_N, rtol=0.01)
+        sigmas.append([prediction.force_rms_N, prediction.torque_rms_Nm, norm(prediction.sigma["mass_kg"])])
+        gaps.append(prediction.second_basin_gap)
+    assert np.isinf(sigmas[1]).all()
+    assert (np.diff(sigmas[3:], axis=0) < 0).all()
+    assert max(gaps[5:]) > {180: 0.5, 40: 0.02, 20: 0.001}[half_angle_deg]
+
+
+def test_next_pose_is_the_best_by_brute_force() -> None:
+    rng = np.random.default_rng(2)
+    R, candidates = optimised(8)[:5], Rotation.random(20, rng=rng).as_matrix()
+    ranked, rms = next_pose(R, candidates, GUESS, least_gap=0.0)
+    predictions = [predicted_sigma(np.concatenate([R, c[None]]), GUESS) for c in candidates]
+    cost = [(p.force_rms_N / 0.2) ** 2 + (p.torque_rms_Nm / 0.005) ** 2 for p in predictions]
+    assert ranked[0] == np.argmin(cost)
+    assert_allclose(rms, [predictions[i].force_rms_N for i in ranked], rtol=1e-4)
+    assert rms[-1] > 1.02 * rms[0]
+
+
+def test_published_greedy_against_random() -> None:
+    rng = np.random.default_rng(0)
+    guess = replace(GUESS, sigma_force_N=0.1, sigma_torque_Nm=0.0025)
+    candidates = Rotation.random(600, rng=rng).as_matrix()
+    R = np.zeros((0, 3, 3))
+    for _ in range(8):
+        ranked, rms = next_pose(R, candidates, guess)
+        R = np.concatenate([R, candidates[ranked[:1]]])
+    assert_allclose(rms[0], 0.0788, rtol=0.03)
+
+
+def test_no_random_order_is_better_than_the_chosen_one() -> None:
+    guess = Guess(20 / 9.80665, 0.02, 0.0005, walk_force_N=0.07, walk_torque_Nm=0.00175)
+    rng, six = np.random.default_rng(6), special(SUBSET_6)
+
+    def variance(index: NDArray[np.integer]) -> float:
+        J = whitened_jacobian(six[index], guess)
+        return float(np.trace(np.linalg.inv(information(J, guess))[:6, :6]))
+
+    best = order(six, guess)
+    assert sorted(best.tolist()) == list(range(6))
+    others = [variance(rng.permutation(6)) for _ in range(60)]
+    assert variance(best) <= min(others) < 0.9 * np.median(others)
+
+
+@pytest.mark.slow
+def test_order_keeps_a_wandering_bias_apart() -> None:
+    guess = Guess(20 / 9.80665, 0.02, 0.0005, walk_force_N=0.07, walk_torque_Nm=0.00175)
+
+    def figures(poses: Array) -> Array:
+        sigma = predicted_sigma(poses, guess).sigma
+        return np.array([np.rad2deg(norm(sigma["R_flange_sensor"])), norm(sigma["gravity_force_base_N"])])
+
+    best = order(ALL, guess)
+    assert sorted(best.tolist()) == list(range(24))
+    assert_allclose(figures(ALL), [0.027, 0.0124], rtol=0.02)  # published, as are the next
+    assert_allclose(figures(ALL[best]), [0.0247, 0.0102], rtol=0.02)
+    shuffled = np.array([figures(ALL[np.random.default_rng(k).permutation(24)]) for k in range(20)])
+    assert_allclose(np.median(shuffled[:, 0]), 0.033, rtol=0.1)
+    assert (shuffled.min(axis=0) > figures(ALL[best])).all()

@@ -1,0 +1,469 @@
+"""Carlson's methods and Umeyama's, against simulated poses."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib.errors import BadDataset, NotObservable
+from calib.model import nearest_rotation
+from calib.published.carlson import ForceFit, eigen, iterative, nullspace, nullspace_all_pairs, polynomial
+from calib.published.carlson_known import cayley, cayley_rotation, relaxation, similarity
+
+Array = NDArray[np.float64]
+Method = Callable[[Array, Array, Array, bool], ForceFit]
+
+UNKNOWN: dict[str, Method] = {
+    "eigen": lambda R, f, _, bias: eigen(R, f, bias=bias),
+    "nullspace": lambda R, f, _, bias: nullspace(R, f, bias=bias),
+    "all pairs": lambda R, f, _, bias: nullspace_all_pairs(R, f, bias=bias),
+    "iterative": lambda R, f, _, bias: iterative(R, f, bias=bias),
+    "polynomial": lambda R, f, _, bias: polynomial(R, f, bias=bias),
+}
+DIRECTION: dict[str, Method] = {
+    "relaxation": lambda R, f, g, bias: relaxation(R, f, g, bias=bias),
+    "similarity": lambda R, f, g, bias: similarity(R, f, g, bias=bias),
+}
+WEIGHT: dict[str, Method] = {
+    "cayley total": lambda R, f, g, bias: cayley(R, f, g, bias=bias),
+    "cayley ordinary": lambda R, f, g, bias: cayley(R, f, g, bias=bias, total=False),
+}
+METHODS = UNKNOWN | DIRECTION | WEIGHT
+MIN_POSES = dict.fromkeys(UNKNOWN, 4) | {"polynomial": 3, "relaxation": 3, "similarity": 2} | dict.fromkeys(WEIGHT, 2)
+
+SROM24 = np.array(
+    [
+        M
+        for order in permutations(np.eye(3))
+        for s in product((1, -1), repeat=3)
+        if np.linalg.det(M := np.array(order).T * s) > 0
+    ]
+)
+DOWN = Rotation.from_rotvec([np.pi, 0, 0])
+MOUNTS = {
+    "plain": np.eye(3),
+    "turned by 180 deg": np.diag([-1.0, -1.0, 1.0]),
+    "axes permuted": np.eye(3)[[1, 2, 0]],
+    "anyhow": Rotation.from_rotvec([0.3, -1.9, 0.8]).as_matrix(),
+}
+
+
+@dataclass
+class Truth:
+    R_flange_sensor: Array
+    gravity_force_base_N: Array
+    force_bias_N: Array
+
+    def force_N(self, R_base_flange: Array, sigma_N: float = 0, seed: int = 0) -> Array:
+        clean = self.gravity_force_base_N @ R_base_flange @ self.R_flange_sensor + self.force_bias_N
+        return clean + sigma_N * np.random.default_rng(seed).normal(size=clean.shape)
+
+
+def random_truth(rng: np.random.Generator, bias_N: float = 0, weight_N: float = 20) -> Truth:
+    gravity, bias = (
+        length * v / np.linalg.norm(v) for length, v in zip((weight_N, bias_N), rng.normal(size=(2, 3)), strict=True)
+    )
+    return Truth(Rotation.random(rng=rng).as_matrix(), gravity, bias)
+
+
+def random_poses(rng: np.random.Generator, n: int) -> Array:
+    return Rotation.random(n, rng=rng).as_matrix()
+
+
+def ball(rng: np.random.Generator, n: int, angle_deg: float) -> Array:
+    """Tool down, turned by up to an angle about any axis."""
+    v = rng.normal(size=(n, 3))
+    v *= (np.radians(angle_deg) * rng.uniform(size=n) ** (1 / 3) / np.linalg.norm(v, axis=1))[:, None]
+    return (Rotation.from_rotvec(v) * DOWN).as_matrix()
+
+
+def rim(rng: np.random.Generator, n: int, tilt_deg: float) -> Array:
+    """Tool tilted by one and the same angle in all directions, wrist anywhere."""
+    heading, wrist = rng.uniform(0, 2 * np.pi, size=(2, n))
+    tilt = np.radians(tilt_deg) * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(n)])
+    return (Rotation.from_rotvec(tilt) * DOWN * Rotation.from_rotvec(np.outer(wrist, [0, 0, 1]))).as_matrix()
+
+
+def apart_deg(R: Array, S: Array) -> float:
+    return float(np.degrees(2 * np.arcsin(min(np.linalg.norm(R - S) / np.sqrt(8), 1))))
+
+
+def error_deg(fit: ForceFit, truth: Truth) -> float:
+    return apart_deg(fit.R_flange_sensor, truth.R_flange_sensor)
+
+
+def rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def assert_equal(fit: ForceFit, R: Array, gravity: Array, bias: Array, tolerance: float) -> None:
+    size = np.linalg.norm(gravity)
+    assert np.linalg.norm(fit.R_flange_sensor - R) < tolerance
+    assert np.linalg.norm(fit.gravity_force_base_N - gravity) < tolerance * size
+    assert np.linalg.norm(fit.force_bias_N - bias) < tolerance * (size + np.linalg.norm(bias))
+    assert fit.converged
+
+
+# --- exact without noise ---
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("poses", ["srom24", "random7", "ball40"])
+@pytest.mark.parametrize("bias", [False, True])
+@pytest.mark.parametrize("name", METHODS)
+def test_exact_without_noise(name: str, bias: bool, poses: str, mount: str) -> None:
+    rng = np.random.default_rng(5)
+    R = {"srom24": SROM24, "random7": random_poses(rng, 7), "ball40": ball(rng, 12, 40)}[poses]
+    for gravity in ([0, 0, -20.0], [0, 0, 20.0], [1.0, -3, -0.4]):
+        truth = Truth(MOUNTS[mount], np.array(gravity), bias * np.array([63.0, -5, 21]))
+        fit = METHODS[name](R, truth.force_N(R), truth.gravity_force_base_N, bias)
+        assert_equal(fit, truth.R_flange_sensor, truth.gravity_force_base_N, truth.force_bias_N, 1e-10)
+        assert np.linalg.det(fit.R_flange_sensor) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("bias", [False, True])
+@pytest.mark.parametrize("name", METHODS)
+def test_exact_with_the_fewest_poses_and_one_less_is_refused(name: str, bias: bool) -> None:
+    rng = np.random.default_rng(1)
+    n = MIN_POSES[name] + bias
+    for _ in range(5):
+        truth = random_truth(rng, 5 * bias)
+        R = random_poses(rng, n)
+        fit = METHODS[name](R, truth.force_N(R), truth.gravity_force_base_N, bias)
+        assert_equal(fit, truth.R_flange_sensor, truth.gravity_force_base_N, truth.force_bias_N, 1e-10)
+    with pytest.raises(NotObservable, match=f"needs {n} poses or more, got {n - 1}: record 1 more"):
+        METHODS[name](R[1:], truth.force_N(R[1:]), truth.gravity_force_base_N, bias)
+
+
+# --- what a bias does ---
+
+
+@pytest.mark.parametrize("name", [name for name in METHODS if name != "all pairs"])
+def test_the_original_form_hides_a_bias_in_the_rotation_and_the_other_finds_it(name: str) -> None:
+    errors: dict[tuple[float, bool], list[float]] = {(bias_N, bias): [] for bias_N in (0, 1) for bias in (False, True)}
+    rng = np.random.default_rng(2)
+    for trial in range(20):
+        R = random_poses(rng, 24)
+        for (bias_N, bias), found in errors.items():
+            truth = random_truth(rng, bias_N)
+            force_N = truth.force_N(R, 0.05, seed=trial)
+            fit = METHODS[name](R, force_N, truth.gravity_force_base_N, bias)
+            found.append(error_deg(fit, truth))
+            if bias:
+                assert np.linalg.norm(fit.force_bias_N - truth.force_bias_N) < 0.08
+    assert 0.04 < rms(errors[0, False]) < 0.09
+    assert 0.55 < rms(errors[1, False]) < 0.95
+    assert rms(errors[1, True]) == pytest.approx(rms(errors[0, True]), abs=0.02)
+    assert rms(errors[1, True]) < 0.1
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_constant_added_to_the_forces_changes_only_the_bias(name: str) -> None:
+    rng = np.random.default_rng(3)
+    truth, R = random_truth(rng), random_poses(rng, 9)
+    force_N = truth.force_N(R, 0.5)
+    constant = np.array([-40.0, 7, 300])
+    one = METHODS[name](R, force_N, truth.gravity_force_base_N, True)
+    two = METHODS[name](R, force_N + constant, truth.gravity_force_base_N, True)
+    assert_equal(two, one.R_flange_sensor, one.gravity_force_base_N, one.force_bias_N + constant, 1e-9)
+
+
+# --- invariances, with noise ---
+
+
+@pytest.mark.parametrize("bias", [False, True])
+@pytest.mark.parametrize("name", METHODS)
+def test_follows_the_frames_the_unit_and_the_order(name: str, bias: bool) -> None:
+    rng = np.random.default_rng(4)
+    truth, R = random_truth(rng, 3 * bias), random_poses(rng, 12)
+    force_N = truth.force_N(R, 0.3)
+    turn_base, turn_flange, turn_sensor = Rotation.random(3, rng=rng).as_matrix()
+    if name in WEIGHT:  # the Cayley transform favours small rotations: not invariant to where they are counted from
+        turn_flange = turn_sensor = np.eye(3)
+    order = rng.permutation(12)
+    one = METHODS[name](R, force_N, truth.gravity_force_base_N, bias)
+    two = METHODS[name](
+        (turn_base @ R @ turn_flange.T)[order],
+        2.5 * (force_N @ turn_sensor.T)[order],
+        2.5 * turn_base @ truth.gravity_force_base_N,
+        bias,
+    )
+    assert_equal(
+        two,
+        turn_flange @ one.R_flange_sensor @ turn_sensor.T,
+        2.5 * turn_base @ one.gravity_force_base_N,
+        2.5 * turn_sensor @ one.force_bias_N,
+        1e-8,
+    )
+
+
+# --- nullspace and eigendecomposition ---
+
+
+@pytest.mark.parametrize("bias", [False, True])
+@pytest.mark.parametrize(("n", "sigma_N"), [(5, 0.1), (12, 3.0), (40, 0.5)])
+def test_nullspace_equals_all_pairwise_differences(n: int, sigma_N: float, bias: bool) -> None:
+    rng = np.random.default_rng(6)
+    for poses in (random_poses(rng, n), ball(rng, n, 60)):
+        truth = random_truth(rng, 8)
+        force_N = truth.force_N(poses, sigma_N)
+        fast, published = (method(poses, force_N, bias=bias) for method in (nullspace, nullspace_all_pairs))
+        assert_equal(fast, published.R_flange_sensor, published.gravity_force_base_N, published.force_bias_N, 1e-10)
+
+
+def test_more_samples_cure_nullspace_but_not_eigen() -> None:
+    """Eight lopsided orientations, each measured many times at a signal-to-noise ratio of 10."""
+    rng = np.random.default_rng(7)
+    errors: dict[tuple[str, int], list[float]] = {(name, m): [] for name in ("eigen", "nullspace") for m in (50, 1000)}
+    for trial in range(7):
+        eight, truth = ball(rng, 8, 40), random_truth(rng)
+        for (name, repeats), found in errors.items():
+            R = np.tile(eight, (repeats, 1, 1))
+            fit = METHODS[name](R, truth.force_N(R, 2.0, seed=trial), np.zeros(3), False)
+            found.append(error_deg(fit, truth))
+    median = {key: float(np.median(values)) for key, values in errors.items()}
+    assert median["nullspace", 1000] < 0.45 * median["nullspace", 50]
+    assert median["eigen", 1000] > 0.6 * median["eigen", 50]
+    assert median["eigen", 1000] > 3 * median["nullspace", 1000]
+
+
+def test_nullspace_takes_many_poses() -> None:
+    rng = np.random.default_rng(8)
+    truth, R = random_truth(rng, 5), random_poses(rng, 20_000)
+    fit = nullspace(R, truth.force_N(R, 0.5), bias=True)
+    assert error_deg(fit, truth) < 0.1
+
+
+# --- algorithm 1 ---
+
+
+def test_algorithm_1_reaches_the_truth_from_any_gravity_with_100_random_poses() -> None:
+    rng = np.random.default_rng(9)
+    for trial in range(60):
+        truth, R = random_truth(rng), random_poses(rng, 100)
+        fit = iterative(
+            R, truth.force_N(R, 0.2, seed=trial), bias=bool(trial % 2), gravity_start_base=rng.normal(size=3)
+        )
+        assert fit.converged
+        assert error_deg(fit, truth) < 0.5
+
+
+def test_algorithm_1_reaches_the_truth_with_few_poses_from_its_own_start() -> None:
+    rng = np.random.default_rng(10)
+    stuck = 0
+    for _ in range(20):
+        truth, R = random_truth(rng, 5), random_poses(rng, 8)
+        force_N = truth.force_N(R)
+        assert_equal(
+            iterative(R, force_N, bias=True),
+            truth.R_flange_sensor,
+            truth.gravity_force_base_N,
+            truth.force_bias_N,
+            1e-9,
+        )
+        stuck += error_deg(iterative(R, force_N, bias=True, gravity_start_base=rng.normal(size=3)), truth) > 1
+    assert stuck  # why the start matters
+
+
+def test_algorithm_1_says_when_it_was_stopped() -> None:
+    rng = np.random.default_rng(11)
+    truth, R = random_truth(rng), ball(rng, 24, 20)
+    force_N = truth.force_N(R, 0.02)
+    slow = iterative(R, force_N, bias=True)
+    assert slow.converged
+    stopped = iterative(R, force_N, bias=True, max_iterations=6)
+    assert not stopped.converged
+    assert apart_deg(stopped.R_flange_sensor, slow.R_flange_sensor) > 1e-4
+    from_another = iterative(R, force_N, bias=True, gravity_start_base=truth.gravity_force_base_N)
+    assert apart_deg(from_another.R_flange_sensor, slow.R_flange_sensor) < 1e-9
+
+
+# --- the polynomial problem ---
+
+
+@pytest.mark.parametrize("bias", [False, True])
+def test_polynomial_is_the_certified_least_squares_solution(bias: bool) -> None:
+    rng = np.random.default_rng(12)
+
+    def residual(fit: ForceFit, R: Array, force_N: Array) -> float:
+        model = Truth(fit.R_flange_sensor, fit.gravity_force_base_N, fit.force_bias_N)
+        return float(np.sum((force_N - model.force_N(R)) ** 2))
+
+    for trial in range(5):
+        truth, R = random_truth(rng, 4 * bias), ball(rng, 10, 70)
+        force_N = truth.force_N(R, 0.2, seed=trial)
+        best = polynomial(R, force_N, bias=bias)
+        cost = residual(best, R, force_N)
+        assert best.certificate_gap is not None
+        assert abs(best.certificate_gap) < 1e-7 * np.sum(force_N**2)
+        for other in (eigen, nullspace, iterative):
+            assert cost <= residual(other(R, force_N, bias=bias), R, force_N) * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("sigma_N", [0, 0.05])
+def test_polynomial_refuses_one_tilt_only_because_gravity_may_be_up_or_down(sigma_N: float) -> None:
+    R = rim(np.random.default_rng(13), 12, 40)
+    truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), np.ones(3))
+    with pytest.raises(NotObservable, match="two sensor orientations 180 deg apart"):
+        polynomial(R, truth.force_N(R, sigma_N), bias=True)
+    assert (
+        error_deg(polynomial(R, truth.force_N(R, sigma_N), bias=False), truth) > 1
+    )  # a bias of 1 N is not for this form
+    clean = Truth(truth.R_flange_sensor, truth.gravity_force_base_N, np.zeros(3))
+    assert error_deg(polynomial(R, clean.force_N(R, sigma_N), bias=False), clean) < 0.5
+
+
+# --- known gravity ---
+
+
+@pytest.mark.parametrize("bias", [False, True])
+def test_similarity_is_the_least_squares_solution(bias: bool) -> None:
+    rng = np.random.default_rng(14)
+    truth, R = random_truth(rng, 4 * bias), ball(rng, 10, 60)
+    force_N = truth.force_N(R, 1.0)
+    fit = similarity(R, force_N, truth.gravity_force_base_N, bias=bias)
+
+    def cost(turn: Array, scale: float, shift: Array) -> float:
+        model = Truth(
+            fit.R_flange_sensor @ Rotation.from_rotvec(turn).as_matrix(),
+            scale * fit.gravity_force_base_N,
+            fit.force_bias_N + bias * shift,
+        )
+        return float(np.sum((force_N - model.force_N(R)) ** 2))
+
+    best = cost(np.zeros(3), 1, np.zeros(3))
+    for step in rng.normal(size=(100, 7)) * np.logspace(-5, 0, 100)[:, None]:
+        assert cost(step[:3], float(np.exp(step[3])), step[4:]) >= best
+
+
+def test_a_wrong_weight_goes_into_the_rotation_of_the_cayley_transform_only() -> None:
+    rng = np.random.default_rng(15)
+    plateau, free = [], []
+    for _ in range(20):
+        truth, R = random_truth(rng), random_poses(rng, 24)
+        force_N, wrong = truth.force_N(R, 1e-6), 1.1 * truth.gravity_force_base_N
+        plateau.append(error_deg(cayley(R, force_N, wrong, bias=True), truth))
+        free.append(max(error_deg(method(R, force_N, wrong, bias=True), truth) for method in (relaxation, similarity)))
+    assert 0.05 < np.median(plateau) < 1
+    assert max(free) < 1e-4
+
+
+def test_total_least_squares_is_what_the_cayley_transform_needs() -> None:
+    rng = np.random.default_rng(16)
+    errors: dict[bool, list[float]] = {True: [], False: []}
+    for trial in range(40):
+        truth, R = random_truth(rng), random_poses(rng, 100)
+        a = truth.gravity_force_base_N @ R
+        for total, found in errors.items():
+            rotation = cayley_rotation(truth.force_N(R, 2.0, seed=trial), a, total=total)
+            found.append(apart_deg(rotation, truth.R_flange_sensor.T))
+    assert np.median(errors[False]) > 1.5 * np.median(errors[True])
+
+
+@pytest.mark.parametrize("sigma_N", [0, 0.1])
+@pytest.mark.parametrize("bias", [False, True])
+@pytest.mark.parametrize("name", DIRECTION | WEIGHT)
+def test_known_gravity_refuses_forces_that_point_up(name: str, bias: bool, sigma_N: float) -> None:
+    rng = np.random.default_rng(17)
+    for R in (random_poses(rng, 12), ball(rng, 12, 60)):
+        truth = random_truth(rng)
+        with pytest.raises(BadDataset, match="against the given gravity"):
+            METHODS[name](R, -truth.force_N(R, sigma_N), truth.gravity_force_base_N, bias)
+
+
+def test_a_direction_has_a_length() -> None:
+    for method in (relaxation, similarity, cayley):
+        with pytest.raises(ValueError, match="length"):
+            method(SROM24, np.ones((24, 3)), np.zeros(3), bias=True)
+
+
+# --- degenerate poses ---
+
+TURN = np.linspace(0, 5, 24)
+START = Rotation.from_rotvec([0.4, 2.0, -0.7])
+DEGENERATE = {
+    "one horizontal base axis": (Rotation.from_rotvec(np.outer(TURN, [0, 1, 0])) * START).as_matrix(),
+    "one oblique base axis": (Rotation.from_rotvec(np.outer(TURN, [0.5, 0.6, 0.7])) * START).as_matrix(),
+    "about the vertical": (Rotation.from_rotvec(np.outer(TURN, [0, 0, 1])) * START).as_matrix(),
+    "wrist yaw": (START * Rotation.from_rotvec(np.outer(TURN, [0, 0, 1]))).as_matrix(),
+    "one pose": np.repeat(START.as_matrix()[None], 24, axis=0),
+    "two poses": np.repeat(SROM24[[0, 9]], 12, axis=0),
+}
+
+
+@pytest.mark.parametrize("sigma_N", [0, 0.05])
+@pytest.mark.parametrize("poses", DEGENERATE)
+@pytest.mark.parametrize("bias", [False, True])
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_refuses_poses_that_leave_gravity_open(name: str, bias: bool, poses: str, sigma_N: float) -> None:
+    truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), bias * np.array([1.0, 2, -30]))
+    method = METHODS[name]
+    if name == "iterative":  # it never rests here, with noise
+        method = lambda R, f, _, bias: iterative(R, f, bias=bias, max_iterations=300)  # noqa: E731
+    with pytest.raises(NotObservable, match="add poses"):
+        method(DEGENERATE[poses], truth.force_N(DEGENERATE[poses], sigma_N), np.zeros(3), bias)
+
+
+@pytest.mark.parametrize("sigma_N", [0, 0.05])
+@pytest.mark.parametrize("bias", [False, True])
+@pytest.mark.parametrize("name", DIRECTION | WEIGHT)
+def test_known_gravity_needs_a_change_of_tilt(name: str, bias: bool, sigma_N: float) -> None:
+    R = DEGENERATE["about the vertical"]
+    truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), bias * np.array([1.0, 2, -30]))
+    with pytest.raises(NotObservable, match="tilt the tool"):
+        METHODS[name](R, truth.force_N(R, sigma_N), truth.gravity_force_base_N, bias)
+
+
+@pytest.mark.parametrize("name", ["similarity", *WEIGHT])
+def test_known_gravity_is_content_with_one_axis(name: str) -> None:
+    R = DEGENERATE["one horizontal base axis"]
+    truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), np.array([1.0, 2, -30]))
+    fit = METHODS[name](R, truth.force_N(R), truth.gravity_force_base_N, True)
+    assert_equal(fit, truth.R_flange_sensor, truth.gravity_force_base_N, truth.force_bias_N, 1e-10)
+
+
+@pytest.mark.parametrize("name", ["eigen", "nullspace", "all pairs", "iterative", "relaxation"])
+def test_relaxed_methods_refuse_one_tilt_only_with_bias(name: str) -> None:
+    R = rim(np.random.default_rng(18), 12, 40)
+    truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), np.zeros(3))
+    with pytest.raises(NotObservable, match="only 2"):
+        METHODS[name](R, truth.force_N(R), truth.gravity_force_base_N, True)
+    assert error_deg(METHODS[name](R, truth.force_N(R), truth.gravity_force_base_N, False), truth) < 1e-9
+
+
+@pytest.mark.parametrize("bias", [False, True])
+@pytest.mark.parametrize("name", METHODS)
+def test_refuses_a_sensor_that_carries_nothing(name: str, bias: bool) -> None:
+    with pytest.raises(NotObservable, match="no weight"):
+        METHODS[name](SROM24, np.full((24, 3), 7.0 * bias), np.array([0, 0, -1.0]), bias)
+
+
+# --- input ---
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_names_the_row_that_is_not_finite(name: str) -> None:
+    force_N = np.ones((24, 3))
+    force_N[5, 2] = np.nan
+    with pytest.raises(BadDataset, match="row 5"):
+        METHODS[name](SROM24, force_N, np.array([0, 0, -1.0]), True)
+
+
+def test_names_the_shapes() -> None:
+    with pytest.raises(ValueError, match=r"got \(24, 3, 3\) and \(23, 3\)"):
+        nullspace(SROM24, np.ones((23, 3)), bias=True)
+
+
+def test_projection_is_the_nearest_rotation() -> None:
+    rng = np.random.default_rng(19)
+    for _ in range(20):
+        M = rng.normal(size=(3, 3))
+        nearest = nearest_rotation(M)
+        assert nearest @ nearest.T == pytest.approx(np.eye(3))
+        assert np.linalg.det(nearest) == pytest.approx(1)
+        distances = np.linalg.norm(Rotation.random(200, rng=rng).as_matrix() - M, axis=(1, 2))
+        assert np.linalg.norm(nearest - M) <= distances.min()

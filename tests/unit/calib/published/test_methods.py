@@ -1,0 +1,44 @@
+"""The published methods behind one shape."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import NotObservable, Parameters
+from calib.model import UP_IN_BASE, predict
+from calib.published.methods import PUBLISHED, published
+from calib.published.yu import SPECIAL_R_flange_base
+
+TRUTH = Parameters(
+    Rotation.from_euler("zyx", [70, 15, 13], degrees=True).as_matrix(),
+    np.array([0.0, 0.0, -12.0]),
+    np.array([3.0, -1.0, 2.0]),
+    np.array([0.01, -0.02, 0.08]),
+    np.array([0.1, 0.2, -0.3]),
+)
+SPECIAL = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+R_BASE_FLANGE = np.concatenate([SPECIAL, Rotation.random(6, rng=4).as_matrix()])
+
+
+@pytest.mark.parametrize("method", PUBLISHED)
+def test_every_published_method_is_exact_without_noise(method: str) -> None:
+    R_base_flange = SPECIAL if method == "srom" else R_BASE_FLANGE
+    estimate = published(method, R_base_flange, gravity_direction_base=-UP_IN_BASE, weight_N=12.0)
+    np.testing.assert_allclose(TRUTH.difference(estimate(predict(TRUTH, R_base_flange))), 0, atol=1e-9)
+
+
+def test_methods_that_know_gravity_are_wrong_on_a_tilted_base_unless_told() -> None:
+    direction = np.array([0.1, 0.0, -1.0]) / np.sqrt(1.01)
+    tilted = Parameters(
+        TRUTH.R_flange_sensor, 12.0 * direction, TRUTH.force_bias_N, TRUTH.p_sensor_com_m, TRUTH.torque_bias_Nm
+    )
+    wrench = predict(tilted, R_BASE_FLANGE)
+    for direction_given, limit in ((-UP_IN_BASE, None), (direction, 1e-9)):
+        estimate = published("carlson-relaxation", R_BASE_FLANGE, gravity_direction_base=direction_given)
+        error = np.abs(tilted.difference(estimate(wrench))).max()
+        assert error > 0.05 if limit is None else error < limit
+
+
+def test_cayley_asks_for_the_mass() -> None:
+    with pytest.raises(NotObservable, match="mass"):
+        published("carlson-cayley", R_BASE_FLANGE, gravity_direction_base=-UP_IN_BASE)

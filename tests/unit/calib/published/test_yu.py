@@ -1,0 +1,131 @@
+"""Yu's closed forms: the 24 orientations, their recognition, the tilt angles."""
+
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import NotObservable, Parameters
+from calib.model import Array, predict
+from calib.published.yu import SPECIAL_R_flange_base, lrom, special_numbers, srom, srom_gravity_force, weight_and_tilt
+
+R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+TRUTH = Parameters(
+    Rotation.from_euler("ZYX", [105, 2, 179], degrees=True).as_matrix(),
+    np.array([0.6, -0.4, -20.0]),
+    np.array([3.0, -5.0, 8.0]),
+    np.array([0.01, -0.02, 0.07]),
+    np.array([0.1, 0.2, -0.3]),
+)
+
+
+def turned(axis: str, angle_deg: float | list[float]) -> Array:
+    return np.asarray(Rotation.from_euler(axis, angle_deg, degrees=True).as_matrix())
+
+
+def error(estimate: Parameters) -> float:
+    return float(np.abs(TRUTH.difference(estimate)).max())
+
+
+def test_the_24_are_the_rotations_of_the_cube_in_the_papers_order() -> None:
+    np.testing.assert_array_equal(SPECIAL_R_flange_base[10], [[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(np.linalg.det(SPECIAL_R_flange_base), 1)
+    assert len({R.tobytes() for R in SPECIAL_R_flange_base + 0.0}) == 24
+    np.testing.assert_array_equal(SPECIAL_R_flange_base.sum(axis=0), 0)
+    # Eqs 15-17: the first four add up to 4 e1 e1^T, the next four to its negative.
+    np.testing.assert_array_equal(SPECIAL_R_flange_base[:4].sum(axis=0), np.diag([4, 0, 0]))
+    np.testing.assert_array_equal(SPECIAL_R_flange_base[4:8].sum(axis=0), np.diag([-4, 0, 0]))
+
+
+def test_srom_knows_its_orientations_in_any_order() -> None:
+    order = np.random.default_rng(0).permutation(24)
+    number, Y = special_numbers(R24[order])
+    np.testing.assert_array_equal(number, order)
+    np.testing.assert_array_equal(Y, np.eye(3))
+    assert error(srom(R24[order], predict(TRUTH, R24[order]))) < 1e-13
+
+
+@pytest.mark.parametrize(
+    "Y",
+    [turned("z", 45), turned("z", -45), turned("z", 20), turned("x", 170), turned("ZYX", [10, 20, 30])],
+)
+def test_srom_works_when_all_orientations_are_turned_by_a_common_rotation(Y: Array) -> None:
+    rng = np.random.default_rng(1)
+    order = rng.permutation(24)
+    R = (Y @ R24)[order]
+    number, found = special_numbers(R)
+    np.testing.assert_allclose(found @ R24[number], R, atol=1e-12)
+    np.testing.assert_allclose(special_numbers(Y @ R24)[1], found, atol=1e-12)  # the same choice in every order
+    assert error(srom(R, predict(TRUTH, R))) < 1e-12
+
+
+def test_srom_tolerates_what_an_arm_misses_by() -> None:
+    rng = np.random.default_rng(2)
+    small = Rotation.from_rotvec(np.deg2rad(0.03) * rng.normal(size=(24, 3)).clip(-1.4, 1.4)).as_matrix()
+    for Y in (np.eye(3), turned("z", 33)):
+        R = small @ Y @ R24
+        number, found = special_numbers(R)
+        np.testing.assert_array_equal(np.sort(number), np.arange(24))
+        assert Rotation.from_matrix(found @ R24[number] @ np.swapaxes(R, 1, 2)).magnitude().max() < np.deg2rad(0.1)
+
+
+def test_srom_names_what_is_missing_repeated_or_off() -> None:
+    def refusal(R: Array) -> str:
+        with pytest.raises(NotObservable) as caught:
+            srom(R, np.zeros((len(R), 6)))
+        return str(caught.value)
+
+    assert "missing 3, 17. Use LROM or ML" in refusal(np.delete(R24, [2, 16], axis=0))
+    assert "missing 5; repeated 9." in refusal(np.concatenate([np.delete(R24, 4, axis=0), R24[8:9]]))
+    assert "repeated 1." in refusal(np.concatenate([R24, R24[:1]]))
+    bent = R24.copy()
+    bent[6] = turned("y", 2.0) @ bent[6]
+    assert re.search(r"missing 7; .*row 7 is 2\.00° from orientation 7", refusal(bent))
+    assert "missing 3, 17." in refusal(turned("z", 5) @ np.delete(R24, [2, 16], axis=0))
+    scattered = Rotation.random(24, rng=np.random.default_rng(0)).as_matrix()
+    assert "use LROM" in refusal(scattered).replace("Use", "use")
+
+
+def test_srom_gravity_force_has_the_sign_of_every_component() -> None:
+    for F_b in ([1.0, 3.0, -40.0], [-5.0, 0.5, 2.0], [0.0, 0.0, 10.0]):
+        force_N = (TRUTH.R_flange_sensor.T @ SPECIAL_R_flange_base @ F_b) + [63, 5, 21]
+        np.testing.assert_allclose(srom_gravity_force(force_N), F_b, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [5, 7, 100])
+def test_lrom_is_exact_from_five_poses_whatever_the_mounting(n: int) -> None:
+    rng = np.random.default_rng(n)
+    for _ in range(20):
+        R = Rotation.random(n, rng=rng).as_matrix()
+        truth = Parameters(Rotation.random(rng=rng).as_matrix(), *rng.normal(size=(4, 3)) * 5)
+        assert np.abs(truth.difference(lrom(R, predict(truth, R)))).max() < (1e-8 if n == 5 else 1e-10)
+
+
+def test_lrom_refuses_four_poses_and_poses_it_cannot_tell_apart() -> None:
+    R = Rotation.random(4, rng=np.random.default_rng(0)).as_matrix()
+    with pytest.raises(NotObservable, match="at least 5 poses, there are 4"):
+        lrom(R, predict(TRUTH, R))
+    spin = Rotation.from_euler("x", np.arange(8)[:, None] * 40.0, degrees=True).as_matrix()
+    with pytest.raises(NotObservable, match="more than one solution"):
+        lrom(spin, predict(TRUTH, spin))
+
+
+def test_tilt_angles_reproduce_the_gravity_force() -> None:
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(500, 3))
+    for F_b in [*directions, *np.eye(3), *-np.eye(3)]:
+        weight, alpha, beta = weight_and_tilt(F_b)
+        up = [np.cos(alpha) * np.sin(beta), -np.sin(alpha), np.cos(alpha) * np.cos(beta)]
+        np.testing.assert_allclose(-weight * np.array(up), F_b, atol=1e-15)
+        assert abs(alpha) <= np.pi / 2
+        assert -np.pi < beta <= np.pi
+
+
+def test_tilt_of_the_usual_mountings() -> None:
+    assert weight_and_tilt(np.array([0, 0, -20.0])) == (20.0, 0.0, 0.0)
+    np.testing.assert_allclose(weight_and_tilt(np.array([0, 0, 20.0])), [20, 0, np.pi])
+    assert weight_and_tilt(np.array([-20.0, 0, 0]))[2] == pytest.approx(np.pi / 2)
+    np.testing.assert_allclose(weight_and_tilt(np.array([0, 20.0, 0])), [20, np.pi / 2, 0])
+    # Table II of the paper: 20.047 N are 2.044 kg, so eq. 48 cannot mean the square of the norm.
+    assert weight_and_tilt(np.array([0, 0, -20.047]))[0] / 9.80665 == pytest.approx(2.044, abs=5e-4)
