@@ -16,15 +16,15 @@ from types import MappingProxyType
 from typing import Any, Protocol, cast
 from urllib.parse import parse_qsl, quote, unquote, urlsplit
 
-from drivers._stream import StreamingSensor
 from drivers.clock import REAL, Clock
 from drivers.interfaces import Fact, ForceTorqueSensor, RobotArm
+from drivers.streaming.sensor import StreamingSensor
 
 SENSORS: Mapping[str, str] = MappingProxyType(
     {
         "ati-can": "drivers.ati.can:AtiCanSensor",
         "ati-serial": "drivers.ati.serial:AtiSerialSensor",
-        "ati-netft": "drivers.netft:NetFtSensor",
+        "ati-netft": "drivers.ati.netft:NetFtSensor",
         "bota": "drivers.bota.sensor:BotaSensor",
         "robotiq-ft300": "drivers.robotiq.sensor:RobotiqFt300",
         "robotous-can": "drivers.robotous.can:RobotousCan",

@@ -80,7 +80,7 @@ def exit_code(error: BaseException) -> int | None:
     """Exit code of an error that a user can mend; None for a defect of ours."""
     from calib.errors import BadCalibration, BadDataset, CalibError, TooFewSamples
     from drivers.errors import ConnectError, DeviceFault, DriverError
-    from drivers.transcript import BadTranscript
+    from drivers.transcript.recorder import BadTranscript
     from ftdrive.errors import BadPlan, ConfigError, NotAccepted
 
     codes: list[tuple[type[BaseException], int]] = [

@@ -7,8 +7,8 @@ from serial.tools import list_ports
 
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError
-from drivers.probe import Answer, probe
-from drivers.probe_can import probe_can
+from drivers.probe.can_bus import probe_can
+from drivers.probe.serial_line import Answer, probe
 from drivers.registry import Options, split_url
 from ftdrive.checks import (
     Check,

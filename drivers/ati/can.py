@@ -13,9 +13,6 @@ from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
 
-from drivers._can import CanBus
-from drivers._status import describe_status
-from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.ati import codec
 from drivers.ati.calibration import (
     NEWTON,
@@ -30,6 +27,9 @@ from drivers.ati.codec import Op
 from drivers.clock import REAL, Clock
 from drivers.errors import UNUSABLE, ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import Array, DeviceInfo, FtSamples
+from drivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
+from drivers.wires.can_bus import CanBus
+from drivers.wires.status_word import describe_status
 
 if TYPE_CHECKING:
     from drivers.registry import Options

@@ -15,10 +15,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers import _modbus
 from drivers.ati.codec import decode_text
 from drivers.errors import ProtocolError
 from drivers.interfaces import Array
+from drivers.wires import modbus as _modbus
 
 ADDRESS = 10
 """The slave address, fixed by ATI."""
@@ -70,7 +70,7 @@ START = frame(START_STREAM, b"\x55")
 
 
 def check_reply(request: bytes, reply: bytes) -> bytes:
-    """Check a whole reply against its request and return the registers it carries; see `drivers._modbus`."""
+    """Check a whole reply against its request and return the registers it carries; see `drivers.wires.modbus`."""
     payload = _modbus.check_reply(request, reply)
     function = request[1]
     if function not in {START_STREAM, STORAGE}:

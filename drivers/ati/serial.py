@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from drivers._modbus import ask
-from drivers._serial import SerialPort
-from drivers._status import describe_status
-from drivers._stream import StreamingSensor, scale_facts
 from drivers.ati import modbus
 from drivers.ati.calibration import Calibration, refuse_saturated, units
 from drivers.clock import REAL, Clock
 from drivers.errors import UNUSABLE, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
+from drivers.streaming.sensor import StreamingSensor, scale_facts
+from drivers.wires.modbus import ask
+from drivers.wires.serial_port import SerialPort
+from drivers.wires.status_word import describe_status
 
 if TYPE_CHECKING:
     from drivers.registry import Options

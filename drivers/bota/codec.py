@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from drivers._crc import crc16_x25
-from drivers._frames import Deframer
 from drivers.errors import ProtocolError
+from drivers.wires.crc import crc16_x25
+from drivers.wires.framing import Deframer
 
 HEADER = b"\xaa"
 _PAYLOAD = struct.Struct("<H6fIf")

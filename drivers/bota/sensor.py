@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from drivers._serial import SerialPort
-from drivers._status import describe_status
-from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.bota import codec
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
+from drivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
+from drivers.wires.serial_port import SerialPort
+from drivers.wires.status_word import describe_status
 
 if TYPE_CHECKING:
     from drivers.registry import Options

@@ -12,11 +12,11 @@ import struct
 from collections.abc import Sequence
 from functools import partial
 
-from drivers import _modbus
-from drivers._crc import crc16_modbus
-from drivers._frames import Deframer
 from drivers.errors import ProtocolError
 from drivers.interfaces import NOT_REPORTED
+from drivers.wires import modbus as _modbus
+from drivers.wires.crc import crc16_modbus
+from drivers.wires.framing import Deframer
 
 ADDRESS = 9
 

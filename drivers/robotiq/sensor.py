@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from drivers._modbus import ask
-from drivers._serial import SerialPort
-from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.clock import REAL, Clock
 from drivers.errors import DeviceFault
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 from drivers.robotiq import codec
+from drivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
+from drivers.wires.modbus import ask
+from drivers.wires.serial_port import SerialPort
 
 if TYPE_CHECKING:
     from drivers.registry import Options

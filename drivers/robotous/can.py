@@ -5,12 +5,12 @@ Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7: 1 M
 
 from typing import TYPE_CHECKING, Self
 
-from drivers._can import CanBus
 from drivers.clock import REAL, Clock
 from drivers.robotous import codec
 from drivers.robotous.codec import Command, Field
 from drivers.robotous.halves import Halves
 from drivers.robotous.sensor import RobotousSensor
+from drivers.wires.can_bus import CanBus
 
 if TYPE_CHECKING:
     from drivers.registry import Options

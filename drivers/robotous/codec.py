@@ -16,8 +16,8 @@ from enum import IntEnum
 from types import MappingProxyType
 from typing import NamedTuple
 
-from drivers._frames import Deframer
 from drivers.errors import ProtocolError
+from drivers.wires.framing import Deframer
 
 COMMAND_SIZE, REPLY_SIZE = 8, 16
 START_OF_FRAME, END_OF_FRAME = 0x55, 0xAA

@@ -11,12 +11,12 @@ from typing import Protocol
 
 import numpy as np
 
-from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.interfaces import DeviceInfo, FtSamples
 from drivers.robotous import codec
 from drivers.robotous.codec import Command, Field
+from drivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 
 _REPLY_S = 0.15
 _ATTEMPTS = 3

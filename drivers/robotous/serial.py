@@ -5,11 +5,11 @@ Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7: 8N1
 
 from typing import TYPE_CHECKING, Self
 
-from drivers._serial import SerialPort
 from drivers.clock import REAL, Clock
 from drivers.robotous import codec
 from drivers.robotous.codec import Command, Field
 from drivers.robotous.sensor import RobotousSensor
+from drivers.wires.serial_port import SerialPort
 
 if TYPE_CHECKING:
     from drivers.registry import Options

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from drivers._stream import NOTHING, StreamingSensor, scale_facts
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
+from drivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from drivers.ur.rtde import Subscription
 from drivers.ur.timing import STRICT, UrTiming
 

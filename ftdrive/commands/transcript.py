@@ -14,9 +14,9 @@ from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceTimeout, ProtocolError
 from drivers.interfaces import ForceTorqueSensor
 from drivers.registry import BadUrl, sensor_from_url
-from drivers.transcript import INTERRUPTED, BadTranscript, Transcript, Writer
-from drivers.transcript_player import Player
-from drivers.transcript_taps import recording
+from drivers.transcript.player import Player
+from drivers.transcript.recorder import INTERRUPTED, BadTranscript, Transcript, Writer
+from drivers.transcript.taps import recording
 from ftdrive.checks import SensorAddress
 from ftdrive.commands.common import EMULATED_SENSOR, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError

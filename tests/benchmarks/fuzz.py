@@ -23,18 +23,18 @@ from itertools import count
 from pathlib import Path
 from typing import cast
 
-from drivers._crc import crc16_modbus, crc16_x25
 from drivers.ati import codec as ati
 from drivers.ati import modbus
+from drivers.ati.netft import range_in
 from drivers.bota import codec as bota
 from drivers.errors import ProtocolError
-from drivers.netft import range_in
 from drivers.registry import SENSORS, BadUrl, sensor_from_url
 from drivers.robotiq import codec as robotiq
 from drivers.robotous import codec as robotous
 from drivers.robotous.halves import Halves
-from drivers.transcript import FORMAT, BadTranscript, Transcript
+from drivers.transcript.recorder import FORMAT, BadTranscript, Transcript
 from drivers.ur import rtde
+from drivers.wires.crc import crc16_modbus, crc16_x25
 from ftdrive.checks import SensorAddress
 
 LONGEST = 400

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers._stream import StreamingSensor
 from drivers.clock import Clock
 from drivers.registry import sensor_from_url
+from drivers.streaming.sensor import StreamingSensor
 from drivers.ur.arm import UrArm
 from drivers.ur.timing import UrTiming
 from ftdrive.emulated_clock import EmulatedClock

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers import probe as module
 from drivers.errors import ConnectError
-from drivers.probe import probe
+from drivers.probe import serial_line as module
+from drivers.probe.serial_line import probe
 from drivers.registry import sensor_from_url
 from mocks.ati_can import AtiCanNode
 from mocks.ati_serial import AtiSerialBox

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import serial
 
-from drivers import probe_can as module
 from drivers.errors import ConnectError, PortInUse
-from drivers.probe_can import probe_can
+from drivers.probe import can_bus as module
+from drivers.probe.can_bus import probe_can
 from drivers.registry import sensor_from_url
 from mocks.ati_can import AtiCanNode
 from mocks.robotous import RobotousCanNode

@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers._stream import StreamingSensor
 from drivers.clock import REAL, Clock
 from drivers.errors import DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import Array, FtSamples
 from drivers.registry import sensor_from_url
+from drivers.streaming.sensor import StreamingSensor
 from ftdrive.emulated_clock import EmulatedClock
 
 pytestmark = pytest.mark.slow  # `test_sensor_drivers.py` has a share of it

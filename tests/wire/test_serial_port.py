@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import serial
 
-from drivers._serial import SerialPort
 from drivers.errors import ConnectError, PortInUse
+from drivers.wires.serial_port import SerialPort
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
 
@@ -190,7 +190,7 @@ def test_a_port_that_takes_no_flags_is_freed(far_side: FarSide, monkeypatch: pyt
     def refuse(_: object) -> bool:
         raise termios.error(5, "gone")
 
-    monkeypatch.setattr("drivers._serial.ask_for_marks", refuse)
+    monkeypatch.setattr("drivers.wires.serial_port.ask_for_marks", refuse)
     port = SerialPort("sensor", far_side.path, 1_250_000, even_parity=True)
     with pytest.raises(ConnectError, match="gone"):
         port.open()

@@ -19,15 +19,15 @@ import numpy as np
 import pytest
 import serial
 
-from drivers._parity import Unmarker, ask_for_marks
-from drivers._serial import SerialPort
 from drivers.clock import Clock
 from drivers.errors import ConnectError
 from drivers.interfaces import DeviceInfo, ForceTorqueSensor
 from drivers.registry import sensor_from_url
-from drivers.transcript import BadTranscript, Passage, Transcript, Writer
-from drivers.transcript_player import Player
-from drivers.transcript_taps import recording
+from drivers.transcript.player import Player
+from drivers.transcript.recorder import BadTranscript, Passage, Transcript, Writer
+from drivers.transcript.taps import recording
+from drivers.wires.parity import Unmarker, ask_for_marks
+from drivers.wires.serial_port import SerialPort
 from mocks.ati_can import AtiCanNode
 from mocks.ati_serial import AtiSerialBox
 from mocks.bota import BotaBox

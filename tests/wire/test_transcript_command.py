@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from drivers._stream import StreamingSensor
 from drivers.clock import REAL
 from drivers.errors import StreamBroken
 from drivers.interfaces import ForceTorqueSensor
 from drivers.registry import sensor_from_url
-from drivers.transcript import BadTranscript, Writer
-from drivers.transcript_player import Player
+from drivers.streaming.sensor import StreamingSensor
+from drivers.transcript.player import Player
+from drivers.transcript.recorder import BadTranscript, Writer
 from ftdrive.commands import transcript
 from ftdrive.errors import ConfigError
 from mocks.bota import BotaBox

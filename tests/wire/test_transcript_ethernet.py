@@ -17,15 +17,15 @@ import pynetft
 import pytest
 from click.testing import CliRunner, Result
 
+from drivers.ati.netft import NetFtSensor
 from drivers.clock import Clock
 from drivers.errors import ConnectError, ProtocolError
 from drivers.interfaces import DeviceInfo, FtSamples
-from drivers.netft import NetFtSensor
 from drivers.registry import sensor_from_url
-from drivers.transcript import BadTranscript, Page, Passage, Transcript, Writer
-from drivers.transcript_player import Player
-from drivers.transcript_relays import _DatagramRelay, _PageRelay
-from drivers.transcript_taps import recording
+from drivers.transcript.player import Player
+from drivers.transcript.recorder import BadTranscript, Page, Passage, Transcript, Writer
+from drivers.transcript.relays import _DatagramRelay, _PageRelay
+from drivers.transcript.taps import recording
 from ftdrive.commands import transcript
 from ftdrive.errors import ConfigError
 from mocks.netft import NetFtBox

@@ -10,16 +10,16 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers._stream import StreamingSensor
 from drivers.ati.can import AtiCanSensor
+from drivers.ati.netft import NetFtSensor
 from drivers.ati.serial import AtiSerialSensor
 from drivers.bota.sensor import BotaSensor
 from drivers.interfaces import Fact
-from drivers.netft import NetFtSensor
 from drivers.registry import BadUrl, arm_class, in_url, sensor_from_url, split_url
 from drivers.robotiq.sensor import RobotiqFt300
 from drivers.robotous.can import RobotousCan
 from drivers.robotous.serial import RobotousSerial
+from drivers.streaming.sensor import StreamingSensor
 from drivers.ur.arm import UrArm
 from drivers.ur.sensor import UrWristSensor
 from ftdrive.commands import doctor

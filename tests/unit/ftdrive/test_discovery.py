@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from drivers.errors import ConnectError
-from drivers.probe import Answer
+from drivers.probe.serial_line import Answer
 from ftdrive import checks, discovery
 from ftdrive.discovery import ask, is_place, places, sensor_at
 from ftdrive.errors import ConfigError

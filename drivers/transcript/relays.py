@@ -18,8 +18,8 @@ from typing import Any, Final, Self
 
 import pynetft
 
-from drivers.transcript import Writer
-from drivers.transcript_ports import AT_ONCE, HTTP_S, LOOK_S, LOOPBACK, PageServer
+from drivers.transcript.ports import AT_ONCE, HTTP_S, LOOK_S, LOOPBACK, PageServer
+from drivers.transcript.recorder import Writer
 
 _CLIENT_CLASS: Final = "Client"
 _CONNECTION_CLASS: Final = "HTTPConnection"

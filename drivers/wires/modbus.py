@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TypeVar
 
-from drivers._crc import crc16_modbus
-from drivers._serial import SerialPort
 from drivers.clock import Clock
 from drivers.errors import DeviceTimeout, ProtocolError
+from drivers.wires.crc import crc16_modbus
+from drivers.wires.serial_port import SerialPort
 
 T = TypeVar("T")
 

@@ -8,9 +8,9 @@ import termios
 
 import serial
 
-from drivers._parity import Unmarker, ask_for_marks
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, PortInUse, StreamBroken
+from drivers.wires.parity import Unmarker, ask_for_marks
 
 LINK_ERRORS = (OSError, termios.error)
 """What a vanished serial port raises; `termios.error` is not an `OSError`."""

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from drivers.probe import Answer
-from drivers.probe_can import probe_can
+from drivers.probe.can_bus import probe_can
+from drivers.probe.serial_line import Answer
 from tests.unit.drivers.dialogue import CanWire, Stream, Table
 
 ATI_SERIAL, ATI_FIRMWARE, ROBOTOUS_MODEL = "205", "20F", "064 0100000000000000"

@@ -9,8 +9,8 @@ from typing import Any, Final, cast
 import can
 import serial
 
-from drivers._parity import marks_asked_for
-from drivers.transcript import Writer
+from drivers.transcript.recorder import Writer
+from drivers.wires.parity import marks_asked_for
 
 _PORT_CLASS: Final = "Serial"
 _BUS_CLASS: Final = "Bus"
@@ -29,7 +29,7 @@ def recording(writer: Writer) -> Iterator[None]:
 def _ethernet(writer: Writer) -> AbstractContextManager[None]:
     """Record pynetft; nothing where it is not installed, for then nobody uses it."""
     try:
-        relays = import_module("drivers.transcript_relays")
+        relays = import_module("drivers.transcript.relays")
     except ModuleNotFoundError as error:
         if error.name != "pynetft":
             raise

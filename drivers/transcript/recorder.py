@@ -13,10 +13,10 @@ come, with the time of the driver's clock as `t_ns`:
 {"t_ns", "event": "end", "error"}   the error it ended with; where there was none, what the driver made of it:
                                     "identity", "samples", "mean_force_N", "mean_torque_Nm" and more
 
-Where `parity_marks` is true, the bytes that were read hold the marks of `drivers/_parity.py`; older transcripts do not
-say it and hold none. Some CAN adapters, such as those of slcan, are on a serial port too. The frames of any other CAN
-interface are written as the lines that an slcan adapter would carry, and such an adapter plays them; what python-can
-tells it is not compared.
+Where `parity_marks` is true, the bytes that were read hold the marks of `drivers/wires/parity.py`; older transcripts
+do not say it and hold none. Some CAN adapters, such as those of slcan, are on a serial port too. The frames of any
+other CAN interface are written as the lines that an slcan adapter would carry, and such an adapter plays them; what
+python-can tells it is not compared.
 """
 
 import json

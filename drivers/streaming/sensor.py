@@ -11,10 +11,10 @@ from typing import Literal
 
 import numpy as np
 
-from drivers._plausible import DeviceClock, Liveness, Rate
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
+from drivers.streaming.plausibility import DeviceClock, Liveness, Rate
 
 log = logging.getLogger(__name__)
 

@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 import pynetft
 
-from drivers._status import describe_status
-from drivers._stream import NOTHING, StreamingSensor, StreamLimits, scale_facts
 from drivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM, units
 from drivers.clock import REAL, Clock
 from drivers.errors import UNUSABLE, ConnectError, DeviceFault, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples, Health
+from drivers.streaming.sensor import NOTHING, StreamingSensor, StreamLimits, scale_facts
+from drivers.wires.status_word import describe_status
 
 if TYPE_CHECKING:
     from drivers.registry import Options

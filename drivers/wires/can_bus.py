@@ -10,9 +10,9 @@ import can
 import serial
 from can.interfaces.slcan import slcanBus
 
-from drivers._serial import LINK_ERRORS, refusal
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, StreamBroken
+from drivers.wires.serial_port import LINK_ERRORS, refusal
 
 BUS_ERRORS = (can.CanError, ValueError, *LINK_ERRORS)
 _SEND_S, _LOOK_S = 0.1, 0.05

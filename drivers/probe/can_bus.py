@@ -12,15 +12,15 @@ from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
-from drivers._can import CanBus
 from drivers.ati import codec as ati
 from drivers.ati.codec import Op
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, ProtocolError, StreamBroken
-from drivers.probe import Answer
+from drivers.probe.serial_line import Answer
 from drivers.registry import in_url
 from drivers.robotous import can as robotous_can
 from drivers.robotous import codec as robotous
+from drivers.wires.can_bus import CanBus
 
 _LISTEN_S = 1.0
 """Ten samples of the slowest Robotous, and about the slowest heartbeat in use."""

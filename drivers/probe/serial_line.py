@@ -7,8 +7,6 @@ They are still bytes, and what an unknown device makes of them is unknown. CAN b
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers._frames import Deframer
-from drivers._serial import SerialPort
 from drivers.ati import modbus
 from drivers.ati.codec import decode_text
 from drivers.bota import codec as bota
@@ -17,6 +15,8 @@ from drivers.errors import ConnectError, ProtocolError, StreamBroken
 from drivers.registry import in_url
 from drivers.robotiq import codec as robotiq
 from drivers.robotous import codec as robotous
+from drivers.wires.framing import Deframer
+from drivers.wires.serial_port import SerialPort
 
 _LISTEN_S = 0.25
 _REPLY_S = 0.25

@@ -1,5 +1,5 @@
 """What a sensor driver in another package builds on: see "A driver in another package" in README.md."""
 
-from drivers._stream import NOTHING, StreamingSensor, StreamLimits, scale_facts
+from drivers.streaming.sensor import NOTHING, StreamingSensor, StreamLimits, scale_facts
 
 __all__ = ["NOTHING", "StreamLimits", "StreamingSensor", "scale_facts"]

@@ -10,10 +10,10 @@ from collections.abc import Callable
 from socketserver import BaseRequestHandler
 from typing import Any, Final
 
-from drivers._parity import leave_marks_to_far_side, marks_asked_for
 from drivers.clock import REAL, Clock
-from drivers.transcript import Page, Passage, Transcript, asked_for
-from drivers.transcript_ports import AT_ONCE, HTTP_S, LOOK_S, LOOPBACK, PageServer
+from drivers.transcript.ports import AT_ONCE, HTTP_S, LOOK_S, LOOPBACK, PageServer
+from drivers.transcript.recorder import Page, Passage, Transcript, asked_for
+from drivers.wires.parity import leave_marks_to_far_side, marks_asked_for
 
 _EARLY_S: Final = 0.05
 """A driver may ask this much earlier than it did; what the device had sent before is then sent at once."""
