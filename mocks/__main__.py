@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable
 
 from mocks.kinematics import MODELS, Array
-from mocks.sensors import CHOICES
+from mocks.sensors.catalogue import CHOICES
 from mocks.station import Station, parse_vector
 from mocks.world import MOUNTS_RAD
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from mocks.clock import CellClock
 from mocks.kinematics import MODELS, Array, Vector6, rotation, vector3, vector6
-from mocks.sensors import WRIST, Sensor
+from mocks.sensors.catalogue import WRIST, Sensor
 from mocks.ur.operator import Operator
 from mocks.ur.robot import Robot, RobotSettings
 from mocks.ur.server import UrServer

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from mocks.disturbances import FOREVER_S, Cable, Drift, Push
-from mocks.faults import Faults
 from mocks.kinematics import Array
-from mocks.sensors import Sensor
+from mocks.sensors.catalogue import Sensor
+from mocks.wires.faults import Faults
 from mocks.world import World
 
 Request = dict[str, Any]

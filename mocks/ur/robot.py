@@ -13,13 +13,13 @@ import numpy as np
 
 from mocks.kinematics import ZERO6, Array, Dh, Vector3, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
 from mocks.ur.events import Event
-from mocks.ur.library import ScriptError
 from mocks.ur.modes import PAUSING, PERMITTED, POWERED, POWERLESS, RobotMode, Runtime, SafetyMode
 from mocks.ur.motion import Arm, CannotFollow, HandMove, MotionError
-from mocks.ur.program import Program
 from mocks.ur.rtde import Value
 from mocks.ur.script import STOP_SCRIPT, ControlScript, Upload
-from mocks.ur.syntax import UrscriptSyntaxError
+from mocks.ur.urscript.library import ScriptError
+from mocks.ur.urscript.program import Program
+from mocks.ur.urscript.syntax import UrscriptSyntaxError
 from mocks.world import World
 
 UNLOCK_AFTER_S = 5.0

@@ -2,7 +2,7 @@
 
 The script port takes URScript text. The control script of ur_rtde is recognised by its name and not interpreted: this
 twin runs instead, one step per control cycle, with the same loop, registers and blocking behaviour. Any other program
-is run as it stands, by `mocks.ur.program`.
+is run as it stands, by `mocks.ur.urscript.program`.
 
 Source: the control script inside ur_rtde 1.6.5 (`ScriptClient.getScript()`), read for behaviour.
 """
@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from mocks.kinematics import Array, Vector6, forward, inverse, inverse_matrix, matrix_of, pose_of
-from mocks.ur.library import ScriptError
 from mocks.ur.motion import JointMove, LineMove, Path
+from mocks.ur.urscript.library import ScriptError
 
 if TYPE_CHECKING:
     from mocks.ur.robot import Robot

@@ -13,7 +13,7 @@ from ftdrive.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.errors import ConfigError
 from ftdrive.simulation import SENSORS, Station, sensor_url
 from ftdrive.wiring import build_sensor
-from mocks.sensors import CHOICES
+from mocks.sensors.catalogue import CHOICES
 
 
 def test_the_application_knows_all_sensors_of_a_station() -> None:

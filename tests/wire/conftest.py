@@ -118,13 +118,13 @@ PROGRAM = """
 import json, sys, threading, time
 import numpy as np
 from mocks.clock import CellClock
-from mocks.ati_can import AtiCanNode
-from mocks.ati_serial import AtiSerialBox
-from mocks.bota import BotaBox
-from mocks.faults import Faults
-from mocks.netft import Calibration, NetFtBox
-from mocks.robotiq import RobotiqBox
-from mocks.robotous import Model, RobotousCanNode, RobotousSerialBox
+from mocks.sensors.ati_can import AtiCanNode
+from mocks.sensors.ati_serial import AtiSerialBox
+from mocks.sensors.bota import BotaBox
+from mocks.wires.faults import Faults
+from mocks.sensors.netft import Calibration, NetFtBox
+from mocks.sensors.robotiq import RobotiqBox
+from mocks.sensors.robotous import Model, RobotousCanNode, RobotousSerialBox
 
 wrench, noise = np.array(json.loads(sys.argv[1])), np.array(json.loads(sys.argv[2]))
 rng = np.random.default_rng(1)

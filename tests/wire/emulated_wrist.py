@@ -14,11 +14,11 @@ from contextlib import suppress
 from typing import TypeVar
 
 from mocks.clock import CellClock
-from mocks.faults import Faults
 from mocks.kinematics import MODELS, ZERO6, Array
 from mocks.station import free_hosts
 from mocks.ur.robot import Robot, RobotSettings
 from mocks.ur.server import UrServer
+from mocks.wires.faults import Faults
 from mocks.world import Truth, World
 
 T = TypeVar("T")

@@ -10,11 +10,11 @@ from drivers.errors import ConnectError
 from drivers.probe import serial_line as module
 from drivers.probe.serial_line import probe
 from drivers.registry import sensor_from_url
-from mocks.ati_can import AtiCanNode
-from mocks.ati_serial import AtiSerialBox
-from mocks.bota import BotaBox
-from mocks.robotiq import RobotiqBox
-from mocks.robotous import RobotousSerialBox
+from mocks.sensors.ati_can import AtiCanNode
+from mocks.sensors.ati_serial import AtiSerialBox
+from mocks.sensors.bota import BotaBox
+from mocks.sensors.robotiq import RobotiqBox
+from mocks.sensors.robotous import RobotousSerialBox
 
 
 def measure(n: int) -> Any:

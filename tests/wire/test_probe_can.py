@@ -12,8 +12,8 @@ from drivers.errors import ConnectError, PortInUse
 from drivers.probe import can_bus as module
 from drivers.probe.can_bus import probe_can
 from drivers.registry import sensor_from_url
-from mocks.ati_can import AtiCanNode
-from mocks.robotous import RobotousCanNode
+from mocks.sensors.ati_can import AtiCanNode
+from mocks.sensors.robotous import RobotousCanNode
 
 
 @pytest.fixture(autouse=True)

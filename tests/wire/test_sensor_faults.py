@@ -36,13 +36,13 @@ PROGRAM = """
 import json, sys, threading, time
 import numpy as np
 from mocks.clock import CellClock
-from mocks.ati_can import AtiCanNode
-from mocks.ati_serial import AtiSerialBox
-from mocks.bota import BotaBox
-from mocks.faults import Faults
-from mocks.netft import NetFtBox
-from mocks.robotiq import RobotiqBox
-from mocks.robotous import RobotousCanNode, RobotousSerialBox
+from mocks.sensors.ati_can import AtiCanNode
+from mocks.sensors.ati_serial import AtiSerialBox
+from mocks.sensors.bota import BotaBox
+from mocks.wires.faults import Faults
+from mocks.sensors.netft import NetFtBox
+from mocks.sensors.robotiq import RobotiqBox
+from mocks.sensors.robotous import RobotousCanNode, RobotousSerialBox
 from tests.wire.emulated_wrist import EmulatedWrist
 
 class Counter:

@@ -28,12 +28,12 @@ from drivers.transcript.recorder import BadTranscript, Passage, Transcript, Writ
 from drivers.transcript.taps import recording
 from drivers.wires.parity import Unmarker, ask_for_marks
 from drivers.wires.serial_port import SerialPort
-from mocks.ati_can import AtiCanNode
-from mocks.ati_serial import AtiSerialBox
-from mocks.bota import BotaBox
-from mocks.faults import Faults
-from mocks.robotiq import RobotiqBox
-from mocks.robotous import RobotousSerialBox
+from mocks.sensors.ati_can import AtiCanNode
+from mocks.sensors.ati_serial import AtiSerialBox
+from mocks.sensors.bota import BotaBox
+from mocks.sensors.robotiq import RobotiqBox
+from mocks.sensors.robotous import RobotousSerialBox
+from mocks.wires.faults import Faults
 
 WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])
 NOISE = np.array([0.03] * 3 + [0.001] * 3)

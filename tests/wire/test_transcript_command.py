@@ -18,7 +18,7 @@ from drivers.transcript.player import Player
 from drivers.transcript.recorder import BadTranscript, Writer
 from ftdrive.commands import transcript
 from ftdrive.errors import ConfigError
-from mocks.bota import BotaBox
+from mocks.sensors.bota import BotaBox
 
 WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])
 

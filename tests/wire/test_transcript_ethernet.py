@@ -28,7 +28,7 @@ from drivers.transcript.relays import _DatagramRelay, _PageRelay
 from drivers.transcript.taps import recording
 from ftdrive.commands import transcript
 from ftdrive.errors import ConfigError
-from mocks.netft import NetFtBox
+from mocks.sensors.netft import NetFtBox
 
 WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])
 START, STOP = bytes.fromhex("1234 0002 0000 0000"), bytes.fromhex("1234 0000 0000 0000")

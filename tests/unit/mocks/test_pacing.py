@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mocks.ati_can import AtiCanNode
-from mocks.ati_serial import AtiSerialBox
-from mocks.bota import BANNER, BotaBox
 from mocks.clock import LEAD_NS, CellClock
-from mocks.faults import Faults
-from mocks.netft import RECORD, Command, NetFtBox
-from mocks.pty import PtyDevice
-from mocks.robotiq import FRAME_GAP_S, RobotiqBox
-from mocks.robotous import RobotousCanNode, RobotousSerialBox
-from mocks.slcan import CanFrame
-from mocks.stream import Pacer
+from mocks.sensors.ati_can import AtiCanNode
+from mocks.sensors.ati_serial import AtiSerialBox
+from mocks.sensors.bota import BANNER, BotaBox
+from mocks.sensors.netft import RECORD, Command, NetFtBox
+from mocks.sensors.robotiq import FRAME_GAP_S, RobotiqBox
+from mocks.sensors.robotous import RobotousCanNode, RobotousSerialBox
+from mocks.wires.faults import Faults
+from mocks.wires.pty import PtyDevice
+from mocks.wires.slcan import CanFrame
+from mocks.wires.stream import Pacer
 from tests.unit.mocks.real_time import RealTime
 
 STEP_S = 0.001

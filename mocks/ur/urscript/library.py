@@ -15,7 +15,7 @@ from mocks.kinematics import Array, Vector6, forward, inverse, inverse_matrix, m
 from mocks.ur.motion import JointMove, LineMove, Path
 
 if TYPE_CHECKING:
-    from mocks.ur.program import Program
+    from mocks.ur.urscript.program import Program
 
 Cycles = Generator[None, None, None]
 """Takes as many control cycles as it yields."""

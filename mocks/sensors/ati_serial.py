@@ -13,10 +13,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mocks.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
 from mocks.clock import CellClock
-from mocks.faults import Faults, FaultyWire
-from mocks.modbus import (
+from mocks.sensors.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
+from mocks.wires.faults import Faults, FaultyWire
+from mocks.wires.modbus import (
     DEVICE_FAILURE,
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
@@ -27,8 +27,8 @@ from mocks.modbus import (
     reply,
     written_registers,
 )
-from mocks.pty import PtyDevice
-from mocks.stream import Measure
+from mocks.wires.pty import PtyDevice
+from mocks.wires.stream import Measure
 
 ADDRESS = 0x0A
 STREAM_HZ = 7000.0

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mocks.clock import CellClock
-from mocks.faults import Faults, FaultyWire
-from mocks.slcan import CanFrame
+from mocks.wires.faults import Faults, FaultyWire
+from mocks.wires.slcan import CanFrame
 from tests.unit.mocks.real_time import RealTime
 
 CLOCK = CellClock(RealTime())

@@ -20,7 +20,7 @@ from bisect import bisect_left
 from collections.abc import Callable
 
 from mocks.clock import CellClock, time_out_s
-from mocks.uart import marked
+from mocks.wires.uart import marked
 
 _END, _RESET = b"!", b"r"
 

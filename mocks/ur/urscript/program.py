@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from inspect import isgenerator, signature
 from typing import TYPE_CHECKING, Any, cast
 
-from mocks.ur.library import FUNCTIONS, Pose, ScriptError, is_number, shown
-from mocks.ur.syntax import (
+from mocks.ur.urscript.library import FUNCTIONS, Pose, ScriptError, is_number, shown
+from mocks.ur.urscript.syntax import (
     Assignment,
     Call,
     Expression,

@@ -14,7 +14,7 @@ from mocks.ur.events import Event
 from mocks.ur.modes import Runtime
 from mocks.ur.robot import Robot, RobotSettings
 from mocks.ur.script import Upload, take_uploads
-from mocks.ur.syntax import UrscriptSyntaxError, parse
+from mocks.ur.urscript.syntax import UrscriptSyntaxError, parse
 from mocks.world import Truth, World
 
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))

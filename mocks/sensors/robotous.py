@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mocks.clock import CellClock
-from mocks.faults import Faults
-from mocks.slcan import CanFrame
-from mocks.stream import CanSensor, Measure, Pacer, SerialSensor
+from mocks.wires.faults import Faults
+from mocks.wires.slcan import CanFrame
+from mocks.wires.stream import CanSensor, Measure, Pacer, SerialSensor
 
 COMMAND_BYTES, RESPONSE_BYTES = 8, 16
 START_OF_PACKET, END_OF_PACKET = 0x55, 0xAA

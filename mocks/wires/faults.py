@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from mocks.clock import CellClock
-from mocks.slcan import CanFrame
-from mocks.uart import WrongParity
+from mocks.wires.slcan import CanFrame
+from mocks.wires.uart import WrongParity
 
 Frame = TypeVar("Frame", bytes, CanFrame)
 

@@ -14,11 +14,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mocks.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
 from mocks.clock import CellClock
-from mocks.faults import Faults
-from mocks.slcan import CanFrame
-from mocks.stream import CanSensor, Measure
+from mocks.sensors.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
+from mocks.wires.faults import Faults
+from mocks.wires.slcan import CanFrame
+from mocks.wires.stream import CanSensor, Measure
 
 EMPTY_SLOT_STATUS = 0x8040  # bad active calibration, any error
 NO_ARGUMENT, ONE_ARGUMENT = (0, 1), (1,)  # accepted data lengths; a superfluous byte is tolerated

@@ -9,8 +9,8 @@ from importlib import import_module
 from typing import Any, Protocol
 
 from mocks.clock import CellClock
-from mocks.faults import Faults
-from mocks.stream import Measure
+from mocks.wires.faults import Faults
+from mocks.wires.stream import Measure
 
 
 class SensorEmulator(Protocol):
@@ -60,22 +60,22 @@ def _slcan(bitrate: int, **more: Any) -> dict[str, Any]:
 
 KINDS = {
     "can": Kind(
-        "mocks.ati_can:AtiCanNode",
+        "mocks.sensors.ati_can:AtiCanNode",
         "ati-can",
         "interface=slcan&bitrate=250000&base=32",
         _slcan(250_000, base=0x20),
         {"base": 0x20, "bitrate": 250_000},
     ),
-    "serial": Kind("mocks.ati_serial:AtiSerialBox", "ati-serial"),
+    "serial": Kind("mocks.sensors.ati_serial:AtiSerialBox", "ati-serial"),
     "robotous-can": Kind(
-        "mocks.robotous:RobotousCanNode", "robotous-can", "interface=slcan&rate=1000", _slcan(1_000_000)
+        "mocks.sensors.robotous:RobotousCanNode", "robotous-can", "interface=slcan&rate=1000", _slcan(1_000_000)
     ),
     "robotous-serial": Kind(
-        "mocks.robotous:RobotousSerialBox", "robotous-serial", "baud=115200&rate=200", {"baud": 115_200}
+        "mocks.sensors.robotous:RobotousSerialBox", "robotous-serial", "baud=115200&rate=200", {"baud": 115_200}
     ),
-    "robotiq": Kind("mocks.robotiq:RobotiqBox", "robotiq-ft300"),
-    "bota": Kind("mocks.bota:BotaBox", "bota", floats=True),
-    "netft": Kind("mocks.netft:NetFtBox", "ati-netft", options={"rdt_port": 0, "rate_hz": 1000}),
+    "robotiq": Kind("mocks.sensors.robotiq:RobotiqBox", "robotiq-ft300"),
+    "bota": Kind("mocks.sensors.bota:BotaBox", "bota", floats=True),
+    "netft": Kind("mocks.sensors.netft:NetFtBox", "ati-netft", options={"rdt_port": 0, "rate_hz": 1000}),
 }
 """Sensors on a wire of their own."""
 

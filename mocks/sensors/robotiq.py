@@ -13,10 +13,10 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from mocks import modbus
 from mocks.clock import CellClock
-from mocks.faults import Faults
-from mocks.stream import Measure, SerialSensor
+from mocks.wires import modbus
+from mocks.wires.faults import Faults
+from mocks.wires.stream import Measure, SerialSensor
 
 ADDRESS = 0x09
 STREAM_HZ = 100.0

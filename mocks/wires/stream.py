@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mocks.clock import CellClock
-from mocks.faults import Faults, FaultyWire, Frame
-from mocks.pty import PtyDevice
-from mocks.slcan import CanFrame, SlcanAdapter
+from mocks.wires.faults import Faults, FaultyWire, Frame
+from mocks.wires.pty import PtyDevice
+from mocks.wires.slcan import CanFrame, SlcanAdapter
 
 Measure = Callable[[int], NDArray[np.float64]]
 MIN_WAIT_S = 1e-3

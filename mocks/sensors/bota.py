@@ -16,8 +16,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from mocks.clock import CellClock
-from mocks.faults import Faults
-from mocks.stream import Measure, SerialSensor
+from mocks.wires.faults import Faults
+from mocks.wires.stream import Measure, SerialSensor
 
 HEADER = b"\xaa"
 LONGEST_COMMAND = len(b"f,4096,0,0,0")

@@ -26,10 +26,10 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from mocks.ati_gauges import Scale
 from mocks.clock import CellClock, time_out_s
-from mocks.faults import Faults, FaultyWire
-from mocks.stream import Measure, Pacer
+from mocks.sensors.ati_gauges import Scale
+from mocks.wires.faults import Faults, FaultyWire
+from mocks.wires.stream import Measure, Pacer
 
 RDT_PORT = 49152
 REQUEST = struct.Struct(">HHI")

@@ -6,7 +6,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mocks.robotous import Model, RobotousCanNode, RobotousSensor, RobotousSerialBox, fields, packet, sample_field
+from mocks.sensors.robotous import (
+    Model,
+    RobotousCanNode,
+    RobotousSensor,
+    RobotousSerialBox,
+    fields,
+    packet,
+    sample_field,
+)
 
 WRENCH = np.array([10, -5, 20, 1, -0.5, 0.05])
 SAMPLE = "0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000"
