@@ -62,7 +62,7 @@ def cli(verbose: int, quiet: bool) -> None:
     logger = logging.StreamHandler() if quiet else _Talk()
     logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[logger])
     if quiet:
-        from ftdrive.talk import talk
+        from ftdrive.terminal.console import talk
 
         talk.quiet = True
 
@@ -71,7 +71,7 @@ class _Talk(logging.Handler):
     """To where people are told things, above a live screen if there is one."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        from ftdrive.talk import talk
+        from ftdrive.terminal.console import talk
 
         talk.print(self.format(record))
 
@@ -125,7 +125,7 @@ def run(arguments: Sequence[str]) -> int:
         _siblings.check()
         return int(cli.main(list(arguments), prog_name="ftdrive", standalone_mode=False) or 0)
     except click.ClickException as error:
-        from ftdrive.talk import in_whole_words
+        from ftdrive.terminal.console import in_whole_words
 
         error.show(told := StringIO())
         click.echo(in_whole_words(told.getvalue(), sys.stderr), err=True, nl=False)
@@ -137,7 +137,7 @@ def run(arguments: Sequence[str]) -> int:
         code = exit_code(error)
         if code is None:
             raise
-        from ftdrive.talk import in_whole_words
+        from ftdrive.terminal.console import in_whole_words
 
         click.echo(in_whole_words(f"error: {in_a_sentence(error)}", sys.stderr), err=True)
         return code

@@ -2,7 +2,7 @@
 
 import threading
 
-from ftdrive.emulated_clock import EmulatedClock
+from ftdrive.cell.emulated_clock import EmulatedClock
 from mocks.clock import CellClock
 
 

@@ -11,9 +11,9 @@ import click
 from ftdrive.commands.common import CELL, NewFile, rows, runs, stop_unless_accepted, write_json
 
 if TYPE_CHECKING:
-    from ftdrive.config import CellConfig
-    from ftdrive.runs import Mode
-    from ftdrive.session.outcome import Outcome
+    from ftdrive.cell.config import CellConfig
+    from ftdrive.runs.outcome import Outcome
+    from ftdrive.runs.run import Mode
 
 _OF_A_PLAN = ("--quick", "--minimal", "--output", "--png", "--view")
 _EXCLUDE_ONE_ANOTHER = (
@@ -89,14 +89,14 @@ def calibrate(
     Every move is proven clear and shown before it happens; a first motion needs a typed word and is slow. Where the arm
     has room only the three wrist joints move. Ctrl-C stops the arm; what was taken is kept and --resume goes on.
     """
+    from ftdrive.cell.emulated import MOVED_BY, Station, sensor_name
     from ftdrive.errors import Declined
-    from ftdrive.report import print_result
-    from ftdrive.runs import Run
-    from ftdrive.screen import open_operator
-    from ftdrive.session.guided import Options, as_begun
-    from ftdrive.session.guided import calibrate as guide
-    from ftdrive.simulation import MOVED_BY, Station, sensor_name
-    from ftdrive.talk import talk
+    from ftdrive.runs.run import Run
+    from ftdrive.session.session import Options, as_begun
+    from ftdrive.session.session import calibrate as guide
+    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.report import print_result
+    from ftdrive.terminal.screen import open_operator
 
     given = {
         "--step": step,
@@ -189,8 +189,8 @@ class Said:
         return {"config": self.config, "robot": self.robot, "sensor": self.sensor, "tool": list(self.tool)}
 
     def settings(self) -> dict[str, Any]:
-        """Give these options, environment and files, in this order of precedence; see `ftdrive.config.settings`."""
-        from ftdrive.config import settings
+        """Give these options, environment and files, in this order of precedence; see `cell.config.settings`."""
+        from ftdrive.cell.config import settings
 
         flags = {
             "robot.host": ("--robot", self.robot),
@@ -201,7 +201,7 @@ class Said:
 
     def cell(self) -> "CellConfig":
         """Put the cell together."""
-        from ftdrive.config import cell_of
+        from ftdrive.cell.config import cell_of
 
         return cell_of(self.settings())
 
@@ -212,9 +212,9 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
     Tool and surroundings are those that files and environment describe now: when they are not those of the plan, it is
     refused. Where nothing describes them any more, the run's own record counts.
     """
-    from ftdrive.config import Setting, cell_of, recorded_cell
-    from ftdrive.runs import Run
-    from ftdrive.talk import talk
+    from ftdrive.cell.config import Setting, cell_of, recorded_cell
+    from ftdrive.runs.run import Run
+    from ftdrive.terminal.console import talk
 
     header = Run(folder).header()
     begun: dict[str, Any] = {**Said().to_dict(), **header.get("said", {})}
@@ -247,7 +247,7 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
 
 def _as_json(outcome: "Outcome") -> dict[str, Any]:
     """Give the run, the result, and what the report says beside: pose 1 seen again, and what probably happened."""
-    from ftdrive.hints import hints
+    from ftdrive.runs.pose_hints import hints
 
     drift = outcome.drift
     return {

@@ -10,7 +10,7 @@ import click
 
 if TYPE_CHECKING:
     from calib import CalibrationResult
-    from ftdrive.config import CellConfig
+    from ftdrive.cell.config import CellConfig
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -127,7 +127,7 @@ def write_json(value: Mapping[str, Any]) -> None:
 
 def read_cell(config: Path | None, robot: str | None, sensor: str | None, *, model: str | None = None) -> "CellConfig":
     """Take the cell from options, environment and files, in this order of precedence."""
-    from ftdrive.config import load
+    from ftdrive.cell.config import load
 
     flags = {"robot.host": ("--robot", robot), "robot.model": ("--model", model), "sensor.url": ("--sensor", sensor)}
     return load(config, flags)

@@ -30,11 +30,11 @@ def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as
     An option of a command comes first, then the environment, then ftdrive.toml here, then the user's file, then the
     default.
     """
-    from ftdrive.config import FORMAT, as_toml, settings
+    from ftdrive.cell.config import FORMAT, as_toml, settings
 
     check_simulate(simulate, real={"--config": path}, emulated={"--sensor": sensor})
     if simulate:
-        from ftdrive.simulation import Station, sensor_name
+        from ftdrive.cell.emulated import Station, sensor_name
 
         with Station(sensor_name(sensor)) as station:
             found = settings(cell=station.cell)

@@ -8,11 +8,11 @@ from typing import Any
 import click
 import numpy as np
 
+from ftdrive.cell.emulated import SENSORS, Station
+from ftdrive.cell.emulated_run import rehearse
 from ftdrive.commands.common import JSON, runs, stop_unless_accepted, write_json
-from ftdrive.rehearsal import rehearse
-from ftdrive.report import errors_in_sigma, print_result
-from ftdrive.simulation import SENSORS, Station
-from ftdrive.talk import talk
+from ftdrive.terminal.console import talk
+from ftdrive.terminal.report import errors_in_sigma, print_result
 
 
 @click.command()

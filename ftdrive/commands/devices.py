@@ -11,11 +11,11 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from drivers.errors import DriverError
-from ftdrive.checks import Check, can_details, can_interfaces, check_serial_port, name_by_id
+from ftdrive.cell.emulated import Station
+from ftdrive.checks.computer import Check, can_details, can_interfaces, check_serial_port, name_by_id
 from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
-from ftdrive.simulation import Station
-from ftdrive.talk import hanging
+from ftdrive.terminal.console import hanging
 
 _PLACES = """\b
 A PLACE is
@@ -80,7 +80,7 @@ def _can_interfaces() -> list[dict[str, Any]]:
 
 def _answers(place: str, failures: list[Exception]) -> list[dict[str, Any]]:
     """Ask at one place; why it cannot be asked is told with the answers of the others, and added to `failures`."""
-    from ftdrive.discovery import ask
+    from ftdrive.checks.discovery import ask
 
     nothing = {"port": place, "url": None, "what": "no known sensor answers", "error": None}
     try:

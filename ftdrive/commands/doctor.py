@@ -20,14 +20,14 @@ from drivers.errors import DriverError
 from drivers.interfaces import ArmStatus, ForceTorqueSensor, RobotArm
 from drivers.ur.dashboard import Dashboard, ask_dashboard
 from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
-from ftdrive import checks, diagnosis
-from ftdrive.checks import Check, SensorAddress
+from ftdrive.cell.config import USUAL_KG, CellConfig
+from ftdrive.cell.devices import build_arm, build_sensor, ur_timing
+from ftdrive.cell.emulated import Station, sensor_name, sensor_url
+from ftdrive.checks import computer, devices
+from ftdrive.checks.computer import Check, SensorAddress
 from ftdrive.commands.common import CELL, JSON, MODEL, Number, check_simulate, read_cell, runs, simulate, write_json
-from ftdrive.config import USUAL_KG, CellConfig
 from ftdrive.errors import NotAccepted
-from ftdrive.simulation import Station, sensor_name, sensor_url
-from ftdrive.talk import hanging, talk
-from ftdrive.wiring import build_arm, build_sensor, ur_timing
+from ftdrive.terminal.console import hanging, talk
 
 Array = NDArray[np.float64]
 Blame = Callable[[str, DriverError], Check]
@@ -84,16 +84,16 @@ def doctor(
         device = build_sensor(cell)
 
         arm = _examine_robot(cell, found, stack)
-        permissions = checks.check_permissions(address)
-        blame = partial(diagnosis.check_sensor_error, address=address, permissions=permissions)
+        permissions = computer.check_permissions(address)
+        blame = partial(devices.check_sensor_error, address=address, permissions=permissions)
         alive = _examine_sensor(device, address, cell, mass_kg or cell.tool.mass_kg or USUAL_KG, found, blame, stack)
         told = cell.robot.model if arm is None else arm.identify().model
-        found += [checks.check_workcell(cell, told), checks.check_disk(runs), *permissions]
+        found += [computer.check_workcell(cell, told), computer.check_disk(runs), *permissions]
         if calibration is not None:
             connected = {"sensor": device.identify()} if alive else {}
             if arm is not None:
                 connected["arm"] = arm.identify()
-            found.append(diagnosis.check_calibration(calibration, connected))
+            found.append(devices.check_calibration(calibration, connected))
         if push:
             R_flange_sensor = None if calibration is None else calibration.R_flange_sensor
             if station is not None and calibration is None:
@@ -106,7 +106,7 @@ def doctor(
         answer = {
             "schema_version": 1,
             "checks": [asdict(check) for check in found],
-            "verdict": checks.verdict(found),
+            "verdict": computer.verdict(found),
         }
         write_json({**answer, "push": pushed} if push else answer)
     else:
@@ -123,16 +123,16 @@ def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> Ro
         info, status = arm.identify(), arm.status()
         after = f" in {1e3 * _dashboard_s(cell):.1f} ms" if is_ur else ""
     except DriverError as error:
-        found.append(diagnosis.check_unreachable(error, host))
+        found.append(devices.check_unreachable(error, host))
         return None
     found.append(Check("robot.reachable", "ok", f"{host} answers{after}"))
-    found.append(diagnosis.check_arm(info) if is_ur else Check("robot.identity", "ok", diagnosis.who(info)))
+    found.append(devices.check_arm(info) if is_ur else Check("robot.identity", "ok", devices.who(info)))
     try:
-        found.append(diagnosis.check_remote(arm.in_remote_control()))
+        found.append(devices.check_remote(arm.in_remote_control()))
     except DriverError as error:
-        found.append(replace(diagnosis.check_unreachable(error, host), name="robot.remote"))
+        found.append(replace(devices.check_unreachable(error, host), name="robot.remote"))
     found += [_registers(cell), _script_port(cell)] if is_ur else [_NOT_UR]
-    found += diagnosis.check_status(status)
+    found += devices.check_status(status)
     found.append(_flange(arm, status))
     found.append(_clock(arm, cell.clock))
     return arm
@@ -153,7 +153,7 @@ def _dashboard_s(cell: CellConfig) -> float:
 def _registers(cell: CellConfig) -> Check:
     host, limit_s = cell.robot.host, ur_timing(cell).connect_s
     try:
-        return diagnosis.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=limit_s, clock=cell.clock))
+        return devices.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=limit_s, clock=cell.clock))
     except DriverError as error:
         return Check("robot.registers", "failed", error.found, error.cure or f"ping {host}")
 
@@ -191,7 +191,7 @@ def _clock(arm: RobotArm, clock: Clock) -> Check:
                 device_s.append(status.t_device_s)
     except DriverError as error:
         return Check("clock.pace", "failed", error.found, error.cure or "check the robot and the network")
-    return diagnosis.check_clock(host_ns, device_s)
+    return devices.check_clock(host_ns, device_s)
 
 
 def _examine_sensor(
@@ -206,15 +206,15 @@ def _examine_sensor(
     name = "sensor.identity"
     try:
         stack.enter_context(device)
-        found += diagnosis.check_identity(device.identify())
+        found += devices.check_identity(device.identify())
         name = "sensor.stream"
         samples = device.collect(_LOOK_S)
         health = device.health()
     except DriverError as error:
         found.append(blame(name, error))
         return False
-    found += diagnosis.check_stream(samples, health, address, _LOOK_S)
-    found += diagnosis.check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg)
+    found += devices.check_stream(samples, health, address, _LOOK_S)
+    found += devices.check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg)
     return True
 
 
@@ -254,7 +254,7 @@ def _examine_push(
         found.append(blame("push.sign", error))
         return None
     largest = max(changes, key=lambda change: float(np.linalg.norm(change)))
-    check, moved = diagnosis.check_push(largest, R_base_flange, R_flange_sensor, sign)
+    check, moved = devices.check_push(largest, R_base_flange, R_flange_sensor, sign)
     found.append(check)
     return moved
 
@@ -269,5 +269,5 @@ def _print(found: list[Check]) -> None:
         if check.fix is not None and check.state in {"warning", "failed"}:
             data.print(hanging(f"{'':15}fix: ", check.fix, data))
         subject = first
-    worst = checks.verdict(found)
+    worst = computer.verdict(found)
     talk.print({"ok": " All is well.", "warning": " Usable; see what is marked !", "failed": " Not ready."}[worst])

@@ -48,7 +48,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     from ftdrive.errors import ConfigError
     from ftdrive.exports import targets_csv, urscript
     from ftdrive.planning.plan import Plan
-    from ftdrive.talk import talk
+    from ftdrive.terminal.console import talk
 
     check_simulate(simulate, real={"PLAN.json": path})
     if simulate:
@@ -69,9 +69,9 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
 
 
 def _emulated() -> "Plan":
-    from ftdrive.planning.cell import certifier_for, plan_for
+    from ftdrive.cell.emulated import Station
+    from ftdrive.planning.cell_plan import certifier_for, plan_for
     from ftdrive.planning.planner import USUAL_POSTURE_RAD
-    from ftdrive.simulation import Station
 
     with Station() as station:
         cell = station.cell

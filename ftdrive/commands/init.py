@@ -68,11 +68,11 @@ def init(
     """
     from calib.files import write_new
     from drivers.ur.kinematics import model_named
-    from ftdrive.cellfile import cell_file
-    from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, settings
-    from ftdrive.planning.arm_model import SHAPES
-    from ftdrive.planning.cell import require_possible
-    from ftdrive.simulation import Station, sensor_name
+    from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, settings
+    from ftdrive.cell.emulated import Station, sensor_name
+    from ftdrive.cell.template import cell_file
+    from ftdrive.planning.cell_plan import require_possible
+    from ftdrive.planning.geometry.arm_model import SHAPES
 
     check_simulate(simulate, real={"--robot": robot})
     said = settings()
@@ -171,7 +171,7 @@ class Questions:
     def ask(self, words: str, flag: str, given: str | None, usual: str | None, read: Callable[[str], T]) -> T:
         """Return what was given, or the answer; `usual` is what Enter and `--yes` say, None where they must not."""
         from ftdrive.errors import ConfigError
-        from ftdrive.talk import in_whole_words
+        from ftdrive.terminal.console import in_whole_words
 
         if given is None and self._yes:
             if usual is None:
@@ -195,7 +195,7 @@ class Questions:
 
     def text(self, words: str, key: str, flag: str, given: str | None, usual: str | None = None) -> str:
         """Ask for a text."""
-        from ftdrive.config import checked
+        from ftdrive.cell.config import checked
 
         return str(self.ask(words, flag, given, usual, lambda text: checked(flag, key, text)))
 
@@ -216,7 +216,7 @@ class Questions:
         whole: Judge = _anything,
     ) -> Any:
         """Ask for rows of numbers until an empty answer; at least one when `needed`. Each and all are judged."""
-        from ftdrive.config import checked
+        from ftdrive.cell.config import checked
 
         found: list[Any] = []
 
@@ -245,7 +245,7 @@ class Questions:
 
 
 def _number(key: str, flag: str, text: str) -> Any:
-    from ftdrive.config import checked
+    from ftdrive.cell.config import checked
 
     if not text:
         return None
@@ -261,8 +261,8 @@ def _robot(
 ) -> tuple[str, str | None, str]:
     """Host, model, and what the arm says of itself; a person may keep an address that does not answer."""
     from drivers.errors import DriverError
-    from ftdrive.config import checked
-    from ftdrive.discovery import look_at_robot
+    from ftdrive.cell.config import checked
+    from ftdrive.checks.discovery import look_at_robot
 
     if model is not None:
         checked("--model", "robot.model", model)
@@ -288,7 +288,7 @@ def _robot(
 def _sensor(ask: Questions, given: str | None, usual: str | None, clock: Clock) -> tuple[str, str]:
     """Address, and what the sensor says of itself; a person may keep an address that does not answer."""
     from drivers.errors import DriverError
-    from ftdrive.discovery import is_place, look_at_sensor, places, sensor_at
+    from ftdrive.checks.discovery import is_place, look_at_sensor, places, sensor_at
     from ftdrive.errors import ConfigError
 
     found = [] if given or not ask.somebody_answers else places()
@@ -321,6 +321,6 @@ def _sensor(ask: Questions, given: str | None, usual: str | None, clock: Clock) 
 
 
 def _say(words: str, head: str = "") -> None:
-    from ftdrive.talk import hanging, talk
+    from ftdrive.terminal.console import hanging, talk
 
     talk.print(hanging(head, words))

@@ -19,17 +19,17 @@ from rich.text import Text
 from calib import CalibrationResult
 from calib.data.dwell_mean import LEAST_SAMPLES, PoseMean, mean_and_covariance
 from drivers.interfaces import DeviceInfo
+from ftdrive.cell.config import CellConfig
+from ftdrive.cell.devices import build_arm, build_sensor
+from ftdrive.cell.emulated import Station, sensor_name
+from ftdrive.cell.emulated_run import rehearse
+from ftdrive.checks.devices import belonging
 from ftdrive.commands.common import CELL, JSON, check_simulate, read_cell, simulate, stop_unless_accepted, write_json
-from ftdrive.config import CellConfig
-from ftdrive.diagnosis import belonging
 from ftdrive.errors import ConfigError
-from ftdrive.keyboard import Keyboard
-from ftdrive.rehearsal import rehearse
-from ftdrive.report import likely_error
-from ftdrive.runs import Run
-from ftdrive.simulation import Station, sensor_name
-from ftdrive.talk import talk
-from ftdrive.wiring import build_arm, build_sensor
+from ftdrive.runs.run import Run
+from ftdrive.terminal.console import talk
+from ftdrive.terminal.keyboard import Keyboard
+from ftdrive.terminal.report import likely_error
 
 Array = NDArray[np.float64]
 Axes = Literal["sensor", "flange", "base"]

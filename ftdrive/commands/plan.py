@@ -9,7 +9,7 @@ import click
 from ftdrive.commands.common import CONFIG, JSON, NewFile, check_simulate, numbers, rows, simulate, write_json
 
 if TYPE_CHECKING:
-    from ftdrive.planning.certify import Certifier
+    from ftdrive.planning.geometry.certify import Certifier
     from ftdrive.planning.plan import Plan
 
 USUAL_POSTURE_DEG = (45, -100, 60)
@@ -93,12 +93,12 @@ def plan(
     """
     import numpy as np
 
-    from ftdrive.config import cell_of, settings
+    from ftdrive.cell.config import cell_of, settings
+    from ftdrive.cell.emulated import Station
     from ftdrive.errors import ConfigError
-    from ftdrive.planning.cell import certifier_for, plan_for
+    from ftdrive.planning.cell_plan import certifier_for, plan_for
     from ftdrive.planning.planner import USUAL_POSTURE_RAD
-    from ftdrive.simulation import Station
-    from ftdrive.talk import talk
+    from ftdrive.terminal.console import talk
 
     if quick and minimal:
         raise ConfigError("give --quick (12 poses) or --minimal (6), not both")
@@ -141,7 +141,7 @@ def plan(
         tip_unlimited=_unlimited(tip_speed_limit),
     )
     if png is not None:
-        from ftdrive.planning.picture import draw
+        from ftdrive.planning.show.picture import draw
 
         draw(made, certifier, png)
     if output is not None:
@@ -149,7 +149,7 @@ def plan(
     if as_json:
         write_json({"schema_version": 1} | made.to_dict())
     else:
-        from ftdrive.planning.words import plan_in_words
+        from ftdrive.planning.show.words import plan_in_words
 
         talk.print(plan_in_words(made))
     if view:
@@ -161,8 +161,8 @@ def _look(made: "Plan", certifier: "Certifier") -> None:
     import threading
     from contextlib import suppress
 
-    from ftdrive.planning.view import open_in_browser, shown
-    from ftdrive.talk import talk
+    from ftdrive.planning.show.view import open_in_browser, shown
+    from ftdrive.terminal.console import talk
 
     with shown(made, certifier) as url, suppress(KeyboardInterrupt):
         talk.print(f"The plan is shown at {url} until Ctrl-C.")

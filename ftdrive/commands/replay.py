@@ -7,6 +7,7 @@ import click
 
 from calib import CalibrationResult
 from calib.routine import PoseRecord, Sampling, take_pose
+from ftdrive.cell.emulated_run import rehearsed_run
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
     JSON,
@@ -16,12 +17,11 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.recorded import RecordedRun
-from ftdrive.rehearsal import rehearsed_run
-from ftdrive.report import print_result
-from ftdrive.runs import Run
+from ftdrive.runs.replay_source import RecordedRun
+from ftdrive.runs.run import Run
 from ftdrive.session import solve_records
-from ftdrive.talk import talk
+from ftdrive.terminal.console import talk
+from ftdrive.terminal.report import print_result
 
 
 @click.command()

@@ -19,6 +19,7 @@ from calib.likelihood.fit import Drift
 from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE
 from calib.result import Method
 from calib.routine import drift_check
+from ftdrive.cell.emulated_run import rehearsed_run
 from ftdrive.cli import exit_code
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
@@ -32,12 +33,11 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.hints import hints
-from ftdrive.rehearsal import rehearsed_run
-from ftdrive.report import print_comparison, print_result
-from ftdrive.runs import Run, versions
+from ftdrive.runs.pose_hints import hints
+from ftdrive.runs.run import Run, versions
 from ftdrive.session import dataset_of
-from ftdrive.talk import talk
+from ftdrive.terminal.console import talk
+from ftdrive.terminal.report import print_comparison, print_result
 
 Orientation = Literal["R_base_flange", "R_flange_base"]
 

@@ -17,12 +17,12 @@ from drivers.registry import BadUrl, sensor_from_url
 from drivers.transcript.player import Player
 from drivers.transcript.recorder import INTERRUPTED, BadTranscript, Transcript, Writer
 from drivers.transcript.taps import recording
-from ftdrive.checks import SensorAddress
+from ftdrive.cell.emulated import EMULATED, sensor_clock, sensor_name, sensor_url
+from ftdrive.checks.computer import SensorAddress
 from ftdrive.commands.common import EMULATED_SENSOR, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
-from ftdrive.runs import versions
-from ftdrive.simulation import EMULATED, sensor_clock, sensor_name, sensor_url
-from ftdrive.talk import talk
+from ftdrive.runs.run import versions
+from ftdrive.terminal.console import talk
 
 _PIECE_S = 60.0
 """One `collect` of a million samples would end at 143 s with an ATI sensor on a serial port."""

@@ -14,10 +14,10 @@ from scipy.sparse.csgraph import dijkstra
 
 from drivers.ur.kinematics import Array
 from ftdrive.errors import PlanRefused
-from ftdrive.planning.certify import Certificate, Certifier
-from ftdrive.planning.kinematics import checked_joints
+from ftdrive.planning.geometry.certify import Certificate, Certifier
+from ftdrive.planning.geometry.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
-from ftdrive.planning.nodes import ELBOW_RAD
+from ftdrive.planning.search.nodes import ELBOW_RAD
 
 NEAR_RAD = float(np.radians(30))
 """A person jogs every joint so near to the first pose where the way is not proven, then lets a program take over."""

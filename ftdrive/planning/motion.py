@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.ur.kinematics import Array
-from ftdrive.planning.arm_model import ArmModel
+from ftdrive.planning.geometry.arm_model import ArmModel
 
 SAMPLE_RAD = np.radians(0.5)
 

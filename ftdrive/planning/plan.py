@@ -13,7 +13,7 @@ from calib.files import check_format, read_object, write_new
 from calib.poses.information import Guess, Prediction, predicted_sigma, special
 from drivers.ur.kinematics import Array
 from ftdrive.errors import BadPlan, PlanRefused
-from ftdrive.planning.certify import Certificate, Certifier
+from ftdrive.planning.geometry.certify import Certificate, Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
 
 PLAN_FORMAT = "ftdrive.plan/1"

@@ -12,18 +12,18 @@ from scipy.spatial.transform import Rotation
 
 from calib.poses.information import SUBSET_6, T12, Guess, special
 from drivers.ur.kinematics import Array
-from ftdrive.config import USUAL_KG
+from ftdrive.cell.config import USUAL_KG
 from ftdrive.errors import ConfigError, PlanRefused
-from ftdrive.planning import constant_tour
-from ftdrive.planning.certify import Certifier
-from ftdrive.planning.chosen import Chosen, chosen_tour
-from ftdrive.planning.free_box import box_tour
-from ftdrive.planning.kinematics import checked_joints
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds
-from ftdrive.planning.nodes import WRIST_6_RAD, wrist_nodes
 from ftdrive.planning.plan import Plan, make_plan
-from ftdrive.planning.postures import with_room
-from ftdrive.planning.tours import clear_tour
+from ftdrive.planning.search import constant_tour
+from ftdrive.planning.search.chosen import Chosen, chosen_tour
+from ftdrive.planning.search.free_box import box_tour
+from ftdrive.planning.search.nodes import WRIST_6_RAD, wrist_nodes
+from ftdrive.planning.search.postures import with_room
+from ftdrive.planning.search.tours import clear_tour
 
 USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 """Where all models have room for the constant tour with usual tools; the wrist is at its first pose."""

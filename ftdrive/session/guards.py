@@ -1,4 +1,4 @@
-"""What is watched while the arm is under control, row by row of the hazard table; `watch.py` has the thread.
+"""What is watched while the arm is under control, row by row of the hazard table; `watchdog.py` has the thread.
 
 A guard looks at one `Seen` and raises `Tripped`. None of them is a safety function: that is the safety system of the
 robot and the user's risk assessment. README.md lists every row, where it is watched and which test injects it.
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import DeviceFault, DeviceTimeout, DriverError
 from drivers.interfaces import ArmState, ArmStatus
-from ftdrive.planning.certify import Certifier
+from ftdrive.planning.geometry.certify import Certifier
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from drivers.interfaces import NOT_REPORTED, ForceTorqueSensor, RobotArm
 from drivers.registry import Options, split_url
-from ftdrive.config import CellConfig
+from ftdrive.cell.config import CellConfig
 from ftdrive.errors import PlanRefused
-from ftdrive.runs import Run
+from ftdrive.runs.run import Run
 
 _CHOOSES_CALIBRATION: Final = {"slot": 0, "calibration": 1}
 """Options of a sensor's address that choose one of its calibrations, and which that is where they are not said."""

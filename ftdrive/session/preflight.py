@@ -17,15 +17,15 @@ from calib.data.dwell_mean import LEAST_SAMPLES
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
-from ftdrive import checks, diagnosis
-from ftdrive.checks import RATE_TOLERANCE, Check
-from ftdrive.config import CellConfig
+from ftdrive.cell.config import CellConfig
+from ftdrive.checks import computer, devices
+from ftdrive.checks.computer import RATE_TOLERANCE, Check
+from ftdrive.checks.controller_settings import PAYLOAD_KG, PAYLOAD_SHARE
 from ftdrive.errors import NotAccepted, PlanRefused
-from ftdrive.mismatch import PAYLOAD_KG, PAYLOAD_SHARE
 from ftdrive.planning.approach import Approach
-from ftdrive.planning.certify import Certifier
-from ftdrive.planning.nodes import WRIST_6_RAD
+from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.plan import Plan
+from ftdrive.planning.search.nodes import WRIST_6_RAD
 from ftdrive.session.events import Checked
 from ftdrive.session.guards import AXES, G_M_S2, Limits, ModelGuard, Tripped
 
@@ -70,7 +70,7 @@ Row = Callable[[Before], Checked]
 
 def check_workcell(before: Before) -> Checked:
     """Row 3: tool, planes and boxes are described, can be, and are as a person measured them."""
-    check = checks.check_workcell(before.cell, before.certifier.arm.name)
+    check = computer.check_workcell(before.cell, before.certifier.arm.name)
     return replace(_told("workcell", check), passed=check.state == "ok")
 
 
@@ -138,13 +138,13 @@ def forbidden(arm: RobotArm, q_rad: Array, step_rad: float = _EDGE_RAD) -> str:
 
 def check_safety(before: Before) -> Checked:
     """Rows 10, 11 and 12: the safety system lets the arm move."""
-    return _told("safety", diagnosis.check_safety(before.arm.status()))
+    return _told("safety", devices.check_safety(before.arm.status()))
 
 
 def check_remote(before: Before) -> Checked:
     """Row 21: the controller takes programs from here."""
     try:
-        return _told("remote", diagnosis.check_remote(before.arm.in_remote_control()))
+        return _told("remote", devices.check_remote(before.arm.in_remote_control()))
     except DriverError as error:
         return _failed("remote", str(error))
 
@@ -182,7 +182,7 @@ def check_payload(before: Before) -> Checked:
     told = status.payload_kg
     if told is None:
         return _passed("payload", "this controller does not tell its payload: compare it at the pendant")
-    if (check := diagnosis.check_payload(status)).state == "failed":
+    if (check := devices.check_payload(status)).state == "failed":
         return _told("payload", check)
     if words := _misplaced(before):
         return _failed("payload", words)
@@ -217,7 +217,7 @@ def _misplaced(before: Before) -> str:
 
 def check_slider(before: Before) -> Checked:
     """Row 22: a slow arm only takes longer, but not for ever; the slider is never touched."""
-    return _told("slider", diagnosis.check_speed(before.arm.status()))
+    return _told("slider", devices.check_speed(before.arm.status()))
 
 
 def check_sensor(before: Before) -> Checked:
@@ -285,7 +285,7 @@ def _answers_s(arm: RobotArm, clock: Clock) -> list[float]:
 
 def check_disk(before: Before) -> Checked:
     """Row 26: poses can be written, and there is room for them."""
-    return _told("disk", checks.check_disk(before.runs))
+    return _told("disk", computer.check_disk(before.runs))
 
 
 CHECKS: Final[Sequence[Row]] = (

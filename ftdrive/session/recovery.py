@@ -6,10 +6,10 @@ from typing import Final
 
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ForceTorqueSensor, RobotArm
-from ftdrive.session.desk import Desk
 from ftdrive.session.events import GuardTripped, Noted, Witness
 from ftdrive.session.guards import ContactGuard, Tripped, by_safety, out_of_sight
-from ftdrive.session.watch import Watcher
+from ftdrive.session.journal import Desk
+from ftdrive.session.watchdog import Watcher
 
 _LOOK_AGAIN_S: Final = 0.4
 

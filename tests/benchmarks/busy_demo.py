@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from ftdrive.simulation import SENSORS
+from ftdrive.cell.emulated import SENSORS
 
 SEEDS = range(10)
 COMMANDS = (

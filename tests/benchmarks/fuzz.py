@@ -35,7 +35,7 @@ from drivers.robotous.halves import Halves
 from drivers.transcript.recorder import FORMAT, BadTranscript, Transcript
 from drivers.ur import rtde
 from drivers.wires.crc import crc16_modbus, crc16_x25
-from ftdrive.checks import SensorAddress
+from ftdrive.checks.computer import SensorAddress
 
 LONGEST = 400
 SLOWEST_S = 0.5

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from ftdrive.config import CellConfig, ToolConfig, WorkcellConfig
-from ftdrive.simulation import Station
+from ftdrive.cell.config import CellConfig, ToolConfig, WorkcellConfig
+from ftdrive.cell.emulated import Station
 
 Json = dict[str, Any]
 

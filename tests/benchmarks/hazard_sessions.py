@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ftdrive.config import FORMAT, CellConfig
-from ftdrive.simulation import Station
+from ftdrive.cell.config import FORMAT, CellConfig
+from ftdrive.cell.emulated import Station
 from tests.benchmarks.hazard_rows import PAYLOAD_KG, Beforehand, Child, Fault, Json, Scene
 
 Array = NDArray[np.float64]

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from calib.routine import Sampling
-from ftdrive.report import errors_in_sigma
-from ftdrive.session.guided import Options, calibrate
-from ftdrive.session.operators import PlainOperator
-from ftdrive.simulation import Station
+from ftdrive.cell.emulated import Station
+from ftdrive.session.session import Options, calibrate
+from ftdrive.terminal.operators import PlainOperator
+from ftdrive.terminal.report import errors_in_sigma
 
 TARGETS_S = {24: 150.0, 12: 84.0}
 """By poses."""

@@ -12,8 +12,9 @@ from dataclasses import replace
 from functools import wraps
 from typing import Any
 
-from ftdrive import cli, config
-from ftdrive.emulated_clock import EmulatedClock
+from ftdrive import cli
+from ftdrive.cell import config
+from ftdrive.cell.emulated_clock import EmulatedClock
 
 
 def keep_time_of(path: str, put: Callable[[object, str, object], None] = setattr) -> None:

@@ -15,9 +15,9 @@ import pytest
 from click.testing import CliRunner
 
 from ftdrive import cli
-from ftdrive.config import FORMAT
-from ftdrive.simulation import Station
-from ftdrive.talk import talk
+from ftdrive.cell.config import FORMAT
+from ftdrive.cell.emulated import Station
+from ftdrive.terminal.console import talk
 from tests.system.cell_time import keep_time_of
 
 _LONG_S = 90

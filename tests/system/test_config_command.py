@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
+from ftdrive.cell.config import load, settings
 from ftdrive.cli import cli, exit_code
-from ftdrive.config import load, settings
 
 CELL = """format = "ftdrive.config/1"
 [robot]

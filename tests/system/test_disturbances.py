@@ -11,13 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.routine import Sampling
+from ftdrive.cell.emulated import Station
 from ftdrive.errors import Declined
-from ftdrive.report import errors_in_sigma, print_result
+from ftdrive.runs.outcome import Outcome
 from ftdrive.session.events import Event, GuardTripped, PoseTaken, State, StateChanged
-from ftdrive.session.guided import Options, calibrate
 from ftdrive.session.operator import Question
-from ftdrive.session.outcome import Outcome
-from ftdrive.simulation import Station
+from ftdrive.session.session import Options, calibrate
+from ftdrive.terminal.report import errors_in_sigma, print_result
 
 pytestmark = pytest.mark.slow
 

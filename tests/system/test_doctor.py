@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ftdrive.cell.emulated import Station, sensor_clock
 from ftdrive.commands import transcript
-from ftdrive.simulation import Station, sensor_clock
 from tests.system.command_line import CommandLine, listen_for
 
 NAMED = {

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from drivers.errors import DeviceFault, ProtocolError
-from ftdrive.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.cell.devices import build_sensor
+from ftdrive.cell.emulated import SENSORS, Station, sensor_url
 from ftdrive.errors import ConfigError
-from ftdrive.simulation import SENSORS, Station, sensor_url
-from ftdrive.wiring import build_sensor
 from mocks.sensors.catalogue import CHOICES
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from ftdrive.simulation import Station
+from ftdrive.cell.emulated import Station
 from tests.system.command_line import CommandLine, end_of, say
 
 ANSWERS = "yes\nyes\nyes\nMOVE\nyes\n"

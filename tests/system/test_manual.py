@@ -15,16 +15,16 @@ from calib import solve
 from calib.routine import PoseRecord, TourPose, dataset_from, drift_check
 from drivers.errors import StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, RobotArm
-from ftdrive import simulation
+from ftdrive.cell import emulated
+from ftdrive.cell.devices import build_arm, build_sensor
+from ftdrive.cell.emulated import Station
 from ftdrive.cli import cli
-from ftdrive.planning.constant_tour import NUMBERS, constant_tour
-from ftdrive.report import errors_in_sigma
-from ftdrive.runs import Run
+from ftdrive.planning.search.constant_tour import NUMBERS, constant_tour
+from ftdrive.runs.run import Run
 from ftdrive.session.events import Estimated, Event, PoseTaken
-from ftdrive.session.manual import collect_manually
+from ftdrive.session.hand_guided import collect_manually
 from ftdrive.session.operator import Key, Question
-from ftdrive.simulation import Station
-from ftdrive.wiring import build_arm, build_sensor
+from ftdrive.terminal.report import errors_in_sigma
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 
@@ -190,8 +190,8 @@ def test_a_lost_sensor_ends_it_with_the_poses_on_disk(station: Station, tmp_path
 def test_somebody_in_the_emulated_cell_brings_it_to_its_end(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    request, words = simulation.MOVED_BY[mode]
-    monkeypatch.setattr(simulation, "MOVED_BY", {mode: ({**request, "rest_s": 1.2}, words)})  # in a hurry
+    request, words = emulated.MOVED_BY[mode]
+    monkeypatch.setattr(emulated, "MOVED_BY", {mode: ({**request, "rest_s": 1.2}, words)})  # in a hurry
     arguments = ["calibrate", "--simulate", f"--{mode}", "--runs", str(tmp_path), "--json"]
     outcome = CliRunner().invoke(cli, arguments)
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)

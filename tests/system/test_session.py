@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from calib import CalibrationResult
+from ftdrive.cell.emulated import Station
 from ftdrive.planning.plan import Plan
-from ftdrive.report import errors_in_sigma
-from ftdrive.simulation import Station
+from ftdrive.terminal.report import errors_in_sigma
 from tests.system.command_line import CommandLine, end_of, listen_for, say, wait_until
 
 QUESTIONS = "yes\nyes\nyes\n"

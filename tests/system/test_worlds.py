@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from calib import CalibrationResult
-from ftdrive.report import errors_in_sigma
-from ftdrive.simulation import Station
+from ftdrive.cell.emulated import Station
+from ftdrive.terminal.report import errors_in_sigma
 from tests.system.command_line import CommandLine
 
 WORLDS = {

@@ -18,7 +18,7 @@ from drivers.registry import sensor_from_url
 from drivers.streaming.sensor import StreamingSensor
 from drivers.ur.arm import UrArm
 from drivers.ur.timing import UrTiming
-from ftdrive.emulated_clock import EmulatedClock
+from ftdrive.cell.emulated_clock import EmulatedClock
 from tests.cell_time import CellTime
 from tests.wire.station_process import StationProcess
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from ftdrive.exports.urscript import program
-from ftdrive.planning.arm_model import ArmModel, Cylinder
-from ftdrive.planning.certify import Certifier
+from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
+from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
-from ftdrive.planning.scene import Scene
+from ftdrive.planning.show.scene import Scene
 from tests.wire.conftest import Station
 
 SCRIPT_PORT = 30003

@@ -23,7 +23,7 @@ from drivers.errors import DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import Array, FtSamples
 from drivers.registry import sensor_from_url
 from drivers.streaming.sensor import StreamingSensor
-from ftdrive.emulated_clock import EmulatedClock
+from ftdrive.cell.emulated_clock import EmulatedClock
 
 pytestmark = pytest.mark.slow  # `test_sensor_drivers.py` has a share of it
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from ftdrive.simulation import SENSORS, Station
+from ftdrive.cell.emulated import SENSORS, Station
 
 PROGRAM = """
 import json, sys, threading, time

@@ -402,7 +402,7 @@ APPLICATION = """
 import sys
 from drivers.ur.arm import UrArm
 from drivers.ur.timing import UrTiming
-from ftdrive.emulated_clock import EmulatedClock
+from ftdrive.cell.emulated_clock import EmulatedClock
 print("main")
 clock = EmulatedClock(sys.argv[2])
 arm = UrArm(sys.argv[1], speed_rad_s=0.03, acceleration_rad_s2=0.3, clock=clock, timing=UrTiming.emulated())

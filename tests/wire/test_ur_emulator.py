@@ -19,7 +19,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ftdrive.emulated_clock import EmulatedClock
+from ftdrive.cell.emulated_clock import EmulatedClock
 from mocks.clock import LEAD_NS
 from mocks.ur import rtde
 from mocks.ur.script import take_uploads

@@ -22,10 +22,10 @@ from drivers.robotous.serial import RobotousSerial
 from drivers.streaming.sensor import StreamingSensor
 from drivers.ur.arm import UrArm
 from drivers.ur.sensor import UrWristSensor
+from ftdrive.cell.config import FORMAT, CellConfig, RobotConfig, SensorConfig
+from ftdrive.cell.devices import build_arm
 from ftdrive.commands import doctor
-from ftdrive.config import FORMAT, CellConfig, RobotConfig, SensorConfig
 from ftdrive.errors import ConfigError
-from ftdrive.wiring import build_arm
 
 
 @given(st.text(min_size=1))

@@ -15,15 +15,16 @@ from calib.routine import Sampling
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
-from ftdrive.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import Declined
-from ftdrive.planning.arm_model import ArmModel, Cylinder
-from ftdrive.planning.cell import certifier_for, plan_for
-from ftdrive.planning.certify import Certifier
+from ftdrive.planning.cell_plan import certifier_for, plan_for
+from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
+from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
-from ftdrive.runs import Run
-from ftdrive.session import guided
+from ftdrive.runs.outcome import Outcome
+from ftdrive.runs.run import Run
+from ftdrive.session import session
 from ftdrive.session.events import (
     Event,
     Noted,
@@ -31,10 +32,9 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
-from ftdrive.session.guided import Options
 from ftdrive.session.operator import Key, Question
-from ftdrive.session.outcome import Outcome
-from ftdrive.session.watch import Watcher
+from ftdrive.session.session import Options
+from ftdrive.session.watchdog import Watcher
 from tests.fake_clock import FakeClock
 
 Array = NDArray[np.float64]
@@ -357,10 +357,10 @@ class Lab:
         )
         self.watchers: list[SteppedWatcher] = []
         """Of each session that came to its tour."""
-        monkeypatch.setattr(guided, "build_arm", lambda _: self.arm)
-        monkeypatch.setattr(guided, "build_sensor", lambda _: self.sensor)
-        monkeypatch.setattr(guided, "plan_for", planned_once)
-        monkeypatch.setattr(guided, "Watcher", self._watcher)
+        monkeypatch.setattr(session, "build_arm", lambda _: self.arm)
+        monkeypatch.setattr(session, "build_sensor", lambda _: self.sensor)
+        monkeypatch.setattr(session, "plan_for", planned_once)
+        monkeypatch.setattr(session, "Watcher", self._watcher)
         monkeypatch.setattr("shutil.which", lambda _: None)
         monkeypatch.setattr("os.fsync", lambda _: None)  # the disk of whoever runs the tests is slow
 
@@ -374,7 +374,7 @@ class Lab:
         return any(watcher.looking for watcher in self.watchers)
 
     def calibrate(self, **options: Any) -> Outcome | None:
-        return guided.calibrate(self.cell, self.operator, Options(self.folder / "runs", poses=6, **options))
+        return session.calibrate(self.cell, self.operator, Options(self.folder / "runs", poses=6, **options))
 
     def run(self) -> Run:
         (folder,) = (self.folder / "runs").iterdir()

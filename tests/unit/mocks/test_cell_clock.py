@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from ftdrive.emulated_clock import EmulatedClock
+from ftdrive.cell.emulated_clock import EmulatedClock
 from mocks.clock import (
     DEBT_NS,
     LEAD_NS,

@@ -30,7 +30,7 @@ from calib.poses.information import (
     whitened_jacobian,
 )
 from calib.poses.selection import Criterion, choose, cone_candidates, next_pose, order
-from ftdrive.planning.constant_tour import NUMBERS
+from ftdrive.planning.search.constant_tour import NUMBERS
 
 ALL = special(range(1, 25))
 GUESS = Guess(mass_kg=20 / 9.80665, sigma_force_N=0.2, sigma_torque_Nm=0.005)  # weight / sigma 100, lever 25 mm

@@ -11,12 +11,12 @@ import pytest
 from click.testing import CliRunner
 
 from calib.errors import BadDataset, CalibError
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.cli import cli, exit_code
-from ftdrive.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.errors import ConfigError
-from ftdrive.runs import Run
-from ftdrive.session import guided
-from ftdrive.session.guided import Options
+from ftdrive.runs.run import Run
+from ftdrive.session import session
+from ftdrive.session.session import Options
 
 CELL = """format = "ftdrive.config/1"
 [robot]
@@ -48,7 +48,7 @@ def cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[CellCon
         raise Opened
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(guided, "calibrate", guide)
+    monkeypatch.setattr(session, "calibrate", guide)
     return found
 
 
@@ -115,7 +115,7 @@ def begin(cells: list[Any], tmp_path: Path) -> Begin:
     def begun(*arguments: str) -> str:
         assert isinstance(call(*arguments), Opened)
         cell, options = cells.pop()
-        description = guided._description(cell, {}, options)
+        description = session._description(cell, {}, options)
         run = Run.create(tmp_path / "runs", "calibrate", json.loads(json.dumps(description)))
         run.plan_path.touch()
         return str(run.folder)
@@ -182,7 +182,7 @@ def stations(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Sequence[str]]]
 
         def __exit__(self, *_: object) -> None: ...
 
-    monkeypatch.setattr("ftdrive.simulation.Station", Emulated)
+    monkeypatch.setattr("ftdrive.cell.emulated.Station", Emulated)
     return found
 
 

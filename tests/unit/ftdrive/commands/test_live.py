@@ -17,7 +17,7 @@ from calib.model import predict
 from calib.published.yu import SPECIAL_R_flange_base
 from drivers.interfaces import Health
 from ftdrive.commands import live
-from ftdrive.report import likely_error
+from ftdrive.terminal.report import likely_error
 
 
 class Slow:

@@ -12,11 +12,11 @@ import pytest
 
 from drivers.errors import DeviceFault, StreamBroken
 from drivers.interfaces import ArmState
-from ftdrive import checks
-from ftdrive.config import ToolConfig, WorkcellConfig
-from ftdrive.diagnosis import SLOWEST_SLIDER, check_speed
+from ftdrive.cell.config import ToolConfig, WorkcellConfig
+from ftdrive.checks import computer
+from ftdrive.checks.devices import SLOWEST_SLIDER, check_speed
 from ftdrive.errors import NotAccepted
-from ftdrive.session import guided, preflight
+from ftdrive.session import preflight, session
 from ftdrive.session.events import Checked, Noted
 from ftdrive.session.guards import Limits
 from tests.unit.ftdrive.fake_cell import Lab
@@ -82,7 +82,7 @@ def test_a_tool_too_heavy_or_too_long_for_the_sensor_is_refused(
     range_N: float, range_Nm: float, share: int, passes: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limits = np.array([200.0, range_N, 200, 20, 20, range_Nm])
-    monkeypatch.setattr(guided, "_range_of", lambda _: limits)
+    monkeypatch.setattr(session, "_range_of", lambda _: limits)
     lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=1.5))
     words = f"twice the tool's weight is {share} % of the sensor's range"
     if passes:
@@ -147,7 +147,7 @@ def test_a_folder_that_cannot_be_written_is_refused(lab: Lab, monkeypatch: pytes
     def full(**_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(checks, "TemporaryFile", full)
+    monkeypatch.setattr(computer, "TemporaryFile", full)
     refuse(lab, "No space left")
 
 

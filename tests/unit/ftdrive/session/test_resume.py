@@ -12,12 +12,11 @@ import pytest
 from calib.routine import DriftCheck
 from drivers.errors import DeviceFault
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
-from ftdrive.config import ToolConfig
+from ftdrive.cell.config import ToolConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
-from ftdrive.planning.constant_tour import constant_tour
 from ftdrive.planning.plan import Plan
-from ftdrive.report import drift_in_words
-from ftdrive.session import guided, machine
+from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrive.session import session, tour
 from ftdrive.session.events import (
     Checked,
     Estimated,
@@ -29,8 +28,9 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
+from ftdrive.session.live_fit import faces
 from ftdrive.session.operator import Key
-from ftdrive.session.running import faces
+from ftdrive.terminal.report import drift_in_words
 from tests.unit.ftdrive.fake_cell import Lab
 
 
@@ -207,7 +207,7 @@ def test_a_way_past_a_skipped_pose_is_told_and_confirmed_by_a_person(lab: Lab, m
     lab.operator.asked.clear()
     lab.operator.answers["Pose 3 of 7"] = ["s"] * 2
     lab.calibrate(mode="step")
-    monkeypatch.setattr(machine, "_NEAR_RAD", np.pi)
+    monkeypatch.setattr(tour, "_NEAR_RAD", np.pi)
     lab.calibrate(mode="step")
     ways = [question for question in lab.operator.asked if "the way to pose 4" in question.text]
     assert ["skipped pose 3" in question.text for question in ways] == [False, True]
@@ -485,7 +485,7 @@ def test_a_cell_that_cannot_be_built_is_told_before_its_sensor_opens(lab: Lab, m
     def opened() -> None:
         raise AssertionError("opened")
 
-    monkeypatch.setattr(guided, "build_arm", refuse)
+    monkeypatch.setattr(session, "build_arm", refuse)
     monkeypatch.setattr(lab.sensor, "open", opened)
     with pytest.raises(ConfigError, match="driver"):
         lab.calibrate()

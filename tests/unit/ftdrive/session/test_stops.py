@@ -14,11 +14,11 @@ from drivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from drivers.interfaces import FtSamples
 from ftdrive.errors import Declined
 from ftdrive.planning.approach import Approach, plan_approach
-from ftdrive.planning.certify import Certifier
+from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
-from ftdrive.runs import Run
-from ftdrive.session import guided, machine
+from ftdrive.runs.run import Run
+from ftdrive.session import session, tour
 from ftdrive.session.events import (
     Checked,
     Event,
@@ -367,7 +367,7 @@ def test_each_part_of_a_way_begins_where_the_one_before_should_have_ended(
         move_to(*args, **kwargs)
         lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 1.0, 0])
 
-    monkeypatch.setattr(machine, "plan_approach", in_two)
+    monkeypatch.setattr(tour, "plan_approach", in_two)
     monkeypatch.setattr(lab.arm, "move_to", past_it)
     with pytest.raises(DeviceFault, match=r"joint 5 is 1\.0° from"):
         lab.calibrate()
@@ -399,7 +399,7 @@ def test_saturation_that_only_the_samples_of_a_pose_show_discards_it(lab: Lab, m
             samples.wrench[7, 5] = -3.8  # the newest ones, which the guards see, are as ever
         return samples
 
-    monkeypatch.setattr(guided, "_range_of", lambda _: np.array([40.0, 40, 40, 4, 4, 4]))
+    monkeypatch.setattr(session, "_range_of", lambda _: np.array([40.0, 40, 40, 4, 4, 4]))
     monkeypatch.setattr(lab.sensor, "collect", one_high)
     with pytest.raises(DeviceFault, match="95 % of its range"):
         lab.calibrate()
@@ -408,7 +408,7 @@ def test_saturation_that_only_the_samples_of_a_pose_show_discards_it(lab: Lab, m
 
 
 def test_saturated_samples_discard_the_pose(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(guided, "_range_of", lambda _: np.array([40.0, 40, 40, 4, 4, 4]))
+    monkeypatch.setattr(session, "_range_of", lambda _: np.array([40.0, 40, 40, 4, 4, 4]))
     lab.arm.at_move[4] = lambda: setattr(lab.sensor, "push", np.array([0, 0, 0, 0, 0, 3.8]))
     with pytest.raises(DeviceFault, match="of its range"):
         lab.calibrate()

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from calib.routine import Sampling
 from drivers.errors import DeviceFault
 from drivers.interfaces import NOT_REPORTED, DeviceInfo
-from ftdrive.config import WorkcellConfig
+from ftdrive.cell.config import WorkcellConfig
 from ftdrive.errors import Declined, NotAccepted
-from ftdrive.planning import view
-from ftdrive.planning.cell import certifier_for
-from ftdrive.planning.certify import Certifier
+from ftdrive.planning.cell_plan import certifier_for
+from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
+from ftdrive.planning.show import view
 from ftdrive.session import preflight
 from ftdrive.session.completed import has_completed, remember_completed
 from ftdrive.session.events import (
@@ -35,7 +35,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Key
-from ftdrive.session.operators import in_words
+from ftdrive.terminal.operators import in_words
 from tests.unit.ftdrive.fake_cell import MODEL, Lab
 
 Array = NDArray[np.float64]

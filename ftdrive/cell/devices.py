@@ -1,0 +1,48 @@
+"""The only place where configuration becomes drivers."""
+
+from collections.abc import Callable
+from math import radians
+from typing import cast
+
+from calib.ports import Arm, Sensor
+from drivers.interfaces import ForceTorqueSensor, RobotArm
+from drivers.registry import arm_class, sensor_from_url
+from drivers.ur.timing import STRICT, UrTiming
+from ftdrive.cell.config import CellConfig
+from ftdrive.cell.emulated import sensor_clock, sensor_url
+from ftdrive.errors import ConfigError
+
+
+def build_arm(cell: CellConfig) -> RobotArm:
+    """Build the arm's driver, not yet open; it moves at the speed of the cell unless a move names its own."""
+    try:
+        build = cast("Callable[..., RobotArm]", arm_class(cell.robot.driver))
+    except ValueError as error:
+        raise ConfigError(f"[robot] driver: {error}") from error
+    # A real arm, perhaps of another package, is not given what only an emulated one needs.
+    emulated = {"clock": cell.clock, "timing": ur_timing(cell)} if cell.clock.emulated else {}
+    arm = build(
+        cell.robot.host,
+        model=cell.robot.model,
+        speed_rad_s=radians(cell.robot.speed_deg_s),
+        acceleration_rad_s2=radians(cell.robot.acceleration_deg_s2),
+        **emulated,
+    )
+    _fits: Arm = arm  # checked statically: what the routine asks for is what the driver gives
+    return arm
+
+
+def ur_timing(cell: CellConfig) -> UrTiming:
+    """Limits of time of a UR arm: strict, or patient with the processes of an emulated cell."""
+    return UrTiming.emulated() if cell.clock.emulated else STRICT
+
+
+def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
+    """Build the sensor's driver, not yet open."""
+    url = cell.sensor.url
+    try:
+        sensor = sensor_from_url(sensor_url(url), sign=cell.sensor.sign, clock=sensor_clock(url, cell.clock))
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    _fits: Sensor = sensor
+    return sensor

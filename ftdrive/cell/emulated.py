@@ -1,0 +1,160 @@
+"""An emulated cell as a child process: the real drivers talk to it over real wires."""
+
+import atexit
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any, Self
+
+from calib.routine import Sampling
+from drivers.clock import REAL, Clock
+from drivers.errors import ConnectError
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.cell.emulated_clock import EmulatedClock
+from ftdrive.errors import ConfigError
+
+TIME_SCALE = 20
+"""The emulated arm lives this many times faster; nothing else differs from a real cell."""
+
+SENSORS = {
+    "can": "ATI sensor on CAN",
+    "serial": "ATI sensor on RS-485",
+    "robotous-can": "Robotous sensor on CAN",
+    "robotous-serial": "Robotous sensor on a serial port",
+    "robotiq": "Robotiq sensor",
+    "bota": "Bota sensor",
+    "netft": "ATI Net F/T",
+    "ur-ft": "sensor of its own",
+}
+"""Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm."""
+EMULATED = "emulated://"
+MOVED_BY: Mapping[str, tuple[Mapping[str, Any], str]] = {
+    "manual": ({"do": "hand-guide"}, "somebody guides its arm by hand from orientation to orientation"),
+    "listen": ({"do": "pendant-program"}, "somebody starts a program on its pendant, which turns the wrist"),
+}
+"""Who moves the emulated arm where a session does not, by its mode: what the cell is asked for, and words for it."""
+
+_PAYLOAD_COG_M = "0,0,0.06"
+"""What its controller is told about the tool, as somebody should have; it knows the mass."""
+TOOL_MM = (0.0, 200.0, 100.0)
+
+
+class Station:
+    """One `mocks` process, ended by leaving its `with` block or by the end of ours.
+
+    Parameters
+    ----------
+    sensor : one of `SENSORS`, "both" (can and serial) or "none"
+    options : sequence of str
+        More options of `python -m mocks station`.
+    """
+
+    def __init__(self, sensor: str = "can", options: Sequence[str] = ()) -> None:
+        self.sensor = sensor
+        self.options = tuple(options)
+        self.endpoints: Mapping[str, Any] = {}
+        self.clock: Clock = REAL
+        """The cell's own, once it has started."""
+        self._process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> Self:
+        command = [sys.executable, "-P", "-m", "mocks", "station", "--sensor", self.sensor]
+        command += ["--time-scale", str(TIME_SCALE), "--payload-cog", _PAYLOAD_COG_M, *self.options]
+        # A session of its own: Ctrl-C in the terminal is for us, not for the emulated cell.
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+        )
+        self.endpoints = self._answer()
+        self.clock = EmulatedClock(self.endpoints["clock"])
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is None:
+            return
+        process, self._process = self._process, None
+        try:
+            process.communicate(timeout=3)  # closes its stdin, which ends it
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+
+    @property
+    def truth(self) -> Mapping[str, Any]:
+        """What a perfect calibration of this cell would find."""
+        truth: Mapping[str, Any] = self.endpoints["truth"]
+        return truth
+
+    @property
+    def pid(self) -> int:
+        """Process number while the station lives."""
+        return self._process.pid if self._process else 0
+
+    def control(self, **request: Any) -> Mapping[str, Any]:
+        """Send one request, such as `do="unplug", device="sensor"`, and return the answer."""
+        if self._process and self._process.stdin:
+            self._process.stdin.write(json.dumps(request) + "\n")
+            self._process.stdin.flush()
+        return self._answer()
+
+    def _answer(self) -> Mapping[str, Any]:
+        line = self._process.stdout.readline() if self._process and self._process.stdout else ""
+        if not line:
+            raise ConnectError("the emulated cell has ended: its message stands above")
+        answer: Mapping[str, Any] = json.loads(line)
+        return answer
+
+    @property
+    def mounting(self) -> str:
+        """As its options say."""
+        return self.options[self.options.index("--mount") + 1] if "--mount" in self.options else "floor"
+
+    @property
+    def cell(self) -> CellConfig:
+        """Configuration that reaches this station as it would reach a real cell."""
+        arm = self.endpoints["arm"]
+        url = next(iter(self.endpoints["sensors"].values()))["url"]
+        return CellConfig(
+            robot=RobotConfig(arm["host"], arm["model"], speed_deg_s=60.0, acceleration_deg_s2=80.0),
+            sensor=SensorConfig(url),
+            tool=ToolConfig("emulated", (TOOL_MM,)),
+            workcell=WorkcellConfig(self.mounting, measured=True),
+            sampling=Sampling(average_s=0.4, noise_record_s=0.0),
+            clock=self.clock,
+        )
+
+
+def sensor_url(url: str) -> str:
+    """Return the address a driver understands: for emulated://NAME that of a sensor which is started for it.
+
+    Its orientation is constant; emulated:// alone is an ATI sensor on CAN. Any other address is returned as it is.
+
+    Raises
+    ------
+    ConfigError
+        Unknown name.
+    """
+    return _emulated_alone(sensor_name(url)).sensor.url if url.startswith(EMULATED) else url
+
+
+def sensor_clock(url: str, clock: Clock = REAL) -> Clock:
+    """Return the clock of a sensor: for emulated://NAME its own, for any other address that of its cell."""
+    return _emulated_alone(sensor_name(url)).clock if url.startswith(EMULATED) else clock
+
+
+def sensor_name(url: str | None) -> str:
+    """Return the name in emulated://NAME; the first one where none is named. Raises `ConfigError`."""
+    name = (url or EMULATED).removeprefix(EMULATED) or next(iter(SENSORS))
+    if name not in SENSORS:
+        known = ", ".join(EMULATED + name for name in SENSORS)
+        raise ConfigError(f"{url} is no emulated sensor: leave --sensor out, or give one of {known}")
+    return name
+
+
+@cache
+def _emulated_alone(name: str) -> CellConfig:
+    """Start one, which lives as long as this process."""
+    station = Station(name, ["--time-scale", "1"])
+    atexit.register(station.__exit__)
+    return station.__enter__().cell

@@ -1,0 +1,60 @@
+"""A calibration of an emulated cell: what `demo` shows, and what other commands need first with `--simulate`."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from ftdrive.cell.emulated import Station, sensor_name
+from ftdrive.runs.outcome import Outcome
+from ftdrive.session.events import Event
+from ftdrive.session.operator import Key, Operator, Question
+from ftdrive.session.session import Options, calibrate
+from ftdrive.terminal.screen import open_operator
+
+
+class _Unkept:
+    """An operator who is not told of a folder that is gone when the command ends."""
+
+    def __init__(self, operator: Operator, folder: Path) -> None:
+        self._operator, self._folder = operator, str(folder)
+
+    @property
+    def has_keys(self) -> bool:
+        return self._operator.has_keys
+
+    def tell(self, event: Event) -> None:
+        if self._folder not in str(event.to_dict()):
+            self._operator.tell(event)
+
+    def ask(self, question: Question) -> str:
+        return self._operator.ask(question)
+
+    def pressed(self) -> Key | None:
+        return self._operator.pressed()
+
+
+def rehearse(station: Station, runs: Path, name: str, *, poses: int = 24, kept: bool = True) -> Outcome:
+    """Take an emulated cell through a calibration without a question; the run is in `runs`, whether `kept` or not."""
+    description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
+    options = Options(runs, name, poses=poses, real=False, questions=False, description=description)
+    with open_operator() as operator:
+        outcome = calibrate(station.cell, operator if kept else _Unkept(operator, runs), options)
+    if outcome is None:
+        raise RuntimeError("a rehearsal is never a dry run")
+    return outcome
+
+
+@contextmanager
+def rehearsed_run(sensor: str | None) -> Iterator[Path]:
+    """Make a short run of an emulated cell; yields its folder, which is gone afterwards.
+
+    Parameters
+    ----------
+    sensor : str, optional
+        As `sensor_name` takes it.
+    """
+    with TemporaryDirectory(prefix="ftdrive-") as runs:
+        with Station(sensor_name(sensor)) as station:
+            outcome = rehearse(station, Path(runs), "simulated", poses=6, kept=False)
+        yield outcome.run.folder

@@ -1,0 +1,192 @@
+"""From a cell as its configuration describes it, in millimetres and degrees, to what judges moves in it, and a plan."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drivers.ur.kinematics import MODELS, model_named
+from ftdrive.cell.config import CellConfig
+from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
+from ftdrive.planning.geometry.certify import Certifier, Margins
+from ftdrive.planning.motion import Speeds, slower
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import guess_of, plan_box, plan_cone, plan_tour
+from ftdrive.planning.show.scene import BASE_PLANE, Box, Plane, Scene, lean_of
+
+FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
+"""Nothing goes faster, whatever a plan, or the configuration of an old run, says."""
+
+
+def speeds_of(cell: CellConfig) -> Speeds:
+    """Give the speeds in force in a cell."""
+    robot = cell.robot
+    joint_rad_s, joint_rad_s2 = np.radians([robot.speed_deg_s, robot.acceleration_deg_s2])
+    return slower(Speeds(float(joint_rad_s), float(joint_rad_s2), robot.tip_speed_mm_s / 1e3), FASTEST)
+
+
+def plan_for(
+    cell: CellConfig,
+    certifier: Certifier,
+    q_rad: ArrayLike,
+    poses: int = 24,
+    *,
+    cone_deg: float | None = None,
+    box_mm: float | None = None,
+    tip_unlimited: bool = False,
+) -> Plan:
+    """Plan for a cell, with what `certifier_for` gives for it, where the arm stands at `q_rad` (6,).
+
+    Raises as `plan_cone` with `cone_deg`, `plan_box` with `box_mm`, else `plan_tour`.
+    """
+    speeds, guess = speeds_of(cell), guess_of(certifier, cell.tool.mass_kg)
+    if tip_unlimited:
+        speeds = replace(speeds, tip_m_s=None)
+    if cone_deg is not None:
+        half_angle_rad = float(np.radians(cone_deg))
+        made = plan_cone(certifier, q_rad, poses, half_angle_rad=half_angle_rad, speeds=speeds, guess=guess)
+    elif box_mm is not None:
+        made = plan_box(certifier, q_rad, poses, half_size_m=box_mm / 1e3, speeds=speeds, guess=guess)
+    else:
+        made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess)
+    if not made.certified:
+        raise PlanRefused("a move of the plan could not be proven clear")
+    return made.marked(measured=cell.workcell.measured)
+
+
+def certifier_for(cell: CellConfig, model: str | None) -> Certifier:
+    """Describe arm, tool and surroundings of a cell to the certifier.
+
+    Whether somebody has measured them is not asked here.
+
+    Parameters
+    ----------
+    cell : CellConfig
+    model : str or None
+        Of the arm, as the controller or the configuration tells it.
+
+    Raises
+    ------
+    ConfigError
+        Arm or tool are not named, a shape is impossible, the arm has no measured shape, or see `require_possible`.
+    """
+    if model is None:
+        raise ConfigError("which arm? Give --model, or [robot] model in ftdrive.toml")
+    if not cell.tool.cylinders_mm:
+        raise ConfigError("what is mounted? Give --tool FROM:TO:DIAMETER, or [tool] cylinders_mm in ftdrive.toml")
+    planes = (BASE_PLANE, *map(plane_from_mm, cell.workcell.planes_mm))
+    scene = Scene(planes, tuple(map(box_from_mm, cell.workcell.boxes_mm)), lean_of(cell.workcell.mounting))
+    certifier = Certifier(ArmModel(model, [cylinder_from_mm(values) for values in cell.tool.cylinders_mm]), scene)
+    require_possible(cell, model)
+    return certifier
+
+
+def require_possible(cell: CellConfig, model: str | None) -> None:
+    """Refuse what no cell looks like: a tool shorter than its sensor, a plane or box with the arm itself inside.
+
+    Judged is the shoulder, which no motion takes away: of what is refused here nothing could be proven clear. What is
+    at the base, such as a table around its plate, stays allowed.
+
+    Parameters
+    ----------
+    cell : CellConfig
+        Without cylinders the tool is not judged.
+    model : str or None
+        Of the arm; without a measured shape planes and boxes are not judged.
+
+    Raises
+    ------
+    ConfigError
+        With the cylinders, plane or box, and what to do after the last colon.
+    """
+    end_mm, height_mm = max((row[1] for row in cell.tool.cylinders_mm), default=np.inf), cell.sensor.height_mm
+    if height_mm is not None and end_mm < height_mm:
+        raise ConfigError(
+            f"the tool ends {end_mm:g} mm from the flange, before the sensor's origin at {height_mm:g} mm ([sensor] "
+            "height_mm): describe all that is mounted, the sensor too, in mm from the flange"
+        )
+    name = None if model is None else model_named(model, controller_major=0)
+    if name not in SHAPES:
+        return
+    shoulder = _Shoulder(name)
+    for words in (
+        *map(shoulder.against_plane, cell.workcell.planes_mm),
+        *map(shoulder.against_box, cell.workcell.boxes_mm),
+    ):
+        if words:
+            raise ConfigError(words)
+
+
+class _Shoulder:
+    """The ball that the shoulder of an arm fills in every posture."""
+
+    def __init__(self, name: str) -> None:
+        self._centre_m = np.array([0.0, 0.0, MODELS[name].d1_m])
+        self._radius_m, self._margin_m = SHAPES[name].shoulder_radius_m, Margins().scene_m
+
+    def against_plane(self, row: Sequence[float]) -> str:
+        """Say what is wrong with a plane, and what it may have been meant to be; empty if nothing is."""
+        gap_m, (x, y, z, place) = self._above_m(row), row
+        if gap_m >= self._margin_m:
+            return ""
+        meant = (-x, -y, -z, -place), (x, y, z, -place)
+        same, opposite = (_words(one) if self._above_m(one) >= self._margin_m else "" for one in meant)
+        if gap_m > -self._radius_m or not same:
+            return self._too_near(f"the plane {_words(row)}", gap_m)
+        return (
+            f"the arm's own {'base' if place > 0 else 'shoulder'} stands on the wrong side of the plane {_words(row)}, "
+            f"for the arm stays where normal times point is {place:g} mm or more: give {same} if the plane is there"
+            + (f", {opposite} if it is on the other side of the base" if opposite else "")
+        )
+
+    def against_box(self, row: Sequence[float]) -> str:
+        """Say what is wrong with a box; empty if nothing is."""
+        box = box_from_mm(row)
+        away_m = float(np.linalg.norm(self._centre_m - np.clip(self._centre_m, box.low_m, box.high_m)))
+        gap_m = away_m - self._radius_m
+        return "" if gap_m >= self._margin_m else self._too_near(f"the box {_words(row)}", gap_m)
+
+    def _above_m(self, row: Sequence[float]) -> float:
+        plane = plane_from_mm(row)
+        return float(np.dot(plane.normal, self._centre_m)) - plane.offset_m - self._radius_m
+
+    def _too_near(self, what: str, gap_m: float) -> str:
+        return (
+            f"{what} is {1e3 * max(gap_m, 0.0):.0f} mm from the arm's shoulder, which no motion takes away, and "
+            f"{1e3 * self._margin_m:.0f} mm are kept: measure it again, in mm from the centre of the base, in its axes"
+        )
+
+
+def _words(row: Sequence[float]) -> str:
+    return f"[{', '.join(f'{value + 0.0:g}' for value in row)}]"
+
+
+def cylinder_from_mm(values: Sequence[float]) -> Cylinder:
+    """Read from, to, diameter, and x, y of an axis that stands aside."""
+    return Cylinder(*_metres("a cylinder of the tool", "from, to, diameter, or these and x, y", values, (3, 5)))
+
+
+def plane_from_mm(values: Sequence[float]) -> Plane:
+    """Read a normal of any length, and the least offset along it."""
+    *normal, offset_m = _metres("a plane", "its normal and an offset", values, (4,))
+    length = float(np.linalg.norm(normal))
+    if not length:
+        raise ConfigError(f"a plane is {list(values)}: its normal has no direction, give for example -1, 0, 0, -800")
+    x, y, z = (value / length for value in normal)
+    return Plane((x, y, z), offset_m)
+
+
+def box_from_mm(values: Sequence[float]) -> Box:
+    """Read any two opposite corners."""
+    corners = np.array(_metres("a box", "two opposite corners", values, (6,))).reshape(2, 3)
+    (x1, y1, z1), (x2, y2, z2) = np.sort(corners, axis=0).tolist()
+    return Box((x1, y1, z1), (x2, y2, z2))
+
+
+def _metres(what: str, content: str, values: Sequence[float], counts: Sequence[int]) -> list[float]:
+    if len(values) not in counts or not all(map(np.isfinite, values)):
+        wanted = " or ".join(map(str, counts))
+        raise ConfigError(f"{what} is {list(values)}: give {wanted} numbers, {content}, in mm")
+    return [float(value) / 1e3 for value in values]

@@ -1,0 +1,142 @@
+"""A tour through poses chosen for what they tell, from those the wrist reaches: in a cone, or anywhere.
+
+The poses follow the design of `calib.poses.selection`, which keeps the second solution away and the gravity directions
+out of one plane.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from calib.poses.information import Guess, predicted_sigma
+from calib.poses.selection import choose, cone_candidates
+from drivers.ur.kinematics import Array
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.kinematics import wrist_inverse
+from ftdrive.planning.motion import Speeds
+from ftdrive.planning.search.nodes import wrist_nodes
+from ftdrive.planning.search.postures import grid
+from ftdrive.planning.search.tours import clear_tour, connected
+
+DIRECTIONS, SPINS = 150, 8
+DIRECTIONS_OF_A_LUMP, SPINS_OF_A_LUMP = 60, 4
+"""Where joint 6 changes what can collide: every spin is a shape of its own then."""
+MOST_PARTS = 2
+"""Parts of free space, which do not hang together, that are tried."""
+NEARLY = 1.05
+"""A prediction this much above that of the best poses of the cone is not worth another posture."""
+OTHER_POSTURES = 2
+POSTURE_STEP_DEG = 20
+LOOKS = 24
+"""Directions of the tool by which postures are compared."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chosen:
+    """Poses in the order of travel."""
+
+    numbers: tuple[int, ...]
+    """From 101 on, in the order of choice: not those of the paper."""
+    q_rad: Array
+    """(n, 6)"""
+    force_rms_N: float
+    """Predicted error of compensation."""
+    ideal_force_rms_N: float
+    """The same of the poses that would be chosen if the arm reached every one."""
+    elsewhere: bool
+    """Joints 1 to 3 are not where the arm stands."""
+
+
+def chosen_tour(
+    certifier: Certifier,
+    q_rad: ArrayLike,
+    poses: int,
+    half_angle_rad: float,
+    speeds: Speeds,
+    guess: Guess,
+) -> Chosen | None:
+    """Choose poses and find a short closed tour through them, base, shoulder and elbow at rest.
+
+    Parameters
+    ----------
+    certifier : Certifier
+    q_rad : array_like, shape (6,)
+        Where the arm stands; another posture is taken where it brings much.
+    poses : int
+        4 or more.
+    half_angle_rad : float
+        Between the tool axis (flange z) and straight down; pi for any orientation.
+    speeds : Speeds
+    guess : Guess
+
+    Returns
+    -------
+    Chosen or None
+        None where so many poses, different enough to estimate everything, are nowhere in reach.
+    """
+    stands = np.asarray(q_rad, dtype=np.float64)
+    lumps = certifier.arm.travel_m[:, 5].any()
+    spins, directions = (SPINS_OF_A_LUMP, DIRECTIONS_OF_A_LUMP) if lumps else (SPINS, DIRECTIONS)
+    candidates = cone_candidates(half_angle_rad, spins, directions)
+    candidates = _from_down(certifier.scene.down_base) @ candidates
+    ideal = predicted_sigma(candidates[choose(candidates, poses, guess)], guess).force_rms_N
+    best = _at(certifier, stands, candidates, spins, poses, speeds, guess, ideal)
+    if best is None or best.force_rms_N > NEARLY * ideal:
+        for posture in _others(certifier, stands, candidates):
+            found = _at(certifier, np.array([*posture, *stands[3:]]), candidates, spins, poses, speeds, guess, ideal)
+            if found is not None and (best is None or found.force_rms_N * NEARLY < best.force_rms_N):
+                best = Chosen(found.numbers, found.q_rad, found.force_rms_N, ideal, elsewhere=True)
+    return best
+
+
+def _at(
+    certifier: Certifier,
+    stands: Array,
+    candidates: Array,
+    spins: int,
+    poses: int,
+    speeds: Speeds,
+    guess: Guess,
+    ideal: float,
+) -> Chosen | None:
+    """Choose from what is reached in this posture and hangs together."""
+    q, group = wrist_nodes(certifier, stands, candidates)
+    if not len(q):
+        return None
+    part = connected(certifier, q, group % spins)
+    reached = [np.unique(group[part == p]) for p in range(part.max() + 1)]
+    for p in sorted(range(len(reached)), key=lambda p: -len(reached[p]))[:MOST_PARTS]:
+        if len(reached[p]) < poses:
+            break
+        chosen = reached[p][choose(candidates[reached[p]], poses, guess)]
+        nodes = np.flatnonzero((part == p) & np.isin(group, chosen))
+        place = np.full(len(candidates), -1)
+        place[chosen] = np.arange(poses)
+        order = clear_tour(certifier, q[nodes], place[group[nodes]], speeds)
+        if order is None:
+            continue
+        nodes = nodes[order]
+        rms = predicted_sigma(candidates[group[nodes]], guess).force_rms_N
+        if np.isfinite(rms):  # else there is something that these poses cannot tell
+            return Chosen(tuple((101 + place[group[nodes]]).tolist()), q[nodes], rms, ideal, elsewhere=False)
+    return None
+
+
+def _others(certifier: Certifier, stands: Array, candidates: Array) -> Array:
+    """Postures (k, 3) of joints 1 to 3 that bring the tool into most directions."""
+    postures = grid(certifier, stands, POSTURE_STEP_DEG)
+    looks = candidates[np.linspace(0, len(candidates) - 1, LOOKS).astype(int)]
+    q = np.array([wrist_inverse(posture, looks) for posture in postures])  # (m, LOOKS, 2, 6)
+    free = certifier.free(q.reshape(-1, 6)).reshape(q.shape[:3]).any(axis=2)
+    return np.asarray(postures[np.argsort(-free.sum(axis=1), kind="stable")][:OTHER_POSTURES])
+
+
+def _from_down(axis: Array) -> Array:
+    """Turn (3, 3) of base -z onto a unit vector, the shortest one."""
+    down = np.array([0.0, 0.0, -1.0])
+    normal = np.cross(down, axis)
+    sine = float(np.linalg.norm(normal))
+    turn = np.arctan2(sine, float(down @ axis))
+    return Rotation.from_rotvec(turn * (normal / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0]))).as_matrix()

@@ -1,0 +1,74 @@
+"""From a run on disk to a result."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from calib import CalibrationDataset, CalibrationResult, solve
+from calib.routine import DriftCheck, PoseRecord, dataset_from, drift_check
+from ftdrive.planning.show.scene import down_of
+from ftdrive.runs.run import Run, versions
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What a session leaves."""
+
+    run: Run
+    dataset: CalibrationDataset
+    result: CalibrationResult
+    drift: DriftCheck | None
+
+
+def solve_and_save(run: Run) -> Outcome:
+    """Solve a run from its files, not from memory: what is on disk is then enough to repeat it."""
+    outcome = solve_records(run, run.records())
+    outcome.dataset.save(run.new_path("dataset"))
+    if outcome.result.verdict != "rejected":
+        outcome.result.save(run.new_path("calibration"))
+    return outcome
+
+
+def dataset_of(run: Run) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
+    """Read a run as a dataset, with gravity and up where it was made, as `solve` takes them, and the provenance."""
+    return _prepared(run, run.records())
+
+
+def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
+    """Solve records of a run, as they are on disk or as a replay gives them."""
+    dataset, circumstances, provenance = _prepared(run, records)
+    result = solve(dataset, **circumstances, provenance=provenance)
+    return Outcome(run, dataset, result, drift_check(records))
+
+
+def _prepared(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
+    header = run.header()
+    config, devices = header["config"], header.get("devices", {})
+    dataset = dataset_from(records, {"run": run.folder.name, "devices": devices})
+    provenance = {
+        "created_utc": datetime.now(UTC).isoformat(),
+        "argv": sys.argv,
+        "versions": versions(),
+        "devices": devices,
+        "run": run.folder.name,
+        "station": header.get("station"),
+        "setup": _setup(run, config),
+    }
+    mounting = config.get("workcell", {}).get("mounting", "floor")
+    circumstances = {"g_m_s2": float(config["site"]["g_m_s2"]), "up_in_base": -down_of(mounting)}
+    return dataset, circumstances, provenance
+
+
+def _setup(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what `checks.controller_settings` compares a result with, among it the payload last reported."""
+    payload_kg = None
+    for event in run.events():
+        if event.get("event") == "weighed":
+            payload_kg = event["payload_kg"]
+    return {
+        "payload_kg": payload_kg,
+        "sensor_mass_kg": config.get("sensor", {}).get("mass_kg"),
+        "mounting": config.get("workcell", {}).get("mounting"),
+    }

@@ -1,0 +1,244 @@
+"""Results and plans as text for a person."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+from rich.text import Text
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationResult
+from calib.assessment.verdict import SURE
+from calib.compare import Compared
+from calib.routine import DriftCheck, PoseRecord
+from ftdrive.runs.pose_hints import hints, names_of
+from ftdrive.terminal.console import hanging, talk
+
+Array = NDArray[np.float64]
+
+_STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
+_ROUNDED = 1e-9
+"""A standard deviation below this share of the largest one is one of rounding: its value was taken as known."""
+_NO_LIMIT = 10_000
+
+
+def print_result(
+    result: CalibrationResult,
+    *,
+    truth: Mapping[str, Any] | None = None,
+    drift: DriftCheck | None = None,
+    records: Sequence[PoseRecord] = (),
+    saved: Path | None = None,
+) -> None:
+    """Show verdict, estimates with one sigma, how well poses fit, what probably happened, and where the file is.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+    truth : mapping, optional
+        By the names of the result: truth and error are shown beside the estimates.
+    drift : DriftCheck, optional
+    records : sequence of PoseRecord
+        Of the result's dataset: poses are named by their orientation, and those that fit badly are explained.
+    saved : Path, optional
+        The calibration file, told in the last line.
+    """
+    data = result.to_dict()
+    talk.print()
+    talk.print(
+        hanging(
+            Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  "),
+            f"{result.n_poses} poses, method {result.method}; compensation error {error_in_words(result)}",
+        )
+    )
+    for reason in result.reasons:
+        talk.print(hanging("   ", reason))
+    errors = {} if truth is None else errors_in_sigma(result, truth)
+    fixed_below = _ROUNDED * float(np.sqrt(np.diag(result.covariance).max()))
+    table = Table(box=None, padding=(0, 1))
+    for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
+        if truth is not None or title not in {"truth", "error / sigma"}:
+            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may be folded
+    for label, scale, unit, key in _ROWS:
+        estimates, sigmas = (_values(source[key], key) * scale for source in (data, data["sigma"]))
+        truths = None if truth is None else _values(truth[key], key) * scale
+        fixed = sigmas <= fixed_below * scale
+        least = sigmas[~fixed].min(initial=np.inf)
+        # two digits of the smallest sigma
+        digits = 4 if fixed.all() else int(np.clip(1 - np.floor(np.log10(max(least, 1e-9))), 0, 7))
+        for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
+            spread = "fixed" if fixed[i] else f"{sigmas[i]:.{digits}f}"
+            cells = [f"{label} {axis}".strip() + f", {unit}", f"{estimates[i]:.{digits}f}", spread]
+            if truths is not None:
+                cells.insert(1, f"{truths[i]:.{digits}f}")
+                cells.append(f"{errors[key][i]:+.1f}")
+            table.add_row(*cells)
+    talk.print(table)
+    residual = data["residual"]
+    talk.print(
+        hanging(
+            " residuals: ",
+            f"force {residual['force_rms_N']:.4f} N rms, {residual['force_max_N']:.4f} max; "
+            f"torque {residual['torque_rms_Nm']:.5f} N·m rms, {residual['torque_max_Nm']:.5f} max",
+        )
+    )
+    if (poses := poses_in_words(result, names_of(records))) is not None:
+        talk.print(hanging(" worst: ", poses))
+    if drift is not None:
+        words, bad = drift_in_words(drift)
+        talk.print(hanging(" drift: ", words), style="yellow" if bad else None)
+    if result.drift is not None:
+        change, sigma = result.drift.change, result.drift.sigma
+        words = (
+            f"{np.linalg.norm(change[:3]):.3f} ± {np.max(sigma[:3]):.3f} N, "
+            f"{np.linalg.norm(change[3:]):.4f} ± {np.max(sigma[3:]):.4f} N·m from the first pose to the last"
+        )
+        talk.print(hanging(" drift in the fit: ", words))
+    if records:
+        for hint in hints(result, records):
+            talk.print(hanging(" ? ", hint), style="yellow")
+    if saved is not None:
+        talk.print(f" Saved {saved}")
+
+
+def error_in_words(result: CalibrationResult) -> str:
+    """Say how well a free tool will be compensated, N and N·m, and from what that is known."""
+    words = "{:.4f} N, {:.5f} N·m".format(*result.predicted_error())
+    if _noise_explains(result):
+        return f"{words} rms over all orientations (predicted)"
+    seen = "{:.4f} N, {:.5f} N·m".format(*likely_error(result))
+    why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
+    return f"{seen} rms (cross-validated, as {why}; predicted: {words})"
+
+
+def likely_error(result: CalibrationResult) -> Array:
+    """Root mean square error (2,) of compensating a free tool over all orientations, N and N·m.
+
+    What noise makes uncertain says it all only where the measured noise explains the residuals. Elsewhere it is the
+    larger of that and of the error in predicting each pose from all others.
+    """
+    predicted = np.array(result.predicted_error())
+    if _noise_explains(result):
+        return predicted
+    left_out = [result.quality["loo_force_rms_N"], result.quality["loo_torque_rms_Nm"]]
+    return np.asarray(np.maximum(predicted, left_out))
+
+
+def _noise_explains(result: CalibrationResult) -> bool:
+    """Tell whether nothing speaks against the noise model: files of the first version hold nothing that could."""
+    return not result.quality or (result.p_value is not None and result.p_value >= SURE)
+
+
+def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:
+    """Say which pose fits worst and how well each is predicted by the others; None for results that do not know.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+    names : sequence of str
+        Of the rows of its dataset; their numbers where there are none.
+    """
+    quality = result.quality
+    if not quality:
+        return None
+    row = int(quality["worst_pose"])
+    worst = names[row - 1] if names else f"pose {row}"
+    return (
+        f"{worst}, {quality['residual_sigma'][row - 1]:.1f} sigma; each pose predicted by the others: "
+        f"{quality['loo_force_rms_N']:.4f} N, {quality['loo_torque_rms_Nm']:.5f} N·m rms"
+    )
+
+
+# Label, factor from the file's unit to the screen's, unit on the screen, key.
+_ROWS: Sequence[tuple[str, float, str, str]] = (
+    ("mass", 1.0, "kg", "mass_kg"),
+    ("centre of mass", 1e3, "mm", "p_sensor_com_m"),
+    ("force bias", 1.0, "N", "force_bias_N"),
+    ("torque bias", 1.0, "N·m", "torque_bias_Nm"),
+    ("flange to sensor", 180 / np.pi, "deg", "R_flange_sensor"),
+    ("gravity in base", 1.0, "N", "gravity_force_base_N"),
+    ("base tilt alpha", 180 / np.pi, "deg", "tilt_alpha_rad"),
+    ("base tilt beta", 180 / np.pi, "deg", "tilt_beta_rad"),
+)
+
+
+def _values(value: Any, key: str) -> Array:
+    values = np.asarray(value, dtype=np.float64)
+    if key == "R_flange_sensor" and values.ndim == 2:  # shown as a rotation vector
+        values = Rotation.from_matrix(values).as_rotvec()
+    return np.atleast_1d(values)
+
+
+def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, Array]:
+    """Errors of the estimates, each divided by its standard deviation.
+
+    That of the rotation is the small rotation about the flange axes that leads from the truth to the estimate; that of
+    an angle is at most half a turn.
+    """
+    data = result.to_dict()
+    errors = {}
+    for _, _, _, key in _ROWS:
+        if key == "R_flange_sensor":
+            error = Rotation.from_matrix(result.R_flange_sensor @ np.transpose(truth[key])).as_rotvec()
+        else:
+            error = np.atleast_1d(np.subtract(data[key], truth[key]))
+            if key.endswith("_rad"):
+                error = np.remainder(error + np.pi, 2 * np.pi) - np.pi  # a ceiling is at both +180 and -180 degrees
+        errors[key] = error / np.atleast_1d(data["sigma"][key])
+    return errors
+
+
+def print_comparison(compared: Sequence[Compared]) -> None:
+    """Show all methods side by side, no number cut: a narrow terminal gets no vectors, a pipe lines of any length."""
+    table = _comparison(compared, vectors=True)
+    if talk.is_terminal and table.width is not None and table.width > talk.width:
+        table = _comparison(compared, vectors=False)
+    talk.print(table, soft_wrap=True)
+    for one in compared:
+        if one.reason is not None:
+            talk.print(hanging(f" {one.method}: ", one.reason.removeprefix(f"{one.method} ")))
+
+
+def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:
+    """Make the table, as wide as it needs to be."""
+    table = Table(box=None, padding=(0, 1))
+    for title, shown in (
+        *(("method", True), ("mass\nkg", True)),
+        *(("centre of mass\nmm", vectors), ("force bias\nN", vectors), ("torque bias\nN·m", vectors)),
+        *(("mounting\ndiffers", True), ("residual\nrms N", True), ("residual\nrms N·m", True)),
+        *(("left out\nrms N", True), ("left out\nrms N·m", True)),
+    ):
+        if shown:
+            table.add_column(title, justify="left" if title == "method" else "right", no_wrap=True)
+    for one in compared:
+        if one.parameters is None:
+            continue
+        p = one.parameters
+        three = ((1e3 * p.p_sensor_com_m, 1), (p.force_bias_N, 3), (p.torque_bias_Nm, 4)) if vectors else ()
+        triples = (", ".join(f"{value:.{digits}f}" for value in vector) for vector, digits in three)
+        angle = f"{np.degrees(one.rotation_difference_rad):.3f}°"
+        rms = (one.force_rms_N, one.torque_rms_Nm, one.cv_force_rms_N, one.cv_torque_rms_Nm)
+        cells = ("-" if np.isnan(value) else f"{value:.5f}" for value in rms)
+        table.add_row(one.method, f"{one.mass_kg:.5f}", *triples, angle, *cells)
+    table.width = talk.measure(table, options=talk.options.update(width=_NO_LIMIT)).maximum
+    return table
+
+
+def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
+    """Say how the first pose reads at the end; true where that is more than noise."""
+    worst = float(np.max(np.abs(drift.change) / drift.sigma))
+    force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
+    apart_s = abs(drift.elapsed_s)
+    again = f"first pose again after {apart_s:.0f} s"
+    if drift.elapsed_s < 0:  # --redo 1
+        again = f"first pose, taken anew {apart_s:.0f} s after the return to it"
+    words = f"{again}, {force_N:.3f} N, {torque_Nm:.4f} N·m away: "
+    if worst < 4:
+        return words + "none seen", False
+    minutes = max(apart_s, 1.0) / 60
+    in_force = np.max(np.abs(drift.change[:3]) / drift.sigma[:3]) >= 4
+    rate = f"{force_N / minutes:.2g} N/min" if in_force else f"{torque_Nm / minutes:.2g} N·m/min"
+    return words + rate, True

@@ -1,0 +1,252 @@
+"""The cell's configuration: what counts, where it came from, and what is wrong is said with place, section and key."""
+
+from itertools import combinations
+from pathlib import Path
+
+import pytest
+
+from ftdrive.cell.config import _KEYS, _RANGES, _WRONG, CellConfig, load, settings, user_file, variable
+from ftdrive.errors import ConfigError
+
+HEAD = 'format = "ftdrive.config/1"\n'
+GOOD = HEAD + '[robot]\nhost = "10.0.0.2"\n[sensor]\nurl = "ati-can://can0"\n'
+
+
+@pytest.fixture(autouse=True)
+def _nobody_else_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "user"))
+
+
+def write_user_file(text: str) -> None:
+    user_file().parent.mkdir(parents=True)
+    user_file().write_text(text)
+
+
+def test_defaults_fill_what_is_not_said(tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(GOOD + "[sampling]\naverage_s = 1\n")
+    cell = load(path)
+    assert (cell.robot.host, cell.sensor.sign, cell.sampling.average_s, cell.site.g_m_s2) == ("10.0.0.2", 1, 1, 9.80665)
+    assert (cell.robot.speed_deg_s, cell.robot.acceleration_deg_s2, cell.robot.tip_speed_mm_s) == (60, 80, 250)
+    assert cell.sensor.height_mm is None
+    assert cell.workcell.measured is False
+
+
+def test_every_section_reaches_the_cell(tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(
+        GOOD
+        + "height_mm = 33\nmass_kg = 0.255\n"
+        + '[tool]\nname = "gripper"\ncylinders_mm = [[0, 33, 80], [33, 200, 100, 0, -5.5]]\nmass_kg = 1.2\n'
+        + '[workcell]\nmounting = "30"\nplanes_mm = [[-1, 0, 0, -800]]\nboxes_mm = [[10, 20, 30, 40, 50, 60]]\n'
+        + "measured = true\n"
+    )
+    cell = load(path)
+    assert (cell.sensor.height_mm, cell.sensor.mass_kg, cell.tool.name, cell.tool.mass_kg) == (
+        33,
+        0.255,
+        "gripper",
+        1.2,
+    )
+    assert cell.tool.cylinders_mm == ((0.0, 33.0, 80.0), (33.0, 200.0, 100.0, 0.0, -5.5))
+    assert cell.workcell.planes_mm == ((-1.0, 0.0, 0.0, -800.0),)
+    assert cell.workcell.boxes_mm == ((10.0, 20.0, 30.0, 40.0, 50.0, 60.0),)
+    assert (cell.workcell.mounting, cell.workcell.measured) == ("30", True)
+
+
+SOURCES = ("option", "variable", "project", "user")
+
+
+@pytest.mark.parametrize("said", [said for n in range(1, 5) for said in combinations(SOURCES, n)], ids="+".join)
+def test_the_first_that_says_it_counts(said: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    hosts = dict(zip(SOURCES, ("10.0.0.1", "10.0.0.2", "10.0.0.3", "10.0.0.4"), strict=True))
+    if "user" in said:
+        write_user_file(HEAD + f'[robot]\nhost = "{hosts["user"]}"\nmodel = "ur10e"\n')
+    if "project" in said:
+        Path("ftdrive.toml").write_text(HEAD + f'[robot]\nhost = "{hosts["project"]}"\n')
+    if "variable" in said:
+        monkeypatch.setenv("FTDRIVE_ROBOT_HOST", hosts["variable"])
+    flags = {"robot.host": ("--robot", hosts["option"] if "option" in said else None)}
+    origins = {
+        "option": "--robot",
+        "variable": "FTDRIVE_ROBOT_HOST",
+        "project": "ftdrive.toml",
+        "user": str(user_file()),
+    }
+    found = settings(None, flags)
+    assert (found["robot.host"].value, found["robot.host"].origin) == (hosts[said[0]], origins[said[0]])
+    assert found["robot.model"].origin == (origins["user"] if "user" in said else "not set")
+    assert found["robot.speed_deg_s"].origin == "default"
+
+
+def test_a_named_file_replaces_the_projects_but_not_the_users(tmp_path: Path) -> None:
+    write_user_file(HEAD + "[site]\ng_m_s2 = 9.81\n")
+    Path("ftdrive.toml").write_text(HEAD + "[sampling]\naverage_s = 9\n")
+    path = tmp_path / "cell.toml"
+    path.write_text(GOOD)
+    cell = load(path)
+    assert (cell.site.g_m_s2, cell.sampling.average_s) == (9.81, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "value"),
+    [
+        ("robot.host", "10.0.0.9", "10.0.0.9"),
+        ("robot.model", "ur5e", "ur5e"),
+        ("robot.speed_deg_s", "45", 45.0),
+        ("sensor.sign", "-1", -1),
+        ("sensor.height_mm", "33.5", 33.5),
+        ("tool.cylinders_mm", "[[0, 200, 100]]", ((0.0, 200.0, 100.0),)),
+        ("workcell.measured", "true", True),
+        ("workcell.mounting", "12.5", "12.5"),
+    ],
+)
+def test_variables_are_read_as_the_key_needs(
+    key: str, text: str, value: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(variable(key), text)
+    assert settings()[key].value == value
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        (
+            "FTDRIVE_ROBOT_SPEED_DEG_S",
+            "fast",
+            ["FTDRIVE_ROBOT_SPEED_DEG_S", "robot", "speed_deg_s", "fast", "a number"],
+        ),
+        ("FTDRIVE_ROBOT_SPEED_DEG_S", "4000", ["FTDRIVE_ROBOT_SPEED_DEG_S", "4000", "0.5 to 60"]),
+        ("FTDRIVE_ROBOT_SPEED_DEG_S", "60\nmodel = 5", ["speed_deg_s", "a number"]),
+        ("FTDRIVE_ROBOT_SPEED_DEG_S", "nan", ["a number"]),
+        ("FTDRIVE_WORKCELL_MEASURED", "yes", ["true or false"]),
+        ("FTDRIVE_TOOL_CYLINDERS_MM", "[[0, 200]]", ["cylinder"]),
+        ("FTDRIVE_SENSOR_SIGN", "1.0", ["whole number"]),
+        ("FTDRIVE_ROBOT_HOST", "", ["FTDRIVE_ROBOT_HOST", "empty", "unset"]),
+        ("FTDRIVE_ROBOT_HOTS", "10.0.0.2", ["FTDRIVE_ROBOT_HOTS", "the keys are host"]),
+    ],
+)
+def test_a_variable_that_cannot_be_used_is_named(
+    name: str, text: str, words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(name, text)
+    with pytest.raises(ConfigError) as error:
+        settings()
+    assert all(word in str(error.value) for word in words), error.value
+
+
+def test_degrees_of_the_mounting_are_a_number_too() -> None:
+    Path("ftdrive.toml").write_text(GOOD + "[workcell]\nmounting = 45\n")
+    assert load().workcell.mounting == "45"
+
+
+@pytest.mark.parametrize(
+    ("line", "cure"),
+    [
+        ("[site]\ng_m_s2 = '9.81'", "a number: give one such as"),
+        ("[sampling]\nattempts = 1.5", "a whole number: give one such as 1,"),
+        ("[workcell]\nmounting = true", "a text: put it in quotes"),
+        ("[workcell]\nmeasured = 1", "true or false: give one of them"),
+        ("[tool]\ncylinders_mm = [0, 60, 90]", r"such as \[\[0, 60, 90\]\]"),
+    ],
+)
+def test_a_wrong_type_says_what_to_give(line: str, cure: str) -> None:
+    Path("ftdrive.toml").write_text(f"{GOOD}{line}\n")
+    with pytest.raises(ConfigError, match=cure):
+        load()
+
+
+@pytest.mark.parametrize(
+    ("said", "record_s"),
+    [("", 12), ("average_s = 1\n", 0), ("noise_record_s = 30\n", 30), ("average_s = 1\nnoise_record_s = 30\n", 30)],
+)
+def test_an_average_that_is_said_alone_needs_no_record(said: str, record_s: float) -> None:
+    Path("ftdrive.toml").write_text(f"{GOOD}[sampling]\n{said}")
+    assert load().sampling.noise_record_s == record_s
+
+
+def test_other_programs_variables_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FTDRIVE_REAL_DATA", "/somewhere")
+    assert "default" in {setting.origin for setting in settings().values()}
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("", "format"),
+        (GOOD.replace("/1", "/2"), "ftdrive.config/2"),
+        (GOOD.replace("host", "hots"), "hots"),
+        (GOOD.replace("[robot]", "[robots]"), "robots"),
+        (GOOD.replace('"10.0.0.2"', "10"), "host"),
+        (GOOD.replace('"10.0.0.2"', '" "'), "host.* empty"),
+        (GOOD.replace('host = "10.0.0.2"', ""), "host"),
+        (GOOD.replace("url", "sign = 1 #"), "url"),
+        ("robot = 5\n" + HEAD, "robot"),
+        (GOOD + "[sampling]\nattempts = 1.5\n", "attempts"),
+        (GOOD + "[sampling]\naverage_s = inf\n", "average_s"),
+        (GOOD + "[sampling]\naverage_s = 0\n", "0.05 to 600"),
+        (GOOD + "[sampling]\nnoise_record_s = 2\n", "3 or more"),
+        (GOOD.replace("host", "tip_speed_mm_s = 300\nhost"), "1 to 250"),
+        (GOOD + "sign = true\n", "sign"),
+        (GOOD + "sign = 0\n", "sign = 0.*-1 for"),
+        (GOOD + "height_mm = 3300\n", "0 to 500"),
+        (GOOD + "height_mm = 0.033\n", "is it mm"),
+        (GOOD.replace("10.0.0.2", "http://10.0.0.2/"), "name or IPv4 address alone"),
+        (GOOD + "[robot", "TOML"),
+        (GOOD + '[site]\ng_m_s2 = "9.8"\n', "g_m_s2"),
+        (GOOD + "[site]\ng_m_s2 = -9.8\n", "9.7 to 9.9"),
+        (HEAD + '[robot]\nmodel = "ur6"\n', "UR5e"),
+        (GOOD + "[tool]\ncylinders_mm = [0, 200, 100]\n", "list of lists"),
+        (GOOD + "[tool]\ncylinders_mm = [[200, 100, 50]]\n", "cylinder"),
+        (GOOD + "[tool]\ncylinders_mm = [[0, 200, 100, 5]]\n", "cylinder"),
+        (GOOD + "[tool]\ncylinders_mm = [[0, 0.2, 0.1]]\n", "are these mm"),
+        (GOOD + "[tool]\ncylinders_mm = [[0, 60, 90], [60, 200, 4]]\n", "5 mm for what is thinner"),
+        (GOOD + "[workcell]\nplanes_mm = [[0, 0, 0, 5]]\n", "plane"),
+        (GOOD + "[workcell]\nboxes_mm = [[0, 0, 0, 1, 1, 0]]\n", "box"),
+        (GOOD + "[workcell]\nboxes_mm = [[0.6, 0.6, 0, 0.8, 0.8, 0.2]]\n", "are these mm"),
+        (GOOD + '[workcell]\nmounting = "sideways"\n', "mounting"),
+        (GOOD + "[workcell]\nmounting = 450\n", "-180 to 180"),
+        (GOOD + '[workcell]\nmounting = "nan"\n', "mounting"),
+        (GOOD + "[workcell]\nmeasured = 1\n", "measured"),
+    ],
+)
+def test_errors_name_file_and_key(text: str, word: str, tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=word) as error:
+        load(path)
+    assert str(path) in str(error.value) or "is not set" in str(error.value)
+
+
+def test_a_file_of_another_kind_is_told_what_its_first_line_must_be(tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text("[robot]\n")
+    with pytest.raises(ConfigError, match=r'format = "ftdrive\.config/1"'):
+        load(path)
+
+
+def test_a_mark_of_the_byte_order_is_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(GOOD, encoding="utf-8-sig")  # as an editor on Windows may write it
+    assert load(path).robot.host == "10.0.0.2"
+
+
+def test_every_number_has_a_range_and_every_range_a_key() -> None:
+    values = settings()
+    numbers = {key for key in values if _KEYS[key].type in {int, float, float | None}}
+    assert numbers - {"sensor.sign"} == set(_RANGES)
+    assert set(_WRONG) <= set(values)
+
+
+def test_a_plan_needs_no_addresses() -> None:
+    assert isinstance(load(devices=False), CellConfig)
+    with pytest.raises(ConfigError, match="ftdrive init"):
+        load()
+
+
+def test_a_relative_folder_of_the_user_does_not_count(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", "relative")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert user_file() == tmp_path / ".config" / "ftdrive" / "ftdrive.toml"

@@ -1,0 +1,136 @@
+"""The clock of an emulated cell, as the program reads it; the station's side is `mocks.clock`, in this process."""
+
+import os
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from drivers.errors import ConnectError
+from ftdrive.cell.emulated_clock import EmulatedClock
+from mocks.clock import LEAD_NS, CellClock
+
+
+@pytest.fixture
+def cell() -> Iterator[CellClock]:
+    cell = CellClock()
+    yield cell
+    cell.close()
+
+
+@pytest.fixture
+def clock(cell: CellClock) -> EmulatedClock:
+    return EmulatedClock(cell.path)
+
+
+@pytest.fixture
+def running(cell: CellClock) -> Iterator[None]:
+    """Let a thread move the cell's time on, as a station does."""
+    ended = threading.Event()
+
+    def run() -> None:
+        while not ended.wait(0.001):
+            cell.now_ns()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    yield
+    ended.set()
+    thread.join()
+
+
+def test_it_shows_the_time_of_the_cell_and_nothing_else(cell: CellClock, clock: EmulatedClock) -> None:
+    shown = cell.now_ns()
+    time.sleep(0.02)
+    assert clock.now_ns() == shown
+    assert cell.now_ns() > shown
+
+
+def test_the_cell_waits_for_a_thread_that_keeps_up(cell: CellClock, clock: EmulatedClock) -> None:
+    with clock.keeping_up():
+        seen = clock.now_ns()
+        time.sleep(0.05)
+        assert cell.now_ns() == seen + LEAD_NS
+        assert cell.now_ns() == seen + LEAD_NS
+        clock.now_ns()
+        assert cell.now_ns() > seen + LEAD_NS
+    seen = cell.now_ns()
+    time.sleep(0.05)
+    assert cell.now_ns() > seen + LEAD_NS
+
+
+def test_the_end_of_an_inner_block_does_not_end_the_outer_one(cell: CellClock, clock: EmulatedClock) -> None:
+    with clock.keeping_up():
+        with clock.keeping_up():
+            pass
+        seen = clock.now_ns()
+        time.sleep(0.05)
+        assert cell.now_ns() == seen + LEAD_NS
+
+
+def test_the_cell_does_not_wait_for_a_thread_that_is_away(cell: CellClock, clock: EmulatedClock) -> None:
+    with clock.keeping_up():
+        with clock.away():
+            seen = cell.now_ns()
+            time.sleep(0.05)
+            assert cell.now_ns() > seen + LEAD_NS
+        seen = clock.now_ns()
+        time.sleep(0.05)
+        assert cell.now_ns() == seen + LEAD_NS
+
+
+def test_two_threads_have_two_slots(cell: CellClock, clock: EmulatedClock) -> None:
+    begun, end = threading.Event(), threading.Event()
+
+    def sit() -> None:
+        with clock.keeping_up():
+            begun.set()
+            end.wait()
+
+    other = threading.Thread(target=sit)
+    with clock.keeping_up():
+        other.start()
+        begun.wait()
+        seen = clock.now_ns()
+        time.sleep(0.05)
+        clock.now_ns()
+        assert cell.now_ns() <= seen + LEAD_NS
+    end.set()
+    other.join()
+
+
+@pytest.mark.usefixtures("running")
+def test_a_sleeper_is_not_waited_for_until_it_wants_to_wake(clock: EmulatedClock) -> None:
+    with clock.keeping_up():
+        begin = clock.now_ns()
+        clock.sleep(0.05)
+        assert clock.now_ns() >= begin + 50_000_000
+
+
+@pytest.mark.usefixtures("running")
+def test_waiting_ends_by_the_time_of_the_cell_or_by_what_is_waited_for(clock: EmulatedClock) -> None:
+    event = threading.Event()
+    with clock.keeping_up():
+        begin = clock.now_ns()
+        assert not clock.wait(event, 0.03)
+        assert clock.now_ns() >= begin + 30_000_000
+    threading.Timer(0.01, event.set).start()
+    assert clock.wait(event, 60.0)
+
+
+def test_time_goes_on_with_the_computer_when_the_station_has_ended(cell: CellClock, clock: EmulatedClock) -> None:
+    last = clock.now_ns()
+    cell.close()
+    clock.sleep(0.01)
+    assert clock.now_ns() >= last + 10_000_000
+
+
+def test_a_page_that_is_not_there_or_of_another_version_is_an_error(cell: CellClock) -> None:
+    with pytest.raises(ConnectError):
+        EmulatedClock("/proc/self/fd/99999")
+    descriptor = os.open(cell.path, os.O_RDWR)
+    os.pwrite(descriptor, (7).to_bytes(8, "little"), 0)
+    os.close(descriptor)
+    with pytest.raises(ConnectError, match="7"):
+        EmulatedClock(cell.path)

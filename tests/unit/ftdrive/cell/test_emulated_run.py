@@ -1,0 +1,68 @@
+"""What a calibration of an emulated cell tells: no folder that is gone afterwards, and commands that can be typed."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from ftdrive.cell import emulated_run
+from ftdrive.commands import demo
+from ftdrive.runs.run import Run
+from ftdrive.session.events import Event, Noted, RunOpened
+
+STATION: Any = SimpleNamespace(sensor="can", options=(), truth={"mass_kg": 0.5}, cell=None)
+
+
+class Told:
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+
+    def tell(self, event: Event) -> None:
+        self.events.append(event)
+
+
+@pytest.mark.parametrize(("kept", "told"), [(True, [RunOpened, Noted, Noted]), (False, [Noted])])
+def test_of_a_run_that_is_not_kept_nobody_is_told_where_it_is(
+    kept: bool, told: list[type[Event]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, person = str(tmp_path / "2026-simulated"), Told()
+
+    @contextmanager
+    def open_operator() -> Iterator[Told]:
+        yield person
+
+    def calibrate(_: object, operator: Any, options: Any) -> SimpleNamespace:
+        assert options.runs == tmp_path
+        operator.tell(RunOpened(folder=folder, resume=f"ftdrive calibrate --resume {folder}"))
+        operator.tell(Noted(words="this computer cannot be kept awake"))
+        operator.tell(Noted(words=f"3 poses are kept in {folder}"))
+        return SimpleNamespace()
+
+    monkeypatch.setattr(emulated_run, "open_operator", open_operator)
+    monkeypatch.setattr(emulated_run, "calibrate", calibrate)
+    emulated_run.rehearse(STATION, tmp_path, "simulated", kept=kept)
+    assert [type(event) for event in person.events] == told
+
+
+@pytest.mark.parametrize(("environment", "command"), [("1", "   uv run ftdrive "), (None, "   ftdrive ")])
+def test_the_demo_names_its_next_commands_as_they_can_be_typed(
+    environment: str | None, command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("UV_RUN_RECURSION_DEPTH", raising=False)
+    if environment is not None:
+        monkeypatch.setenv("UV_RUN_RECURSION_DEPTH", environment)
+    run = Run(Path("runs/a"))
+    monkeypatch.setattr(Run, "records", lambda _: [])
+    outcome = SimpleNamespace(run=run, result=SimpleNamespace(verdict="good"), drift=None)
+    monkeypatch.setattr(demo, "Station", lambda *_: nullcontext(STATION))
+    monkeypatch.setattr(demo, "rehearse", lambda *_: outcome)
+    monkeypatch.setattr(demo, "print_result", lambda *_, **__: None)
+    with capsys.disabled():
+        told = CliRunner().invoke(demo.demo, catch_exceptions=False).stderr
+    lines = [line for line in told.splitlines() if "runs/a" in line and "Saved" not in line]
+    assert len(lines) == 3
+    assert all(line.startswith(command) for line in lines)

@@ -1,0 +1,394 @@
+"""What doctor finds in states of a sensor and an arm that can be made up, and what it says mends them."""
+
+from dataclasses import replace
+from socket import gaierror
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationResult
+from drivers.errors import (
+    ConnectError,
+    DeviceFault,
+    DeviceTimeout,
+    DriverError,
+    Frozen,
+    NoDashboard,
+    PortInUse,
+    ProtocolError,
+    StreamBroken,
+    Unreachable,
+)
+from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
+from ftdrive.checks import devices as diagnosis
+from ftdrive.checks.computer import Check, SensorAddress
+
+FACTS = {
+    "serial": Fact("FT1", "device"),
+    "counts_per_N": Fact(1e6, "device"),
+    "counts_per_Nm": Fact(1e6, "device"),
+    "range": Fact((130.0, 130.0, 400.0, 10.0, 10.0, 10.5), "configured"),
+    "sign": Fact(-1, "configured"),
+}
+
+
+def test_what_is_known_of_a_sensor_is_said_with_its_source() -> None:
+    found = {check.name: check for check in diagnosis.check_identity(DeviceInfo("Gamma", "FT1", "3.8", FACTS))}
+    assert {check.state for check in found.values()} == {"ok"}
+    counts = found["sensor.counts"].found
+    assert counts.startswith("1000000 counts per N and")
+    assert counts.endswith("by the device")
+    assert found["sensor.range"].found.split(" N") == ["±(130, 130, 400)", ", ±(10, 10, 10.5)", "·m, configured"]
+    assert found["sensor.sign"].found.startswith("sign -1, configured")
+
+
+def test_what_is_assumed_or_unknown_of_a_sensor_is_a_warning() -> None:
+    facts = {name: Fact(1e6, "assumed") for name in ("counts_per_N", "counts_per_Nm")}
+    info = DeviceInfo("Mini45", NOT_REPORTED, "3.6", facts)
+    found = {check.name: check for check in diagnosis.check_identity(info)}
+    warned = {name for name, check in found.items() if check.state == "warning"}
+    assert warned == {"sensor.identity", "sensor.counts", "sensor.range"}
+    assert "serial=" in str(found["sensor.identity"].fix)
+    assert "range=300,30" in str(found["sensor.range"].fix)
+    assert {check.state for check in diagnosis.check_identity(DeviceInfo("plain", "1", "2"))} == {"ok", "warning"}
+
+
+STATUS = ArmStatus(
+    t_host_ns=0,
+    t_device_s=1.0,
+    robot_mode="running",
+    safety_mode="normal",
+    program="stopped",
+    fault=None,
+    speed_slider=0.5,
+    speed_scaling=1.0,
+    payload_kg=1.2,
+    p_flange_payload_m=(0.0, 0.01, 0.05),
+    tcp_offset=(0.0,) * 6,
+)
+
+
+def test_a_ready_arm() -> None:
+    found = {check.name: check for check in diagnosis.check_status(STATUS)}
+    assert {check.state for check in found.values()} == {"ok"}
+    assert "50%" in found["robot.speed"].found
+    payload = found["robot.payload"].found
+    assert "1.20 kg" in payload
+    assert "(0, 10, 50) mm" in payload
+
+
+@pytest.mark.parametrize(
+    ("different", "name", "state", "words"),
+    [
+        ({"fault": DeviceFault("protective stop", "clear it")}, "robot.safety", "failed", "clear it"),
+        ({"safety_mode": "reduced"}, "robot.safety", "warning", "calibrate asks"),
+        ({"program": "playing"}, "robot.program", "warning", "does not begin beside it"),
+        ({"payload_kg": 0.0}, "robot.payload", "failed", "at the pendant"),
+        ({"payload_kg": 0.0, "p_flange_payload_m": None}, "robot.payload", "failed", "at the pendant"),
+        ({"p_flange_payload_m": (0.0, 0.0, 0.0)}, "robot.payload", "warning", "centre of gravity"),
+        ({"speed_slider": 0.04}, "robot.speed", "failed", "at the pendant"),
+        ({"payload_kg": None}, "robot.payload", "skipped", ""),
+    ],
+)
+def test_an_arm_that_is_not(different: dict[str, Any], name: str, state: str, words: str) -> None:
+    found = {check.name: check for check in diagnosis.check_status(replace(STATUS, **different))}
+    assert {other for other, check in found.items() if check.state != "ok"} == {name}
+    assert found[name].state == state
+    assert words in (found[name].fix or "")
+
+
+@pytest.mark.parametrize(("remote", "state"), [(True, "ok"), (False, "failed"), (None, "skipped")])
+def test_remote_control(remote: bool | None, state: str) -> None:
+    assert diagnosis.check_remote(remote).state == state
+
+
+PORT = SensorAddress.of("bota:///dev/ttyUSB7")
+BY_NETWORK = SensorAddress.of("ati-netft://192.168.1.1")
+BY_PCAN = SensorAddress.of("ati-can://PCAN_USBBUS1?interface=pcan")
+
+
+def stream(
+    rate_Hz: float,
+    *,
+    nominal_Hz: float = 100.0,
+    status: int = 0,
+    address: SensorAddress = PORT,
+    **counted: Any,
+) -> dict[str, Check]:
+    n = round(2 * rate_Hz)
+    samples = FtSamples(
+        t_host_ns=np.arange(n, dtype=np.int64),
+        t_device_s=np.full(n, np.nan),
+        seq=np.arange(n, dtype=np.int64),
+        counts=np.zeros((n, 6), np.int32),
+        wrench=np.zeros((n, 6)),
+        status=np.full(n, status, np.uint32),
+    )
+    health = Health(received=n, lost=0, malformed=0, rate_Hz=rate_Hz, age_s=0.001, nominal_rate_Hz=nominal_Hz)
+    health = replace(health, **counted)
+    return {check.name: check for check in diagnosis.check_stream(samples, health, address, 2.0)}
+
+
+def test_a_healthy_stream_and_three_that_are_not() -> None:
+    assert {check.state for check in stream(100).values()} == {"ok"}
+    slow = stream(62.5)["sensor.rate"]
+    assert slow.state == "failed"
+    assert "ttyUSB7/latency_timer" in str(slow.fix)
+    assert stream(93)["sensor.rate"].state == "warning"
+    assert stream(100, lost=1)["sensor.lost"].state == "warning"
+    assert stream(100, lost=20)["sensor.lost"].state == "failed"
+    assert stream(100, status=0x4000)["sensor.status"].found == "status 0x4000"
+    assert stream(7, nominal_Hz=np.nan)["sensor.rate"].state == "ok"
+
+
+@pytest.mark.parametrize(
+    ("counted", "state", "words"),
+    [
+        ({"duplicated": 60}, "warning", "of 200, 60 came twice"),
+        ({"lost": 1, "out_of_order": 1}, "warning", "of 200, 1 came out"),
+        ({"out_of_order": 3}, "failed", "3 came out of order"),
+        ({"malformed": 3, "duplicated": 1}, "failed", "of 200, 1 came twice"),
+    ],
+)
+def test_what_comes_twice_or_too_late_is_told(counted: dict[str, Any], state: str, words: str) -> None:
+    lost = stream(100, **counted)["sensor.lost"]
+    assert lost.state == state
+    assert words in lost.found
+    assert lost.fix
+
+
+@pytest.mark.parametrize(("rate_Hz", "state"), [(96, "ok"), (109, "ok"), (115, "failed"), (200, "failed")])
+def test_a_rate_that_is_too_high(rate_Hz: float, state: str) -> None:
+    rate = stream(rate_Hz)["sensor.rate"]
+    assert rate.state == state
+    assert ("records come twice" in str(rate.fix)) == (state != "ok")
+
+
+@pytest.mark.parametrize(
+    "address", [BY_NETWORK, SensorAddress.of("ur-ft://192.168.1.10?counts_per_N=1&counts_per_Nm=1")]
+)
+def test_a_sensor_on_ethernet_gets_no_advice_about_cables_it_has_not(address: SensorAddress) -> None:
+    found = stream(80, lost=1, address=address)
+    for name in ("sensor.rate", "sensor.lost"):
+        assert "a network of its own" in str(found[name].fix)
+        assert "cable" not in str(found[name].fix)
+    on_can = stream(80, lost=1, address=BY_PCAN)
+    assert "termination" in str(on_can["sensor.lost"].fix)
+
+
+def test_a_polled_sensor_may_lose_samples_to_a_busy_computer() -> None:
+    polled, streaming = (stream(80, lost=1, address=address)["sensor.lost"].fix for address in (BY_PCAN, PORT))
+    assert "fewer programs on this computer" in str(polled)
+    assert "fewer programs" not in str(streaming)
+
+
+def test_noise_at_rest_under_a_hand_and_none_at_all() -> None:
+    noise = np.random.default_rng(0).normal(size=(2000, 6)) * ([0.03] * 3 + [0.001] * 3)
+    level, accuracy = diagnosis.check_noise(noise, 2.0, 2.0, 1.2)
+    assert (level.state, accuracy.state) == ("ok", "ok")
+    assert "σ (0.03" in level.found
+    assert "1.2 kg" in accuracy.found
+    hand = noise.copy()
+    hand[1000:, 2] += 0.5
+    assert diagnosis.check_noise(hand, 2.0, 2.0, 1.2)[0].state == "warning"
+    (dead,) = diagnosis.check_noise(np.ones((2000, 6)), 2.0, 2.0, 1.2)
+    assert dead.state == "failed"
+    (few,) = diagnosis.check_noise(noise[:10], 2.0, 2.0, 1.2)
+    assert few.state == "failed"
+
+
+@pytest.mark.parametrize(("pace", "state"), [(1.0, "ok"), (1.001, "ok"), (1.1, "warning"), (0.5, "warning")])
+def test_pace_of_the_controllers_clock(pace: float, state: str) -> None:
+    t_host_s = np.arange(0, 1, 0.02) + np.random.default_rng(0).uniform(0, 0.002, 50)
+    t_host_ns = (t_host_s * 1e9).astype(np.int64) + 12345
+    assert diagnosis.check_clock(t_host_ns.tolist(), (7e5 + pace * t_host_s).tolist()).state == state
+
+
+rotations = st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(rng=seed).as_matrix())
+
+
+@given(rotations, rotations, st.floats(3, 100))
+def test_push_names_axis_and_sign(R_base_flange: Any, R_flange_sensor: Any, size_N: float) -> None:
+    R_sensor_base = (R_base_flange @ R_flange_sensor).T
+    check, moved = diagnosis.check_push(R_sensor_base @ [size_N, 0, 0], R_base_flange, R_flange_sensor, 1)
+    assert check.state == "ok"
+    assert moved["base"]["axis"] == "+X"
+    np.testing.assert_allclose(moved["flange"]["force_N"], R_base_flange.T @ [size_N, 0, 0], atol=1e-9)
+
+    check, moved = diagnosis.check_push(R_sensor_base @ [-size_N, 0, 0], R_base_flange, R_flange_sensor, -1)
+    assert (check.state, moved["base"]["axis"]) == ("failed", "-X")
+    assert "sign = 1 " in str(check.fix)
+
+    check, moved = diagnosis.check_push(R_sensor_base @ [0, -size_N, 0], R_base_flange, R_flange_sensor, 1)
+    assert (check.state, moved["base"]["axis"]) == ("failed", "-Y")
+    assert "sign" not in str(check.fix)
+
+
+def test_push_without_mounting_or_without_a_push() -> None:
+    check, moved = diagnosis.check_push(np.array([0.5, -9.0, 1.0]), np.eye(3), None, 1)
+    assert check.state == "skipped"
+    assert moved["sensor"]["axis"] == "-Y"
+    assert moved["flange"] is moved["base"] is None
+    check, _ = diagnosis.check_push(np.array([0.5, 0.0, 0.0]), np.eye(3), np.eye(3), 1)
+    assert check.state == "failed"
+
+
+def told(serial: str, model: str = "M") -> DeviceInfo:
+    return DeviceInfo(model, serial, NOT_REPORTED)
+
+
+def test_calibration_of_another_sensor() -> None:
+    made_with = {"arm": {"serial": "A", "model": "UR5e"}, "sensor": {"serial": "S", "model": "M"}}
+    provenance = {"devices": made_with, "created_utc": "2026-01-01"}
+    result = cast(CalibrationResult, SimpleNamespace(provenance=provenance, verdict="good"))
+    assert diagnosis.check_calibration(result, {"arm": told("A", "UR5e"), "sensor": told("S")}).state == "ok"
+    other = diagnosis.check_calibration(result, {"arm": told("A"), "sensor": told("T")})
+    assert other.state == "failed"
+    assert "sensor S, but the sensor T" in other.found
+    unknown = diagnosis.check_calibration(result, {"arm": told("A"), "sensor": told(NOT_REPORTED)})
+    assert unknown.state == "warning"
+    assert "cannot be checked" in unknown.found
+    assert "serial=" in str(unknown.fix)
+    both = diagnosis.check_calibration(result, {"arm": told("B"), "sensor": told(NOT_REPORTED)})
+    assert (both.state, both.fix) == ("failed", "ftdrive calibrate")
+
+
+@pytest.mark.parametrize(("made", "connected"), [("S", NOT_REPORTED), (NOT_REPORTED, "S"), (NOT_REPORTED,) * 2])
+def test_a_calibration_of_another_model_is_of_another_sensor_without_serial_numbers(made: str, connected: str) -> None:
+    devices = {"sensor": {"serial": made, "model": "ATI F/T (NETCANOEM, CAN)"}}
+    result = cast(CalibrationResult, SimpleNamespace(provenance={"devices": devices}, verdict="good"))
+    check = diagnosis.check_calibration(result, {"sensor": told(connected, "Bota force/torque sensor")})
+    assert (check.state, check.fix) == ("failed", "ftdrive calibrate")
+    assert "ATI F/T (NETCANOEM, CAN), but Bota" in check.found
+    same = diagnosis.check_calibration(result, {"sensor": told(connected, "ATI F/T (NETCANOEM, CAN)")})
+    assert same.state == "warning"
+
+
+@pytest.mark.parametrize("devices", [{"sensor": {"serial": NOT_REPORTED}}, {"sensor": {}}, {}, None])
+def test_a_calibration_that_does_not_know_its_sensor_cannot_be_checked(devices: object) -> None:
+    result = cast(CalibrationResult, SimpleNamespace(provenance={"devices": devices}, verdict="good"))
+    for serial in ("FT12345", NOT_REPORTED):
+        (words,) = diagnosis.belonging(result, {"sensor": told(serial)}).unknown
+        assert "was made with" in words
+        assert not diagnosis.belonging(result, {"sensor": told(serial)}).others
+
+
+ALLOWED = Check("permissions.port", "ok", "may be read and written")
+FORBIDDEN = Check("permissions.port", "failed", "may not", "sudo usermod")
+
+
+def wrapped(error: DriverError) -> ConnectError:
+    """As a driver tells what went wrong while it was opened."""
+    outer = ConnectError(error.found, error.cure)
+    outer.__cause__ = error
+    return outer
+
+
+def not_opened(found: str, cure: str = "") -> ConnectError:
+    """As a driver tells that the system refused its port."""
+    outer = ConnectError(found, cure)
+    outer.__cause__ = OSError(13, "Permission denied")
+    return outer
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ConnectError("serial number A, not B", "check its option serial"),
+        wrapped(ProtocolError("slot 3 is empty", "choose another")),
+        DeviceFault("status 0x0008 (bit 3: raw)", "?sinc=512 configures it"),
+        StreamBroken("silent for 0.4 s", "check cable; try again"),
+        ProtocolError("no reply (closed (x; y); z)", "check wiring"),
+        Frozen("frozen, 50 samples", "power it off and on"),
+        ConnectError("no RTDE (x; y)", "ask; look"),
+    ],
+)
+@pytest.mark.parametrize("address", [PORT, BY_NETWORK, BY_PCAN])
+def test_the_cure_that_a_message_names_is_the_one_shown(error: DriverError, address: SensorAddress) -> None:
+    check = diagnosis.check_sensor_error("sensor.stream", error, address, [ALLOWED])
+    assert check == Check("sensor.stream", "failed", error.found, error.cure)
+
+
+@pytest.mark.parametrize(
+    ("address", "ask"), [(PORT, "ftdrive devices --probe "), (BY_NETWORK, "ping ")], ids=["serial port", "network"]
+)
+def test_to_the_cure_of_a_silence_belongs_how_to_see_who_answers(address: SensorAddress, ask: str) -> None:
+    check = diagnosis.check_sensor_error("sensor.stream", DeviceTimeout("silent", "check cable"), address, [ALLOWED])
+    assert str(check.fix).startswith("check cable; ")
+    assert str(check.fix).partition(": ")[2].startswith(ask)
+
+
+@pytest.mark.parametrize(
+    ("error", "address", "permission", "cure"),
+    [
+        (not_opened("the port does not open"), PORT, FORBIDDEN, "sudo usermod"),
+        (not_opened("does not open (13)", "plugged in?"), PORT, FORBIDDEN, "sudo usermod"),
+        (DeviceTimeout("silent for 0.4 s", "check cable and supply"), PORT, FORBIDDEN, "sudo usermod"),
+        (StreamBroken("the port is gone (x)", "plug it in"), PORT, FORBIDDEN, "sudo usermod"),
+        (ConnectError("no port may be read"), PORT, FORBIDDEN, "sudo usermod"),
+        (ConnectError("serial number A answers", "check the address"), PORT, FORBIDDEN, "check the address"),
+        (wrapped(ProtocolError("slot 3 is empty", "choose another")), PORT, FORBIDDEN, "choose another"),
+        (ConnectError("does not open"), PORT, ALLOWED, "ftdrive devices --probe /dev/ttyUSB7"),
+        (DeviceTimeout("silent"), PORT, ALLOWED, "ftdrive devices --probe /dev/ttyUSB7"),
+        (DeviceTimeout("silent"), BY_NETWORK, ALLOWED, "ping 192.168.1.1"),
+        (wrapped(DeviceTimeout("no reply")), PORT, ALLOWED, "supply and cable"),
+        (DeviceTimeout("silent"), BY_PCAN, ALLOWED, "ftdrive doctor again"),
+        (StreamBroken("interrupted (silent; check cable)"), BY_PCAN, ALLOWED, "supply and cable"),
+        (DeviceFault("status 4"), PORT, FORBIDDEN, "switch it off and on"),
+        (wrapped(DeviceFault("status 4")), PORT, ALLOWED, "switch it off and on"),
+        (ProtocolError("no intact record"), PORT, ALLOWED, "ftdrive devices --probe"),
+    ],
+)
+def test_another_cure_is_shown_where_the_way_to_a_sensor_is_wrong_or_its_message_names_none(
+    error: DriverError, address: SensorAddress, permission: Check, cure: str
+) -> None:
+    found = diagnosis.check_sensor_error("sensor.stream", error, address, [permission])
+    assert (found.name, found.state, found.found) == ("sensor.stream", "failed", error.found)
+    assert cure in str(found.fix)
+
+
+def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable() -> None:
+    error = PortInUse("the port is in use", "end it, `fuser -v /dev/ttyUSB7` names it")
+    found = diagnosis.check_sensor_error("sensor.identity", error, PORT, [FORBIDDEN])
+    assert (found.found, found.fix) == (error.found, error.cure)
+
+
+@pytest.mark.parametrize(("own", "shown"), [("check the robot", "check the robot"), ("", "ping ur5")])
+def test_the_error_of_an_arm_that_names_no_cure_gets_one(own: str, shown: str) -> None:
+    check = diagnosis.check_unreachable(StreamBroken("ur5:30004 was lost (x; y)", own), "ur5")
+    assert (check.found, check.fix) == ("ur5:30004 was lost (x; y)", shown)
+
+
+@pytest.mark.parametrize(("firmware", "state"), [("5.3.1.64192", "failed"), ("5.4.0", "ok"), ("3.15.8", "ok")])
+def test_a_polyscope_that_cannot_be_controlled(firmware: str, state: str) -> None:
+    check = diagnosis.check_arm(DeviceInfo("UR5e", "1", firmware))
+    assert check.state == state
+    assert ("PolyScope 5.4" in str(check.fix)) == (state == "failed")
+
+
+@pytest.mark.parametrize(
+    ("cause", "cure"),
+    [
+        (TimeoutError("timed out"), "ping ur5"),
+        (OSError(113, "No route to host"), "ping ur5"),
+        (ConnectionRefusedError(111, "Connection refused"), "enable RTDE"),
+        (gaierror(-2, "Name or service not known"), "IPv4 address"),
+    ],
+)
+def test_an_arm_that_is_not_reached(cause: OSError, cure: str) -> None:
+    error = Unreachable(f"ur5:30004 cannot be reached ({cause})", "check the address and the cable")
+    error.__cause__ = cause
+    check = diagnosis.check_unreachable(error, "ur5")
+    assert (check.name, check.state) == ("robot.reachable", "failed")
+    assert cure in str(check.fix)
+
+
+def test_what_a_dashboard_server_says_is_not_lost() -> None:
+    error = NoDashboard("ur5 says: Timeout connecting", "enable the dashboard server")
+    check = diagnosis.check_unreachable(error, "ur5")
+    assert (check.found, check.fix) == (error.found, error.cure)

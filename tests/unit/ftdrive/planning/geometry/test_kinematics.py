@@ -1,0 +1,76 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.ur.kinematics import MODELS, Array, forward
+from ftdrive.planning.geometry.kinematics import frames, inverse, wrist_inverse
+
+angles = st.lists(st.floats(-np.pi, np.pi), min_size=6, max_size=6)
+
+
+def random_joints(n: int) -> Array:
+    return np.random.default_rng(1).uniform(-np.pi, np.pi, (n, 6))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_flange_is_where_the_chain_of_links_puts_it(model: str) -> None:
+    q = random_joints(20)
+    found = frames(MODELS[model], q)
+    for i, one in enumerate(q):
+        pose = forward(MODELS[model], one)
+        assert np.allclose(found.R_base_flange[i], pose.R, atol=1e-12)
+        assert np.allclose(found.flange_m[i], pose.p_m, atol=1e-12)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_inverse_agrees_with_an_independent_one(model: str) -> None:
+    oracle = getattr(pytest.importorskip("ur_analytic_ik"), model.lower())
+    at = frames(MODELS[model], random_joints(100))
+    ours = inverse(MODELS[model], at.R_base_flange, at.flange_m)
+    for R, p, branches in zip(at.R_base_flange, at.flange_m, ours, strict=True):
+        pose = np.block([[R, p[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+        expected = np.array(oracle.inverse_kinematics(pose)).reshape(-1, 6)
+        found = branches[~np.isnan(branches[:, 0])]
+        apart = np.abs(np.exp(1j * expected[:, None]) - np.exp(1j * found)).max(axis=2)
+        assert len(expected) == len(found)
+        assert apart.min(axis=1).max() < 1e-6
+        assert apart.min(axis=0).max() < 1e-6
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_branch_of_the_inverse_reaches_the_pose(model: str) -> None:
+    q = random_joints(500)
+    at = frames(MODELS[model], q)
+    branches = inverse(MODELS[model], at.R_base_flange, at.flange_m)
+    row, branch = np.nonzero(~np.isnan(branches[:, :, 0]))
+    again = frames(MODELS[model], branches[row, branch])
+    assert np.abs(again.flange_m - at.flange_m[row]).max() < 1e-9
+    assert np.abs(again.R_base_flange - at.R_base_flange[row]).max() < 1e-9
+    one_is_the_start = np.nanmin(np.abs(np.exp(1j * branches) - np.exp(1j * q[:, None])).max(axis=2), axis=1)
+    assert one_is_the_start.max() < 1e-6
+
+
+def test_inverse_says_nothing_where_the_arm_does_not_reach() -> None:
+    too_far = inverse(MODELS["UR5e"], np.eye(3)[None], np.array([[1.5, 0.0, 0.3]]))
+    too_near = inverse(MODELS["UR5e"], np.eye(3)[None], np.array([[0.05, 0.0, 0.8]]))
+    assert np.isnan(too_far).all()
+    assert np.isnan(too_near).all()
+
+
+@given(angles)
+def test_the_wrist_alone_gives_the_orientation_in_two_ways(q: list[float]) -> None:
+    R = frames(MODELS["UR10e"], q).R_base_flange
+    found = wrist_inverse(q[:3], R)[0]
+    assert np.array_equal(found[:, :3], [q[:3], q[:3]])
+    assert np.allclose(frames(MODELS["UR10e"], found).R_base_flange, R, atol=1e-7)
+    assert found[0, 4] >= 0 >= found[1, 4]
+
+
+@pytest.mark.parametrize("q5", [0.0, np.pi])
+def test_where_axes_4_and_6_are_parallel_the_wrist_turns_with_axis_4(q5: float) -> None:
+    q = [0.3, -1.2, 0.8, 0.5, q5, 0.9]
+    R = frames(MODELS["UR3e"], q).R_base_flange
+    found = wrist_inverse(q[:3], R)[0]
+    assert np.array_equal(found[:, 5], [0, 0])
+    assert np.allclose(frames(MODELS["UR3e"], found).R_base_flange, R, atol=1e-12)

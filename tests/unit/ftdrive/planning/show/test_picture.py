@@ -1,0 +1,79 @@
+"""The picture of a plan: what is in it. How it looks is looked at by eye."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.motion import Speeds
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import guess_of, plan_tour
+from ftdrive.planning.show.picture import draw, title_of
+from ftdrive.planning.show.scene import BASE_PLANE, Box, Plane, Scene
+
+TUBE, LUMP = Cylinder(0.0, 0.2, 0.1), Cylinder(0.05, 0.15, 0.05, 0.08, 0.0)
+WALL, BOX = Plane((-1.0, 0.0, 0.0), -0.8), Box((0.5, 0.5, 0.0), (0.7, 0.7, 0.2))
+SLANTING = Plane((0.6, 0.48, 0.64), -0.9)
+
+
+def certifier_of(tool: tuple[Cylinder, ...] = (TUBE,), scene: Scene | None = None) -> Certifier:
+    return Certifier(ArmModel("ur5e", tool), scene or Scene())
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    certifier = certifier_of()
+    return plan_tour(certifier, poses=6, speeds=Speeds(), guess=guess_of(certifier))
+
+
+def test_title_tells_whether_the_whole_arm_moves(plan: Plan) -> None:
+    first, second, *others = plan.steps
+    moving = replace(plan, steps=(first, replace(second, q_rad=(0.5, *second.q_rad[1:])), *others))
+    title = title_of(plan, certifier_of(), on_its_way=False)
+    assert "stays in this ball" in title
+    assert "WHOLE ARM" not in title
+    assert "grey: arm, orange: tool" in title
+    title = title_of(moving, certifier_of(), on_its_way=True)
+    assert "all that moves" not in title
+    assert "WHOLE ARM moves" in title
+    assert "green" in title
+
+
+def test_what_cannot_be_drawn_is_named(plan: Plan) -> None:
+    shown = certifier_of(scene=Scene((BASE_PLANE, WALL)))
+    assert "not drawn" not in title_of(plan, shown, on_its_way=False)
+    slanting = certifier_of(scene=Scene((BASE_PLANE, WALL, SLANTING)))
+    assert "slanting planes (1)" in title_of(plan, slanting, on_its_way=False)
+
+
+def test_tool_surroundings_and_the_way_are_drawn(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    figures = pytest.importorskip("matplotlib.figure")
+    save, saved = figures.Figure.savefig, list[Any]()
+
+    def keep(figure: Any, *arguments: object, **options: object) -> None:
+        saved.append(figure)
+        save(figure, *arguments, **options)
+
+    monkeypatch.setattr(figures.Figure, "savefig", keep)
+    stands = np.array(plan.steps[0].q_rad) + np.radians([20, 0, 0, 0, 0, 0])
+    cases: list[tuple[Certifier, ArrayLike]] = [
+        (certifier_of(), ()),
+        (certifier_of((TUBE, LUMP)), ()),
+        (certifier_of(scene=Scene((BASE_PLANE, WALL), (BOX,))), ()),
+        (certifier_of(), np.array([stands, plan.steps[0].q_rad])),
+    ]
+    for i, (certifier, way_rad) in enumerate(cases):
+        draw(plan, certifier, tmp_path / f"{i}.png", way_rad)
+    areas = [[len(axes.patches) for axes in figure.axes] for figure in saved]
+    lines = [[len(axes.lines) for axes in figure.axes] for figure in saved]
+    assert np.subtract(areas[1], areas[0]).tolist() == [6, 6, 6]  # the lump at each pose
+    assert np.subtract(areas[2], areas[0]).tolist() == [1, 2, 2]  # the box, and the wall from its edge
+    assert np.subtract(lines[3], lines[0]).tolist() == [1, 1, 1]
+    assert [figure.axes[2].get_xlim()[1] > 0.8 for figure in saved] == [False, False, True, False]  # the wall is seen
+    with pytest.raises(FileExistsError, match="never overwritten"):
+        draw(plan, certifier_of(), tmp_path / "0.png")

@@ -1,0 +1,75 @@
+"""A plan in words."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from syrupy.assertion import SnapshotAssertion
+
+from ftdrive.planning.approach import arm_moves
+from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.motion import Speeds
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
+from ftdrive.planning.show.scene import Scene
+from ftdrive.planning.show.words import plan_in_words, room_in_words, turns_in_words, way_in_words
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    certifier = Certifier(ArmModel("ur5e", [Cylinder(0.0, 0.2, 0.1)]), Scene())
+    return plan_tour(certifier, speeds=Speeds(), guess=guess_of(certifier))
+
+
+def test_every_pose_range_and_figure_is_there(plan: Plan) -> None:
+    lines = plan_in_words(plan).split("\n")
+    rows = [line.split() for line in lines if line[:4].strip().isdecimal()]
+    assert [int(row[1]) for row in rows] == [step.number for step in plan.steps]
+    q_deg = np.degrees([step.q_rad[3:] for step in plan.steps])
+    np.testing.assert_allclose([[float(cell) for cell in row[2:5]] for row in rows], q_deg, atol=0.5)
+    ranges = {
+        line.split()[0]: [float(cell) for cell in line.split()[1:]] for line in lines if line[:4] in {"from", "to  "}
+    }
+    np.testing.assert_allclose([ranges["from"], ranges["to"]], [q_deg.min(axis=0), q_deg.max(axis=0)], atol=0.5)
+    words = "\n".join(lines)
+    for figure in (
+        "stay at 45, -100, 60",
+        "ball of 0.35 m around x -0.07, y -0.25, z 0.83 m",
+        "57 s of motion",
+        "Nearest: ",
+    ):
+        assert figure in words
+    assert f"mass {1e3 * plan.predicted['mass_kg']:.1f} g" in words
+
+
+def test_where_base_shoulder_and_elbow_move_the_room_is_that_of_the_whole_arm(plan: Plan) -> None:
+    assert "All that moves stays" in room_in_words(plan)
+    moved = replace(plan.steps[1], q_rad=(0.5, *plan.steps[1].q_rad[1:]))
+    moving = replace(plan, steps=(plan.steps[0], moved, *plan.steps[2:]))
+    assert "the whole arm moves" in room_in_words(moving)
+    assert "stay at 45" not in plan_in_words(moving)
+
+
+def test_a_plan_that_is_not_proven_does_not_look_proven(plan: Plan) -> None:
+    steps = (replace(plan.steps[0], certified=False), *plan.steps[1:])
+    assert "NOT ALL PROVEN" in plan_in_words(replace(plan, steps=steps))
+
+
+def test_what_the_poses_do_not_tell_is_no_crash(plan: Plan) -> None:
+    words = plan_in_words(
+        replace(plan, predicted={**plan.predicted, "mass_kg": None, "force_bias_N": [None, 0.1, 0.1]})
+    )
+    assert "mass nan g" in words
+
+
+def test_a_way_names_the_joints_and_the_range_each_turns_over(snapshot: SnapshotAssertion) -> None:
+    stands = USUAL_POSTURE_RAD
+    way = stands + np.radians([[0.0] * 6, [0.0, 30, 0, 10, 0, 0.3], [0.0, -20, 0, 10, 0, 0]])
+    assert turns_in_words(way) == "shoulder 50°, wrist 1 10°"
+    assert arm_moves(way)
+    assert way_in_words(way, 0.042) == snapshot
+    wrist = stands + np.radians([[0.0] * 6, [0.1, 0, 0, 91, 0, 0]])
+    assert not arm_moves(wrist)
+    assert way_in_words(wrist, 0.042) == snapshot
+    assert not arm_moves(np.zeros((0, 6)))

@@ -1,0 +1,93 @@
+"""Cells that cannot be: what is told to whom described one, and that nothing possible is refused."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from syrupy.assertion import SnapshotAssertion
+
+from ftdrive.cell.config import CellConfig, RobotConfig, Rows, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.errors import ConfigError
+from ftdrive.planning.cell_plan import box_from_mm, certifier_for, plane_from_mm, require_possible
+from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
+from ftdrive.planning.geometry.certify import Margins
+from ftdrive.planning.geometry.shapes import height_above, separation_from_box
+
+Row = Sequence[float]
+SHOULDER = 1
+
+
+def cell(planes: Sequence[Row] = (), boxes: Sequence[Row] = (), tool: Rows = ((0, 60, 90),)) -> CellConfig:
+    workcell = WorkcellConfig(planes_mm=tuple(map(tuple, planes)), boxes_mm=tuple(map(tuple, boxes)))
+    return CellConfig(RobotConfig(""), SensorConfig("", height_mm=33), ToolConfig(cylinders_mm=tool), workcell)
+
+
+@pytest.mark.parametrize(
+    ("plane", "named"),
+    [
+        ((1, 0, 0, 800), ["base", "[-1, 0, 0, -800]", "[1, 0, 0, -800]"]),  # both ways to mend it
+        ((0, 0, 1, 300), ["base", "[0, 0, -1, -300]", "[0, 0, 1, -300]"]),
+        ((0, 0, -1, 0), ["shoulder", "[0, 0, 1, 0]"]),
+        ((0, 0, -1, -100), ["shoulder", " 0 mm"]),  # a ceiling at its height
+        ((-1, 0, 0, -100), [" 12 mm", " 30 mm"]),
+    ],
+    ids=str,
+)
+def test_a_plane_with_the_arm_itself_on_its_wrong_side_is_named(
+    plane: Row, named: Sequence[str], snapshot: SnapshotAssertion
+) -> None:
+    with pytest.raises(ConfigError) as error:
+        certifier_for(cell(planes=[(0, 0, 1, -5), plane]), "ur5e")
+    assert [value for value in (str(list(plane)), *named) if value not in str(error.value)] == []
+    assert str(error.value) == snapshot
+
+
+@pytest.mark.parametrize("model", SHAPES)
+def test_usual_surroundings_are_possible(model: str) -> None:
+    table, sunk, walls = (0, 0, 1, 0), (0, 0, 1, 20), [(-1, 0, 0, -800), (0, 2, 0, -500), (0.6, 0, 0.8, -400)]
+    pedestal, block = (-500, -500, -700, 500, 500, 0), (300, 300, 0, 600, 600, 400)
+    require_possible(cell([table, sunk, *walls], [pedestal, block]), model)
+
+
+def test_a_box_around_the_arm_itself_is_named() -> None:
+    for box in ((-100, -100, 0, 100, 100, 300), (-400, -400, -10, 400, 400, 80)):
+        with pytest.raises(ConfigError, match=rf"the box \[{box[0]}, .* mm from the arm's shoulder"):
+            certifier_for(cell(boxes=[box]), "ur5e")
+
+
+def test_without_a_measured_shape_surroundings_are_not_judged() -> None:
+    for model in (None, "ur5"):
+        require_possible(cell(planes=[(1, 0, 0, 800)]), model)
+
+
+@given(
+    st.sampled_from(list(SHAPES)),
+    st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda normal: np.linalg.norm(normal) > 0.1),
+    st.floats(-400, 400),
+    st.tuples(*[st.floats(-400, 400)] * 6).filter(lambda box: all(abs(box[i] - box[i + 3]) > 1 for i in range(3))),
+)
+def test_refused_is_just_what_the_shoulder_is_never_clear_of(
+    model: str, normal: tuple[float, ...], place: float, box: tuple[float, ...]
+) -> None:
+    """By the bodies and distances that judge moves."""
+    arm = ArmModel(model, [Cylinder(0.0, 0.06, 0.09)])
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (40, 6))
+    shoulder = arm.bodies(q)[np.arange(40), np.full(40, SHOULDER)]
+    plane, block = plane_from_mm((*normal, place)), box_from_mm(box)
+    to_plane = height_above(shoulder, np.array(plane.normal), plane.offset_m).max()
+    to_box = separation_from_box(shoulder, np.array(block.low_m), np.array(block.high_m)).max()
+    for described, distance_m in ((cell(planes=[(*normal, place)]), to_plane), (cell(boxes=[box]), to_box)):
+        try:
+            require_possible(described, model)
+        except ConfigError:
+            assert distance_m < Margins().scene_m
+        else:
+            assert distance_m > 0
+
+
+def test_a_tool_that_ends_before_its_sensor_is_refused() -> None:
+    require_possible(cell(tool=((0, 20, 80), (20, 33, 80))), "ur5e")
+    with pytest.raises(ConfigError, match=r"20 mm .* 33 mm"):
+        certifier_for(cell(tool=((0, 20, 10),)), "ur5e")

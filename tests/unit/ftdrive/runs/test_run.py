@@ -1,0 +1,131 @@
+"""A run folder that is damaged or incomplete: the file is named, with what to do; and what to type to go on with it."""
+
+import json
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.errors import BadDataset
+from calib.routine import PoseRecord, TourPose
+from drivers.interfaces import FtSamples
+from ftdrive.runs.run import Reading, Run
+
+CONFIG = {"robot": {"host": "10.0.0.2"}, "sensor": {"url": "ati-can://can0"}, "tool": {"mass_kg": None, "later": 1}}
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    """One of one pose."""
+    run = Run.create(tmp_path, "calibrate", {"mode": "auto", "config": CONFIG, "devices": {"arm": {"serial": "1"}}})
+    reading = Reading(0, np.zeros(6), np.eye(3))
+    n = 20
+    samples = FtSamples(
+        np.arange(n),
+        np.full(n, np.nan),
+        np.arange(n),
+        np.zeros((n, 0), np.int32),
+        np.zeros((n, 6)),
+        np.zeros(n, np.uint32),
+    )
+    run.commit(PoseRecord(1, TourPose(1, np.zeros(6)), reading, reading, samples, steady=True))
+    return run
+
+
+def edit(run: Run, change: Callable[[dict[str, Any]], object]) -> None:
+    path = run.folder / "run.json"
+    header = json.loads(path.read_text())
+    change(header)
+    path.write_text(json.dumps(header))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda header: header.pop("devices"), r"has no 'devices'.*from a copy"),
+        (lambda header: header.update(devices=[1]), r"'devices' is \[1\].*from a copy"),
+        (lambda header: header["devices"].pop("arm"), r"has no 'arm'.*from a copy"),
+        (lambda header: header["devices"]["arm"].clear(), r"has no 'serial'.*from a copy"),
+        (lambda header: header["devices"]["arm"].update(serial=5), r"'devices\.arm\.serial' is 5.*from a copy"),
+        (lambda header: header.update(mode=5), r"'mode' is 5 and not one of auto, step.*from a copy"),
+        (lambda header: header.update(mode=["auto"]), r"'mode' is \['auto'\].*from a copy"),
+        (lambda header: header.update(said=5), r"'said' is 5 and not an object.*from a copy"),
+        (lambda header: header.update(said={"robot": 5}), r"'said\.robot' is 5 and not a text or null.*from a copy"),
+        (lambda header: header.update(said={"config": ["a"]}), r"'said\.config' is \['a'\].*from a copy"),
+        (
+            lambda header: header.update(said={"tool": "0:60:90"}),
+            r"'said\.tool' is '0:60:90' and not a list.*from a copy",
+        ),
+        (lambda header: header.update(said={"tool": [5]}), r"'said\.tool' is \[5\].*from a copy"),
+        (lambda header: header.update(station=["can"]), r"'station' is \['can'\] and not an object.*from a copy"),
+        (lambda header: header.update(station={"sensor": 5}), r"'station\.sensor' is 5 and not a text.*from a copy"),
+        (
+            lambda header: header.update(station={"options": "x"}),
+            r"'station\.options' is 'x' and not a list.*from a copy",
+        ),
+        (lambda header: header["config"].update(robot=["10.0.0.2"]), r"'config' is .* and not an object.*from a copy"),
+        (lambda header: header.update(config=5), r"'config' is 5.*from a copy"),
+        (lambda header: header["config"]["robot"].update(host=5), r"\[robot\] host = 5 is not a text"),
+        (lambda header: header["config"]["robot"].clear(), r"has no 'host'.*from a copy"),
+        (lambda header: header.pop("format"), "not an ftdrive.run file"),
+    ],
+)
+def test_a_damaged_header_names_its_file_and_what_is_wrong(
+    change: Callable[[dict[str, Any]], object], words: str, run: Run
+) -> None:
+    run.plan_path.touch()
+    edit(run, change)
+    with pytest.raises(BadDataset, match=rf"run\.json.*{words}"):
+        assert run.header_to_resume()["devices"]["arm"]["serial"]
+
+
+def test_a_header_that_is_no_json_names_its_file(run: Run) -> None:
+    (run.folder / "run.json").write_text('{"format": "ftd')
+    with pytest.raises(BadDataset, match=r"run\.json: .*JSON"):
+        run.header()
+
+
+def test_what_a_later_version_keeps_is_left_out(run: Run) -> None:
+    assert run.header()["config"]["tool"] == {"mass_kg": None}
+
+
+@pytest.mark.parametrize("mode", ["auto", "step"])
+def test_without_its_plan_a_run_cannot_go_on_and_says_how_to_solve_it(mode: str, run: Run) -> None:
+    edit(run, lambda header: header.update(mode=mode))
+    with pytest.raises(BadDataset, match=r"plan\.json .*ftdrive solve "):
+        run.header_to_resume()
+    edit(run, lambda header: header.update(mode="manual"))
+    assert run.header_to_resume()["mode"] == "manual"
+
+
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.9])
+def test_a_recording_that_was_cut_is_named(part: float, run: Run) -> None:
+    path = run.folder / "poses" / "01.npz"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(part * len(whole))])
+    with pytest.raises(BadDataset, match=r"01\.npz .*--resume"):
+        run.records()
+
+
+def test_a_recording_that_lacks_something_is_named(run: Run) -> None:
+    path = run.folder / "poses" / "01.npz"
+    with np.load(path) as file:
+        data = {name: file[name] for name in file.files if name != "steady"}
+    with path.open("wb") as kept:
+        np.savez(kept, **data)
+    with pytest.raises(BadDataset, match=r"01\.npz .*'steady'"):
+        run.records()
+
+
+def test_a_file_of_somebody_else_is_no_pose(run: Run) -> None:
+    (run.folder / "poses" / "copy of 01.npz").touch()
+    assert run.stops() == [1]
+
+
+def test_what_is_to_be_typed_survives_the_shell(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "my $HOME 'runs'", "calibrate", {})
+    assert shlex.split(run.resume_command) == ["ftdrive", "calibrate", "--resume", str(run.folder)]
+    assert shlex.split(run.solve_command) == ["ftdrive", "solve", str(run.folder)]

@@ -1,0 +1,57 @@
+"""How fast a plan is driven, and how long it takes."""
+
+import numpy as np
+import pytest
+
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.planning.approach import plan_approach
+from ftdrive.planning.cell_plan import speeds_of
+from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.motion import Speeds, move_duration_s
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
+from ftdrive.planning.show.scene import BASE_PLANE, Scene
+from ftdrive.session.forecast import at_most, moves_s
+from ftdrive.session.tour import APPROACH_RAD_S, SLOW
+
+
+@pytest.fixture(scope="module")
+def certifier() -> Certifier:
+    return Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene((BASE_PLANE,)))
+
+
+@pytest.fixture(scope="module")
+def plan(certifier: Certifier) -> Plan:
+    return plan_tour(certifier, USUAL_POSTURE_RAD, 24, speeds=Speeds(), guess=guess_of(certifier))
+
+
+def test_the_whole_tour_takes_as_long_as_the_plan_says_and_the_approach(certifier: Certifier, plan: Plan) -> None:
+    first = np.array(plan.steps[0].q_rad)
+    away = first + np.radians([0, 0, 0, 0, 0, 30.0])
+    approach = plan_approach(certifier, away, first, SLOW)
+    total_s = moves_s(plan, range(1, 26), away, approach)
+    approach_s = float(move_duration_s(np.radians(30.0), APPROACH_RAD_S, SLOW.joint_rad_s2))
+    assert total_s == pytest.approx(plan.to_dict()["motion_time_s"] + approach_s)
+
+
+def test_the_rest_of_a_tour_counts_what_is_left_and_the_ways_past_what_is_not(certifier: Certifier, plan: Plan) -> None:
+    third = np.array(plan.steps[2].q_rad)
+    there = plan_approach(certifier, third, third, SLOW)
+    one = plan.steps[2].duration_s
+    assert moves_s(plan, [3, 4], third, there) == pytest.approx(moves_s(plan, [3], third, there) + one)
+    past = np.abs(np.subtract(plan.steps[8].q_rad, plan.steps[2].q_rad)).max()
+    expected_s = float(move_duration_s(past, APPROACH_RAD_S, SLOW.joint_rad_s2))
+    assert moves_s(plan, [3, 9], third, there) - moves_s(plan, [3], third, there) == pytest.approx(expected_s)
+
+
+def test_limits_in_force_slow_a_plan_down_and_never_speed_it_up(certifier: Certifier, plan: Plan) -> None:
+    slow = at_most(plan, certifier, Speeds(0.2, 0.3, 0.1))
+    assert max(step.speed_rad_s for step in slow.steps) <= 0.2
+    assert slow.acceleration_rad_s2 == 0.3
+    assert at_most(slow, certifier, Speeds()) == slow
+
+
+def test_not_even_the_settings_of_an_old_run_go_faster_than_allowed() -> None:
+    robot = RobotConfig("fake", speed_deg_s=180.0, acceleration_deg_s2=80.0, tip_speed_mm_s=1000.0)
+    assert speeds_of(CellConfig(robot, SensorConfig("fake://"))) == Speeds()

@@ -1,0 +1,608 @@
+"""Poses that somebody else moves the arm to: which are taken, what is told, when it ends. The clock is simulated."""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import solve
+from calib.errors import TooFewSamples
+from calib.model import Array
+from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
+from drivers.errors import DeviceFault, DeviceTimeout, StreamBroken
+from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
+from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
+from ftdrive.session.hand_guided import collect_manually
+from ftdrive.session.operator import Key, Question
+from tests.fake_clock import FakeClock
+from tests.unit.ftdrive.fake_cell import STATUS
+
+RATE_HZ = 200
+MOVE_S = 1.5
+NOISE = np.repeat([0.05, 0.002], 3)
+BIAS = np.array([3.0, -2.0, 1.0, 0.1, -0.2, 0.3])
+COM_M = np.array([0.0, 0.01, 0.06])
+AVERAGE_S = 2.0
+FLOOR = np.array([0.0, 0.0, -1.0])
+
+UP, DOWN, LEFT, RIGHT, FRONT, BACK = (
+    Rotation.from_euler("xyz", angles, degrees=True)
+    for angles in ((0, 0, 0), (180, 0, 20), (90, 0, 0), (-90, 0, 40), (0, 90, 0), (0, -90, 10))
+)
+AROUND = [UP, DOWN, LEFT, RIGHT, FRONT, BACK]
+
+
+@dataclass(frozen=True)
+class Dwell:
+    """A place where the arm is held."""
+
+    at: Rotation
+    seconds: float = 4.0
+    creep_rad_s: float = 0.0
+    wrench: Callable[[Array], Array] = lambda t: np.zeros((len(t), 6))
+    """What else acts on the sensor, by the time in the dwell."""
+
+
+def status(program: str = "playing", fault: DeviceFault | None = None) -> ArmStatus:
+    return replace(STATUS, program=program, fault=fault)
+
+
+class Cell(ForceTorqueSensor):
+    """An arm that somebody moves from dwell to dwell, and its sensor; both make time pass."""
+
+    def __init__(self, dwells: Sequence[Dwell]) -> None:
+        self.dwells = dwells
+        self.clock = FakeClock()
+        self.clock.ns = 0
+        self.rng = np.random.default_rng(1)
+        self.rate_Hz = RATE_HZ
+        self.says: Callable[[float], ArmStatus] = lambda _: status()
+        self.fails: dict[str, float] = {}
+        self.recover = False
+        self.unplugged_s = np.inf
+        self.back_s = 0.0
+        self.away_s = 0.3
+        self.silent_s = (np.inf, np.inf)
+        self.events: tuple[tuple[int, str], ...] = ()
+        starts = np.cumsum([0.0, *(dwell.seconds + MOVE_S for dwell in dwells)])
+        self.starts, self.end_s = starts[:-1], float(starts[-1]) - MOVE_S
+
+    @property
+    def now_s(self) -> float:
+        return self.clock.now_s()
+
+    @now_s.setter
+    def now_s(self, t_s: float) -> None:
+        self.clock.ns = round(t_s * 1e9)
+
+    def _where(self, t_s: float) -> tuple[Rotation, float, int]:
+        """Orientation, joint speed, dwell."""
+        k = int(np.searchsorted(self.starts, t_s, side="right")) - 1
+        dwell, into_s = self.dwells[k], t_s - self.starts[k]
+        if into_s <= dwell.seconds or k == len(self.dwells) - 1:
+            turned = Rotation.from_rotvec([dwell.creep_rad_s * into_s, 0, 0])
+            return dwell.at * turned, dwell.creep_rad_s, k
+        way = (self.dwells[k + 1].at * dwell.at.inv()).as_rotvec()
+        return Rotation.from_rotvec(way * (into_s - dwell.seconds) / MOVE_S) * dwell.at, 0.7, k
+
+    def _may_fail(self, what: str) -> None:
+        if self.now_s >= self.fails.get(what, np.inf):
+            raise ConnectionError(what)
+
+    def state(self) -> ArmState:
+        self.now_s += 0.002
+        assert self.now_s < self.end_s + 100, "it should have ended"
+        self._may_fail("arm")
+        if self.silent_s[0] < self.now_s < self.silent_s[1]:
+            self.now_s += 0.2
+            raise DeviceTimeout("its clock has stood still", "press the emergency stop if the arm moves")
+        R, speed, _ = self._where(self.now_s)
+        return ArmState(
+            t_host_ns=round(self.now_s * 1e9),
+            t_device_s=self.now_s,
+            q_rad=R.as_rotvec().repeat(2),
+            qd_rad_s=np.array([0, 0, 0, -speed, 0, 0]),
+            R_base_flange=R.as_matrix(),
+            p_base_flange_m=np.zeros(3),
+        )
+
+    def status(self) -> ArmStatus:
+        return self.says(self.now_s)
+
+    def open(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def identify(self) -> DeviceInfo:
+        raise AssertionError
+
+    def latest(self, *, timeout_s: float) -> FtSamples:
+        raise AssertionError(timeout_s)
+
+    def collect(self, duration_s: float) -> FtSamples:
+        t = self.now_s + np.arange(max(1, round(duration_s * self.rate_Hz))) / self.rate_Hz
+        self.now_s += duration_s
+        self._may_fail("sensor")
+        if self.now_s > self.unplugged_s:
+            self.back_s, self.unplugged_s = self.now_s + self.away_s, np.inf
+            self.events = ((17, "a cable came off"), (18, "connected again"))
+            raise StreamBroken("interrupted, connecting again")
+        wrench = []
+        for some in np.array_split(t, max(1, len(t) // 20)):  # the arm stands still for a tenth of a second each time
+            R, _, k = self._where(some[0])
+            force = R.inv().apply([0, 0, -12.0])
+            load = np.concatenate([force, np.cross(COM_M, force)])
+            wrench.append(load + self.dwells[k].wrench(some - self.starts[k]))
+        n = len(t)
+        return FtSamples(
+            t_host_ns=np.round(t * 1e9).astype(np.int64),
+            t_device_s=np.full(n, np.nan),
+            seq=np.arange(n),
+            counts=np.zeros((n, 0), np.int32),
+            wrench=np.concatenate(wrench) + BIAS + self.rng.normal(size=(n, 6)) * NOISE,
+            status=np.zeros(n, np.uint32),
+        )
+
+    def check(self) -> None:
+        if self.now_s < self.back_s:
+            self.now_s += 0.1
+            raise StreamBroken("interrupted, connecting again")
+
+    def health(self) -> Health:
+        return Health(0, 0, 0, RATE_HZ, 0.0, events=self.events)
+
+
+class Person:
+    """Hears everything, presses keys at given times, and q a while after the arm's last dwell."""
+
+    def __init__(self, cell: Cell, keys: dict[float, Key], *, has_keys: bool = True) -> None:
+        self.cell = cell
+        self.has_keys = has_keys
+        self.keys = keys | {cell.end_s + 20: Key.STOP}
+        self.told: list[Event] = []
+
+    def tell(self, event: Event) -> None:
+        self.told.append(event)
+
+    def ask(self, question: Question) -> str:
+        raise AssertionError(question)
+
+    def pressed(self) -> Key | None:
+        if not self.has_keys:
+            assert self.cell.now_s < self.cell.end_s + 20, "it should have ended"
+            return None
+        due = min(self.keys)
+        return self.keys.pop(due) if self.cell.now_s >= due else None
+
+    def words(self) -> str:
+        return "\n".join(event.words for event in self.told if isinstance(event, Noted))
+
+
+@dataclass
+class Fit:
+    """Turns green with the sixth pose."""
+
+    poses: dict[int, PoseRecord] = field(default_factory=dict)
+    residual: tuple[float, float] | None = None
+
+    def add(self, record: PoseRecord) -> Estimated:
+        self.poses[record.stop] = record
+        green = len(self.poses) >= 6
+        return Estimated(
+            poses=len(self.poses),
+            values={},
+            sigma={},
+            residual_sigma=self.residual and self.residual[0],
+            residual_force_N=self.residual and self.residual[1],
+            faces=(0, 0, 0, 0, 0, 0),
+            cond9=1.0,
+            cond_u1=1.0,
+            empty_cap_deg=1.0,
+            light="green" if green else "amber",
+            hint="" if green else "point it down",
+        )
+
+
+class Outcome:
+    """What a collection leaves."""
+
+    def __init__(
+        self,
+        dwells: Sequence[Dwell],
+        *,
+        listen: bool = False,
+        keys: dict[float, Key] | None = None,
+        earlier: Sequence[PoseRecord] = (),
+        says: Callable[[float], ArmStatus] | None = None,
+        fit: Fit | None = None,
+        has_keys: bool = True,
+        raises: Any = None,
+        **cell: Any,
+    ) -> None:
+        self.cell = Cell(dwells)
+        self.cell.says = says or self.cell.says
+        for name, value in cell.items():
+            setattr(self.cell, name, value)
+        self.person = Person(self.cell, keys or {}, has_keys=has_keys)
+        self.fit = fit or Fit()
+        self.kept: list[PoseRecord] = []
+
+        def collect() -> None:
+            sampling = Sampling(average_s=AVERAGE_S, attempts=3)
+            collect_manually(
+                self.cell,
+                self.cell,
+                sampling,
+                self.person,
+                self.fit.add,
+                self._commit,
+                down_base=FLOOR,
+                listen=listen,
+                earlier=earlier,
+                clock=self.cell.clock,
+            )
+
+        if raises is None:
+            collect()
+        else:
+            with raises:
+                collect()
+
+    def _commit(self, record: PoseRecord) -> None:
+        self.kept.append(record)
+        self.person.told.append(Noted(words=f"committed {record.stop}"))
+
+    @property
+    def stops(self) -> list[int]:
+        return [record.stop for record in self.kept]
+
+
+def dwells(*at: Rotation, seconds: float = 4.0) -> list[Dwell]:
+    return [Dwell(one, seconds) for one in at]
+
+
+def test_every_standstill_at_a_new_orientation_is_a_pose() -> None:
+    outcome = Outcome(dwells(*AROUND))
+    assert outcome.stops == [1, 2, 3, 4, 5, 6]
+    for record, expected in zip(outcome.kept, AROUND, strict=True):
+        np.testing.assert_allclose(record.before.R_base_flange, expected.as_matrix(), atol=1e-9)
+        assert record.steady
+        assert len(record.samples.wrench) == AVERAGE_S * RATE_HZ
+        assert record.samples.t_host_ns[0] * 1e-9 >= outcome.cell.starts[record.stop - 1] + 1.0  # still for a second
+    dataset = dataset_from(outcome.kept, {})
+    assert len(dataset) == 6  # none is taken for the return to the first
+    result = solve(dataset)
+    assert np.abs(result.force_bias_N - BIAS[:3]).max() < 4 * np.max(result.sigma["force_bias_N"])
+
+
+def test_a_pose_is_on_disk_before_it_is_told() -> None:
+    told = Outcome(dwells(UP, DOWN)).person.told
+    kinds = [
+        event.words if isinstance(event, Noted) else event.state.value if isinstance(event, StateChanged) else "pose"
+        for event in told
+        if not isinstance(event, Estimated)
+    ]
+    one = ["settle", "sample", "committed 1", "pose", "move"]
+    assert kinds[1:-1] == ["move", *one, *(words.replace("1", "2") for words in one)]
+    taken = next(event for event in told if isinstance(event, PoseTaken))
+    np.testing.assert_allclose(taken.gravity_flange, [0, 0, -1])
+    assert 1.0 <= taken.settle_s < 1.15
+    assert taken.attempts == 1
+    estimates = [event for event in told if isinstance(event, Estimated)]
+    assert [event.hint for event in estimates] == ["point it down"] * 2
+
+
+def test_an_arm_that_hardly_rests_or_creeps_is_not_measured() -> None:
+    outcome = Outcome([Dwell(UP, 0.9), Dwell(LEFT, 30, creep_rad_s=0.0019), Dwell(DOWN, 0.5), Dwell(FRONT)])
+    assert outcome.stops == [1]
+    np.testing.assert_allclose(outcome.kept[0].before.R_base_flange, FRONT.as_matrix(), atol=1e-9)
+
+
+def test_an_arm_that_moves_off_while_measured_is_told_how_long_to_wait() -> None:
+    outcome = Outcome([*dwells(UP, seconds=2.0), *dwells(DOWN)])
+    assert outcome.stops == [1]
+    assert "moved while pose 1" in outcome.person.words()
+
+
+@pytest.mark.parametrize("turn_deg", [2.0, 9.0])
+def test_a_repeat_is_told_once_and_left_out(turn_deg: float) -> None:
+    near = Rotation.from_euler("y", turn_deg, degrees=True)
+    nudged = near * Rotation.from_euler("x", 0.5, degrees=True)
+    outcome = Outcome(dwells(UP, DOWN, near, nudged, LEFT))
+    assert outcome.stops == [1, 2, 3]
+    assert outcome.person.words().count(f"This is pose 1 again, {turn_deg:.0f}° from it") == 1
+
+
+def test_a_repeat_once_the_poses_are_enough_names_the_key_that_finishes() -> None:
+    near = Rotation.from_euler("y", 5.0, degrees=True)
+    outcome = Outcome(dwells(UP, near, DOWN, LEFT, RIGHT, FRONT, BACK, near), keys={40.0: Key.KEEP})
+    told = [words for words in outcome.person.words().splitlines() if words.startswith("This is pose 1 again")]
+    left_out = "This is pose 1 again, 5° from it: it is left out."
+    assert [words.startswith(left_out) for words in told] == [True, True]
+    assert ["Press k" in words for words in told] == [False, True]
+
+
+def test_a_quarter_turn_about_gravity_is_no_repeat() -> None:
+    assert Outcome(dwells(UP, Rotation.from_euler("z", 90, degrees=True))).stops == [1, 2]
+
+
+def test_keep_ends_it_when_the_poses_are_enough_and_not_before() -> None:
+    outcome = Outcome(dwells(*AROUND, Rotation.from_euler("x", 45, degrees=True)), keys={8.0: Key.KEEP, 32.0: Key.KEEP})
+    words = outcome.person.words()
+    assert "The light is amber" in words
+    assert words.count("press k to finish") == 1
+    moves = [event.words for event in outcome.person.told if isinstance(event, StateChanged) and event.words]
+    move_on = "move on to another orientation"
+    assert moves[:5] == [move_on] * 5
+    assert "press k" in moves[5]  # the screen says so all the time
+    assert outcome.person.told[-1].to_dict()["words"] == "Finished: 6 poses are kept."
+    assert outcome.cell.now_s == pytest.approx(32.0, abs=0.2)
+
+
+def test_stop_ends_it_at_any_time_and_says_what_is_missing() -> None:
+    outcome = Outcome(dwells(UP, DOWN), keys={5.0: Key.STOP})
+    last = outcome.person.told[-1]
+    assert isinstance(last, Noted)
+    assert last.warning
+    assert last.words.startswith("Stopped: 1 pose is kept")
+    assert "amber" in last.words
+
+
+TILTED = [Rotation.from_euler("xyz", angles, degrees=True) for angles in ((45, 0, 0), (0, 45, 0))]
+
+
+def test_without_keys_it_ends_by_itself_when_the_poses_are_enough() -> None:
+    outcome = Outcome(dwells(*AROUND, *TILTED), has_keys=False)
+    assert outcome.stops == [1, 2, 3, 4, 5, 6]
+    assert "ends by itself" in outcome.person.words()
+    assert "6 poses are kept." in outcome.person.words()
+    assert "press" not in outcome.person.words()
+
+
+def test_without_keys_it_does_not_end_with_a_pose_that_is_in_doubt() -> None:
+    def shaken(t: Array) -> Array:
+        return np.outer(np.sin(40 * t), [8, 0, 0, 0, 0, 0])
+
+    poses = dwells(*AROUND, *TILTED)
+    poses[5] = Dwell(AROUND[5], 12.0, wrench=shaken)
+    outcome = Outcome(poses, has_keys=False)
+    assert [record.steady for record in outcome.kept] == [True] * 5 + [False, True]
+    assert "It is kept and marked." in outcome.person.words()
+    assert "press" not in outcome.person.words()
+
+
+def test_a_run_that_is_continued_without_keys_takes_one_pose_more() -> None:
+    first = Outcome(dwells(*AROUND), has_keys=False)
+    outcome = Outcome(dwells(*TILTED), earlier=first.kept, has_keys=False)
+    assert outcome.stops == [7]
+    assert "ends with the next" in outcome.person.words()
+
+
+def test_redo_replaces_the_newest_pose_where_the_arm_stands_or_goes() -> None:
+    there = Outcome(dwells(UP, DOWN, LEFT, seconds=8.0), keys={14.5: Key.REDO})
+    assert there.stops == [1, 2, 2, 3]
+    np.testing.assert_array_equal(there.kept[1].before.R_base_flange, there.kept[2].before.R_base_flange)
+    elsewhere = Outcome(dwells(UP, DOWN, LEFT), keys={9.8: Key.REDO})
+    assert elsewhere.stops == [1, 2, 2]
+    np.testing.assert_allclose(elsewhere.fit.poses[2].before.R_base_flange, LEFT.as_matrix(), atol=1e-9)
+
+
+def test_skip_and_pause() -> None:
+    skipped = Outcome(dwells(UP, DOWN, LEFT), keys={6.0: Key.SKIP})
+    assert [r.before.R_base_flange[2, 2].round(3) for r in skipped.kept] == [1.0, 0.0]
+    paused = Outcome(dwells(UP, DOWN, LEFT), keys={5.0: Key.PAUSE, 10.9: Key.PAUSE})
+    assert [r.before.R_base_flange[2, 2].round(3) for r in paused.kept] == [1.0, 0.0]
+
+
+def test_keys_pressed_while_a_pose_is_averaged_mean_what_is_shown_then() -> None:
+    redone = Outcome(dwells(UP, DOWN, LEFT), keys={7.5: Key.REDO})  # pose 1 is shown, pose 2 is averaged
+    assert redone.stops == [1, 1, 2]
+    np.testing.assert_allclose(redone.fit.poses[1].before.R_base_flange, DOWN.as_matrix(), atol=1e-9)
+    skipped = Outcome(dwells(UP, DOWN, LEFT), keys={7.5: Key.SKIP})
+    assert [r.before.R_base_flange[2, 2].round(3) for r in skipped.kept] == [1.0, 0.0]
+    paused = Outcome(dwells(UP, DOWN), keys={7.5: Key.PAUSE})
+    assert paused.stops == [1]
+
+
+@pytest.mark.parametrize("listen", [False, True])
+def test_a_pose_that_is_done_with_is_no_longer_measured_on_the_screen(listen: bool) -> None:
+    told = Outcome(dwells(UP, DOWN, UP), listen=listen).person.told
+    after = False
+    for event in told:
+        if isinstance(event, StateChanged):
+            assert not after or (event.state is State.MOVE and event.words)
+            after = False
+        after |= isinstance(event, PoseTaken) or (isinstance(event, Noted) and "left out" in event.words)
+    words = [event.words for event in told if isinstance(event, StateChanged) and event.words]
+    assert words == (["the program goes on"] if listen else ["move on to another orientation"]) * 3
+
+
+def test_a_sensor_that_recovers_is_waited_for_and_what_it_went_through_is_told_once() -> None:
+    outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), recover=True, unplugged_s=9.5)  # while pose 2 is averaged
+    assert outcome.stops == [1, 2, 3]
+    assert outcome.person.words().count("a cable came off") == 1
+    assert outcome.person.words().count("connected again") == 1
+    outcome = Outcome(dwells(UP, DOWN), unplugged_s=8.0, raises=pytest.raises(StreamBroken))
+    assert outcome.stops == [1]
+    assert "a cable came off" in outcome.person.words()
+
+
+def test_a_sensor_that_comes_back_within_12_s_is_waited_for() -> None:
+    outcome = Outcome(dwells(UP, DOWN), recover=True, unplugged_s=8.0, away_s=11.7)
+    assert outcome.stops == [1, 2]
+
+
+@pytest.mark.parametrize("away_s", [12.5, 1e9])
+def test_a_sensor_that_does_not_come_back_ends_it(away_s: float) -> None:
+    outcome = Outcome(
+        dwells(UP, DOWN), recover=True, unplugged_s=8.0, away_s=away_s, raises=pytest.raises(StreamBroken)
+    )
+    assert outcome.stops == [1]
+
+
+@pytest.mark.parametrize("listen", [False, True])
+@pytest.mark.parametrize("since_s", [4.5, 6.3, 8.2])  # on the way, before and while pose 2 is averaged
+def test_an_arm_that_is_silent_for_a_second_is_waited_for(since_s: float, listen: bool) -> None:
+    outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), silent_s=(since_s, since_s + 1.0), listen=listen)
+    assert [r.before.R_base_flange[2, 2].round(3) for r in outcome.kept] == [1.0, -1.0, 0.0]
+    words = "Nothing is measured until the arm is heard again: its clock has stood still."
+    assert outcome.person.words().count(words) == 1
+
+
+def test_an_arm_that_is_heard_again_within_12_s_is_waited_for() -> None:
+    assert Outcome(dwells(UP, DOWN), silent_s=(8.0, 19.7)).stops == [1, 2]
+
+
+@pytest.mark.parametrize("again_s", [21.6, np.inf])
+def test_an_arm_that_stays_silent_ends_it(again_s: float) -> None:
+    outcome = Outcome(dwells(UP, DOWN), silent_s=(8.0, again_s), raises=pytest.raises(DeviceTimeout))
+    assert outcome.stops == [1]
+
+
+def trembling(t: Array) -> Array:
+    """A hand on the tool for the first 3 s."""
+    force = np.zeros((len(t), 6))
+    force[:, 1] = 2.0 * np.sin(40 * t) * (t < 3.0)
+    return force
+
+
+def test_a_hand_on_the_tool_is_named_and_the_pose_taken_again() -> None:
+    outcome = Outcome([Dwell(UP), Dwell(DOWN, 9.0, wrench=trembling), Dwell(LEFT)])
+    assert outcome.stops == [1, 2, 3]
+    assert all(record.steady for record in outcome.kept)
+    words = outcome.person.words()
+    assert re.search(r"fy scatters by 1\.\d N, .* 0\.0[45]", words)
+    assert "Let go of" in words
+    assert [event.attempts for event in outcome.person.told if isinstance(event, PoseTaken)] == [1, 2, 1]
+    assert np.abs(outcome.kept[1].mean.mean[1] - BIAS[1]) < 0.05  # without the hand
+
+
+def test_a_pose_that_is_never_quiet_is_kept_and_marked() -> None:
+    outcome = Outcome([Dwell(UP), Dwell(DOWN, 15.0, wrench=lambda t: trembling(t - 100)), Dwell(LEFT)])
+    assert [record.steady for record in outcome.kept] == [True, False, True]
+    assert "press r to take" in outcome.person.words()
+
+
+def test_a_mean_that_changes_is_seen_at_the_first_pose_too() -> None:
+    outcome = Outcome([Dwell(UP, 30.0, wrench=lambda t: np.outer(np.minimum(t, 5.0), np.full(6, 0.2)))])
+    assert "its mean still changes" in outcome.person.words()
+    assert outcome.kept[-1].steady
+
+
+@pytest.mark.parametrize(
+    ("residual", "asked"), [((40.0, 3.2), True), ((40.0, 0.1), False), ((3.0, 3.2), False), (None, False)]
+)
+def test_a_pose_that_the_others_contradict_is_asked_about(residual: tuple[float, float] | None, asked: bool) -> None:
+    words = Outcome(dwells(*AROUND), fit=Fit(residual=residual)).person.words()
+    assert ("Pose 6 is 3.2 N" in words) == asked
+    assert "Pose 5 is" not in words  # too few to tell
+
+
+def test_nothing_is_measured_while_the_controller_reports_a_fault() -> None:
+    def says(t: float) -> ArmStatus:
+        return status("stopped", DeviceFault("protective stop", "clear it at the pendant") if 4.5 < t < 10.9 else None)
+
+    outcome = Outcome(dwells(UP, DOWN, LEFT), says=says)
+    assert [r.before.R_base_flange[2, 2].round(3) for r in outcome.kept] == [1.0, 0.0]
+    assert outcome.person.words().count("Nothing is measured: protective stop") == 1
+
+
+def test_a_run_is_continued_where_it_was() -> None:
+    first = Outcome(dwells(*AROUND[:3]))
+    second = Outcome(dwells(DOWN, *AROUND[3:]), earlier=first.kept)
+    assert second.stops == [4, 5, 6]
+    assert "This is pose 2 again" in second.person.words()
+    assert "These poses are enough" in second.person.words()
+    assert len(dataset_from([*first.kept, *second.kept], {})) == 6
+
+
+# ------------------------------------------------------------------ listening to a program
+
+
+def test_listening_ends_when_the_program_is_back_at_its_first_pose() -> None:
+    outcome = Outcome(dwells(*AROUND, UP, DOWN), listen=True)
+    assert outcome.stops == [1, 2, 3, 4, 5, 6, 7]
+    assert outcome.cell.now_s < outcome.cell.starts[-1]
+    drift = drift_check(outcome.kept)
+    assert drift is not None
+    assert drift.elapsed_s == pytest.approx(6 * (4.0 + MOVE_S), abs=0.5)
+    assert len(dataset_from(outcome.kept, {})) == 6
+    words = outcome.person.words()
+    assert "dwell 3.3 s" in words
+    assert "first pose: 7 poses" in words
+    assert not any(hint in words for hint in ("press k", "Turn the tool"))
+    assert {event.hint for event in outcome.person.told if isinstance(event, Estimated)} == {""}
+
+
+def test_a_program_that_passes_its_first_pose_is_followed_to_its_end() -> None:
+    ends_s = 9 * (4.0 + MOVE_S) - MOVE_S
+    outcome = Outcome(
+        dwells(UP, DOWN, UP, LEFT, RIGHT, FRONT, BACK, UP, Rotation.from_euler("x", 50, degrees=True)),
+        listen=True,
+        says=lambda t: status("playing" if t < ends_s else "stopped"),
+    )
+    assert outcome.stops == [1, 2, 3, 4, 5, 6, 7]
+    assert [record.pose.number for record in outcome.kept] == [1, 2, 3, 4, 5, 6, 7]
+    assert "ended: 7 poses" in outcome.person.words()
+
+
+def test_only_standstills_of_the_running_program_count_and_the_last_though_it_has_ended() -> None:
+    def says(t: float) -> ArmStatus:
+        moments = [(5, "stopped"), (11, "playing"), (15.4, "paused"), (22, "playing"), (1e9, "stopped")]
+        return status(next(program for until, program in moments if t < until))
+
+    outcome = Outcome(dwells(UP, DOWN, LEFT, RIGHT, FRONT), listen=True, says=says)
+    rest = [record.before.R_base_flange.round(6).tolist() for record in outcome.kept]
+    assert rest == [one.as_matrix().round(6).tolist() for one in (DOWN, RIGHT, FRONT)]
+    assert outcome.cell.now_s < outcome.cell.end_s + 5  # by itself
+
+
+def test_a_program_that_ends_where_it_has_been_ends_it() -> None:
+    outcome = Outcome(dwells(UP, DOWN, UP), listen=True, says=lambda t: status("playing" if t < 10 else "stopped"))
+    assert outcome.stops == [1, 2]
+    *_, left_out, ended = outcome.person.words().splitlines()
+    assert "pose 1 again, 0°" in left_out
+    assert ended.startswith("The program has ended")
+    assert outcome.cell.now_s < 13
+
+
+# ------------------------------------------------------------------ what breaks
+
+
+@pytest.mark.parametrize("listen", [False, True])
+@pytest.mark.parametrize("what", ["arm", "sensor"])
+@pytest.mark.parametrize("at_s", [5.0, 8.0])
+def test_a_device_that_fails_ends_it_at_once_and_what_is_committed_stands(what: str, at_s: float, listen: bool) -> None:
+    outcome = Outcome(
+        dwells(UP, DOWN, LEFT), listen=listen, fails={what: at_s}, raises=pytest.raises(ConnectionError, match=what)
+    )
+    assert outcome.stops == [1]
+    assert outcome.cell.now_s < at_s + AVERAGE_S + 0.2
+
+
+def test_a_slow_sensor_is_averaged_for_longer() -> None:
+    outcome = Outcome(dwells(UP, DOWN, seconds=12.0), rate_Hz=9)
+    assert [len(record.samples.wrench) for record in outcome.kept] == [36, 36]
+
+
+def test_a_sensor_that_is_too_slow_is_refused() -> None:
+    outcome = Outcome(dwells(UP), rate_Hz=2, raises=pytest.raises(TooFewSamples, match=r"16 samples in 8\.0 s"))
+    assert outcome.stops == []
+
+
+def test_a_disk_that_is_full_ends_it() -> None:
+    cell = Cell(dwells(UP))
+    person = Person(cell, {})
+
+    def commit(_: PoseRecord) -> None:
+        raise OSError("No space left on device")
+
+    with pytest.raises(OSError, match="No space"):
+        collect_manually(
+            cell, cell, Sampling(average_s=AVERAGE_S), person, Fit().add, commit, down_base=FLOOR, listen=False
+        )
+    assert not any(isinstance(event, PoseTaken) for event in person.told)

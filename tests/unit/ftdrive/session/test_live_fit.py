@@ -1,0 +1,405 @@
+"""The fit while poses come in, what is said about what is missing, and what is said at the end about odd poses."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib import Parameters, solve
+from calib.model import predict
+from calib.poses.information import AMBIGUOUS_6, T12, Prediction, TOOL_DOWN_R_base_flange, special
+from calib.poses.selection import cone_candidates
+from calib.routine import PoseRecord, TourPose, dataset_from, drift_check
+from ftdrive.planning.search.constant_tour import NUMBERS
+from ftdrive.runs.pose_hints import hints
+from ftdrive.session.events import Estimated
+from ftdrive.session.live_fit import Running, _light, empty_cap_deg, faces
+from ftdrive.terminal.report import print_result
+
+Array = NDArray[np.float64]
+
+SAMPLES = 200
+SIGMA = np.repeat([0.3, 0.3 * 0.025], 3)
+"""Of one sample."""
+TRUTH = Parameters(
+    Rotation.from_euler("ZYX", [105, 2, 179], degrees=True).as_matrix(),
+    np.array([0.3, -0.2, -11.0]),
+    np.array([3.0, -5.0, 8.0]),
+    np.array([0.01, -0.02, -0.07]),
+    np.array([0.1, 0.2, -0.3]),
+)
+TOUR = NUMBERS
+
+
+@dataclass
+class Samples:
+    wrench: Array
+    t_host_ns: NDArray[np.int64]
+    t_device_s: Array = field(default_factory=lambda: np.full(SAMPLES, np.nan))
+    seq: NDArray[np.int64] = field(default_factory=lambda: np.arange(SAMPLES, dtype=np.int64))
+    counts: NDArray[np.int32] = field(default_factory=lambda: np.zeros((SAMPLES, 0), np.int32))
+    status: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(SAMPLES, np.uint32))
+
+
+@dataclass
+class Reading:
+    t_host_ns: int
+    q_rad: Array
+    R_base_flange: Array
+
+
+def record(
+    stop: int, R_base_flange: Array, number: int, *, bump_N: float = 0.0, truth: Parameters = TRUTH
+) -> PoseRecord:
+    rng = np.random.default_rng(stop)
+    wrench = predict(truth, R_base_flange) + rng.normal(size=(SAMPLES, 6)) * SIGMA
+    wrench[:, 0] += bump_N
+    start_ns = stop * 4_000_000_000
+    reading = Reading(start_ns, np.zeros(6), R_base_flange)
+    samples = Samples(wrench, start_ns + np.arange(SAMPLES) * 10_000_000)
+    return PoseRecord(stop, TourPose(number, np.zeros(6)), reading, reading, samples, steady=True)
+
+
+def records(R_base_flange: Array) -> list[PoseRecord]:
+    return [record(stop, R, stop) for stop, R in enumerate(R_base_flange, start=1)]
+
+
+def tour() -> list[PoseRecord]:
+    """24 poses and the return to the first."""
+    numbers = [*TOUR, TOUR[0]]
+    return [record(stop, R, n) for stop, (n, R) in enumerate(zip(numbers, special(numbers), strict=True), start=1)]
+
+
+def run(taken: list[PoseRecord], running: Running | None = None) -> Estimated:
+    """Take all poses in and return what the last one gives, without a fit after each."""
+    running = running or Running()
+    running._records = {one.stop: one for one in taken[:-1]}
+    running._refit()
+    return running.add(taken[-1])
+
+
+def test_at_the_end_of_a_tour_the_running_fit_is_the_solvers() -> None:
+    running, taken = Running(), tour()
+    events = [running.add(one) for one in taken]
+    expected = solve(dataset_from(taken, {}))
+    last = events[-1]
+    assert last.poses == 24
+    for name, sigma in expected.sigma.items():
+        np.testing.assert_array_equal(last.values[name], getattr(expected, name))
+        np.testing.assert_array_equal(last.sigma[name], sigma)
+    assert last.light == "green"
+    assert last.hint == ""
+    # The sigmas shrink as poses come in, and they tell the error.
+    first = next(event for event in events if event.values)
+    assert last.sigma["mass_kg"] < 0.8 * first.sigma["mass_kg"]
+    assert (
+        abs(last.values["mass_kg"] - np.linalg.norm(TRUTH.gravity_force_base_N) / 9.80665) < 4 * last.sigma["mass_kg"]
+    )
+
+
+def test_one_pose_is_a_start() -> None:
+    running = Running()
+    event = running.add(tour()[0])
+    assert event.poses == 1
+    assert event.values == {}
+    assert event.residual_sigma is None
+    assert event.faces == (0, 0, 0, 0, 0, 1)  # the paper's first orientation: flange z upwards, gravity along -z
+    assert event.light == "red"
+    assert event.hint
+    assert np.isinf(event.cond9)
+    assert running.predict(special([5])[0]) is None
+    assert '"cond9": null' in str(event.to_dict()).replace("'", '"').replace("None", "null")
+
+
+def test_the_special_orientations_have_the_figures_of_the_theory() -> None:
+    event = run(records(special(T12)))
+    assert event.faces == (2, 2, 2, 2, 2, 2)
+    assert event.cond9 == pytest.approx(1.22, abs=0.03)
+    assert event.cond_u1 == pytest.approx(1.73, abs=0.1)
+    assert event.empty_cap_deg == pytest.approx(54.7, abs=2)  # from a cube's corner to its faces
+    assert event.light == "green"
+
+
+@pytest.mark.parametrize(
+    ("different", "light"),
+    [
+        ({}, "green"),
+        ({"n_poses": 5}, "amber"),
+        ({"cond9": 4.1}, "amber"),
+        ({"cond_u1": 8.1}, "amber"),
+        ({"second_basin_gap": 0.019}, "amber"),
+        ({"cond9": 8.1}, "red"),
+        ({"cond_u1": 25.1}, "red"),
+        ({"second_basin_gap": 0.9e-6}, "red"),
+    ],
+)
+def test_one_figure_that_is_not_good_enough_decides_the_light(different: dict[str, Any], light: str) -> None:
+    just_good = Prediction(
+        n_poses=6, sigma={}, force_rms_N=0, torque_rms_Nm=0, cond9=4.0, cond_u1=8.0, second_basin_gap=0.02
+    )
+    assert _light(replace(just_good, **different)) == light
+
+
+@pytest.mark.parametrize(("half_angle_deg", "light"), [(70, "green"), (37, "amber"), (15, "red")])
+def test_the_light_tells_wide_cones_from_narrow_ones(half_angle_deg: float, light: str) -> None:
+    from calib.poses.information import Guess
+    from calib.poses.selection import choose
+
+    candidates = cone_candidates(np.radians(half_angle_deg), directions=60)
+    event = run(records(candidates[choose(candidates, 24, Guess(1.1, 0.05, 0.00125))]))
+    assert event.light == light
+    assert bool(event.hint) == (light != "green")
+
+
+def test_six_well_conditioned_poses_with_two_solutions_are_red_and_give_no_numbers() -> None:
+    event = run(records(special(AMBIGUOUS_6)))
+    assert event.cond9 < 1.3
+    assert event.light == "red"
+    assert event.values == {}
+
+
+def test_following_the_hints_from_tool_down_leads_to_green_soon() -> None:
+    running, R, seen = Running(), TOOL_DOWN_R_base_flange, list[Estimated]()
+    for stop in range(1, 15):
+        event = running.add(record(stop, R, stop))
+        seen.append(event)
+        if event.light == "green":
+            break
+        R = follow(event.hint, R)
+    assert seen[-1].light == "green"
+    assert seen[-1].poses <= 9
+    assert not seen[-1].hint
+    assert [light for light, _ in pairwise([*(e.light for e in seen), ""])].count("red") < 6
+
+
+def follow(words: str, R: Array) -> Array:
+    """Do as the hint says, as a person would read it, and check where it says the axes will point."""
+    where, turn = words.split(": ")
+    angle = np.radians(float(turn.rsplit(" ", 1)[1].rstrip("°")))
+    if "last joint" in turn:
+        R = R @ Rotation.from_rotvec([0, 0, angle]).as_matrix()
+    elif "vertical" in turn:
+        R = Rotation.from_rotvec([0, 0, angle]).as_matrix() @ R
+    else:
+        axis = "xyz".index(turn.split(" axis")[0][-1])
+        R = R @ Rotation.from_rotvec(angle * np.eye(3)[axis]).as_matrix()
+    down = -R[2]  # base -z in the flange
+    for k, axis_name in enumerate("xyz"):
+        assert (f"+{axis_name}" in where) == (down[k] > np.sin(np.radians(22.5)))
+        assert (f"-{axis_name}" in where) == (down[k] < -np.sin(np.radians(22.5)))
+    return np.asarray(R)
+
+
+def test_a_bumped_pose_stands_out_when_it_comes_and_can_be_taken_again() -> None:
+    running, taken = Running(), tour()
+    quiet = run(taken[:14], running)
+    assert quiet.residual_sigma is not None
+    assert quiet.residual_sigma < 5
+    bumped = running.add(record(15, special([TOUR[14]])[0], TOUR[14], bump_N=1.0))
+    assert bumped.residual_sigma is not None
+    assert bumped.residual_sigma > 8
+    assert bumped.residual_force_N == pytest.approx(1.0, abs=0.2)
+    running.remove(15)
+    assert running.result is not None
+    assert running.result.n_poses == 14
+    again = running.add(taken[14])
+    assert again.poses == 15
+    assert again.residual_sigma is not None
+    assert again.residual_sigma < 5
+    running.remove(99)
+
+
+def test_the_first_pose_can_be_taken_again() -> None:
+    running, first = Running(), tour()[0]
+    running.add(first)
+    running.remove(1)
+    assert running.add(first).poses == 1
+
+
+def test_a_stop_taken_twice_counts_once() -> None:
+    running, taken = Running(), tour()
+    run(taken[:12], running)
+    assert running.add(taken[4]).poses == 12
+
+
+def test_the_return_to_the_first_pose_changes_no_estimate_but_is_compared() -> None:
+    running, taken = Running(), tour()
+    before = run(taken[:-1], running)
+    after = running.add(taken[-1])
+    assert after.poses == 24
+    assert after.values["mass_kg"] == before.values["mass_kg"]
+    assert after.residual_sigma is not None
+    assert after.residual_sigma < 5
+
+
+def test_the_prediction_waits_until_it_can_be_trusted_and_is_then_right() -> None:
+    running, taken = Running(), tour()
+    R = special([24])[0]
+    told = []
+    for one in taken:
+        running.add(one)
+        told.append(running.predict(R))
+    assert all(wrench is None for wrench in told[:5])
+    known = [wrench for wrench in told if wrench is not None]
+    assert len(known) >= 12
+    for wrench in known:
+        assert np.linalg.norm((wrench - predict(TRUTH, R))[:3]) < 0.1 * np.linalg.norm(TRUTH.gravity_force_base_N)
+
+
+def test_an_arm_on_a_wall_is_seen_as_such_once_the_fit_knows() -> None:
+    wall = Parameters(
+        TRUTH.R_flange_sensor,
+        np.array([0.0, -11.0, 0.0]),
+        TRUTH.force_bias_N,
+        TRUTH.p_sensor_com_m,
+        TRUTH.torque_bias_Nm,
+    )
+    R = special(range(1, 25))
+    event = run([record(stop, one, stop, truth=wall) for stop, one in enumerate(R, start=1)])
+    assert event.faces == faces(-R[:, 1])
+    told = Running(down_base=(0, -1, 0)).add(record(1, R[0], 1, truth=wall))
+    assert told.faces == faces(-R[:1, 1])
+
+
+def test_drift_is_told_with_the_estimates() -> None:
+    drifting = [
+        record(one.stop, one.before.R_base_flange, one.pose.number, bump_N=0.5 * k / 23)
+        for k, one in enumerate(tour()[:-1])
+    ]
+    event = run(drifting)
+    assert event.values["drift"][0] == pytest.approx(0.5, abs=5 * event.sigma["drift"][0])
+    assert "drift" not in run(tour()).values
+
+
+def test_the_empty_cap_of_one_direction_is_half_a_turn() -> None:
+    assert empty_cap_deg(np.array([[0.0, 0.0, 1.0]])) == pytest.approx(180, abs=2)
+
+
+# At the end: what happened at which pose.
+
+Disturbed = Callable[[int, Array, np.random.Generator], Array]
+
+
+def disturbed(wrench_of: Disturbed, seed: int = 0) -> list[PoseRecord]:
+    """Take the tour with wrenches (6,) that depend on the stop, the orientation and chance."""
+    rng = np.random.default_rng(seed)
+    taken = []
+    for one in tour():
+        noise = one.samples.wrench - one.samples.wrench.mean(axis=0) + rng.normal(size=6) * SIGMA / np.sqrt(SAMPLES)
+        wrench = wrench_of(one.stop, one.before.R_base_flange, rng) + noise
+        taken.append(replace(one, samples=Samples(wrench, one.samples.t_host_ns)))
+    return taken
+
+
+def said(taken: list[PoseRecord]) -> tuple[str, ...]:
+    return hints(solve(dataset_from(taken, {})), taken)
+
+
+def name(stop: int) -> str:
+    return f"R{TOUR[stop - 1]:02d}"
+
+
+def test_nothing_is_said_of_quiet_runs_and_inexact_arms_and_no_pose_is_named_where_the_sensor_wanders() -> None:
+    def rough(_: int, R: Array, rng: np.random.Generator) -> Array:
+        return predict(TRUTH, R @ Rotation.from_rotvec(rng.normal(size=3) * 0.002).as_matrix())
+
+    def drifting(stop: int, R: Array, _: np.random.Generator) -> Array:
+        return np.asarray(predict(TRUTH, R) + 0.5 * stop / 25 * np.eye(6)[0])
+
+    def wandering(_: int, R: Array, rng: np.random.Generator) -> Array:
+        bias[:] += rng.normal(size=6) * np.repeat([0.03, 0.0005], 3)
+        return np.asarray(predict(TRUTH, R) + bias)
+
+    for seed in range(2):
+        bias = np.zeros(6)
+        for wrench_of in (lambda _, R, __: predict(TRUTH, R), rough):
+            assert said(disturbed(wrench_of, seed)) == ()
+        for drifts in (drifting, wandering):
+            (words,) = said(disturbed(drifts, seed))
+            assert words.startswith("the sensor drifts")
+
+
+def test_a_bumped_pose_is_named() -> None:
+    (words,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 8) * np.array([0.8, 0, 0, 0, 0.03, 0])))
+    assert words.startswith(f"{name(8)} is off by 0.8")
+    assert "bumped" in words
+
+
+def test_a_cable_that_pulls_in_three_poses_is_named_with_them() -> None:
+    pull = np.array([0.3, 0.2, 0.4, 0.01, -0.03, 0.03])
+    words = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop in {5, 6, 14}) * pull))
+    assert f"something pulls in {name(5)}, {name(6)}, {name(14)}: a cable" in words[-1]
+
+
+@pytest.mark.parametrize("since", [6, 12, 20])
+def test_a_load_that_shifts_is_named_with_the_pose_from_which_on(since: int) -> None:
+    shifted = replace(TRUTH, p_sensor_com_m=TRUTH.p_sensor_com_m + np.array([0.004, 0.002, 0]))
+    (words,) = said(disturbed(lambda stop, R, _: predict(shifted if stop >= since else TRUTH, R)))
+    assert words.startswith(f"from {name(since)} on the centre of mass")
+    assert "did the load shift" in words
+
+
+def test_a_tare_and_a_lost_part_in_mid_tour_are_told_apart() -> None:
+    step = np.array([0.3, 0, 0.2, 0, 0, 0])
+    (words,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop >= 10) * step))
+    assert words.startswith(f"from {name(10)} on the force reads 0.3")
+    assert "was the sensor tared" in words
+    lighter = replace(TRUTH, gravity_force_base_N=0.95 * TRUTH.gravity_force_base_N)
+    (words,) = said(disturbed(lambda stop, R, _: predict(lighter if stop >= 14 else TRUTH, R)))
+    found = re.match(rf"from {name(14)} on the load weighs ([\d.]+) N less: was something lost", words)
+    assert found is not None, words
+    assert float(found[1]) == pytest.approx(0.05 * np.linalg.norm(TRUTH.gravity_force_base_N), rel=0.15)
+
+
+def test_a_pose_that_moved_is_named_and_not_explained_otherwise() -> None:
+    taken = tour()
+    turned = Reading(0, np.zeros(6), taken[6].before.R_base_flange @ Rotation.from_rotvec([0, 0, 0.01]).as_matrix())
+    taken[6] = replace(record(7, taken[6].before.R_base_flange, TOUR[6], bump_N=1.0), after=turned, steady=False)
+    taken[8] = replace(taken[8], steady=False)
+    assert [words.split(" while")[0] for words in said(taken)] == [
+        f"{name(7)} turned by 0.57°",
+        f"{name(9)} was not steady",
+    ]
+
+
+def test_a_first_pose_that_is_touched_at_the_end_is_no_drift() -> None:
+    (words,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 25) * np.array([0.5, 0, 0, 0, 0, 0])))
+    assert words.startswith(f"{name(1)} reads otherwise at the end")
+    assert "touched" in words
+
+
+def test_the_rate_of_a_drift_is_that_of_what_drifts(capsys: pytest.CaptureFixture[str]) -> None:
+    taken = disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop - 1) / 24 * np.array([0, 0, 0, 0, 0, 0.096]))
+    print_result(solve(dataset_from(taken, {})), drift=drift_check(taken), records=taken)
+    assert "away: 0.06 N·m/min" in capsys.readouterr().err
+
+
+def test_hints_refuse_records_of_another_run() -> None:
+    with pytest.raises(ValueError, match="23 records"):
+        hints(solve(dataset_from(tour(), {})), tour()[:23])
+
+
+def test_the_report_names_poses_says_the_drift_and_ends_with_the_file(capsys: pytest.CaptureFixture[str]) -> None:
+    pull = np.array([1.0, 0, 0, 0, 0, 0])
+    taken = disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 8) * pull + stop / 25 * np.eye(6)[1])
+    result = solve(dataset_from(taken, {}))
+    path = Path("runs") / "x [1]" / "calibration.json"
+    print_result(result, drift=drift_check(taken), records=taken, saved=path)
+    lines = capsys.readouterr().err.rstrip().splitlines()
+    assert lines[-1] == f" Saved {path}"
+    text = "\n".join(lines)
+    assert "USABLE" in text
+    assert "worst: R" in text
+    assert "predicted by the others: 0." in text
+    assert f"? {name(8)} is off by" in text
+    assert "away: 0.6 N/min" in text
+    assert "the sensor drifts" in text
+    assert " drift in the fit: " in text
+    assert "1.12" in next(line for line in lines if "mass, kg" in line)

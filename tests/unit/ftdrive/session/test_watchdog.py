@@ -1,0 +1,385 @@
+"""The guards' looks and their thread: how often, what counts as late, how a stop is reported, and who misses them."""
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drivers.clock import REAL
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout
+from ftdrive.session.events import Event, GuardTripped, Noted, PoseTaken, State, StateChanged
+from ftdrive.session.guards import Guard, Limits, Seen, SensorGuard, StallGuard, Tripped
+from ftdrive.session.watchdog import Watcher
+from tests.fake_clock import FakeClock
+from tests.unit.ftdrive.fake_cell import FakeArm, FakeSensor, Lab, SteppedWatcher
+
+
+class Looks(Guard):
+    """Remembers what it was shown."""
+
+    def __init__(self) -> None:
+        self.seen: list[Seen] = []
+
+    def look(self, seen: Seen) -> None:
+        self.seen.append(seen)
+
+
+@contextmanager
+def trips(hazard: int) -> Iterator[None]:
+    """Expect that a guard of this row of the hazard table trips in the block."""
+    with pytest.raises(Tripped) as found:
+        yield
+    assert found.value.hazard == hazard
+
+
+class Cell:
+    """An arm that stands, controlled, and its sensor; looked at by guards that are stepped by a fake clock."""
+
+    def __init__(self, *guards: Guard) -> None:
+        self.clock = FakeClock()
+        self.arm = FakeArm(self.clock)
+        self.arm.control = True
+        self.arm.answers_s = 0.0
+        self.sensor = FakeSensor(self.arm)
+        self.trips: list[tuple[float, Tripped]] = []
+        self.watcher = SteppedWatcher(self.arm, self.sensor, guards, self._on_trip, clock=self.clock, limits=Limits())
+
+    def _on_trip(self, trip: Tripped) -> None:
+        self.trips.append((self.clock.now_s(), trip))
+
+    @contextmanager
+    def watched(self, *, moving: bool = True) -> Iterator[SteppedWatcher]:
+        with self.watcher as watcher:
+            watcher.begin()
+            with watcher.watching(self.arm.q, self.arm.q + moving, moving=moving):
+                yield watcher
+
+
+# ------------------------------------------------------------------------------------------------------ when they look
+
+
+def test_a_block_begins_with_a_look_and_goes_on_a_hundred_times_a_second() -> None:
+    looks = Looks()
+    cell = Cell(looks)
+    with cell.watched():
+        assert len(looks.seen) == 1
+        cell.clock.advance(1.0)
+        assert len(looks.seen) == pytest.approx(101, abs=1)
+
+
+def test_a_look_that_takes_long_does_not_delay_the_next() -> None:
+    looks = Looks()
+    cell = Cell(looks)
+    cell.arm.answers_s = 0.008
+    with cell.watched():
+        cell.clock.advance(1.0)
+    assert len(looks.seen) == pytest.approx(101, abs=2)
+
+
+def test_what_is_wrong_already_is_seen_before_the_arm_moves(lab: Lab) -> None:
+    def on_event(event: Event) -> None:
+        if isinstance(event, PoseTaken) and event.stop == 2:
+            lab.arm.set_status(program="paused")
+
+    lab.operator.on_event = on_event
+    with pytest.raises(DeviceFault, match="paused"):
+        lab.calibrate()
+    assert len(lab.arm.moves) == 2
+
+
+@pytest.mark.parametrize(("between_s", "counted_s"), [(0.01, 0.01), (0.018, 0.018), (0.022, 0.02), (3.0, 0.02)])
+def test_the_time_that_this_computer_takes_counts_only_in_part(between_s: float, counted_s: float) -> None:
+    looks = Looks()
+    cell = Cell(looks)
+    with cell.watched():
+        cell.clock.stall(looks.seen[-1].t_s + between_s - cell.clock.now_s())
+        cell.clock.advance(0.0)
+    assert looks.seen[-1].dt_s == pytest.approx(counted_s)
+
+
+def test_a_computer_that_stalls_for_two_seconds_trips_no_guard() -> None:
+    cell = Cell(SensorGuard(Limits()), StallGuard(Limits()))
+    with cell.watched() as watcher:
+        cell.clock.advance(0.5)
+        cell.clock.stall(2.0)
+        cell.clock.advance(0.0)
+        cell.clock.advance(0.5)
+        watcher.check()
+    assert cell.trips == []
+
+
+# --------------------------------------------------------------------------------------------------- the sensor's age
+
+
+def silent(sensor: FakeSensor) -> None:
+    """Let the newest sample stay the newest."""
+    newest = sensor.latest(timeout_s=0)
+    sensor.latest = lambda **_: newest  # type: ignore[method-assign]  # this sensor only
+
+
+@pytest.mark.parametrize(("moving", "limit_s"), [(True, 0.1), (False, 0.5)])
+def test_a_sensor_that_falls_silent_stops_the_arm_in_time(moving: bool, limit_s: float) -> None:
+    cell = Cell(SensorGuard(Limits()))
+    with trips(15), cell.watched(moving=moving) as watcher:
+        cell.clock.advance(1.0)
+        watcher.check()
+        silent(cell.sensor)
+        silent_s = cell.clock.now_s()
+        cell.clock.advance(1.0)
+        assert cell.arm.halted.is_set()
+    ((stopped_s, _),) = cell.trips
+    assert stopped_s - silent_s == pytest.approx(limit_s, abs=0.021)  # seen at the next look but one
+
+
+# ----------------------------------------------------------------------------------------------- a stop, and its report
+
+
+@pytest.mark.parametrize(("takes_s", "told_after_s"), [(0.0, 0.0), (0.17, 0.17), (0.23, 0.2), (5.0, 0.2)])
+def test_a_stop_is_reported_when_it_is_done_or_after_a_fifth_of_a_second(takes_s: float, told_after_s: float) -> None:
+    cell = Cell()
+    with cell.watcher as watcher:
+        watcher.begin()
+        with trips(16), watcher.watching(cell.arm.q, cell.arm.q, moving=False):
+            cell.watcher.stop_takes_s = takes_s
+            cell.arm.gone = DeviceTimeout("silent")
+            begin_s = cell.clock.now_s()
+            cell.clock.advance(6.0)
+            assert cell.arm.halted.is_set()
+            assert watcher.tripped(wait_s=0.0) is not None
+    ((told_s, _),) = cell.trips
+    assert told_s - begin_s == pytest.approx(told_after_s, abs=0.011)  # one look
+
+
+def test_a_stop_that_cannot_be_told_ends_no_guard_and_is_told_in_the_hold(lab: Lab) -> None:
+    failed: list[bool] = []
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, GuardTripped) and not failed:
+            failed.append(lab.guards_look)
+            raise BlockingIOError("the terminal takes no more")
+        if isinstance(event, StateChanged) and event.state is State.HOLD:
+            assert lab.arm.halted.is_set()
+            lab.sensor.push = np.zeros(6)
+
+    lab.push_on_the_way(3, 6)
+    lab.operator.on_event = on_event
+    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    assert lab.calibrate() is not None
+    assert failed == [True]
+    diary = (lab.run().folder / "events.ndjson").read_text()
+    assert diary.count('"guard-tripped"') == 2  # one for each of the two pushes
+    (note,) = [event.words for event in lab.operator.of(Noted) if "not told at once" in event.words]
+    assert "the terminal takes no more" in note
+    assert "unexpected contact" in note
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+
+
+# ---------------------------------------------------------------------------------------------- guards that do not look
+
+
+@pytest.mark.parametrize(("late_s", "missed"), [(0.95, False), (1.05, True)])
+def test_guards_that_hang_for_a_second_are_missed(late_s: float, missed: bool) -> None:
+    cell = Cell()
+    with cell.watcher as watcher:
+        watcher.begin()
+        with watcher.watching(cell.arm.q, cell.arm.q, moving=False):
+            cell.clock.stall(late_s)
+            with trips(18) if missed else nullcontext():
+                watcher.check()
+            cell.clock.advance(0.0)
+
+
+@pytest.mark.parametrize(("gone_s", "unseen"), [(0.9, False), (1.06, True)])
+def test_an_arm_that_reports_nothing_for_a_second_was_out_of_sight(gone_s: float, unseen: bool) -> None:
+    def out_of_sight() -> None:
+        raise ConnectError("the arm is not open")
+
+    cell = Cell()
+    with cell.watcher as watcher:
+        cell.arm.at_look = out_of_sight
+        watcher.look_aside()
+        cell.clock.advance(gone_s)
+        cell.arm.at_look = lambda: None
+        assert watcher.unseen == unseen
+
+
+def test_two_short_silences_are_no_long_one() -> None:
+    def out_of_sight() -> None:
+        raise ConnectError("the arm is not open")
+
+    cell = Cell()
+    with cell.watcher as watcher:
+        for _ in range(3):
+            cell.arm.at_look = out_of_sight
+            cell.clock.advance(0.8)
+            cell.arm.at_look = lambda: None
+            cell.clock.advance(0.2)
+        assert not watcher.unseen
+
+
+def test_an_emergency_stop_is_seen_within_a_twentieth_of_a_second_while_the_arm_stands() -> None:
+    cell = Cell()
+    with cell.watcher as watcher:
+        cell.clock.advance(1.0)
+        cell.arm.set_status(fault=DeviceFault("a stop"), safety_mode="robot emergency stop")
+        cell.clock.advance(0.051)
+        cell.arm.set_status()
+        assert watcher.safety_stop is not None
+
+
+def end(lab: Lab) -> None:
+    """Let the guards' thread end with the next look, whatever it does."""
+
+    def leave() -> None:
+        if lab.guards_look:
+            raise SystemExit
+
+    lab.arm.at_look = leave
+
+
+def test_guards_that_ended_on_the_way_are_missed_at_once(lab: Lab) -> None:
+    lab.arm.at_move[3] = lambda: end(lab)
+    lab.operator.answers["Type resume"] = ["resume", "quit"]
+    with pytest.raises(DeviceFault, match="thread has ended"):
+        lab.calibrate()
+    assert [event.hazard for event in lab.operator.of(GuardTripped)] == [18]
+    assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet: the guards'")]) == 1
+    assert len(lab.arm.moves) == 3
+
+
+@pytest.mark.parametrize("stop", [0, 3])
+def test_nothing_moves_where_nobody_watches(stop: int, lab: Lab) -> None:
+    def on_event(event: Event) -> None:
+        if isinstance(event, PoseTaken) and event.stop == stop:
+            end(lab)
+            lab.clock.sleep(0.1)
+
+    if stop == 0:
+        lab.operator.at_question.append(("Is the tool free", lambda: setattr(lab.watchers[-1], "ended", True)))
+    lab.operator.on_event = on_event
+    with pytest.raises(DeviceFault, match="nothing is watched"):
+        lab.calibrate()
+    assert len(lab.arm.moves) == stop
+
+
+# ---------------------------------------------------------------------------------------------------------- the thread
+
+
+@contextmanager
+def thread_of(arm: FakeArm, *guards: Guard) -> Iterator[Watcher]:
+    """Let the thread itself watch an arm that stands, by the computer's clock; it may be as late as it likes."""
+    patient = replace(Limits(), hung_s=60.0)
+    with Watcher(arm, FakeSensor(arm), guards, lambda _: None, clock=REAL, limits=patient) as watcher:
+        watcher.begin()
+        with watcher.watching(arm.q, arm.q, moving=False):
+            yield watcher
+
+
+def real_arm() -> FakeArm:
+    arm = FakeArm(REAL)
+    arm.control, arm.answers_s = True, 0.0
+    return arm
+
+
+def test_the_thread_looks_by_itself_and_ends_with_its_block() -> None:
+    class Twice(Guard):
+        seen = 0
+        done = threading.Event()
+
+        def look(self, _: Seen) -> None:
+            assert threading.current_thread().name == "guards"
+            self.seen += 1
+            if self.seen == 3:
+                self.done.set()
+
+    guard = Twice()
+    with thread_of(real_arm(), guard) as watcher:
+        assert guard.seen >= 1
+        assert guard.done.wait(60.0)
+        watcher.check()
+    assert not [thread for thread in threading.enumerate() if thread.name == "guards"]
+
+
+def test_the_thread_stops_an_arm_that_does_not_answer_the_stop() -> None:
+    arm = real_arm()
+    answered, told = threading.Event(), threading.Event()
+    stop = arm.stop
+
+    def slow() -> None:
+        assert told.wait(60.0), "it is told meanwhile"
+        stop()
+        answered.set()
+
+    arm.stop = slow  # type: ignore[method-assign]  # this arm only
+    with (
+        trips(16),
+        Watcher(arm, FakeSensor(arm), [], lambda _: told.set(), clock=REAL, limits=Limits()) as watcher,
+    ):
+        watcher.begin()
+        with watcher.watching(arm.q, arm.q, moving=False):
+            arm.gone = DeviceTimeout("silent")
+            assert watcher.tripped(wait_s=60.0) is not None
+            assert answered.is_set()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_thread_that_has_ended_is_missed() -> None:
+    def leave() -> None:
+        if threading.current_thread().name == "guards":
+            raise SystemExit
+
+    arm = real_arm()
+    with trips(18), thread_of(arm) as watcher:
+        arm.at_look = leave
+        (guards,) = [thread for thread in threading.enumerate() if thread.name == "guards"]
+        guards.join(60.0)
+        watcher.check()
+
+
+def _hang(free: threading.Event) -> None:
+    free.wait(10.0)
+
+
+@pytest.mark.realtime
+def test_the_thread_looks_sixty_times_a_second_and_is_missed_after_one() -> None:
+    class Counts(Guard):
+        seen = 0
+
+        def look(self, _: Seen) -> None:
+            self.seen += 1
+
+    arm, guard, free = real_arm(), Counts(), threading.Event()
+    with Watcher(arm, FakeSensor(arm), [guard], lambda _: None, clock=REAL, limits=Limits()) as watcher:
+        watcher.begin()
+        with watcher.watching(arm.q, arm.q, moving=False):
+            time.sleep(1.0)
+            assert 60 <= guard.seen <= 102
+            arm.at_look = lambda: _hang(free)
+            began_s = time.monotonic()
+            with trips(18):
+                while time.monotonic() < began_s + 5.0:
+                    watcher.check()
+                    time.sleep(0.001)
+            assert 0.9 < time.monotonic() - began_s < 1.2
+            arm.at_look = lambda: None
+            free.set()
+
+
+@pytest.mark.realtime
+def test_a_sensor_that_falls_silent_stops_an_arm_on_its_way_within_150_ms() -> None:
+    arm = real_arm()
+    sensor = FakeSensor(arm)
+    limits = Limits()
+    with Watcher(arm, sensor, [SensorGuard(limits)], lambda _: None, clock=REAL, limits=limits) as watcher:
+        watcher.begin()
+        with trips(15), watcher.watching(arm.q, arm.q + 1, moving=True):
+            time.sleep(0.5)
+            watcher.check()
+            silent(sensor)
+            began_s = time.monotonic()
+            assert arm.halted.wait(5.0)
+            assert 0.08 < time.monotonic() - began_s < 0.15

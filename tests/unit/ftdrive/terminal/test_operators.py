@@ -1,0 +1,238 @@
+"""Operators without a screen: JSON for scripts, plain lines for logs; what counts as an answer."""
+
+import io
+import json
+import os
+import pty
+import select
+import sys
+import termios
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from syrupy.assertion import SnapshotAssertion
+
+from ftdrive.errors import Declined
+from ftdrive.session.events import (
+    Asked,
+    Checked,
+    Estimated,
+    Event,
+    GuardTripped,
+    Noted,
+    PoseTaken,
+    RunOpened,
+    State,
+    StateChanged,
+)
+from ftdrive.session.operator import Operator, Question
+from ftdrive.terminal.console import in_whole_words
+from ftdrive.terminal.operators import JsonOperator, PlainOperator, match
+
+FREE = Question("Is the tool free?", assumed="yes")
+MOVE = Question("Type MOVE to let the arm move", ("MOVE",))
+ASKED = Asked(question="?", answer="yes", by="--yes")
+STEP = Question("Next pose?", ("", "stop"))
+
+
+def estimated(**changes: Any) -> Estimated:
+    fields: dict[str, Any] = {
+        "poses": 5,
+        "values": {"mass_kg": 1.2},
+        "sigma": {"mass_kg": 0.003},
+        "residual_sigma": 1.5,
+        "residual_force_N": 0.06,
+        "faces": (1, 0, 2, 0, 1, 1),
+        "cond9": 5.1,
+        "cond_u1": float("inf"),
+        "empty_cap_deg": 95.0,
+        "light": "amber",
+        "hint": "point the tool's +x axis down: turn the last joint by +90°",
+    }
+    return Estimated(**(fields | changes))
+
+
+POSE = PoseTaken(
+    stop=7,
+    stops=25,
+    number=5,
+    gravity_flange=np.array([0.0, 0.0, 1.0]),
+    mean=np.zeros(6),
+    sigma=np.repeat([0.031, 0.0012], 3),
+    samples=2000,
+    settle_s=0.9,
+    average_s=2.0,
+    attempts=2,
+    steady=False,
+)
+
+
+@pytest.mark.parametrize(
+    ("question", "typed", "answer"),
+    [
+        (FREE, "yes\n", "yes"),
+        (FREE, "Y", "yes"),
+        (FREE, " no ", "no"),
+        (FREE, "", None),
+        (FREE, "maybe", None),
+        (MOVE, "MOVE\n", "MOVE"),
+        (MOVE, "move", None),  # typed in full, as it stands
+        (MOVE, "M", None),
+        (MOVE, "", None),
+        (STEP, "\n", ""),
+        (STEP, "Stop", "stop"),
+        (Question("?", ("resume", "quit")), "r", None),  # one letter moves no arm
+    ],
+)
+def test_what_counts_as_an_answer(question: Question, typed: str, answer: str | None) -> None:
+    assert match(question, typed) == answer
+
+
+def test_a_word_that_must_be_typed_can_be_refused() -> None:
+    with pytest.raises(Declined, match="no: Type MOVE"):
+        match(MOVE, "no")
+
+
+def test_a_script_reads_events_and_answers_questions() -> None:
+    stdin, stdout = io.StringIO("no idea\nMOVE\n"), io.StringIO()
+    operator: Operator = JsonOperator(stdin=stdin, stdout=stdout)
+    operator.tell(StateChanged(state=State.MOVE, stop=1, stops=25, number=19))
+    assert operator.ask(MOVE) == "MOVE"
+    operator.tell(estimated())
+    operator.tell(POSE)
+    lines = [json.loads(line) for line in stdout.getvalue().splitlines()]
+    assert [line["event"] for line in lines] == ["state-changed", "question", "question", "estimated", "pose-taken"]
+    assert all(line["schema_version"] == 1 for line in lines)
+    assert lines[1]["answers"] == ["MOVE"]
+    assert lines[1]["error"] is None
+    assert "'no idea'" in lines[2]["error"]
+    assert lines[3]["cond_u1"] is None  # JSON has no infinity
+    assert lines[3]["values"] == {"mass_kg": 1.2}
+    assert lines[4]["sigma"] == POSE.sigma.tolist()
+    assert operator.pressed() is None
+    assert not operator.has_keys
+
+
+def test_every_event_is_one_line_of_json_and_arrives_at_once() -> None:
+    class Pipe(io.StringIO):
+        flushed = ""
+
+        def flush(self) -> None:
+            self.flushed = self.getvalue()
+
+    stdout = Pipe()
+    operator = JsonOperator(stdin=io.StringIO(), stdout=stdout)
+    for event in (Noted(words="two\nlines"), GuardTripped(hazard=7, words="31 N"), ASKED):
+        operator.tell(event)
+        assert stdout.flushed.endswith("}\n")
+    assert len(stdout.flushed.splitlines()) == 3
+    assert json.loads(stdout.flushed.splitlines()[0])["words"] == "two\nlines"
+    assert json.loads(stdout.flushed.splitlines()[2])["by"] == "--yes"
+
+
+def json_operator(typed: str) -> Operator:
+    return JsonOperator(stdin=io.StringIO(typed), stdout=io.StringIO())
+
+
+def plain_operator(typed: str) -> Operator:
+    return PlainOperator(stdin=io.StringIO(typed), stderr=io.StringIO())
+
+
+@pytest.mark.parametrize("operator", [json_operator, plain_operator])
+def test_nobody_to_answer_is_no_consent(operator: Callable[..., Operator]) -> None:
+    with pytest.raises(Declined, match="nobody answered 'Type MOVE"):
+        operator("").ask(MOVE)
+    with pytest.raises(Declined):
+        operator("maybe\n").ask(FREE)
+
+
+def test_plain_lines_tell_what_is_worth_a_line(snapshot: SnapshotAssertion) -> None:
+    stderr = io.StringIO()
+    operator: Operator = PlainOperator(stdin=io.StringIO("what\nMOVE\n"), stderr=stderr)
+    events: list[Event] = [
+        StateChanged(state=State.PREFLIGHT),
+        Checked(name="robot", passed=False, words="remote control is off: switch it on"),
+        RunOpened(folder="runs/a", resume="ftdrive calibrate --resume runs/a"),
+        StateChanged(state=State.SETTLE, stop=7, stops=25, number=5),
+        POSE,
+        estimated(),
+        Noted(words="[bold] stays as it is", warning=True),
+        GuardTripped(hazard=7, words="31 N: look at the tool"),
+        StateChanged(state=State.HOLD, words="contact"),
+    ]
+    for event in events:
+        operator.tell(event)
+    assert operator.ask(MOVE) == "MOVE"
+    operator.tell(Asked(question=MOVE.text, answer="MOVE", by="person"))  # stands there already
+    operator.tell(Asked(question=FREE.text, answer="yes", by="--yes"))  # never asked
+    assert stderr.getvalue() == snapshot
+    assert "\x1b" not in stderr.getvalue()
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_what_is_told_goes_on_behind_its_mark(quiet: bool) -> None:
+    person, program = pty.openpty()
+    termios.tcsetwinsize(program, (24, 40))
+    with os.fdopen(program, "w", encoding="utf-8") as file:
+        operator = PlainOperator(stdin=io.StringIO("yes\n"), stderr=file, quiet=quiet)
+        operator.tell(Checked(name="load", passed=True, words="not compared: the tool's mass is not known"))
+        operator.tell(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
+        operator.ask(Question("Go?"))
+        told = ""
+        while not told.endswith("] yes\r\n"):
+            told += os.read(person, 4096).decode()
+    os.close(person)
+    assert told.splitlines() == [
+        "ok   load: not compared: the tool's mass",
+        "     is not known",
+        "! the first run of a plan is slow,",
+        "  whatever was asked",
+        "Go? [yes/no] yes",
+    ]
+
+
+def test_a_terminal_gets_whole_words_and_a_file_whole_lines() -> None:
+    person, program = pty.openpty()
+    termios.tcsetwinsize(program, (24, 40))
+    path = "/home/somebody/" + "deep/" * 8 + "run"
+    text = f"error: the sensor must be measured, set it in the file {path} then start again: "
+    with os.fdopen(program, "w", encoding="utf-8") as file:
+        folded = in_whole_words(text, file)
+        operator = PlainOperator(stdin=io.StringIO("MOVE\n"), stderr=file)
+        assert operator.ask(Question("The arm goes the way to pose 1. Type MOVE", ("MOVE",))) == "MOVE"
+    os.close(person)
+    lines = folded.split("\n")
+    assert all(len(line) <= 40 or line == path for line in lines)
+    assert " ".join(folded.split()) == text.strip()
+    assert folded.endswith("again: ")
+    assert in_whole_words("a\n  b\n", sys.__stderr__ or sys.stderr) == "a\n  b\n"
+    assert in_whole_words(text, io.StringIO()) == text
+
+
+def test_what_was_typed_before_a_question_is_no_answer_to_it() -> None:
+    person, program = pty.openpty()
+    told, answers = list[bytes](), list[str]()
+
+    def read_until(words: bytes, times: int = 1) -> None:
+        while b"".join(told).count(words) < times:
+            assert select.select([person], [], [], 10.0)[0], "nothing more is told"
+            told.append(os.read(person, 4096))
+
+    with os.fdopen(program, "r+b", buffering=0) as device:
+        stdin = io.TextIOWrapper(io.BufferedReader(device), encoding="utf-8")
+        stderr = io.TextIOWrapper(io.FileIO(program, "w", closefd=False), write_through=True)
+        operator = PlainOperator(stdin=stdin, stderr=stderr)
+        for question, answer in ((STEP, "stop"), (FREE, "no"), (STEP, "")):
+            told.clear()
+            os.write(person, b"\n\nyes\n")
+            read_until(b"\n", 3)  # the terminal's echo: it has them all
+            asking = threading.Thread(target=lambda asked: answers.append(operator.ask(asked)), args=(question,))
+            asking.start()
+            read_until(b"] ")
+            os.write(person, answer.encode() + b"\n")
+            asking.join(10.0)
+            assert answers.pop() == answer
+    os.close(person)

@@ -1,0 +1,255 @@
+"""The report of a solve: a headline that its own residuals do not refute, and tables without a cut number."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationDataset, Known, Parameters, solve
+from calib.compare import Compared, compare
+from calib.errors import NotObservable
+from calib.model import predict
+from calib.published.yu import SPECIAL_R_flange_base
+from calib.result import Method
+from ftdrive.commands.solve import solve as solve_command
+from ftdrive.errors import ConfigError
+from ftdrive.runs.pose_hints import hints
+from ftdrive.terminal.console import talk
+from ftdrive.terminal.report import error_in_words, errors_in_sigma, print_comparison, print_result
+from tests.unit.ftdrive.fake_cell import Lab
+
+SIGMA = np.repeat([2e-3, 1e-4], 3)
+R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+TILTED = Parameters(  # 0.5 kg under a base that is 1.9 degrees off level
+    Rotation.from_euler("z", 80, degrees=True).as_matrix(),
+    np.array([0.06, -0.15, -4.9]),
+    np.array([3.0, -5.0, 8.0]),
+    np.array([0.01, -0.02, 0.09]),
+    np.array([0.1, 0.2, -0.3]),
+)
+
+
+def tilted(*, measured: bool = True) -> CalibrationDataset:
+    wrench = predict(TILTED, R24) + np.random.default_rng(3).normal(size=(24, 6)) * SIGMA
+    cov = np.tile(np.diag(SIGMA**2), (24, 1, 1)) if measured else None
+    return CalibrationDataset(R24, wrench, cov, np.zeros(24, np.int64), np.full(24, np.nan))
+
+
+def test_the_error_of_an_angle_does_not_count_whole_turns() -> None:
+    result = solve(tilted())
+    truth = result.to_dict()
+    truth["tilt_beta_rad"] += 2 * np.pi - 2 * truth["sigma"]["tilt_beta_rad"]
+    np.testing.assert_allclose(errors_in_sigma(result, truth)["tilt_beta_rad"], 2)
+
+
+@pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["carlson-cayley", "ml"])
+def test_the_headline_promises_no_error_that_the_residuals_refute(method: Method, measured: bool) -> None:
+    known = Known(mass_kg=0.5, gravity_direction_base=(0, 0, -1))  # a base that is not level
+    result = solve(tilted(measured=measured), method, known=known)
+    left_out_N = result.quality["loo_force_rms_N"]
+    assert left_out_N > 0.1 > 2 * result.predicted_error()[0]
+    words = error_in_words(result)
+    assert words.startswith(f"{left_out_N:.4f} N, {result.quality['loo_torque_rms_Nm']:.5f} N·m rms (cross-validated")
+    assert f"predicted: {result.predicted_error()[0]:.4f} N" in words
+    assert ("not measured" in words) != measured
+
+
+def test_the_headline_of_a_good_calibration_is_what_its_noise_predicts() -> None:
+    result = solve(tilted())
+    assert result.verdict == "good"
+    force_N, torque_Nm = result.predicted_error()
+    assert error_in_words(result) == f"{force_N:.4f} N, {torque_Nm:.5f} N·m rms over all orientations (predicted)"
+
+
+def test_a_method_that_was_told_wrong_is_named_as_the_cause() -> None:
+    result = solve(tilted(measured=False), "carlson-relaxation")
+    assert result.verdict != "good"
+    assert any("taken as known the forces fit to 0.00" in reason for reason in result.reasons)
+    assert not any("taken as known" in reason for reason in solve(tilted(), "lrom").reasons)
+
+
+LEVEL = Known(gravity_direction_base=(0, 0, -1), mass_kg=0.5)
+
+
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize(
+    ("known", "words"),
+    [
+        (Known(mass_kg=0.61), r"data: mass 0\.61 kg, they say 0\.4999\d* ± 0\.0000\d+ kg: correct it"),
+        (LEVEL, r"data: the direction of gravity in base, they say 1\.89\d* ± 0\.00\d+° off that: correct"),
+        (Known(R_flange_sensor=np.eye(3)), r"data: the mounting of the sensor, they say (79\.99|80\.00)\d* ± "),
+    ],
+)
+def test_what_was_given_wrongly_is_named_with_what_the_data_say(known: Known, words: str, measured: bool) -> None:
+    result = solve(tilted(measured=measured), known=known)
+    assert re.search(words, result.reasons[0])
+
+
+def test_what_was_given_and_may_be_true_is_not_blamed() -> None:
+    right = Known(TILTED.R_flange_sensor, 0.0, False, TILTED.gravity_force_base_N, 0.0, 0.49998, 1e-4)
+    loose = Known(gravity_direction_base=(0, 0, -1), direction_tolerance_rad=0.03, mass_kg=0.51, mass_tolerance_kg=0.01)
+    flat = Known(yaw_only=True)
+    for known in (right, loose, flat):
+        assert not any("given as known" in reason for reason in solve(tilted(), known=known).reasons)
+
+
+def test_too_few_poses_to_do_without_what_is_known_blame_nothing() -> None:
+    R = Rotation.from_rotvec([[0, 0, 0], [1.5, 0, 0.3], [0, 1.5, 0.7]]).as_matrix()
+    few = CalibrationDataset(R, predict(TILTED, R), None, np.zeros(3, np.int64), np.full(3, np.nan))
+    known = Known(TILTED.R_flange_sensor, gravity_direction_base=(0, 0, -1), mass_kg=0.61)
+    assert not any("given as known" in reason for reason in solve(few, known=known).reasons)
+
+
+def terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+    state: Any = {"_force_terminal": True, "_width": width, "_height": 25, "_color_system": None, "soft_wrap": False}
+    for name, value in state.items():
+        monkeypatch.setattr(talk, name, value)
+
+
+@pytest.mark.parametrize("width", [44, 80])
+def test_lines_of_the_report_go_on_under_their_text(
+    width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    terminal(monkeypatch, width)
+    result = solve(tilted(), known=Known(mass_kg=0.61))
+    print_result(result)
+    lines = [line.rstrip() for line in capsys.readouterr().err.splitlines()]
+    assert max(map(len, lines)) <= width
+    start = next(i for i, line in enumerate(lines) if line.startswith(" REJECTED"))
+    end = next(i for i, line in enumerate(lines) if "estimate" in line)
+    assert lines[start + 1].startswith(" " * len(" REJECTED  "))
+    assert all(line.startswith("   ") for line in lines[start + 1 : end])
+    residuals = next(i for i, line in enumerate(lines) if line.startswith(" residuals:"))
+    assert "…" not in "".join(lines)
+    below = [re.match(r" (residuals:|worst:| {7,}) ?\S", line) for line in lines[residuals:]]
+    assert len(below) > 2
+    assert all(below)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--level-deg", "-1", "-1.0 is not in the range 0<=x<=180"),
+        ("--mounting-deg", "nan,0,0", "--mounting-deg is 'nan,0,0': give 3 numbers"),
+        ("--mass-kg", "0", "0.0 is not in the range x>0"),
+    ],
+)
+def test_a_known_value_that_cannot_be_is_told_as_it_was_given(
+    option: str, value: str, words: str, tmp_path: Path
+) -> None:
+    tilted().save(tmp_path / "data.json")
+    with pytest.raises((click.UsageError, ConfigError)) as error:
+        solve_command.main([str(tmp_path / "data.json"), option, value], standalone_mode=False)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_solve_says_of_a_run_what_calibrate_says(as_json: bool, lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
+    lab.arm.set_status(payload_kg=2.5)
+    lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting="3"))
+    outcome = lab.calibrate()
+    assert outcome is not None
+    records = outcome.run.records()
+    told = hints(outcome.result, records)
+    assert any("the base leans" in one for one in told)
+    assert any("2.50 kg" in one for one in told)
+    capsys.readouterr()
+    print_result(outcome.result, drift=outcome.drift, records=records)
+    by_calibrate = capsys.readouterr().err
+    solve_command.main([str(outcome.run.folder), *["--json"][:as_json]], standalone_mode=False)
+    by_solve = capsys.readouterr()
+    if as_json:
+        assert json.loads(by_solve.out)["hints"] == list(told)
+    else:
+        assert by_solve.err == by_calibrate
+
+
+def test_a_method_that_lacks_the_mass_says_how_to_give_it() -> None:
+    with pytest.raises(NotObservable, match="--mass-kg"):
+        solve(tilted(), "carlson-cayley")
+
+
+@pytest.mark.parametrize(
+    ("method", "known", "fixed"),
+    [
+        (
+            "carlson-cayley",
+            Known(mass_kg=0.5),
+            {
+                "mass, kg",
+                *(f"gravity in base {axis}, N" for axis in "xyz"),
+                "base tilt alpha, deg",
+                "base tilt beta, deg",
+            },
+        ),
+        ("ml", Known(mass_kg=0.5), {"mass, kg"}),
+        ("yaw-only", None, {"flange to sensor x, deg", "flange to sensor y, deg"}),
+        ("ml", None, set()),
+    ],
+)
+def test_what_was_taken_as_known_is_called_fixed(
+    method: Method, known: Known | None, fixed: set[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    print_result(solve(tilted(), method, known=known))
+    lines = capsys.readouterr().err.splitlines()
+    assert {line[: line.index("  ")].strip() for line in lines if line.rstrip().endswith(" fixed")} == fixed
+    assert not any(" 0.0000000" in line for line in lines)
+
+
+@pytest.mark.parametrize("mass_kg", np.linspace(0.4995, 0.5005, 5))
+def test_a_weight_known_exactly_has_an_uncertainty_of_zero(mass_kg: float) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        R = Rotation.random(12, rng=rng).as_matrix()
+        wrench = predict(TILTED, R) + rng.normal(size=(12, 6)) * SIGMA
+        cov = np.tile(np.diag(SIGMA**2), (12, 1, 1))
+        data = CalibrationDataset(R, wrench, cov, np.zeros(12, np.int64), np.full(12, np.nan))
+        result = solve(data, known=Known(mass_kg=mass_kg))  # a root of a rounding error below 0 would warn
+        assert not any("uncertainty" in reason and "nan" in reason for reason in result.reasons)
+
+
+def shown(compared: list[Compared], capsys: pytest.CaptureFixture[str]) -> list[str]:
+    print_comparison(compared)
+    return capsys.readouterr().err.splitlines()
+
+
+@pytest.fixture(scope="module")
+def compared() -> list[Compared]:
+    return compare(tilted(), known=Known(mass_kg=0.5))
+
+
+def test_a_pipe_gets_every_number_of_every_method_on_a_line(
+    compared: list[Compared], capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = shown(compared, capsys)
+    assert "…" not in "".join(lines)
+    assert [line.split()[0] for line in lines[2:]] == list(get_args(Method))
+    for line, one in zip(lines[2:], compared, strict=True):
+        assert one.parameters is not None
+        assert ", ".join(f"{value:.4f}" for value in one.parameters.torque_bias_Nm) in line
+        assert f" {one.force_rms_N:.5f} " in line
+
+
+@pytest.mark.parametrize(("width", "vectors"), [(60, False), (80, False), (200, True)])
+def test_a_narrow_terminal_gets_no_vectors_and_nothing_is_cut(
+    width: int,
+    vectors: bool,
+    compared: list[Compared],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    terminal(monkeypatch, width)
+    lines = shown(compared, capsys)
+    assert "…" not in "".join(lines)
+    assert [line.split()[0] for line in lines[2:]] == list(get_args(Method))
+    assert max(map(len, lines)) <= max(width, 80)
+    assert ("force bias" in lines[0]) == vectors
+    for line, one in zip(lines[2:], compared, strict=True):
+        assert f" {one.mass_kg:.5f} " in line

@@ -1,0 +1,533 @@
+"""The live screen: all that is needed at 80x24, nothing that wraps, keys, questions, and the terminal as it was."""
+
+import io
+import os
+import pty
+import select
+import subprocess
+import sys
+import termios
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.cells import cell_len
+from rich.console import Console
+from syrupy.assertion import SnapshotAssertion
+
+from ftdrive.session.events import (
+    Asked,
+    Checked,
+    Estimated,
+    Event,
+    GuardTripped,
+    Noted,
+    PoseTaken,
+    RunOpened,
+    State,
+    StateChanged,
+)
+from ftdrive.session.operator import Key, Question
+from ftdrive.terminal.keyboard import Keyboard
+from ftdrive.terminal.operators import JsonOperator, PlainOperator
+from ftdrive.terminal.screen import Screen, View, frame, open_operator
+
+RESUME = "ftdrive calibrate --resume runs/2026-11-20T211503Z-gripper_a"
+VALUES: dict[str, Any] = {
+    "mass_kg": 1.187,
+    "p_sensor_com_m": np.array([0.0123, -0.0041, 0.0618]),
+    "force_bias_N": np.array([-3.21, 7.90, -112.04]),
+    "torque_bias_Nm": np.array([0.12, -0.08, 0.03]),
+    "R_flange_sensor": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "tilt_alpha_rad": np.radians(1.8),
+    "tilt_beta_rad": np.radians(-0.4),
+}
+SIGMA: dict[str, Any] = {
+    "mass_kg": 0.0011,
+    "p_sensor_com_m": np.full(3, 0.0002),
+    "force_bias_N": np.full(3, 0.021),
+    "torque_bias_Nm": np.full(3, 0.001),
+    "R_flange_sensor": np.full(3, np.radians(0.1)),
+    "tilt_alpha_rad": np.radians(0.06),
+    "tilt_beta_rad": np.radians(0.05),
+}
+HINT = "point the middle of the tool's -x, -y and -z axes down: tilt it about its own x axis by -45°"
+
+
+def pose(stop: int, number: int, **changes: Any) -> PoseTaken:
+    fields: dict[str, Any] = {
+        "stop": stop,
+        "stops": 25,
+        "number": number,
+        "gravity_flange": np.array([0.0, -1.0, 0.0]),
+        "mean": np.zeros(6),
+        "sigma": np.repeat([0.031, 0.0012], 3),
+        "samples": 2000,
+        "settle_s": 0.9,
+        "average_s": 2.0,
+        "attempts": 1,
+        "steady": True,
+    }
+    return PoseTaken(**(fields | changes))
+
+
+def estimated(**changes: Any) -> Estimated:
+    fields: dict[str, Any] = {
+        "poses": 6,
+        "values": VALUES,
+        "sigma": SIGMA,
+        "residual_sigma": 1.4,
+        "residual_force_N": 0.062,
+        "faces": (1, 0, 2, 3, 0, 12),
+        "cond9": 5.14,
+        "cond_u1": 12.0,
+        "empty_cap_deg": 95.0,
+        "light": "amber",
+        "hint": HINT,
+    }
+    return Estimated(**(fields | changes))
+
+
+def view(*events: Event) -> View:
+    found = View()
+    for second, event in enumerate(events):
+        found.update(event, float(second))
+    return found
+
+
+MIDDLE: tuple[Event, ...] = (
+    RunOpened(folder="runs/2026-11-20T211503Z-gripper_a", resume=RESUME),
+    *(pose(stop, number) for stop, number in enumerate((1, 19, 12, 8, 16, 14), start=1)),
+    estimated(),
+    StateChanged(state=State.SETTLE, stop=7, stops=25, number=5),
+)
+
+
+def drawn(found: View, *, width: int = 80, height: int = 24, now_s: float = 9.0) -> list[str]:
+    console = Console(width=width, height=height, file=io.StringIO(), color_system=None, force_terminal=False)
+    console.print(frame(found, now_s, width=width, height=height))
+    file = console.file
+    assert isinstance(file, io.StringIO)
+    return [line.rstrip() for line in file.getvalue().splitlines()]
+
+
+def test_a_long_hold_brings_the_end_no_nearer() -> None:
+    assert drawn(view(*MIDDLE), now_s=5000.0)[0].endswith("6 kept, about 18 s left")
+
+
+def test_everything_needed_is_on_a_screen_of_80_by_24(snapshot: SnapshotAssertion) -> None:
+    lines = drawn(view(*MIDDLE, Noted(words="R12 was repeated", warning=True)))
+    assert len(lines) <= 23
+    assert max(map(len, lines)) <= 80
+    assert "\n".join(lines) == snapshot
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (79, 24), (60, 20), (40, 15), (132, 50), (80, 12), (20, 8)])
+def test_nothing_wraps_and_what_matters_most_stays(width: int, height: int) -> None:
+    found = view(*MIDDLE, GuardTripped(hazard=7, words="a force of 31 N where a free tool gives 3 N: " * 4))
+    lines = drawn(found, width=width, height=height)
+    assert len(lines) < height
+    assert max(cell_len(line) for line in lines) <= width
+    text = "\n".join(lines)
+    for needed in ("pose 7/25", " r  redo", "gripper_a", "kept in"):
+        assert needed in text
+    if height > 12 and width > 20:
+        assert "AMBER" in text
+        assert "mass kg" in text
+        assert "0.0011" in text or width < 50
+
+
+def test_only_keys_that_do_something_are_offered() -> None:
+    def keys(**changed: Any) -> str:
+        (line,) = [line for line in drawn(view(MIDDLE[0], StateChanged(**changed))) if "Ctrl-C" in line]
+        return line
+
+    tour = keys(state=State.SAMPLE, stop=3, stops=25)
+    assert "redo" in tour
+    assert "finish" not in tour
+    by_hand = keys(state=State.SAMPLE, stop=3)
+    assert by_hand.startswith(" k  finish   r  redo   s  skip ")
+    assert keys(state=State.PREFLIGHT).startswith("Ctrl-C")
+    assert drawn(view(StateChanged(state=State.SAMPLE, stop=3, stops=7), pose(2, 19)))[-1].endswith(" Ctrl-C ends")
+
+
+def test_before_a_run_there_is_no_table_of_nothing() -> None:
+    lines = drawn(view(StateChanged(state=State.PREFLIGHT)))
+    assert lines[:2] == [
+        "ftdrive calibrate                                                         0 kept",
+        "PREFLIGHT  9 s",
+    ]
+    assert "estimate" not in "\n".join(lines)
+    assert "kept in" not in "\n".join(lines)
+
+
+def test_a_first_pose_shows_its_coverage_and_no_numbers() -> None:
+    first = estimated(
+        values={}, sigma={}, residual_sigma=None, residual_force_N=None, cond9=np.inf, cond_u1=np.inf, light="red"
+    )
+    text = "\n".join(drawn(view(MIDDLE[0], pose(1, 1), first)))
+    assert "coverage  RED   condition >100 " in text
+    assert "out of plane >100 " in text
+    assert "residual: no fit" in text
+    assert "drift  not known" in text
+    assert "nan" not in text
+    assert "inf" not in text
+
+
+def test_a_pose_out_of_line_says_which_key_helps() -> None:
+    text = "\n".join(drawn(view(*MIDDLE, pose(7, 5, steady=False, attempts=3), estimated(residual_sigma=31.0))))
+    assert "OUT OF LINE: press r" in text
+    assert "3 tries, NOT STEADY" in text
+
+
+def test_the_first_pose_seen_again_tells_the_drift() -> None:
+    quiet = view(pose(1, 19), pose(2, 5), pose(3, 19, mean=np.full(6, 1e-4)))
+    assert any("drift  first pose again after 2 s" in line and "none seen" in line for line in drawn(quiet))
+    drifted = view(pose(1, 19), pose(2, 5), pose(3, 19, mean=np.array([0.5, 0, 0, 0, 0, 0])))
+    assert any("0.500 N" in line and "15 N/min" in line for line in drawn(drifted))
+    fitted = estimated(values=VALUES | {"drift": np.full(6, 0.3)}, sigma=SIGMA | {"drift": np.full(6, 0.02)})
+    assert any("drift  0.520 ± 0.020 N" in line for line in drawn(view(*MIDDLE, fitted)))
+
+
+def test_a_drift_of_the_force_alone_is_told_for_sure_and_without_torque() -> None:
+    def told(force: str, event: Estimated) -> list[str]:
+        lines = [line for line in drawn(view(*MIDDLE, event)) if line.startswith(f"drift  {force} ")]
+        assert not any("N·m" in line for line in lines)
+        return ["perhaps" if line.endswith("perhaps") else "sure" for line in lines]
+
+    change, sigma = np.array([0.3, 0, 0.01, 3e-20, 0, 0]), np.array([6e-4, 6e-4, 6e-4, 2e-21, 0, 3e-12])
+    fitted = estimated(values=VALUES | {"drift": change}, sigma=SIGMA | {"drift": sigma})
+    assert told("0.300 ± 0.001 N", fitted) == ["sure"]
+    doubtful = estimated(values=VALUES | {"drift": change / 200}, sigma=SIGMA | {"drift": sigma})
+    assert told("0.002 ± 0.001 N", doubtful) == ["perhaps"]
+
+
+def test_a_reason_stands_once_on_the_screen() -> None:
+    words = "a force of 77 N where a free tool gives 3 N"
+    held = view(
+        *MIDDLE,
+        GuardTripped(hazard=14, words=words),
+        *(StateChanged(state=s, words=words) for s in (State.STOP, State.HOLD)),
+    )
+    assert "\n".join(drawn(held)).count("77 N") == 1
+    by_key = view(*MIDDLE, StateChanged(state=State.HOLD, words="paused by a person"))
+    assert "\n".join(drawn(by_key)).count("paused by a person") == 1
+
+
+def test_while_a_question_waits_nothing_is_measured() -> None:
+    asking = view(*MIDDLE)
+    asking.keys = "asking"
+    assert drawn(asking)[1] == "WAITS for an answer"
+
+
+def test_numbers_never_touch() -> None:
+    precise = {name: np.full(np.shape(sigma), 1e-6) for name, sigma in SIGMA.items()}
+    lines = drawn(view(*MIDDLE, estimated(sigma=precise)))
+    assert "F bias N        -3.210    7.900 -112.040  ± 1e-06" in "\n".join(lines)
+
+
+def test_a_resumed_run_counts_the_poses_it_had() -> None:
+    assert drawn(view(MIDDLE[0], estimated(poses=12)))[0].endswith("12 kept")
+
+
+def test_a_warning_stays_until_the_next_pose() -> None:
+    warned = view(*MIDDLE, Noted(words="wait", warning=True))
+    assert "! wait" in drawn(warned)
+    warned.update(pose(7, 5), 10.0)
+    assert "! wait" not in drawn(warned)
+
+
+def test_a_long_path_keeps_the_end_that_tells_runs_apart() -> None:
+    long = "/home/somebody/" + "deep/" * 20 + "2026-11-20T211503Z-gripper_a"
+    lines = drawn(view(RunOpened(folder=long, resume=f"ftdrive calibrate --resume {long}")))
+    assert [line for line in lines if line.endswith("2026-11-20T211503Z-gripper_a") and len(line) == 80] == lines[-2:]
+
+
+# The terminal.
+
+
+@contextmanager
+def terminal(rows: int = 24, columns: int = 80) -> Iterator[tuple[int, int]]:
+    """Open a pseudo-terminal: the person's end and the program's."""
+    person, program = pty.openpty()
+    termios.tcsetwinsize(program, (rows, columns))
+    try:
+        yield person, program
+    finally:
+        os.close(program)
+        os.close(person)
+
+
+def eventually(condition: Callable[[], object], timeout_s: float = 10.0) -> None:
+    limit_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < limit_s, "it never happened"
+        time.sleep(0.005)
+
+
+class Shown:
+    """What arrives at the person's end."""
+
+    def __init__(self, person: int) -> None:
+        self.text = ""
+        self._person = person
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        try:
+            while more := os.read(self._person, 65536):
+                self.text += more.decode(errors="replace")
+        except OSError:
+            pass  # the terminal was closed
+
+
+def test_keys_arrive_without_enter_and_escapes_and_letters_without_meaning_do_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ftdrive.terminal.keyboard._WORD_S", 0.0)
+    with terminal() as (person, program), Keyboard(program) as keyboard:
+        for letter, key in zip(b"krspq", (Key.KEEP, Key.REDO, Key.SKIP, Key.PAUSE, Key.STOP), strict=True):
+            os.write(person, bytes([letter]))
+            eventually(lambda: keyboard.waiting)
+            assert keyboard.pressed() is key
+        for noise in (b"\x1bOS", b"\x1bOq", b"\x1b[15;2~", b"\x1b[A", b"xyz1 "):  # F4, keypad 1, shift-F5, up
+            os.write(person, noise)
+        os.write(person, b"Q")
+        eventually(lambda: keyboard.waiting)
+        assert keyboard.waiting == (Key.STOP,)
+
+
+@pytest.mark.parametrize(
+    ("strokes", "heard"),
+    [
+        (("y", "e", "s"), []),
+        (("yes\n",), []),
+        (("s\n",), []),
+        (("\n", "s"), []),
+        (("rs",), []),
+        (("s", "s", "s"), [Key.SKIP]),  # held down
+        (("p", "p"), [Key.PAUSE]),
+        (("s", "k", "i", "p"), [Key.SKIP, Key.PAUSE]),  # the first came alone
+        (("resume, please\n",), [Key.PAUSE]),
+    ],
+)
+def test_letters_of_a_word_are_no_keys_but_those_that_stop(
+    strokes: tuple[str, ...], heard: list[Key], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ftdrive.terminal.keyboard._WORD_S", 60.0)
+    with terminal() as (person, program), Keyboard(program) as keyboard:
+        for stroke in strokes:
+            os.write(person, stroke.encode())
+            eventually(lambda: not select.select([program], [], [], 0)[0])
+        os.write(person, b"q")  # heard in a word too
+        eventually(lambda: Key.STOP in keyboard.waiting)
+        assert list(keyboard.waiting) == [*heard, Key.STOP]
+
+
+def test_the_terminal_is_restored_after_success_failure_and_while_suspended() -> None:
+    with terminal() as (_, program):
+        before = termios.tcgetattr(program)
+        with Keyboard(program) as keyboard:
+            assert not termios.tcgetattr(program)[3] & (termios.ICANON | termios.ECHO)
+            assert termios.tcgetattr(program)[3] & termios.ISIG  # Ctrl-C stays a signal
+            with keyboard.suspended():
+                assert termios.tcgetattr(program) == before
+            assert not termios.tcgetattr(program)[3] & termios.ICANON
+        assert termios.tcgetattr(program) == before
+        with pytest.raises(ZeroDivisionError), Keyboard(program):
+            raise ZeroDivisionError
+        assert termios.tcgetattr(program) == before
+        with pytest.raises(ZeroDivisionError), Keyboard(program) as keyboard, keyboard.suspended():
+            raise ZeroDivisionError
+        assert termios.tcgetattr(program) == before
+    assert not [thread for thread in threading.enumerate() if thread.name == "keyboard"]
+
+
+def test_keys_pressed_before_a_question_do_not_answer_it() -> None:
+    with terminal() as (person, program), Keyboard(program) as keyboard:
+        os.write(person, b"q")
+        eventually(lambda: keyboard.waiting)
+        with keyboard.suspended():
+            assert keyboard.pressed() is None
+        assert keyboard.pressed() is None
+        os.write(person, b"p")
+        eventually(lambda: keyboard.waiting == (Key.PAUSE,))
+
+
+def test_a_pipe_has_no_keys() -> None:
+    reading, writing = os.pipe()
+    assert not Keyboard.usable(reading)
+    os.close(reading)
+    os.close(writing)
+
+
+@contextmanager
+def screen(person: int, program: int) -> Iterator[tuple[Screen, Shown]]:
+    with (
+        open(program, "w", encoding="utf-8", closefd=False) as file,
+        open(program, encoding="utf-8", closefd=False) as stdin,
+    ):
+        console = Console(file=file, force_terminal=True, width=80, height=24, color_system=None)
+        with Screen(console, Keyboard(program), stdin=stdin) as found:
+            yield found, Shown(person)
+
+
+def test_the_screen_draws_asks_and_goes_on() -> None:
+    with terminal() as (person, program):
+        before = termios.tcgetattr(program)
+        with screen(person, program) as (operator, shown):
+            for event in MIDDLE:
+                operator.tell(event)
+            eventually(lambda: "SETTLE" in shown.text and RESUME in shown.text)
+            assert "6/25 R14: settled 0.9 s" in shown.text  # above the frame, to stay
+            answers: list[str] = []
+            asking = threading.Thread(target=lambda: answers.append(operator.ask(Question("Go? Type MOVE", ("MOVE",)))))
+            asking.start()
+            eventually(lambda: "Go? Type MOVE: " in shown.text)
+            assert termios.tcgetattr(program)[3] & termios.ECHO
+            os.write(person, b"move\n")
+            eventually(lambda: "'move' is none of the answers" in shown.text)
+            os.write(person, b"MOVE\n")
+            asking.join(10)
+            assert answers == ["MOVE"]
+            eventually(lambda: not termios.tcgetattr(program)[3] & termios.ECHO)
+            eventually(lambda: "ftdrive calibrate" in shown.text.partition("\x1b[J")[2])
+            erased, drawn_again = shown.text.split("\x1b[J")
+            used = len(drawn(view(*MIDDLE))) + 3  # the question twice, and a line about the wrong answer
+            assert erased.endswith(f"\x1b[{used}F")
+            assert "\x1b[1A" not in drawn_again.split("ftdrive calibrate")[0]  # what stands above stays
+            os.write(person, b"p")
+            eventually(lambda: "PAUSE asked" in shown.text)
+            assert operator.pressed() is Key.PAUSE
+            assert operator.pressed() is None
+        assert termios.tcgetattr(program) == before
+        eventually(lambda: shown.text.count("\x1b[?25l") == shown.text.count("\x1b[?25h"))  # the cursor is back
+
+
+def test_a_person_is_asked_what_a_question_assumes_and_needs_no_keyboard() -> None:
+    console = Console(file=io.StringIO(), width=80, height=24)
+    with Screen(console, stdin=io.StringIO("no\nMOVE\n")) as operator:
+        assert operator.ask(Question("Free?", assumed="yes")) == "no"
+        assert operator.ask(Question("Go?", ("MOVE",))) == "MOVE"
+        assert operator.pressed() is None
+
+
+def test_a_terminal_that_knows_only_ascii_gets_ascii() -> None:
+    file = io.TextIOWrapper(io.BytesIO(), encoding="ascii")  # would raise at anything else
+    console = Console(file=file, width=80, height=24, force_terminal=True, color_system=None)
+    with Screen(console, stdin=io.StringIO()) as operator:
+        for event in (*MIDDLE, Noted(words="±0.1 N·m at 90°", warning=True)):
+            operator.tell(event)
+    file.seek(0)
+    text = file.read()
+    assert "+- 0.0011" in text
+    assert "|-y 3*|" in text
+
+
+def test_ascii_is_longer_and_nothing_is_cut_off_for_it() -> None:
+    hint = "point the middle of the tool's -x, -y and -z axes down: tilt it about y by -45°"
+    found = view(
+        *MIDDLE, estimated(hint=hint), Noted(words="turned by 45° 45° 45° 45° 45° 45° 45° 45° 45° 45°", warning=True)
+    )
+    found.ascii_only = True
+    lines = drawn(found)
+    text = " ".join(lines)
+    assert "tilt it about y by -45 deg" in text
+    assert text.count("45 deg") == 11
+    assert all(line.isascii() and len(line) <= 80 for line in lines)
+    assert len({line.index("|") for line in lines if line.endswith("|-y 3*|")} | {60}) == 1  # the cube stays in line
+
+
+def test_enter_in_step_mode_leaves_no_line_behind() -> None:
+    console = Console(file=(file := io.StringIO()), width=80, height=24, force_terminal=True, color_system=None)
+    with Screen(console, stdin=io.StringIO()) as operator:
+        operator.tell(Asked(question="Pose 3 of 25: Enter moves joint 4", answer="", by="person"))
+        operator.tell(Asked(question="Is the tool free?", answer="yes", by="--yes"))
+    assert "Enter moves" not in file.getvalue()
+    assert "free? yes (--yes)" in file.getvalue()
+
+
+def test_a_long_finding_goes_on_under_its_text() -> None:
+    console = Console(file=(file := io.StringIO()), width=40, force_terminal=True, color_system=None)
+    words = "the controller carries 0.50 kg; nothing in [tool] to compare it with"
+    with Screen(console, stdin=io.StringIO()) as operator:
+        operator.tell(Checked(name="payload", passed=True, words=words))
+    told = file.getvalue()
+    begins = told.index("ok   payload:")
+    lines = [line.rstrip() for line in told[begins : told.index("with", begins) + 4].splitlines()]
+    assert lines[0] == "ok   payload: the controller carries"
+    assert all(line.startswith(" " * 5) and len(line) <= 40 for line in lines[1:])
+    assert " ".join(" ".join(lines).split()) == f"ok payload: {words}"
+
+
+def test_without_a_terminal_there_are_plain_lines_and_json_where_asked_for() -> None:
+    with open_operator() as operator:
+        assert isinstance(operator, PlainOperator)  # the test's own stderr is captured
+    with open_operator(as_json=True) as operator:
+        assert isinstance(operator, JsonOperator)
+
+
+PROGRAM = """
+import signal, sys, time
+from ftdrive.terminal.screen import open_operator
+from ftdrive.session.events import Noted
+signal.signal(signal.SIGTERM, signal.default_int_handler)
+try:
+    with open_operator() as operator:
+        operator.tell(Noted(words=type(operator).__name__ + " is here"))
+        time.sleep(60)
+except KeyboardInterrupt:
+    print("interrupted", file=sys.stderr)
+    sys.exit(130)
+"""
+
+
+@pytest.mark.parametrize(
+    ("how", "environment", "kind"),
+    [
+        ("Ctrl-C", {"NO_COLOR": "1"}, "Screen"),
+        ("SIGTERM", {}, "Screen"),
+        ("Ctrl-C", {"TERM": "dumb"}, "PlainOperator"),
+    ],
+)
+def test_ctrl_c_and_sigterm_end_the_program_and_restore_the_terminal(
+    how: str, environment: dict[str, str], kind: str
+) -> None:
+    with terminal() as (person, program):
+        before = termios.tcgetattr(program)
+        shown = Shown(person)
+        child = subprocess.Popen(
+            [
+                sys.executable,
+                "-c",
+                f"import os; os.setsid(); __import__('fcntl').ioctl(0, {termios.TIOCSCTTY}, 0)" + PROGRAM,
+            ],
+            stdin=program,
+            stdout=program,
+            stderr=program,
+            cwd=Path(__file__).parents[3],
+            env={**os.environ, "TERM": "xterm-256color", **environment},
+        )
+        try:
+            eventually(lambda: f"{kind} is here" in shown.text, 30)
+            if kind == "Screen":
+                eventually(lambda: not termios.tcgetattr(program)[3] & termios.ICANON)
+            if how == "Ctrl-C":
+                os.write(person, b"\x03")
+            else:
+                child.terminate()
+            assert child.wait(20) == 130
+            eventually(lambda: "interrupted" in shown.text)
+            assert termios.tcgetattr(program) == before
+            if "NO_COLOR" in environment:
+                assert not any(f"\x1b[{colour}" in shown.text for colour in ("31m", "32m", "33m", "36m", "1;3"))
+            if environment.get("TERM") == "dumb":
+                assert "\x1b" not in shown.text
+        finally:
+            child.kill()
+            child.wait()
