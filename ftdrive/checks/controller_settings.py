@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import CalibrationResult
-from ftdrive.planning.show.scene import down_of
+from ftdrive.planning.geometry.scene import down_of
 
 Array = NDArray[np.float64]
 

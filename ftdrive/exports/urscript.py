@@ -10,8 +10,8 @@ from typing import Any
 
 from ftdrive.exports.common import plain, require_usable
 from ftdrive.planning.approach import NEAR_RAD
+from ftdrive.planning.geometry.scene import MOUNTINGS
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.show.scene import MOUNTINGS
 from ftdrive.planning.show.words import point_in_words, room_in_words
 
 APPROACH_RAD_S, APPROACH_RAD_S2 = radians(10), radians(20)

@@ -11,10 +11,10 @@ from ftdrive.cell.config import CellConfig
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier, Margins
+from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene, lean_of
 from ftdrive.planning.motion import Speeds, slower
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_box, plan_cone, plan_tour
-from ftdrive.planning.show.scene import BASE_PLANE, Box, Plane, Scene, lean_of
 
 FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
 """Nothing goes faster, whatever a plan, or the configuration of an old run, says."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from calib import CalibrationDataset, CalibrationResult, solve
 from calib.routine import DriftCheck, PoseRecord, dataset_from, drift_check
-from ftdrive.planning.show.scene import down_of
+from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.run import Run, versions
 
 

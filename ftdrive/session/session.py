@@ -19,10 +19,10 @@ from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.errors import ConfigError, Declined, NotAccepted
 from ftdrive.planning.approach import arm_moves, plan_approach
 from ftdrive.planning.cell_plan import certifier_for, plan_for, speeds_of
+from ftdrive.planning.geometry.scene import down_of
 from ftdrive.planning.motion import slower
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.constant_tour import constant_tour
-from ftdrive.planning.show.scene import down_of
 from ftdrive.planning.show.words import point_in_words, turns_in_words, way_in_words
 from ftdrive.runs.outcome import Outcome, solve_and_save
 from ftdrive.runs.run import Mode, Run

@@ -11,10 +11,10 @@ import pytest
 from ftdrive.exports.urscript import program
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.scene import Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
-from ftdrive.planning.show.scene import Scene
 from tests.wire.conftest import Station
 
 SCRIPT_PORT = 30003

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from drivers.ur.kinematics import Array
 from ftdrive.planning.geometry.arm_model import ArmModel
+from ftdrive.planning.geometry.scene import Scene
 from ftdrive.planning.geometry.shapes import Bodies, height_above, separation, separation_from_box
-from ftdrive.planning.show.scene import Scene
 
 FIRST_STEP_RAD = np.radians(15)
 LAST_STEP_RAD = np.radians(0.4)

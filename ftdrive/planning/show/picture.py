@@ -15,8 +15,8 @@ from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import Frames
+from ftdrive.planning.geometry.scene import Plane, Scene
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.show.scene import Plane, Scene
 
 VIEWS = ((1, 2, "along base x"), (0, 2, "along base y"), (0, 1, "from above"))
 """Axis to the right, axis up, title."""

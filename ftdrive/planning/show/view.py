@@ -13,9 +13,9 @@ import numpy as np
 from drivers.ur.kinematics import Array
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.scene import Plane
 from ftdrive.planning.motion import tips
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.show.scene import Plane
 from ftdrive.planning.show.words import room_in_words
 
 HOST = "127.0.0.1"

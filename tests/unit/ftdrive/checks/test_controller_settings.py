@@ -14,7 +14,7 @@ from calib.model import predict
 from calib.poses.information import special
 from ftdrive.cell.config import SensorConfig, ToolConfig
 from ftdrive.checks.controller_settings import LEAN_DEG, lean_in_words, mismatches, payload_in_words
-from ftdrive.planning.show.scene import Scene, lean_of
+from ftdrive.planning.geometry.scene import Scene, lean_of
 from ftdrive.runs.pose_hints import hints
 from ftdrive.session.events import Noted, PoseTaken, Weighed
 from ftdrive.session.preflight import Before, check_payload

@@ -10,9 +10,9 @@ from ftdrive.planning.approach import Approach, arm_moves, plan_approach
 from ftdrive.planning.cell_plan import certifier_for
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
-from ftdrive.planning.show.scene import BASE_PLANE, Box, Plane, Scene
 
 TOOL = (Cylinder(0, 0.2, 0.1),)
 CROWDED = Scene(

@@ -13,11 +13,11 @@ from drivers.ur.kinematics import Array
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier, Margins
+from ftdrive.planning.geometry.scene import Box, Plane, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import NUMBERS, USUAL_POSTURE_RAD, guess_of, plan_tour
 from ftdrive.planning.search.tours import shortest_tour
-from ftdrive.planning.show.scene import Box, Plane, Scene
 
 MODELS = ("UR3e", "UR5e", "UR10e", "UR16e", "UR20", "UR30")
 TOOLS = (

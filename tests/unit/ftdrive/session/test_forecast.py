@@ -8,10 +8,10 @@ from ftdrive.planning.approach import plan_approach
 from ftdrive.planning.cell_plan import speeds_of
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.scene import BASE_PLANE, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
-from ftdrive.planning.show.scene import BASE_PLANE, Scene
 from ftdrive.session.forecast import at_most, moves_s
 from ftdrive.session.tour import APPROACH_RAD_S, SLOW
 

@@ -11,7 +11,7 @@ from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.interfaces import ArmState, ArmStatus
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.show.scene import Scene
+from ftdrive.planning.geometry.scene import Scene
 from ftdrive.session.guards import (
     ContactGuard,
     Guard,

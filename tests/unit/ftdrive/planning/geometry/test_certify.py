@@ -11,9 +11,9 @@ from drivers.ur.kinematics import Array
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier, Margins
+from ftdrive.planning.geometry.scene import Box, Plane, Scene
 from ftdrive.planning.geometry.shapes import Bodies, height_above, separation, separation_from_box
 from ftdrive.planning.search.constant_tour import constant_tour
-from ftdrive.planning.show.scene import Box, Plane, Scene
 
 MODELS = ("UR3e", "UR5e", "UR10e", "UR16e", "UR20", "UR30")
 TOOLS = (

@@ -11,12 +11,12 @@ from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import frames
+from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
 from ftdrive.planning.search.constant_tour import DIFFERENT_SHAPES, NUMBERS, constant_tour
 from ftdrive.planning.search.nodes import WINDOW_RAD
-from ftdrive.planning.show.scene import BASE_PLANE, Box, Plane, Scene
 
 TOOL = (Cylinder(0, 0.2, 0.1),)
 LUMP = (*TOOL, Cylinder(0.05, 0.1, 0.03, 0.06, 0.0))

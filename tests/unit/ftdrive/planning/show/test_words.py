@@ -9,10 +9,10 @@ from syrupy.assertion import SnapshotAssertion
 from ftdrive.planning.approach import arm_moves
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.scene import Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
-from ftdrive.planning.show.scene import Scene
 from ftdrive.planning.show.words import plan_in_words, room_in_words, turns_in_words, way_in_words
 
 
