@@ -229,7 +229,7 @@ class RobotArm(_Device):
         """Whether the controller takes programs from the network; None where there is no such switch."""
         return None
 
-    def program_told(self) -> str | None:
+    def reported_program(self) -> str | None:
         """What the controller calls the program it runs, in its own words; None where it does not tell."""
         return None
 

@@ -185,7 +185,7 @@ class UrArm(RobotArm):
         deadline_s = self._clock.now_s() + self._timing.release_s
         while reader.look().program_state != PROGRAM_STOPPED:
             if self._clock.now_s() > deadline_s:
-                told = self.program_told()
+                told = self.reported_program()
                 raise ConnectError(
                     f"a program that this one has not started is on {self._host}{f' ({told})' if told else ''} and is "
                     "not ended",
@@ -252,7 +252,7 @@ class UrArm(RobotArm):
             return None
         return self._ask_dashboard(lambda dashboard: dashboard.isInRemoteControl())
 
-    def program_told(self) -> str | None:
+    def reported_program(self) -> str | None:
         """Ask the dashboard server for the program's state and name; None where it does not answer.
 
         A program that a client has sent may come under the name of one that is loaded: not tried on hardware.

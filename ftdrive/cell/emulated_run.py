@@ -23,9 +23,9 @@ class _Unkept:
     def has_keys(self) -> bool:
         return self._operator.has_keys
 
-    def tell(self, event: Event) -> None:
+    def show(self, event: Event) -> None:
         if self._folder not in str(event.to_dict()):
-            self._operator.tell(event)
+            self._operator.show(event)
 
     def ask(self, question: Question) -> str:
         return self._operator.ask(question)

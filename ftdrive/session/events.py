@@ -203,15 +203,15 @@ class Asked(Event):
 class Witness:
     """Tells what a sensor has been through, each thing once: interruptions, connections that came back."""
 
-    def __init__(self, sensor: ForceTorqueSensor, tell: Callable[[Event], None]) -> None:
-        self._sensor, self._tell = sensor, tell
+    def __init__(self, sensor: ForceTorqueSensor, show: Callable[[Event], None]) -> None:
+        self._sensor, self._show = sensor, show
         self._told = 0
 
-    def tell_news(self) -> None:
+    def show_new(self) -> None:
         """Tell what has happened since the last time."""
         events = self._sensor.health().events
         for t_host_ns, words in events[self._told :]:
-            self._tell(Noted(words=f"sensor: {words} (host clock {t_host_ns / 1e9:.3f} s)", warning=True))
+            self._show(Noted(words=f"sensor: {words} (host clock {t_host_ns / 1e9:.3f} s)", warning=True))
         self._told = len(events)
 
 

@@ -136,7 +136,7 @@ class _Collection:
         earlier: Sequence[PoseRecord],
     ) -> None:
         self._arm, self._sensor, self._sampling = arm, sensor, sampling
-        self._witness = Witness(sensor, operator.tell)
+        self._witness = Witness(sensor, operator.show)
         self._operator, self._estimate, self._commit = operator, estimate, commit
         self._clock, self._down_base, self._listen = clock, down_base, listen
         self._earlier = earlier
@@ -167,7 +167,7 @@ class _Collection:
             self._learn(record)
         if self._ends_by_itself and self._enough:
             self._note("The poses that are there are enough: it ends with the next one.")
-        self._tell_state(State.MOVE)
+        self._show_state(State.MOVE)
         while not self._over:
             state = self._ask(self._arm.state)
             self._collect(LOOK_S)  # paces the loop, and raises as soon as the sensor fails
@@ -197,7 +197,7 @@ class _Collection:
             self._wait_out(self._sensor.check, StreamBroken, DeviceTimeout)
             return None
         finally:
-            self._witness.tell_news()
+            self._witness.show_new()
         return samples
 
     def _collect_enough(self) -> FtSamples | None:
@@ -221,7 +221,7 @@ class _Collection:
             except losses:
                 if self._clock.now_s() > deadline_s:
                     raise
-            self._witness.tell_news()
+            self._witness.show_new()
             self._clock.sleep(LOOK_S)
 
     def _may_measure(self) -> bool:
@@ -242,12 +242,12 @@ class _Collection:
         if self._rests_at is not None and turned_rad(self._rests_at, state) > LEFT_RAD:
             self._rests_at = None
             if not self._dealt_with:
-                self._tell_state(State.MOVE)
+                self._show_state(State.MOVE)
         if self._rests_at is None:
             if not still:
                 return False
             self._dealt_with = False
-            self._tell_state(State.SETTLE)
+            self._show_state(State.SETTLE)
         elif still and turned_rad(self._rests_at, state) < MOVED_RAD:
             return not self._dealt_with and state.t_device_s - self._still_since_s >= STILL_S
         elif self._dealt_with:
@@ -284,7 +284,7 @@ class _Collection:
     def _measure(self, stop: int, number: int, *, settle_s: float) -> bool:
         """Average, again while something is not quiet, and keep the pose; False when the arm moved on."""
         for attempt in range(1, self._sampling.attempts + 1):
-            self._tell_state(State.SAMPLE)
+            self._show_state(State.SAMPLE)
             before = self._ask(self._arm.state)
             if (found := self._collect_enough()) is None:
                 return False
@@ -293,7 +293,7 @@ class _Collection:
             if turned_rad(before, after) >= MOVED_RAD or np.abs(after.qd_rad_s).max() >= STILL_RAD_S:
                 self._still_since_s = after.t_device_s
                 self._note(f"The arm moved while pose {stop} was measured: {self._hold_still()}.", warning=True)
-                self._tell_state(State.SETTLE)
+                self._show_state(State.SETTLE)
                 return False
             unrest = self._unrest(samples)
             if not unrest:
@@ -314,7 +314,7 @@ class _Collection:
     def _keep(self, record: PoseRecord, settle_s: float, attempts: int) -> None:
         self._commit(record)
         self._redo = None
-        self._operator.tell(
+        self._operator.show(
             PoseTaken.of(
                 record,
                 self._down_base,
@@ -333,7 +333,7 @@ class _Collection:
         words = "the program goes on" if self._listen else "move on to another orientation"
         if self._may_finish:
             words = f"enough: press k to finish, or {words}"
-        self._tell_state(State.MOVE, words)
+        self._show_state(State.MOVE, words)
 
     @property
     def _may_finish(self) -> bool:
@@ -347,7 +347,7 @@ class _Collection:
             std = record.samples.wrench.std(axis=0, ddof=1)
             self._level = std if self._level is None else np.minimum(self._level, std)
         estimated = self._estimate(record)
-        self._operator.tell(replace(estimated, hint="") if self._listen else estimated)
+        self._operator.show(replace(estimated, hint="") if self._listen else estimated)
         sigmas, force_N = estimated.residual_sigma or 0.0, estimated.residual_force_N or 0.0
         touched = estimated.poses >= LEAST_TO_COMPARE and sigmas > SURPRISE_SIGMA and force_N > SURPRISE_N
         if touched:
@@ -416,11 +416,11 @@ class _Collection:
         enough = "" if self._light == "green" else f"; the light is {self._light}, a calibration of them may be refused"
         self._note(f"{why}: {kept}{enough}.", warning=bool(enough))
 
-    def _tell_state(self, state: State, words: str = "") -> None:
-        self._operator.tell(StateChanged(state=state, stop=self._next_stop(), words=words))
+    def _show_state(self, state: State, words: str = "") -> None:
+        self._operator.show(StateChanged(state=state, stop=self._next_stop(), words=words))
 
     def _next_stop(self) -> int:
         return self._redo or max(self._taken, default=0) + 1
 
     def _note(self, words: str, *, warning: bool = False) -> None:
-        self._operator.tell(Noted(words=words, warning=warning))
+        self._operator.show(Noted(words=words, warning=warning))

@@ -11,7 +11,7 @@ from ftdrive.session.operator import Key, Operator, Question
 log = logging.getLogger(__name__)
 
 
-class Desk:
+class Journal:
     """The person, and the diary: every event goes to both, from any thread, one at a time.
 
     Parameters
@@ -33,12 +33,12 @@ class Desk:
             for event in self._early:
                 run.append_event(event.to_dict())
             self._early.clear()
-        self.tell(RunOpened(folder=str(run.folder), resume=run.resume_command), sync=True)
+        self.show(RunOpened(folder=str(run.folder), resume=run.resume_command), sync=True)
 
-    def tell(self, event: Event, *, sync: bool = False) -> None:
+    def show(self, event: Event, *, sync: bool = False) -> None:
         """Show and keep an event."""
         with self._lock:
-            self._operator.tell(event)
+            self._operator.show(event)
             if self._run is None:
                 self._early.append(event)
                 return
@@ -51,7 +51,7 @@ class Desk:
         """Ask, and keep the answer, and who gave it."""
         assumed = question.assumed if self._yes else None
         answer = self._operator.ask(question) if assumed is None else assumed
-        self.tell(Asked(question=question.text, answer=answer, by="person" if assumed is None else "--yes"))
+        self.show(Asked(question=question.text, answer=answer, by="person" if assumed is None else "--yes"))
         return answer
 
     def require(self, text: str, *, assumed: bool) -> None:

@@ -32,7 +32,7 @@ class Question:
 class Operator(Protocol):
     """Whoever runs the session."""
 
-    def tell(self, event: Event) -> None:
+    def show(self, event: Event) -> None:
         """Show an event; returns at once."""
 
     def ask(self, question: Question) -> str:

@@ -149,14 +149,14 @@ def check_remote(before: Before) -> Checked:
         return _failed("remote", str(error))
 
 
-def leave_programs_alone(arm: RobotArm, clock: Clock, limits: Limits) -> None:
+def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
     """Row 21: raise `NotAccepted` where a program is, and stays, on the controller: no session ends one to begin."""
     deadline_s = clock.now_s() + limits.program_ends_s
     while (program := arm.status().program) != "stopped":
         if clock.now_s() > deadline_s:
             raise NotAccepted(
-                f"a program is on the controller ({arm.program_told() or program}) and is not ended by this one: stop "
-                "it at the pendant, then start again; nothing was touched"
+                f"another program is on the controller ({arm.reported_program() or program}): stop it at the pendant, "
+                "then start again; nothing was touched"
             )
         clock.sleep(0.02)
 

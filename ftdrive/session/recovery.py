@@ -8,7 +8,7 @@ from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrive.session.events import GuardTripped, Noted, Witness
 from ftdrive.session.guards import ContactGuard, Tripped, by_safety, out_of_sight
-from ftdrive.session.journal import Desk
+from ftdrive.session.journal import Journal
 from ftdrive.session.watchdog import Watcher
 
 _LOOK_AGAIN_S: Final = 0.4
@@ -30,20 +30,20 @@ class Recovery:
         self,
         arm: RobotArm,
         sensor: ForceTorqueSensor,
-        desk: Desk,
+        journal: Journal,
         watcher: Watcher,
         contact: ContactGuard,
         recheck: Callable[[bool], None],
     ) -> None:
-        self._arm, self._sensor, self._desk, self._watcher = arm, sensor, desk, watcher
+        self._arm, self._sensor, self._journal, self._watcher = arm, sensor, journal, watcher
         self._contact, self._recheck = contact, recheck
-        self._witness = Witness(sensor, desk.tell)
+        self._witness = Witness(sensor, journal.show)
         self._told: Tripped | None = None  # last, as what the arm is held for
         self._answered: Tripped | None = None  # last stop of row 11 after which the questions were answered
 
-    def tell_news(self) -> None:
+    def show_new(self) -> None:
         """Tell what the sensor went through."""
-        self._witness.tell_news()
+        self._witness.show_new()
 
     def cause(self, error: Exception, *, moving: bool) -> Tripped | None:
         """What a guard has to say about it, or the row of the table that the error belongs to."""
@@ -73,18 +73,18 @@ class Recovery:
         try:
             self._sensor.check()
         except DriverError:
-            self._witness.tell_news()
+            self._witness.show_new()
             self._sensor.close()
             self._sensor.open()
             self._contact.forget()
-            self._witness = Witness(self._sensor, self._desk.tell)
+            self._witness = Witness(self._sensor, self._journal.show)
         stop = self._watcher.safety_stop
         if stop is not None and stop not in {self._answered, self._told}:  # pressed while the arm was held already
             self._told = stop
-            self._desk.tell(GuardTripped(hazard=stop.hazard, words=str(stop)))
+            self._journal.show(GuardTripped(hazard=stop.hazard, words=str(stop)))
         elif unseen:
             words = "the arm was out of sight: nobody knows whether its emergency stop was pressed meanwhile"
-            self._desk.tell(Noted(words=words, warning=True))
+            self._journal.show(Noted(words=words, warning=True))
         self._recheck(unseen or stop is not self._answered)
         self._answered = stop
         self._watcher.begin()

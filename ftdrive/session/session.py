@@ -45,7 +45,7 @@ from ftdrive.session.guards import (
 )
 from ftdrive.session.hand_guided import collect_manually
 from ftdrive.session.identity import require_same_devices
-from ftdrive.session.journal import Desk
+from ftdrive.session.journal import Journal
 from ftdrive.session.live_fit import Running
 from ftdrive.session.operator import Operator
 from ftdrive.session.recovery import Recovery
@@ -110,31 +110,31 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
         It was broken off; what was taken stands in the run, which can be resumed.
     """
     limits = limits or (Limits.emulated() if cell.clock.emulated else Limits())
-    desk = Desk(operator, yes=options.yes)
-    desk.tell(StateChanged(state=State.IDLE))
+    journal = Journal(operator, yes=options.yes)
+    journal.show(StateChanged(state=State.IDLE))
     options = as_begun(options)
     by_hand = options.mode in _BY_HAND
     plan = None if by_hand else _plan_on_disk(options)
     device, driver = build_sensor(cell), build_arm(cell)
     if options.resume is not None:
-        desk.keep_in(Run(options.resume))
+        journal.keep_in(Run(options.resume))
     with device as sensor, closing(driver) as arm, preflight.awake() as kept_awake:
         arm.open()
-        desk.tell(StateChanged(state=State.PREFLIGHT))
+        journal.show(StateChanged(state=State.PREFLIGHT))
         if not by_hand:
-            preflight.leave_programs_alone(arm, cell.clock, limits)
+            preflight.require_no_program(arm, cell.clock, limits)
         devices = {"arm": asdict(arm.identify()), "sensor": asdict(sensor.identify())}
         if by_hand:
-            run = _by_hand(cell, arm, sensor, desk, options, devices)
+            run = _by_hand(cell, arm, sensor, journal, options, devices)
         else:
-            desk.tell(Noted(words=kept_awake))
+            journal.show(Noted(words=kept_awake))
             if not options.dry_run and arm.status().tcp_offset is None:
                 arm.open(control=True)  # an old controller tells no poses before
-            begun = _Begun(cell, arm, sensor, desk, options, plan, limits)
+            begun = _Begun(cell, arm, sensor, journal, options, plan, limits)
             begun.look()
             begun.check(preflight.CHECKS)
             if options.dry_run:
-                desk.tell(
+                journal.show(
                     Noted(words="the controller's own safety limits are not asked for: only a program on it could")
                 )
             else:
@@ -146,7 +146,7 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
             run = begun.tour(devices)
     if not run.stops():
         raise Declined(f"ended before the first pose: {run.folder} holds nothing to solve")
-    desk.tell(StateChanged(state=State.REPORT))
+    journal.show(StateChanged(state=State.REPORT))
     return solve_and_save(run)
 
 
@@ -194,12 +194,12 @@ class _Begun:
         cell: CellConfig,
         arm: RobotArm,
         sensor: ForceTorqueSensor,
-        desk: Desk,
+        journal: Journal,
         options: Options,
         plan: Plan | None,
         limits: Limits,
     ) -> None:
-        self._cell, self._arm, self._sensor, self._desk, self._options = cell, arm, sensor, desk, options
+        self._cell, self._arm, self._sensor, self._journal, self._options = cell, arm, sensor, journal, options
         self._limits = limits
         self._reduced = False  # as a person has said it should be
         info: DeviceInfo = arm.identify()
@@ -220,7 +220,7 @@ class _Begun:
         q = self._stands_rad = arm.state().q_rad
         self._todo, self._taken = self._what_is_left()
         for record in self._taken:
-            self._desk.tell(self._running.add(record))
+            self._journal.show(self._running.add(record))
         first = self._todo[0] - 1 if self._todo else 0
         goal = np.array(self._plan.steps[first % len(self._plan.steps)].q_rad)
         self._before = preflight.Before(
@@ -262,7 +262,7 @@ class _Begun:
         try:
             return self._sensor.collect(duration_s)
         except DriverError as error:
-            self._desk.tell(Noted(words=f"{error}; trying once more", warning=True))
+            self._journal.show(Noted(words=f"{error}; trying once more", warning=True))
         self._sensor.close()
         self._sensor.open()
         return self._sensor.collect(duration_s)
@@ -272,7 +272,7 @@ class _Begun:
         failed = []
         for check in checks:
             found = check(self._before)
-            self._desk.tell(found)
+            self._journal.show(found)
             if not found.passed:
                 failed.append(f"{found.name}: {found.words}")
         if failed:
@@ -284,7 +284,9 @@ class _Begun:
         if not (sampling.noise_record_s and self._todo):
             variance = np.diag(mean_and_covariance(self._before.quiet.wrench).covariance)
             return sampling, np.sqrt(variance * preflight.LISTEN_S / sampling.average_s)
-        self._desk.tell(Noted(words=f"listening to the sensor for {sampling.noise_record_s:g} s; do not touch the arm"))
+        self._journal.show(
+            Noted(words=f"listening to the sensor for {sampling.noise_record_s:g} s; do not touch the arm")
+        )
         record = self._listen(sampling.noise_record_s)
         chosen = averaging_time(
             record.wrench,
@@ -292,7 +294,7 @@ class _Begun:
             target_force_N=_TARGET_N,
             target_torque_Nm=_TARGET_NM,
         )
-        self._desk.tell(Noted(words=chosen.words))
+        self._journal.show(Noted(words=chosen.words))
         return replace(sampling, average_s=chosen.seconds), chosen.sigma
 
     def _show(self) -> None:
@@ -302,35 +304,35 @@ class _Begun:
         if len(way):
             near = way_in_words(way, self._before.approach.clearance_m)
             words = f"The way to the first pose to be taken, from where the arm stands: {near}."
-        self._desk.tell(Planned(plan=plan, way_rad=way, way_words=words))
+        self._journal.show(Planned(plan=plan, way_rad=way, way_words=words))
         if options.output is not None:
             plan.save(options.output)
-            self._desk.tell(Noted(words=f"the plan is saved as {options.output}"))
+            self._journal.show(Noted(words=f"the plan is saved as {options.output}"))
         if options.png is not None:
             from ftdrive.planning.show.picture import draw
 
             draw(plan, self._certifier, options.png, way)
-            self._desk.tell(Noted(words=f"the plan is drawn in {options.png}"))
+            self._journal.show(Noted(words=f"the plan is drawn in {options.png}"))
         if options.view:
             from ftdrive.planning.show.view import open_in_browser, shown
 
             with shown(plan, self._certifier, way) as url:
                 open_in_browser(url)
-                self._desk.require(f"The plan is shown at {url} until you answer. Go on?", assumed=False)
+                self._journal.require(f"The plan is shown at {url} until you answer. Go on?", assumed=False)
 
     def predict(self) -> None:
         """Choose how long to average; tell what the plan is worth with this sensor's noise, and how long it takes."""
         self._sampling, noise = self._chosen_sampling()
         mass_kg, average_s = self._cell.tool.mass_kg, self._sampling.average_s
-        self._desk.tell(Noted(words=prediction(self._plan, self._certifier, mass_kg, average_s, noise)))
+        self._journal.show(Noted(words=prediction(self._plan, self._certifier, mass_kg, average_s, noise)))
         if self._options.fast and self._slow:
             why = f": {_NO_SERIAL}" if self._key[0] == NOT_REPORTED else ""
             words = f"{'every' if why else 'the first'} run of a plan is slow, whatever was asked{why}"
-            self._desk.tell(Noted(words=words, warning=True))
+            self._journal.show(Noted(words=words, warning=True))
         fastest_rad_s = max(step.speed_rad_s for step in self._driven.steps)
         total_s = moves_s(self._driven, self._todo, self._stands_rad, self._before.approach)
         total_s += len(self._todo) * (average_s + 0.6)
-        self._desk.tell(
+        self._journal.show(
             Noted(
                 words=f"stops to come: {len(self._todo)}, at most {np.degrees(fastest_rad_s):.0f}°/s: about "
                 f"{total_s / 60:.1f} min; {len(self._taken)} poses are there already"
@@ -353,7 +355,7 @@ class _Begun:
 
     def tour(self, devices: Mapping[str, Any]) -> Run:
         """Ask, move, keep."""
-        desk, plan, cell = self._desk, self._driven, self._cell
+        journal, plan, cell = self._journal, self._driven, self._cell
         quiet = self._before.quiet.wrench
         window = int(len(quiet) * min(1.0, self._sampling.average_s / preflight.LISTEN_S))
         quiet_std = noise_level(quiet, max(LEAST_SAMPLES, window))
@@ -376,7 +378,7 @@ class _Begun:
         )
 
         def on_trip(trip: Tripped) -> None:
-            desk.tell(GuardTripped(hazard=trip.hazard, words=str(trip)))
+            journal.show(GuardTripped(hazard=trip.hazard, words=str(trip)))
 
         watcher = Watcher(self._arm, self._sensor, rows, on_trip, clock=cell.clock, limits=self._limits)
         with watcher:  # an emergency stop at a question counts too
@@ -389,17 +391,17 @@ class _Begun:
                 self._certifier,
                 plan,
                 run,
-                desk,
+                journal,
                 self._running,
                 watcher,
-                recovery=Recovery(self._arm, self._sensor, desk, watcher, contact, self._recheck),
+                recovery=Recovery(self._arm, self._sensor, journal, watcher, contact, self._recheck),
                 load=load,
                 sampling=self._sampling,
                 pace=self._pace,
                 quiet_std=quiet_std,
                 sensor_kg=cell.sensor.mass_kg,
             )
-            with _kept(desk, run):
+            with _kept(journal, run):
                 tour.run(self._todo)
         if self._todo and not self._known:
             self._judge_completed(run, tour.undriven)
@@ -415,7 +417,9 @@ class _Begun:
         else:
             remember_completed(*self._key)
             return
-        self._desk.tell(Noted(words=f"the next run of this plan is slow again and begins with the typed word: {why}"))
+        self._journal.show(
+            Noted(words=f"the next run of this plan is slow again and begins with the typed word: {why}")
+        )
 
     def _recheck(self, asks: bool) -> None:
         """Do the checks again after a stop; with `asks`, all of the preflight: the questions again too."""
@@ -442,14 +446,14 @@ class _Begun:
             "of people too?",
             "Is the emergency stop in reach, and tested?",
         ):
-            self._desk.require(text, assumed=assumed)
+            self._journal.require(text, assumed=assumed)
         self._ask_reduced(assumed=assumed)
 
     def _ask_reduced(self, *, assumed: bool) -> None:
         """Ask whether reduced mode is meant, once as long as it lasts."""
         reduced = self._arm.status().safety_mode == "reduced"
         if reduced and not self._reduced:
-            self._desk.require("The controller is in reduced mode. Is that as it should be?", assumed=assumed)
+            self._journal.require("The controller is in reduced mode. Is that as it should be?", assumed=assumed)
         self._reduced = reduced
 
     def _run(self, devices: Mapping[str, Any]) -> Run:
@@ -458,7 +462,7 @@ class _Begun:
         options, clock = self._options, self._cell.clock
         run = Run.create(options.runs, options.name, _description(self._cell, devices, options), clock)
         self._plan.save(run.plan_path)
-        self._desk.keep_in(run)
+        self._journal.keep_in(run)
         return run
 
 
@@ -474,14 +478,14 @@ def _range_of(sensor: ForceTorqueSensor) -> Array | None:
 
 
 @contextmanager
-def _kept(desk: Desk, run: Run) -> Iterator[None]:
+def _kept(journal: Journal, run: Run) -> Iterator[None]:
     """Say where the poses are when a session ends before its time."""
     try:
         yield
     except BaseException:
         words = f"{len(run.stops())} poses are kept in {run.folder}; go on with {run.resume_command}"
         words += f", or solve them with {run.solve_command}" if run.stops() else ""
-        desk.tell(Noted(words=words), sync=True)
+        journal.show(Noted(words=words), sync=True)
         raise
 
 
@@ -489,26 +493,26 @@ def _by_hand(
     cell: CellConfig,
     arm: RobotArm,
     sensor: ForceTorqueSensor,
-    desk: Desk,
+    journal: Journal,
     options: Options,
     devices: Mapping[str, Any],
 ) -> Run:
     """No motion command at all: a person moves the arm, or a program on the pendant does."""
     if options.resume is None:
         run, earlier = Run.create(options.runs, options.name, _description(cell, devices, options), cell.clock), []
-        desk.keep_in(run)
+        journal.keep_in(run)
     else:
         run = Run(options.resume, cell.clock)
         require_same_devices(run, cell, arm, sensor)
         earlier = run.records()
     down_base, listen = down_of(cell.workcell.mounting), options.mode == "listen"
     running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base)
-    with _kept(desk, run):
+    with _kept(journal, run):
         collect_manually(
             arm,
             sensor,
             cell.sampling,
-            desk,
+            journal,
             running.add,
             run.commit,
             clock=cell.clock,

@@ -36,7 +36,7 @@ from ftdrive.session.events import (
     Weighed,
 )
 from ftdrive.session.guards import RangeGuard, Tripped
-from ftdrive.session.journal import Desk
+from ftdrive.session.journal import Journal
 from ftdrive.session.live_fit import Running
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.preflight import forbidden
@@ -106,7 +106,7 @@ class Tour:
         certifier: Certifier,
         plan: Plan,
         run: Run,
-        desk: Desk,
+        journal: Journal,
         running: Running,
         watcher: Watcher,
         *,
@@ -118,7 +118,7 @@ class Tour:
         sensor_kg: float | None,
     ) -> None:
         self._arm, self._sensor, self._certifier = arm, sensor, certifier
-        self._plan, self._run, self._desk, self._running, self._watcher = plan, run, desk, running, watcher
+        self._plan, self._run, self._journal, self._running, self._watcher = plan, run, journal, running, watcher
         self._recovery, self._load, self._sampling, self._pace = recovery, load, sampling, pace
         self._quiet_std, self._sensor_kg = quiet_std, sensor_kg
         self._nodes = np.array([step.q_rad for step in plan.steps])
@@ -157,8 +157,8 @@ class Tour:
                 self._turn(turned.key)
             except (Tripped, DriverError, OSError, Stopped, TooFewSamples, NotAccepted) as error:
                 self._hold(error)
-        self._recovery.tell_news()
-        self._tell(State.CLOSE)
+        self._recovery.show_new()
+        self._show_state(State.CLOSE)
 
     @property
     def undriven(self) -> list[int]:
@@ -188,7 +188,7 @@ class Tour:
         if mass_kg is None or told_kg is None or told_kg == self._payload_kg:
             return
         self._payload_kg = told_kg
-        self._desk.tell(Weighed(mass_kg=mass_kg, payload_kg=told_kg))
+        self._journal.show(Weighed(mass_kg=mass_kg, payload_kg=told_kg))
         if words := payload_in_words(told_kg, mass_kg, self._sensor_kg):
             self._note(words, warning=True)
 
@@ -197,7 +197,7 @@ class Tour:
 
     def _step(self, stop: int, index: int) -> bool:
         """Ask for Enter; whether to go."""
-        answer = self._desk.ask(
+        answer = self._journal.ask(
             Question(
                 f"Pose {stop} of {self._stops}, orientation {self._plan.steps[index].number:02d}: {self._way(index)}, "
                 "s skips it, r takes the last pose again, q ends",
@@ -234,7 +234,7 @@ class Tour:
         moving = self._under_way is not None and self._at is None
         if self._again and not moving:
             raise Turned(Key.REDO)
-        while (key := self._desk.pressed()) is not None:
+        while (key := self._journal.pressed()) is not None:
             if key is Key.PAUSE:
                 raise Stopped("paused by a person")
             if key is Key.STOP:
@@ -288,7 +288,7 @@ class Tour:
         stay = set(dropped).intersection(self._run.stops())
         for record in self._run.records() if stay else ():
             if record.stop in stay:
-                self._desk.tell(self._running.add(record))
+                self._journal.show(self._running.add(record))
                 self._note(f"{names[record.stop]} stays as it was taken", warning=True)
         if left := [name for stop, name in names.items() if stop not in stay]:
             way = f"the arm goes on to pose {self._todo[0]}" if self._todo else "it was the last"
@@ -304,7 +304,7 @@ class Tour:
             nonlocal settled_s, attempts
             if stage == "sample":
                 settled_s, attempts = clock.now_s() - began_s, attempts + 1
-            self._tell(State.SETTLE if stage == "settle" else State.SAMPLE, stop)
+            self._show_state(State.SETTLE if stage == "settle" else State.SAMPLE, stop)
 
         with self._watcher.watching(pose.q_rad, pose.q_rad, moving=False):
             record = take_pose(
@@ -319,7 +319,7 @@ class Tour:
             )
         self._load.judge(record.samples.wrench)
         self._run.commit(record)
-        self._desk.tell(
+        self._journal.show(
             PoseTaken.of(
                 record,
                 self._certifier.scene.down_base,
@@ -330,8 +330,8 @@ class Tour:
             ),
             sync=True,
         )
-        self._recovery.tell_news()
-        self._desk.tell(self._running.add(record))
+        self._recovery.show_new()
+        self._journal.show(self._running.add(record))
         return record
 
     # -------------------------------------------------------------------------------------------- moving
@@ -344,7 +344,7 @@ class Tour:
         if at is None or speed_rad_s is None:
             self._approach(self._arm.state().q_rad, index, stop)
         else:
-            self._tell(State.MOVE, stop)
+            self._show_state(State.MOVE, stop)
             self._move(self._nodes[at], self._nodes[index], speed_rad_s, self._plan.acceleration_rad_s2)
             if index == (at + 1) % len(self._nodes):
                 self._driven.add(at)
@@ -379,7 +379,7 @@ class Tour:
         )
         if passed:
             words += f"; it passes close to the skipped pose {' and '.join(passed)} and does not stop there"
-        self._tell(State.APPROACH, stop, words)
+        self._show_state(State.APPROACH, stop, words)
         self._confirm(f"The arm goes {words}.", by_person=back or bool(passed) or arm_moves(way))
         for goal, speed in zip(approach.q_rad, approach.speed_rad_s, strict=True):
             self._move(q, goal, min(float(speed), most_rad_s), SLOW.joint_rad_s2)
@@ -403,12 +403,12 @@ class Tour:
             return
         trusted = self._pace.trusted and not by_person
         if self._moved:
-            if self._desk.ask(Question(text, assumed="yes" if trusted else None)) != "yes":
+            if self._journal.ask(Question(text, assumed="yes" if trusted else None)) != "yes":
                 raise Stopped(f"not confirmed: {text}")
             return
         assumed = _FIRST_WORD if trusted else None
         question = Question(f"{text} Hand on the emergency stop. Type {_FIRST_WORD}", (_FIRST_WORD,), assumed)
-        if self._desk.ask(question) != _FIRST_WORD:
+        if self._journal.ask(question) != _FIRST_WORD:
             raise Declined("the word was not typed: nothing moves")
         self._moved = True
 
@@ -449,7 +449,7 @@ class Tour:
         """Say why the arm stands, and wait for a person; returns when it may go on. The arm was stopped before."""
         self._arm.stop()
         if isinstance(error, Stopped) and error.for_good:
-            self._tell(State.STOP, words=str(error))
+            self._show_state(State.STOP, words=str(error))
             raise Declined(str(error))
         trip = self._recovery.cause(error, moving=self._at is None)
         if trip is not None and self._mended(trip):
@@ -459,12 +459,12 @@ class Tour:
         words = str(error if trip is None else trip).rstrip(".")
         told, untold = self._watcher.tripped(wait_s=0.0), self._watcher.untold
         if trip is not None and (trip is not told or untold is not None):
-            self._desk.tell(GuardTripped(hazard=trip.hazard, words=words))
+            self._journal.show(GuardTripped(hazard=trip.hazard, words=words))
         if untold is not None:
             self._note(f"not told at once, for {untold!r}, see to screen, pipe and disk: {told}", warning=True)
-        self._tell(State.STOP, words=words)
-        self._recovery.tell_news()
-        self._tell(State.HOLD, words=words)
+        self._show_state(State.STOP, words=words)
+        self._recovery.show_new()
+        self._show_state(State.HOLD, words=words)
         by_person = isinstance(error, Stopped)
         end = Declined(words) if by_person else error if trip is None else trip.error
         ways = {"resume": f"resume {'to go on' if by_person else 'when it is mended'}"}
@@ -475,7 +475,7 @@ class Tour:
         question = Question(f"{len(self._run.stops())} poses are kept. Type {', '.join(ways.values())}", tuple(ways))
         while True:
             try:
-                answer = self._desk.ask(question)
+                answer = self._journal.ask(question)
             except Declined:
                 raise end from error
             if answer == "quit":
@@ -483,7 +483,7 @@ class Tour:
             try:
                 self._recovery.make_sure()
             except (Tripped, DriverError, NotAccepted, Declined) as again:
-                self._desk.tell(Noted(words=f"not yet: {again}", warning=True))
+                self._journal.show(Noted(words=f"not yet: {again}", warning=True))
                 continue
             if answer == "skip":
                 self._skip()
@@ -507,14 +507,14 @@ class Tour:
         except (Tripped, DriverError, NotAccepted, Declined) as error:
             log.info("the sensor does not come back: %s", error)
             return False
-        self._desk.tell(Noted(words=f"{trip}; it is back, pose {stop} begins anew", warning=True))
+        self._journal.show(Noted(words=f"{trip}; it is back, pose {stop} begins anew", warning=True))
         return True
 
     # -------------------------------------------------------------------------------------------- telling
 
-    def _tell(self, state: State, stop: int | None = None, words: str = "") -> None:
+    def _show_state(self, state: State, stop: int | None = None, words: str = "") -> None:
         number = None if stop is None else self._plan.steps[self._index(stop)].number
-        self._desk.tell(StateChanged(state=state, stop=stop, stops=self._stops, number=number, words=words))
+        self._journal.show(StateChanged(state=state, stop=stop, stops=self._stops, number=number, words=words))
 
     def _note(self, words: str, *, warning: bool = False) -> None:
-        self._desk.tell(Noted(words=words, warning=warning))
+        self._journal.show(Noted(words=words, warning=warning))

@@ -74,7 +74,7 @@ class JsonOperator:
         self._stdin, self._stdout = stdin or sys.stdin, stdout or sys.stdout
         self._lock = Lock()
 
-    def tell(self, event: Event) -> None:
+    def show(self, event: Event) -> None:
         """Write the event."""
         self._write(event.to_dict())
 
@@ -127,7 +127,7 @@ class PlainOperator:
         self._lock = Lock()
         self._asked = ""
 
-    def tell(self, event: Event) -> None:
+    def show(self, event: Event) -> None:
         """Write the event in words, if it is worth a line."""
         if isinstance(event, Asked) and event.question == self._asked:
             return  # stands there already

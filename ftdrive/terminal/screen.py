@@ -388,7 +388,7 @@ class Screen:
         with self._stack:
             self._live.stop()
 
-    def tell(self, event: Event) -> None:
+    def show(self, event: Event) -> None:
         """Show an event."""
         with self._lock:
             self._view.update(event, self._clock())

@@ -41,7 +41,7 @@ class Nobody:
     told: list[Event] = field(default_factory=list)
     has_keys: bool = False
 
-    def tell(self, event: Event) -> None:
+    def show(self, event: Event) -> None:
         self.told.append(event)
         self.happening(event)
 

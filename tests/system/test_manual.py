@@ -86,7 +86,7 @@ class Person:
     def __init__(self, taken: Callable[[], None]) -> None:
         self._taken = taken
 
-    def tell(self, event: Event) -> None:
+    def show(self, event: Event) -> None:
         if isinstance(event, PoseTaken):
             self._taken()
 

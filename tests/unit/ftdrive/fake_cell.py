@@ -250,7 +250,7 @@ class Scripted:
     told: list[Event] = field(default_factory=list)
     asked: list[Question] = field(default_factory=list)
 
-    def tell(self, event: Event) -> None:
+    def show(self, event: Event) -> None:
         self.told.append(event)
         self.on_event(event)
 

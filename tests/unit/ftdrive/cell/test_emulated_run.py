@@ -21,7 +21,7 @@ class Told:
     def __init__(self) -> None:
         self.events: list[Event] = []
 
-    def tell(self, event: Event) -> None:
+    def show(self, event: Event) -> None:
         self.events.append(event)
 
 
@@ -37,9 +37,9 @@ def test_of_a_run_that_is_not_kept_nobody_is_told_where_it_is(
 
     def calibrate(_: object, operator: Any, options: Any) -> SimpleNamespace:
         assert options.runs == tmp_path
-        operator.tell(RunOpened(folder=folder, resume=f"ftdrive calibrate --resume {folder}"))
-        operator.tell(Noted(words="this computer cannot be kept awake"))
-        operator.tell(Noted(words=f"3 poses are kept in {folder}"))
+        operator.show(RunOpened(folder=folder, resume=f"ftdrive calibrate --resume {folder}"))
+        operator.show(Noted(words="this computer cannot be kept awake"))
+        operator.show(Noted(words=f"3 poses are kept in {folder}"))
         return SimpleNamespace()
 
     monkeypatch.setattr(emulated_run, "open_operator", open_operator)

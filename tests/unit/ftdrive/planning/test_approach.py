@@ -129,7 +129,7 @@ def test_a_cell_in_millimetres_becomes_what_judges_moves() -> None:
         (cell(workcell=WorkcellConfig(planes_mm=((0, 0, 0, 5),))), "no direction"),
         (cell(workcell=WorkcellConfig(boxes_mm=((0, 0, 0, float("nan"), 1, 1),))), "6 numbers"),
         (cell(workcell=WorkcellConfig(boxes_mm=((0, 0, 0, 0, 1, 1),))), "is empty"),
-        (cell(workcell=WorkcellConfig("desk")), "mounting is 'desk'"),
+        (cell(workcell=WorkcellConfig("journal")), "mounting is 'journal'"),
     ],
 )
 def test_a_cell_that_cannot_be_is_refused(changed: CellConfig, words: str) -> None:

@@ -165,7 +165,7 @@ class Person:
         self.keys = keys | {cell.end_s + 20: Key.STOP}
         self.told: list[Event] = []
 
-    def tell(self, event: Event) -> None:
+    def show(self, event: Event) -> None:
         self.told.append(event)
 
     def ask(self, question: Question) -> str:

@@ -167,9 +167,9 @@ def test_a_plan_for_another_tool_is_refused(lab: Lab) -> None:
 def test_a_program_of_somebody_else_is_refused_before_anything_is_done(
     program: str, dry_run: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lab.arm, "program_told", lambda: "PLAYING pick.urp")
+    monkeypatch.setattr(lab.arm, "reported_program", lambda: "PLAYING pick.urp")
     lab.arm.program = program
-    words = r"a program is on the controller \(PLAYING pick\.urp\) .* stop it at the pendant, then start again"
+    words = r"program is on the controller \(PLAYING pick\.urp\): stop it at the pendant, then start again"
     with pytest.raises(NotAccepted, match=words):
         lab.calibrate(dry_run=dry_run)
     assert (lab.arm.opened, lab.arm.moves, lab.operator.asked) == (1, [], [])

@@ -97,15 +97,15 @@ def test_quiet_leaves_only_errors() -> None:
 def test_quiet_asks_with_all_that_a_question_is_about(monkeypatch: pytest.MonkeyPatch) -> None:
     stderr = io.StringIO()
     operator = PlainOperator(stdin=io.StringIO("yes\n"), stderr=stderr, quiet=True)
-    operator.tell(Noted(words="the arm goes there"))
+    operator.show(Noted(words="the arm goes there"))
     assert stderr.getvalue() == ""
     assert operator.ask(Question("Go?")) == "yes"
-    operator.tell(Noted(words="it went"))
+    operator.show(Noted(words="it went"))
     assert stderr.getvalue().splitlines() == ["the arm goes there", "Go? [yes/no] yes"]
     monkeypatch.setattr(talk, "quiet", True)
     with open_operator() as chosen:
         assert isinstance(chosen, PlainOperator)
-        chosen.tell(Noted(words="not told"))
+        chosen.show(Noted(words="not told"))
 
 
 def test_errors_of_the_system_name_the_file_and_what_to_look_at(tmp_path: Path, snapshot: SnapshotAssertion) -> None:

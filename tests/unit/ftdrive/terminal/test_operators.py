@@ -99,10 +99,10 @@ def test_a_word_that_must_be_typed_can_be_refused() -> None:
 def test_a_script_reads_events_and_answers_questions() -> None:
     stdin, stdout = io.StringIO("no idea\nMOVE\n"), io.StringIO()
     operator: Operator = JsonOperator(stdin=stdin, stdout=stdout)
-    operator.tell(StateChanged(state=State.MOVE, stop=1, stops=25, number=19))
+    operator.show(StateChanged(state=State.MOVE, stop=1, stops=25, number=19))
     assert operator.ask(MOVE) == "MOVE"
-    operator.tell(estimated())
-    operator.tell(POSE)
+    operator.show(estimated())
+    operator.show(POSE)
     lines = [json.loads(line) for line in stdout.getvalue().splitlines()]
     assert [line["event"] for line in lines] == ["state-changed", "question", "question", "estimated", "pose-taken"]
     assert all(line["schema_version"] == 1 for line in lines)
@@ -126,7 +126,7 @@ def test_every_event_is_one_line_of_json_and_arrives_at_once() -> None:
     stdout = Pipe()
     operator = JsonOperator(stdin=io.StringIO(), stdout=stdout)
     for event in (Noted(words="two\nlines"), GuardTripped(hazard=7, words="31 N"), ASKED):
-        operator.tell(event)
+        operator.show(event)
         assert stdout.flushed.endswith("}\n")
     assert len(stdout.flushed.splitlines()) == 3
     assert json.loads(stdout.flushed.splitlines()[0])["words"] == "two\nlines"
@@ -164,10 +164,10 @@ def test_plain_lines_tell_what_is_worth_a_line(snapshot: SnapshotAssertion) -> N
         StateChanged(state=State.HOLD, words="contact"),
     ]
     for event in events:
-        operator.tell(event)
+        operator.show(event)
     assert operator.ask(MOVE) == "MOVE"
-    operator.tell(Asked(question=MOVE.text, answer="MOVE", by="person"))  # stands there already
-    operator.tell(Asked(question=FREE.text, answer="yes", by="--yes"))  # never asked
+    operator.show(Asked(question=MOVE.text, answer="MOVE", by="person"))  # stands there already
+    operator.show(Asked(question=FREE.text, answer="yes", by="--yes"))  # never asked
     assert stderr.getvalue() == snapshot
     assert "\x1b" not in stderr.getvalue()
 
@@ -178,8 +178,8 @@ def test_what_is_told_goes_on_behind_its_mark(quiet: bool) -> None:
     termios.tcsetwinsize(program, (24, 40))
     with os.fdopen(program, "w", encoding="utf-8") as file:
         operator = PlainOperator(stdin=io.StringIO("yes\n"), stderr=file, quiet=quiet)
-        operator.tell(Checked(name="load", passed=True, words="not compared: the tool's mass is not known"))
-        operator.tell(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
+        operator.show(Checked(name="load", passed=True, words="not compared: the tool's mass is not known"))
+        operator.show(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
         operator.ask(Question("Go?"))
         told = ""
         while not told.endswith("] yes\r\n"):

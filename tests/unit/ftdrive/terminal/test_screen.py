@@ -382,7 +382,7 @@ def test_the_screen_draws_asks_and_goes_on() -> None:
         before = termios.tcgetattr(program)
         with screen(person, program) as (operator, shown):
             for event in MIDDLE:
-                operator.tell(event)
+                operator.show(event)
             eventually(lambda: "SETTLE" in shown.text and RESUME in shown.text)
             assert "6/25 R14: settled 0.9 s" in shown.text  # above the frame, to stay
             answers: list[str] = []
@@ -422,7 +422,7 @@ def test_a_terminal_that_knows_only_ascii_gets_ascii() -> None:
     console = Console(file=file, width=80, height=24, force_terminal=True, color_system=None)
     with Screen(console, stdin=io.StringIO()) as operator:
         for event in (*MIDDLE, Noted(words="±0.1 N·m at 90°", warning=True)):
-            operator.tell(event)
+            operator.show(event)
     file.seek(0)
     text = file.read()
     assert "+- 0.0011" in text
@@ -446,8 +446,8 @@ def test_ascii_is_longer_and_nothing_is_cut_off_for_it() -> None:
 def test_enter_in_step_mode_leaves_no_line_behind() -> None:
     console = Console(file=(file := io.StringIO()), width=80, height=24, force_terminal=True, color_system=None)
     with Screen(console, stdin=io.StringIO()) as operator:
-        operator.tell(Asked(question="Pose 3 of 25: Enter moves joint 4", answer="", by="person"))
-        operator.tell(Asked(question="Is the tool free?", answer="yes", by="--yes"))
+        operator.show(Asked(question="Pose 3 of 25: Enter moves joint 4", answer="", by="person"))
+        operator.show(Asked(question="Is the tool free?", answer="yes", by="--yes"))
     assert "Enter moves" not in file.getvalue()
     assert "free? yes (--yes)" in file.getvalue()
 
@@ -456,7 +456,7 @@ def test_a_long_finding_goes_on_under_its_text() -> None:
     console = Console(file=(file := io.StringIO()), width=40, force_terminal=True, color_system=None)
     words = "the controller carries 0.50 kg; nothing in [tool] to compare it with"
     with Screen(console, stdin=io.StringIO()) as operator:
-        operator.tell(Checked(name="payload", passed=True, words=words))
+        operator.show(Checked(name="payload", passed=True, words=words))
     told = file.getvalue()
     begins = told.index("ok   payload:")
     lines = [line.rstrip() for line in told[begins : told.index("with", begins) + 4].splitlines()]
@@ -479,7 +479,7 @@ from ftdrive.session.events import Noted
 signal.signal(signal.SIGTERM, signal.default_int_handler)
 try:
     with open_operator() as operator:
-        operator.tell(Noted(words=type(operator).__name__ + " is here"))
+        operator.show(Noted(words=type(operator).__name__ + " is here"))
         time.sleep(60)
 except KeyboardInterrupt:
     print("interrupted", file=sys.stderr)
