@@ -9,7 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
-from mocks.kinematics import Array, Vector6, cross
+from mocks.arrays import Array
+from mocks.kinematics import Vector6, cross
 
 FOREVER_S = math.inf
 

@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from mocks.arrays import Array
 from mocks.clock import CellClock
-from mocks.kinematics import MODELS, Array, Vector6, rotation, vector3, vector6
+from mocks.kinematics import MODELS, Vector6, rotation, vector3, vector6
 from mocks.sensors.catalogue import WRIST, Sensor
 from mocks.ur.operator import Operator
 from mocks.ur.robot import Robot, RobotSettings

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from mocks.arrays import Array
 from mocks.disturbances import FOREVER_S, Cable, Drift, Push
-from mocks.kinematics import Array
 from mocks.sensors.catalogue import Sensor
 from mocks.wires.faults import Faults
 from mocks.world import World

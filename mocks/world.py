@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from mocks.arrays import Array
 from mocks.clock import CellClock
 from mocks.disturbances import Contact, Drift
-from mocks.kinematics import Array, Dh, Vector6, cross, forward, rotation
+from mocks.kinematics import Dh, Vector6, cross, forward, rotation
 
 MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
 """Tilt beta of the base for each mounting."""

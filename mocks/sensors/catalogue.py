@@ -6,26 +6,10 @@ The addresses are those of the project's drivers (its drivers/README.md); any ot
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any
 
 from mocks.clock import CellClock
-from mocks.wires.faults import Faults
-from mocks.wires.stream import Measure
-
-
-class SensorEmulator(Protocol):
-    """What a sensor emulator offers: it opens its end of a wire in `start` and serves it from its own threads."""
-
-    faults: Faults
-
-    def start(self) -> Any:
-        """Open the wire and return what a client opens: a path, or addresses by name."""
-
-    def unplug(self) -> None:
-        """Close the wire, as if the cable were pulled."""
-
-    def stop(self) -> None:
-        """End the threads."""
+from mocks.wires.device import Device, Measure
 
 
 @dataclass(frozen=True)
@@ -104,13 +88,13 @@ class Sensor:
     def __init__(self, name: str, measure: Measure, *, seed: int, host: str, clock: CellClock) -> None:
         self.name = name
         self._kind = KINDS.get(name)
-        self._emulator: SensorEmulator | None = None
+        self._emulator: Device[Any] | None = None
         if self._kind is None:
             self.endpoint = {"url": f"{WRIST}://{host}?counts_per_N=1&counts_per_Nm=1", "host": host}
             return
         module, _, class_name = self._kind.emulator.partition(":")
         options = self._kind.options | ({"host": host} if name == "netft" else {})
-        make: Callable[..., SensorEmulator] = getattr(import_module(module), class_name)
+        make: Callable[..., Device[Any]] = getattr(import_module(module), class_name)
         self._emulator = make(measure, seed=seed, clock=clock, **options)
         self.endpoint = self._endpoint(self._kind, self._emulator.start())
 
@@ -128,7 +112,7 @@ class Sensor:
         return self._kind is None or self._kind.floats
 
     @property
-    def emulator(self) -> SensorEmulator:
+    def emulator(self) -> Device[Any]:
         """What stands behind the wire.
 
         Raises
@@ -144,8 +128,7 @@ class Sensor:
         """Let an axis, or a gauge of a sensor that sends gauges, read the end of its range; None ends it."""
         if axis is not None and not 0 <= axis < 6:
             raise ValueError(f"axis {axis} is not 0 to 5")
-        attribute = "saturated_gauge" if hasattr(self.emulator, "saturated_gauge") else "saturated_axis"
-        setattr(self.emulator, attribute, axis)
+        self.emulator.saturated_axis = axis
 
     def stop(self) -> None:
         """End it."""

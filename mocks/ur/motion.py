@@ -9,9 +9,9 @@ from collections import deque
 from collections.abc import Generator
 from typing import Protocol
 
+from mocks.arrays import Array
 from mocks.kinematics import (
     ZERO6,
-    Array,
     Dh,
     Vector6,
     forward,

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from mocks.kinematics import ZERO6, Array, Dh, Vector3, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
+from mocks.arrays import Array
+from mocks.kinematics import ZERO6, Dh, Vector3, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
 from mocks.ur.events import Event
 from mocks.ur.modes import PAUSING, PERMITTED, POWERED, POWERLESS, RobotMode, Runtime, SafetyMode
 from mocks.ur.motion import Arm, CannotFollow, HandMove, MotionError

@@ -13,7 +13,8 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mocks.kinematics import Array, Vector6, forward, inverse, inverse_matrix, matrix_of, pose_of
+from mocks.arrays import Array
+from mocks.kinematics import Vector6, forward, inverse, inverse_matrix, matrix_of, pose_of
 from mocks.ur.motion import JointMove, LineMove, Path
 from mocks.ur.urscript.library import ScriptError
 

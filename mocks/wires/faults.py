@@ -68,22 +68,14 @@ class FaultyWire(Generic[Frame]):
         Of the cell, for delays.
     seed
         Of all chances.
-    foreign
-        Makes another node's frame.
     """
 
-    def __init__(
-        self,
-        faults: Faults,
-        clock: CellClock,
-        seed: int = 0,
-        *,
-        foreign: Callable[[random.Random], Frame] | None = None,
-    ) -> None:
+    def __init__(self, faults: Faults, clock: CellClock, seed: int = 0) -> None:
         self._faults = faults
         self._clock = clock
         self._random = random.Random(seed)
-        self._foreign: Callable[[random.Random], Frame] | None = foreign
+        self.foreign: Callable[[random.Random], Frame] | None = None
+        """Makes another node's frame."""
         self._outbox: deque[tuple[float, Frame]] = deque()
         self._held: list[Frame] = []
 
@@ -126,8 +118,8 @@ class FaultyWire(Generic[Frame]):
         faults, chance = self._faults, self._random.random
         sent: list[Frame] = []
         for left, frame in zip(range(len(frames) - 1, -1, -1), frames, strict=True):
-            if self._foreign is not None and chance() < faults.foreign:
-                sent.append(self._foreign(self._random))
+            if self.foreign is not None and chance() < faults.foreign:
+                sent.append(self.foreign(self._random))
             if chance() < faults.drop:
                 continue
             copies = [self._damaged(frame)]

@@ -8,7 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mocks.kinematics import MODELS, Array, Vector6, forward, vector6
+from mocks.arrays import Array
+from mocks.kinematics import MODELS, Vector6, forward, vector6
 from mocks.ur.hand import IN_A_PROGRAM, SPEED_RAD_S, guided_by_hand, orientations, pendant_program
 from mocks.ur.modes import Runtime
 from mocks.ur.robot import Robot, RobotSettings
