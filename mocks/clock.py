@@ -56,7 +56,8 @@ class CellClock:
     """
 
     def __init__(self, real_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self._real_ns = real_ns
+        self.real_ns = real_ns
+        """The computer's clock, for limits of clients that count in real time."""
         self._descriptor = os.memfd_create("emulated-cell-clock")
         os.ftruncate(self._descriptor, 8 * (_HEAD + 2 * SLOTS))
         fcntl.flock(self._descriptor, fcntl.LOCK_EX)
@@ -117,7 +118,7 @@ class CellClock:
         self._end()
 
     def _move_on(self) -> int:
-        real_ns = self._real_ns()
+        real_ns = self.real_ns()
         target_ns = real_ns - self._lost_ns
         slowest_ns = min((*self._own.values(), *self._slots(real_ns)), default=target_ns)
         now_ns = max(self._now_ns, min(target_ns, slowest_ns + LEAD_NS))

@@ -18,6 +18,11 @@ from mocks.ur.variables import INPUTS, OUTPUTS, Reader, output_type
 
 PORTS = {30001: "script", 30002: "script", 30003: "script", 30004: "rtde", 29999: "dashboard"}
 BACKLOG_LIMIT_S = 10.0  # a client that does not read for so long is disconnected
+KEEP_ALIVE_NS = 500_000_000
+"""While the cell's clock is held, clients that command the robot get the last sample again after so much real time.
+
+After 2.5 s without a sample ur_rtde reconnects, stops the running program and uploads it again.
+"""
 
 Select = selectors.BaseSelector
 
@@ -162,9 +167,9 @@ class RtdeClient(Client):
             self.server.reject(str(error))
             self.close()
 
-    def sample(self) -> None:
-        """Send the present outputs if this cycle is due; skip them when the client lags."""
-        due = self.robot.cycle % self._every == 0
+    def sample(self, *, again: bool = False) -> None:
+        """Send the outputs if this cycle is due, or `again` to a client that commands; skip them when it lags."""
+        due = bool(self._inputs) if again else self.robot.cycle % self._every == 0
         if self._started and due and not self.lagging and self._outputs is not None:
             self.send(self._outputs.pack([read(self.robot) for read in self._readers]))
 
@@ -265,6 +270,7 @@ class UrServer:
         self.streaming = True
         """While false RTDE clients are answered, but get no samples."""
         self._silent: set[str] = set()
+        self._sent_real_ns = 0
         self._selector = selector
         self._clients: list[Client] = []
         self._listeners: dict[int, socket.socket] = {}
@@ -372,6 +378,8 @@ class UrServer:
                     if not self.frozen:
                         self.robot.tick()
                         self._send_samples()
+                if not self.frozen and clock.real_ns() - self._sent_real_ns >= KEEP_ALIVE_NS:
+                    self._send_samples(again=True)
                 for key in self._ready(time_out_s(1e-9 * (due_ns - now_ns))):
                     key.data()
 
@@ -383,10 +391,11 @@ class UrServer:
         others = {key.fd: key for key in keys if not isinstance(key.fileobj, (Client, socket.socket))}
         return [others[fd] for fd in select.select(list(others), [], [], time_out_s)[0]]
 
-    def _send_samples(self) -> None:
+    def _send_samples(self, *, again: bool = False) -> None:
+        self._sent_real_ns = self.robot.clock.real_ns()
         for client in list(self._clients):
             if client.kind in self._silent:
                 continue
             client.flush()
             if self.streaming and isinstance(client, RtdeClient):
-                client.sample()
+                client.sample(again=again)
