@@ -21,7 +21,7 @@ NO_NUMBER: Array = np.full(6, np.nan)
 
 
 class Workcell:
-    """Everybody who touches the tool, and what becomes of the sensor.
+    """Control requests that act on the tool and on the sensor.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class Workcell:
 
     def _nan(self, request: Request) -> dict[str, Any]:
         for sensor in self._chosen(request):
-            if not sensor.says_nan:
+            if not sensor.carries_nan:
                 raise ValueError(f"the wire of {sensor.name} carries whole numbers only")
         self._world.read_always(NO_NUMBER if request.get("on", True) else None)
         return {"done": "nan"}

@@ -1,4 +1,4 @@
-"""Six strain gauges and the calibration that gives them meaning, shared by both emulated ATI interfaces.
+"""Six strain gauges and their calibration, shared by both emulated ATI interfaces.
 
 Ref: ATI 9610-05-1030-04 (NETCANOEM): runtime matrix, counts per unit, unit codes; ATI 9620-05-Digital FT, section 8.
 

@@ -3,8 +3,10 @@
 Ref: ATI 9620-05-Digital FT, sections 8.1, 8.3, 8.4; ATI 9610-05-1030-04, section 9 (the same port on a NETCANOEM).
 
 Does not model: baud mismatch (a pty has no speed), parity of what the client sends, collisions of a half-duplex line,
-writing calibrations to storage, the power-up time. Unspecified by the sources and chosen here: an empty calibration
-slot reads zeros, the 23 registers between two slots do not exist, a read of more than 64 registers is exception 3.
+writing calibrations to storage, the power-up time.
+
+Chosen here, because the sources leave it open: an empty calibration slot reads zeros. The 23 registers between two
+slots do not exist. A read of more than 64 registers is exception 3.
 """
 
 import struct

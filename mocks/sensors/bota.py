@@ -3,10 +3,12 @@
 Ref: Bota Systems, SensONE serial user manual and the vendor's Python example (configuration, frame, CRC).
 
 Does not model: line speed, the filters' effect on the readings (only the sampling time follows from the sinc length),
-offsets and tare, raw output. Chosen here, because the sources leave it open: the text around ``App Init``; commands
-need no line ending, CR, LF and spaces between them are ignored; while running, everything but ``C`` is ignored; a
-configuration command with values out of range, or an unknown one, is answered with error 1; settings survive `reset`;
-the CSV format is one line per sample with the fields of the frame; the sinc length may be 51 to 4096.
+offsets and tare, raw output.
+
+Chosen here, because the sources leave it open: the text around ``App Init``. Commands need no line ending; CR, LF and
+spaces between them are ignored. While the sensor streams, it ignores everything but ``C``. A configuration command with
+values out of range, or an unknown one, is answered with error 1. Settings survive `reset`. The CSV format is one line
+per sample with the fields of the frame. The sinc length may be 51 to 4096.
 """
 
 import re
@@ -40,7 +42,7 @@ _X25 = [_x25_entry(byte) for byte in range(256)]
 
 
 def crc16_x25(data: bytes) -> bytes:
-    """CRC-16/X-25 as it goes on the wire, low byte first."""
+    """Return the CRC-16/X-25 as it goes on the wire, low byte first."""
     crc = 0xFFFF
     for byte in data:
         crc = (crc >> 8) ^ _X25[(crc ^ byte) & 0xFF]
@@ -68,7 +70,7 @@ class BotaBox(SerialSensor):
     status
         Status bits set besides those that follow from the readings and the configuration.
     streaming_at_start
-        Has been running for long when the client comes; else it powers up at `start` and prints its banner first.
+        Streams already when the client opens it; else it powers up at `start` and sends its banner first.
     boot_s
         Silence before the banner.
     """

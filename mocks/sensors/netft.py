@@ -3,10 +3,11 @@
 Ref: ATI 9620-05-Net FT, sections "UDP Interface Using RDT" and "XML"; 9610-05-Ethernet Axia, sections 9 and 10.
 
 Does not model: the TCP interface, multi-unit mode, filters, tool transformation, monitor conditions, more than one
-configuration, the web pages, DHCP, and that a real box answers only a few HTTP requests in a row. Chosen here, because
-the sources leave it open: a new request of samples replaces the running one and takes over its address; "one-shot"
-sends its count of samples, one for count 0, at the set rate; a reading at its rating sets the summary and saturation
-bits; what is no request is ignored.
+configuration, the web pages, DHCP, and that a real box answers only a few HTTP requests in a row.
+
+Chosen here, because the sources leave it open: a new request of samples replaces the running one and its address.
+"One-shot" sends its count of samples, one for count 0, at the set rate. A reading at its rating sets the summary and
+saturation bits. A datagram that is no request is ignored.
 """
 
 import contextlib
@@ -39,7 +40,7 @@ TORQUE_UNITS = {1: "lbf-in", 2: "lbf-ft", 3: "Nm", 4: "Nmm", 5: "kgf-cm", 6: "kN
 
 
 class Command(IntEnum):
-    """What a request asks for."""
+    """Command code of a request."""
 
     STOP = 0x0000
     ONE_SHOT = 0x0001
@@ -50,7 +51,7 @@ class Command(IntEnum):
 
 
 class Endpoint(TypedDict):
-    """Where a client finds the box."""
+    """Addresses of the box."""
 
     host: str
     rdt_port: int
@@ -59,7 +60,7 @@ class Endpoint(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class Calibration(Scale):
-    """What the box tells over HTTP about its transducer.
+    """What the box reports over HTTP about its transducer.
 
     Parameters
     ----------
@@ -75,7 +76,7 @@ class Calibration(Scale):
 
 
 def rdt_records(first: int, ft: NDArray[np.int64], status: NDArray[np.int64], counts: Array) -> bytes:
-    """Consecutive 36-byte records, big-endian.
+    """Return consecutive 36-byte records, big-endian.
 
     Parameters
     ----------
@@ -115,7 +116,7 @@ class NetFtBox(Device[bytes]):
     status
         Status bits sent with every sample.
     streaming_at_start
-        Address and port of a client that asked for a stream before it died.
+        Address and port of the last client, which crashed while it streamed.
     """
 
     host: str = "127.0.0.1"
@@ -314,4 +315,4 @@ class _HttpHandler(BaseHTTPRequestHandler):
         self.wfile.write(content or b"")
 
     def log_message(self, format: str, *args: object) -> None:
-        """Keep quiet."""
+        """Log nothing."""

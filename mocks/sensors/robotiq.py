@@ -2,10 +2,11 @@
 
 Ref: Robotiq FT 300 instruction manual, section "Control" (registers, data stream).
 
-Does not model: parity and baud mismatch, accelerometer readings (gravity along the sensor's z axis is told). Chosen
-here, because the sources leave it open: requests during a stream are not answered, 50 bytes FF in a row end it and
-nothing less does, a register that does not exist is exception 2, only register 410 can be written, and it starts the
-stream at 0x0200 and takes any other value without effect. The stream has neither status nor overload.
+Does not model: parity and baud mismatch, accelerometer readings (they report gravity along the sensor's z axis).
+
+Chosen here, because the sources leave it open: requests during a stream are not answered. Only 50 bytes FF in a row end
+the stream. A register that does not exist is exception 2. Only register 410 can be written: 0x0200 starts the stream,
+any other value has no effect. The stream has neither status nor overload.
 """
 
 import struct
@@ -54,7 +55,7 @@ class RobotiqBox(SerialSensor):
     year
         Of production.
     streaming_at_start
-        Streams from power-up on, as some do, and as one does whose client died.
+        Streams from power-up on, as some sensors do, and as after a crash of the last client.
     """
 
     firmware: tuple[str, int, int, int] = ("FTS", 2, 0, 1)

@@ -2,12 +2,13 @@
 
 Ref: Robotous RFT series installation and operation manual, revision 1.7 (commands, data field, CAN and UART packets).
 
-Does not model: what the low-pass filter does to the readings (type and code are kept and told), storage wear, line
-speed. Chosen here, because the manual leaves it open: a command that is unknown or whose packet is damaged is met with
-silence; setting what the other wire needs is answered as unsupported; 1000 Hz on a slower line becomes what the
-line carries; a reading at the end of the int16 range, or beyond the capacity, raises the overload bit of its axis; the
-overload counters count the beginnings of overloads and saturate at 255; CAN identifiers and the baud rate, which need
-a reboot, are also taken over by `reset`, all other settings survive it except bias and streaming.
+Does not model: the low-pass filter (its type and code are stored and reported), storage wear, line speed.
+
+Chosen here, because the manual leaves it open: an unknown command or a damaged packet gets no answer. A setting of the
+other wire is answered as unsupported. 1000 Hz on a slower line becomes the rate that the line carries. A reading at the
+end of the int16 range, or beyond the capacity, sets the overload bit of its axis. The overload counters count the
+beginnings of overloads up to 255. CAN identifiers and the baud rate need a reboot; `reset` is one. All other settings
+survive it, except bias and streaming.
 """
 
 import random
@@ -126,7 +127,7 @@ class RobotousSensor(PtyDevice[Frame]):
     overload
         Overload bits set besides those of the readings: bit 5 to 0 are Fx to Tz.
     streaming_at_start
-        Streams from power-up on, as a sensor whose client died.
+        Streams from power-up on, as after a crash of the last client.
     """
 
     unsupported: ClassVar[frozenset[Command]] = frozenset()

@@ -27,10 +27,10 @@ FOLLOW_TIME_S = 0.005
 """Time constant with which the joints follow the set-point."""
 
 PAUSE_TIME_S = 0.15
-"""How long the arm takes to come to rest on its path when the program pauses, and to follow the speed slider."""
+"""Time in which the arm comes to rest on its path when the program pauses, or follows the speed slider."""
 
 IDLE_DECELERATION_RAD_S2 = 8.0
-"""How an arm that nobody commands any more comes to rest."""
+"""Deceleration of an arm that lost its path."""
 
 
 class MotionError(Exception):
@@ -76,7 +76,7 @@ class Path(Protocol):
 
     duration_s: float
     real_time: bool
-    """Whether it runs at its own speed, whatever slider and limiter say."""
+    """Whether it ignores speed slider and limiter."""
 
     def begin(self, q: Vector6, qd: Vector6, /) -> None:
         """Plan from the present set-point: angles (rad) and speeds (rad/s). Sets `duration_s`."""
@@ -166,7 +166,7 @@ class LineMove:
 
 
 class HandMove(JointMove):
-    """Somebody pushes the arm along: as movej, but neither slider nor limiter has a say in it."""
+    """The operator pushes the arm: as movej, but slider and limiter do not act on it."""
 
     real_time = True
 
@@ -209,9 +209,9 @@ class Arm:
         self.speed_fraction = 1.0
         """Speed slider, 0 to 1."""
         self.pushed_rad = ZERO6
-        """How far somebody pushes the joints off their set-points."""
+        """How far the operator pushes the joints off their set-points."""
         self.scaling = 1.0
-        """What the trajectory limiter leaves of the speed, 0 to 1."""
+        """Fraction of the speed that the trajectory limiter allows, 0 to 1."""
         self.paused = False
         """Whether the arm should stand still on its path."""
         self.pace = 1.0
@@ -268,7 +268,7 @@ class Arm:
             self.release(owner)
 
     def release(self, owner: str | None = None) -> None:
-        """Forget the path of `owner` (of anybody without a name); a moving arm comes to rest by itself."""
+        """Drop the path of `owner` (None: of any owner); a moving arm comes to rest by itself."""
         if owner is None or owner == self._owner:
             self._owner = None
             self._follow([self._rundown()] if self._under_way else [])

@@ -32,7 +32,7 @@ class Client(ABC):
 
     kind = ""
     banner = b""
-    """What the port says first."""
+    """What the port sends first."""
 
     def __init__(self, server: "UrServer", connection: socket.socket) -> None:
         self.server = server
@@ -55,7 +55,7 @@ class Client(ABC):
         return bool(self._out)
 
     def on_ready(self) -> None:
-        """Read what is there and act on it."""
+        """Read what has arrived and act on it."""
         try:
             data = self._socket.recv(65536)
         except BlockingIOError:
@@ -73,12 +73,12 @@ class Client(ABC):
         """Consume what is complete at the start of `buffer`."""
 
     def send(self, data: bytes) -> None:
-        """Send now what the socket takes, keep the rest."""
+        """Send what the socket takes, keep the rest."""
         self._out += data
         self.flush()
 
     def flush(self) -> None:
-        """Try again to send what is left; give up on a client that does not read."""
+        """Send what is left; disconnect a client that has not read for `BACKLOG_LIMIT_S`."""
         if not self._out or not self.open:
             return
         try:
@@ -98,7 +98,7 @@ class Client(ABC):
             self._stuck_since = None
 
     def close(self, *, reset: bool = False) -> None:
-        """Hang up: in order, or with a TCP reset."""
+        """Close the connection: in order, or with a TCP reset."""
         if self.open:
             self.open = False
             self.server.forget(self)
@@ -108,7 +108,7 @@ class Client(ABC):
 
 
 class ScriptClient(Client):
-    """Ports 30001 to 30003: takes programs, says nothing."""
+    """Ports 30001 to 30003: receives programs, sends nothing."""
 
     kind = "script"
 
@@ -131,7 +131,7 @@ class DashboardClient(Client):
 
     @property
     def trusted(self) -> bool:
-        """Whether the pendant was in remote control ever since this client connected; else it can only ask."""
+        """Whether the pendant was in remote control since this client connected; else it can only query."""
         return self._opened_remote and self._switches == self.robot.remote_switches
 
     def on_bytes(self, buffer: bytearray) -> None:
@@ -262,11 +262,11 @@ class UrServer:
         self.host = host
         self.input_owners: dict[str, RtdeClient] = {}
         self.claimed: set[str] = set()
-        """Input variables that a fieldbus holds, as far as no client had them before."""
+        """Input variables that a fieldbus holds, without those a client had before."""
         self.bad_inputs: list[str] = []
-        """Packages a well-behaved client would not have sent."""
+        """Packages that break the protocol."""
         self.frozen = False
-        """While true nothing runs and nothing is read or sent, but connections stay."""
+        """While true no cycle runs and no byte is read or sent, but connections stay."""
         self.streaming = True
         """While false RTDE clients are answered, but get no samples."""
         self._silent: set[str] = set()
@@ -315,7 +315,7 @@ class UrServer:
             client.send(client.banner)
 
     def forget(self, client: Client) -> None:
-        """A client hung up: its input variables are free again."""
+        """Remove a client whose connection has ended; its input variables are free again."""
         if client in self._selector.get_map():
             self._selector.unregister(client)
         self._clients.remove(client)
@@ -327,14 +327,14 @@ class UrServer:
         self.bad_inputs.append(what)
 
     def drop(self, kind: str, *, reset: bool = False) -> int:
-        """Hang up on all clients of a kind (rtde, dashboard, script); the port goes on listening."""
+        """Disconnect all clients of a kind (rtde, dashboard, script); the port still listens."""
         clients = self._of_kind(kind)
         for client in clients:
             client.close(reset=reset)
         return len(clients)
 
     def set_listening(self, kind: str, on: bool) -> None:
-        """Open or close the ports of a kind; who is connected stays connected."""
+        """Open or close the ports of a kind; open connections stay."""
         self._of_kind(kind)
         for port in [port for port, its_kind in PORTS.items() if its_kind == kind]:
             if on and port not in self._listeners:
@@ -343,7 +343,7 @@ class UrServer:
                 self._close_listener(port)
 
     def set_silent(self, kind: str, on: bool) -> None:
-        """While on, clients of a kind are accepted, but nothing is read from them or sent; afterwards it is."""
+        """While on, accept clients of a kind without reading or sending; afterwards serve what has waited."""
         clients = self._of_kind(kind)
         if on and kind not in self._silent:
             self._silent.add(kind)
@@ -360,14 +360,14 @@ class UrServer:
         return [client for client in self._clients if client.kind == kind]
 
     def close(self) -> None:
-        """Hang up and stop listening."""
+        """Close all connections and stop listening."""
         for client in list(self._clients):
             client.close()
         for port in list(self._listeners):
             self._close_listener(port)
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Serve until `ended()`: it is asked at least once per control cycle."""
+        """Serve until `ended()`, which is called at least once per control cycle."""
         clock, period_ns = self.robot.clock, round(1e9 * self.robot.period_s)
         with clock.keeping_up():
             due_ns = clock.now_ns() + period_ns

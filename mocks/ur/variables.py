@@ -25,7 +25,7 @@ def _joint_mode(robot: Robot) -> Value:
 
 
 def _accelerometer(robot: Robot) -> Value:
-    """At rest a tool accelerometer feels the support against gravity, tool axes."""
+    """Return what a tool accelerometer measures at rest: the support against gravity, tool axes."""
     R_base_flange = forward(robot.arm.dh, robot.world.q)[:3, :3]
     x, y, z = (-R_base_flange.T @ robot.world.truth.gravity_m_s2).tolist()
     return (x, y, z)

@@ -1,10 +1,10 @@
 """A sensor behind a pseudo-terminal, which answers and streams through a faulty wire.
 
-Ref: pty(7), termios(3). The slave end stays open here, or the master would read EIO as soon as a client leaves.
+Ref: pty(7), termios(3). The slave end stays open here, or the master would read EIO when a client closes its end.
 
-A pty has no parity. Where the line has, a client asks for marks with INPCK and PARMRK, as it asks a real port. PARMRK
-is then taken off again, or the kernel would double what is marked here; as long as INPCK stays, all marking is done
-here. Bytes that are in the terminal while the client changes its flags come in either form.
+A pty has no parity. Where the line has, a client requests marks with INPCK and PARMRK, as on a real port. The emulator
+then clears PARMRK, or the kernel would double the marks. While INPCK is set, the emulator does all marking. Bytes in
+the terminal while the client changes its flags arrive in either form.
 
 Does not model: line speed (a pty has none), INPCK without PARMRK, IGNPAR, parity of what the client sends, modem lines,
 breaks.

@@ -189,7 +189,7 @@ def test_a_client_that_never_reads_is_disconnected_in_the_end(controller: Contro
         assert controller.clock.now_s() - begun_s >= BACKLOG_LIMIT_S
 
 
-def test_the_diary_is_in_the_time_of_the_cell(controller: Controller) -> None:
+def test_the_event_log_is_in_the_time_of_the_cell(controller: Controller) -> None:
     controller.real.pass_s(5.0)
     controller.robot.note("operator", "slider")
     assert controller.robot.events[-1].t_host_ns == controller.clock.now_ns()

@@ -1,6 +1,4 @@
-"""The emulated person who guides the arm, and their program on the pendant: where the wrist goes, how fast, how long it
-rests, and what both put up with.
-"""
+"""The emulated operator who guides the arm, and the program on the pendant: poses, speed, rests and interruptions."""
 
 import math
 from itertools import pairwise
