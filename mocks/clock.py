@@ -77,7 +77,7 @@ class CellClock:
 
     @property
     def path(self) -> str:
-        """Where a process of the same user opens the page, as long as this one lives."""
+        """Path under which a process of the same user opens the page, until this process ends."""
         return f"/proc/{os.getpid()}/fd/{self._descriptor}"
 
     def now_ns(self) -> int:

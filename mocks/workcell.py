@@ -1,4 +1,4 @@
-"""What happens to the tool and to the sensor: the verbs of the control channel that are not about the arm."""
+"""Control requests that act on the tool and on the sensor: the verbs that are not about the arm."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields

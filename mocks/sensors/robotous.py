@@ -98,7 +98,7 @@ def packet(field: bytes) -> bytes:
 
 
 def fields(stream: bytearray) -> list[bytes]:
-    """Take the whole command packets out of received bytes, skipping what is none."""
+    """Remove received bytes and return the whole command packets in them."""
     found = []
     size = COMMAND_BYTES + 3
     while (start := stream.find(START_OF_PACKET)) >= 0 and len(stream) >= start + size:

@@ -362,7 +362,7 @@ class Robot:
             self.set_mode(RobotMode.POWER_OFF)
 
     def set_safety(self, mode: SafetyMode, reason: str) -> None:
-        """Enter a safety mode, with what it does to program and power; NORMAL means REDUCED when that is on."""
+        """Enter a safety mode, with its effects on program and power; NORMAL means REDUCED when that is on."""
         if mode in PERMITTED:
             mode = SafetyMode.REDUCED if self._reduced else SafetyMode.NORMAL
         self.safety_mode = mode

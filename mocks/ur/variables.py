@@ -1,4 +1,4 @@
-"""The RTDE variables: name, type, and where a value comes from.
+"""The RTDE variables: names, types and sources.
 
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", tables of controller outputs and inputs.
 """

@@ -106,7 +106,7 @@ class FaultyWire(Generic[Frame]):
         return arrived
 
     def wait_s(self, now_s: float) -> float | None:
-        """Time until the next frame arrives, None when there is none on its way."""
+        """Return the time until the next frame arrives, None when there is none."""
         return max(0.0, self._outbox[0][0] - now_s) if self._outbox else None
 
     def clear(self) -> None:
