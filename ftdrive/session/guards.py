@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from drivers.errors import DeviceFault, DeviceTimeout, DriverError
 from drivers.interfaces import ArmState, ArmStatus
 from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.session.hazards import Hazard
 
 Array = NDArray[np.float64]
 
@@ -25,7 +26,7 @@ AXES: Final = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 class Tripped(Exception):
     """A guard does not let the session go on; `error` says why, `hazard` is the row of the hazard table."""
 
-    def __init__(self, hazard: int, error: Exception) -> None:
+    def __init__(self, hazard: Hazard, error: Exception) -> None:
         super().__init__(str(error))
         self.hazard = hazard
         self.error = error
@@ -144,13 +145,13 @@ class PathGuard(Guard):
         words = f"joint {joint + 1} is {np.degrees(off[joint]):.1f}° from where it should be"
         if motion.moving:
             raise Tripped(
-                2,
+                Hazard.SELF_COLLISION,
                 DeviceFault(
                     f"{words} on the way (allowed: {np.degrees(allowed[joint]):.1f}°): look what holds the arm"
                 ),
             )
         raise Tripped(
-            21,
+            Hazard.OTHER_CLIENT,
             DeviceFault(f"{words} while the arm should stand: something else moves it; end that, then go on"),
         )
 
@@ -174,7 +175,7 @@ class StallGuard(Guard):
         self._still_s += seen.dt_s
         if self._still_s > self.limits.stalled_s and left > 1e-3:
             raise Tripped(
-                22,
+                Hazard.STALL,
                 DeviceTimeout(
                     f"the arm has not come nearer to its goal for {self._still_s:.0f} s (speed slider "
                     f"{100 * seen.status.speed_slider:.0f} %, scaling {100 * seen.status.speed_scaling:.0f} %): set "
@@ -202,7 +203,7 @@ class ModelGuard(Guard):
         away_rad = float(np.arccos(np.clip(cosine, -1, 1)))
         if away_m > self.limits.flange_m or away_rad > self.limits.flange_rad:
             raise Tripped(
-                8,
+                Hazard.WRONG_TCP,
                 DeviceFault(
                     f"the flange is {1e3 * away_m:.1f} mm and {np.degrees(away_rad):.2f}° from where a "
                     f"{self.certifier.arm.name} has it: check the model and the active TCP"
@@ -227,7 +228,7 @@ class SettingsGuard(Guard):
             return
         if _changed(before.tcp_offset, now.tcp_offset):
             raise Tripped(
-                8,
+                Hazard.WRONG_TCP,
                 DeviceFault(f"the active TCP was set to {_rounded(now.tcp_offset)}: find out what did, then go on"),
             )
         for what, was, told in (
@@ -236,7 +237,7 @@ class SettingsGuard(Guard):
         ):
             if _changed(was, told):
                 raise Tripped(
-                    7,
+                    Hazard.WRONG_PAYLOAD,
                     DeviceFault(
                         f"the controller's {what} was changed from {_rounded(was)} to {_rounded(told)}: find out what "
                         "set it, then go on"
@@ -261,12 +262,12 @@ class SafetyGuard(Guard):
             raise by_safety(status, f"the arm stopped: {status.fault}")
         if self._mode is not None and status.safety_mode != self._mode:
             raise Tripped(
-                12,
+                Hazard.SAFETY_MODE,
                 DeviceFault(f"the safety mode changed from {self._mode} to {status.safety_mode}: see the pendant"),
             )
         if status.program != "playing":
             raise Tripped(
-                21,
+                Hazard.OTHER_CLIENT,
                 DeviceFault(
                     f"the control program is {status.program}: somebody else has ended or paused it; leave the arm to "
                     "this program, then go on"
@@ -293,7 +294,9 @@ class SensorGuard(Guard):
     def look(self, seen: Seen) -> None:
         """Count silence and sameness."""
         if not np.isfinite(seen.wrench).all():
-            raise Tripped(15, DeviceFault(f"the sensor says {seen.wrench.tolist()}: check its cable and supply"))
+            raise Tripped(
+                Hazard.SENSOR_LOST, DeviceFault(f"the sensor says {seen.wrench.tolist()}: check its cable and supply")
+            )
         if seen.sample == self._sample:
             self._silent_s += seen.dt_s
         else:
@@ -301,7 +304,7 @@ class SensorGuard(Guard):
         allowed = self.limits.sensor_age_moving_s if seen.motion.moving else self.limits.sensor_age_holding_s
         if self._silent_s > allowed:
             raise Tripped(
-                15,
+                Hazard.SENSOR_LOST,
                 DeviceTimeout(f"the sensor has been silent for {self._silent_s:.2f} s: check its cable and supply"),
             )
         if self._wrench is not None and np.array_equal(seen.wrench, self._wrench):
@@ -311,7 +314,7 @@ class SensorGuard(Guard):
         self._wrench = seen.wrench
         if self._silent_s == 0 and self._same > 10 and self._same_s > self.limits.frozen_samples_s:
             raise Tripped(
-                15,
+                Hazard.SENSOR_LOST,
                 DeviceFault(f"the sensor repeats one reading for {self._same_s:.2f} s: restart it, then go on"),
             )
 
@@ -336,7 +339,7 @@ class RangeGuard(Guard):
         if share.max() > self.limits.saturation:
             axis = int(share.argmax())
             raise Tripped(
-                13,
+                Hazard.OVERLOAD,
                 DeviceFault(
                     f"the sensor reads {100 * share[axis]:.0f} % of its range in {AXES[axis]}: "
                     "take the load off; a lighter or shorter tool may be needed"
@@ -412,7 +415,7 @@ class ContactGuard(Guard):
         force_N, torque_Nm = float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
         if force_N > limit_N or torque_Nm > limit_Nm:
             raise Tripped(
-                14,
+                Hazard.CONTACT,
                 DeviceFault(
                     f"unexpected contact: the wrench {verb} {force_N:.1f} N, {torque_Nm:.2f} N·m {than} (allowed: "
                     f"{limit_N:.1f} N, {limit_Nm:.2f} N·m); look at tool, cables and whoever is near, then go on"
@@ -423,12 +426,12 @@ class ContactGuard(Guard):
 def out_of_sight(error: DriverError, *, moving: bool) -> Tripped:
     """Row 16: nobody sees the arm any more. On its way it may not hear the stop either."""
     if not moving:
-        return Tripped(16, error)
+        return Tripped(Hazard.CONTROLLER_LOST, error)
     found = (
         f"{error.found}; the arm was told to stop, but may not have heard it: then it ends the one move it was given, "
         "which is proven clear, and goes no further"
     )
-    return Tripped(16, type(error)(found, error.cure))
+    return Tripped(Hazard.CONTROLLER_LOST, type(error)(found, error.cure))
 
 
 def by_safety(status: ArmStatus, words: str) -> Tripped:
@@ -437,8 +440,9 @@ def by_safety(status: ArmStatus, words: str) -> Tripped:
     if mode == "protective stop":
         told = "" if status.payload_kg is None else f" (it was told {status.payload_kg:.2f} kg)"
         words += f"; usual causes are contact, and a controller with a wrong payload or centre of mass{told}"
-        return Tripped(10, DeviceFault(words))
-    return Tripped(11 if "emergency" in mode or "safeguard" in mode else 12, DeviceFault(words))
+        return Tripped(Hazard.PROTECTIVE_STOP, DeviceFault(words))
+    stopped = "emergency" in mode or "safeguard" in mode
+    return Tripped(Hazard.EMERGENCY_STOP if stopped else Hazard.SAFETY_MODE, DeviceFault(words))
 
 
 def _changed(before: Any, now: Any) -> bool:

@@ -8,6 +8,7 @@ from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrive.session.events import GuardTripped, Noted, Witness
 from ftdrive.session.guards import ContactGuard, Tripped, by_safety, out_of_sight
+from ftdrive.session.hazards import Hazard
 from ftdrive.session.journal import Journal
 from ftdrive.session.watchdog import Watcher
 
@@ -97,7 +98,7 @@ class Recovery:
         if isinstance(error, Tripped):
             return error
         if isinstance(error, OSError) and not isinstance(error, DriverError):
-            return Tripped(26, error)
+            return Tripped(Hazard.DISK_FULL, error)
         if not isinstance(error, DriverError):
             return None
         if (trip := self._watcher.tripped(wait_s=0.3)) is not None:
@@ -105,11 +106,11 @@ class Recovery:
         try:
             self._sensor.check()
         except DriverError:
-            return Tripped(15, error)
+            return Tripped(Hazard.SENSOR_LOST, error)
         try:
             status = self._arm.status()
         except DriverError:
             return out_of_sight(error, moving=moving)
         if status.fault is not None:
             return by_safety(status, str(error))
-        return Tripped(21, error) if isinstance(error, DeviceFault) else Tripped(16, error)
+        return Tripped(Hazard.OTHER_CLIENT if isinstance(error, DeviceFault) else Hazard.CONTROLLER_LOST, error)

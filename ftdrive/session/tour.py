@@ -36,6 +36,7 @@ from ftdrive.session.events import (
     Weighed,
 )
 from ftdrive.session.guards import RangeGuard, Tripped
+from ftdrive.session.hazards import Hazard
 from ftdrive.session.journal import Journal
 from ftdrive.session.live_fit import Running
 from ftdrive.session.operator import Key, Question
@@ -421,7 +422,7 @@ class Tour:
         if off_rad.max() > _AT_RAD:
             self._at = self._stood_at = None
             raise Tripped(
-                21,
+                Hazard.OTHER_CLIENT,
                 DeviceFault(
                     f"joint {off_rad.argmax() + 1} is {np.degrees(off_rad.max()):.1f}° from where its move begins: "
                     "somebody has moved the arm; end that, then go on"
@@ -499,7 +500,7 @@ class Tour:
     def _mended(self, trip: Tripped) -> bool:
         """Open a sensor that failed while the arm stood at a pose, once for each pose; the pose begins anew."""
         stop = self._todo[0]
-        if trip.hazard != 15 or self._at is None or stop in self._reopened:
+        if trip.hazard != Hazard.SENSOR_LOST or self._at is None or stop in self._reopened:
             return False
         self._reopened.add(stop)
         try:

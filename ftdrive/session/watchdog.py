@@ -16,6 +16,7 @@ from drivers.clock import Clock
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ArmState, ForceTorqueSensor, RobotArm
 from ftdrive.session.guards import Guard, Limits, Motion, Seen, Tripped, by_safety, out_of_sight
+from ftdrive.session.hazards import Hazard
 
 log = logging.getLogger(__name__)
 
@@ -119,14 +120,14 @@ class Watcher:
                 return
             self._blind_since_s = None
             trip = None if status.fault is None else by_safety(status, f"the arm stopped: {status.fault}")
-            if trip is None or trip.hazard != 11:
+            if trip is None or trip.hazard != Hazard.EMERGENCY_STOP:
                 self._stopped_by_safety = False
             elif not self._stopped_by_safety:
                 self.keep(trip)
 
     def keep(self, trip: Tripped) -> None:
         """Remember it as `safety_stop` when it is one."""
-        if trip.hazard == 11:
+        if trip.hazard == Hazard.EMERGENCY_STOP:
             with self._judging:
                 self.safety_stop, self._stopped_by_safety = trip, True
 
@@ -135,10 +136,13 @@ class Watcher:
         if self._tripped is not None:
             raise self._tripped
         if self._has_ended:
-            raise Tripped(18, DeviceFault("the guards' thread has ended, nothing is watched", "end this session"))
+            raise Tripped(
+                Hazard.UNGUARDED, DeviceFault("the guards' thread has ended, nothing is watched", "end this session")
+            )
         if self._motion is not None and (late_s := self.clock.now_s() - self._looked_s) > self._limits.hung_s:
             raise Tripped(
-                18, DeviceFault(f"the guards have not looked for {late_s:.1f} s: give this computer less to do")
+                Hazard.UNGUARDED,
+                DeviceFault(f"the guards have not looked for {late_s:.1f} s: give this computer less to do"),
             )
 
     def tripped(self, *, wait_s: float) -> Tripped | None:
@@ -165,7 +169,9 @@ class Watcher:
             self._stop(out_of_sight(error, moving=motion.moving))
         except Exception as error:
             log.exception("a guard failed")
-            self._stop(Tripped(18, DeviceFault(f"a guard failed ({error!r}): report this, and do not go on")))
+            self._stop(
+                Tripped(Hazard.UNGUARDED, DeviceFault(f"a guard failed ({error!r}): report this, and do not go on"))
+            )
         return started_s + self._limits.look_s - self.clock.now_s()
 
     @property
@@ -184,12 +190,14 @@ class Watcher:
             state = self._arm.state()
         except DeviceFault as error:
             status = self._arm.status()  # what stopped the arm may have come between the two
-            raise (Tripped(9, error) if status.fault is None else by_safety(status, str(error))) from error
+            if status.fault is not None:
+                raise by_safety(status, str(error)) from error
+            raise Tripped(Hazard.WRONG_MODEL, error) from error
         try:
             self._sensor.check()
             sample = self._sensor.latest(timeout_s=0.0)
         except DriverError as error:
-            raise Tripped(15, error) from error
+            raise Tripped(Hazard.SENSOR_LOST, error) from error
         if motion is not self._motion:  # the block has ended meanwhile: what was seen may belong to the next one
             return
         now_s = self.clock.now_s()
