@@ -5,9 +5,8 @@ that is planned from where the arm stands, shown and confirmed.
 """
 
 import logging
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
@@ -41,6 +40,7 @@ from ftdrive.session.journal import Journal
 from ftdrive.session.live_fit import Running
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.preflight import forbidden
+from ftdrive.session.progress import Progress
 from ftdrive.session.recovery import Recovery
 from ftdrive.session.watchdog import Watcher
 
@@ -123,19 +123,7 @@ class Tour:
         self._recovery, self._load, self._sampling, self._pace = recovery, load, sampling, pace
         self._quiet_std, self._sensor_kg = quiet_std, sensor_kg
         self._nodes = np.array([step.q_rad for step in plan.steps])
-        self._stops = len(self._nodes) + 1
-        self._todo: deque[int] = deque()
-        self._at: int | None = None  # index of the pose where the arm was left
-        self._stood_at: int | None = None  # index of the pose where it stood last
-        self._back: tuple[int, str] | None = None  # index of the pose to return to, and why the arm was stopped
-        self._moved = False
-        self._under_way: int | None = None  # stop that the arm goes to or stands at to be measured
-        self._last: PoseRecord | None = None  # taken last
-        self._again = False  # the last one is to be taken again
-        self._skipped: set[int] = set()  # indices of postures where the arm should not go
-        self._reopened: set[int] = set()
-        self._payload_kg: float | None = None  # as the controller told it when it was compared
-        self._driven: set[int] = set()  # indices of poses whose move to the next one was driven to its end
+        self._now = Progress(len(plan.steps))
 
     # -------------------------------------------------------------------------------------------- the tour
 
@@ -149,9 +137,9 @@ class Tour:
         Tripped, DriverError, OSError
             What stopped the arm, when a person then ended it.
         """
-        self._todo = deque(todo)
+        self._now = replace(self._now, todo=tuple(todo))
         self._watcher.begin()
-        while self._todo:
+        while self._now.todo:
             try:
                 self._next()
             except Turned as turned:
@@ -163,45 +151,43 @@ class Tour:
 
     @property
     def undriven(self) -> list[int]:
-        """Poses, from 1, whose move to the next one was not driven as planned, but over an approach or not at all."""
-        return [index + 1 for index in range(len(self._nodes)) if index not in self._driven]
+        """As `Progress.undriven`."""
+        return self._now.undriven
 
     def _next(self) -> None:
-        if self._back is not None:
-            self._go_back(*self._back)
-        self._under_way = None
+        if self._now.back is not None:
+            self._go_back(*self._now.back)
+        self._now = replace(self._now, under_way=None)
         self._hear()
-        stop = self._todo[0]
-        index = self._index(stop)
+        stop = self._now.todo[0]
+        index = self._now.index(stop)
         if self._pace.step and not self._step(stop, index):
             return
-        self._under_way = stop
+        self._now = replace(self._now, under_way=stop)
         self._go(index, stop)
         self._hear()
-        self._last = self._take(stop, index)
+        self._take(stop, index)
+        self._now = replace(self._now, taken_last=stop)
         self._compare_payload()
-        self._todo.popleft()
+        self._now = self._now.finish()
 
     def _compare_payload(self) -> None:
         """Row 7: say what hangs on the sensor, and where the controller was told otherwise; once for each payload."""
         mass_kg = self._running.weighed_kg
         told_kg = None if mass_kg is None else self._arm.status().payload_kg
-        if mass_kg is None or told_kg is None or told_kg == self._payload_kg:
+        if mass_kg is None or told_kg is None or told_kg == self._now.payload_kg:
             return
-        self._payload_kg = told_kg
+        self._now = replace(self._now, payload_kg=told_kg)
         self._journal.show(Weighed(mass_kg=mass_kg, payload_kg=told_kg))
         if words := payload_in_words(told_kg, mass_kg, self._sensor_kg):
             self._note(words, warning=True)
-
-    def _index(self, stop: int) -> int:
-        return (stop - 1) % len(self._nodes)
 
     def _step(self, stop: int, index: int) -> bool:
         """Ask for Enter; whether to go."""
         answer = self._journal.ask(
             Question(
-                f"Pose {stop} of {self._stops}, orientation {self._plan.steps[index].number:02d}: {self._way(index)}, "
-                "s skips it, r takes the last pose again, q ends",
+                f"Pose {stop} of {self._now.stops}, orientation {self._plan.steps[index].number:02d}: "
+                f"{self._way(index)}, s skips it, r takes the last pose again, q ends",
                 ("", "s", "r", "q"),
             )
         )
@@ -232,8 +218,8 @@ class Tour:
 
         Called between two looks, so before another pose is shown.
         """
-        moving = self._under_way is not None and self._at is None
-        if self._again and not moving:
+        moving = self._now.moving
+        if self._now.again and not moving:
             raise Turned(Key.REDO)
         while (key := self._journal.pressed()) is not None:
             if key is Key.PAUSE:
@@ -243,11 +229,11 @@ class Tour:
             if key is Key.KEEP:
                 self._note("a pose is kept by itself; r takes it again")
             if key is Key.SKIP:
-                if self._under_way is not None:
+                if self._now.under_way is not None:
                     raise Turned(key)
                 self._note("s skips a pose while the arm goes there or measures: none is under way")
             if key is Key.REDO and (last := self._redoable()) is not None:
-                self._again = True
+                self._now = replace(self._now, again=True)
                 if not moving:
                     raise Turned(key)
                 self._note(f"the arm ends its move, then goes back to pose {last}")
@@ -256,43 +242,40 @@ class Tour:
         if key is Key.REDO:
             self._redo()
             return
-        if self._at is None:
+        if not self._now.standing:
             self._arm.stop()
         self._skip()
 
     def _redoable(self) -> int | None:
         """Stop that r takes again; None, and why, where there is none."""
-        if self._last is None:
+        last = self._now.taken_last
+        if last is None:
             self._note("there is no pose yet to be taken again")
-        elif self._todo[0] == self._last.stop:
-            self._note(f"pose {self._last.stop} is being taken again already")
+        elif self._now.todo[0] == last:
+            self._note(f"pose {last} is being taken again already")
         else:
-            return self._last.stop
+            return last
         return None
 
     def _redo(self) -> None:
-        self._again = False
-        if self._last is None:
+        stop = self._now.taken_last
+        if stop is None:
             return
-        self._running.remove(self._last.stop)
-        self._todo.appendleft(self._last.stop)
-        self._skipped.discard(self._index(self._last.stop))
-        self._note(f"pose {self._last.stop} is taken again")
+        self._running.remove(stop)
+        self._now = self._now.redo(stop)
+        self._note(f"pose {stop} is taken again")
 
     def _skip(self) -> None:
         """Drop the pose, and the return to it: the arm does not go there. What was to be taken again stays."""
-        index = self._index(self._todo[0])
-        self._skipped.add(index)
-        dropped = [stop for stop in self._todo if self._index(stop) == index]
-        self._todo = deque(stop for stop in self._todo if stop not in dropped)
-        names = {stop: "the return to pose 1" if stop == self._stops else f"pose {stop}" for stop in dropped}
+        self._now, dropped = self._now.skip()
+        names = {stop: "the return to pose 1" if stop == self._now.stops else f"pose {stop}" for stop in dropped}
         stay = set(dropped).intersection(self._run.stops())
         for record in self._run.records() if stay else ():
             if record.stop in stay:
                 self._journal.show(self._running.add(record))
                 self._note(f"{names[record.stop]} stays as it was taken", warning=True)
         if left := [name for stop, name in names.items() if stop not in stay]:
-            way = f"the arm goes on to pose {self._todo[0]}" if self._todo else "it was the last"
+            way = f"the arm goes on to pose {self._now.todo[0]}" if self._now.todo else "it was the last"
             self._note(f"skipped: {' and '.join(left)}, {way}; --resume takes what was skipped", warning=True)
 
     def _take(self, stop: int, index: int) -> PoseRecord:
@@ -324,7 +307,7 @@ class Tour:
             PoseTaken.of(
                 record,
                 self._certifier.scene.down_base,
-                stops=self._stops,
+                stops=self._now.stops,
                 settle_s=settled_s,
                 average_s=self._sampling.average_s,
                 attempts=attempts,
@@ -339,7 +322,7 @@ class Tour:
 
     def _go(self, index: int, stop: int) -> None:
         """Bring the arm to a pose of the plan, over certified moves only."""
-        at, speed_rad_s = self._at, self._own_speed(index)
+        at, speed_rad_s, driven_from = self._now.at, self._own_speed(index), None
         if index == at:
             return
         if at is None or speed_rad_s is None:
@@ -347,20 +330,19 @@ class Tour:
         else:
             self._show_state(State.MOVE, stop)
             self._move(self._nodes[at], self._nodes[index], speed_rad_s, self._plan.acceleration_rad_s2)
-            if index == (at + 1) % len(self._nodes):
-                self._driven.add(at)
-        self._at = self._stood_at = index
+            driven_from = at if index == (at + 1) % len(self._nodes) else None
+        self._now = self._now.arrive(index, driven_from=driven_from)
 
     def _go_back(self, index: int, why: str) -> None:
         """Return to the pose the arm came from, then raise `Stopped`: a person decides again."""
-        self._back, self._under_way = None, self._todo[0]
+        self._now = replace(self._now, back=None, under_way=self._now.todo[0])
         self._approach(self._arm.state().q_rad, index, index + 1, back=True)
-        self._at = index
+        self._now = self._now.arrive(index)
         raise Stopped(f"back at pose {index + 1}; what stopped the arm: {why}")
 
     def _own_speed(self, index: int) -> float | None:
         """Speed of the plan's own move from where the arm was left to a pose, rad/s; None where it has none."""
-        at, n = self._at, len(self._nodes)
+        at, n = self._now.at, len(self._nodes)
         if at is None or (index - at) % n not in {1, n - 1}:
             return None
         return self._plan.steps[at if (index - at) % n == 1 else index].speed_rad_s
@@ -386,7 +368,7 @@ class Tour:
             self._move(q, goal, min(float(speed), most_rad_s), SLOW.joint_rad_s2)
             q = goal
         if stop == 1 and not back:
-            self._confirm(f"The arm stands at the first pose. The tour has {self._stops} stops. Begin?")
+            self._confirm(f"The arm stands at the first pose. The tour has {self._now.stops} stops. Begin?")
 
     def _passed(self, way: Array, goal: int) -> list[str]:
         """Skipped poses that a way (k, 6), which ends at another one, comes close to."""
@@ -394,7 +376,7 @@ class Tour:
         points = np.concatenate([start + share * (end - start) for start, end in pairwise(way)])
         return [
             str(index + 1)
-            for index in sorted(self._skipped - {goal})
+            for index in sorted(self._now.skipped - {goal})
             if np.abs(points - self._nodes[index]).max(axis=1).min() < _NEAR_RAD
         ]
 
@@ -403,7 +385,7 @@ class Tour:
         if not self._pace.asks:
             return
         trusted = self._pace.trusted and not by_person
-        if self._moved:
+        if self._now.confirmed:
             if self._journal.ask(Question(text, assumed="yes" if trusted else None)) != "yes":
                 raise Stopped(f"not confirmed: {text}")
             return
@@ -411,16 +393,16 @@ class Tour:
         question = Question(f"{text} Hand on the emergency stop. Type {_FIRST_WORD}", (_FIRST_WORD,), assumed)
         if self._journal.ask(question) != _FIRST_WORD:
             raise Declined("the word was not typed: nothing moves")
-        self._moved = True
+        self._now = replace(self._now, confirmed=True)
 
     def _move(self, start: Array, goal: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Make one certified move, from nowhere else than where it was certified to begin."""
-        if not self._moved:
+        if not self._now.confirmed:
             self._confirm("The arm begins the tour.")
         self._recovery.require_answers()
         off_rad = np.abs(self._arm.state().q_rad - start)
         if off_rad.max() > _AT_RAD:
-            self._at = self._stood_at = None
+            self._now = self._now.lose_place()
             raise Tripped(
                 Hazard.OTHER_CLIENT,
                 DeviceFault(
@@ -430,7 +412,7 @@ class Tour:
             )
         turn = np.abs(goal - start).max()
         duration_s = float(move_duration_s(turn, speed_rad_s, acceleration_rad_s2))
-        self._at = None
+        self._now = self._now.start_move()
         with self._watcher.watching(start, goal, moving=True):
             self._arm.move_to(
                 goal.tolist(),
@@ -452,11 +434,11 @@ class Tour:
         if isinstance(error, Stopped) and error.for_good:
             self._show_state(State.STOP, words=str(error))
             raise Declined(str(error))
-        trip = self._recovery.cause(error, moving=self._at is None)
+        trip = self._recovery.cause(error, moving=not self._now.standing)
         if trip is not None and self._mended(trip):
             return
-        stop, back = self._todo[0], self._left_behind()
-        self._at = None
+        stop, back = self._now.todo[0], self._now.came_from
+        self._now = self._now.start_move()
         words = str(error if trip is None else trip).rstrip(".")
         told, untold = self._watcher.tripped(wait_s=0.0), self._watcher.untold
         if trip is not None and (trip is not told or untold is not None):
@@ -489,20 +471,15 @@ class Tour:
             if answer == "skip":
                 self._skip()
             if answer == "back" and back is not None:
-                self._back = back, words
+                self._now = replace(self._now, back=(back, words))
             return
-
-    def _left_behind(self) -> int | None:
-        """Index of the pose that the arm came from, where it was stopped on its way to another."""
-        gone = {self._index(self._todo[0]), *self._skipped}
-        return None if self._at is not None or self._stood_at in gone else self._stood_at
 
     def _mended(self, trip: Tripped) -> bool:
         """Open a sensor that failed while the arm stood at a pose, once for each pose; the pose begins anew."""
-        stop = self._todo[0]
-        if trip.hazard != Hazard.SENSOR_LOST or self._at is None or stop in self._reopened:
+        stop = self._now.todo[0]
+        if trip.hazard != Hazard.SENSOR_LOST or not self._now.standing or stop in self._now.reopened:
             return False
-        self._reopened.add(stop)
+        self._now = replace(self._now, reopened=self._now.reopened | {stop})
         try:
             self._recovery.make_sure()
         except (Tripped, DriverError, NotAccepted, Declined) as error:
@@ -514,8 +491,8 @@ class Tour:
     # -------------------------------------------------------------------------------------------- telling
 
     def _show_state(self, state: State, stop: int | None = None, words: str = "") -> None:
-        number = None if stop is None else self._plan.steps[self._index(stop)].number
-        self._journal.show(StateChanged(state=state, stop=stop, stops=self._stops, number=number, words=words))
+        number = None if stop is None else self._plan.steps[self._now.index(stop)].number
+        self._journal.show(StateChanged(state=state, stop=stop, stops=self._now.stops, number=number, words=words))
 
     def _note(self, words: str, *, warning: bool = False) -> None:
         self._journal.show(Noted(words=words, warning=warning))
