@@ -5,7 +5,7 @@ orientation that is new, the sensor is averaged and the pose is put on disk.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import degrees, radians
 from typing import Final, Protocol, TypeVar
 
@@ -66,17 +66,28 @@ class WatchedArm(Protocol):
         """Tell the controller's modes, or raise."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorder:
+    """Where the poses go."""
+
+    estimate: Callable[[PoseRecord], Estimated]
+    """Is given each pose, in place of one with the same stop; judges whether they are enough, and says what would
+    help. `Running.add` of `ftdrive.session.live_fit`."""
+    commit: Callable[[PoseRecord], None]
+    """Takes each record and returns when it is safe on disk; one with the `stop` of an earlier one replaces it."""
+    earlier: Sequence[PoseRecord] = ()
+    """Poses of the run that is continued; `estimate` is given them too."""
+
+
 def collect_manually(
     arm: WatchedArm,
     sensor: ForceTorqueSensor,
     sampling: Sampling,
     operator: Operator,
-    estimate: Callable[[PoseRecord], Estimated],
-    commit: Callable[[PoseRecord], None],
+    recorder: Recorder,
     *,
     down_base: Array,
     listen: bool,
-    earlier: Sequence[PoseRecord] = (),
     clock: Clock = REAL,
 ) -> None:
     """Take poses until there are enough, in place of a tour.
@@ -89,19 +100,13 @@ def collect_manually(
     ----------
     arm, sensor
         Open; the arm for reading. A sensor with `recover` is waited for when its stream was interrupted.
-    estimate : callable
-        Is given each pose, in place of one with the same stop; judges whether they are enough, and says what would
-        help. `Running.add` of `ftdrive.session.live_fit`.
-    commit : callable
-        Takes each record and returns when it is safe on disk; one with the `stop` of an earlier one replaces it.
+    recorder : Recorder
     down_base : array, shape (3,)
         Unit vector down in base, as it is mounted.
     listen : bool
         A program moves the arm: no advice on where to move it. Poses are taken from its start to its end, or until it
         comes back to its first pose when there are enough. That return is committed too and serves
         `calib.routine.drift_check`. A program that passes its first pose before is followed to its end.
-    earlier : sequence of PoseRecord
-        Poses of the run that is continued; `estimate` is given them too.
     clock : Clock
         Of the cell; an emulated one waits for this thread, which must see each standstill.
 
@@ -118,7 +123,7 @@ def collect_manually(
         Whatever the arm or the sensor raises; the poses committed so far stand.
     """
     with clock.keeping_up():
-        _Collection(arm, sensor, sampling, operator, estimate, commit, clock, down_base, listen, earlier).run()
+        _Collection(arm, sensor, sampling, operator, recorder, clock, down_base, listen).run()
 
 
 class _Collection:
@@ -128,18 +133,15 @@ class _Collection:
         sensor: ForceTorqueSensor,
         sampling: Sampling,
         operator: Operator,
-        estimate: Callable[[PoseRecord], Estimated],
-        commit: Callable[[PoseRecord], None],
+        recorder: Recorder,
         clock: Clock,
         down_base: Array,
         listen: bool,
-        earlier: Sequence[PoseRecord],
     ) -> None:
         self._arm, self._sensor, self._sampling = arm, sensor, sampling
         self._witness = Witness(sensor, operator.show)
-        self._operator, self._estimate, self._commit = operator, estimate, commit
+        self._operator, self._recorder = operator, recorder
         self._clock, self._down_base, self._listen = clock, down_base, listen
-        self._earlier = earlier
         self._taken: dict[int, PoseRecord] = {}
         self._level: Array | None = None
         self._redo: int | None = None
@@ -153,7 +155,7 @@ class _Collection:
         self._program_ran = False
         self._program = ""
         """As the controller tells it while listening; empty before its start."""
-        self._passes_first = bool(earlier)
+        self._passes_first = bool(recorder.earlier)
         """Whether the program comes to its first pose on its way; one that is started again does."""
         self._fault: str | None = None
         self._over = False
@@ -163,7 +165,7 @@ class _Collection:
 
     def run(self) -> None:
         self._greet()
-        for record in self._earlier:
+        for record in self._recorder.earlier:
             self._learn(record)
         if self._ends_by_itself and self._enough:
             self._note("The poses that are there are enough: it ends with the next one.")
@@ -312,7 +314,7 @@ class _Collection:
         return True
 
     def _keep(self, record: PoseRecord, settle_s: float, attempts: int) -> None:
-        self._commit(record)
+        self._recorder.commit(record)
         self._redo = None
         self._operator.show(
             PoseTaken.of(
@@ -346,7 +348,7 @@ class _Collection:
         if record.steady:  # the quietest tell how much the sensor scatters when left alone
             std = record.samples.wrench.std(axis=0, ddof=1)
             self._level = std if self._level is None else np.minimum(self._level, std)
-        estimated = self._estimate(record)
+        estimated = self._recorder.estimate(record)
         self._operator.show(replace(estimated, hint="") if self._listen else estimated)
         sigmas, force_N = estimated.residual_sigma or 0.0, estimated.residual_force_N or 0.0
         touched = estimated.poses >= LEAST_TO_COMPARE and sigmas > SURPRISE_SIGMA and force_N > SURPRISE_N

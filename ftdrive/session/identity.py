@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.interfaces import NOT_REPORTED, ForceTorqueSensor, RobotArm
 from drivers.registry import Options, split_url
-from ftdrive.cell.config import CellConfig
+from ftdrive.cell.config import SensorConfig
 from ftdrive.errors import PlanRefused
 from ftdrive.runs.run import Run
 
@@ -18,7 +18,7 @@ _OF_NUMBERS: Final = ("counts_per_N", "counts_per_Nm", "range")
 """Facts that tell another scale, or another calibration."""
 
 
-def require_same_devices(run: Run, cell: CellConfig, arm: RobotArm, sensor: ForceTorqueSensor) -> None:
+def require_same_devices(run: Run, config: SensorConfig, arm: RobotArm, sensor: ForceTorqueSensor) -> None:
     """Raise `PlanRefused` for other devices than those of the run, or a sensor whose numbers mean something else now.
 
     A device that tells no serial number is taken for the same one where the model is, and told none in the run either.
@@ -37,7 +37,7 @@ def require_same_devices(run: Run, cell: CellConfig, arm: RobotArm, sensor: Forc
             f"{info.serial}: {cure}, or make a new run"
         )
     then = _meaning(header["config"]["sensor"], devices["sensor"].get("facts", {}))
-    now = _meaning(asdict(cell.sensor), asdict(sensor.identify())["facts"])
+    now = _meaning(asdict(config), asdict(sensor.identify())["facts"])
     if other := [name for name in then if name in now and not np.array_equal(then[name], now[name])]:
         changes = " and ".join(f"{name} was {then[name]} and is {now[name]}" for name in other)
         raise PlanRefused(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Final
 
 from drivers.errors import DeviceFault, DriverError
@@ -13,6 +14,16 @@ from ftdrive.session.journal import Journal
 from ftdrive.session.watchdog import Watcher
 
 _LOOK_AGAIN_S: Final = 0.4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GuardedCell:
+    """Arm and sensor of a cell under control, with the guards that watch them."""
+
+    arm: RobotArm
+    sensor: ForceTorqueSensor
+    journal: Journal
+    watcher: Watcher
 
 
 class Recovery:
@@ -27,18 +38,10 @@ class Recovery:
         arm may not go on.
     """
 
-    def __init__(
-        self,
-        arm: RobotArm,
-        sensor: ForceTorqueSensor,
-        journal: Journal,
-        watcher: Watcher,
-        contact: ContactGuard,
-        recheck: Callable[[bool], None],
-    ) -> None:
-        self._arm, self._sensor, self._journal, self._watcher = arm, sensor, journal, watcher
+    def __init__(self, cell: GuardedCell, contact: ContactGuard, recheck: Callable[[bool], None]) -> None:
+        self._arm, self._sensor, self._journal, self._watcher = cell.arm, cell.sensor, cell.journal, cell.watcher
         self._contact, self._recheck = contact, recheck
-        self._witness = Witness(sensor, journal.show)
+        self._witness = Witness(cell.sensor, cell.journal.show)
         self._told: Tripped | None = None  # last, as what the arm is held for
         self._answered: Tripped | None = None  # last stop of row 11 after which the questions were answered
 

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from calib.errors import TooFewSamples
 from calib.routine import PoseRecord, Sampling, Stage, TourPose, take_pose
 from drivers.errors import DeviceFault, DriverError
-from drivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrive.checks.controller_settings import payload_in_words
 from ftdrive.checks.devices import SLOWEST_SLIDER
 from ftdrive.errors import Declined, NotAccepted, PlanRefused
@@ -36,13 +35,11 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.guards import RangeGuard, Tripped
 from ftdrive.session.hazards import Hazard
-from ftdrive.session.journal import Journal
 from ftdrive.session.live_fit import Running
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.progress import Progress
-from ftdrive.session.recovery import Recovery
-from ftdrive.session.watchdog import Watcher
+from ftdrive.session.recovery import GuardedCell, Recovery
 
 log = logging.getLogger(__name__)
 
@@ -87,41 +84,50 @@ class Pace:
     """`--yes` answers where it may."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Measuring:
+    """How the sensor is averaged at a pose."""
+
+    sampling: Sampling
+    quiet_std: Array
+    """(6,) standard deviation of the resting sensor's samples."""
+    load: RangeGuard
+    """Judges every sample of a pose."""
+    sensor_kg: float | None
+    """Mass of sensor and adapter; None if unknown. The payload is compared with it."""
+
+
 class Tour:
-    """One plan on its way.
+    """Takes the arm along one plan.
 
     Parameters
     ----------
-    load
-        The guard that also judges every sample of a pose.
-    quiet_std : array, shape (6,)
-        Of the resting sensor's samples.
-    sensor_kg
-        Mass of sensor and adapter; None where it is not known.
+    cell : GuardedCell
+    plan : Plan
+        With the speeds of this session.
+    certifier : Certifier
+    run : Run
+        Keeps every pose.
+    running : Running
+    recovery : Recovery
+    measuring : Measuring
+    pace : Pace
     """
 
     def __init__(
         self,
-        arm: RobotArm,
-        sensor: ForceTorqueSensor,
-        certifier: Certifier,
+        cell: GuardedCell,
         plan: Plan,
+        certifier: Certifier,
         run: Run,
-        journal: Journal,
         running: Running,
-        watcher: Watcher,
-        *,
         recovery: Recovery,
-        load: RangeGuard,
-        sampling: Sampling,
+        measuring: Measuring,
         pace: Pace,
-        quiet_std: Array,
-        sensor_kg: float | None,
     ) -> None:
-        self._arm, self._sensor, self._certifier = arm, sensor, certifier
-        self._plan, self._run, self._journal, self._running, self._watcher = plan, run, journal, running, watcher
-        self._recovery, self._load, self._sampling, self._pace = recovery, load, sampling, pace
-        self._quiet_std, self._sensor_kg = quiet_std, sensor_kg
+        self._arm, self._sensor, self._journal, self._watcher = cell.arm, cell.sensor, cell.journal, cell.watcher
+        self._plan, self._certifier, self._run, self._running = plan, certifier, run, running
+        self._recovery, self._measuring, self._pace = recovery, measuring, pace
         self._nodes = np.array([step.q_rad for step in plan.steps])
         self._now = Progress(len(plan.steps))
 
@@ -179,7 +185,7 @@ class Tour:
             return
         self._now = replace(self._now, payload_kg=told_kg)
         self._journal.show(Weighed(mass_kg=mass_kg, payload_kg=told_kg))
-        if words := payload_in_words(told_kg, mass_kg, self._sensor_kg):
+        if words := payload_in_words(told_kg, mass_kg, self._measuring.sensor_kg):
             self._note(words, warning=True)
 
     def _step(self, stop: int, index: int) -> bool:
@@ -296,12 +302,12 @@ class Tour:
                 self._sensor,
                 stop,
                 pose,
-                self._sampling,
+                self._measuring.sampling,
                 guard=self._between_looks,
                 on_stage=on_stage,
-                quiet_std=self._quiet_std,
+                quiet_std=self._measuring.quiet_std,
             )
-        self._load.judge(record.samples.wrench)
+        self._measuring.load.judge(record.samples.wrench)
         self._run.commit(record)
         self._journal.show(
             PoseTaken.of(
@@ -309,7 +315,7 @@ class Tour:
                 self._certifier.scene.down_base,
                 stops=self._now.stops,
                 settle_s=settled_s,
-                average_s=self._sampling.average_s,
+                average_s=self._measuring.sampling.average_s,
                 attempts=attempts,
             ),
             sync=True,

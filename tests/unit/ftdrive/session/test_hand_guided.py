@@ -16,7 +16,7 @@ from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
 from drivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
 from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
-from ftdrive.session.hand_guided import collect_manually
+from ftdrive.session.hand_guided import Recorder, collect_manually
 from ftdrive.session.operator import Key, Question
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import STATUS
@@ -238,11 +238,9 @@ class Outcome:
                 self.cell,
                 sampling,
                 self.person,
-                self.fit.add,
-                self._commit,
+                Recorder(self.fit.add, self._commit, earlier),
                 down_base=FLOOR,
                 listen=listen,
-                earlier=earlier,
                 clock=self.cell.clock,
             )
 
@@ -603,6 +601,12 @@ def test_a_disk_that_is_full_ends_it() -> None:
 
     with pytest.raises(OSError, match="No space"):
         collect_manually(
-            cell, cell, Sampling(average_s=AVERAGE_S), person, Fit().add, commit, down_base=FLOOR, listen=False
+            cell,
+            cell,
+            Sampling(average_s=AVERAGE_S),
+            person,
+            Recorder(Fit().add, commit),
+            down_base=FLOOR,
+            listen=False,
         )
     assert not any(isinstance(event, PoseTaken) for event in person.told)

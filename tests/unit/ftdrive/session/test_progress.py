@@ -19,7 +19,7 @@ def test_the_arm_stands_until_it_leaves_and_may_return_to_where_it_came_from() -
 
 def test_a_skipped_first_pose_takes_its_return_along_and_a_redo_brings_it_back() -> None:
     left, dropped = BEGUN.skip()
-    assert (left.todo, list(dropped), left.skipped) == ((2, 3, 4, 5, 6), [1, 7], {0})
+    assert (left.todo, list(dropped), left.skipped) == ((2, 3, 4, 5, 6), [1, 7], frozenset({0}))
     again = replace(left, again=True).redo(1)
     assert (again.todo[0], again.skipped, again.again) == (1, frozenset(), False)
 

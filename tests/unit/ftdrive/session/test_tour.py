@@ -23,7 +23,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
 from ftdrive.planning.show import view
 from ftdrive.session import preflight
-from ftdrive.session.completed import has_completed, remember_completed
+from ftdrive.session.completed_plans import has_completed, remember_completed
 from ftdrive.session.events import (
     Asked,
     Checked,
