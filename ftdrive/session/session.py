@@ -115,7 +115,7 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
     limits = limits or (Limits.emulated() if cell.clock.emulated else Limits())
     journal = Journal(operator, yes=options.yes)
     journal.show(StateChanged(state=State.IDLE))
-    options = as_begun(options)
+    options = with_recorded_mode(options)
     by_hand = options.mode in _BY_HAND
     run = None if options.resume is None else Run(options.resume, cell.clock)
     plan = None if by_hand else _plan_on_disk(options, run)
@@ -139,7 +139,7 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
     return solve_and_save(run)
 
 
-def as_begun(options: Options) -> Options:
+def with_recorded_mode(options: Options) -> Options:
     """Give a run that is resumed the mode it was begun in; raises `ConfigError` for options that do not go together."""
     begun = options.mode if options.resume is None else Run(options.resume).header().get("mode", "auto")
     if options.mode != "auto" and (begun in _BY_HAND) != (options.mode in _BY_HAND):
