@@ -17,13 +17,13 @@ class SafetyQuestions:
 
     def ask(self, way_rad: Array, *, assumed: bool) -> None:
         """Ask everything before the arm moves along `way_rad` (k, 6); with `assumed`, `--yes` may answer."""
-        room = "" if self._plan.arm_rests else ", and the room of the whole arm, which moves too,"
+        room = "" if self._plan.arm_rests else ", and the space of the whole arm, which moves too,"
         if arm_moves(way_rad):
-            room = f", and the room of the whole arm, which moves on its way there too ({turns_in_words(way_rad)}),"
+            room = f", and the space of the whole arm, which moves in the approach ({turns_in_words(way_rad)}),"
         for text in (
-            "Is the tool free: nothing touches it, nothing is held, no fluid, cables slack, the base bolted?",
-            f"Is the ball of {self._plan.ball_m:.2f} m around {point_in_words(self._plan)} (the wrist){room} free, "
-            "of people too?",
+            "Is the tool free: no contact, no workpiece, no fluid, cables slack? Is the base bolted?",
+            f"Is the ball of {self._plan.ball_m:.2f} m around {point_in_words(self._plan)} (the wrist){room} free of "
+            "obstacles and people?",
             "Is the emergency stop in reach, and tested?",
         ):
             self._journal.require(text, assumed=assumed)
@@ -33,5 +33,5 @@ class SafetyQuestions:
         """Ask whether reduced mode is intended, once as long as it lasts."""
         reduced = self._arm.status().safety_mode == "reduced"
         if reduced and not self._reduced:
-            self._journal.require("The controller is in reduced mode. Is that as it should be?", assumed=assumed)
+            self._journal.require("The controller is in reduced mode. Is that intended?", assumed=assumed)
         self._reduced = reduced

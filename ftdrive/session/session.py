@@ -1,4 +1,4 @@
-"""A whole session: open the cell, plan, check, show, ask, move and average, solve, save."""
+"""A whole session: open the cell, then look, check, predict, tour, solve and save."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -58,59 +58,59 @@ from ftdrive.session.watchdog import Watcher
 Array = NDArray[np.float64]
 
 _GRID_RAD: Final = float(np.radians(0.1))
-"""Plans are made where joints 1 to 3 stand, to this grid: the same place gives the same plan, and hash, again."""
+"""Joints 1 to 3 are rounded to this grid before planning, so that the same posture gives the same plan and hash."""
 _TARGET_N, _TARGET_NM = 0.057, 0.0035
-"""Of one average: 0.02 N of bias from 24 poses."""
+"""Target sigma of one average: it gives 0.02 N of bias from 24 poses."""
 _BY_HAND: Final = ("manual", "listen")
 _HEAVIEST_KG: Final = {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5, "UR16e": 16.0, "UR20": 20.0}
 _HEAVIEST_OF_ALL_KG: Final = 30.0
 _NO_SERIAL: Final = (
-    "the controller tells no serial number, so nobody knows which arm has run a plan to its end (a younger PolyScope "
-    "tells it)"
+    "the controller reports no serial number, so a completed plan cannot be assigned to an arm: newer PolyScope "
+    "versions report it"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What a person asked for."""
+    """Options of a session, as the operator gave them."""
 
     runs: Path
     name: str = "calibrate"
     poses: int = 24
     mode: Mode = "auto"
-    """A run that is resumed keeps to its own where nothing else is said."""
+    """With `resume`, "auto" means the mode of that run."""
     dry_run: bool = False
     fast: bool = False
-    """At the plan's speeds, once it has run to its end slowly."""
+    """Move at the plan's speeds if it has run to its end slowly before."""
     plan: Path | None = None
     output: Path | None = None
     """Save the plan as a new file."""
     png: Path | None = None
     """Draw it."""
     view: bool = False
-    """Show it in the browser, until a person has seen it."""
+    """Show it in the browser until the operator answers."""
     resume: Path | None = None
     redo: tuple[int, ...] = ()
     real: bool = True
-    """Something real moves. An emulated cell needs no typed word and no slow first run."""
+    """Whether a real arm moves. An emulated cell needs no typed word and no slow first run."""
     questions: bool = True
     yes: bool = False
-    """Nobody is asked what a question assumes."""
+    """Answer the safety questions automatically, never the first motion."""
     description: Mapping[str, Any] = field(default_factory=dict)
     """Goes into run.json."""
 
 
 def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Limits | None = None) -> Outcome | None:
-    """Lead a person through a calibration; None after a dry run.
+    """Guide the operator through a calibration; None after a dry run.
 
     Raises
     ------
     Declined
-        A person ended it.
+        The operator ended it.
     NotAccepted, PlanRefused, ConfigError
-        It may not begin.
+        The session refuses to start.
     DriverError, OSError
-        It was broken off; what was taken stands in the run, which can be resumed.
+        The session failed; the poses taken are in the run, which can be resumed.
     """
     limits = limits or (Limits.emulated() if cell.clock.emulated else Limits())
     journal = Journal(operator, yes=options.yes)
@@ -134,20 +134,20 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
     if run is None:
         return None
     if not run.stops():
-        raise Declined(f"ended before the first pose: {run.folder} holds nothing to solve")
+        raise Declined(f"ended before the first pose: {run.folder} has no pose to solve")
     journal.show(StateChanged(state=State.REPORT))
     return solve_and_save(run)
 
 
 def with_recorded_mode(options: Options) -> Options:
-    """Give a run that is resumed the mode it was begun in; raises `ConfigError` for options that do not go together."""
+    """Return options with the mode of the resumed run; raises `ConfigError` for options that exclude each other."""
     begun = options.mode if options.resume is None else Run(options.resume).header().get("mode", "auto")
     if options.mode != "auto" and (begun in _BY_HAND) != (options.mode in _BY_HAND):
         way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
-        raise ConfigError(f"{options.resume} was begun {way} and can only go on like that: leave out --{options.mode}")
+        raise ConfigError(f"{options.resume} was started {way} and only continues so: leave out --{options.mode}")
     options = replace(options, mode=begun if options.mode == "auto" else options.mode)
     if options.redo and options.resume is None:
-        raise ConfigError("--redo takes poses of a run again: name the run with --resume RUN")
+        raise ConfigError("--redo needs a run: name the run with --resume RUN")
     if options.mode not in _BY_HAND:
         return options
     no_motion = {
@@ -160,12 +160,12 @@ def with_recorded_mode(options: Options) -> Options:
         "--view": options.view,
     }
     if wrong := [name for name, given in no_motion.items() if given]:
-        raise ConfigError(f"with --{options.mode} ftdrive plans and moves nothing: leave out {' and '.join(wrong)}")
+        raise ConfigError(f"with --{options.mode} ftdrive neither plans nor moves: leave out {' and '.join(wrong)}")
     return options
 
 
 def _plan_on_disk(options: Options, run: Run | None) -> Plan | None:
-    """Load the plan of the run that is resumed, or the one that is named; raises `ConfigError` for poses it has not."""
+    """Load the plan of the resumed run, or the given one; raises `ConfigError` if it lacks a pose of `redo`."""
     if run is None:
         return None if options.plan is None else Plan.load(options.plan)
     plan = Plan.load(run.plan_path)
@@ -177,7 +177,7 @@ def _plan_on_disk(options: Options, run: Run | None) -> Plan | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Session:
-    """What every stage of a session works with."""
+    """Open devices, options and limits of a session."""
 
     cell: CellConfig
     arm: RobotArm
@@ -262,10 +262,10 @@ def _along_a_plan(session: _Session, plan: Plan | None) -> Run | None:
     """Take the arm along a plan; None after a dry run, which never takes control of the arm."""
     dry_run, arm = session.options.dry_run, session.arm
     if not dry_run and arm.status().tcp_offset is None:
-        arm.open(control=True)  # an old controller tells no poses before
+        arm.open(control=True)  # an old controller reports no poses before
     checked = _check(_look(session, plan), preflight.CHECKS)
     if dry_run:
-        session.note("the controller's own safety limits are not asked for: only a program on it could")
+        session.note("the controller's safety limits are not checked: only a program on the controller can query them")
     else:
         arm.open(control=True)
         checked = _check(checked.looked, preflight.IN_CONTROL)
@@ -312,8 +312,8 @@ def _look(session: _Session, plan: Plan | None) -> _Looked:
 def _plan_here(session: _Session, certifier: Certifier) -> Plan:
     """Make a plan where the arm stands."""
     q = np.round(session.arm.state().q_rad / _GRID_RAD) * _GRID_RAD
-    with suppress(ConfigError):  # the planner says what to do about it
-        q[3:5] = constant_tour(q)[0, 3:5]  # wherever the wrist was left; joint 6 tells how the cable is wound
+    with suppress(ConfigError):  # the planner reports it, with what to do
+        q[3:5] = constant_tour(q)[0, 3:5]  # joint 6 keeps its turn: it shows how the cable is wound
     return plan_for(session.cell, certifier, q, session.options.poses)
 
 
@@ -331,19 +331,19 @@ def _what_is_left(session: _Session, plan: Plan) -> tuple[list[int], list[PoseRe
 def _show(session: _Session, before: preflight.Before) -> None:
     """Show every motion to come: in words, and as the options ask in files and in the browser."""
     options, plan, way = session.options, before.plan, before.approach.way_rad
-    words = "The arm stands at the first pose to be taken."
+    words = "The arm stands at the first pose."
     if len(way):
         near = way_in_words(way, before.approach.clearance_m)
-        words = f"The way to the first pose to be taken, from where the arm stands: {near}."
+        words = f"Approach to the first pose: {near}."
     session.journal.show(Planned(plan=plan, way_rad=way, way_words=words))
     if options.output is not None:
         plan.save(options.output)
-        session.note(f"the plan is saved as {options.output}")
+        session.note(f"plan saved as {options.output}")
     if options.png is not None:
         from ftdrive.planning.show.picture import draw
 
         draw(plan, before.certifier, options.png, way)
-        session.note(f"the plan is drawn in {options.png}")
+        session.note(f"plan drawn in {options.png}")
     if options.view:
         from ftdrive.planning.show.view import open_in_browser, shown
 
@@ -373,15 +373,15 @@ def _predict(checked: _Checked) -> _Predicted:
     session.note(prediction(before.plan, before.certifier, mass_kg, average_s, noise))
     if session.options.fast and looked.slow:
         why = f": {_NO_SERIAL}" if looked.serial == NOT_REPORTED else ""
-        session.note(f"{'every' if why else 'the first'} run of a plan is slow, whatever was asked{why}", warning=True)
+        session.note(f"{'every' if why else 'the first'} run of a plan is slow, also with --fast{why}", warning=True)
     speeds = speeds_of(session.cell)
     driven = at_most(before.plan, before.certifier, slower(speeds, SLOW) if looked.slow else speeds)
     fastest_rad_s = max(step.speed_rad_s for step in driven.steps)
     total_s = moves_s(driven, looked.todo, looked.stands_rad, before.approach)
     total_s += len(looked.todo) * (average_s + 0.6)
     session.note(
-        f"stops to come: {len(looked.todo)}, at most {np.degrees(fastest_rad_s):.0f}°/s: about "
-        f"{total_s / 60:.1f} min; {looked.taken} poses are there already"
+        f"{len(looked.todo)} stops left, at most {np.degrees(fastest_rad_s):.0f}°/s: about {total_s / 60:.1f} min; "
+        f"{looked.taken} poses taken before"
     )
     return _Predicted(looked, driven, sampling)
 
@@ -395,7 +395,7 @@ def _chosen_sampling(looked: _Looked) -> tuple[Sampling, Array]:
     if not (sampling.noise_record_s and looked.todo):
         variance = np.diag(mean_and_covariance(looked.before.quiet.wrench).covariance)
         return sampling, np.sqrt(variance * preflight.LISTEN_S / sampling.average_s)
-    session.note(f"listening to the sensor for {sampling.noise_record_s:g} s; do not touch the arm")
+    session.note(f"recording the sensor's noise for {sampling.noise_record_s:g} s: do not touch the arm")
     record = session.listen(sampling.noise_record_s)
     chosen = averaging_time(
         record.wrench,
@@ -431,11 +431,13 @@ def _tour(predicted: _Predicted) -> _Toured:
         journal.show(GuardTripped(hazard=trip.hazard, words=str(trip)))
 
     watcher = Watcher(session.arm, session.sensor, rows, on_trip, clock=session.cell.clock, limits=limits)
-    with watcher:  # an emergency stop at a question counts too
+    with watcher:  # sees an emergency stop at a question too
         questions = SafetyQuestions(session.arm, journal, before.plan)
         way = before.approach.way_rad
         if options.questions and looked.todo:
-            questions.ask(way, assumed=before.known and not arm_moves(way))  # nobody has seen a way of the arm
+            questions.ask(
+                way, assumed=before.known and not arm_moves(way)
+            )  # an approach with base, shoulder or elbow is new
         run = session.run or _run_of(looked)
         cell = GuardedCell(session.arm, session.sensor, journal, watcher)
         tour = Tour(
@@ -473,7 +475,7 @@ def _recheck(looked: _Looked, questions: SafetyQuestions, asks: bool) -> None:
     """Repeat the checks after a stop; with `asks`, all the safety questions too."""
     session, before = looked.session, looked.before
     q = session.arm.state().q_rad
-    stays = plan_approach(before.certifier, q, q, SLOW)  # the way on is judged by itself, once it is known where to
+    stays = plan_approach(before.certifier, q, q, SLOW)  # the next approach is checked when its goal is known
     quiet = session.listen(preflight.LISTEN_S)
     again = replace(before, quiet=quiet, approach=stays, known=True, resumed=True)
     _check(replace(looked, before=again), preflight.AGAIN)
@@ -489,14 +491,14 @@ def _judge_completed(looked: _Looked, toured: _Toured) -> None:
     """Record that the plan was driven to its end, slowly, or show why it does not count."""
     plan = looked.before.plan
     if toured.undriven or len(toured.run.stops()) <= len(plan.steps):
-        why = "a plan counts as run to its end when one session takes every pose and drives every move along it; "
-        why += f"not driven so: from {_poses(toured.undriven)} on" if toured.undriven else "poses are missing"
+        why = "a plan counts as completed when one session takes every pose and drives every move of it; "
+        why += f"moves replaced: from {_poses(toured.undriven)} on" if toured.undriven else "poses are missing"
     elif looked.serial == NOT_REPORTED:
         why = _NO_SERIAL
     else:
         remember_completed(looked.serial, _sha256(plan))
         return
-    looked.session.note(f"the next run of this plan is slow again and begins with the typed word: {why}")
+    looked.session.note(f"the next run of this plan is slow again and needs the typed word: {why}")
 
 
 def _sha256(plan: Plan) -> str:
@@ -516,11 +518,11 @@ def _range_of(sensor: ForceTorqueSensor) -> Array | None:
 
 @contextmanager
 def _kept(journal: Journal, run: Run) -> Iterator[None]:
-    """Say where the poses are when a session ends before its time."""
+    """Show where the poses are when a session ends early."""
     try:
         yield
     except BaseException:
-        words = f"{len(run.stops())} poses are kept in {run.folder}; go on with {run.resume_command}"
+        words = f"{len(run.stops())} poses saved in {run.folder}; continue with {run.resume_command}"
         words += f", or solve them with {run.solve_command}" if run.stops() else ""
         journal.show(Noted(words=words), sync=True)
         raise

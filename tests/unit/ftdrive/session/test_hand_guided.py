@@ -356,7 +356,7 @@ TILTED = [Rotation.from_euler("xyz", angles, degrees=True) for angles in ((45, 0
 def test_without_keys_it_ends_by_itself_when_the_poses_are_enough() -> None:
     outcome = Outcome(dwells(*AROUND, *TILTED), has_keys=False)
     assert outcome.stops == [1, 2, 3, 4, 5, 6]
-    assert "ends by itself" in outcome.person.words()
+    assert "once the coverage is green" in outcome.person.words()
     assert "6 poses are kept." in outcome.person.words()
     assert "press" not in outcome.person.words()
 
@@ -447,7 +447,7 @@ def test_a_sensor_that_does_not_come_back_ends_it(away_s: float) -> None:
 def test_an_arm_that_is_silent_for_a_second_is_waited_for(since_s: float, listen: bool) -> None:
     outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), silent_s=(since_s, since_s + 1.0), listen=listen)
     assert [r.before.R_base_flange[2, 2].round(3) for r in outcome.kept] == [1.0, -1.0, 0.0]
-    words = "Nothing is measured until the arm is heard again: its clock has stood still."
+    words = "Nothing is measured until the arm answers again: its clock has stood still."
     assert outcome.person.words().count(words) == 1
 
 
