@@ -202,7 +202,7 @@ def test_a_computer_that_stalls_does_not_refuse_a_program_that_has_ended_meanwhi
 def test_a_dry_run_takes_no_control_and_says_what_it_left_out(lab: Lab) -> None:
     assert lab.calibrate(dry_run=True) is None
     assert (lab.arm.opened, lab.arm.asked_limits) == (1, 0)
-    assert "limits are not asked for" in lab.said()
+    assert "limits are not checked" in lab.said()
 
 
 def test_control_is_taken_when_all_else_is_well(lab: Lab) -> None:
