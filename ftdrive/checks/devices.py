@@ -4,7 +4,6 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from socket import gaierror
 from types import MappingProxyType
 from typing import Any
 
@@ -23,21 +22,17 @@ from drivers.errors import (
     PortInUse,
     ProtocolError,
     StreamBroken,
-    Unreachable,
 )
-from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
+from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, Finding, FtSamples, Health
 from drivers.ur.kinematics import MODELS
 from ftdrive.checks.computer import RATE_TOLERANCE, Check, SensorAddress, State, latency_command
 
 Array = NDArray[np.float64]
 
 _PUSH_N = 2.0
-_SERVICES = "Settings, Security, Services"
 _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs on this computer"
 SLOWEST_SLIDER = 0.05
 """Moves are waited for as long as they last with this one."""
-_OLDEST_MINOR = 4
-"""Of PolyScope 3 and 5: ur_rtde cannot control older ones."""
 
 
 # ---------------------------------------------------------------------------------------------------------- the sensor
@@ -53,9 +48,9 @@ _SAYS: Mapping[str, str] = MappingProxyType(
 )
 
 
-def who(info: DeviceInfo, firmware: str = "firmware") -> str:
-    """Name a device in words; `firmware` is what its firmware is called."""
-    return f"{info.model}, serial {info.serial}, {firmware} {info.firmware}"
+def who(info: DeviceInfo) -> str:
+    """Return a device's model, serial number and firmware in words."""
+    return f"{info.model}, serial {info.serial}, firmware {info.firmware}"
 
 
 def check_identity(info: DeviceInfo) -> list[Check]:
@@ -227,45 +222,17 @@ def check_noise(wrench: Array, duration_s: float, average_s: float, mass_kg: flo
 
 
 def check_unreachable(error: DriverError, host: str) -> Check:
-    """Say why an arm could not be opened, and what to do about just that."""
-    cure = error.cure or f"ping {host}"
-    if isinstance(error, Unreachable):
-        if isinstance(error.__cause__, ConnectionRefusedError):
-            cure = (
-                f"{host} is there and takes no RTDE: enable RTDE at the pendant under {_SERVICES}, if it is the robot"
-            )
-        elif isinstance(error.__cause__, gaierror):
-            cure = (
-                "write the controller's IPv4 address, at the pendant under Settings, System, Network, as [robot] host"
-            )
-        else:
-            cure = f"ping {host}"
-    elif isinstance(error, ModelUnknown):
-        cure = f'write model = "ur5e" under [robot] in ftdrive.toml, or give --model; it is one of {", ".join(MODELS)}'
-    return Check("robot.reachable", "failed", error.found, cure)
+    """Return why an arm could not be opened, and what to do about it."""
+    fix = error.cure or f"ping {host}"
+    if isinstance(error, ModelUnknown):
+        fix = f'write model = "ur5e" under [robot] in ftdrive.toml, or give --model: one of {", ".join(MODELS)}'
+    return Check("robot.reachable", "failed", error.found, fix)
 
 
-def check_arm(info: DeviceInfo) -> Check:
-    """Say who an arm is, and whether its PolyScope, such as "5.15.0.1261331", can be controlled."""
-    name, found = "robot.identity", who(info, "PolyScope")
-    major, _, rest = info.firmware.partition(".")
-    minor = rest.partition(".")[0]
-    if minor.isdecimal() and int(minor) < _OLDEST_MINOR:
-        fix = f"update it to PolyScope {major}.{_OLDEST_MINOR} or later"
-        return Check(name, "failed", f"{found}, which ur_rtde can read and not control", fix)
-    return Check(name, "ok", found)
-
-
-def check_registers(taken: Sequence[str]) -> Check:
-    """Judge which of the RTDE registers that a control of ours needs belong to somebody else."""
-    name = "robot.registers"
-    if not taken:
-        return Check(name, "ok", "its RTDE registers are free: nobody else controls it")
-    fix = (
-        "end the other program that controls the arm, or disable EtherNet/IP and PROFINET at the pendant under "
-        "Installation, Fieldbus; after a cut cable wait for half a minute"
-    )
-    return Check(name, "failed", f"{len(taken)} RTDE registers are in use by another client, {taken[0]} first", fix)
+def check_finding(finding: Finding) -> Check:
+    """Return what an arm's driver found when it checked its own device."""
+    state: State = "ok" if finding.passed else "failed"
+    return Check(f"robot.{finding.name}", state, finding.found, finding.fix or None)
 
 
 def check_status(status: ArmStatus) -> list[Check]:

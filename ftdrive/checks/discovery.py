@@ -33,7 +33,7 @@ def look_at_robot(host: str, model: str | None, clock: Clock = REAL) -> tuple[st
     with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig(""), clock=clock))) as arm:
         arm.open()
         info, remote = arm.identify(), arm.in_remote_control()
-    told = who(info, "PolyScope")
+    told = who(info)
     return info.model, told if remote is None else f"{told}, remote control {'ON' if remote else 'OFF'}"
 
 

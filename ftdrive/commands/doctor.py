@@ -18,10 +18,8 @@ from calib import CalibrationResult
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import ArmStatus, ForceTorqueSensor, RobotArm
-from drivers.ur.dashboard import Dashboard, ask_dashboard
-from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
 from ftdrive.cell.config import USUAL_KG, CellConfig
-from ftdrive.cell.devices import build_arm, build_sensor, ur_timing
+from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station, sensor_name, sensor_url
 from ftdrive.checks import computer, devices
 from ftdrive.checks.computer import Check, SensorAddress
@@ -38,7 +36,6 @@ _LOOK_S = 2.0
 _PUSH_S = 3.0
 _PUSH_WINDOW_S = 0.2
 _SIMULATED_PUSH_N, _SIMULATED_PUSH_S = 15.0, 0.6
-_NOT_UR = Check("robot.programs", "skipped", "not applicable: only a UR has dashboard, RTDE registers and port 30003")
 _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "red"), "skipped": ("-", "")}
 
 
@@ -116,55 +113,25 @@ def doctor(
 
 
 def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> RobotArm | None:
-    host, arm, is_ur = cell.robot.host, build_arm(cell), cell.robot.driver == "ur"
+    host, arm = cell.robot.host, build_arm(cell)
     stack.callback(arm.close)
     try:
         arm.open()
         info, status = arm.identify(), arm.status()
-        after = f" in {1e3 * _dashboard_s(cell):.1f} ms" if is_ur else ""
     except DriverError as error:
         found.append(devices.check_unreachable(error, host))
         return None
-    found.append(Check("robot.reachable", "ok", f"{host} answers{after}"))
-    found.append(devices.check_arm(info) if is_ur else Check("robot.identity", "ok", devices.who(info)))
+    found.append(Check("robot.reachable", "ok", f"{host} answers"))
+    found.append(Check("robot.identity", "ok", devices.who(info)))
     try:
         found.append(devices.check_remote(arm.in_remote_control()))
     except DriverError as error:
         found.append(replace(devices.check_unreachable(error, host), name="robot.remote"))
-    found += [_registers(cell), _script_port(cell)] if is_ur else [_NOT_UR]
+    found += map(devices.check_finding, arm.diagnose())
     found += devices.check_status(status)
     found.append(_flange(arm, status))
     found.append(_clock(arm, cell.clock))
     return arm
-
-
-def _dashboard_s(cell: CellConfig) -> float:
-    """Measure a question to the dashboard server and its answer."""
-    clock = cell.clock
-
-    def answer_s(dashboard: Dashboard) -> float:
-        begun_s = clock.now_s()
-        dashboard.polyscopeVersion()
-        return clock.now_s() - begun_s
-
-    return ask_dashboard(cell.robot.host, answer_s, timeout_s=ur_timing(cell).connect_s, clock=clock)
-
-
-def _registers(cell: CellConfig) -> Check:
-    host, limit_s = cell.robot.host, ur_timing(cell).connect_s
-    try:
-        return devices.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=limit_s, clock=cell.clock))
-    except DriverError as error:
-        return Check("robot.registers", "failed", error.found, error.cure or f"ping {host}")
-
-
-def _script_port(cell: CellConfig) -> Check:
-    host = cell.robot.host
-    try:
-        find_script_port(host, timeout_s=ur_timing(cell).connect_s)
-    except DriverError as error:
-        return Check("robot.programs", "failed", error.found, error.cure or f"ping {host}")
-    return Check("robot.programs", "ok", f"port {SCRIPT_PORT}, which takes programs, is open")
 
 
 def _flange(arm: RobotArm, status: ArmStatus) -> Check:

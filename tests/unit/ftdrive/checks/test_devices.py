@@ -1,7 +1,6 @@
 """What doctor finds in states of a sensor and an arm that can be made up, and what it says mends them."""
 
 from dataclasses import replace
-from socket import gaierror
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -22,7 +21,6 @@ from drivers.errors import (
     PortInUse,
     ProtocolError,
     StreamBroken,
-    Unreachable,
 )
 from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
 from ftdrive.checks import devices as diagnosis
@@ -362,30 +360,6 @@ def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable() -
 def test_the_error_of_an_arm_that_names_no_cure_gets_one(own: str, shown: str) -> None:
     check = diagnosis.check_unreachable(StreamBroken("ur5:30004 was lost (x; y)", own), "ur5")
     assert (check.found, check.fix) == ("ur5:30004 was lost (x; y)", shown)
-
-
-@pytest.mark.parametrize(("firmware", "state"), [("5.3.1.64192", "failed"), ("5.4.0", "ok"), ("3.15.8", "ok")])
-def test_a_polyscope_that_cannot_be_controlled(firmware: str, state: str) -> None:
-    check = diagnosis.check_arm(DeviceInfo("UR5e", "1", firmware))
-    assert check.state == state
-    assert ("PolyScope 5.4" in str(check.fix)) == (state == "failed")
-
-
-@pytest.mark.parametrize(
-    ("cause", "cure"),
-    [
-        (TimeoutError("timed out"), "ping ur5"),
-        (OSError(113, "No route to host"), "ping ur5"),
-        (ConnectionRefusedError(111, "Connection refused"), "enable RTDE"),
-        (gaierror(-2, "Name or service not known"), "IPv4 address"),
-    ],
-)
-def test_an_arm_that_is_not_reached(cause: OSError, cure: str) -> None:
-    error = Unreachable(f"ur5:30004 cannot be reached ({cause})", "check the address and the cable")
-    error.__cause__ = cause
-    check = diagnosis.check_unreachable(error, "ur5")
-    assert (check.name, check.state) == ("robot.reachable", "failed")
-    assert cure in str(check.fix)
 
 
 def test_what_a_dashboard_server_says_is_not_lost() -> None:
