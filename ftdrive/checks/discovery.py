@@ -12,8 +12,8 @@ from drivers.probe.serial_line import Answer, probe
 from drivers.registry import Options, split_url
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.devices import build_arm, build_sensor
+from ftdrive.checks.check import Check
 from ftdrive.checks.computer import (
-    Check,
     can_details,
     can_interfaces,
     check_can_interface,

@@ -12,7 +12,8 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from drivers.errors import DriverError
 from ftdrive.cell.emulated import Station
-from ftdrive.checks.computer import Check, can_details, can_interfaces, check_serial_port, name_by_id
+from ftdrive.checks.check import Check
+from ftdrive.checks.computer import can_details, can_interfaces, check_serial_port, name_by_id
 from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.terminal.console import hanging

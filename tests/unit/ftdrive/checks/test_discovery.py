@@ -78,7 +78,7 @@ def test_an_adapter_whose_name_is_written_like_in_any_address(asked: list[Any], 
 def test_a_port_without_more_is_a_serial_sensor(asked: list[Any], tmp_path: Path) -> None:
     assert ask("/dev/null") == []
     assert asked == ["/dev/null"]
-    with pytest.raises(ConnectError, match=f"there is no {tmp_path}/ttyUSB0; plug it in"):
+    with pytest.raises(ConnectError, match=f"{tmp_path}/ttyUSB0 does not exist; plug it in"):
         ask(f"{tmp_path}/ttyUSB0")
     assert not is_place("ati-serial:///dev/ttyUSB0")
 
@@ -104,13 +104,15 @@ def test_a_place_that_is_not_written_well(place: str, words: str, asked: list[An
     ("place", "port"), [("ttyUSB0", "/dev/ttyUSB0"), ("socketcan:///dev/null", "/dev/null")], ids=["name", "path"]
 )
 def test_a_serial_port_is_no_can_interface(place: str, port: str, asked: list[Any]) -> None:
-    with pytest.raises(ConnectError, match=rf"is no CAN interface; .* {port}, .* slcan://{port}\?bitrate=250000$"):
+    with pytest.raises(ConnectError, match=rf"is not a CAN interface; .* {port}, .* slcan://{port}\?bitrate=250000$"):
         ask(place)
     assert asked == []
 
 
 def test_an_interface_that_cannot_be_asked(can0: Path, asked: list[Any]) -> None:
-    with pytest.raises(ConnectError, match=r"no interface can1; .*sudo ip link set can1 up type can bitrate 250000$"):
+    with pytest.raises(
+        ConnectError, match=r"no CAN interface can1; .*sudo ip link set can1 up type can bitrate 250000$"
+    ):
         ask("can1")
     with pytest.raises(ConnectError, match=r"can0 is at 500000 bit/s, .*sudo ip link set can0 down"):
         ask("socketcan://can0?bitrate=250000")
