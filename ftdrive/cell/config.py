@@ -25,6 +25,7 @@ from ftdrive.errors import ConfigError
 FORMAT = "ftdrive.config/1"
 FILE = "ftdrive.toml"
 PREFIX = "FTDRIVE_"
+CLOCK = "FTDRIVE_CLOCK"
 
 USUAL_KG = 1.0
 """Expected mass of a tool whose mass is not configured."""
@@ -198,6 +199,18 @@ _KEYS = {f"{name}.{item.name}": item for name, kind in SECTIONS.items() for item
 RULES: Mapping[str, Rule] = {key: rule_of(item) for key, item in _KEYS.items()}
 
 
+def clock_in_force() -> Clock:
+    """Return the clock of the emulated cell whose page FTDRIVE_CLOCK names, else the computer's.
+
+    An emulated cell of another process looks like a real one, but only its own clock waits for a busy computer.
+    """
+    if page := os.environ.get(CLOCK):
+        from ftdrive.cell.emulated_clock import EmulatedClock
+
+        return EmulatedClock(page)
+    return REAL
+
+
 def load(config: Path | None = None, flags: Mapping[str, Flag] | None = None, *, devices: bool = True) -> CellConfig:
     """Read a cell from all sources.
 
@@ -259,7 +272,8 @@ def cell_of(values: Mapping[str, Setting], *, devices: bool = True) -> CellConfi
         **{
             name: kind(**{item.name: found[f"{name}.{item.name}"] for item in fields(kind)})
             for name, kind in SECTIONS.items()
-        }
+        },
+        clock=clock_in_force(),
     )
 
 
@@ -386,7 +400,7 @@ def recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any
 
 def recorded_cell(config: Mapping[str, Mapping[str, Any]]) -> CellConfig:
     """Return the cell of a run from what `recorded` returns."""
-    return CellConfig(**{name: kind(**config.get(name, {})) for name, kind in SECTIONS.items()})
+    return CellConfig(**{name: kind(**config.get(name, {})) for name, kind in SECTIONS.items()}, clock=clock_in_force())
 
 
 def checked(place: str, key: str, value: Any) -> Any:

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftdrive.cell.emulated import Station, sensor_clock
-from ftdrive.commands import transcript
+from ftdrive.cell.emulated import Station
 from tests.system.command_line import CommandLine, listen_for
 
 NAMED = {
@@ -188,6 +187,7 @@ def test_without_an_operator_the_push_is_skipped(cell: Path, ftdrive: CommandLin
 @pytest.mark.slow
 def test_devices_of_this_computer_and_of_an_emulated_cell(station: Station, ftdrive: CommandLine) -> None:
     url = station.cell.sensor.url
+    ftdrive.keep_time_of(station)
     own = ftdrive.json("devices", "--probe", url.removeprefix("ati-serial://"))
     assert all(port["port"].startswith("/dev/") for port in own["serial"])
     assert [answer["url"] for answer in own["answers"]] == [url]
@@ -204,6 +204,7 @@ def test_devices_asks_the_named_serial_port_and_can_bus(ftdrive: CommandLine) ->
         port, can = station.endpoints["sensors"]["serial"]["port"], station.endpoints["sensors"]["can"]
         bus = f"slcan://{can['channel']}?bitrate={can['bitrate']}"
         url = f"ati-can://{can['channel']}?interface=slcan&bitrate={can['bitrate']}"
+        ftdrive.keep_time_of(station)
         serial_answer, can_answer = ftdrive.json("devices", "--probe", port, "--probe", bus)["answers"]
         assert (serial_answer["port"], serial_answer["url"]) == (port, f"ati-serial://{port}")
         assert (can_answer["port"], can_answer["url"]) == (bus, url)
@@ -218,6 +219,7 @@ def test_a_place_that_cannot_be_asked_does_not_take_the_answers_of_the_others(
     station: Station, ftdrive: CommandLine
 ) -> None:
     url = station.cell.sensor.url
+    ftdrive.keep_time_of(station)
     places = ["--probe", "no-can", "--probe", url.removeprefix("ati-serial://"), "--probe", "ftp://x"]
     up = "sudo ip link set no-can up type can bitrate 250000"
     outcome = ftdrive.run("devices", *places, "--json")
@@ -232,7 +234,7 @@ def test_a_place_that_cannot_be_asked_does_not_take_the_answers_of_the_others(
     shown = ftdrive.run("devices", *places[2:])
     assert shown.returncode == 2
     assert url in shown.stdout
-    assert "probed  ftp://x   could not be asked: " in shown.stdout
+    assert "probed  ftp://x   could not be probed: " in shown.stdout
 
 
 def test_a_sensor_that_is_configured_otherwise_gets_the_cure_its_driver_names(
@@ -246,11 +248,11 @@ def test_a_sensor_that_is_configured_otherwise_gets_the_cure_its_driver_names(
     assert "option serial" in identity["fix"]
 
 
-def test_transcript_of_a_sensor(ftdrive: CommandLine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_transcript_of_a_sensor(station: Station, ftdrive: CommandLine) -> None:
     recording = ftdrive.run("transcript", "record", "--simulate", "-o", "sensor.jsonl", "--duration", "1", "--json")
     assert "Saved sensor.jsonl" in recording.stderr
     recorded = json.loads(recording.stdout)["recorded"]
-    monkeypatch.setattr(transcript, "REAL", sensor_clock("emulated://serial"))  # a busy computer plays a file late
+    ftdrive.keep_time_of(station)  # a busy computer would play the file late
     played = ftdrive.json("transcript", "play", ftdrive.folder / "sensor.jsonl")
     assert played["recorded"] == recorded
     assert played["played"]["identity"] == recorded["identity"]
