@@ -247,15 +247,18 @@ def settings(
     if cell is not None:
         found = _from_cell(cell)
     else:
-        for path in _files(config):
-            found |= _from_file(path)
+        for path in (user_file(), config or Path(FILE)):
+            if path == config or path.is_file():
+                found |= _from_file(path)
         found |= _from_environment()
     for key, (option, value) in (flags or {}).items():
         if value is not None:
             found[key] = Setting(checked(option, key, value), option)
     if "sampling.average_s" in found:  # a set averaging time is not chosen again
         found.setdefault("sampling.noise_record_s", Setting(0.0, found["sampling.average_s"].origin))
-    return {key: found.get(key) or _default(key) for key in _KEYS}
+    defaults = {key: None if item.default is MISSING else item.default for key, item in _KEYS.items()}
+    unset = {key: Setting(value, "not set" if value is None else "default") for key, value in defaults.items()}
+    return unset | found
 
 
 def cell_of(values: Mapping[str, Setting], *, devices: bool = True) -> CellConfig:
@@ -278,12 +281,12 @@ def cell_of(values: Mapping[str, Setting], *, devices: bool = True) -> CellConfi
 
 
 def variable(key: str) -> str:
-    """Name of the environment variable of a key."""
+    """Return the environment variable of a key."""
     return PREFIX + key.replace(".", "_").upper()
 
 
 def as_toml(value: Any) -> str:
-    """Write a value as it stands in a file."""
+    """Return a value as a file has it."""
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return json.dumps(value)
@@ -294,19 +297,6 @@ def user_file() -> Path:
     home = os.environ.get("XDG_CONFIG_HOME", "")
     folder = Path(home) if Path(home).is_absolute() else Path("~/.config").expanduser()
     return folder / "ftdrive" / FILE
-
-
-def project_file() -> Path:
-    """Return the file of a project's cell; it need not exist."""
-    return Path(FILE)
-
-
-def _files(config: Path | None) -> list[Path]:
-    """The later one wins."""
-    found = [path for path in (user_file(), project_file()) if path.is_file()]
-    if config is None:
-        return found
-    return [*(path for path in found if path == user_file()), config]
 
 
 def _from_cell(cell: CellConfig) -> dict[str, Setting]:
@@ -345,15 +335,14 @@ def _from_environment() -> dict[str, Setting]:
             values[names[name]] = Setting(checked(name, names[name], _parsed(name, names[name], text)), name)
             continue
         for section in SECTIONS:
-            if name.startswith(variable(section) + "_"):
-                key = name.removeprefix(variable(section) + "_").lower()
-                known = _known(key, "keys", _names(section))
+            if name.startswith(start := variable(section) + "_"):
+                known = _known(name.removeprefix(start).lower(), "keys", _names(section))
                 raise ConfigError(f"{name} is set, but [{section}] has no such key: {known}; unset it")
     return values
 
 
 def _parsed(name: str, key: str, text: str) -> Any:
-    """Texts stand as they are; everything else is written as in the file."""
+    """Read a text as it is, and everything else as a file has it."""
     if not text:
         raise ConfigError(f"{name} is empty: give [{key.replace('.', '] ')} a value, or unset it")
     if _KEYS[key].type in {str, str | None}:
@@ -363,13 +352,6 @@ def _parsed(name: str, key: str, text: str) -> Any:
     except tomllib.TOMLDecodeError:
         document = {}
     return document["value"] if document.keys() == {"value"} else text
-
-
-def _default(key: str) -> Setting:
-    item = _KEYS[key]
-    if item.default is MISSING or item.default is None:
-        return Setting(None, "not set")
-    return Setting(item.default, "default")
 
 
 def _names(section: str) -> list[str]:

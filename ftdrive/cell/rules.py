@@ -104,9 +104,15 @@ _TYPES = {**_TYPES, str | None: _TYPES[str], float | None: _TYPES[float]}
 # Conditions that are not a range. ----------------------------------------------------------------------------------
 
 
-def reject_empty(value: str) -> str | None:
-    """Reject a text without letters."""
-    return None if value.strip() else "it is empty, give one or leave it out"
+def unless(fits: Callable[[Any], bool], fix: str) -> Reject:
+    """Reject values that do not fit."""
+    return lambda value: None if fits(value) else fix
+
+
+reject_empty = unless(lambda text: bool(text.strip()), "it is empty, give one or leave it out")
+reject_sign = unless({-1, 1}.__contains__, "give 1, or -1 for a sensor that reports the reaction")
+reject_height = unless(lambda mm: not 0 < mm < 1, "is it mm? Give the height in mm, such as 33, or 0")
+reject_record = unless(lambda s: s == 0 or s >= 3, "give 3 or more, or 0 for none: a shorter record is of no use")
 
 
 def reject_host(value: str) -> str | None:
@@ -119,21 +125,6 @@ def reject_model(value: str) -> str | None:
     from drivers.ur.kinematics import MODELS, model_named
 
     return None if model_named(value, controller_major=0) else f"the models are {', '.join(MODELS)}"
-
-
-def reject_sign(value: int) -> str | None:
-    """Reject all but 1 and -1."""
-    return None if value in {-1, 1} else "give 1, or -1 for a sensor that reports the reaction"
-
-
-def reject_height(value: float) -> str | None:
-    """Reject a height in metres."""
-    return "is it mm? Give the height in mm, such as 33, or 0" if 0 < value < 1 else None
-
-
-def reject_record(value: float) -> str | None:
-    """Reject a record that is too short to choose an average from."""
-    return None if value == 0 or value >= 3 else "give 3 or more, or 0 for none: a shorter record is too short to use"
 
 
 def reject_mounting(value: str) -> str | None:

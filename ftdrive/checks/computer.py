@@ -95,9 +95,7 @@ def check_disk(folder: Path) -> Check:
             file.flush()
         free = shutil.disk_usage(there).free
     except OSError as error:
-        return Check(
-            name, "failed", f"{there} cannot be written to ({error})", "give --runs DIR, a folder you may write to"
-        )
+        return Check(name, "failed", f"{there} cannot be written to ({error})", "give another folder with --runs DIR")
     state: State = "failed" if free < _LEAST_BYTES else "warning" if free < _FEW_BYTES else "ok"
     fix = None if state == "ok" else "make room, or give --runs DIR on another disk"
     return Check(name, state, f"{free / 1e9:.1f} GB free in {there}", fix)
@@ -143,9 +141,8 @@ def check_serial_port(port: Path, *, sys: Path = SYS, dev: Path = DEV) -> list[C
     if not dev.is_dir():
         return [Check("permissions.port", "skipped", f"not applicable: {port} has no file on this system")]
     if not port.exists():
-        return [
-            Check("permissions.port", "failed", f"{port} does not exist", "plug it in; ftdrive devices lists the ports")
-        ]
+        fix = "plug it in; ftdrive devices lists the ports"
+        return [Check("permissions.port", "failed", f"{port} does not exist", fix)]
     real = Path(os.path.realpath(port))
     checks = [_check_access(port)]
     name = name_by_id(port, dev=dev)
@@ -161,16 +158,10 @@ def check_serial_port(port: Path, *, sys: Path = SYS, dev: Path = DEV) -> list[C
         checks.append(Check("permissions.latency_timer", "skipped", "not applicable: the port has no latency timer"))
         return checks
     latency_ms = timer.read_text(encoding="ascii").strip()
-    slow = latency_ms != "1"
-    checks.append(
-        Check(
-            "permissions.latency_timer",
-            "warning" if slow else "ok",
-            f"the adapter delays data by up to {latency_ms} ms",
-            latency_command(real.name) if slow else None,
-        )
-    )
-    return checks
+    found = f"the adapter delays data by up to {latency_ms} ms"
+    state: State = "ok" if latency_ms == "1" else "warning"
+    command = None if state == "ok" else latency_command(real.name)
+    return [*checks, Check("permissions.latency_timer", state, found, command)]
 
 
 def name_by_id(port: Path, *, dev: Path = DEV) -> Path | None:
@@ -230,11 +221,8 @@ def can_details(interface: str) -> Mapping[str, Any]:
         return {}
     info = (links[0] if links else {}).get("linkinfo", {})
     data = info.get("info_data", {})
-    details = {
-        "kind": info.get("info_kind"),
-        "state": data.get("state"),
-        "bitrate": data.get("bittiming", {}).get("bitrate"),
-    }
+    bitrate = data.get("bittiming", {}).get("bitrate")
+    details = {"kind": info.get("info_kind"), "state": data.get("state"), "bitrate": bitrate}
     return {key: value for key, value in details.items() if value is not None}
 
 

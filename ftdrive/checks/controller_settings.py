@@ -84,7 +84,8 @@ def lean_in_words(gravity_force_base_N: Array, covariance: Array, mounting: str)
     aside_N = gravity_force_base_N - along_N * down
     size_N = float(np.linalg.norm(aside_N))
     lean_deg = float(np.degrees(np.arctan2(size_N, along_N)))
-    mounted = f"[workcell] mounting ({_named(mounting)})"
+    name = mounting if mounting.isalpha() else f"{float(mounting):g}°"
+    mounted = f"[workcell] mounting ({name})"
     if lean_deg > _OTHER_MOUNTING_DEG:
         return (
             f"gravity is {lean_deg:.0f}° off the direction of {mounted}: correct the mounting, here and in PolyScope; "
@@ -99,10 +100,6 @@ def lean_in_words(gravity_force_base_N: Array, covariance: Array, mounting: str)
         f"the base leans {lean_deg:.2f}° (sigma {sigma_deg:.2f}°) towards its {side}, compared with {mounted} and "
         "assuming PolyScope has the same mounting: level the base, or set its mounting in PolyScope"
     )
-
-
-def _named(mounting: str) -> str:
-    return mounting if mounting.isalpha() else f"{float(mounting):g}°"
 
 
 def axes_along(direction: Array) -> list[str]:

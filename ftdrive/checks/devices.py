@@ -185,8 +185,8 @@ def check_rate(rate_Hz: float, nominal_Hz: float, address: SensorAddress | None 
 
 
 def _check_lost(health: Health, address: SensorAddress) -> Check:
-    strange = ((health.out_of_order, "out of order"), (health.duplicated, "twice"))
-    came = "".join(f", {count} came {how}" for count, how in strange if count)
+    odd = ((health.out_of_order, "out of order"), (health.duplicated, "twice"))
+    came = "".join(f", {count} came {how}" for count, how in odd if count)
     found = f"{health.lost} lost, {health.malformed} damaged of {health.received}{came}"
     gone = max(health.lost, health.malformed, health.out_of_order)
     if not gone and not health.duplicated:
@@ -203,9 +203,7 @@ def _check_status(status: NDArray[np.uint32]) -> Check:
     found = f"status {', '.join(words)}"
     if words == ["0x0"]:
         return Check("sensor.status", "ok", found)
-    return Check(
-        "sensor.status", "warning", found, "look the bits up in the sensor's manual; the driver continues with them"
-    )
+    return Check("sensor.status", "warning", found, "look the bits up in the sensor's manual; the driver continues")
 
 
 def check_noise(wrench: Array, duration_s: float, average_s: float, mass_kg: float) -> list[Check]:

@@ -108,8 +108,7 @@ def init(
     tool_config = ToolConfig(
         ask.text("Name of the tool", "tool.name", tool_name),
         ask.rows(
-            "First cylinder of what is mounted, sensor included: FROM:TO:DIAMETER in mm from the flange (such as "
-            "0:60:90)",
+            "First cylinder of sensor and tool: FROM:TO:DIAMETER in mm from the flange (such as 0:60:90)",
             "tool.cylinders_mm",
             tool,
             (3, 5),
@@ -153,10 +152,6 @@ def init(
     else:
         _say(f"Wrote {output}. Measure tool, planes and boxes, then set measured = true in it: nothing moves before.")
         _say("Next: ftdrive doctor, then ftdrive plan")
-
-
-def _anything(_: Any) -> None:
-    """Accept every answer."""
 
 
 class Questions:
@@ -222,8 +217,8 @@ class Questions:
         counts: Sequence[int],
         *,
         needed: bool = False,
-        each: Judge = _anything,
-        whole: Judge = _anything,
+        each: Judge = lambda _: None,
+        whole: Judge = lambda _: None,
     ) -> Any:
         """Ask for rows of numbers until an empty answer; at least one when `needed`. Each and all are judged."""
         from ftdrive.cell.config import RULES

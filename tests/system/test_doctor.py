@@ -135,7 +135,7 @@ def test_each_way_not_to_reach_an_arm_has_its_own_cure(
     assert found in checks["robot.reachable"]["found"]
     assert fix in checks["robot.reachable"]["fix"]
     assert "ping" not in checks["robot.reachable"]["fix"]
-    assert checks["sensor.rate"]["state"] == "ok"
+    assert checks["sensor.rate"]["state"] == "ok", checks["sensor.rate"]
 
 
 def test_an_unplugged_sensor(station: Station, cell: Path, ftdrive: CommandLine) -> None:
