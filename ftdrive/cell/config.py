@@ -387,7 +387,7 @@ def recorded_cell(config: Mapping[str, Mapping[str, Any]]) -> CellConfig:
 
 def checked(place: str, key: str, value: Any) -> Any:
     """Return the value of a key such as "robot.host" as its section takes it, or raise `ConfigError`."""
-    said = f"{place}: [{key.replace('.', '] ')} = {value!r}"
+    where = f"{place}: [{key.replace('.', '] ')} = {value!r}"
     if key == "workcell.mounting" and rules.is_number(value):  # degrees
         value = str(value)
-    return rules.ruled(said, _KEYS[key], value)
+    return rules.ruled(where, _KEYS[key], value)

@@ -57,23 +57,23 @@ def rule_of(item: Field[Any]) -> Rule:
     return found
 
 
-def typed(said: str, item: Field[Any], value: Any) -> Any:
+def typed(where: str, item: Field[Any], value: Any) -> Any:
     """Return a value of the field's type; raises `ConfigError` for another type."""
     wanted, fits = _TYPES[item.type]
     if not fits(value) and not (value is None and item.default is None):
-        raise ConfigError(f"{said} is not {wanted}")
+        raise ConfigError(f"{where} is not {wanted}")
     if value is not None and item.type in {float, float | None}:
         return float(value)
     return tuple(tuple(map(float, row)) for row in value) if item.type == Rows else value
 
 
-def ruled(said: str, item: Field[Any], value: Any) -> Any:
+def ruled(where: str, item: Field[Any], value: Any) -> Any:
     """Return a value of the field's type that follows its rule; raises `ConfigError`."""
-    rule, result = rule_of(item), typed(said, item, value)
+    rule, result = rule_of(item), typed(where, item, value)
     if rule.between is not None and not rule.between[0] <= result <= rule.between[1]:
-        raise ConfigError(f"{said} is out of range: give {rule.range}")
+        raise ConfigError(f"{where} is out of range: give {rule.range}")
     if fix := rule.reject(value):
-        raise ConfigError(f"{said} cannot be used: {fix}")
+        raise ConfigError(f"{where} cannot be used: {fix}")
     return result
 
 
@@ -141,8 +141,8 @@ def reject_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
     for row in rows:
         if len(row) not in {3, 5} or not (0 <= row[0] < row[1] <= 2000 and 0 < row[2] <= 1000):
             return (
-                f"{list(row)} is no cylinder of the tool: give [from, to, diameter] or [from, to, diameter, x, y], mm "
-                "from the flange face, from 0 up, to at most 2000, diameter at most 1000"
+                f"{list(row)} is not a cylinder: give [from, to, diameter] or [from, to, diameter, x, y] in mm from "
+                "the flange face, from 0 up, to at most 2000, diameter at most 1000"
             )
         if min(row[1] - row[0], row[2]) < _THINNEST_MM:
             return (
@@ -156,7 +156,7 @@ def reject_planes(rows: Sequence[Sequence[float]]) -> str | None:
     """Reject planes without a direction."""
     for row in rows:
         if len(row) != 4:
-            return f"{list(row)} is no plane: give [nx, ny, nz, mm], such as [-1, 0, 0, -800]"
+            return f"{list(row)} is not a plane: give [nx, ny, nz, mm], such as [-1, 0, 0, -800]"
         if not any(row[:3]):
             return f"the normal of {list(row)} has no direction: give for example [-1, 0, 0, -800]"
     return None
@@ -166,7 +166,7 @@ def reject_boxes(rows: Sequence[Sequence[float]]) -> str | None:
     """Reject flat boxes, and those in other units."""
     for row in rows:
         if len(row) != 6 or any(row[i] == row[i + 3] for i in range(3)):
-            return f"{list(row)} is no box: give two opposite corners [x, y, z, x, y, z] in mm"
+            return f"{list(row)} is not a box: give two opposite corners [x, y, z, x, y, z] in mm"
         if min(abs(row[i] - row[i + 3]) for i in range(3)) < _THINNEST_MM:
             return (
                 f"{list(row)} is thinner than {_THINNEST_MM:g} mm, are these mm? Give two opposite corners in mm, "

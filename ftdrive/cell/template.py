@@ -12,7 +12,7 @@ _WIDTH = 120
 
 
 def cell_file(cell: CellConfig, found: Sequence[str]) -> str:
-    """Return a cell as a file; `workcell.measured` is false in it, whatever the cell says.
+    """Return a cell as a file; `workcell.measured` is false in it, whatever the cell has.
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ _CAN = ("socketcan", "slcan")
 _SLCAN = "slcan:///dev/ttyACM0?bitrate=250000"
 
 
-def look_at_robot(host: str, model: str | None, clock: Clock = REAL) -> tuple[str, str]:
+def identify_robot(host: str, model: str | None, clock: Clock = REAL) -> tuple[str, str]:
     """Return the model of the arm at an address, and in words what it reports; raises `DriverError`."""
     with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig(""), clock=clock))) as arm:
         arm.open()
@@ -37,7 +37,7 @@ def look_at_robot(host: str, model: str | None, clock: Clock = REAL) -> tuple[st
     return info.model, who(info) + switch
 
 
-def look_at_sensor(url: str, clock: Clock = REAL) -> str:
+def identify_sensor(url: str, clock: Clock = REAL) -> str:
     """Return in words which sensor is at an address, and its rate; raises `DriverError` or `ConfigError`."""
     with build_sensor(CellConfig(RobotConfig(""), SensorConfig(url), clock=clock)) as sensor:
         info = sensor.identify()

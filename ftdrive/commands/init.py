@@ -258,14 +258,14 @@ def _checked(key: str, value: Any) -> Any:
 def _robot(ask: Questions, given: str | None, model: str | None, clock: Clock) -> tuple[str, str | None, str]:
     """Return host, model, and what the arm reports; the operator may keep an address that does not answer."""
     from drivers.errors import DriverError
-    from ftdrive.checks.discovery import look_at_robot
+    from ftdrive.checks.discovery import identify_robot
 
     if model is not None:
         _checked("robot.model", model)
     host = ask.text("Robot address", "robot.host", given)
     while True:
         try:
-            found, words = look_at_robot(host, model, clock)
+            found, words = identify_robot(host, model, clock)
         except DriverError as error:
             if not ask.interactive:
                 raise
@@ -284,7 +284,7 @@ def _robot(ask: Questions, given: str | None, model: str | None, clock: Clock) -
 def _sensor(ask: Questions, given: str | None, clock: Clock) -> tuple[str, str]:
     """Return address and what the sensor reports; the operator may keep an address that does not answer."""
     from drivers.errors import DriverError
-    from ftdrive.checks.discovery import is_place, look_at_sensor, places, sensor_at
+    from ftdrive.checks.discovery import identify_sensor, is_place, places, sensor_at
     from ftdrive.errors import ConfigError
 
     found = [] if given or not ask.interactive else places()
@@ -303,7 +303,7 @@ def _sensor(ask: Questions, given: str | None, clock: Clock) -> tuple[str, str]:
             return url, _SILENT
         try:
             url = sensor_at(url, clock) if is_place(url) else url
-            report = look_at_sensor(url, clock)
+            report = identify_sensor(url, clock)
         except (DriverError, ConfigError) as error:
             if not ask.interactive:
                 raise

@@ -168,7 +168,7 @@ def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
         "out of range",
         "3 or 5 numbers",
         "'0:x:33'",
-        "no cylinder",
+        "not a cylinder",
         "are these mm",
         "ends 20 mm from the flange",
         "wrong side of the plane [1, 0, 0, 800]",

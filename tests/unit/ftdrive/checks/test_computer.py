@@ -1,4 +1,4 @@
-"""What doctor finds in states of a computer that can be made up, and what it says mends them."""
+"""The findings of doctor in made-up states of a computer, and their fixes."""
 
 import os
 import shlex

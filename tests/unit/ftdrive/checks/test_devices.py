@@ -1,4 +1,4 @@
-"""What doctor finds in states of a sensor and an arm that can be made up, and what it says mends them."""
+"""The findings of doctor in made-up states of a sensor and an arm, and their fixes."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -345,14 +345,14 @@ FORBIDDEN = Check("permissions.port", "failed", "may not", "sudo usermod")
 
 
 def wrapped(error: DriverError) -> ConnectError:
-    """As a driver tells what went wrong while it was opened."""
+    """As a driver raises an error that occurred while it was opened."""
     outer = ConnectError(error.found, error.cure)
     outer.__cause__ = error
     return outer
 
 
 def not_opened(found: str, cure: str = "") -> ConnectError:
-    """As a driver tells that the system refused its port."""
+    """As a driver raises an error of the system about its port."""
     outer = ConnectError(found, cure)
     outer.__cause__ = OSError(13, "Permission denied")
     return outer
