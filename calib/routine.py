@@ -9,14 +9,12 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.data.dataset import CalibrationDataset
 from calib.data.dwell_mean import LEAST_SAMPLES, PoseMean, is_quiet, is_stationary, mean_and_covariance
 from calib.errors import CalibError, TooFewSamples
+from calib.model import Array
 from calib.ports import Arm, ArmReading, Sensor, WrenchSamples
-
-Array = NDArray[np.float64]
 
 Stage = Literal["settle", "sample"]
 

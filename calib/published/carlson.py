@@ -20,13 +20,10 @@ The paper has no sensor bias. Every method here has two forms:
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import BadDataset, NotObservable
 from calib.likelihood import rotation_minima
-from calib.model import nearest_rotation, skew
-
-Array = NDArray[np.float64]
+from calib.model import Array, nearest_rotation, skew
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,9 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.errors import BadDataset, NotObservable
-from calib.model import nearest_rotation, skew
+from calib.model import Array, nearest_rotation, skew
 from calib.published.carlson import (
-    Array,
     ForceEquations,
     ForceFit,
     force_equations,

@@ -12,13 +12,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.model import nearest_rotation, skew
+from calib.model import Array, nearest_rotation, skew
 from calib.published import carlson, carlson_known
-
-Array = NDArray[np.float64]
 
 FIG_1_SIGMA_N = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 FIG_1_CURVES = ("relaxation", "Cayley total", "Cayley ordinary", "Cayley total, 4 turns")

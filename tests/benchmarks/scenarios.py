@@ -8,12 +8,11 @@ from dataclasses import astuple, dataclass
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib import Parameters
+from calib.model import Array
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 WEIGHT_N, ARM_M, TILT_DEG = 20.0, 0.08, 2.0

@@ -6,15 +6,13 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib.errors import BadDataset, NotObservable
-from calib.model import nearest_rotation
+from calib.model import Array, nearest_rotation
 from calib.published.carlson import ForceFit, eigen, iterative, nullspace, nullspace_all_pairs, polynomial
 from calib.published.carlson_known import cayley, cayley_rotation, relaxation, similarity
 
-Array = NDArray[np.float64]
 Method = Callable[[Array, Array, Array, bool], ForceFit]
 
 UNKNOWN: dict[str, Method] = {
