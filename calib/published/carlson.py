@@ -146,8 +146,7 @@ def eigen(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
     NotObservable
         Fewer than 4 poses (5 with bias), or poses that leave a family of solutions.
     """
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the eigendecomposition", min_poses=4)
-    _require_spread(eq)
+    eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the eigendecomposition")
     Q_F, R_F = np.linalg.qr(eq.F)
     Q_D = np.linalg.qr(eq.D)[0]
     principal = np.linalg.svd(Q_F.T @ Q_D)[0][:, 0]
@@ -163,19 +162,15 @@ def nullspace(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
 
     Parameters
     ----------
-    R_base_flange : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-        Sensor axes.
-    bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+    R_base_flange, force_N, bias
+        As in `eigen`.
 
     Raises
     ------
     NotObservable
-        Fewer than 4 poses (5 with bias), or poses that leave a family of solutions.
+        As in `eigen`.
     """
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the nullspace method", min_poses=4)
-    _require_spread(eq)
+    eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the nullspace method")
     return _fit_vec(eq, _least_singular_vector(eq.D, eq.F))
 
 
@@ -188,19 +183,15 @@ def nullspace_all_pairs(R_base_flange: Array, force_N: Array, *, bias: bool) -> 
 
     Parameters
     ----------
-    R_base_flange : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-        Sensor axes.
-    bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+    R_base_flange, force_N, bias
+        As in `eigen`.
 
     Raises
     ------
     NotObservable
-        Fewer than 4 poses (5 with bias), or poses that leave a family of solutions.
+        As in `eigen`.
     """
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the nullspace method", min_poses=4)
-    _require_spread(eq)
+    eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the nullspace method")
     i, k = np.triu_indices(len(force_N), 1)
     A_k_i = R_base_flange[k].transpose(0, 2, 1) @ R_base_flange[i]
     F = kron_identity(force_N).reshape(-1, 3, 9)
@@ -233,11 +224,8 @@ def iterative(
 
     Parameters
     ----------
-    R_base_flange : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-        Sensor axes.
-    bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+    R_base_flange, force_N, bias
+        As in `eigen`.
     gravity_start_base : array, shape (3,), optional
         A direction, of any length and sign. The default is the gravity of theorem 1.
     max_iterations : int
@@ -246,10 +234,9 @@ def iterative(
     Raises
     ------
     NotObservable
-        Fewer than 4 poses (5 with bias), or poses that leave a family of solutions.
+        As in `eigen`.
     """
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the iterative method", min_poses=4)
-    _require_spread(eq)
+    eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the iterative method")
     rotation_of_gravity = np.linalg.lstsq(eq.F, eq.D)[0]
     gravity_of_rotation = np.linalg.lstsq(eq.D, eq.F)[0]
     if gravity_start_base is None:
@@ -280,11 +267,8 @@ def polynomial(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
 
     Parameters
     ----------
-    R_base_flange : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-        Sensor axes.
-    bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+    R_base_flange, force_N, bias
+        As in `eigen`.
 
     Raises
     ------
@@ -313,6 +297,14 @@ def polynomial(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
 def kron_identity(f: Array) -> Array:
     """(3n, 9) stack of `f_i^T (x) I` for (n, 3) vectors: times vec(X) it gives the stack of `X f_i`."""
     return np.asarray(np.einsum("nj,ik->nijk", f, np.eye(3)).reshape(-1, 9))
+
+
+def _linear_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method: str) -> ForceEquations:
+    """Form the equations of a method that is linear in all nine entries of the rotation, if the poses suffice."""
+    eq = force_equations(R_base_flange, force_N, bias=bias, method=method, min_poses=4)
+    _require_turns_and_weight(eq)
+    _require_varied_forces(eq.f, 0)
+    return eq
 
 
 def _rotation_of_vec(r: Array) -> Array:
@@ -359,11 +351,6 @@ def require_weight(eq: ForceEquations) -> None:
     """
     if not spanned_dimensions(eq.f, float(np.linalg.norm(eq.f + eq.f_mean))):
         raise NotObservable("the forces show no weight: hang a tool or a mass on the sensor")
-
-
-def _require_spread(eq: ForceEquations) -> None:
-    _require_turns_and_weight(eq)
-    _require_varied_forces(eq.f, 0)
 
 
 def _require_turns_and_weight(eq: ForceEquations) -> None:

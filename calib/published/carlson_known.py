@@ -46,13 +46,9 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     BadDataset
         The forces point against the given gravity.
     """
-    down = _direction(gravity_direction_base)
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the relaxation", min_poses=3)
+    eq, down = _equations(R_base_flange, force_N, gravity_direction_base, 3, bias=bias, method="the relaxation")
     a = eq.A @ down
-    _require_usable(eq, a, 3)
-    R_sensor_flange = nearest_rotation(np.asarray(np.linalg.lstsq(eq.f, a)[0], dtype=np.float64))
-    weight_N = _weight(eq.f, a, R_sensor_flange)
-    return eq.fit(R_sensor_flange.T, weight_N * down)
+    return _with_weight(eq, down, nearest_rotation(np.asarray(np.linalg.lstsq(eq.f, a)[0], dtype=np.float64)))
 
 
 def cayley(
@@ -85,10 +81,8 @@ def cayley(
         The forces point against the given gravity.
     """
     gravity = np.array(gravity_force_base_N, dtype=np.float64)
-    down = _direction(gravity)
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the Cayley transform", min_poses=2)
+    eq, _ = _equations(R_base_flange, force_N, gravity, 2, bias=bias, method="the Cayley transform")
     a = eq.A @ gravity
-    _require_usable(eq, eq.A @ down, 2)
     turns = [np.diag(signs) for signs in ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))]
     candidates = [cayley_rotation(eq.f, a @ turn, total=total) @ turn for turn in turns]
     R_sensor_flange = min(candidates, key=lambda R: float(np.sum((eq.f - a @ R.T) ** 2)))
@@ -134,13 +128,8 @@ def similarity(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
 
     Parameters
     ----------
-    R_base_flange : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-        Sensor axes.
-    gravity_direction_base : array, shape (3,)
-        Down, in base axes, of any length.
-    bias : bool
-        Estimate the force bias too, or take it to be zero (see the module).
+    R_base_flange, force_N, gravity_direction_base, bias
+        As in `relaxation`.
 
     Raises
     ------
@@ -149,37 +138,41 @@ def similarity(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     BadDataset
         The forces point against the given gravity.
     """
-    down = _direction(gravity_direction_base)
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the similarity solution", min_poses=2)
-    a = eq.A @ down
-    _require_usable(eq, a, 2)
-    R_sensor_flange = nearest_rotation(eq.f.T @ a)
-    weight_N = _weight(eq.f, a, R_sensor_flange)
-    return eq.fit(R_sensor_flange.T, weight_N * down)
+    method = "the similarity solution"
+    eq, down = _equations(R_base_flange, force_N, gravity_direction_base, 2, bias=bias, method=method)
+    return _with_weight(eq, down, nearest_rotation(eq.f.T @ (eq.A @ down)))
 
 
-def _weight(f: Array, a: Array, R_sensor_flange: Array) -> float:
-    """Least-squares factor from R a_i to f_i."""
-    return float(np.sum(f * (a @ R_sensor_flange.T)) / np.sum(a**2))
+def _equations(
+    R_base_flange: Array, force_N: Array, gravity_base: Array, needed: int, *, bias: bool, method: str
+) -> tuple[ForceEquations, Array]:
+    """Form the equations of a method that needs as many poses and gravity axes; also the unit vector (3,) of gravity.
 
-
-def _direction(vector: Array) -> Array:
-    length = np.linalg.norm(vector)
+    The spread is judged on the known directions, because noise of the forces would hide a degenerate pose set.
+    """
+    length = np.linalg.norm(gravity_base)
     if not length > 0:
-        raise ValueError(f"a gravity direction must have a length, got {vector}")
-    return np.asarray(vector / length)
-
-
-def _require_usable(eq: ForceEquations, a: Array, needed: int) -> None:
-    """The spread is judged on the known directions a (n, 3): noise of the forces would hide a degenerate pose set."""
-    spanned = spanned_dimensions(a, len(a) ** 0.5)
+        raise ValueError(f"a gravity direction must have a length, got {gravity_base}")
+    down = np.asarray(gravity_base / length)
+    eq = force_equations(R_base_flange, force_N, bias=bias, method=method, min_poses=needed)
+    spanned = spanned_dimensions(eq.A @ down, len(eq.A) ** 0.5)
     if spanned < needed:
         raise NotObservable(
             f"gravity changes along only {spanned} of the {needed} flange axes needed: add poses that tilt the tool "
             "about another axis"
         )
     require_weight(eq)
-    _require_pull_downwards(eq.f, a)
+    _require_pull_downwards(eq.f, eq.A @ down)
+    return eq, down
+
+
+def _with_weight(eq: ForceEquations, down: Array, R_sensor_flange: Array) -> ForceFit:
+    return eq.fit(R_sensor_flange.T, _weight(eq.f, eq.A @ down, R_sensor_flange) * down)
+
+
+def _weight(f: Array, a: Array, R_sensor_flange: Array) -> float:
+    """Least-squares factor from R a_i to f_i."""
+    return float(np.sum(f * (a @ R_sensor_flange.T)) / np.sum(a**2))
 
 
 def _require_pull_downwards(f: Array, a: Array) -> None:
