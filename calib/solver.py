@@ -7,7 +7,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.assessment.cross_validation import Evidence, IndependentFit
+from calib.assessment.cross_validation import AssessedFit, IndependentFit
 from calib.assessment.faults import faults
 from calib.assessment.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
 from calib.assessment.verdict import SIGNIFICANT_SIGMAS, judge
@@ -99,7 +99,7 @@ def solve(
         if mixed_up := faults(dataset.R_base_flange, dataset.wrench, up_in_base):
             raise NotObservable(f"{mixed_up[0]}.") from exc
         raise
-    evidence: Evidence = best
+    evidence: AssessedFit = best
     if estimator:
         parameters = estimator(dataset.wrench)
         noise = wrench_cov

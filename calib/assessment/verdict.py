@@ -11,7 +11,7 @@ from scipy.special import chdtrc as chi2_sf
 from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtr as normal_cdf
 
-from calib.assessment.cross_validation import Drifted, Evidence, standardized
+from calib.assessment.cross_validation import AssessedFit, BiasDrift, standardized
 from calib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, torque_units
 from calib.assessment.load_shift import lasting_change
 from calib.assessment.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
@@ -68,13 +68,13 @@ class Quality:
 
 
 def judge(
-    fit: Evidence,
+    fit: AssessedFit,
     *,
     t_s: Array | None = None,
     measured_sigma: Array | None = None,
     farthest_com_m: float = FARTHEST_COM_M,
     up_in_base: ArrayLike = UP_IN_BASE,
-    unconstrained: Evidence | None = None,
+    unconstrained: AssessedFit | None = None,
     contradicted: Sequence[str] = (),
 ) -> Quality:
     """Judge a fit.
@@ -85,7 +85,7 @@ def judge(
 
     Parameters
     ----------
-    fit : Evidence
+    fit : AssessedFit
     t_s : array, shape (n,), optional
         When each pose was measured; the order of rows counts where it is missing or not finite.
     measured_sigma : array, shape (6,), optional
@@ -94,7 +94,7 @@ def judge(
         How far from the sensor the centre of mass of the tool can be.
     up_in_base : array_like, shape (3,)
         Where up should be, in base: +z for a robot on a table.
-    unconstrained : Evidence, optional
+    unconstrained : AssessedFit, optional
         The best fit to the same poses with nothing taken as known, where `fit` is another.
     contradicted : sequence of str
         What was taken as known and that fit contradicts, as `Known.contradictions` has it.
@@ -183,7 +183,7 @@ def judge(
     )
 
 
-def _faults(fit: Evidence, used: NDArray[np.bool_], t_s: Array | None, up_in_base: ArrayLike) -> list[str]:
+def _faults(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None, up_in_base: ArrayLike) -> list[str]:
     """Look for faults in all poses, and where there are none in those that were used."""
     order = np.arange(len(used)) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
     found = faults(fit.R_base_flange[order], fit.wrench[order], up_in_base)
@@ -270,7 +270,7 @@ def _drift_share(change: Array, weight_N: float) -> float:
     return float(max(sizes) / weight_N) if weight_N else float("inf")
 
 
-def _drift_reasons(drift: Drifted | None) -> list[str]:
+def _drift_reasons(drift: BiasDrift | None) -> list[str]:
     if drift is None or not (np.abs(drift.change) > 3 * drift.sigma).any():
         return []
     force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
@@ -295,7 +295,7 @@ def _inside_m(parameters: Parameters, covariance: Array) -> float:
     return inside_m if inside_m > max(INSIDE_M, 3 * sigma_m) else 0.0
 
 
-def _weight_reasons(fit: Evidence, weight_N: float) -> list[str]:
+def _weight_reasons(fit: AssessedFit, weight_N: float) -> list[str]:
     along = fit.parameters.gravity_force_base_N / (weight_N or 1.0)
     variance = float(along @ fit.covariance[3:6, 3:6] @ along)
     sigma_N = np.sqrt(max(variance, 0.0))  # below 0 is rounding of a weight that is exactly known
@@ -309,7 +309,7 @@ def _weight_reasons(fit: Evidence, weight_N: float) -> list[str]:
     ]
 
 
-def _second_solution_reasons(fit: Evidence) -> list[str]:
+def _second_solution_reasons(fit: AssessedFit) -> list[str]:
     if fit.second_basin_chi2 is None:
         return []
     delta = fit.second_basin_chi2 / max(1.0, fit.chi2 / fit.dof)
@@ -329,7 +329,7 @@ def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
     return np.flatnonzero(~used | (residual_sigma**2 > limit)).tolist()
 
 
-def _change_reasons(fit: Evidence, residual_sigma: Array, measured_sigma: Array, t_s: Array | None) -> list[str]:
+def _change_reasons(fit: AssessedFit, residual_sigma: Array, measured_sigma: Array, t_s: Array | None) -> list[str]:
     """Refuse poses of two different loads. White noise cannot stand for that: half the poses are off the same way.
 
     Where all poses before the change were left out, the rest tells of the load as it is now.
@@ -366,7 +366,7 @@ def _com_reasons(parameters: Parameters, farthest_com_m: float, rejected: list[s
 
 
 def _shares(
-    fit: Evidence, used: NDArray[np.bool_], weight_N: float
+    fit: AssessedFit, used: NDArray[np.bool_], weight_N: float
 ) -> tuple[list[tuple[str, float]], tuple[float, float]]:
     """Errors relative to the weight with the sentence for each, larger of force and torque first, and the left-out rms.
 
@@ -396,7 +396,7 @@ def _shares(
     return sorted(shares, key=lambda pair: -pair[1]), left_out
 
 
-def _contradiction_reasons(fit: Evidence, unconstrained: Evidence) -> list[str]:
+def _contradiction_reasons(fit: AssessedFit, unconstrained: AssessedFit) -> list[str]:
     used = unconstrained.weights > 0.5
     return [
         f"with nothing taken as known the {kind}s fit to {best:.2g} {unit} instead of {ours:.2g} {unit} (method ml): "
@@ -407,7 +407,7 @@ def _contradiction_reasons(fit: Evidence, unconstrained: Evidence) -> list[str]:
     ][:1]
 
 
-def _noise_reason(fit: Evidence, noise_factor: float) -> str:
+def _noise_reason(fit: AssessedFit, noise_factor: float) -> str:
     found = ", ".join(f"{name} {value:.2g}" for name, value in fit.components.items() if value > 0)
     included = f": found {found}" if found else ", and the stated uncertainties do not include them"
     return (
@@ -416,7 +416,7 @@ def _noise_reason(fit: Evidence, noise_factor: float) -> str:
     )
 
 
-def _indispensable_reasons(fit: Evidence, used: NDArray[np.bool_], weight_N: float) -> list[str]:
+def _indispensable_reasons(fit: AssessedFit, used: NDArray[np.bool_], weight_N: float) -> list[str]:
     uncertain = np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > weight_N**2
     rows = np.flatnonzero(uncertain & used)
     if not 0 < rows.size <= used.sum() / 2:
