@@ -1,4 +1,4 @@
-"""What is known before the calibration, exactly or within a tolerance."""
+"""Values that are known before the calibration, exactly or within a tolerance."""
 
 from dataclasses import dataclass
 
@@ -17,21 +17,21 @@ class Known:
     Raises
     ------
     ValueError
-        A rotation that is none, a direction of length zero, a mass or a tolerance that is negative.
+        An invalid rotation, a direction of length zero, a mass that is not positive, or a negative tolerance.
     """
 
     R_flange_sensor: ArrayLike | None = None
-    """(3, 3) how the sensor is mounted; with `yaw_only` but for a turn about the flange z axis (else the identity)."""
+    """(3, 3) mounting of the sensor; with `yaw_only` except for a turn about flange z, default the identity."""
     R_tolerance_rad: float = 0.0
     """Of each of the three angles; with `yaw_only` of the two tilts."""
     yaw_only: bool = False
     """The sensor is mounted flat: only its turn about the flange z axis is unknown."""
     gravity_direction_base: ArrayLike | None = None
-    """(3,) where things fall, of any length: (0, 0, -1) for a level robot."""
+    """(3,) down, of any length: (0, 0, -1) for a level robot."""
     direction_tolerance_rad: float = 0.0
     """Of each of the two tilt angles."""
     mass_kg: float | None = None
-    """Of what hangs on the sensor."""
+    """Of the load on the sensor."""
     mass_tolerance_kg: float = 0.0
 
     def __post_init__(self) -> None:
@@ -53,16 +53,17 @@ class Known:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected 0 (exactly known) or more")
 
     def contradictions(self, found: Parameters, covariance: Array, g_m_s2: float, sigmas: float) -> list[str]:
-        """Say what of this is off by more than so many standard deviations, with what the data say instead.
+        """List the known values that the data contradict, each with the value from the data.
 
         Parameters
         ----------
         found : Parameters
-            Of a fit with nothing taken as known.
+            From a fit without known values.
         covariance : array, shape (15, 15)
-            Of it.
+            Of that fit.
         g_m_s2 : float
         sigmas : float
+            Smallest difference to list, in standard deviations.
         """
         words = []
         if self.mass_kg is not None:
@@ -72,14 +73,14 @@ class Known:
             if abs(mass_kg - self.mass_kg) > sigmas * np.hypot(sigma_kg, self.mass_tolerance_kg):
                 unit = force_unit(self.mass_kg / mass_kg) if mass_kg else None
                 why = f", as if the forces were in {unit}" if unit else ""
-                words.append(f"mass {self.mass_kg:g} kg, they say {_with_sigma(mass_kg, sigma_kg)} kg{why}")
+                words.append(f"mass {self.mass_kg:g} kg (data: {_with_sigma(mass_kg, sigma_kg, ' kg')}{why})")
         if self.gravity_direction_base is not None:
             direction = np.asarray(self.gravity_direction_base)
             turn = _turn(direction, _unit(found.gravity_force_base_N))
             across = np.cross(_unit(turn), direction)
             sigma = float(np.sqrt(across @ covariance[3:6, 3:6] @ across / np.sum(found.gravity_force_base_N**2)))
             if np.linalg.norm(turn) > sigmas * np.hypot(sigma, self.direction_tolerance_rad):
-                words.append(f"the direction of gravity in base, they say {_angle(turn, sigma)} off that")
+                words.append(f"direction of gravity in base (data: {_angle(turn, sigma)})")
         if self.R_flange_sensor is not None:
             turn = Rotation.from_matrix(found.R_flange_sensor @ np.asarray(self.R_flange_sensor).T).as_rotvec()
             if self.yaw_only:
@@ -88,12 +89,12 @@ class Known:
             axis = _unit(turn)
             sigma = float(np.sqrt(axis @ covariance[:3, :3] @ axis))
             if np.linalg.norm(turn) > sigmas * np.hypot(sigma, self.R_tolerance_rad):
-                words.append(f"the mounting of the sensor, they say {_angle(turn, sigma)} off that")
+                words.append(f"mounting of the sensor (data: {_angle(turn, sigma)})")
         return words
 
 
 class Constraints:
-    """A `Known` as the solver needs it: free directions, and pseudo-measurements in units of their tolerance."""
+    """A `Known` in the form of the solver: free directions, and pseudo-measurements in units of their tolerance."""
 
     def __init__(self, known: Known, g_m_s2: float) -> None:
         self.R = None if known.R_flange_sensor is None else np.asarray(known.R_flange_sensor)
@@ -107,7 +108,7 @@ class Constraints:
         self._tilts = 2 if self.yaw_only else 3
 
     def rotations(self, minima: list[Array], cost: Array) -> list[Array]:
-        """Choose starting rotations (3, 3) R_flange_sensor: the minima given, or those that respect what is known.
+        """Choose starting rotations (3, 3) R_flange_sensor: the given minima, or those that respect the known mounting.
 
         Parameters
         ----------
@@ -128,7 +129,7 @@ class Constraints:
         return [*turned[low][np.argsort(value[low])][:4], *(minima if self.R_tolerance > 0 else [])]
 
     def satisfied(self, p: Parameters) -> Parameters:
-        """Put the gravity force onto what is exactly known of it."""
+        """Replace the exactly known direction and size of the gravity force."""
         b = np.array(p.gravity_force_base_N)
         if self.direction is not None and self.direction_tolerance == 0:
             b = float(np.linalg.norm(b)) * self.direction
@@ -154,12 +155,12 @@ class Constraints:
 
     @property
     def dof(self) -> int:
-        """Number of exact constraints and of pseudo-measurements: what they add to the residual degrees of freedom."""
+        """Residual degrees of freedom that exact constraints and pseudo-measurements add."""
         rotation = 0 if self.R is None else self._tilts
         return rotation + 2 * (self.direction is not None) + (self.weight_N is not None)
 
     def measurements(self, p: Parameters) -> tuple[Array, Array]:
-        """Give derivative (k, 15) and residual (k,), known minus estimated, of the inexact knowledge."""
+        """Derivative (k, 15) and residual (k,), known minus estimated, of the values known within a tolerance."""
         rows, residuals = [np.zeros((0, 15))], [np.zeros(0)]
 
         def add(at: int, derivative: Array, residual: Array, tolerance: float) -> None:
@@ -197,12 +198,12 @@ def _turn(a: Array, b: Array) -> Array:
 
 
 def _angle(turn_rad: Array, sigma_rad: float) -> str:
-    return f"{_with_sigma(float(np.degrees(np.linalg.norm(turn_rad))), float(np.degrees(sigma_rad)))}°"
+    return _with_sigma(float(np.degrees(np.linalg.norm(turn_rad))), float(np.degrees(sigma_rad)), "°", " away")
 
 
-def _with_sigma(value: float, sigma: float) -> str:
+def _with_sigma(value: float, sigma: float, unit: str, then: str = "") -> str:
     digits = int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 6))
-    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
+    return f"{value:.{digits}f}{unit}{then}, sigma {sigma:.{digits}f}{unit}"
 
 
 def _unit(v: Array) -> Array:

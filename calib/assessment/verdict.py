@@ -136,7 +136,7 @@ def judge(
         *([f"{fit.response.in_words()}: the calibration corrects this for its own weight"] if fit.response else []),
         *_pose_notes(at),
         *(_tilt_notes(parameters, up_in_base) if plausible else []),
-        *([] if at.chi2_p is not None else ["the noise was not measured: it and chi2 come from the residuals"]),
+        *([] if at.chi2_p is not None else ["the noise was estimated from the residuals: chi2 does not test the fit"]),
     ]
     if (
         fit.drift is not None

@@ -1,10 +1,10 @@
 """Carlson's methods for a known gravity vector, from forces alone, and Umeyama's solution of the same problem.
 
 F. Bagge Carlson, "On the Calibration of Force/Torque Sensors in Robotics", 2019, section 2. Letters and the two forms,
-without and with a bias, are those of `calib.published.carlson`; a bias that the form without bias does not know has
-the same effect here (Cayley transform: 22 deg when the bias is as large as the weight).
+without and with a bias, are those of `calib.published.carlson`. A bias has the same effect on the form without bias
+(Cayley transform: 22 deg if the bias is as large as the weight).
 
-"Known" means exact: when the base is tilted by 2 deg more than assumed, the result is wrong and nothing shows it.
+"Known" means exact: if the base is tilted by 2 deg more than assumed, the result is wrong without any sign of it.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     The linear unknown is the matrix `X / weight`, nine free numbers, with `(X / weight) f_i = A_i d`. (Eq. 3 calls it
     mR; it is (1/m) R_TF^S, and R_TF^S is the inverse of the R_S^TF of eq. 1.) The noise of the regressor f shrinks it
     by a symmetric factor, which the projection on SO(3) removes; the weight is then the least-squares one given X.
-    Consistent, but `similarity` is better when the tool cannot be turned all ways.
+    Consistent, but `similarity` is better if the tool cannot be turned in all directions.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     gravity_direction_base : array, shape (3,)
         Down, in base axes, of any length.
     bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+        Whether to estimate the force bias, or to assume zero like the paper (see the module).
 
     Raises
     ------
@@ -67,9 +67,9 @@ def cayley(
     force_N : array, shape (n, 3)
         Sensor axes.
     gravity_force_base_N : array, shape (3,)
-        Weight of what hangs on the sensor, in base axes; returned as given.
+        Weight of the load on the sensor, in base axes; returned unchanged.
     bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+        Whether to estimate the force bias, or to assume zero like the paper (see the module).
     total : bool
         Total least squares, as the paper recommends, or ordinary.
 
@@ -100,7 +100,7 @@ def cayley_rotation(f: Array, a: Array, *, total: bool) -> Array:
     Parameters
     ----------
     f, a : array, shape (n, 3)
-        With a bias, both less their means.
+        With a bias, both minus their means.
     total : bool
         Total or ordinary least squares; noise makes the latter's s too small.
 
@@ -124,7 +124,7 @@ def similarity(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     1991, eqs. 39-42. Not in Carlson's paper and better: the exact least-squares solution for rotation, weight and bias.
     With the tool within 40 deg of straight down its mean square error of R is the smallest possible (0.95-1.02 times
     the bound), that of `relaxation` 4 to 6 times as large, and that of the total least squares with a bias column in
-    Carlson's Robotlib 6 to 4000 times, depending on the mass it is told and on the size of the bias.
+    Carlson's Robotlib 6 to 4000 times, depending on the configured mass and the size of the bias.
 
     Parameters
     ----------
@@ -176,12 +176,12 @@ def _weight(f: Array, a: Array, R_sensor_flange: Array) -> float:
 
 
 def _require_pull_downwards(f: Array, a: Array) -> None:
-    """No rotation may explain the forces f (n, 3) much better with gravity -a than the best one does with a (n, 3)."""
+    """Reject forces f (n, 3) that a rotation explains much better with gravity -a than with a (n, 3)."""
     residual, reversed_residual = (
         float(np.sum((f - _weight(f, side, R) * side @ R.T) ** 2))
         for side, R in ((a, nearest_rotation(f.T @ a)), (-a, nearest_rotation(-f.T @ a)))
     )
     if residual > 4 * reversed_residual + 1e-12 * float(np.sum(f**2)):
         raise BadDataset(
-            "the forces point against the given gravity: check the sign of the sensor and how the base is mounted"
+            "the forces point against the given gravity: check the sign of the sensor and the mounting of the base"
         )

@@ -424,7 +424,7 @@ def degenerate(lab: Lab) -> Iterator[Row]:
         yield Row(f"rank, {name}", f"{found.rank} (numeric: {own})", str(rank), found.rank == own == rank, 1)
     rim = sim.leaning(np.full(8, np.deg2rad(40.0)), azimuth, np.zeros(8))
     found = assess(rim, guess, advise=False)
-    flagged = found.rank == 15 and found.second_gap < AMBIGUOUS_GAP and bool(found.gauges)
+    flagged = found.rank == 15 and found.second_gap < AMBIGUOUS_GAP and bool(found.ambiguities)
     yield Row(
         "8 poses on the rim of a cone: flagged",
         f"rank {found.rank}, gap {found.second_gap:.1g}",

@@ -136,7 +136,7 @@ def without(name: str) -> str:
     [
         ("", "the file is empty"),
         ("nonsense", "this is not valid JSON"),
-        ("3", "holds a JSON int"),
+        ("3", "a JSON int"),
         ("{}", "the field 'format' is missing"),
         (json.dumps(DATA.to_dict()), "the format is 'ftdrive.dataset/1'"),
         ('{"format": "ftdrive.calibration/2"}', "version '2' of ftdrive.calibration"),

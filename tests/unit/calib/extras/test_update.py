@@ -72,14 +72,14 @@ def test_three_poses_give_payload_and_biases_exactly() -> None:
 
 def test_one_pose_or_parallel_gravity_is_refused_in_words() -> None:
     new, old = loaded(truth()), exact(truth())
-    with pytest.raises(NotObservable, match=r"leaves 1 of 4 .* add 1"):
+    with pytest.raises(NotObservable, match="at least 2 are needed: add 1 or more"):
         update_payload(old, tilted(0), predict(new, tilted(0)), noise_of(1))
     for R in (tilted(0, 0.5), tilted(0, 180), tilted(10, 10, 10)):  # the same, upside down, and repeated
-        with pytest.raises(NotObservable, match="the same line"):
+        with pytest.raises(NotObservable, match="nearly one line"):
             update_payload(old, R, predict(new, R), noise_of(len(R)))
-    for n, free in ((1, "4 of 10"), (2, "1 of 10")):
+    for n in (1, 2):
         R = tilted(0, 60)[:n]
-        with pytest.raises(NotObservable, match=free):
+        with pytest.raises(NotObservable, match="at least 3 are needed"):
             update_payload(old, R, predict(new, R), noise_of(n), retare=True)
     R = tilted(0, 60, 60.1)
     with pytest.raises(NotObservable, match="fewer than three"):
@@ -188,7 +188,7 @@ def test_a_tare_makes_the_tared_pose_more_certain_than_others() -> None:
 def test_a_tare_under_load_is_refused(push: list[float]) -> None:
     R = tilted(30)
     reading = dwell(truth(), R[0], np.random.default_rng(7)) + push
-    with pytest.raises(BadDataset, match="more than a tare explains"):
+    with pytest.raises(BadDataset, match="more than drift explains"):
         tare(exact(truth()), R, [reading])
 
 
@@ -196,7 +196,7 @@ def test_a_tare_while_the_reading_moves_is_refused() -> None:
     R = tilted(30, 60)
     still, moving = (dwell(truth(), R[i], np.random.default_rng(8 + i)) for i in range(2))
     moving[:, 0] += np.linspace(0, 0.2, len(moving))
-    with pytest.raises(BadDataset, match="pose 2: the reading moves"):
+    with pytest.raises(BadDataset, match="pose 2: the reading changes"):
         tare(exact(truth()), R, [still, moving])
 
 
