@@ -1,4 +1,4 @@
-"""How fast a calibration is solved and a wrench compensated: times, and ratios to numpy measured in the same run.
+"""Speed of calibration and compensation: times, and ratios to numpy measured in the same run.
 
     uv run python tests/benchmarks/speed.py [--quick]
 
@@ -53,7 +53,7 @@ def best_seconds(repeats: int, *calls: Callable[[], object]) -> list[float]:
 
 
 def few_poses(repeats: int) -> Iterator[Figure]:
-    """Time nine calibrations: how long one takes depends a little on its noise."""
+    """Time nine calibrations, because the time of one depends on its noise."""
     rng = np.random.default_rng(0)
     R, s = np.swapaxes(sim.CUBE, 1, 2), sim.sigma(100)
     cov = np.broadcast_to(np.diag(s**2), (24, 6, 6))
