@@ -298,7 +298,9 @@ def _one_axis(
         last = abs(axis_flange[2]) > _ALIGNED
         reason = "only the last joint was turned" if last else f"the tool was turned about {_axis(axis_flange)} only"
         if unseen(-axis_flange, np.cross(axis_base, b), zero, zero, zero):
-            inseparable.append("the sensor angle about that axis cannot be separated from the direction of gravity")
+            inseparable.append(
+                "the sensor angle about that axis cannot be separated from the direction of gravity about it"
+            )
     if unseen(zero, axis_base, -axis_sensor, zero, -np.cross(P, axis_sensor)):
         inseparable.append("the weight along the axis cannot be separated from the force bias along it")
     return (reason, *inseparable)

@@ -75,7 +75,7 @@ DEGENERATE = {
     "last joint at one tilt": (turned("z", tilt_deg=150), 13, "only the last joint was turned"),
     "about flange x": (turned("x"), 13, "turned about the flange's x axis only"),
     "about an oblique axis": (OBLIQUE, 13, r"turned about the axis \(.*\) of the flange only"),
-    "half turns": (HALF_TURNS, 13, "gravity pulls along one line of the tool only"),
+    "half turns": (HALF_TURNS, 13, "gravity acts along one line of the tool only"),
 }
 
 

@@ -253,7 +253,7 @@ def test_errors_are_stated_relative_to_the_weight() -> None:
     assert "more than 10 %" in rejected.reasons[0]
 
 
-def test_few_poses_and_left_out_poses_are_said() -> None:
+def test_few_poses_and_rejected_poses_are_reported() -> None:
     rng = np.random.default_rng(12)
     five = R24[[0, 6, 10, 15, 21]]
     quality = judge(fit(five, noisy(rng, five), white(5)))
@@ -354,7 +354,7 @@ F, T = ["fx", "fy", "fz"], ["tx", "ty", "tz"]
     ],
 )
 @pytest.mark.parametrize("seed", [17, 18])
-def test_reversed_channels_are_found_out(reversed_channels: list[str], says: str, seed: int) -> None:
+def test_reversed_channels_are_detected(reversed_channels: list[str], says: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     R = Rotation.random(18, rng=rng).as_matrix()
     signs = [-1.0 if channel in reversed_channels else 1.0 for channel in F + T]
@@ -374,14 +374,14 @@ def test_nothing_is_suspected_of_a_sound_sensor() -> None:
         assert not any(word in solved(R, wrench)[1] for word in ("reversed", "reaction", "inverted", "N·mm"))
 
 
-def test_inverted_orientations_are_found_out() -> None:
+def test_inverted_orientations_are_detected() -> None:
     R = Rotation.random(10, rng=np.random.default_rng(20)).as_matrix()
     verdict, reasons = solved(np.swapaxes(R, 1, 2), noisy(np.random.default_rng(21), R))
     assert verdict == "rejected"
     assert reasons.startswith("the orientations look inverted")
 
 
-def test_wrong_units_of_torque_are_found_out() -> None:
+def test_wrong_units_of_torque_are_detected() -> None:
     wrench = noisy(np.random.default_rng(22), R24)
     for factor, verdict, says in (
         (1e3, "rejected", "the centre of mass is 73.5"),

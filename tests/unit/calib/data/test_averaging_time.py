@@ -52,7 +52,7 @@ def test_it_falls_with_white_noise_and_grows_with_a_random_walk_and_a_ramp() -> 
 
 
 @pytest.mark.parametrize("lengths", [[0], [101], [10, -1]])
-def test_lengths_that_do_not_fit_are_refused(lengths: list[int]) -> None:
+def test_lengths_that_do_not_fit_are_rejected(lengths: list[int]) -> None:
     with pytest.raises(BadDataset, match="choose 1 to 100"):
         allan_deviation(white(1), lengths)
 
@@ -120,7 +120,7 @@ def test_a_frozen_channel_does_not_matter_and_a_coarse_one_is_not_believed() -> 
     assert "too coarse" in result.words
 
 
-def test_a_short_record_says_what_it_cannot_judge() -> None:
+def test_a_short_record_reports_its_limit() -> None:
     result = chosen(white(6), force_N=0.5 * SIGMA[0] / np.sqrt(RATE_HZ))
     assert result.seconds <= 2.0
     assert "record of 6 s" in result.words
@@ -137,7 +137,7 @@ def test_any_rate_will_do(rate_Hz: float) -> None:
     assert 2 < result.seconds < 4.5
 
 
-def test_nonsense_is_refused() -> None:
+def test_invalid_targets_are_rejected() -> None:
     for force_N, torque_Nm in ((0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (1.0, -1.0)):
         with pytest.raises(ValueError, match=f"{force_N} N and {torque_Nm} N·m"):
             chosen(white(10), force_N, torque_Nm)

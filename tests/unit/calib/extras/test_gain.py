@@ -113,7 +113,7 @@ def test_what_the_force_gain_is_worth() -> None:
     assert np.mean(distance) == pytest.approx(14, rel=0.2)
 
 
-def test_without_the_weight_the_scale_is_free_and_said_so() -> None:
+def test_without_the_weight_the_scale_is_undetermined() -> None:
     it = world(0)
     forces = it.wrench[:, :3]
     with pytest.raises(NotObservable, match="scale is undetermined"):
@@ -122,7 +122,7 @@ def test_without_the_weight_the_scale_is_free_and_said_so() -> None:
         estimate_force_gain(it.parameters, it.R_base_flange, forces, covariances(24)[:, :3, :3], -1)
 
 
-def test_poses_that_leave_the_force_gain_free_are_refused() -> None:
+def test_poses_that_leave_the_force_gain_free_are_rejected() -> None:
     it = world(0, 4)
     with pytest.raises(NotObservable, match="12 equations for 14 numbers"):
         estimate_force_gain(it.parameters, it.R_base_flange, it.wrench[:, :3], covariances(4)[:, :3, :3], WEIGHT_N)
@@ -238,7 +238,7 @@ def test_payloads_that_are_listed_but_never_hung_do_not_count() -> None:
         estimate_wrench_gain(p, R, y, covariances(45), index.tolist(), PAYLOADS[:2])
 
 
-def test_too_few_poses_of_a_payload_are_refused() -> None:
+def test_too_few_poses_of_a_payload_are_rejected() -> None:
     _, p, R, y, index = wrench_world(PAYLOADS, 0.0, 0)
     few = [0, 1, 15, 16, 30, 31]
     with pytest.raises(NotObservable, match=r"of 44 parameters.*: tilt"):
