@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from calib.assessment.faults import force_unit
 from calib.model import Array, Parameters, is_rotation, read_only
 
 
@@ -51,46 +50,6 @@ class Known:
         for name in ("R_tolerance_rad", "direction_tolerance_rad", "mass_tolerance_kg"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected 0 (exactly known) or more")
-
-    def contradictions(self, found: Parameters, covariance: Array, g_m_s2: float, sigmas: float) -> list[str]:
-        """List the known values that the data contradict, each with the value from the data.
-
-        Parameters
-        ----------
-        found : Parameters
-            From a fit without known values.
-        covariance : array, shape (15, 15)
-            Of that fit.
-        g_m_s2 : float
-        sigmas : float
-            Smallest difference to list, in standard deviations.
-        """
-        words = []
-        if self.mass_kg is not None:
-            weight_N = float(np.linalg.norm(found.gravity_force_base_N))
-            along = found.gravity_force_base_N / (weight_N or 1.0)
-            mass_kg, sigma_kg = weight_N / g_m_s2, float(np.sqrt(along @ covariance[3:6, 3:6] @ along)) / g_m_s2
-            if abs(mass_kg - self.mass_kg) > sigmas * np.hypot(sigma_kg, self.mass_tolerance_kg):
-                unit = force_unit(self.mass_kg / mass_kg) if mass_kg else None
-                why = f", as if the forces were in {unit}" if unit else ""
-                words.append(f"mass {self.mass_kg:g} kg (data: {_with_sigma(mass_kg, sigma_kg, ' kg')}{why})")
-        if self.gravity_direction_base is not None:
-            direction = np.asarray(self.gravity_direction_base)
-            turn = _turn(direction, _unit(found.gravity_force_base_N))
-            across = np.cross(_unit(turn), direction)
-            sigma = float(np.sqrt(across @ covariance[3:6, 3:6] @ across / np.sum(found.gravity_force_base_N**2)))
-            if np.linalg.norm(turn) > sigmas * np.hypot(sigma, self.direction_tolerance_rad):
-                words.append(f"direction of gravity in base (data: {_angle(turn, sigma)})")
-        if self.R_flange_sensor is not None:
-            turn = Rotation.from_matrix(found.R_flange_sensor @ np.asarray(self.R_flange_sensor).T).as_rotvec()
-            if self.yaw_only:
-                z = np.array([0.0, 0.0, 1.0])
-                turn = _turn(z, Rotation.from_rotvec(turn).apply(z))
-            axis = _unit(turn)
-            sigma = float(np.sqrt(axis @ covariance[:3, :3] @ axis))
-            if np.linalg.norm(turn) > sigmas * np.hypot(sigma, self.R_tolerance_rad):
-                words.append(f"mounting of the sensor (data: {_angle(turn, sigma)})")
-        return words
 
 
 class Constraints:
@@ -143,7 +102,7 @@ class Constraints:
         fixed = []
         if self.R is not None and self.R_tolerance == 0:
             fixed += [keep[k] for k in range(self._tilts)]
-        b_hat = _unit(p.gravity_force_base_N)
+        b_hat = unit_vector(p.gravity_force_base_N)
         if self.direction is not None and self.direction_tolerance == 0:
             fixed += [np.concatenate([np.zeros(3), t, np.zeros(9)]) for t in _across(b_hat)]
         if self.weight_N is not None and self.weight_tolerance_N == 0:
@@ -173,21 +132,21 @@ class Constraints:
             turn = p.R_flange_sensor @ self.R.T
             if self.yaw_only:
                 z = np.array([0.0, 0.0, 1.0])
-                add(0, np.eye(2, 3), _turn(z, turn @ z)[:2], self.R_tolerance)
+                add(0, np.eye(2, 3), turn_between(z, turn @ z)[:2], self.R_tolerance)
             else:
                 add(0, np.eye(3), Rotation.from_matrix(turn).as_rotvec(), self.R_tolerance)
         b = p.gravity_force_base_N
         length = max(float(np.linalg.norm(b)), 1e-300)
         if self.direction is not None and self.direction_tolerance > 0:
             across = _across(self.direction)
-            off = across @ np.cross(_turn(self.direction, b / length), self.direction)
+            off = across @ np.cross(turn_between(self.direction, b / length), self.direction)
             add(3, across / length, -off, self.direction_tolerance)
         if self.weight_N is not None and self.weight_tolerance_N > 0:
             add(3, b[None] / length, np.array([self.weight_N - length]), self.weight_tolerance_N)
         return np.concatenate(rows), np.concatenate(residuals)
 
 
-def _turn(a: Array, b: Array) -> Array:
+def turn_between(a: Array, b: Array) -> Array:
     """Smallest rotation vector that takes unit vector a to b."""
     axis = np.cross(a, b)
     sine = float(np.linalg.norm(axis))
@@ -197,16 +156,8 @@ def _turn(a: Array, b: Array) -> Array:
     return np.asarray(axis * (angle / sine))
 
 
-def _angle(turn_rad: Array, sigma_rad: float) -> str:
-    return _with_sigma(float(np.degrees(np.linalg.norm(turn_rad))), float(np.degrees(sigma_rad)), "°", " away")
-
-
-def _with_sigma(value: float, sigma: float, unit: str, then: str = "") -> str:
-    digits = int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 6))
-    return f"{value:.{digits}f}{unit}{then}, sigma {sigma:.{digits}f}{unit}"
-
-
-def _unit(v: Array) -> Array:
+def unit_vector(v: Array) -> Array:
+    """Vector (3,) divided by its length; -z for a zero vector."""
     length = float(np.linalg.norm(v))
     return v / length if length > 0 else np.array([0.0, 0.0, -1.0])
 

@@ -7,6 +7,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calib.assessment.contradictions import contradictions
 from calib.assessment.cross_validation import AssessedFit, IndependentFit
 from calib.assessment.faults import faults
 from calib.assessment.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
@@ -120,8 +121,8 @@ def solve(
     unconstrained = best if estimator else None if known is None else _unconstrained(dataset, wrench_cov, drift)
     contradicted: list[str] = []
     if known is not None and unconstrained is not None:
-        contradicted = known.contradictions(
-            unconstrained.parameters, unconstrained.covariance, g_m_s2, SIGNIFICANT_SIGMAS
+        contradicted = contradictions(
+            known, unconstrained.parameters, unconstrained.covariance, g_m_s2, SIGNIFICANT_SIGMAS
         )
     quality = judge(
         assessed,

@@ -97,7 +97,7 @@ def judge(
     unconstrained : AssessedFit, optional
         The best fit to the same poses without known values, if `fit` used some.
     contradicted : sequence of str
-        Known values that the unconstrained fit contradicts, from `Known.contradictions`.
+        Known values that the unconstrained fit contradicts, from `calib.assessment.contradictions`.
     """
     at = _statistics(fit, t_s)
     parameters, weight_N, n = fit.parameters, at.weight_N, int(at.used.sum())
