@@ -138,11 +138,8 @@ def judge(
         *(_tilt_notes(parameters, up_in_base) if plausible else []),
         *([] if at.chi2_p is not None else ["the noise was estimated from the residuals: chi2 does not test the fit"]),
     ]
-    if (
-        fit.drift is not None
-        and _drift_share(fit.drift.change, weight_N) > USABLE_SHARE
-        and not (explanation or changed)
-    ):
+    drift_matters = fit.drift is not None and _drift_share(fit.drift.change, weight_N) > USABLE_SHARE
+    if drift_matters and not explanation and not changed:
         (rejected or usable)[:0] = drifted  # before its consequences
     else:
         notes += drifted
