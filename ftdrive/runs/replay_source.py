@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.model import Array
 from calib.ports import ArmReading, WrenchSamples
-from calib.routine import Array, PoseRecord
+from calib.routine import PoseRecord
 
 
 class RecordedRun:
