@@ -12,8 +12,8 @@ DriverError
 └── DeviceFault       the device itself reports a fault: sensor status, protective or emergency stop
     └── Frozen        a sensor says the same again and again
 
-Every error says in `found` what happened, with the value, and in `cure` what to do next, where the driver knows it; its
-text is "found; cure", without capital and full stop. One that is raised anew as another kind keeps its cure.
+Every error says in `found` what happened, with the value, and in `fix` what to do next, where the driver knows it; its
+text is "found; fix", without capital and full stop. One that is raised anew as another kind keeps its fix.
 """
 
 from typing import Final
@@ -29,14 +29,14 @@ class DriverError(Exception):
     ----------
     found
         What happened, with the value.
-    cure
+    fix
         What to do next; empty where the driver does not know.
     """
 
-    def __init__(self, found: str, cure: str = "") -> None:
-        super().__init__(f"{found}; {cure}" if cure else found)  # one argument: two would be those of an `OSError`
+    def __init__(self, found: str, fix: str = "") -> None:
+        super().__init__(f"{found}; {fix}" if fix else found)  # one argument: two would be those of an `OSError`
         self.found = found
-        self.cure = cure
+        self.fix = fix
 
 
 class ConnectError(DriverError):

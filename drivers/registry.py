@@ -240,8 +240,8 @@ def _load(entry: EntryPoint) -> Any:
         return entry.load()
     except Exception as exc:  # whatever a module of another package does when it is imported
         extra = _EXTRAS.get(getattr(exc, "name", None) or "")
-        cure = f"pip install 'ftdrive[{extra}]'" if extra else f"reinstall {_package(entry)}"
-        raise BadUrl(f"the driver '{entry.name}' cannot be imported ({type(exc).__name__}: {exc}): {cure}") from exc
+        fix = f"pip install 'ftdrive[{extra}]'" if extra else f"reinstall {_package(entry)}"
+        raise BadUrl(f"the driver '{entry.name}' cannot be imported ({type(exc).__name__}: {exc}): {fix}") from exc
 
 
 def _package(entry: EntryPoint) -> str:

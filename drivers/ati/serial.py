@@ -199,7 +199,7 @@ class AtiSerialSensor(StreamingSensor):
         try:
             return int.from_bytes(self._ask(modbus.read_registers(modbus.STATUS, 1), self._jam), "big")
         except (DeviceTimeout, ProtocolError) as exc:
-            raise DeviceTimeout(exc.found, f"{exc.cure}; is it this sensor, and is the termination right?") from exc
+            raise DeviceTimeout(exc.found, f"{exc.fix}; is it this sensor, and is the termination right?") from exc
 
     def _start_stream(self) -> None:
         self._ask(modbus.START, self._jam)  # perhaps it streams, and only the reply was lost

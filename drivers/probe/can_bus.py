@@ -75,7 +75,7 @@ def probe_can(
             heard = _hear(bus, clock)
             return [answer for sensor in known if (answer := _look(sensor, heard, bus, clock))]
     except StreamBroken as exc:
-        raise ConnectError(exc.found, exc.cure) from exc
+        raise ConnectError(exc.found, exc.fix) from exc
     finally:
         bus.close()
 

@@ -77,7 +77,7 @@ def _hear(path: str, known: _Known, request: bytes | None, duration_s: float, cl
         for _ in clock.looks(duration_s):
             data += port.read(4096)
     except StreamBroken as exc:
-        raise ConnectError(exc.found, exc.cure) from exc
+        raise ConnectError(exc.found, exc.fix) from exc
     finally:
         port.close()
     return data

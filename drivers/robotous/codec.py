@@ -109,8 +109,8 @@ def check_set(field: bytes) -> None:
     _expect_size(field)
     if field[1] != 1:
         reason = _FAILURES.get(field[2], "unknown reason")
-        cure = "leave rate out of its address, or power it off and on"
-        raise ProtocolError(f"the sensor refused command 0x{field[0]:02X}: {field[2]} ({reason})", cure)
+        fix = "leave rate out of its address, or power it off and on"
+        raise ProtocolError(f"the sensor refused command 0x{field[0]:02X}: {field[2]} ({reason})", fix)
 
 
 def decode_sample(field: bytes) -> Sample:
@@ -132,8 +132,8 @@ def counts_per_unit(model: str) -> tuple[int, int]:
     match = re.match(r"RFT-?(\d\d)", model)
     if match is None or match[1] not in _COUNTS_PER_NM:
         known = ", ".join(f"RFT{number}" for number in _COUNTS_PER_NM)
-        cure = "add its scale, from its manual, to drivers/robotous/codec.py"
-        raise ProtocolError(f"the scale of model '{model}' is not known, only those of {known}", cure)
+        fix = "add its scale, from its manual, to drivers/robotous/codec.py"
+        raise ProtocolError(f"the scale of model '{model}' is not known, only those of {known}", fix)
     return COUNTS_PER_N, _COUNTS_PER_NM[match[1]]
 
 

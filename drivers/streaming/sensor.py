@@ -400,7 +400,7 @@ class StreamingSensor(ForceTorqueSensor):
         while self._is_mine():
             if self._clock.now_s() > deadline_s:
                 found = f"{first.found}, not back within {self._limits.recover_s:g} s ({error})"
-                raise StreamBroken(found, first.cure) from error
+                raise StreamBroken(found, first.fix) from error
             self._let_go()
             try:
                 info = self._connect_and_identify()
@@ -494,7 +494,7 @@ class StreamingSensor(ForceTorqueSensor):
     def _not_opened(self, error: DriverError) -> ConnectError:
         """Put the device's name before what a codec says, which knows none."""
         found = error.found if error.found.startswith(self.name) else f"{self.name}: {error.found}"
-        return ConnectError(found, error.cure)
+        return ConnectError(found, error.fix)
 
     def _let_go(self) -> None:
         try:

@@ -78,8 +78,8 @@ class Writer:
         try:
             self._file: IO[str] | None = self._partial.open("x", encoding="utf-8")
         except OSError as error:
-            cure = "give a file in a folder that exists and is yours"
-            raise OSError(f"{path} cannot be written ({error.strerror}): {cure}") from error
+            fix = "give a file in a folder that exists and is yours"
+            raise OSError(f"{path} cannot be written ({error.strerror}): {fix}") from error
         self._line({"format": FORMAT, **header})
 
     def event(self, name: str, **content: Any) -> None:

@@ -100,7 +100,7 @@ class UrArm(RobotArm):
             self._connect(control)
         except (StreamBroken, DeviceTimeout, DeviceFault, ProtocolError) as error:
             self.close()
-            raise ConnectError(f"cannot open the arm at {self._host}: {error.found}", error.cure) from error
+            raise ConnectError(f"cannot open the arm at {self._host}: {error.found}", error.fix) from error
         except BaseException:
             self.close()
             raise
@@ -142,7 +142,7 @@ class UrArm(RobotArm):
 
         def look_out() -> None:
             if fault := reader.look().safety_fault():
-                raise ConnectError(f"the arm at {self._host} cannot move: {fault.found}", fault.cure)
+                raise ConnectError(f"the arm at {self._host} cannot move: {fault.found}", fault.fix)
 
         def prepare(dashboard: Dashboard) -> None:
             asks = major == 5 and minor > 5 and self._host not in _SIMULATORS
@@ -428,7 +428,7 @@ class UrArm(RobotArm):
         fault = look.safety_fault() or look.program_fault()
         if fault is None:
             return None
-        return DeviceFault(f"the arm at {self._host} stopped: {fault.found}", f"{fault.cure}, then open the arm again")
+        return DeviceFault(f"the arm at {self._host} stopped: {fault.found}", f"{fault.fix}, then open the arm again")
 
     @contextmanager
     def _stopping_on_error(self) -> Iterator[None]:

@@ -131,9 +131,9 @@ class ControlProcess:
                 ended = self._ended
             if reply is not None:
                 if "error" in reply:
-                    # of the start, `UrArm` knows the cure
-                    cure = "check the robot and the cable, then open the arm again" if to else ""
-                    raise StreamBroken(f"ur_rtde says: {reply['error']}", cure)
+                    # of the start, `UrArm` knows the fix
+                    fix = "check the robot and the cable, then open the arm again" if to else ""
+                    raise StreamBroken(f"ur_rtde says: {reply['error']}", fix)
                 return reply["value"]
             if ended:
                 raise self._loss()

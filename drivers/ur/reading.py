@@ -98,7 +98,7 @@ class Reader:
         """Read a state; `ask_tcp` asks for the TCP offset (6,) if samples lack it. Errors as `UrArm.state`."""
         sample, tcp_offset = self._look_with_tcp(ask_tcp)
         if not sample.measures and (fault := sample.safety_fault()):
-            raise DeviceFault(f"{self._host} does not measure its joints: {fault.found}", fault.cure)
+            raise DeviceFault(f"{self._host} does not measure its joints: {fault.found}", fault.fix)
         flange = sample.flange(tcp_offset)
         self._check_model(sample, flange)
         return ArmState(

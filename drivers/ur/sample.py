@@ -127,13 +127,13 @@ class Sample:
 
     def safety_fault(self) -> DeviceFault | None:
         """Say why the arm may not move, as far as the arm itself is concerned."""
-        for bits, meaning, cure in _SAFETY:
+        for bits, meaning, fix in _SAFETY:
             if self.safety_bits & bits:
-                return DeviceFault(f"{meaning} (safety status bits 0x{self.safety_bits:x})", cure)
+                return DeviceFault(f"{meaning} (safety status bits 0x{self.safety_bits:x})", fix)
         if self.robot_mode != ROBOT_RUNNING:
             mode = _ROBOT_MODES.get(self.robot_mode, "unknown")
-            cure = "release its brakes" if self.robot_mode == ROBOT_IDLE else "power the arm on and release its brakes"
-            return DeviceFault(f"robot mode {self.robot_mode} ({mode})", f"{cure} at the pendant")
+            fix = "release its brakes" if self.robot_mode == ROBOT_IDLE else "power the arm on and release its brakes"
+            return DeviceFault(f"robot mode {self.robot_mode} ({mode})", f"{fix} at the pendant")
         return None
 
     def program_fault(self) -> DeviceFault | None:

@@ -92,13 +92,13 @@ class CanBus:
             )
         except Exception as exc:  # an adapter whose library is missing fails in a way of its own
             self.close()
-            cure = "is the adapter plugged in, and is what python-can needs for it installed?"
+            fix = "is the adapter plugged in, and is what python-can needs for it installed?"
             if "/" in self._channel and self._interface == "socketcan":
-                cure = "this is no CAN interface: an adapter on a serial port wants interface=slcan in its address"
+                fix = "this is no CAN interface: an adapter on a serial port wants interface=slcan in its address"
             elif self._interface == "socketcan":
                 up = f"sudo ip link set {self._channel} up type can bitrate {self._bitrate}"
-                cure = f"is the adapter plugged in, and '{up}' done?"
-            raise refusal(self._owner, tty, exc, f"the bus does not open ({exc})", cure) from exc
+                fix = f"is the adapter plugged in, and '{up}' done?"
+            raise refusal(self._owner, tty, exc, f"the bus does not open ({exc})", fix) from exc
 
     def _take(self, tty: str) -> None:
         """Take a serial port for this process alone, before python-can speaks to the adapter: it would not ask."""

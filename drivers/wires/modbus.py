@@ -135,5 +135,5 @@ def _exchange(
     try:
         return check(request, reply)
     except ProtocolError as exc:
-        cure = "is it the sensor that its address names? Check its wiring, power it off and on"
-        raise type(exc)(f"{name}: {exc.found}", cure) from exc
+        fix = "is it the sensor that its address names? Check its wiring, power it off and on"
+        raise type(exc)(f"{name}: {exc.found}", fix) from exc

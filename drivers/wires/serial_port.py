@@ -22,12 +22,12 @@ _DRAIN_BYTES = 416
 """5 ms of the quickest sensor."""
 
 
-def refusal(owner: str, path: str, error: Exception, found: str, cure: str) -> ConnectError:
+def refusal(owner: str, path: str, error: Exception, found: str, fix: str) -> ConnectError:
     """Say that another program has a port, where the error of opening it tells so; else what is given."""
     if isinstance(error, OSError) and error.errno in {errno.EAGAIN, errno.EBUSY}:
         holder = f"`fuser -v {shlex.quote(path)}` names it"
         return PortInUse(f"{owner}: the port is in use by another program", f"end it, {holder}")
-    return ConnectError(f"{owner}: {found}", cure)
+    return ConnectError(f"{owner}: {found}", fix)
 
 
 class SerialPort:
@@ -86,8 +86,8 @@ class SerialPort:
             self._marks = Unmarker() if self._even_parity and ask_for_marks(self._port) else None
         except (ValueError, *LINK_ERRORS) as exc:
             self.close()
-            cure = "is it plugged in, free, and are you in its group?"
-            raise refusal(self._owner, self._path, exc, f"the port does not open ({exc})", cure) from exc
+            fix = "is it plugged in, free, and are you in its group?"
+            raise refusal(self._owner, self._path, exc, f"the port does not open ({exc})", fix) from exc
         with contextlib.suppress(ValueError, NotImplementedError, *LINK_ERRORS):
             self._port.set_low_latency_mode(True)  # a courtesy of some adapters: 1 ms instead of 16 ms
 

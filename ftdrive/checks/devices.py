@@ -105,7 +105,7 @@ def check_sensor_error(name: str, error: DriverError, address: SensorAddress, pe
     there; and only where neither is known, what usually helps against errors of this kind.
     """
     kind = error.__cause__ if isinstance(error, ConnectError) and isinstance(error.__cause__, DriverError) else error
-    own = error.cure
+    own = error.fix
     way = next((check.fix for check in permissions if check.state == "failed"), None)
     if way is not None and not isinstance(kind, PortInUse | DeviceFault) and (_not_reached(kind) or not own):
         own = way
@@ -228,7 +228,7 @@ def check_noise(wrench: Array, duration_s: float, average_s: float, mass_kg: flo
 
 def check_unreachable(error: DriverError, host: str) -> Check:
     """Say why an arm could not be opened, and what to do about just that."""
-    cure = error.cure or f"ping {host}"
+    cure = error.fix or f"ping {host}"
     if isinstance(error, Unreachable):
         if isinstance(error.__cause__, ConnectionRefusedError):
             cure = (
@@ -276,7 +276,7 @@ def check_status(status: ArmStatus) -> list[Check]:
 def check_safety(status: ArmStatus) -> Check:
     """Judge whether the safety system lets the arm move."""
     if status.fault is not None:
-        return Check("robot.safety", "failed", status.fault.found, status.fault.cure)
+        return Check("robot.safety", "failed", status.fault.found, status.fault.fix)
     if status.safety_mode != "normal":
         fix = "see the pendant for what puts it there; calibrate asks whether that is as it should be"
         return Check("robot.safety", "warning", f"safety mode {status.safety_mode}", fix)

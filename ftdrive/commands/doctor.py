@@ -155,7 +155,7 @@ def _registers(cell: CellConfig) -> Check:
     try:
         return devices.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=limit_s, clock=cell.clock))
     except DriverError as error:
-        return Check("robot.registers", "failed", error.found, error.cure or f"ping {host}")
+        return Check("robot.registers", "failed", error.found, error.fix or f"ping {host}")
 
 
 def _script_port(cell: CellConfig) -> Check:
@@ -163,7 +163,7 @@ def _script_port(cell: CellConfig) -> Check:
     try:
         find_script_port(host, timeout_s=ur_timing(cell).connect_s)
     except DriverError as error:
-        return Check("robot.programs", "failed", error.found, error.cure or f"ping {host}")
+        return Check("robot.programs", "failed", error.found, error.fix or f"ping {host}")
     return Check("robot.programs", "ok", f"port {SCRIPT_PORT}, which takes programs, is open")
 
 
@@ -174,7 +174,7 @@ def _flange(arm: RobotArm, status: ArmStatus) -> Check:
     try:
         p_mm = 1e3 * arm.state().p_base_flange_m
     except DriverError as error:
-        return Check(name, "failed", error.found, error.cure or "check the robot and the network")
+        return Check(name, "failed", error.found, error.fix or "check the robot and the network")
     where = ", ".join(f"{value:.0f}" for value in p_mm)
     return Check(name, "ok", f"TCP told; the flange is at ({where}) mm in base, where the model has it")
 
@@ -190,7 +190,7 @@ def _clock(arm: RobotArm, clock: Clock) -> Check:
                 host_ns.append(status.t_host_ns)
                 device_s.append(status.t_device_s)
     except DriverError as error:
-        return Check("clock.pace", "failed", error.found, error.cure or "check the robot and the network")
+        return Check("clock.pace", "failed", error.found, error.fix or "check the robot and the network")
     return devices.check_clock(host_ns, device_s)
 
 

@@ -428,7 +428,7 @@ def out_of_sight(error: DriverError, *, moving: bool) -> Tripped:
         f"{error.found}; the arm was told to stop, but may not have heard it: then it ends the one move it was given, "
         "which is proven clear, and goes no further"
     )
-    return Tripped(16, type(error)(found, error.cure))
+    return Tripped(16, type(error)(found, error.fix))
 
 
 def by_safety(status: ArmStatus, words: str) -> Tripped:

@@ -4,7 +4,7 @@
 
 The events are those of tests/wire/test_ur_failures.py, which shows what is told. They befall an emulated UR5e in the
 middle of a move of 1.3 s. Three times, each the worst of the repeats: from the event until the caller is told, from
-the event until the arm stands, and from its cure until the arm has been opened again and has made a small move. Exit
+the event until the arm stands, and from its fix until the arm has been opened again and has made a small move. Exit
 code 1 when a target is missed.
 """
 
@@ -96,8 +96,8 @@ def usable(arm: UrArm) -> float:
     return time.monotonic() - begin
 
 
-def befall(do: Do, cure: Act, *, later_s: float = 0.0, frozen: bool = False) -> Row:
-    """Let it happen in a move, and cure it `later_s` after it was told and the arm stands."""
+def befall(do: Do, fix: Act, *, later_s: float = 0.0, frozen: bool = False) -> Row:
+    """Let it happen in a move, and fix it `later_s` after it was told and the arm stands."""
     with Station() as station, closing(new_arm(station.host)) as arm:
         arm.open(control=True)
         q = away(arm)
@@ -110,7 +110,7 @@ def befall(do: Do, cure: Act, *, later_s: float = 0.0, frozen: bool = False) -> 
         assert provoke.t_s is not None
         stood = (nan, "frozen itself") if frozen else stands(station, provoke.t_s, q[5])
         time.sleep(later_s)
-        cure(station)
+        fix(station)
         return Row(told_s, *stood, usable(arm))
 
 
@@ -210,7 +210,7 @@ def of_the_cell(do: Act) -> Do:
 def rows() -> dict[str, Callable[[], Row]]:
     """Every event by name."""
     named: dict[str, Callable[[], Row]] = {
-        event.name: partial(befall, of_the_cell(event.do), event.cure, frozen=event.name == FROZEN) for event in EVENTS
+        event.name: partial(befall, of_the_cell(event.do), event.fix, frozen=event.name == FROZEN) for event in EVENTS
     }
     silent, silent_ends = (on("silent", what="rtde", on=state) for state in (True, False))
     foreign = on("foreign-program")  # the tests wait until it plays

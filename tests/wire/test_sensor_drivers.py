@@ -123,7 +123,7 @@ def test_unplugged_is_broken_at_once_and_for_good(start: Start, scheme: str) -> 
     with pytest.raises(StreamBroken) as caught:
         sensor.collect(60.0)
     unplugging.join()
-    assert "again" in caught.value.cure
+    assert "again" in caught.value.fix
     assert emulator.clock.now_s() - begin_s < 10.0  # long before the collection would have ended
     with pytest.raises(StreamBroken):
         sensor.latest(timeout_s=0.1)
@@ -148,7 +148,7 @@ def test_a_silent_device_is_no_device(start: Start, scheme: str) -> None:
     emulator.faults(stall=True)
     with pytest.raises(ConnectError) as caught:
         emulator.sensor().open()
-    assert "supply" in caught.value.cure
+    assert "supply" in caught.value.fix
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """What can go wrong with the controller, its links and our processes, at every moment of using the arm.
 
-Required of every row: reported as below, with a cure; the arm stopped, or known to be finishing the one move it was
+Required of every row: reported as below, with a fix; the arm stopped, or known to be finishing the one move it was
 given; no crash; after the operator has cleared it, `open(control=True)` on the same object moves the arm again. We
 never unlock and never play. On a real clock (`pytest -m realtime -n0`): reported within half a second, usable again
 within 2 s. The limits themselves are proved in `tests/unit/drivers/ur`.
@@ -75,7 +75,7 @@ slow, realtime = pytest.mark.slow, pytest.mark.realtime
 NewArm = Callable[..., UrArm]
 
 
-# ---------------------------------------------------------------------- the events and their cures
+# ---------------------------------------------------------------------- the events and their fixes
 
 Act = Callable[[Station], object]
 
@@ -128,7 +128,7 @@ def plays_another(station: Station) -> bool:
 class Event:
     name: str
     do: Act
-    cure: Act
+    fix: Act
     error: type[DriverError] | tuple[type[DriverError], ...]
     says: str
     reachable: bool = True
@@ -306,7 +306,7 @@ def test_in_move_in_time(station: Station, in_time: NewArm, event: Event) -> Non
 
 
 def befall_move(station: Station, arm: UrArm, event: Event) -> tuple[float, float]:
-    """Let it happen in a move, and cure it; return after how long it was reported, and the arm usable again."""
+    """Let it happen in a move, and fix it; return after how long it was reported, and the arm usable again."""
     q = away(arm)
     provoke = Once(lambda: event.do(station), wait_until_moving(arm))
     with pytest.raises(event.error, match=event.says):
@@ -315,7 +315,7 @@ def befall_move(station: Station, arm: UrArm, event: Event) -> tuple[float, floa
     if event.reachable:
         state = station.wait_for(lambda state: not state["moving"] and state["runtime_state"] == "STOPPED")
         assert abs(state["q_rad"][5] - q[5]) > 0.1
-    event.cure(station)
+    event.fix(station)
     where = station.wait_for(lambda state: not state["moving"])["q_rad"]  # whatever it was, it is one move long
     begin_s = REAL.now_s()
     moves_again(arm)
@@ -330,13 +330,13 @@ def test_at_rest(station: Station, new_arm: NewArm, event: Event) -> None:
     if event.name != "foreign-program":  # while it stands, it may be anybody's program
         with pytest.raises(event.error, match=event.says):
             arm.wait_until_still(timeout_s=30, guard=Once(lambda: event.do(station)))
-        event.cure(station)
+        event.fix(station)
         moves_again(arm)
     q = away(arm, 0.05)
     event.do(station)  # nobody looks
     with pytest.raises(event.error, match=event.says):
         arm.move_to(q, timeout_s=MOVE_S, guard=no_guard)
-    event.cure(station)
+    event.fix(station)
     moves_again(arm)
 
 
@@ -353,7 +353,7 @@ def test_while_opening(station: Station, new_arm: NewArm, event: Event, monkeypa
     arm = new_arm()
     with pytest.raises(ConnectError, match=event.says):
         arm.open(control=True)
-    event.cure(station)
+    event.fix(station)
     moves_again(arm)
 
 
@@ -369,13 +369,13 @@ def test_while_closing(station: Station, new_arm: NewArm, event: Event) -> None:
     arm.close()
     if event.reachable and event.name != "foreign-program":
         station.wait_for(lambda state: not state["moving"] and state["runtime_state"] == "STOPPED")
-    event.cure(station)
+    event.fix(station)
     moves_again(arm)
 
 
 @slow
 @pytest.mark.parametrize(
-    ("do", "cure"),
+    ("do", "fix"),
     [
         (on("reduced", on=True), on("reduced", on=False)),
         (on("remote-control", on=False), on("remote-control", on=True)),
@@ -386,12 +386,12 @@ def test_while_closing(station: Station, new_arm: NewArm, event: Event) -> None:
     ],
     ids=["reduced", "local-mode", "dashboard-fin", "script-reset", "dashboard-refused", "dashboard-silent"],
 )
-def test_what_disturbs_no_move(station: Station, arm: UrArm, do: Act, cure: Act) -> None:
+def test_what_disturbs_no_move(station: Station, arm: UrArm, do: Act, fix: Act) -> None:
     q = away(arm, 0.5)
     arm.move_to(q, timeout_s=MOVE_S, guard=Once(lambda: do(station), wait_until_moving(arm)))
     arm.wait_until_still(timeout_s=30, guard=no_guard)
     assert np.allclose(arm.state().q_rad, q, atol=1e-4)
-    cure(station)
+    fix(station)
 
 
 @realtime
@@ -534,7 +534,7 @@ def test_a_program_of_somebody_else_is_never_ended_for_a_start(station: Station,
     before = len(station.ask("state")["events"])
     error = refused(station)
     assert re.search(r"\((PLAYING|PAUSED) .*\) and is not ended", error.found)
-    assert "stop it at the pendant" in error.cure
+    assert "stop it at the pendant" in error.fix
     state = station.ask("state", since=before)
     assert not [event for event in state["events"] if event["by"] in ("script port", "program")]
     assert not [event for event in state["events"] if event["by"] == "dashboard" and event["what"] == "stop"]
@@ -584,7 +584,7 @@ def test_registers_of_a_fieldbus(station: Station, new_arm: NewArm) -> None:
     station.ask("claim-registers", range="lower", on=True)
     error = refused(station)
     station.ask("claim-registers", range="lower", on=False)
-    assert "EtherNet/IP" in error.cure
+    assert "EtherNet/IP" in error.fix
     assert "input_int_register_0" in error.found
     station.ask("claim-registers", range="upper", on=True)
     moves_again(new_arm())  # these are not ours
@@ -606,35 +606,35 @@ def test_a_second_client_does_not_stop_the_first(station: Station, arm: UrArm) -
 def test_local_mode_keeps_the_running_program(station: Station) -> None:
     another_takes_over(station)
     station.ask("remote-control", on=False)
-    assert "press Local, Remote Control" in refused(station).cure
+    assert "press Local, Remote Control" in refused(station).fix
     assert plays_another(station)
     station.ask("remote-control", on=True)
     station.ask("dashboard-stop")
 
 
 @slow
-@pytest.mark.parametrize(("mode", "cure"), [(3, "power the arm on"), (5, "release its brakes")])
-def test_an_arm_that_is_not_ready(station: Station, mode: int, cure: str) -> None:
+@pytest.mark.parametrize(("mode", "fix"), [(3, "power the arm on"), (5, "release its brakes")])
+def test_an_arm_that_is_not_ready(station: Station, mode: int, fix: str) -> None:
     station.ask("mode", robot=mode)
-    assert cure in refused(station).cure
+    assert fix in refused(station).fix
     station.ask("mode", robot=7)
 
 
 @slow
 @pytest.mark.parametrize(
-    ("what", "found", "cure"),
+    ("what", "found", "fix"),
     [
         ("rtde", "cannot be reached", "the address and the cable"),
         ("dashboard", "dashboard server", "Settings, Security, Services"),
         ("script", "30003", "Settings, Security, Services"),
     ],
 )
-def test_services_that_are_off(station: Station, what: str, found: str, cure: str) -> None:
+def test_services_that_are_off(station: Station, what: str, found: str, fix: str) -> None:
     station.ask("listen", what=what, on=False)
     error = refused(station)
     station.ask("listen", what=what, on=True)
     assert found in error.found
-    assert cure in error.cure
+    assert fix in error.fix
 
 
 @slow

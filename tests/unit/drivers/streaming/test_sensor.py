@@ -729,7 +729,7 @@ class TestRecover:
         assert ended == [False, True]
         with pytest.raises(StreamBroken, match=rf"^gone, not back within 10 s \(.*{said}.*\)") as caught:
             sensor.check()
-        assert caught.value.cure == "plug it in"
+        assert caught.value.fix == "plug it in"
         assert sensor.health().reconnects == 0
 
     def test_a_second_interruption_has_its_own_ten_seconds(self, sensor: FakeSensor) -> None:

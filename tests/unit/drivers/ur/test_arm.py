@@ -139,17 +139,17 @@ def test_without_ur_rtde_the_error_says_where_it_exists(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
-    ("words", "found", "cure"),
+    ("words", "found", "fix"),
     [
         ("ur_rtde: One of the RTDE input registers are already in use! Currently", "another client", "end it"),
         ("ur_rtde: Please enable remote control on the robot!", "remote control", "press Local"),
         ("Failed to start control script, before timeout of 5 seconds", "Failed to start", "pendant"),
     ],
 )
-def test_the_librarys_words_become_advice(words: str, found: str, cure: str) -> None:
+def test_the_librarys_words_become_advice(words: str, found: str, fix: str) -> None:
     error = arm_module._refusal(HOST, words)
     assert found in error.found
-    assert cure in error.cure
+    assert fix in error.fix
 
 
 # ---------------------------------------------------------------------- opening
@@ -221,7 +221,7 @@ def test_what_rtde_may_not_say_refuses_the_opening_too(monkeypatch: pytest.Monke
     monkeypatch.setattr(arm_module, "Reader", damaged)
     with pytest.raises(ConnectError, match="recipe cannot be read: 01") as error:
         UrArm(HOST).open()
-    assert error.value.cure == "is this an RTDE server?"
+    assert error.value.fix == "is this an RTDE server?"
 
 
 # ---------------------------------------------------------------------- moving

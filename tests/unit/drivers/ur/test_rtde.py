@@ -231,4 +231,4 @@ def test_the_greeting_has_one_time_out_in_all() -> None:
 def test_nobody_there() -> None:
     with pytest.raises(Unreachable, match="cannot be reached") as error:
         rtde.Subscription("127.83.7.2", OUTPUTS, 125.0, timeout_s=0.5)
-    assert "switched on" in error.value.cure
+    assert "switched on" in error.value.fix
