@@ -5,10 +5,11 @@ have one that moves only when they say so. No module of `drivers` calls `time.mo
 """
 
 import sys
+import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from typing import Protocol
 
 
@@ -99,3 +100,37 @@ class RealClock(Clock):
 
 
 REAL = RealClock()
+
+
+class Follower(threading.Thread):
+    """A daemon thread whose `work` keeps up with `clock`.
+
+    `start` returns once an emulated cell's time waits for the thread, so that nothing is timed before. It raises what
+    `Clock.keeping_up` raises.
+    """
+
+    def __init__(self, clock: Clock, work: Callable[[], None], name: str) -> None:
+        super().__init__(name=name, daemon=True)
+        self._clock = clock
+        self._work = work
+        self._decided = threading.Event()
+        self._refusal: Exception | None = None
+
+    def start(self) -> None:
+        """Start the thread and wait until it keeps up."""
+        super().start()
+        self._decided.wait()
+        if self._refusal is not None:
+            raise self._refusal
+
+    def run(self) -> None:
+        """Keep up and work; called in the thread."""
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(self._clock.keeping_up())
+            except Exception as error:
+                self._refusal = error
+                return
+            finally:
+                self._decided.set()
+            self._work()

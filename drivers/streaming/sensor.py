@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from drivers.clock import REAL, Clock
+from drivers.clock import REAL, Clock, Follower
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
 from drivers.streaming.plausibility import DeviceClock, Liveness, Rate
@@ -175,8 +175,8 @@ class StreamingSensor(ForceTorqueSensor):
                     raise self._not_opened(exc) from exc
                 raise
             self._opened_ns = self._clock.now_ns()
-            self._start_reader()
             try:
+                self._start_reader()
                 self._await_first_sample()
             except BaseException:
                 self.close()
@@ -320,17 +320,13 @@ class StreamingSensor(ForceTorqueSensor):
         self._is_late = False
 
     def _start_reader(self) -> None:
-        self._thread = threading.Thread(target=self._run, name=f"reader of {self.name}", daemon=True)
+        self._thread = Follower(self._clock, self._run, f"reader of {self.name}")
         self._thread.start()
 
     def _run(self) -> None:
         """Read until `close`, or until something ends the stream for good."""
-        try:
-            with self._clock.keeping_up():
-                while self._is_mine() and not self._has_ended:
-                    self._take_turn()
-        except Exception as exc:
-            self._fail(exc, for_good=True)
+        while self._is_mine() and not self._has_ended:
+            self._take_turn()
 
     def _take_turn(self) -> None:
         """Read once and publish, or connect again; keep the error that ends the stream for good."""

@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.clock import Clock
+from drivers.clock import Clock, Follower
 from drivers.errors import (
     ConnectError,
     DeviceFault,
@@ -67,9 +67,9 @@ class Reader:
         self._names = [name for name in OUTPUTS if name not in missing]
         self.reports_tcp = "tcp_offset" in self._names
         """Whether the controller reports its TCP offset without being controlled; old ones do not."""
-        self._thread = threading.Thread(target=self._run, name="ur-reader", daemon=True)
-        self._thread.start()
+        self._thread = Follower(clock, self._run, "ur-reader")
         try:
+            self._thread.start()
             self.info = self._identify(model, missing - OPTIONAL)
         except BaseException:
             self.close()
@@ -186,9 +186,8 @@ class Reader:
                 patience.wait(self._changed)
 
     def _run(self) -> None:
-        with self._clock.keeping_up():
-            while self._follow():
-                pass
+        while self._follow():
+            pass
 
     def _follow(self) -> bool:
         """Read the next sample; whether to go on. What ends the stream is raised at the next look."""
