@@ -7,11 +7,11 @@ device is gone. Every wait has a time-out. An old value is never returned: stale
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Final, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drivers.errors import DeviceFault
 
@@ -72,14 +72,35 @@ class FtSamples:
         return len(self.t_host_ns)
 
     @classmethod
-    def concatenate(cls, blocks: Sequence["FtSamples"]) -> "FtSamples":
-        """Join blocks in the order given."""
+    def of(
+        cls,
+        t_host_ns: ArrayLike,
+        seq: ArrayLike,
+        wrench: ArrayLike,
+        *,
+        counts: ArrayLike | None = None,
+        t_device_s: ArrayLike = math.nan,
+        status: ArrayLike = 0,
+    ) -> Self:
+        """Build n samples from `wrench` (n, 6). Where all rows share a value, it may be a single number."""
+        n = len(wrench := np.asarray(wrench, np.float64))
         return cls(
-            *(
-                np.concatenate([getattr(block, name) for block in blocks])
-                for name in ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
-            )
+            t_host_ns=np.full(n, t_host_ns, np.int64),
+            t_device_s=np.full(n, t_device_s, np.float64),
+            seq=np.full(n, seq, np.int64),
+            counts=np.zeros((n, 0), np.int32) if counts is None else np.asarray(counts, np.int32),
+            wrench=wrench,
+            status=np.full(n, status, np.uint32),
         )
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence[Self]) -> Self:
+        """Join blocks in the order given."""
+        return cls(*(np.concatenate([getattr(block, column.name) for block in blocks]) for column in fields(cls)))
+
+    def rows(self, which: slice | NDArray[np.bool_]) -> Self:
+        """Select samples."""
+        return type(self)(*(getattr(self, column.name)[which] for column in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -161,15 +161,9 @@ class AtiCanSensor(StreamingSensor):
             self._poll()  # the sensor works on the next reading while we work on this one
         reading = codec.decode_gauges(first, second)
         self._judge(reading)
-        gauges = reading.gauges[np.newaxis]
-        return FtSamples(
-            t_host_ns=np.array([t_host_ns], np.int64),
-            t_device_s=np.array([np.nan]),
-            seq=np.array([seq], np.int64),
-            counts=gauges,
-            wrench=self._calibration.wrench(gauges),
-            status=np.array([reading.status], np.uint32),
-        )
+        counts = reading.gauges[np.newaxis]
+        wrench = self._calibration.wrench(counts)
+        return FtSamples.of(t_host_ns, seq, wrench, counts=counts, status=reading.status)
 
     def _poll(self) -> None:
         self._next_poll_s = max(self._next_poll_s + _PERIOD_S, self._clock.now_s())

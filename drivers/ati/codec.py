@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import ProtocolError
+from drivers.interfaces import Array
 
 COUNTS_PER_UNIT_SINCE = (3, 7)
 """First firmware that answers `COUNTS_PER_UNIT` and `UNIT_CODES`; older ones use 1 000 000 for both."""
@@ -90,7 +91,7 @@ def decode_gauges(first: bytes, second: bytes) -> GaugeReading:
     return GaugeReading(status, np.array([g0, g1, g2, g3, g4, g5], dtype=np.int32))
 
 
-def decode_matrix_row(first: bytes, second: bytes, third: bytes) -> NDArray[np.float64]:
+def decode_matrix_row(first: bytes, second: bytes, third: bytes) -> Array:
     """Decode one row (6,) of the calibration matrix, counts per gauge count, columns G0..G5."""
     row = np.array([_unpack(">ff", part, "part of a matrix row") for part in (first, second, third)]).ravel()
     if not np.isfinite(row).all():

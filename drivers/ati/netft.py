@@ -258,15 +258,7 @@ class NetFtSensor(StreamingSensor):
         status = np.array([sample.status for sample in samples], np.uint32)
         self._judge(int(np.bitwise_or.reduce(status)))
         counts = np.array([sample.raw_wrench for sample in samples], np.int32)
-        n = len(samples)
-        return FtSamples(
-            t_host_ns=np.full(n, t_host_ns, np.int64),
-            t_device_s=np.full(n, np.nan),
-            seq=np.array(numbers, np.int64),
-            counts=counts,
-            wrench=counts / self._counts_per_unit,
-            status=status,
-        )
+        return FtSamples.of(t_host_ns, numbers, counts / self._counts_per_unit, counts=counts, status=status)
 
     def _disconnect(self) -> None:
         with self._news:

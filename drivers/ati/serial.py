@@ -152,15 +152,8 @@ class AtiSerialSensor(StreamingSensor):
         if suspect:
             self._look_at_status(t_host_ns)
         refuse_saturated(self.name, gauges)
-        n = len(gauges)
-        return FtSamples(
-            t_host_ns=np.full(n, t_host_ns, np.int64),
-            t_device_s=np.full(n, np.nan),
-            seq=seq.astype(np.int64),
-            counts=gauges,
-            wrench=self._calibration.wrench(gauges),
-            status=np.full(n, self._status, np.uint32),
-        )
+        wrench = self._calibration.wrench(gauges)
+        return FtSamples.of(t_host_ns, seq, wrench, counts=gauges, status=self._status)
 
     def _discard_backlog(self) -> None:
         """The port has overflowed, and there is no telling where a record begins: it is a slip."""

@@ -95,13 +95,11 @@ class BotaSensor(StreamingSensor):
         times = [self._elapse(frame.t_us) for frame in frames]
         status = np.array([frame.status for frame in frames], np.uint32)
         self._judge(int(np.bitwise_or.reduce(status)))
-        n = len(frames)
-        return FtSamples(
-            t_host_ns=np.full(n, t_host_ns, np.int64),
+        return FtSamples.of(
+            t_host_ns,
+            [seq for _, seq in times],
+            [frame.wrench for frame in frames],
             t_device_s=np.array([t_us for t_us, _ in times]) * 1e-6,
-            seq=np.array([seq for _, seq in times], np.int64),
-            counts=np.zeros((n, 0), np.int32),
-            wrench=np.array([frame.wrench for frame in frames]),
             status=status,
         )
 

@@ -81,15 +81,8 @@ class RobotiqFt300(StreamingSensor):
         counts = np.array([codec.decode_frame(frame) for _, frame in frames], np.int32)
         if (np.abs(counts + 0.5) > 32767).any():
             raise DeviceFault(f"{self.name}: a value is at the end of its range", "take the load off, check the cable")
-        n = len(frames)
-        return FtSamples(
-            t_host_ns=np.full(n, t_host_ns, np.int64),
-            t_device_s=np.full(n, np.nan),
-            seq=np.array([number for number, _ in frames], np.int64),
-            counts=counts,
-            wrench=counts / codec.COUNTS_PER_UNIT,
-            status=np.zeros(n, np.uint32),
-        )
+        numbers = [number for number, _ in frames]
+        return FtSamples.of(t_host_ns, numbers, counts / codec.COUNTS_PER_UNIT, counts=counts)
 
     def _disconnect(self) -> None:
         if not self._port.is_open:

@@ -117,12 +117,11 @@ class RobotousSensor(StreamingSensor):
                 f"{self.name}: overload of {', '.join(axes)}", "take the load off, then check the zero of the sensor"
             )
         counts = np.array([sample.counts for sample in samples], np.int32)
-        return FtSamples(
-            t_host_ns=np.array([field.t_host_ns for field in fields], np.int64),
-            t_device_s=np.full(len(fields), np.nan),
-            seq=np.array([field.number for field in fields], np.int64),
+        return FtSamples.of(
+            [field.t_host_ns for field in fields],
+            [field.number for field in fields],
+            counts * self._unit_per_count,
             counts=counts,
-            wrench=counts * self._unit_per_count,
             status=overload,
         )
 

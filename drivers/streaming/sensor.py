@@ -18,14 +18,7 @@ from drivers.streaming.plausibility import DeviceClock, Liveness, Rate
 
 log = logging.getLogger(__name__)
 
-NOTHING = FtSamples(
-    t_host_ns=np.zeros(0, np.int64),
-    t_device_s=np.zeros(0),
-    seq=np.zeros(0, np.int64),
-    counts=np.zeros((0, 0), np.int32),
-    wrench=np.zeros((0, 6)),
-    status=np.zeros(0, np.uint32),
-)
+NOTHING = FtSamples.of([], [], np.zeros((0, 6)))
 """What `_read_block` returns when nothing came in time."""
 
 
@@ -231,10 +224,9 @@ class StreamingSensor(ForceTorqueSensor):
             finally:
                 # by identity: blocks hold arrays, which do not compare
                 self._taps = [tap for tap in self._taps if tap is not blocks]
-            empty = _rows(self._newest, slice(0, 0))
+            empty = self._newest.rows(slice(0, 0))
         samples = FtSamples.concatenate([empty, *blocks])
-        inside = (samples.t_host_ns >= start_ns) & (samples.t_host_ns < end_ns)
-        samples = _rows(samples, inside)
+        samples = samples.rows((samples.t_host_ns >= start_ns) & (samples.t_host_ns < end_ns))
         silence_s = float(np.diff(samples.t_host_ns, prepend=start_ns, append=end_ns).max()) / 1e9
         if silence_s > self._limits.stale_s:
             raise self._stale(silence_s)
@@ -445,7 +437,7 @@ class StreamingSensor(ForceTorqueSensor):
             self._arrivals.append((t_ns, len(block)))
             while self._arrivals[0][0] < t_ns - 1_000_000_000:
                 self._arrivals.popleft()
-            self._newest, self._newest_ns = _rows(block, slice(-1, None)), t_ns
+            self._newest, self._newest_ns = block.rows(slice(-1, None)), t_ns
             if self._failure is not None:
                 # an interruption is over when the device measures, not when it answers
                 self._failure = self._interruption = None
@@ -465,14 +457,14 @@ class StreamingSensor(ForceTorqueSensor):
             self._seq_offset += newest + missed + 1 - int(seq[0])
             self._earlier_lost += missed
             seq = block.seq + self._seq_offset
-        block = FtSamples(block.t_host_ns, block.t_device_s, seq, block.counts, self._sign * block.wrench, block.status)
+        block = replace(block, seq=seq, wrench=self._sign * block.wrench)
         top = np.maximum.accumulate(np.concatenate([[newest], seq[:-1]]))
         newer = seq > top
         if newer.all():
             return block
         self._duplicated += int((seq == top).sum())
         self._out_of_order += int((seq < top).sum())
-        return _rows(block, newer)
+        return block.rows(newer)
 
     def _fresh_rows(self, block: FtSamples, heard_s: float) -> FtSamples:
         """Drop what was measured too long ago: it has waited in this computer, in the device or on its way."""
@@ -485,7 +477,7 @@ class StreamingSensor(ForceTorqueSensor):
         if fresh.all():
             return block
         self._earlier_lost += int((~fresh).sum())
-        return _rows(block, fresh)
+        return block.rows(fresh)
 
     def _not_opened(self, error: DriverError) -> ConnectError:
         """Put the device's name before what a codec says, which knows none."""
@@ -547,14 +539,3 @@ class StreamingSensor(ForceTorqueSensor):
         age_s = self._age_s()
         if age_s > self._limits.stale_s:
             raise self._stale(age_s)
-
-
-def _rows(samples: FtSamples, which: slice | np.ndarray[tuple[int], np.dtype[np.bool_]]) -> FtSamples:
-    return FtSamples(
-        samples.t_host_ns[which],
-        samples.t_device_s[which],
-        samples.seq[which],
-        samples.counts[which],
-        samples.wrench[which],
-        samples.status[which],
-    )

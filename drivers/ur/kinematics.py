@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from math import cos, pi, sin
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from drivers.interfaces import Array
+
+__all__ = ["MODELS", "Array", "Geometry", "Pose", "forward", "model_named"]
 
 _ALPHA_RAD = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
 

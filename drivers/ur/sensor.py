@@ -112,14 +112,7 @@ class UrWristSensor(StreamingSensor):
                 )
             self._lost += seq - self._seq - 1
         self._seq = seq
-        return FtSamples(
-            t_host_ns=np.array([t_host_ns], np.int64),
-            t_device_s=np.array([t_device_s]),
-            seq=np.array([seq], np.int64),
-            counts=np.zeros((1, 0), np.int32),
-            wrench=(np.array(raw) / self._counts_per_unit)[np.newaxis],
-            status=np.zeros(1, np.uint32),
-        )
+        return FtSamples.of(t_host_ns, seq, [np.array(raw) / self._counts_per_unit], t_device_s=t_device_s)
 
     def _disconnect(self) -> None:
         stream, self._stream = self._stream, None

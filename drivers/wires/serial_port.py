@@ -5,6 +5,7 @@ import errno
 import os
 import shlex
 import termios
+from collections.abc import Iterator
 
 import serial
 
@@ -109,21 +110,15 @@ class SerialPort:
 
     def read_marked(self, size: int) -> tuple[bytes, list[int]]:
         """Read like `read`, and tell at which places in it a byte was received with wrong parity or framing."""
-        port = self._open_or_broken()
-        try:
+        with self._in_use() as port:
             data = port.read(size)
-        except (TypeError, *LINK_ERRORS) as exc:  # TypeError: closed under a blocked read
-            raise self._broken(exc) from exc
         return self._undo(data)
 
     def read_all(self, at_least: int) -> bytes:
         """Read `at_least` bytes, or fewer as in `read`, and whatever else has arrived. Raises `StreamBroken`."""
-        port = self._open_or_broken()
-        try:
+        with self._in_use() as port:
             data = port.read(at_least)
             data += port.read(port.in_waiting)
-        except (TypeError, *LINK_ERRORS) as exc:
-            raise self._broken(exc) from exc
         return self._undo(data)[0]
 
     def drain(self, silence_s: float, at_most_s: float) -> None:
@@ -137,23 +132,22 @@ class SerialPort:
 
     def write(self, data: bytes, *, discard: bool = False) -> None:
         """Send bytes, on request after throwing away what has arrived so far. Raises `StreamBroken`."""
-        port = self._open_or_broken()
-        try:
+        with self._in_use() as port:
             if discard:
                 port.reset_input_buffer()
                 if self._marks is not None:
                     self._marks.forget()
             port.write(data)
-        except (TypeError, *LINK_ERRORS) as exc:
-            raise self._broken(exc) from exc
 
     def _undo(self, data: bytes) -> tuple[bytes, list[int]]:
         return (data, []) if self._marks is None else self._marks.undo(data)
 
-    def _open_or_broken(self) -> serial.Serial:
+    @contextlib.contextmanager
+    def _in_use(self) -> Iterator[serial.Serial]:
+        """Give the open port, and raise `StreamBroken` when it is gone."""
         if self._port is None:
-            raise StreamBroken(f"{self._owner}: closed")
-        return self._port
-
-    def _broken(self, exc: Exception) -> StreamBroken:
-        return StreamBroken(f"{self._owner}: the port is gone ({exc})", "plug it in and open it again")
+            raise StreamBroken(f"{self._owner}: the port is closed", "open it first")
+        try:
+            yield self._port
+        except (TypeError, *LINK_ERRORS) as exc:  # TypeError: closed under a blocked read
+            raise StreamBroken(f"{self._owner}: the port is gone ({exc})", "plug it in and open it again") from exc
