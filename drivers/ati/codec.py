@@ -23,7 +23,7 @@ COUNTS_PER_UNIT_SINCE = (3, 7)
 
 
 class Op(IntEnum):
-    """Opcodes this driver sends; an identifier is `base << 4 | opcode`, for request and reply alike."""
+    """Opcodes that this driver sends; an identifier is `base << 4 | opcode`, for request and reply alike."""
 
     GAUGES = 0x0
     MATRIX_ROW = 0x2
@@ -66,7 +66,7 @@ STATUS_BITS: Mapping[int, str] = MappingProxyType(
 )
 WATCHDOG_RESET = 0x0001
 CRITICAL = 0x18FE
-"""Status bits with which the data must not be used. The device keeps sending: the host has to decide."""
+"""Status bits with which the data is unusable. The device keeps sending, so the host has to check them."""
 
 
 class GaugeReading(NamedTuple):
@@ -100,7 +100,7 @@ def decode_matrix_row(first: bytes, second: bytes, third: bytes) -> Array:
 
 
 def decode_text(data: bytes) -> str:
-    """Decode ASCII padded with NUL or spaces; what is not printable shows as ``?``."""
+    """Decode ASCII padded with NUL or spaces; a byte that is not printable becomes ``?``."""
     text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "?" for byte in data.rstrip(b"\0 "))
     return text.strip()
 

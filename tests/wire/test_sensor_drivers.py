@@ -237,7 +237,7 @@ def test_robotiq_unknown_serial_number(start: Start) -> None:
         assert sensor.identify().firmware == "FTS-2.0.1"
 
 
-@pytest.mark.parametrize(("status", "says"), [(2, "overrange"), (4, "invalid"), (8, "no newtons")])
+@pytest.mark.parametrize(("status", "says"), [(2, "overrange"), (4, "invalid"), (8, "not in N")])
 def test_bota_unusable_samples_are_a_fault(start: Start, status: int, says: str) -> None:
     with pytest.raises(DeviceFault, match=says):
         start("bota", status=status).sensor().open()

@@ -409,7 +409,7 @@ def mended(emulator: Emulator, before_s: float) -> list[Watched]:
         sensor.collect(0.1)
         health = sensor.health()
     assert health.reconnects >= 1
-    assert [what for _, what in health.events][-1] == "connected again"
+    assert [what for _, what in health.events][-1] == "reconnected"
     assert (np.diff(watched.samples().seq) >= 1).all()
     return [watched]
 

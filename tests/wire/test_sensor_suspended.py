@@ -148,4 +148,4 @@ def test_nothing_old_after_a_pause(name: str) -> None:
     assert collected[-1] > 0.3 * rows
     assert {line["error"] for line in later if "error" in line} <= {"DeviceTimeout"}
     assert health["stale"] >= 1
-    assert any("thrown away" in what for _, what in health["events"])
+    assert any("dropped" in what for _, what in health["events"])

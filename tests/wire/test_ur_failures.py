@@ -699,7 +699,7 @@ def test_both_processes_killed(station: Station, application: Application, in_ti
     application.process.kill()
     assert station.ask("state")["moving"]  # nobody is left to stop it
     error = refused(station, clock=REAL, timing=STRICT)  # nobody can tell it from a program of somebody else
-    assert "is not ended" in error.found
+    assert "is not stopped" in error.found
     state = station.wait_for(lambda state: not state["moving"])
     assert state["runtime_state"] == "PLAYING"
     station.ask("dashboard-stop")
@@ -781,7 +781,7 @@ def test_a_guard_that_hangs(station: Station, in_time: NewArm) -> None:
         station.wait_for(lambda state: not state["moving"])
 
     q = away(arm)
-    with pytest.raises(DeviceTimeout, match=r"0\.5 s of a move"):
+    with pytest.raises(DeviceTimeout, match=r"0\.5 s"):
         arm.move_to(q, timeout_s=MOVE_S, guard=Once(hang, wait_until_moving(arm)))
     assert abs(arm.state().q_rad[5] - q[5]) > 0.1
     arm.move_to(q, timeout_s=MOVE_S, guard=no_guard)  # and it is still ours

@@ -95,7 +95,7 @@ def use(arm: UrArm, station: Station, polyscope: str, model: str, tcp: str) -> N
             stopping.start()
 
     stopping = threading.Thread(target=arm.stop)
-    with pytest.raises(DeviceFault, match="told to stop"):
+    with pytest.raises(DeviceFault, match="stop was requested"):
         arm.move_to(q.tolist(), timeout_s=30, guard=stop_on_the_way)
     stopping.join()
     assert not station.ask("state")["moving"]

@@ -203,6 +203,6 @@ def test_a_silence_while_halves_come_is_not_the_fault_of_cable_or_supply(monkeyp
 
     monkeypatch.setattr(link._bus, "look", look)
     assert link.receive() == []
-    assert "cannot be paired" in sensor._stale(0.4).fix
+    assert "to be paired" in sensor._stale(0.4).fix
     clock.stall(0.2)
     assert "cable" in sensor._stale(0.4).fix

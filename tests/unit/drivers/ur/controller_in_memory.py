@@ -276,7 +276,7 @@ class ControlInMemory(ControlProcess):
     def _read_replies(self, pipe: object) -> None:
         pass  # a fake clock is for one thread
 
-    def _read_talk(self, pipe: object) -> None:
+    def _log_output(self, pipe: object) -> None:
         pass
 
 

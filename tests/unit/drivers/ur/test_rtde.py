@@ -200,7 +200,7 @@ def test_inputs_of_others_are_told(types: bytes, taken: list[str]) -> None:
     ("replace", "says"),
     [
         ({"V": b""}, "did not answer within 0.2 s"),
-        ({"V": bytes.fromhex("00045600")}, "protocol version 2 is refused"),
+        ({"V": bytes.fromhex("00045600")}, "refuses protocol version 2"),
         ({"V": b"HTTP/1.1 400 Bad Request\r\n"}, "did not answer"),
         ({"V": b"\x00\x01\x00"}, "does not speak RTDE"),
         ({"S": bytes.fromhex("00045300")}, "does not start"),
