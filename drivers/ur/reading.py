@@ -136,7 +136,7 @@ class Reader:
         if major > 5:
             raise ConnectError(
                 f"{self._host} runs PolyScope X (version {major}), which has no dashboard server to stop the arm with",
-                "use a controller with PolyScope 5 or of the CB3 generation",
+                "use a controller of PolyScope 5 or the CB3 generation",
             )
         if lacking:
             raise ConnectError(

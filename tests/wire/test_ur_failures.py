@@ -165,7 +165,7 @@ EVENTS = [
         on("dashboard-stop"),
         nothing,
         DeviceFault,
-        "ended or paused",
+        "stopped or paused",
         hits_opening=False,
     ),
     Event(
@@ -173,10 +173,10 @@ EVENTS = [
         lambda s: s.dashboard("pause"),
         nothing,
         DeviceFault,
-        "ended or paused",
+        "stopped or paused",
         hits_opening=False,
     ),
-    Event("crash-script", on("crash-script"), nothing, DeviceFault, "ended or paused", hits_opening=False),
+    Event("crash-script", on("crash-script"), nothing, DeviceFault, "stopped or paused", hits_opening=False),
     Event(
         "foreign-program",
         another_takes_over,
@@ -624,7 +624,7 @@ def test_an_arm_that_is_not_ready(station: Station, mode: int, fix: str) -> None
 @pytest.mark.parametrize(
     ("what", "found", "fix"),
     [
-        ("rtde", "cannot be reached", "the address and the cable"),
+        ("rtde", "cannot be reached", "address, cable"),
         ("dashboard", "dashboard server", "Settings, Security, Services"),
         ("script", "30003", "Settings, Security, Services"),
     ],
