@@ -59,7 +59,7 @@ class EmulatedWrist:
         return {"host": self._listener.getsockname()[0]}
 
     def reset(self) -> None:
-        """Restart the controller: it hangs up, and its clock begins anew."""
+        """Restart the controller: it hangs up, and its clock restarts."""
         self._controller.stop()
         self._controller = Controller(self._measure, self._clock)
 

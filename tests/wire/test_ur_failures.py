@@ -10,7 +10,7 @@ event                   what is raised    arm                            test of
 ======================  ================  =============================  ==========================================
 protective stop,        `DeviceFault`     stopped by the controller;     `test_in_move`,
 emergency stop,                           what is left of the program    settling and idle: `test_at_rest`;
-safeguard, power lost,                    is ended, so that nobody can   opening: `test_while_opening`;
+safeguard, power lost,                    is ended: no client can       opening: `test_while_opening`;
 brakes closed                             resume it                      closing: `test_while_closing`
 program stopped,        `DeviceFault`     stopped by the controller      the same
 paused or crashed,
@@ -28,11 +28,11 @@ the child killed, hung  `StreamBroken`,   stopped through the dashboard  `test_u
 both killed             -                 finishes its move; its         `test_both_processes_killed`
                                           program is for the operator
                                           to stop
-program of others       `ConnectError`    goes on: nothing of theirs     `test_a_program_of_somebody_else_is_never…`,
+program of others       `ConnectError`    goes on: nothing of theirs     `test_a_program_of_another_client_is_never…`,
 at a start              of the opening    is touched                     `test_a_program_that_took_the_place_of_ours…`
-program of others       `DeviceFault`     goes on: nothing of theirs     `test_a_program_of_somebody_else_found_before…`
+program of others       `DeviceFault`     goes on: nothing of theirs     `test_a_program_of_another_client_found_before…`
 before a move                             is touched
-end told off the goal   `DeviceFault`     stopped                        `test_an_end_told_before_the_goal…`
+end off the goal        `DeviceFault`     stopped                        `test_an_end_before_the_goal…`
 our process suspended   `DeviceTimeout`   stopped by the child           `test_suspended_in_a_move`
 both suspended          as the arm is     finishes its move              `test_both_processes_suspended`
 suspended while idle    -                 stands                         `test_nothing_old_is_believed`
@@ -106,7 +106,7 @@ def release(station: Station) -> None:
 
 
 def cut(station: Station, *, connected: bool) -> None:
-    """Pull all cables, as far as TCP can tell, or plug them in."""
+    """Pull all cables, as TCP sees it, or plug them in."""
     for what in ("rtde", "dashboard", "script"):
         station.ask("listen", what=what, on=connected)
         if not connected:
@@ -132,7 +132,7 @@ class Event:
     error: type[DriverError] | tuple[type[DriverError], ...]
     says: str
     reachable: bool = True
-    """Whether the controller can still be told to stop."""
+    """Whether the controller can still receive a stop."""
     hits_opening: bool = True
     """Whether it matters before a program of ours runs."""
     reported_s: float = REPORTED_S
@@ -333,7 +333,7 @@ def test_at_rest(station: Station, new_arm: NewArm, event: Event) -> None:
         event.fix(station)
         moves_again(arm)
     q = away(arm, 0.05)
-    event.do(station)  # nobody looks
+    event.do(station)  # without a watcher
     with pytest.raises(event.error, match=event.says):
         arm.move_to(q, timeout_s=MOVE_S, guard=no_guard)
     event.fix(station)
@@ -416,13 +416,13 @@ def test_an_old_attempt_to_stop_does_not_end_the_next_move(station: Station, in_
     with pytest.raises(LOST):
         arm.move_to(q, timeout_s=MOVE_S, guard=no_guard)
     station.ask("silent", what="rtde", on=False)
-    station.ask("dashboard-stop")  # somebody else has stopped it meanwhile
+    station.ask("dashboard-stop")  # another client has stopped it meanwhile
     before = len(station.ask("state")["events"])
     threading.Timer(0.8, lambda: station.ask("silent", what="dashboard", on=False)).start()
     moves_again(arm)
     arm.close()
-    told = [event["what"] for event in station.ask("state", since=before)["events"] if event["by"] == "dashboard"]
-    assert "stop" not in told
+    sent = [event["what"] for event in station.ask("state", since=before)["events"] if event["by"] == "dashboard"]
+    assert "stop" not in sent
 
 
 @slow
@@ -439,9 +439,7 @@ def test_a_slider_at_zero(station: Station, arm: UrArm) -> None:
 
 
 @slow
-def test_an_end_told_before_the_goal_is_no_arrival(
-    station: Station, arm: UrArm, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_end_before_the_goal_is_no_arrival(station: Station, arm: UrArm, monkeypatch: pytest.MonkeyPatch) -> None:
     where, q = arm.state().q_rad, away(arm)
     station.ask("slider", fraction=0.0)
     call = ControlProcess.call
@@ -485,12 +483,12 @@ def test_a_new_arm_moves_after_a_protective_stop(station: Station, arm: UrArm, n
 
 
 @slow
-def test_a_program_of_somebody_else_is_not_stopped_by_leaving(
+def test_a_program_of_another_client_is_not_stopped_by_leaving(
     station: Station, arm: UrArm, caplog: pytest.LogCaptureFixture
 ) -> None:
     another_takes_over(station)
     arm.close()
-    assert "left alone" in caplog.text
+    assert "is not stopped" in caplog.text
     assert plays_another(station)
     arm.open()  # reading is fine
     arm.state()
@@ -498,7 +496,7 @@ def test_a_program_of_somebody_else_is_not_stopped_by_leaving(
 
 
 @slow
-def test_a_program_of_somebody_else_found_before_a_move_is_left_alone(station: Station, arm: UrArm) -> None:
+def test_a_program_of_another_client_found_before_a_move_is_left_alone(station: Station, arm: UrArm) -> None:
     q = away(arm)
     another_takes_over(station)
     with pytest.raises(DeviceFault, match="does not answer: another program"):
@@ -523,7 +521,7 @@ def test_a_program_that_cannot_be_asked_is_ended_by_leaving(
 
 @slow
 @pytest.mark.parametrize("paused", [False, True], ids=["playing", "paused"])
-def test_a_program_of_somebody_else_is_never_ended_for_a_start(station: Station, paused: bool) -> None:
+def test_a_program_of_another_client_is_never_ended_for_a_start(station: Station, paused: bool) -> None:
     q = station.ask("state")["q_rad"]
     q[5] += -STEP_RAD if q[5] > 0.5 else STEP_RAD
     station.ask("foreign-program", q_rad=q, speed_rad_s=0.5 / TIME_SCALE)
@@ -533,7 +531,7 @@ def test_a_program_of_somebody_else_is_never_ended_for_a_start(station: Station,
         station.wait_for(lambda state: state["runtime_state"] == "PAUSED")
     before = len(station.ask("state")["events"])
     error = refused(station)
-    assert re.search(r"\((PLAYING|PAUSED) .*\) and is not ended", error.found)
+    assert re.search(r"\((PLAYING|PAUSED) .*\) and is not stopped", error.found)
     assert "stop it at the pendant" in error.fix
     state = station.ask("state", since=before)
     assert not [event for event in state["events"] if event["by"] in ("script port", "program")]
@@ -557,7 +555,7 @@ def test_a_program_that_took_the_place_of_ours_is_not_ended_when_the_arm_is_open
 @slow
 def test_what_runs_after_ours_was_seen_to_have_ended_is_not_ours(station: Station, arm: UrArm) -> None:
     assert arm._control is not None
-    os.kill(arm._control.pid, signal.SIGKILL)  # so that nobody can ask it whose program it runs
+    os.kill(arm._control.pid, signal.SIGKILL)  # so that it cannot be asked whose program it runs
     station.wait_for(lambda _: arm._control is not None and not arm._control.alive)
     station.ask("dashboard-stop")
     arm.open()
@@ -697,8 +695,8 @@ def application(station: Station, tmp_path: Path) -> Iterator[Application]:
 def test_both_processes_killed(station: Station, application: Application, in_time: NewArm) -> None:
     os.kill(application.child, signal.SIGKILL)
     application.process.kill()
-    assert station.ask("state")["moving"]  # nobody is left to stop it
-    error = refused(station, clock=REAL, timing=STRICT)  # nobody can tell it from a program of somebody else
+    assert station.ask("state")["moving"]  # no process is left to stop it
+    error = refused(station, clock=REAL, timing=STRICT)  # it cannot be distinguished from another program
     assert "is not stopped" in error.found
     state = station.wait_for(lambda state: not state["moving"])
     assert state["runtime_state"] == "PLAYING"
@@ -766,8 +764,8 @@ def test_nothing_old_is_believed(station: Station, arm: UrArm) -> None:
         watcher.stdin.write("\n")  # it is asked the moment it wakes up, with seconds of old samples in its sockets
         watcher.stdin.flush()
         os.kill(watcher.pid, signal.SIGCONT)
-        told = [float(word) for word in watcher.stdout.readline().split()]
-        assert told == pytest.approx([q[5], q[5]], abs=1e-3)
+        q_rad = [float(word) for word in watcher.stdout.readline().split()]
+        assert q_rad == pytest.approx([q[5], q[5]], abs=1e-3)
     finally:
         watcher.kill()
         watcher.communicate()

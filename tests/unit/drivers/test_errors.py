@@ -1,4 +1,4 @@
-"""The errors of the drivers: what is in them, and that nothing of it is lost on the way to whoever tells it."""
+"""The errors of the drivers: their parts, which survive copies and conversions."""
 
 import copy
 import pickle

@@ -253,8 +253,8 @@ def test_error_bit_that_nothing_critical_explains_is_no_damage(
     table: Table, status: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Such as of a NETCANOEM whose CAN side is not connected."""
-    told = read_reply(status.to_bytes(2, "big"))
-    with table.serial(start_up(None, told, stream=flagged(BATCH))) as wire, Sensor(wire.clock) as sensor:
+    status_reply = read_reply(status.to_bytes(2, "big"))
+    with table.serial(start_up(None, status_reply, stream=flagged(BATCH))) as wire, Sensor(wire.clock) as sensor:
         samples = sensor.collect(0.1)
         assert (samples.status == status).all()
         assert (samples.counts == COUNTS).all()

@@ -196,7 +196,7 @@ def test_silence_is_a_timeout_never_an_old_value(sensor: FakeSensor) -> None:
         sensor.latest(timeout_s=0.5)
     assert sensor.time.now_s() - begin_s == pytest.approx(0.5, abs=READ_S + 1e-3)
     sensor.at(0.1, 1)
-    assert sensor.latest(timeout_s=1.0).seq[0] == 1  # fresh again: silence is judged anew
+    assert sensor.latest(timeout_s=1.0).seq[0] == 1  # fresh again: silence counts from now
     sensor.check()
 
 
@@ -236,15 +236,15 @@ def test_more_samples_than_a_collect_may_hold_is_an_error() -> None:
 
 
 def test_what_the_device_does_not_report_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    told = Fact((100.0,) * 6, "device")
+    rating = Fact((100.0,) * 6, "device")
     fake = FakeSensor(sign=-1)
-    monkeypatch.setattr(fake, "_connect", lambda: DeviceInfo("fake", NOT_REPORTED, "1.0", {"range": told}))
+    monkeypatch.setattr(fake, "_connect", lambda: DeviceInfo("fake", NOT_REPORTED, "1.0", {"range": rating}))
     fake.feed.append(1)
     fake.configured = {"serial": Fact("F7", "configured")}
     with fake:
         info = fake.identify()
     assert info.serial == "F7"
-    assert info.facts == {"serial": Fact("F7", "configured"), "range": told, "sign": Fact(-1, "configured")}
+    assert info.facts == {"serial": Fact("F7", "configured"), "range": rating, "sign": Fact(-1, "configured")}
     assert json.loads(json.dumps(asdict(info)))["facts"]["range"] == {"value": [100.0] * 6, "source": "device"}
 
 
@@ -489,7 +489,7 @@ def test_what_has_piled_up_while_the_computer_slept_is_never_delivered() -> None
     clock = AsleepClock()
     with FakeSensor(clock=clock) as sensor:
         sensor.stream(1, 0.005)
-        told: list[str] = []
+        errors: list[str] = []
 
         def sleep() -> None:
             clock.asleep_s = 3600.0
@@ -498,7 +498,7 @@ def test_what_has_piled_up_while_the_computer_slept_is_never_delivered() -> None
         clock.at(0.1, sleep)
         with pytest.raises(DeviceTimeout) as caught:
             sensor.collect(5.0)
-        told.append(str(caught.value))
+        errors.append(str(caught.value))
         newest = sensor.latest(timeout_s=2.0)
         assert newest.seq[0] > 1000
         assert 10 < len(sensor.collect(0.1)) < 25
@@ -507,11 +507,11 @@ def test_what_has_piled_up_while_the_computer_slept_is_never_delivered() -> None
     assert health.stale == 1
     ((_, what),) = health.events
     assert "3600" in what
-    assert "3600" in told[0]
+    assert "3600" in errors[0]
 
 
 class TestAway:
-    """Somebody else had the computer: `_take_turn` comes late, and finds what has piled up."""
+    """Other programs had the computer: `_take_turn` comes late, and finds accumulated samples."""
 
     def test_a_third_of_a_second_is_the_limit(self, sensor: FakeSensor) -> None:
         sensor.time.stall(0.29)
@@ -786,7 +786,7 @@ class TestRecover:
         sensor.feed.append(sensor.block([40]))
         sensor.settle()
         before = sensor.latest(timeout_s=0.0)
-        sensor.seq = 0  # the device counts anew
+        sensor.seq = 0  # the device restarts its count
         sensor.at(0.1, StreamBroken("gone"))
         sensor.time.advance(0.2)
         after = sensor.latest(timeout_s=0.0)

@@ -395,7 +395,7 @@ def test_a_safety_stop_is_the_reason_of_an_ended_program(arm: UrArm, controller:
     with pytest.raises(DeviceFault, match="protective stop"):
         move(arm, controller, provoke)
     assert provoke.ago_s() < 0.1
-    assert controller.did[-1] == "dashboard stop"  # nobody can resume what is left
+    assert controller.did[-1] == "dashboard stop"  # the rest cannot be resumed
 
 
 # ---------------------------------------------------------------------- stopping
