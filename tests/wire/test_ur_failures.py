@@ -10,7 +10,7 @@ event                   what is raised    arm                            test of
 ======================  ================  =============================  ==========================================
 protective stop,        `DeviceFault`     stopped by the controller;     `test_in_move`,
 emergency stop,                           what is left of the program    settling and idle: `test_at_rest`;
-safeguard, power lost,                    is ended: no client can       opening: `test_while_opening`;
+safeguard, power lost,                    is ended: no client can        opening: `test_while_opening`;
 brakes closed                             resume it                      closing: `test_while_closing`
 program stopped,        `DeviceFault`     stopped by the controller      the same
 paused or crashed,
@@ -30,7 +30,7 @@ both killed             -                 finishes its move; its         `test_b
                                           to stop
 program of others       `ConnectError`    goes on: nothing of theirs     `test_a_program_of_another_client_is_never…`,
 at a start              of the opening    is touched                     `test_a_program_that_took_the_place_of_ours…`
-program of others       `DeviceFault`     goes on: nothing of theirs     `test_a_program_of_another_client_found_before…`
+program of others       `DeviceFault`     goes on: nothing of theirs     `…_of_another_client_found_before…`
 before a move                             is touched
 end off the goal        `DeviceFault`     stopped                        `test_an_end_before_the_goal…`
 our process suspended   `DeviceTimeout`   stopped by the child           `test_suspended_in_a_move`
