@@ -1,14 +1,15 @@
-"""Time as the drivers measure it: one object that is given to everything that waits or judges an age.
+"""The clock of the drivers: one object, passed to everything that waits or judges an age.
 
-`REAL` is the computer's own clock. An emulated cell has a clock of its own that waits for a starved reader, and tests
-have one that moves only when they say so. No module of `drivers` calls `time.monotonic` or `time.sleep` itself.
+`REAL` is the computer's own clock. The clock of an emulated cell waits for a starved reader. The clock of a test moves
+only when the test moves it. No module of `drivers` calls `time.monotonic` or `time.sleep` itself.
 """
 
 import sys
+import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from typing import Protocol
 
 
@@ -23,11 +24,11 @@ class Clock(ABC):
     """A monotonic clock and the ways to wait on it. Every method may be called from any thread."""
 
     emulated = False
-    """Whether the cell is emulated: then only the far side's own time may run out, never that of the computer."""
+    """Whether the cell is emulated: then limits hold in the cell's time, never in that of the computer."""
 
     @property
     def poll_s(self) -> float:
-        """How long one read may block in real time; an emulated cell stands still meanwhile."""
+        """The longest that one read may block, in real time; the time of an emulated cell stands still meanwhile."""
         return 0.005 if self.emulated else 0.05
 
     @abstractmethod
@@ -39,17 +40,17 @@ class Clock(ABC):
         return self.now_ns() / 1e9
 
     def awake_s(self) -> float:
-        """Return seconds of a clock that also counts while the computer sleeps; silence is judged by it."""
+        """Return seconds of a clock that also counts while the computer sleeps. It measures silence."""
         return self.now_s()
 
     @abstractmethod
     def sleep(self, duration_s: float) -> None:
-        """Return after `duration_s` seconds, at once where that is not positive."""
+        """Return after `duration_s` seconds, or at once where that is not positive."""
 
     def looks(self, duration_s: float) -> Iterator[float]:
-        """Yield how many seconds are left of `duration_s`, and 0 for a last look when they are over.
+        """Yield how many seconds of `duration_s` are left, and finally 0.
 
-        So what has come in time is found, however late this thread is.
+        The last turn finds what arrived in time, however late this thread is.
         """
         end_ns = self.now_ns() + round(duration_s * 1e9)
         while (left_ns := end_ns - self.now_ns()) > 0:
@@ -63,15 +64,15 @@ class Clock(ABC):
     def keeping_up(self) -> AbstractContextManager[object]:
         """Mark a block whose thread must see time pass in small steps, such as the loop that reads a stream.
 
-        While the block runs, an emulated cell's time goes on by at most some milliseconds between two calls of this
-        clock in this thread. A real clock waits for no thread.
+        Between two calls of this clock in this thread, the time of an emulated cell advances by some milliseconds at
+        most. A real clock waits for no thread.
         """
         return nullcontext()
 
     def away(self) -> AbstractContextManager[object]:
-        """Mark a block whose thread waits for something that does not call this clock, such as a web server's answer.
+        """Mark a block in which a thread that keeps up waits for something else, such as the answer of a web server.
 
-        An emulated cell's time does not wait for the thread meanwhile, although it keeps up before and after.
+        The time of an emulated cell does not wait for the thread meanwhile.
         """
         return nullcontext()
 
@@ -99,3 +100,37 @@ class RealClock(Clock):
 
 
 REAL = RealClock()
+
+
+class Follower(threading.Thread):
+    """A daemon thread whose `work` keeps up with `clock`.
+
+    `start` returns once an emulated cell's time waits for the thread, so that nothing is timed before. It raises what
+    `Clock.keeping_up` raises.
+    """
+
+    def __init__(self, clock: Clock, work: Callable[[], None], name: str) -> None:
+        super().__init__(name=name, daemon=True)
+        self._clock = clock
+        self._work = work
+        self._decided = threading.Event()
+        self._refusal: Exception | None = None
+
+    def start(self) -> None:
+        """Start the thread and wait until it keeps up."""
+        super().start()
+        self._decided.wait()
+        if self._refusal is not None:
+            raise self._refusal
+
+    def run(self) -> None:
+        """Keep up and work; called in the thread."""
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(self._clock.keeping_up())
+            except Exception as error:
+                self._refusal = error
+                return
+            finally:
+                self._decided.set()
+            self._work()

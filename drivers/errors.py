@@ -3,23 +3,23 @@
 DriverError
 ├── ConnectError      the device could not be opened, or is not what it should be
 │   ├── PortInUse     another program has its port
-│   ├── Unreachable   nobody answers at its address
-│   ├── ModelUnknown  an arm does not tell which model it is, and nobody else has
+│   ├── Unreachable   nothing answers at its address
+│   ├── ModelUnknown  an arm does not report its model, and none is configured
 │   └── NoDashboard   the dashboard server of an arm does not answer, or refuses
 ├── StreamBroken      the connection was lost after it had worked
 ├── DeviceTimeout     nothing arrived in time (also a TimeoutError)
 ├── ProtocolError     bytes arrived that the document does not allow
 └── DeviceFault       the device itself reports a fault: sensor status, protective or emergency stop
-    └── Frozen        a sensor says the same again and again
+    └── Frozen        a sensor repeats one reading
 
-Every error says in `found` what happened, with the value, and in `cure` what to do next, where the driver knows it; its
-text is "found; cure", without capital and full stop. One that is raised anew as another kind keeps its cure.
+`found` is what happened, with the value. `fix` starts with a verb and is what to do next, where the driver knows it.
+The text of an error is "found; fix", without capital and full stop. A conversion to another class keeps the fix.
 """
 
 from typing import Final
 
-UNUSABLE: Final = "its data must not be used: check load, supply and cable, then power it off and on"
-"""What follows from a critical status."""
+UNUSABLE: Final = "discard its data, check load, supply and cable, then power it off and on"
+"""The fix for a critical status."""
 
 
 class DriverError(Exception):
@@ -29,14 +29,14 @@ class DriverError(Exception):
     ----------
     found
         What happened, with the value.
-    cure
+    fix
         What to do next; empty where the driver does not know.
     """
 
-    def __init__(self, found: str, cure: str = "") -> None:
-        super().__init__(f"{found}; {cure}" if cure else found)  # one argument: two would be those of an `OSError`
+    def __init__(self, found: str, fix: str = "") -> None:
+        super().__init__(f"{found}; {fix}" if fix else found)  # one argument: two would be those of an `OSError`
         self.found = found
-        self.cure = cure
+        self.fix = fix
 
 
 class ConnectError(DriverError):
@@ -48,11 +48,11 @@ class PortInUse(ConnectError):
 
 
 class Unreachable(ConnectError):
-    """Nobody answers at the address of the device."""
+    """Nothing answers at the address of the device."""
 
 
 class ModelUnknown(ConnectError):
-    """An arm does not tell which model it is, and nobody else has."""
+    """An arm does not report its model, and none is configured."""
 
 
 class NoDashboard(ConnectError):
@@ -76,4 +76,4 @@ class DeviceFault(DriverError):
 
 
 class Frozen(DeviceFault):
-    """A sensor says the same again and again, and one that measures has noise."""
+    """A sensor repeats one reading, although a sensor that measures has noise."""

@@ -1,50 +1,49 @@
-"""The two things a cell has: an arm and a wrist force/torque sensor.
+"""The two devices of a cell: an arm and a wrist force/torque sensor.
 
-Constructors only store configuration; `open` talks to the device and `close` is safe at any time, twice, and after the
-device is gone. Every wait has a time-out. An old value is never returned: stale data is an error.
+A constructor only stores the configuration. `open` connects to the device. `close` is safe at any time, twice, and
+after the device is gone. Every wait has a time-out. Stale data is an error and is never returned.
 """
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Final, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drivers.errors import DeviceFault
 
 Array = NDArray[np.float64]
 
 Guard = Callable[[], None]
-"""Called between two looks at the arm; raises when the motion must not go on."""
+"""Called between two samples of the arm; raises when the motion must not go on."""
 
 
 NOT_REPORTED: Final = "not reported"
-"""What stands for a serial number or a firmware version that a device does not tell."""
+"""Stands for a serial number or a firmware version that a device does not report."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """Something known about a device, and from where."""
+    """A property of a device, and its source."""
 
     value: float | str | tuple[float, ...]
     source: Literal["device", "documented", "configured", "assumed"]
-    """Told by the device, fixed by its manual, given by the user, or none of these: to be checked."""
+    """Reported by the device, fixed by its manual, set by the user, or assumed: check it."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """Who a device says it is, and what is known of it."""
+    """What a device reports about itself, and what is known about it otherwise."""
 
     model: str
     serial: str
     firmware: str
     facts: dict[str, Fact] = field(default_factory=dict)
-    """Of a sensor: `serial`; `counts_per_N` and `counts_per_Nm`, the scale of the device's own numbers; `range`, (6,)
-    the largest force in N and torque in N·m on each axis of the sensor, either way; `sign`, 1 or -1. What is not known
-    is not there."""
+    """Of a sensor, as far as known: `serial`; `counts_per_N` and `counts_per_Nm`, the scale of the device's numbers;
+    `range`, (6,) the largest force in N and torque in N·m on each axis, in both directions; `sign`, 1 or -1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +58,7 @@ class FtSamples:
     t_device_s: Array
     """(n,) the device's own clock, own epoch; NaN where it has none. Never subtract it from host time."""
     seq: NDArray[np.int64]
-    """(n,) counts every sample the device sent or was asked for, so that gaps are visible."""
+    """(n,) numbers every sample that the device sent or was polled for, so that gaps are visible."""
     counts: NDArray[np.int32]
     """(n, k) raw device counts; k = 0 where the device reports physical units."""
     wrench: Array
@@ -72,47 +71,68 @@ class FtSamples:
         return len(self.t_host_ns)
 
     @classmethod
-    def concatenate(cls, blocks: Sequence["FtSamples"]) -> "FtSamples":
-        """Join blocks in the order given."""
+    def of(
+        cls,
+        t_host_ns: ArrayLike,
+        seq: ArrayLike,
+        wrench: ArrayLike,
+        *,
+        counts: ArrayLike | None = None,
+        t_device_s: ArrayLike = math.nan,
+        status: ArrayLike = 0,
+    ) -> Self:
+        """Build n samples from `wrench` (n, 6). Where all rows share a value, it may be a single number."""
+        n = len(wrench := np.asarray(wrench, np.float64))
         return cls(
-            *(
-                np.concatenate([getattr(block, name) for block in blocks])
-                for name in ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
-            )
+            t_host_ns=np.full(n, t_host_ns, np.int64),
+            t_device_s=np.full(n, t_device_s, np.float64),
+            seq=np.full(n, seq, np.int64),
+            counts=np.zeros((n, 0), np.int32) if counts is None else np.asarray(counts, np.int32),
+            wrench=wrench,
+            status=np.full(n, status, np.uint32),
         )
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence[Self]) -> Self:
+        """Join blocks in the order given."""
+        return cls(*(np.concatenate([getattr(block, column.name) for block in blocks]) for column in fields(cls)))
+
+    def rows(self, which: slice | NDArray[np.bool_]) -> Self:
+        """Select samples."""
+        return type(self)(*(getattr(self, column.name)[which] for column in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What a stream has been through since it was opened."""
+    """Counters of a stream since it was opened."""
 
     received: int
     lost: int
-    """Samples the device sent, or was asked for, that never arrived, or too late to be new."""
+    """Samples that the device sent or was polled for and that never arrived, or arrived too late."""
     malformed: int
-    """Frames that arrived damaged and were thrown away."""
+    """Frames that arrived damaged and were dropped."""
     rate_Hz: float
     """Over the last second."""
     age_s: float
     """Since the newest sample."""
     duplicated: int = 0
-    """Frames or samples that came twice; one of them was kept."""
+    """Frames or samples that arrived twice; one of them was kept."""
     out_of_order: int = 0
-    """Samples that came after a newer one and were thrown away; `lost` counts them too."""
+    """Samples that arrived after a newer one and were dropped; `lost` counts them too."""
     stale: int = 0
-    """Silences longer than the stream allows, also while nobody read, after which samples came again."""
+    """Silences longer than the stream allows, after which samples came again; also while the driver did not read."""
     reconnects: int = 0
-    """Interruptions the driver has mended by itself; only where `recover` was asked for."""
+    """Interruptions after which the driver reconnected by itself; only with `recover`."""
     nominal_rate_Hz: float = math.nan
-    """What the device says or documents about its rate; NaN where it does not."""
+    """The rate that the device reports or its manual fixes; NaN where unknown."""
     events: tuple[tuple[int, str], ...] = ()
-    """(`t_host_ns`, what happened): interruptions, reconnections, pauses in which nobody read, late samples, a wrong
-    rate and when it was right again. A recording stores them."""
+    """(`t_host_ns`, what happened): interruptions, reconnections, pauses of the reader, late samples, start and end of
+    a wrong rate. A recording stores them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmState:
-    """One look at the arm. The flange is the mechanical flange, whatever TCP is active."""
+    """One sample of the arm. The flange is the mechanical flange, whatever TCP is active."""
 
     t_host_ns: int
     t_device_s: float
@@ -128,7 +148,7 @@ class ArmState:
 
 @dataclass(frozen=True, slots=True)
 class ArmStatus:
-    """What a controller says of itself, all in one moment. None where this controller does not tell."""
+    """What a controller reports about itself in one sample. None where it does not report a value."""
 
     t_host_ns: int
     t_device_s: float
@@ -137,15 +157,15 @@ class ArmStatus:
     safety_mode: str
     """Such as "normal", "reduced", "protective stop"."""
     program: str
-    """"stopped", "playing", "paused", or on the way to one of them; ours plays too while the arm is controlled."""
+    """"stopped", "playing", "paused", or a transition to one of them. Our control program plays too."""
     fault: DeviceFault | None
-    """Why the arm may not move, and what the operator has to do; None when nothing forbids it. Told, not raised."""
+    """Why the arm may not move, and what the operator has to do; None where it may. Returned, not raised."""
     speed_slider: float
     """0 to 1, as set at the pendant or by a program."""
     speed_scaling: float
-    """0 to 1, how much of the programmed speed the controller allows at this moment."""
+    """0 to 1, the fraction of the programmed speed that the controller allows now."""
     payload_kg: float | None
-    """What the controller was told to hang on the flange."""
+    """The payload that is configured in the controller."""
     p_flange_payload_m: tuple[float, ...] | None
     """(3,) centre of mass of that payload."""
     tcp_offset: tuple[float, ...] | None
@@ -166,11 +186,11 @@ class Finding:
 class _Device(ABC):
     @abstractmethod
     def close(self) -> None:
-        """Let the device go. Idempotent; never raises on a lost device."""
+        """Disconnect. Idempotent; never raises on a lost device."""
 
     @abstractmethod
     def identify(self) -> DeviceInfo:
-        """Tell model, serial number and firmware, as read when the device was opened."""
+        """Return model, serial number and firmware, as read when the device was opened."""
 
 
 class ForceTorqueSensor(_Device):
@@ -180,28 +200,28 @@ class ForceTorqueSensor(_Device):
     def open(self) -> None:
         """Connect and start the stream. Raises `ConnectError`.
 
-        Does nothing while there is a stream; opens one that has ended anew.
+        Does nothing while there is a stream; reopens one that has ended.
         """
 
     @abstractmethod
     def collect(self, duration_s: float) -> FtSamples:
-        """Every sample received in the `duration_s` seconds that begin with this call.
+        """Return every sample received in the `duration_s` seconds that begin with this call.
 
-        Raises `StreamBroken`, `DeviceTimeout` or `DeviceFault` as soon as the stream fails, never later than half a
-        second after the end; never a result with missing time.
+        Raises `StreamBroken`, `DeviceTimeout` or `DeviceFault` as soon as the stream fails, at most 0.5 s after the
+        end. A result never has missing time.
         """
 
     @abstractmethod
     def latest(self, *, timeout_s: float) -> FtSamples:
-        """The newest sample (one row), waiting up to `timeout_s` for one that is fresh. Never an old value."""
+        """Return the newest sample (one row); wait up to `timeout_s` for one that is not stale."""
 
     @abstractmethod
     def check(self) -> None:
-        """Raise the stream's failure, if it has one: broken, silent for too long, or a critical device status."""
+        """Raise the stream's failure, if it has one: broken, stale, or a critical device status."""
 
     @abstractmethod
     def health(self) -> Health:
-        """Counters since `open`."""
+        """Return the counters since `open`."""
 
     def __enter__(self) -> Self:
         self.open()
@@ -216,32 +236,31 @@ class RobotArm(_Device):
 
     @abstractmethod
     def open(self, *, control: bool = False) -> None:
-        """Connect, read-only unless `control` is asked for. Idempotent. Raises `ConnectError`.
+        """Connect, read-only unless `control` is requested. Idempotent. Raises `ConnectError`.
 
-        Taking control ends no program that somebody else has on the controller: that is a `ConnectError`.
+        It never stops a program of another client: while one is on the controller, taking control is a `ConnectError`.
         """
 
     @abstractmethod
     def state(self) -> ArmState:
-        """Read a fresh, consistent state; raises `DeviceTimeout` when the controller's clock stands still.
+        """Read a new, consistent state; raises `DeviceTimeout` when the controller's clock stands still.
 
         From any thread, also while `move_to` runs in another.
         """
 
     @abstractmethod
     def status(self) -> ArmStatus:
-        """Tell the controller's modes and settings. Quick; from any thread, whatever else the arm does in another.
+        """Return the controller's modes and settings. Quick; from any thread, whatever the arm does in another.
 
-        Never older than the last tenth of a second; raises `DeviceTimeout` or `StreamBroken` instead, `ConnectError`
-        while it is not open.
+        Never older than 0.1 s; otherwise raises `DeviceTimeout` or `StreamBroken`. Raises `ConnectError` while closed.
         """
 
     def in_remote_control(self) -> bool | None:
-        """Whether the controller takes programs from the network; None where there is no such switch."""
+        """Return whether the controller accepts programs from the network; None where it has no such switch."""
         return None
 
     def reported_program(self) -> str | None:
-        """What the controller calls the program it runs, in its own words; None where it does not tell."""
+        """Return the program that runs, as the controller reports it; None where it does not."""
         return None
 
     def diagnose(self) -> list[Finding]:
@@ -267,9 +286,9 @@ class RobotArm(_Device):
     ) -> None:
         """Move all joints to `q_rad` (6,) and return when they have arrived.
 
-        Speed and acceleration are those of the leading joint; None takes what was given at construction.
-        `guard` is called at least 20 times a second while the arm moves. Whatever ends the wait early (an exception
-        of the guard, a fault, the time-out, Ctrl-C) stops the arm first and is raised after.
+        Speed and acceleration are those of the leading joint; None takes those of the constructor. `guard` is called at
+        least 20 times a second while the arm moves. Whatever ends the wait early (an exception of the guard, a fault,
+        the time-out, Ctrl-C) stops the arm first and is raised afterwards.
         """
 
     @abstractmethod
@@ -278,4 +297,4 @@ class RobotArm(_Device):
 
     @abstractmethod
     def stop(self) -> None:
-        """Stop the arm. From any thread, any time; does nothing without control."""
+        """Stop the arm. From any thread, at any time; does nothing without control."""

@@ -1,11 +1,11 @@
 """From the address of a sensor to its driver: ``ati-can://can0?bitrate=250000``.
 
-The part before ``://`` chooses the driver, which is imported only then; the middle says where the device is; what
-follows the question mark are the driver's options. Anything unknown is an error.
+The part before ``://`` selects the driver, which is imported only then. The middle is the port, bus or host of the
+device. The driver's options follow the question mark. Anything unknown is an error.
 
-Another package adds drivers by entry points, without a change here: ``scheme = "package.module:Class"`` in the group
-``ftdrive.sensors``, where the class has a `from_url` like those of this project, and ``name = "package.module:Class"``
-in the group ``ftdrive.arms``. What this project brings itself cannot be replaced that way.
+Another package adds drivers by entry points: ``scheme = "package.module:Class"`` in the group ``ftdrive.sensors``,
+where the class has a `from_url` like those of this project, and ``name = "package.module:Class"`` in the group
+``ftdrive.arms``. An entry point cannot replace a driver of this project.
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ SENSORS: Mapping[str, str] = MappingProxyType(
 ARMS: Mapping[str, str] = MappingProxyType({"ur": "drivers.ur.arm:UrArm"})
 
 _EXTRAS: Mapping[str, str] = MappingProxyType({"pynetft": "netft"})
-"""Which optional part of ftdrive brings a library."""
+"""The optional part of ftdrive that installs a library."""
 
 _EXAMPLES = (
     "ati-can://can0?bitrate=250000&base=0x20",
@@ -45,11 +45,11 @@ _EXAMPLES = (
 
 
 class BadUrl(ValueError):
-    """An address no driver understands: a mistake in the configuration, not of the device."""
+    """An address that no driver understands: an error in the configuration, not in the device."""
 
 
 class Options:
-    """The options of one address; remembers which ones a driver asked for."""
+    """The options of one address; records which ones a driver has read."""
 
     def __init__(self, url: str, query: str) -> None:
         self._url = url
@@ -57,26 +57,26 @@ class Options:
         try:
             pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if query else []
         except ValueError as exc:
-            raise BadUrl(f"{url}: options are key=value, joined by &") from exc
+            raise BadUrl(f"{url}: the options cannot be read; write them as key=value, joined by &") from exc
         self._given = dict(pairs)
         if len(self._given) < len(pairs):
-            raise BadUrl(f"{url}: an option is given twice")
+            raise BadUrl(f"{url}: an option is given twice; remove one")
 
     def text(self, key: str, default: str) -> str:
-        """Take an option as it stands."""
+        """Return an option as text."""
         self._asked.add(key)
         value = self._given.get(key, default)
         if not value:
-            raise BadUrl(f"{self._url}: option '{key}' is empty")
+            raise BadUrl(f"{self._url}: option '{key}' is empty; give it a value or leave it out")
         return value
 
     def optional(self, key: str) -> str | None:
-        """Take an option as it stands; None where it is not given."""
+        """Return an option as text; None where it is not given."""
         self._asked.add(key)
         return self.text(key, "") if key in self._given else None
 
     def integer(self, key: str, default: int, lowest: int, highest: int) -> int:
-        """Take an option as a number, decimal or 0x hexadecimal."""
+        """Return an option as a number, decimal or 0x hexadecimal."""
         text = self.text(key, str(default))
         try:
             value = int(text, 0)
@@ -87,7 +87,7 @@ class Options:
         return value
 
     def positive(self, key: str, why: str) -> float:
-        """Take an option that must be given, as a positive number; `why` tells the user where to get it."""
+        """Return a required option as a positive number; the error ends with `why`, its source."""
         if key not in self._given:
             raise BadUrl(f"{self._url}: option '{key}' is missing: {why}")
         text = self.text(key, "")
@@ -100,7 +100,7 @@ class Options:
         return value
 
     def configured(self) -> dict[str, Fact]:
-        """Take what may be said of any sensor that does not say it itself: `serial` and `range`."""
+        """Return what the user may configure for any sensor: `serial` and `range`."""
         facts = {}
         if "serial" in self._given:
             facts["serial"] = Fact(self.text("serial", ""), "configured")
@@ -114,15 +114,15 @@ class Options:
                 numbers = [numbers[0]] * 3 + [numbers[1]] * 3
             if len(numbers) != 6 or not all(isfinite(number) and number > 0 for number in numbers):
                 raise BadUrl(
-                    f"{self._url}: option 'range' is '{text}'; it is the largest force in N and torque in N·m, such as "
-                    f"300,30 or 300,300,500,30,30,20"
+                    f"{self._url}: option 'range' is '{text}'; give the largest force in N and torque in N·m, such as "
+                    "300,30 or 300,300,500,30,30,20"
                 )
             facts["range"] = Fact(tuple(numbers), "configured")
         self._asked |= {"serial", "range"}
         return facts
 
     def reject_others(self) -> None:
-        """Refuse options that nobody asked for."""
+        """Reject options that the driver has not read."""
         if unknown := sorted(self._given.keys() - self._asked):
             known = ", ".join(sorted(self._asked)) or "none"
             raise BadUrl(f"{self._url}: unknown option {', '.join(unknown)}; known: {known}")
@@ -130,18 +130,18 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class UrlParts:
-    """The parts of an address, as it is written and not yet judged."""
+    """The parts of an address, not yet checked."""
 
     scheme: str
     address: str
-    """Where the device is, without %20 and the like."""
+    """Port, bus or host of the device, percent-decoded."""
     query: str
-    """The options as they stand."""
+    """The options, still encoded."""
     fragment: str
 
 
 def split_url(url: str) -> UrlParts:
-    """Take an address apart. Raises `BadUrl` for what is none."""
+    """Split an address into its parts. Raises `BadUrl`."""
     try:
         parts = urlsplit(url)
     except ValueError as exc:
@@ -150,7 +150,7 @@ def split_url(url: str) -> UrlParts:
 
 
 def in_url(address: str) -> str:
-    """Write where a device is so that `split_url` reads it back: a port may have a space or a question mark in it."""
+    """Quote a port, bus or host for an address: its name may contain a space or a question mark."""
     return quote(address, safe="/:@")
 
 
@@ -159,7 +159,7 @@ class _FromUrl(Protocol):
 
 
 def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTorqueSensor:
-    """Build the sensor an address names; nothing is opened.
+    """Build the sensor that an address names, without opening it.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
     sign : int
         -1 for a sensor that reports the reaction.
     clock : Clock
-        That of an emulated cell; a driver of another package is given none.
+        The clock of an emulated cell; a driver of another package gets none.
 
     Raises
     ------
@@ -182,10 +182,10 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
         known = ", ".join(_names("ftdrive.sensors", SENSORS))
         raise BadUrl(f"{url}: unknown sensor '{parts.scheme}'; known: {known}, as in {_EXAMPLES[0]}")
     if not parts.address or parts.fragment or not url.lower().startswith(f"{parts.scheme}://"):
-        raise BadUrl(f"{url}: which device? Write it like {', '.join(_EXAMPLES)}")
+        raise BadUrl(f"{url}: names no device; write it like {', '.join(_EXAMPLES)}")
     driver = cast("_FromUrl", _load(entry))
     if not hasattr(driver, "from_url"):
-        raise BadUrl(f"{url}: {entry.value} has no from_url, so it is no driver: reinstall {_package(entry)}")
+        raise BadUrl(f"{url}: {entry.value} has no from_url, so it is no driver; reinstall {_package(entry)}")
     options = Options(url, parts.query)
     recover, configured = bool(options.integer("recover", 0, 0, 1)), options.configured()
     own_time = {} if clock is REAL else {"clock": clock}
@@ -199,14 +199,14 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
     if isinstance(sensor, StreamingSensor):
         sensor.recover, sensor.configured = recover, configured
     elif recover or configured:
-        raise BadUrl(f"{url}: this driver knows none of the options recover, serial and range; leave them out")
+        raise BadUrl(f"{url}: this driver has no options recover, serial and range; leave them out")
     return sensor
 
 
 def arm_class(name: str = "ur") -> type[RobotArm]:
     """Find the class of an arm by its name.
 
-    It is built like `drivers.ur.arm.UrArm`: from the host, and by keyword `model`, `speed_rad_s`,
+    Its constructor takes the arguments of `drivers.ur.arm.UrArm`: the host, and by keyword `model`, `speed_rad_s` and
     `acceleration_rad_s2`.
 
     Raises
@@ -221,7 +221,7 @@ def arm_class(name: str = "ur") -> type[RobotArm]:
 
 
 def _find(group: str, own: Mapping[str, str], name: str) -> EntryPoint | None:
-    """Look a name up among our own drivers, then among those of other packages."""
+    """Look up a name in this project, then in other packages."""
     if name in own:
         return EntryPoint(name, own[name], group)
     found = sorted(entry_points(group=group, name=name), key=lambda entry: entry.value)
@@ -238,10 +238,10 @@ def _names(group: str, own: Mapping[str, str]) -> list[str]:
 def _load(entry: EntryPoint) -> Any:
     try:
         return entry.load()
-    except Exception as exc:  # whatever a module of another package does when it is imported
+    except Exception as exc:  # a module of another package may raise anything
         extra = _EXTRAS.get(getattr(exc, "name", None) or "")
-        cure = f"pip install 'ftdrive[{extra}]'" if extra else f"reinstall {_package(entry)}"
-        raise BadUrl(f"the driver '{entry.name}' cannot be imported ({type(exc).__name__}: {exc}): {cure}") from exc
+        fix = f"pip install 'ftdrive[{extra}]'" if extra else f"reinstall {_package(entry)}"
+        raise BadUrl(f"the driver '{entry.name}' cannot be imported ({type(exc).__name__}: {exc}): {fix}") from exc
 
 
 def _package(entry: EntryPoint) -> str:

@@ -26,7 +26,7 @@ FORCE_UNITS_N: Mapping[str, float] = MappingProxyType(
         "gf": 0.00980665,
     }
 )
-"""In the order of ATI's unit codes, 1 to 6; so are the torques."""
+"""In the order of ATI's unit codes 1 to 6, as are the torque units."""
 TORQUE_UNITS_NM: Mapping[str, float] = MappingProxyType(
     {
         "lbf-in": 0.1129848290276167,
@@ -52,7 +52,7 @@ def unit_names(unit_codes: tuple[int, int]) -> tuple[str, str]:
 
 
 def units(unit_codes: tuple[int, int]) -> tuple[float, float]:
-    """Look up what one unit of force is in N, and one of torque in N·m. Raises `ProtocolError` for unknown codes."""
+    """Return one unit of force in N and one of torque in N·m. Raises `ProtocolError` for unknown codes."""
     force, torque = unit_names(unit_codes)
     return FORCE_UNITS_N[force], TORQUE_UNITS_NM[torque]
 
@@ -62,7 +62,7 @@ def parse_units(text: str) -> tuple[int, int]:
     force, _, torque = text.partition(",")
     if force not in _FORCES or torque not in _TORQUES:
         raise ValueError(
-            f"units are '{text}'; they are one of {' '.join(_FORCES)}, a comma, and one of {' '.join(_TORQUES)}"
+            f"units are '{text}'; give one of {' '.join(_FORCES)}, a comma, and one of {' '.join(_TORQUES)}"
         )
     return _FORCES.index(force) + 1, _TORQUES.index(torque) + 1
 
@@ -72,7 +72,7 @@ def parse_counts(text: str) -> tuple[int, int]:
     force, _, torque = text.partition(",")
     if not (force.isdecimal() and torque.isdecimal() and int(force) and int(torque)):
         raise ValueError(
-            f"counts are '{text}'; they are two whole numbers, per unit of force and of torque: 1000000,1000000"
+            f"counts are '{text}'; give two whole numbers, per unit of force and of torque, such as 1000000,1000000"
         )
     return int(force), int(torque)
 
@@ -88,23 +88,23 @@ class Calibration:
 
     @classmethod
     def from_vendor(cls, matrix: Array, counts_per_unit: tuple[int, int], unit_codes: tuple[int, int]) -> "Calibration":
-        """Build from what the device tells.
+        """Build from the values that the device reports.
 
         Parameters
         ----------
         matrix : array, shape (6, 6)
-            The run-time matrix: gauge gains are already inside.
+            The run-time matrix, which includes the gauge gains.
         counts_per_unit, unit_codes : (int, int)
             For force, for torque.
 
         Raises
         ------
         ProtocolError
-            An unknown unit code, or a matrix no transducer can have (not finite or singular).
+            An unknown unit code, or a matrix that is not finite or singular.
         """
         unit_N, unit_Nm = units(unit_codes)
         if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix) < 6:
-            raise ProtocolError("the calibration matrix is not invertible, as if it were empty")
+            raise ProtocolError("the calibration matrix is empty or not invertible")
         counts_per_N, counts_per_Nm = counts_per_unit[0] / unit_N, counts_per_unit[1] / unit_Nm
         return cls(matrix / np.repeat([counts_per_N, counts_per_Nm], 3)[:, np.newaxis], counts_per_N, counts_per_Nm)
 
@@ -114,9 +114,9 @@ class Calibration:
 
 
 def saturated_gauges(gauges: NDArray[np.int32]) -> list[int]:
-    """Name the gauges at the end of their range in any of n rows (n, 6): the wrench is then meaningless.
+    """Return the gauges at the end of their range in any of n rows (n, 6): the wrench is then meaningless.
 
-    No status bit tells: an overload and a broken cable both show only here.
+    No status bit reports an overload or a broken cable.
     """
     return [int(g) for g in np.flatnonzero(((gauges == _LOWEST) | (gauges == _HIGHEST)).any(axis=0))]
 
@@ -125,4 +125,4 @@ def refuse_saturated(name: str, gauges: NDArray[np.int32]) -> None:
     """Raise `DeviceFault` when a gauge of the sensor is at the end of its range in any of n rows (n, 6)."""
     if saturated := saturated_gauges(gauges):
         names = ", ".join(f"G{gauge}" for gauge in saturated)
-        raise DeviceFault(f"{name}: gauge {names} at the end of its range", "take the load off, check the cable")
+        raise DeviceFault(f"{name}: gauge {names} is at the end of its range", "take the load off, check the cable")

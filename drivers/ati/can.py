@@ -3,8 +3,8 @@
 Ref: ATI Industrial Automation, "F/T CAN Bus and Serial Bus Network Interface for OEM", 9610-05-1030 revision 04.
 Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_codec.py and the emulator (tests/wire).
 
-The sensor is polled; it has no stream, no clock and no bias command. It keeps sending data in critical error, does not
-report saturation, and falls back to calibration slot 0 after every reset: all three are judged here.
+The sensor is polled; it has no stream, no clock and no bias command. In a critical error it keeps sending data. It does
+not report saturation. A reset selects calibration slot 0. The driver checks all three.
 """
 
 import contextlib
@@ -39,38 +39,38 @@ log = logging.getLogger(__name__)
 _TRANSACTION_S = 0.1
 _ATTEMPTS = 3
 _POLL_S = 0.05
-"""A poll takes 1 to 3 ms, more on a busy computer; a lost frame must not make the stream stale."""
+"""A poll takes 1 to 3 ms, more on a busy computer. A lost frame must not make the stream stale."""
 _LATE_FRAMES = 32
-"""So many are looked at after the deadline: on a busy host it is often this process that is late, not the answer."""
+"""Read after the deadline, because on a busy host often this process is late, not the reply."""
 _QUIET_S = 0.01
 _STRAGGLER_S = 0.004
-"""How long a reading in the wrong order waits for a frame that would contradict it."""
-_ANOTHER_SLOT = "choose another, slot=0 to 15 in its address"
+"""How long a reading whose halves came in the wrong order waits for a contradicting frame."""
+_ANOTHER_SLOT = "choose another slot, slot=0 to 15 in its address"
 _MILLION = (1_000_000, 1_000_000)
 _PERIOD_S = 1e-3
-"""About what a 250 kbit/s bus carries; polling a faster one, or an emulator, for all it gives would eat a CPU core."""
+"""About what a 250 kbit/s bus carries; faster polls of a faster bus or an emulator would load a CPU core."""
 
 
 class AtiCanSensor(StreamingSensor):
-    """An ATI NETCANOEM sensor on any CAN interface python-can knows.
+    """An ATI NETCANOEM sensor on any CAN interface of python-can.
 
-    `seq` counts polls, `t_device_s` is NaN, `counts` are the six gauges. A poll that is not answered counts as lost.
+    `seq` counts polls, `t_device_s` is NaN, `counts` are the six gauges. A poll without a reply counts as lost.
 
     Parameters
     ----------
     channel : str
-        The bus as python-can names it: ``can0``, or the serial port of an slcan adapter.
+        As python-can names it: ``can0``, or the serial port of an slcan adapter.
     interface : str
         python-can's interface name.
     bitrate : int
-        Bit/s; on socketcan it is set with ``ip link`` and this value is not used.
+        Bit/s; not used on socketcan, where ``ip link`` sets it.
     base : int
         Base identifier, 0x00 to 0x7F; factory setting 0x20 (identifiers 0x200 to 0x20F).
     slot : int
         Calibration slot, 0 to 15.
     unit_codes, counts_per_unit : (int, int), optional
-        For force, for torque, as on the calibration certificate: for firmware before 3.7, which does not tell them. A
-        sensor that tells others is refused. Without them N and N·m are assumed, and 1 000 000 counts.
+        For force, for torque, as on the calibration certificate: for firmware before 3.7, which does not report them.
+        A sensor that reports others is rejected. The default is N, N·m and 1 000 000 counts, logged as assumed.
     sign : int
         -1 for a sensor mounted or wired to report the reaction.
     """
@@ -103,7 +103,7 @@ class AtiCanSensor(StreamingSensor):
     def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``ati-can://can0?bitrate=250000&base=0x20&slot=0&interface=socketcan``.
 
-        Old firmware wants ``units=lbf,lbf-in`` and, if the certificate says so, ``counts=1000000,1000000``.
+        Firmware before 3.7 needs ``units=lbf,lbf-in``, and ``counts=1000000,1000000`` if the certificate differs.
         """
         units, counts = options.optional("units"), options.optional("counts")
         return cls(
@@ -149,27 +149,21 @@ class AtiCanSensor(StreamingSensor):
         except (DeviceTimeout, ProtocolError):
             self._lost += 1
             self._missed += 1
-            self._await_quiet()  # a late half must not pair up with the next reading
+            self._await_quiet()  # a late half must not be paired with the next reading
             if self._missed > 1:
-                self._select_slot()  # it may have restarted, and would be back at slot 0
+                self._select_slot()  # a restart would have selected slot 0
             return NOTHING
         finally:
             self._malformed = self._bus.malformed
         t_host_ns, seq = self._clock.now_ns(), self._polls
         self._missed = 0
         if t_host_ns >= self._next_poll_s * 1e9:
-            self._poll()  # the sensor works on the next reading while we work on this one
+            self._poll()  # the sensor prepares the next reading while this one is decoded
         reading = codec.decode_gauges(first, second)
         self._judge(reading)
-        gauges = reading.gauges[np.newaxis]
-        return FtSamples(
-            t_host_ns=np.array([t_host_ns], np.int64),
-            t_device_s=np.array([np.nan]),
-            seq=np.array([seq], np.int64),
-            counts=gauges,
-            wrench=self._calibration.wrench(gauges),
-            status=np.array([reading.status], np.uint32),
-        )
+        counts = reading.gauges[np.newaxis]
+        wrench = self._calibration.wrench(counts)
+        return FtSamples.of(t_host_ns, seq, wrench, counts=counts, status=reading.status)
 
     def _poll(self) -> None:
         self._next_poll_s = max(self._next_poll_s + _PERIOD_S, self._clock.now_s())
@@ -184,8 +178,8 @@ class AtiCanSensor(StreamingSensor):
         echo = codec.decode_slot(*self._ask(Op.SELECT_SLOT, self._slot))
         if echo != self._slot:
             raise ConnectError(
-                f"{self.name}: asked for calibration slot {self._slot}, the sensor answered {echo}",
-                f"end other programs that use it, or {_ANOTHER_SLOT}",
+                f"{self.name}: requested calibration slot {self._slot}, the sensor selected {echo}",
+                f"end other programs that use the sensor, or {_ANOTHER_SLOT}",
             )
 
     def _read_matrix(self) -> Array:
@@ -197,14 +191,15 @@ class AtiCanSensor(StreamingSensor):
     def _read_scale(
         self, firmware: codec.Firmware
     ) -> tuple[tuple[int, int], tuple[int, int], Literal["device", "configured", "assumed"]]:
-        """Find counts per unit, unit codes, and where they are from. Raises `ConnectError` where two sources differ."""
+        """Return counts per unit, unit codes and their source. Raises `ConnectError` where two sources differ."""
         if firmware < codec.COUNTS_PER_UNIT_SINCE:
-            counts = self._counts_per_unit or _MILLION  # for this firmware the manual fixes them
+            counts = self._counts_per_unit or _MILLION  # fixed by the manual for this firmware
             if self._unit_codes is not None:
                 return counts, self._unit_codes, "configured"
             log.warning(
-                "%s: firmware %d.%d does not tell its units; %d counts per N and %d per N·m assumed, compare with the "
-                "calibration certificate and add them to the address, such as units=lbf,lbf-in&counts=1000000,1000000",
+                "%s: firmware %d.%d does not report its units; assuming %d counts per N and %d per N·m; compare with "
+                "the calibration certificate and set units and counts in the address, such as "
+                "units=lbf,lbf-in&counts=1000000,1000000",
                 self.name,
                 *firmware[:2],
                 *counts,
@@ -215,14 +210,14 @@ class AtiCanSensor(StreamingSensor):
         configured = self._counts_per_unit or counts, self._unit_codes or unit_codes
         if configured != (counts, unit_codes):
             raise ConnectError(
-                f"{self.name}: the sensor tells {_scale_text(counts, unit_codes)}, configured are "
+                f"{self.name}: the sensor reports {_scale_text(counts, unit_codes)}, configured are "
                 f"{_scale_text(*configured)}",
-                "check slot, or units and counts in its address",
+                "check slot, units and counts in its address",
             )
         return counts, unit_codes, "device"
 
     def _judge(self, reading: codec.GaugeReading) -> None:
-        """Raise on what makes a reading unusable, log the rest of a status word once."""
+        """Raise when a reading is unusable; log other status bits once."""
         status = reading.status
         if status & codec.CRITICAL:
             raise DeviceFault(f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}", UNUSABLE)
@@ -231,7 +226,7 @@ class AtiCanSensor(StreamingSensor):
                 f"{self.name}: the sensor has reset itself and may be back at calibration slot 0", "open it again"
             )
         if new := status & ~self._seen_status:
-            log.warning("%s: status %s; measuring goes on", self.name, describe_status(new, codec.STATUS_BITS))
+            log.warning("%s: status %s; measuring continues", self.name, describe_status(new, codec.STATUS_BITS))
             self._seen_status |= new
         refuse_saturated(self.name, reading.gauges[np.newaxis])
 
@@ -241,34 +236,30 @@ class AtiCanSensor(StreamingSensor):
             with contextlib.suppress(DeviceTimeout, ProtocolError):
                 return self._exchange(op, bytes(args), _TRANSACTION_S)
         raise DeviceTimeout(
-            f"{self.name}: no answer to {op.name} after {_ATTEMPTS} attempts of {_TRANSACTION_S} s",
+            f"{self.name}: no reply to {op.name} after {_ATTEMPTS} attempts of {_TRANSACTION_S} s",
             "check bit rate, base identifier, supply and termination",
         )
 
     def _exchange(self, op: Op, data: bytes, timeout_s: float) -> list[bytes]:
-        """Send one request and return the payloads of its reply. One thread at a time: the opening one, or the reader.
-
-        Raises as `_answer`.
-        """
+        """Send one request and return the payloads of its reply; in one thread at a time. Raises as `_answer`."""
         self._request(op, data)
         return self._answer(op, data, timeout_s)
 
     def _request(self, op: Op, data: bytes) -> None:
-        """Send a request, after throwing away what belongs to earlier ones; `_answer` must follow."""
+        """Drop what belongs to earlier requests, and send one; `_answer` must follow."""
         self._bus.discard()
         self._bus.send(self._base << 4 | op, data)
 
     def _answer(self, op: Op, data: bytes, timeout_s: float) -> list[bytes]:
         """Return the payloads of the reply to the request just sent, or raise `DeviceTimeout`: never half a reply.
 
-        Frames are matched by identifier and length, not by order of arrival. They carry no number: when two differing
-        ones answer, or come in the wrong order with another behind, one belongs to an earlier request, nobody knows
-        which, and that is a `ProtocolError`.
+        Frames are matched by identifier and length, not by order of arrival, as they carry no number. Two differing
+        frames for one part are a `ProtocolError`: one of them belongs to an earlier request.
         """
         expected = codec.REPLIES[op]
         request_id = self._base << 4 | op
         parts: dict[int, bytes] = {}
-        # only the reply to SELECT_SLOT looks like its request: on a bus that echoes, the first one is ours
+        # only the reply to SELECT_SLOT equals its request: on a bus that echoes, the first one is ours
         skip_echo = self._echoes and op is Op.SELECT_SLOT
         deadline_s = self._clock.now_s() + timeout_s
         late = 0
@@ -282,7 +273,9 @@ class AtiCanSensor(StreamingSensor):
             if frame is None and whole:
                 break
             if frame is None:
-                raise DeviceTimeout(f"{self.name}: no answer to {op.name} within {timeout_s} s")
+                raise DeviceTimeout(
+                    f"{self.name}: no reply to {op.name} within {timeout_s} s", "check supply and wiring"
+                )
             identifier, payload = frame
             opcode = identifier & 0xF
             if opcode in expected and len(payload) == expected[opcode]:
@@ -290,13 +283,13 @@ class AtiCanSensor(StreamingSensor):
                     skip_echo = False
                 elif parts.setdefault(opcode, payload) != payload:
                     self._bus.malformed += 1
-                    raise ProtocolError(f"{self.name}: two different answers to {op.name}")
+                    raise ProtocolError(f"{self.name}: two different replies to {op.name}")
             elif identifier == request_id and payload == data:
                 self._echoes = True
         return [parts[opcode] for opcode in expected]
 
     def _await_quiet(self) -> None:
-        """Throw away what arrives until nothing comes any more; at most for a transaction."""
+        """Drop what arrives until nothing does, at most for a transaction."""
         for _ in self._clock.looks(_TRANSACTION_S):
             if self._bus.receive(_QUIET_S) is None:
                 return

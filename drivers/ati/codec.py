@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import ProtocolError
+from drivers.interfaces import Array
 
 COUNTS_PER_UNIT_SINCE = (3, 7)
 """First firmware that answers `COUNTS_PER_UNIT` and `UNIT_CODES`; older ones use 1 000 000 for both."""
 
 
 class Op(IntEnum):
-    """Opcodes this driver sends; an identifier is `base << 4 | opcode`, for request and reply alike."""
+    """Opcodes that this driver sends; an identifier is `base << 4 | opcode`, for request and reply alike."""
 
     GAUGES = 0x0
     MATRIX_ROW = 0x2
@@ -65,7 +66,7 @@ STATUS_BITS: Mapping[int, str] = MappingProxyType(
 )
 WATCHDOG_RESET = 0x0001
 CRITICAL = 0x18FE
-"""Status bits with which the data must not be used. The device keeps sending: the host has to decide."""
+"""Status bits with which the data is unusable. The device keeps sending, so the host has to check them."""
 
 
 class GaugeReading(NamedTuple):
@@ -90,7 +91,7 @@ def decode_gauges(first: bytes, second: bytes) -> GaugeReading:
     return GaugeReading(status, np.array([g0, g1, g2, g3, g4, g5], dtype=np.int32))
 
 
-def decode_matrix_row(first: bytes, second: bytes, third: bytes) -> NDArray[np.float64]:
+def decode_matrix_row(first: bytes, second: bytes, third: bytes) -> Array:
     """Decode one row (6,) of the calibration matrix, counts per gauge count, columns G0..G5."""
     row = np.array([_unpack(">ff", part, "part of a matrix row") for part in (first, second, third)]).ravel()
     if not np.isfinite(row).all():
@@ -99,7 +100,7 @@ def decode_matrix_row(first: bytes, second: bytes, third: bytes) -> NDArray[np.f
 
 
 def decode_text(data: bytes) -> str:
-    """Decode ASCII padded with NUL or spaces; what is not printable shows as ``?``."""
+    """Decode ASCII padded with NUL or spaces; a byte that is not printable becomes ``?``."""
     text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "?" for byte in data.rstrip(b"\0 "))
     return text.strip()
 

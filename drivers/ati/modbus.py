@@ -28,7 +28,7 @@ START_STREAM, STORAGE = 0x46, 0x6A
 GAINS, OFFSETS, STATUS = 0x0000, 0x0006, 0x001D
 
 JAM = b"\xaa" * 14
-"""Any 14 bytes stop a running stream; these are no Modbus frame."""
+"""Any 14 bytes stop a running stream; these are not a Modbus frame."""
 
 RECORD_SIZE = 13
 NOMINAL_RATE_Hz = 7000.0
@@ -56,11 +56,11 @@ STATUS_BITS: Mapping[int, str] = MappingProxyType(
 WATCHDOG_RESET = 0x0001
 ANY_ERROR = 0x8000
 CRITICAL = 0x3EFE
-"""All but watchdog reset, configuration, CAN and the summary bit."""
+"""All bits but watchdog reset, configuration, CAN and the summary bit."""
 
 frame = partial(_modbus.frame, ADDRESS)
 read_registers = partial(_modbus.read_registers, ADDRESS)
-"""At most 64 at once are known to work."""
+"""At most 64 registers in one request are known to work."""
 write_registers = partial(_modbus.write_registers, ADDRESS)
 reply_size = _modbus.reply_size
 
@@ -70,27 +70,27 @@ START = frame(START_STREAM, b"\x55")
 
 
 def check_reply(request: bytes, reply: bytes) -> bytes:
-    """Check a whole reply against its request and return the registers it carries; see `drivers.wires.modbus`."""
+    """Check a whole reply against its request and return the registers in it; see `drivers.wires.modbus`."""
     payload = _modbus.check_reply(request, reply)
     function = request[1]
     if function not in {START_STREAM, STORAGE}:
         return payload
     if payload != b"\x01":
         raise _modbus.Refused(
-            f"the sensor refused command 0x{function:02X} 0x{request[2]:02X} (answer 0x{payload.hex()})"
+            f"the sensor refused command 0x{function:02X} 0x{request[2]:02X} (reply 0x{payload.hex()})"
         )
     return b""
 
 
 def calibration_reads(index: int) -> list[tuple[int, int]]:
-    """Registers (start, count) that hold calibration `index`, 1 to 16, in reads of at most 64."""
+    """Return the registers (start, count) of calibration `index`, 1 to 16, in reads of at most 64."""
     base = 0x00E3 + 192 * (index - 1)
     return [(base, 64), (base + 64, 64), (base + 128, 41)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationBlock:
-    """What the sensor stores about one calibration."""
+    """One calibration as the sensor stores it."""
 
     serial: str
     part_number: str
@@ -111,7 +111,7 @@ def decode_calibration_block(data: bytes) -> CalibrationBlock:
     matrix = np.frombuffer(data, ">f4", 36, offset=2 * 32).reshape(6, 6)
     force, torque = struct.unpack_from(">ii", data, 2 * 117)
     if not np.isfinite(matrix).all() or force <= 0 or torque <= 0:
-        raise ProtocolError(f"it is empty, with counts per unit {force} and {torque}")
+        raise ProtocolError(f"the slot is empty, with counts per unit {force} and {torque}")
     return CalibrationBlock(
         serial=decode_text(data[0:8]),
         part_number=decode_text(data[8:40]),
@@ -133,9 +133,9 @@ class Records:
     intact: NDArray[np.bool_]
     """(n,) the checksum holds."""
     parity: NDArray[np.bool_]
-    """(n,) so does the parity of every byte; not for judging slips: some adapters blame a whole packet for one byte."""
+    """(n,) the parity of every byte holds. Not for slips, because some adapters mark a whole packet for one byte."""
     error: NDArray[np.bool_]
-    """(n,) the sensor says: stop and read the status word."""
+    """(n,) the error bit: stop the stream and read the status word."""
 
 
 _RECORD = np.dtype([("gauges", ">i2", 6), ("last", "u1")])
@@ -145,11 +145,11 @@ _NATURAL_ORDER = np.array([0, 3, 1, 4, 2, 5])
 def decode_records(data: bytes, damaged: Sequence[int] = ()) -> Records:
     """Decode n whole stream records, 13 bytes each: G0 G2 G4 G1 G3 G5, then error bit and 7-bit sum.
 
-    The sum misses a flipped bit 7 of any byte, parity an even number of flipped bits in one: both together miss no
-    single damaged byte. `damaged` are the places of bytes received with wrong parity; those behind `data` are ignored.
+    The sum misses a flipped bit 7 of any byte, parity an even number of flipped bits in one byte. Together they find
+    every single damaged byte. `damaged` are the places of bytes with wrong parity; places behind `data` are ignored.
     """
     if len(data) % RECORD_SIZE:
-        raise ProtocolError(f"{len(data)} bytes are no whole number of {RECORD_SIZE}-byte records")
+        raise ProtocolError(f"{len(data)} bytes are not a whole number of {RECORD_SIZE}-byte records")
     columns = np.frombuffer(data, np.uint8).reshape(-1, RECORD_SIZE).T.copy()
     total = columns[:12].sum(axis=0, dtype=np.uint8)  # wraps at 256, and only seven bits count
     last = columns[12]
@@ -162,19 +162,19 @@ def decode_records(data: bytes, damaged: Sequence[int] = ()) -> Records:
 
 
 def keep_records(intact: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int, bool]:
-    """Judge n records by their checksums: which to use, how many are settled, and whether the stream has slipped.
+    """Judge n records by their checksums: which to keep, how many are settled, and whether the stream has slipped.
 
     The stream has no sync byte, and after a slip one record in 128 still passes. So three damaged records in a row mean
-    a slip, and neither an intact one between two damaged ones nor the last one before a slip is believed. So the last
-    record waits for what comes next, and with it the damage around it.
+    a slip. An intact record between two damaged ones, or directly before a slip, is dropped. Therefore the last record
+    waits for its successor, and so does the damage next to it.
 
     Returns
     -------
     keep : array of bool, shape (settled,)
     settled : int
-        The remaining n - settled records are to be judged again, together with their successors.
+        Judge the other n - settled records again, together with their successors.
     slipped : bool
-        Everything behind `settled` is misaligned.
+        All bytes behind `settled` are misaligned.
     """
     bad = ~intact
     n = len(bad)

@@ -4,8 +4,7 @@ Ref: ATI, "Net F/T User Manual" 9620-05-Net FT, and "Ethernet Axia" 9610-05-Ethe
 netftcalapi.xml, as in public drivers; OptoForce, "Ethernet Converter" manual, version 2.0.
 Checked on hardware: no. Verified against: tests/unit/drivers/test_netft.py and the emulator (tests/wire).
 
-pynetft discovers the scale, keeps the socket drained and says why a stream has ended. It could also set the software
-bias; this driver never does.
+pynetft reads the scale, drains the socket and reports why a stream has ended. Its bias command is never used here.
 """
 
 import http.client
@@ -34,22 +33,22 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _SILENCE_S = 0.3
-"""After this the stream has ended: a sensor that is set to less than 10 Hz is too slow for this driver."""
+"""A longer silence ends the stream: a sensor set to less than 10 Hz is too slow for this driver."""
 _STARTS = 5
-"""The request to start is a datagram and can be lost."""
+"""The request to start is a datagram, which can be lost."""
 _HTTP_S = 1.0
 _PATIENCE_S = 30.0
-"""In place of it where the cell is emulated: its pages are served in real time."""
+"""Replaces `_HTTP_S` in an emulated cell, whose pages are served in real time."""
 _NEVER_S = 3600.0
 _WAIT_S, _BATCH_S = 0.05, 0.002
-"""In real time for the first sample, then for those that come with it."""
+"""In real time, for the first sample and then for those after it."""
 _QUEUE = 16_384
-"""More than two seconds at 7 kHz; the oldest is dropped then, and its number is missing."""
+"""More than 2 s at 7 kHz. A full queue drops the oldest sample, whose number is then missing."""
 _ONROBOT_COUNTS = (10_000, 100_000)
-"""Per N and per N·m, fixed by the manual: an OnRobot box does not tell."""
+"""Per N and per N·m, fixed by the manual: an OnRobot converter does not report them."""
 
 MONITOR_LATCHED = 0x80010000
-"""A monitored threshold was crossed some time ago: says nothing about the data."""
+"""A monitored threshold was crossed earlier; the data is valid."""
 
 NET_FT_BITS: Mapping[int, str] = MappingProxyType(
     {
@@ -121,13 +120,13 @@ ONROBOT_BITS: Mapping[int, str] = MappingProxyType(
 
 
 def text_in(page: bytes, element: str) -> str:
-    """Find the text of an element in a page of a sensor; empty where it is not."""
+    """Find the text of an element in a page of a sensor; empty where it is missing."""
     match = re.search(rf"<{element}>\s*([\x20-\x3b\x3d-\x7e]{{1,64}}?)\s*</{element}>".encode(), page)
     return match[1].decode("ascii") if match else ""
 
 
 def numbers_in(page: bytes, element: str) -> list[float]:
-    """Find the positive numbers of an element, such as ``130;130;400;10;10;10``; none where it holds anything else."""
+    """Find the positive numbers of an element, such as ``130;130;400;10;10;10``; empty where it holds other text."""
     try:
         numbers = [float(number) for number in text_in(page, element).split(";")]
     except ValueError:
@@ -148,10 +147,10 @@ def range_in(page: bytes) -> tuple[float, ...] | None:
 
 
 class NetFtSensor(StreamingSensor):
-    """A sensor that speaks ATI's RDT.
+    """A sensor with ATI's RDT protocol.
 
     `counts` are the six values as sent, `seq` is the RDT sequence number, `t_device_s` is NaN: records carry no time.
-    Nominal rate and range are known where the pages of the sensor tell them. Every status but a latched monitor
+    Nominal rate and range are known where the pages of the sensor contain them. Every status but a latched monitor
     condition is a `DeviceFault`.
 
     Parameters
@@ -159,9 +158,9 @@ class NetFtSensor(StreamingSensor):
     host : str
         Address of the sensor; ATI's factory setting is 192.168.1.1.
     onrobot : bool
-        An OnRobot HEX or OptoForce converter: scale and status bits as its manual fixes them.
+        An OnRobot HEX or OptoForce converter, with the scale and status bits of its manual.
     rdt_port, http_port : int
-        Where a sensor listens for RDT (UDP) and serves its configuration.
+        Ports of RDT (UDP) and of the configuration pages.
     sign : int
         -1 for a sensor that reports the reaction.
     """
@@ -177,7 +176,7 @@ class NetFtSensor(StreamingSensor):
         clock: Clock = REAL,
     ) -> None:
         name = f"{'OnRobot' if onrobot else 'ATI'} Ethernet sensor at {host}"
-        # UDP has no cable that breaks: a silence ends the stream, and that is to be known before it is called stale
+        # UDP reports no broken cable: a silence ends the stream, before the stream is stale
         super().__init__(name, sign=sign, clock=clock, limits=StreamLimits(stale_s=_SILENCE_S + 0.15))
         self._http_s = _PATIENCE_S if clock.emulated else _HTTP_S
         self._host = host
@@ -201,7 +200,7 @@ class NetFtSensor(StreamingSensor):
     def _connect(self) -> DeviceInfo:
         # an OnRobot converter serves no pages
         page = b"" if self._onrobot else self._read_page("/netftapi2.xml")
-        self._nominal_Hz, *_ = numbers_in(page, "comm?rdtrate") or [math.nan]  # both spellings are in use
+        self._nominal_Hz, *_ = numbers_in(page, "comm?rdtrate") or [math.nan]  # both spellings exist
         index = text_in(page, "cfgcalsel")
         rating = range_in(self._read_page(f"/netftcalapi.xml?index={index}")) if index.isdecimal() else None
         override = None
@@ -226,18 +225,18 @@ class NetFtSensor(StreamingSensor):
         try:
             self._client = pynetft.Client(config, queue_size=_QUEUE)
         except pynetft.NetFTError as exc:
-            raise self._untold(exc) from exc
-        told = self._start(self._client)
-        scale = told.calibration
+            raise self._unread(exc) from exc
+        configuration = self._start(self._client)
+        scale = configuration.calibration
         if scale.force_unit.value not in FORCE_UNITS_N or scale.torque_unit.value not in TORQUE_UNITS_NM:
             raise ConnectError(
-                f"{self.name}: it measures in {scale.force_unit.value} and {scale.torque_unit.value}",
+                f"{self.name}: the sensor measures in {scale.force_unit.value} and {scale.torque_unit.value}",
                 "choose N and Nm on its configuration page",
             )
         counts_per_N = scale.counts_per_force_unit / FORCE_UNITS_N[scale.force_unit.value]
         counts_per_Nm = scale.counts_per_torque_unit / TORQUE_UNITS_NM[scale.torque_unit.value]
         self._counts_per_unit = np.repeat([counts_per_N, counts_per_Nm], 3)
-        model = "OnRobot HEX (Ethernet)" if self._onrobot else told.product_name or "ATI Net F/T"
+        model = "OnRobot HEX (Ethernet)" if self._onrobot else configuration.product_name or "ATI Net F/T"
         facts = scale_facts(counts_per_N, counts_per_Nm, "documented" if self._onrobot else "device")
         if rating:
             facts["range"] = Fact(rating, "device")
@@ -258,54 +257,46 @@ class NetFtSensor(StreamingSensor):
         status = np.array([sample.status for sample in samples], np.uint32)
         self._judge(int(np.bitwise_or.reduce(status)))
         counts = np.array([sample.raw_wrench for sample in samples], np.int32)
-        n = len(samples)
-        return FtSamples(
-            t_host_ns=np.full(n, t_host_ns, np.int64),
-            t_device_s=np.full(n, np.nan),
-            seq=np.array(numbers, np.int64),
-            counts=counts,
-            wrench=counts / self._counts_per_unit,
-            status=status,
-        )
+        return FtSamples.of(t_host_ns, numbers, counts / self._counts_per_unit, counts=counts, status=status)
 
     def _disconnect(self) -> None:
         with self._news:
             client, self._client = self._client, None
             if client is None:
                 return
-            told = client.health()
-            self._earlier_malformed += told.malformed_count
-            self._duplicated += told.duplicate_count
-            self._out_of_order += told.out_of_order_count
+            counted = client.health()
+            self._earlier_malformed += counted.malformed_count
+            self._duplicated += counted.duplicate_count
+            self._out_of_order += counted.out_of_order_count
         client.stop()
 
     def health(self) -> Health:
-        """Counters since `open`; what came twice or too late pynetft has thrown away and counted."""
+        """Return the counters since `open`, including datagrams that pynetft has dropped."""
         with self._news:
             health, client = super().health(), self._client
             if client is None:
                 return health
-            told = client.health()
+            counted = client.health()
         return replace(
             health,
-            malformed=health.malformed + told.malformed_count,
-            duplicated=health.duplicated + told.duplicate_count,
-            out_of_order=health.out_of_order + told.out_of_order_count,
+            malformed=health.malformed + counted.malformed_count,
+            duplicated=health.duplicated + counted.duplicate_count,
+            out_of_order=health.out_of_order + counted.out_of_order_count,
         )
 
     def _start(self, client: pynetft.Client) -> pynetft.SensorConfiguration:
-        """Ask for the stream until it comes; returns what the sensor tells about itself."""
+        """Request the stream until it starts; return the configuration that the sensor reports."""
         for _ in range(_STARTS):
             try:
                 client.start()
             except pynetft.NetFTError as exc:
-                raise self._untold(exc) from exc
+                raise self._unread(exc) from exc
             looks = self._clock.looks(_SILENCE_S)
             arrived = any(client.wait_for_first_sample(min(left_s, self._clock.poll_s)) for left_s in looks)
             self._arrived_ns = self._clock.now_ns()
             health = client.health()
             if health.sensor_configuration is None:
-                raise ConnectError(f"{self.name}: the sensor told no scale", "open it again")
+                raise ConnectError(f"{self.name}: the sensor reports no scale", "open it again")
             is_axia = "Axia" in health.sensor_configuration.product_name
             self._bits = ONROBOT_BITS if self._onrobot else AXIA_BITS if is_axia else NET_FT_BITS
             self._judge(health.last_status)
@@ -314,11 +305,11 @@ class NetFtSensor(StreamingSensor):
             client.stop()
         raise ConnectError(
             f"{self.name}: no sample after {_STARTS} requests",
-            "check supply and cable; is RDT enabled on its communications page?",
+            "check supply and cable, and enable RDT on its communications page",
         )
 
     def _fetch(self) -> list[pynetft.Sample]:
-        """Take everything that has arrived, waiting a little for the first sample and 2 ms for company."""
+        """Return all samples that have arrived; wait 50 ms for the first and 2 ms for more."""
         client = self._client
         if client is None:
             raise StreamBroken(f"{self.name}: closed")
@@ -338,7 +329,7 @@ class NetFtSensor(StreamingSensor):
             if has_failed:
                 self._judge(health.last_status)
             if has_failed or silent_s > _SILENCE_S:
-                why = health.last_error if has_failed else f"nothing came for {silent_s:.2f} s"
+                why = health.last_error if has_failed else f"nothing arrived for {silent_s:.2f} s"
                 raise StreamBroken(
                     f"{self.name}: the stream has ended ({why})", "check cable and supply, then open it again"
                 )
@@ -349,23 +340,21 @@ class NetFtSensor(StreamingSensor):
         if status not in {0, MONITOR_LATCHED}:
             raise self._fault(status)
         if status and not self._warned:
-            log.warning("%s: status %s; measuring goes on", self.name, describe_status(status, self._bits, 32))
+            log.warning("%s: status %s; measuring continues", self.name, describe_status(status, self._bits, 32))
             self._warned = True
 
     def _fault(self, status: int) -> DeviceFault:
         return DeviceFault(f"{self.name}: status {describe_status(status, self._bits, 32)}", UNUSABLE)
 
     def _read_page(self, path: str) -> bytes:
-        """Ask for what pynetft does not: serial number of the calibration in use, rate, range."""
+        """Read a page that pynetft does not: serial number of the calibration in use, rate, range."""
         try:
             page = http.client.HTTPConnection(self._host, self._http_port, timeout=self._http_s)
             with self._clock.away(), closing(page) as connection:
                 connection.request("GET", path)
                 return connection.getresponse().read(65536)
         except (OSError, ValueError, http.client.HTTPException) as exc:
-            raise self._untold(exc) from exc
+            raise self._unread(exc) from exc
 
-    def _untold(self, exc: Exception) -> ConnectError:
-        return ConnectError(
-            f"{self.name}: it does not tell its configuration ({exc})", "check address, cable and supply"
-        )
+    def _unread(self, exc: Exception) -> ConnectError:
+        return ConnectError(f"{self.name}: its configuration cannot be read ({exc})", "check address, cable and supply")

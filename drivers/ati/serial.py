@@ -3,8 +3,8 @@
 Ref: ATI "Digital F/T" Modbus interface (sections 8.1, 8.3, 8.4 of 9620-05-Digital FT, as cited by public drivers).
 Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_modbus.py and the emulator (tests/wire).
 
-Modbus RTU for set-up, then a bare stream of 13-byte records at 7 kHz which only a jamming sequence stops, and which
-outlives the program that started it. Gauge gains and offsets are volatile and are written at every start.
+Modbus RTU for set-up, then a bare stream of 13-byte records at 7 kHz. Only a jamming sequence stops the stream, which
+outlives the program that started it. Gauge gains and offsets are volatile, so every start writes them.
 """
 
 import logging
@@ -30,30 +30,29 @@ log = logging.getLogger(__name__)
 
 _BAUD = 1_250_000
 _READ_S = 0.02
-"""What one read waits, and the silence after which a stopped stream is believed to have stopped."""
+"""The longest wait of one read, and the silence that proves that a stream has stopped."""
 _REPLY_S = 0.1
 _SILENCE_S = 0.2
 _BATCH_BYTES = 32 * modbus.RECORD_SIZE
-"""4.6 ms of stream, less where bytes are FF and come doubled: few wake-ups, and far less than a port buffers."""
+"""4.6 ms of stream, less where FF bytes are doubled: few wake-ups, and far less than a port buffers."""
 _MAX_RESTARTS = 3
 
 
 class AtiSerialSensor(StreamingSensor):
     """An ATI Digital F/T (or the RS-485 port of a NETCANOEM) on a serial port, 7 kHz.
 
-    Records carry no time and no number: `t_host_ns` is the receipt of the batch of about 32 they came in, `t_device_s`
-    is NaN, `seq` counts records, damaged ones included; what a restart of the stream lost is estimated from the clock.
-    Damaged is a record whose sum is wrong or in which a byte came with wrong parity.
-    `status` is the status word as last read: a record itself has one error bit, on which the stream is stopped and the
-    word read anew. Where the word explains the bit and nothing critical is in it, measuring goes on. `counts` are the
-    six gauges.
+    Records carry no time and no number. `t_host_ns` is the receipt of their batch of about 32, `t_device_s` is NaN.
+    `seq` counts records, including damaged ones (wrong sum, or a byte with wrong parity) and an estimate from the clock
+    for those lost in a restart. `counts` are the six gauges. `status` is the status word as last read. A record has
+    only an error bit; when it is set, the driver stops the stream and reads the word again. If the word explains the
+    bit and is not critical, measuring continues.
 
     Parameters
     ----------
     port : str
         The serial port; ``/dev/serial/by-id/…`` survives replugging.
     calibration : int
-        Which stored calibration to use, 1 to 16.
+        Stored calibration to use, 1 to 16.
     sign : int
         -1 for a sensor mounted or wired to report the reaction.
     """
@@ -64,11 +63,11 @@ class AtiSerialSensor(StreamingSensor):
         self._port = SerialPort(self.name, port, _BAUD, even_parity=True, read_s=_READ_S, clock=clock)
         self._buffer = bytearray()
         self._damaged: list[int] = []
-        """Places in the buffer of bytes that were received with wrong parity."""
+        """Places in the buffer of bytes with wrong parity."""
         self._seq = self._status = self._restarts = 0
         self._slipped = False
         self._last_good_ns: int | None = None
-        """While a restarted stream has not delivered: when the old one last did."""
+        """Until a restarted stream delivers: when the old one last delivered."""
 
     @classmethod
     def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
@@ -91,7 +90,7 @@ class AtiSerialSensor(StreamingSensor):
         except ProtocolError as exc:
             raise ProtocolError(
                 f"{self.name}: calibration slot {self._calibration_index}: {exc.found}",
-                "choose another, calibration=1 to 16 in its address",
+                "choose another slot, calibration=1 to 16 in its address",
             ) from exc
         self._ask(modbus.UNLOCK)
         try:
@@ -130,7 +129,7 @@ class AtiSerialSensor(StreamingSensor):
         if suspect:
             keep &= ~flagged
         elif keep.any() and not flagged.any():
-            self._status &= ~modbus.ANY_ERROR  # if there was an error it is over: the next one is a new one
+            self._status &= ~modbus.ANY_ERROR  # an error is over: the next one is new
         gauges = records.gauges[:settled][keep]
         seq = self._seq + 1 + np.flatnonzero(keep)
         if self._last_good_ns is not None and len(gauges):
@@ -141,7 +140,7 @@ class AtiSerialSensor(StreamingSensor):
             self._last_good_ns = None
         if len(gauges) and not suspect:
             self._restarts = 0
-        # what lies behind a slip has been sent, and is gone
+        # the records behind a slip were sent and are lost
         done = len(records.intact) if slipped else settled
         self._seq += done
         self._malformed += done - len(gauges)
@@ -152,35 +151,30 @@ class AtiSerialSensor(StreamingSensor):
         if suspect:
             self._look_at_status(t_host_ns)
         refuse_saturated(self.name, gauges)
-        n = len(gauges)
-        return FtSamples(
-            t_host_ns=np.full(n, t_host_ns, np.int64),
-            t_device_s=np.full(n, np.nan),
-            seq=seq.astype(np.int64),
-            counts=gauges,
-            wrench=self._calibration.wrench(gauges),
-            status=np.full(n, self._status, np.uint32),
-        )
+        wrench = self._calibration.wrench(gauges)
+        return FtSamples.of(t_host_ns, seq, wrench, counts=gauges, status=self._status)
 
     def _discard_backlog(self) -> None:
-        """The port has overflowed, and there is no telling where a record begins: it is a slip."""
+        """Treat an overflow of the port as a slip, because the start of a record is unknown."""
         self._buffer.clear()
         self._slipped = True
         self._last_good_ns = self._last_good_ns or self._newest_ns
 
     def _look_at_status(self, t_host_ns: int) -> None:
-        """Stop and read the status, as the error bit of a record asks; the sum does not cover it: it may be damage."""
+        """Stop and read the status, because the sum does not cover the error bit of a record."""
         self._judge_status(self._stop_stream())
         if not self._status & modbus.ANY_ERROR:
             text = describe_status(self._status, modbus.STATUS_BITS)
             self._restarts += 1
             if self._restarts > _MAX_RESTARTS:
                 raise ProtocolError(
-                    f"{self.name}: records carry the error bit, but the status is {text}, {self._restarts} times in a "
-                    "row",
+                    f"{self.name}: records have the error bit set, but the status is {text}, {self._restarts} times in "
+                    "a row",
                     "check parity and wiring, power it off and on",
                 )
-            log.warning("%s: a record with its error bit set, but the status is %s; going on", self.name, text)
+            log.warning(
+                "%s: a record with its error bit set, but the status is %s; measuring continues", self.name, text
+            )
         self._start_stream()
         self._slipped = False
         self._last_good_ns = self._last_good_ns or t_host_ns
@@ -194,15 +188,15 @@ class AtiSerialSensor(StreamingSensor):
             self._port.close()
 
     def _stop_stream(self) -> int:
-        """Jam, wait for silence and prove it by reading the status word, which is returned."""
+        """Stop the stream, prove it by reading the status word, and return the word."""
         self._jam()
         try:
             return int.from_bytes(self._ask(modbus.read_registers(modbus.STATUS, 1), self._jam), "big")
         except (DeviceTimeout, ProtocolError) as exc:
-            raise DeviceTimeout(exc.found, f"{exc.cure}; is it this sensor, and is the termination right?") from exc
+            raise DeviceTimeout(exc.found, f"{exc.fix}, check termination and address") from exc
 
     def _start_stream(self) -> None:
-        self._ask(modbus.START, self._jam)  # perhaps it streams, and only the reply was lost
+        self._ask(modbus.START, self._jam)  # it may stream already, with only the reply lost
         self._buffer.clear()
         self._damaged.clear()
 
@@ -212,23 +206,23 @@ class AtiSerialSensor(StreamingSensor):
             raise ProtocolError(
                 f"{self.name}: no intact record after {_MAX_RESTARTS} restarts of the stream", "check parity and wiring"
             )
-        log.warning("%s: stream out of step, restarting it", self.name)
+        log.warning("%s: the stream has slipped; restarting it", self.name)
         self._judge_status(self._stop_stream())
         self._start_stream()
         self._slipped = False
 
     def _jam(self) -> None:
-        """Stop whatever is streaming and wait until the line is silent."""
+        """Stop any stream and wait until the line is silent."""
         self._port.write(modbus.JAM, discard=True)
         self._port.drain(_READ_S, _SILENCE_S)
 
     def _ask(self, request: bytes, before_again: Callable[[], object] | None = None) -> bytes:
-        """Exchange with retries; unless told otherwise, a late reply passes between them."""
+        """Exchange with retries; by default a late reply is read between them."""
         again = before_again or (lambda: self._port.read(_BATCH_BYTES))
         return ask(self._port, self.name, request, modbus.check_reply, self._clock, _REPLY_S, again)
 
     def _judge_status(self, status: int) -> None:
-        """Raise on what makes the data unusable, log the rest of a status word once."""
+        """Raise when the data is unusable; log other status bits once."""
         new, self._status = status & ~self._status, status
         text = describe_status(status, modbus.STATUS_BITS)
         if status & modbus.CRITICAL:
@@ -236,4 +230,4 @@ class AtiSerialSensor(StreamingSensor):
         if self._seq and new & modbus.WATCHDOG_RESET:
             raise StreamBroken(f"{self.name}: the sensor has reset itself and lost its gains", "open it again")
         if new:
-            log.warning("%s: status %s; measuring goes on", self.name, text)
+            log.warning("%s: status %s; measuring continues", self.name, text)

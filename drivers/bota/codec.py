@@ -42,32 +42,32 @@ class Frame(NamedTuple):
 
 
 def is_frame(data: bytes) -> bool:
-    """Tell whether bytes are a whole frame: length, header and checksum."""
+    """Return whether bytes are a whole frame: length, header and checksum."""
     return (
         len(data) == FRAME_SIZE and data.startswith(HEADER) and crc16_x25(data[1:-2]).to_bytes(2, "little") == data[-2:]
     )
 
 
 def deframer() -> Deframer:
-    """Something that finds frames in a stream of bytes."""
+    """Build a finder of frames in a stream of bytes."""
     return Deframer(HEADER, FRAME_SIZE, is_frame)
 
 
 def decode_frame(data: bytes) -> Frame:
     """Decode a whole frame."""
     if not is_frame(data):
-        raise ProtocolError(f"these bytes are no frame: {data.hex(' ')}")
+        raise ProtocolError(f"the bytes {data.hex(' ')} are not a frame")
     status, *wrench, t_us, temperature_C = _PAYLOAD.unpack_from(data, 1)
     if not all(map(math.isfinite, wrench)):
-        raise ProtocolError(f"the sensor sends {wrench}, which is no wrench", "power it off and on")
+        raise ProtocolError(f"the sensor sends the wrench {wrench}, which is not finite", "power it off and on")
     return Frame(status, tuple(wrench), t_us, temperature_C)
 
 
 def filter_command(sinc: int) -> bytes:
-    """Command that sets the sinc length: no chopping, no fast mode, FIR off (the vendor's example)."""
+    """Build the command that sets the sinc length: no chopping, no fast mode, FIR off (the vendor's example)."""
     return f"f,{sinc},0,0,1".encode("ascii")
 
 
 def success(command: bytes) -> bytes:
-    """Tell how the sensor confirms a command."""
+    """Return the confirmation of a command."""
     return b"r,0," + command[:1] + b",0"

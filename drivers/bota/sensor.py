@@ -3,8 +3,8 @@
 Ref: Bota Systems, serial interface of SensONE and Rokubi, as in the vendor's example programs.
 Checked on hardware: no. Verified against: tests/unit/drivers/bota/test_codec.py and the emulator (tests/wire).
 
-The sensor streams from power-up for ever. The driver listens, and sends something only when it was asked to configure;
-closing leaves the stream running. The text a sensor prints when it boots is not waited for: it may have been hours ago.
+The sensor streams from power-up on. The driver only reads, unless the address configures the filter; `close` leaves the
+stream running. The driver does not wait for the boot text, which may have been sent hours ago.
 """
 
 import logging
@@ -31,7 +31,7 @@ _BAUD = 460_800
 _FIRST_FRAMES = 8
 """The median of their spacing is the sample period."""
 _FIRST_FRAMES_S = 3.0
-"""A sensor that was switched on this moment boots meanwhile."""
+"""Enough for a sensor that is still booting."""
 _REPLY_S = 1.0
 _ATTEMPTS = 3
 _CLOCK = 1 << 32
@@ -40,16 +40,16 @@ _CLOCK = 1 << 32
 class BotaSensor(StreamingSensor):
     """A Bota SensONE or Rokubi with the serial interface of 37-byte frames.
 
-    `t_device_s` is the sensor's clock, `seq` counts sample periods on it, so that gaps are visible. The sensor sends
-    N and N·m: `counts` are empty. Overrange, invalid and uncalibrated samples are a `DeviceFault`.
+    `t_device_s` is the sensor's clock, `seq` counts its sample periods, so that gaps are visible. `counts` are empty,
+    because the sensor sends N and N·m. Overrange, invalid and uncalibrated samples are a `DeviceFault`.
 
     Parameters
     ----------
     port : str
         The serial port; ``/dev/serial/by-id/…`` survives replugging.
     sinc : int, optional
-        Filter length, such as 512: the sample period is 19.53125 µs times this. Given, the sensor is configured to
-        stream calibrated binary frames; otherwise nothing is ever sent to it.
+        Filter length, such as 512; the sample period is 19.53125 µs times this. With it, the driver configures the
+        sensor to stream calibrated binary frames; without it, the driver never sends anything.
     sign : int
         -1 for a sensor mounted or wired to report the reaction.
     """
@@ -95,13 +95,11 @@ class BotaSensor(StreamingSensor):
         times = [self._elapse(frame.t_us) for frame in frames]
         status = np.array([frame.status for frame in frames], np.uint32)
         self._judge(int(np.bitwise_or.reduce(status)))
-        n = len(frames)
-        return FtSamples(
-            t_host_ns=np.full(n, t_host_ns, np.int64),
+        return FtSamples.of(
+            t_host_ns,
+            [seq for _, seq in times],
+            [frame.wrench for frame in frames],
             t_device_s=np.array([t_us for t_us, _ in times]) * 1e-6,
-            seq=np.array([seq for _, seq in times], np.int64),
-            counts=np.zeros((n, 0), np.int32),
-            wrench=np.array([frame.wrench for frame in frames]),
             status=status,
         )
 
@@ -109,7 +107,7 @@ class BotaSensor(StreamingSensor):
         self._port.close()
 
     def _configure(self, sinc: int) -> None:
-        """Enter set-up, ask for calibrated binary frames and the filter, and let it run again."""
+        """Enter set-up, set calibrated binary frames and the filter, and run again."""
         for command in (
             codec.ENTER_SETUP,
             codec.BINARY_AND_CALIBRATED,
@@ -121,7 +119,7 @@ class BotaSensor(StreamingSensor):
     def _command(self, command: bytes) -> None:
         for _ in range(_ATTEMPTS):
             self._port.write(command)
-            answer = b""  # until it listens the sensor streams: its answer comes somewhere behind the frames
+            answer = b""  # its reply comes after frames that were already on the way
             for _ in self._clock.looks(_REPLY_S):
                 answer = answer[-len(codec.success(command)) :] + self._port.read_all(1)
                 if codec.success(command) in answer:
@@ -138,13 +136,12 @@ class BotaSensor(StreamingSensor):
             if len(frames) >= _FIRST_FRAMES:
                 return frames
         raise ConnectError(
-            f"{self.name}: {len(frames)} intact frames within {_FIRST_FRAMES_S} s",
-            "check supply and wiring; a sensor that was left in set-up, in text mode or at another rate is put right "
-            "by ?sinc=512",
+            f"{self.name}: {len(frames)} intact frames within {_FIRST_FRAMES_S} s, {_FIRST_FRAMES} are needed",
+            "check supply and wiring; add ?sinc=512 for a sensor in set-up, in text mode or at another rate",
         )
 
     def _elapse(self, t_us: int) -> tuple[int, int]:
-        """Follow the sensor's clock over its wraps; returns (time in µs, sequence number)."""
+        """Unwrap the sensor's clock; return (time in µs, sequence number)."""
         step_us = (t_us - self._t_us) % _CLOCK
         if step_us > _CLOCK // 2:
             raise StreamBroken(
@@ -159,12 +156,12 @@ class BotaSensor(StreamingSensor):
         return self._t_us, self._seq
 
     def _judge(self, status: int) -> None:
-        """Raise on what makes a sample unusable, log the rest of a status word once."""
+        """Raise when a sample is unusable; log other status bits once."""
         if status & (codec.RAW | codec.OVERRANGE | codec.INVALID):
-            told = f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}"
+            found = f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}"
             if status & codec.RAW:
-                raise DeviceFault(f"{told}: these are no newtons", "?sinc=512 configures it")
-            raise DeviceFault(told, "take the load off, check the cable")
+                raise DeviceFault(f"{found}, samples are not in N", "add ?sinc=512 to its address")
+            raise DeviceFault(found, "take the load off, check the cable")
         if new := status & ~self._seen_status:
-            log.warning("%s: status %s; measuring goes on", self.name, describe_status(new, codec.STATUS_BITS))
+            log.warning("%s: status %s; measuring continues", self.name, describe_status(new, codec.STATUS_BITS))
             self._seen_status |= new

@@ -1,8 +1,8 @@
-"""Which known sensors are on a CAN bus: listen first, then ask for their names. Only for buses that the user names.
+"""Probe a CAN bus for known sensors: listen first, then request their names. Only for buses that the user names.
 
-Three frames may be sent, all requests to read: serial number and firmware of an ATI NETCANOEM, and the model of a
-Robotous. A sensor is asked only if nothing is heard on its identifiers: they may be commands to other devices, such as
-motor drives, for which 0x201 to 0x20F are set values.
+Three frames may be sent, all read requests: serial number and firmware of an ATI NETCANOEM, and model of a Robotous. A
+sensor is asked only if its identifiers are silent, because they may be commands to other devices. For motor drives,
+0x201 to 0x20F are set values.
 
 Ref: ATI 9610-05-1030-04, command list; Robotous RFT manual 1.7, communication protocol; CiA 301, predefined connection
 set.
@@ -23,13 +23,13 @@ from drivers.robotous import codec as robotous
 from drivers.wires.can_bus import CanBus
 
 _LISTEN_S = 1.0
-"""Ten samples of the slowest Robotous, and about the slowest heartbeat in use."""
+"""Ten samples of the slowest Robotous, and about the slowest usual heartbeat."""
 _REPLY_S = 0.25
 _ENOUGH_SAMPLES = 5
-"""In a row and in order, before frames are believed to be that sensor's."""
+"""So many in a row and in order identify a sensor."""
 
 _HEARTBEATS = frozenset(range(0x701, 0x780))
-"""Nodes of CANopen; with them on a bus every lower identifier may be a command, also one that is silent now."""
+"""Nodes of CANopen. On their bus every lower identifier may be a command, even one that is silent now."""
 
 Frame = tuple[int, bytes]
 
@@ -39,7 +39,7 @@ class _Known:
     name: str
     url: str
     must_be_silent: AbstractSet[int]
-    """Identifiers on which nothing may be heard before it is asked."""
+    """Identifiers that must be silent before the sensor is asked."""
     shows_itself: Callable[[Sequence[Frame]], str | None]
     ask: Callable[[CanBus, Clock], str | None]
 
@@ -47,18 +47,18 @@ class _Known:
 def probe_can(
     channel: str, *, interface: str, bitrate: int | None, base: int = 0x20, clock: Clock = REAL
 ) -> list[Answer]:
-    """Tell which known sensors are on a bus, and which could not be asked.
+    """Return the known sensors on a bus, and those that could not be asked.
 
     Parameters
     ----------
     channel, interface : str
         ``can0`` and ``socketcan``, or a serial port and ``slcan``.
     bitrate : int or None
-        Bit/s of the bus: a wrong one disturbs it. None on socketcan, where it is not known.
+        Bit/s of the bus: a wrong one disturbs it. None on socketcan, where it is unknown.
     base : int
-        Where an ATI sensor is looked for, 0x00 to 0x7F.
+        Base identifier of an ATI sensor, 0x00 to 0x7F.
     clock : Clock
-        What the waits are measured by.
+        Measures the waits.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def probe_can(
             heard = _hear(bus, clock)
             return [answer for sensor in known if (answer := _look(sensor, heard, bus, clock))]
     except StreamBroken as exc:
-        raise ConnectError(exc.found, exc.cure) from exc
+        raise ConnectError(exc.found, exc.fix) from exc
     finally:
         bus.close()
 
@@ -91,8 +91,8 @@ def _look(known: _Known, heard: Sequence[Frame], bus: CanBus, clock: Clock) -> A
         some = ", ".join(f"0x{identifier:03X}" for identifier in busy[:4]) + (" …" if busy[4:] else "")
         return Answer(
             None,
-            f"{known.name} was not asked, because something else sends on {some}; "
-            f"if you know that it is there, its address is {known.url}",
+            f"{known.name} was not asked, because another device sends on {some}; "
+            f"use {known.url} if you know that it is there",
         )
     return Answer(known.url, what) if (what := known.ask(bus, clock)) else None
 
@@ -146,10 +146,10 @@ def _robotous(channel: str, interface: str) -> _Known:
     def ask(bus: CanBus, clock: Clock) -> str | None:
         field = _ask(bus, clock, robotous_can.COMMAND, robotous.encode(robotous.Command.MODEL), reply)
         try:
-            told = field and field[0] == robotous.Command.MODEL and robotous.decode_text(field)
+            model = field and field[0] == robotous.Command.MODEL and robotous.decode_text(field)
         except ProtocolError:
             return None
-        return f"Robotous {told}" if told else None
+        return f"Robotous {model}" if model else None
 
     return _Known(
         "a Robotous",
@@ -178,12 +178,12 @@ def _ask(bus: CanBus, clock: Clock, identifier: int, data: bytes, parts: Mapping
 
 
 def _messages(frames: Sequence[Frame], parts: Mapping[int, int]) -> list[bytes]:
-    """Put whole messages together; none if one frame is out of order or of the wrong length.
+    """Assemble whole messages; none if a frame is out of order or of the wrong length.
 
     Parameters
     ----------
     parts : mapping
-        From identifier to length in bytes of the frames of one message, in their order.
+        Identifier and length in bytes of the frames of one message, in their order.
     """
     order = list(parts)
     if not frames or frames[0][0] not in order:

@@ -1,7 +1,6 @@
-"""Which known sensor is on a serial port: listen first, then ask for its name. Only for ports that the user names.
+"""Probe a serial port for known sensors: listen first, then request their names. Only for ports that the user names.
 
-Nothing is set, started or stopped: what is sent are requests to read, in the protocols of ATI, Robotiq and Robotous.
-They are still bytes, and what an unknown device makes of them is unknown. CAN buses: `probe_can`.
+Only read requests are sent, with the protocols of ATI, Robotiq and Robotous. Their effect on other devices is unknown.
 """
 
 from collections.abc import Callable
@@ -21,17 +20,17 @@ from drivers.wires.serial_port import SerialPort
 _LISTEN_S = 0.25
 _REPLY_S = 0.25
 _ENOUGH_FRAMES = 5
-"""That fit by their checksums, before a stream is believed to be that sensor's."""
+"""So many with a right checksum identify a stream."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A sensor that has shown itself, or one that could not be asked."""
+    """A sensor that was found, or one that could not be asked."""
 
     url: str | None
-    """To be used as it is; None for a sensor that was not asked."""
+    """Its address; None for a sensor that was not asked."""
     what: str
-    """What it says of itself, or why it was not asked."""
+    """What it reports about itself, or why it was not asked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +41,11 @@ class _Known:
     streams: Callable[[bytes], bool]
     request: bytes | None
     reply: Callable[[bytes], str]
-    """What the device says of itself; raises `ProtocolError`."""
+    """What the device reports about itself; raises `ProtocolError`."""
 
 
 def probe(port: str, clock: Clock = REAL) -> Answer | None:
-    """Tell which known sensor is on this port, or None.
+    """Return the known sensor on this port, or None.
 
     Raises
     ------
@@ -77,7 +76,7 @@ def _hear(path: str, known: _Known, request: bytes | None, duration_s: float, cl
         for _ in clock.looks(duration_s):
             data += port.read(4096)
     except StreamBroken as exc:
-        raise ConnectError(exc.found, exc.cure) from exc
+        raise ConnectError(exc.found, exc.fix) from exc
     finally:
         port.close()
     return data
@@ -88,7 +87,7 @@ def _frames(deframer: Callable[[], Deframer]) -> Callable[[bytes], bool]:
 
 
 def _ati_streams(data: bytes) -> bool:
-    """Records have neither header nor number: all that follow each other must have a right checksum."""
+    """Require a right checksum in 20 records or more, because they have neither header nor number."""
     data = data[-100 * modbus.RECORD_SIZE :]
     if not data.strip(b"\0"):
         return False
@@ -106,8 +105,8 @@ _ROBOTOUS_REQUEST = robotous.encode_frame(robotous.encode(robotous.Command.MODEL
 
 
 def _ati_reply(data: bytes) -> str:
-    told = modbus.check_reply(_ATI_REQUEST, data[: modbus.reply_size(_ATI_REQUEST)])
-    return f"ATI Digital F/T {decode_text(told[8:])}, serial {decode_text(told[:8])}"
+    registers = modbus.check_reply(_ATI_REQUEST, data[: modbus.reply_size(_ATI_REQUEST)])
+    return f"ATI Digital F/T {decode_text(registers[8:])}, serial {decode_text(registers[:8])}"
 
 
 def _robotiq_reply(data: bytes) -> str:
@@ -124,7 +123,7 @@ def _robotous_reply(data: bytes) -> str:
 
 
 def _nothing(_: bytes) -> str:
-    raise ProtocolError("it is not asked")
+    raise ProtocolError("this sensor is not asked")
 
 
 _robotous_streams = _frames(robotous.deframer)

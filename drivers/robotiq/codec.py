@@ -24,7 +24,7 @@ STREAM, FIRMWARE, SERIAL = 410, 500, 510
 START_STREAM = 0x0200
 
 STOP = b"\xff" * 50
-"""Ends a running stream; the sensor may take half a second to do so."""
+"""Stops a running stream, which may take 0.5 s."""
 
 HEADER = b"\x20\x4e"
 FRAME_SIZE = 16
@@ -32,7 +32,7 @@ NOMINAL_RATE_Hz = 100.0
 COUNTS_PER_UNIT = (100, 100, 100, 1000, 1000, 1000)
 """Per N and per N·m."""
 RANGE = (300.0, 300.0, 300.0, 30.0, 30.0, 30.0)
-"""N and N·m, either way."""
+"""N and N·m, in both directions."""
 
 
 Refused = _modbus.Refused
@@ -46,13 +46,13 @@ def write_register(register: int, value: int) -> bytes:
 
 
 def check_reply(request: bytes, reply: bytes) -> tuple[int, ...]:
-    """Check a whole reply against its request and return the registers it carries; none for a write."""
+    """Check a whole reply against its request and return the registers in it; none for a write."""
     payload = _modbus.check_reply(request, reply)
     return struct.unpack(f">{len(payload) // 2}H", payload)
 
 
 def is_frame(data: bytes) -> bool:
-    """Tell whether bytes are a whole stream frame: length, header and checksum."""
+    """Return whether bytes are a whole stream frame: length, header and checksum."""
     return (
         len(data) == FRAME_SIZE
         and data.startswith(HEADER)
@@ -61,14 +61,14 @@ def is_frame(data: bytes) -> bool:
 
 
 def deframer() -> Deframer:
-    """Something that finds frames in a stream of bytes."""
+    """Build a finder of frames in a stream of bytes."""
     return Deframer(HEADER, FRAME_SIZE, is_frame)
 
 
 def decode_frame(data: bytes) -> tuple[int, ...]:
     """Decode a stream frame: six counts Fx..Tz."""
     if not is_frame(data):
-        raise ProtocolError(f"these bytes are no stream frame: {data.hex(' ')}")
+        raise ProtocolError(f"the bytes {data.hex(' ')} are not a stream frame")
     return struct.unpack_from("<6h", data, len(HEADER))
 
 
@@ -95,5 +95,5 @@ def _words(registers: Sequence[int], count: int) -> Sequence[int]:
 
 
 def _letters(*codes: int) -> str:
-    """Text of character codes; none where one of them is not printable."""
+    """Decode character codes; empty where one of them is not printable."""
     return bytes(codes).decode("ascii") if all(0x20 < code < 0x7F for code in codes) else ""

@@ -3,8 +3,8 @@
 Ref: Robotiq, "FT 300 Force Torque Sensor" instruction manual, control over Modbus RTU and data stream.
 Checked on hardware: no. Verified against: tests/unit/drivers/robotiq/test_codec.py and the emulator (tests/wire).
 
-Modbus RTU for set-up, then a bare stream at 100 Hz which only 50 bytes of 0xFF end, and which may already run when the
-sensor has booted. The sensor has no zero command: what others call zeroing is done on the host.
+Modbus RTU for set-up, then a bare stream at 100 Hz, which may run directly after boot. Only 50 bytes of 0xFF stop it.
+The sensor has no zero command: other programs zero on the host.
 """
 
 from typing import TYPE_CHECKING, Self
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
 _BAUD = 19_200
 _REPLY_S = 0.2
 _SILENCE_S, _STOP_S = 0.05, 1.0
-"""How long nothing may come before a stopped stream is believed to have stopped, and how long to wait for that."""
+"""The silence that proves that a stream has stopped, and the longest wait for it."""
 _LATENT_RATE_Hz = (55.0, 70.0)
-"""Around 62.5 Hz, one answer in each 16 ms of an FTDI adapter's latency timer."""
+"""Around 62.5 Hz, one delivery in each 16 ms of an FTDI adapter's latency timer."""
 
 
 class RobotiqFt300(StreamingSensor):
     """A Robotiq FT 300 or FT 300-S, 100 Hz.
 
-    `counts` are the six raw values (0.01 N and 0.001 N·m), `t_device_s` is NaN, `status` is 0: the sensor tells none.
-    A value at the end of its 16 bits is a `DeviceFault`. Frames carry no number: `seq` counts what arrived, damaged
-    frames included, so a frame the wire swallowed whole shows only in the rate.
+    `counts` are the six raw values (0.01 N and 0.001 N·m), `t_device_s` is NaN, `status` is 0, as the sensor reports
+    neither. A value at the end of its 16 bits is a `DeviceFault`. Frames carry no number: `seq` counts arrived frames,
+    including damaged ones, so a wholly lost frame shows only in the rate.
 
     Parameters
     ----------
@@ -81,15 +81,8 @@ class RobotiqFt300(StreamingSensor):
         counts = np.array([codec.decode_frame(frame) for _, frame in frames], np.int32)
         if (np.abs(counts + 0.5) > 32767).any():
             raise DeviceFault(f"{self.name}: a value is at the end of its range", "take the load off, check the cable")
-        n = len(frames)
-        return FtSamples(
-            t_host_ns=np.full(n, t_host_ns, np.int64),
-            t_device_s=np.full(n, np.nan),
-            seq=np.array([number for number, _ in frames], np.int64),
-            counts=counts,
-            wrench=counts / codec.COUNTS_PER_UNIT,
-            status=np.zeros(n, np.uint32),
-        )
+        numbers = [number for number, _ in frames]
+        return FtSamples.of(t_host_ns, numbers, counts / codec.COUNTS_PER_UNIT, counts=counts)
 
     def _disconnect(self) -> None:
         if not self._port.is_open:
@@ -100,18 +93,18 @@ class RobotiqFt300(StreamingSensor):
             self._port.close()
 
     def _stop_stream(self) -> None:
-        """End a stream and wait for silence."""
+        """Stop a stream and wait for silence."""
         self._port.write(codec.STOP)
         self._port.drain(_SILENCE_S, _STOP_S)
 
     def _ask(self, request: bytes) -> tuple[int, ...]:
-        """Exchange with retries, each after another stop: a stream may run that we did not start."""
+        """Exchange with retries, each after another stop, because an earlier stream may still run."""
         return ask(self._port, self.name, request, codec.check_reply, self._clock, _REPLY_S, self._stop_stream)
 
-    def _why_rate(self, rate_Hz: float) -> str:
+    def _rate_fix(self, rate_Hz: float) -> str:
         if not _LATENT_RATE_Hz[0] < rate_Hz < _LATENT_RATE_Hz[1]:
-            return super()._why_rate(rate_Hz)
+            return super()._rate_fix(rate_Hz)
         return (
-            "the USB adapter waits 16 ms before it delivers: "
+            "reduce the 16 ms latency of the USB adapter: "
             "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer (with the name of your port)"
         )

@@ -19,17 +19,17 @@ COMMAND, FIRST_HALF, SECOND_HALF = 0x64, 0x01, 0x02
 BITRATE = 1_000_000
 _WAIT_S = 0.05
 _HEARD_S = 0.15
-"""Since the last half: shorter than the silence that is an error, longer than the slowest sensor's period."""
+"""Since the last half: shorter than `StreamLimits.stale_s`, longer than the slowest sensor's period."""
 _LATE_S = 0.03
-"""By how much an emulated sensor may be late: more than an emulated cell's time ever runs ahead of it."""
+"""The most that an emulated sensor may be late: more than its cell's time ever runs ahead of it."""
 _OVERSLEPT_S = 0.002
-"""Where a wait ends so much too late the host was busy, and frames may be there: it has to look once more."""
+"""After a wait that ends this late the host was busy, and frames may have arrived: look once more."""
 
 
 class CanLink:
-    """The wire of a Robotous sensor with the identifiers of the factory, 0x64 to it, 0x01 and 0x02 from it.
+    """The CAN bus of a Robotous sensor with the factory's identifiers, 0x64 to it, 0x01 and 0x02 from it.
 
-    The second half of a field says nothing about the first; `Halves` says which belong together.
+    `Halves` pairs the frames, because the second half of a field does not identify the first.
     """
 
     def __init__(self, channel: str, *, interface: str = "socketcan", clock: Clock = REAL) -> None:
@@ -42,12 +42,12 @@ class CanLink:
 
     @property
     def damaged(self) -> int:
-        """Samples that are missing, by the clock, or were not certain to be whole."""
+        """Samples that are missing by the clock, or were dropped because their pairing was uncertain."""
         return self._halves.lost
 
     @property
     def unpaired(self) -> bool:
-        """Whether halves come: where no fields do, they are not believed, as on a computer that is too busy."""
+        """Whether halves arrived lately. Without fields, they could not be paired, as on an overloaded computer."""
         return self._heard_ns is not None and self.clock.now_ns() - self._heard_ns < _HEARD_S * 1e9
 
     def open(self) -> None:
@@ -65,7 +65,7 @@ class CanLink:
         self.send(codec.encode(Command.START))
 
     def receive(self) -> list[Field]:
-        """Take the next fields, or none after 0.05 s."""
+        """Return the next fields, or none after 0.05 s."""
         if self.clock.emulated:
             return self._receive_all()
         overslept = False
@@ -87,9 +87,9 @@ class CanLink:
         return []
 
     def _receive_all(self) -> list[Field]:
-        """Take what an emulated sensor has sent so far, in place of a silence, which a starved program never sees.
+        """Return all that an emulated sensor has sent. A starved program never sees the silence that ends a run.
 
-        The cell's time stands still meanwhile, so there is an end of it.
+        The cell's time stands still meanwhile, so the loop ends.
         """
         frame = self._bus.look(self.clock.poll_s)
         now_ns = self.clock.now_ns()

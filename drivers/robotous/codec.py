@@ -1,7 +1,7 @@
 """Robotous RFT: commands, replies and samples, the same on both wires, as pure functions on bytes.
 
-A command is a field of 8 bytes, a reply or sample one of 16; byte 0 is the command. CAN carries fields as they are, the
-UART puts each into a frame. All multi-byte numbers are big-endian.
+A command is a field of 8 bytes, a reply or sample one of 16; byte 0 is the command. CAN carries bare fields, the UART
+puts each into a frame. All multi-byte numbers are big-endian.
 
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7, communication protocol.
 Checked on hardware: no. Verified against: tests/unit/drivers/robotous/test_codec.py.
@@ -27,7 +27,7 @@ FRAME_SIZE = REPLY_SIZE + 3
 AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 RATE_CODES: Mapping[int, int] = MappingProxyType({10: 1, 20: 2, 50: 3, 100: 4, 200: 5, 333: 6, 500: 7, 1000: 8})
-"""Code of each output rate in Hz. A sensor fresh from the factory tells code 0, which is 200 Hz."""
+"""Code of each output rate in Hz. A new sensor reports code 0, which is 200 Hz."""
 
 COUNTS_PER_N = 50
 _COUNTS_PER_NM: Mapping[str, int] = MappingProxyType(
@@ -37,7 +37,7 @@ _FAILURES = {1: "not supported", 2: "value out of range", 3: "failed to set"}
 
 
 class Command(IntEnum):
-    """What this driver asks for. The bias command, 0x11, is not among them."""
+    """The commands of this driver, which never sends the bias command, 0x11."""
 
     MODEL = 0x01
     SERIAL = 0x02
@@ -50,7 +50,7 @@ class Command(IntEnum):
 
 
 class Field(NamedTuple):
-    """A field of 16 bytes as it came; `number` counts damaged ones too."""
+    """A received field of 16 bytes; `number` counts damaged ones too."""
 
     number: int
     t_host_ns: int
@@ -75,12 +75,12 @@ def encode_frame(field: bytes) -> bytes:
 
 
 def is_frame(data: bytes) -> bool:
-    """Tell whether bytes are a whole frame of the sensor: length, both marks and the sum."""
+    """Return whether bytes are a whole frame of the sensor: length, both marks and the sum."""
     return len(data) == FRAME_SIZE and data == encode_frame(data[1:-2])
 
 
 def deframer() -> Deframer:
-    """Something that finds frames in a stream of bytes."""
+    """Build a finder of frames in a stream of bytes."""
     return Deframer(bytes([START_OF_FRAME]), FRAME_SIZE, is_frame)
 
 
@@ -90,7 +90,7 @@ def decode_text(field: bytes) -> str:
     text = field[1:].split(b"\0")[0].strip()
     if not text or not all(0x20 <= byte < 0x7F for byte in text):
         raise ProtocolError(
-            f"the reply to command 0x{field[0]:02X} is no text: {field.hex(' ')}", "power it off and on"
+            f"the reply to command 0x{field[0]:02X} is not text: {field.hex(' ')}", "power it off and on"
         )
     return text.decode("ascii")
 
@@ -101,7 +101,7 @@ def decode_rate(field: bytes) -> int:
     for rate_Hz, code in RATE_CODES.items():
         if field[1] in {code, 0} and (field[1] or rate_Hz == 200):
             return rate_Hz
-    raise ProtocolError(f"the sensor tells output rate code {field[1]}, known are 0 to 8", "power it off and on")
+    raise ProtocolError(f"the sensor reports output rate code {field[1]}, known are 0 to 8", "power it off and on")
 
 
 def check_set(field: bytes) -> None:
@@ -109,31 +109,31 @@ def check_set(field: bytes) -> None:
     _expect_size(field)
     if field[1] != 1:
         reason = _FAILURES.get(field[2], "unknown reason")
-        cure = "leave rate out of its address, or power it off and on"
-        raise ProtocolError(f"the sensor refused command 0x{field[0]:02X}: {field[2]} ({reason})", cure)
+        fix = "leave rate out of its address, or power it off and on"
+        raise ProtocolError(f"the sensor refused command 0x{field[0]:02X}: {field[2]} ({reason})", fix)
 
 
 def decode_sample(field: bytes) -> Sample:
     """Decode a sample, sent once for `ONE_SAMPLE` or continually after `START`."""
     _expect_size(field)
     if field[0] not in {Command.ONE_SAMPLE, Command.START}:
-        raise ProtocolError(f"a field of command 0x{field[0]:02X} is no sample: {field.hex(' ')}")
+        raise ProtocolError(f"a field of command 0x{field[0]:02X} is not a sample: {field.hex(' ')}")
     *counts, overload = struct.unpack_from(">6hB", field, 1)
     return Sample(tuple(counts), overload)
 
 
 def overloaded_axes(overload: int) -> list[str]:
-    """Name the axes whose overload bit is set."""
+    """Return the axes whose overload bit is set."""
     return [axis for bit, axis in zip(range(5, -1, -1), AXES, strict=True) if overload >> bit & 1]
 
 
 def counts_per_unit(model: str) -> tuple[int, int]:
-    """Counts per N and per N·m of a model, by its name such as ``RFT60-HA01``."""
+    """Return counts per N and per N·m of a model such as ``RFT60-HA01``."""
     match = re.match(r"RFT-?(\d\d)", model)
     if match is None or match[1] not in _COUNTS_PER_NM:
         known = ", ".join(f"RFT{number}" for number in _COUNTS_PER_NM)
-        cure = "add its scale, from its manual, to drivers/robotous/codec.py"
-        raise ProtocolError(f"the scale of model '{model}' is not known, only those of {known}", cure)
+        fix = "add its scale, from its manual, to drivers/robotous/codec.py"
+        raise ProtocolError(f"the scale of model '{model}' is unknown, known are those of {known}", fix)
     return COUNTS_PER_N, _COUNTS_PER_NM[match[1]]
 
 

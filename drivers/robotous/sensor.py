@@ -1,10 +1,10 @@
-"""Robotous RFT force/torque sensor, whatever the wire.
+"""Robotous RFT force/torque sensor, on either wire.
 
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7.
 Checked on hardware: no. Verified against: tests/unit/drivers/robotous/test_codec.py and the emulator (tests/wire).
 
-While it streams the sensor hears only stop and bias, so an answer to any other question proves that it has stopped. It
-has a bias command; this driver never sends it.
+A streaming sensor accepts only stop and bias, so a reply to any other command proves that it has stopped. This driver
+never sends the bias command.
 """
 
 from typing import Protocol
@@ -23,22 +23,22 @@ _ATTEMPTS = 3
 
 
 class Link(Protocol):
-    """What carries fields: a CAN bus or a UART."""
+    """The wire that carries fields: a CAN bus or a UART."""
 
     name: str
-    """The device as the user knows it."""
+    """Name of the device, for errors."""
     fastest_Hz: int
-    """The highest output rate it carries."""
+    """The highest output rate of the wire."""
     clock: Clock
-    """What the sensor's limits are measured by."""
+    """Measures the sensor's limits."""
 
     @property
     def damaged(self) -> int:
-        """How many fields arrived damaged or in part."""
+        """How many fields were damaged or incomplete."""
 
     @property
     def unpaired(self) -> bool:
-        """Whether what comes at this moment makes no fields."""
+        """Whether frames arrive that cannot be paired into fields."""
 
     def open(self) -> None:
         """Open the wire."""
@@ -47,29 +47,29 @@ class Link(Protocol):
         """Send a command field (8 bytes)."""
 
     def stream(self, rate_Hz: int, /) -> None:
-        """Send the command to start; from now on samples come at this rate."""
+        """Start the stream at this rate."""
 
     def receive(self) -> list[Field]:
-        """Take the fields that come within about 0.05 s."""
+        """Return the fields that arrive within about 0.05 s."""
 
     def close(self) -> None:
-        """Free the wire. Idempotent."""
+        """Close the wire. Idempotent."""
 
 
 class RobotousSensor(StreamingSensor):
     """A Robotous RFT on a `Link`.
 
     `counts` are the six raw values, `t_device_s` is NaN, `status` holds the overload bits (5 for Fx down to 0 for Tz);
-    any of them set is a `DeviceFault`. Samples carry no number: on a UART `seq` counts what arrived, damaged frames
-    included, so a sample the wire swallowed whole shows only in the rate; on CAN the clock tells what is missing.
+    any of them set is a `DeviceFault`. Samples carry no number. On a UART `seq` counts arrived frames, including
+    damaged ones, so a wholly lost sample shows only in the rate. On CAN the clock shows what is missing.
 
     Parameters
     ----------
     link : Link
         `drivers.robotous.can.CanLink` or `drivers.robotous.serial.SerialLink`.
     rate_Hz : int, optional
-        10, 20, 50, 100, 200, 333, 500 or 1000, which a UART carries at 921600 baud only. Without it the sensor keeps
-        the rate it has.
+        10, 20, 50, 100, 200, 333, 500 or 1000, which a UART carries at 921600 baud only. Without it, the rate that is
+        set in the sensor.
     sign : int
         -1 for a sensor mounted or wired to report the reaction.
     """
@@ -77,9 +77,9 @@ class RobotousSensor(StreamingSensor):
     def __init__(self, link: Link, *, rate_Hz: int | None = None, sign: int = 1) -> None:
         super().__init__(link.name, sign=sign, clock=link.clock)
         if rate_Hz is not None and rate_Hz not in codec.RATE_CODES:
-            raise ValueError(f"rate is {rate_Hz} Hz; the sensor knows {', '.join(map(str, codec.RATE_CODES))}")
+            raise ValueError(f"rate is {rate_Hz} Hz; choose one of {', '.join(map(str, codec.RATE_CODES))}")
         if rate_Hz is not None and rate_Hz > link.fastest_Hz:
-            raise ValueError(f"rate is {rate_Hz} Hz; at this baud rate {link.fastest_Hz} Hz is the most")
+            raise ValueError(f"rate is {rate_Hz} Hz; choose at most {link.fastest_Hz} Hz, or a higher baud rate")
         self._link = link
         self._rate_Hz = rate_Hz
 
@@ -117,12 +117,11 @@ class RobotousSensor(StreamingSensor):
                 f"{self.name}: overload of {', '.join(axes)}", "take the load off, then check the zero of the sensor"
             )
         counts = np.array([sample.counts for sample in samples], np.int32)
-        return FtSamples(
-            t_host_ns=np.array([field.t_host_ns for field in fields], np.int64),
-            t_device_s=np.full(len(fields), np.nan),
-            seq=np.array([field.number for field in fields], np.int64),
+        return FtSamples.of(
+            [field.t_host_ns for field in fields],
+            [field.number for field in fields],
+            counts * self._unit_per_count,
             counts=counts,
-            wrench=counts * self._unit_per_count,
             status=overload,
         )
 
@@ -132,13 +131,13 @@ class RobotousSensor(StreamingSensor):
         finally:
             self._link.close()
 
-    def _why_silent(self) -> str:
+    def _silence_fix(self) -> str:
         if self._link.unpaired:
-            return "frames come but cannot be paired: give this computer less to do"
-        return super()._why_silent()
+            return "give this computer less to do, because frames arrive too late to be paired"
+        return super()._silence_fix()
 
     def _ask(self, command: Command, *parameters: int) -> bytes:
-        """Stop whatever streams, send a command and return the field that answers it."""
+        """Stop any stream, send a command and return the field that replies to it."""
         for _ in range(_ATTEMPTS):
             self._link.send(codec.encode(Command.STOP))
             self._link.send(codec.encode(command, *parameters))
@@ -147,6 +146,6 @@ class RobotousSensor(StreamingSensor):
                     if field.data[0] == command:
                         return field.data
         raise DeviceTimeout(
-            f"{self.name}: no answer to {command.name} after {_ATTEMPTS} attempts of {_REPLY_S} s",
-            "check supply, wiring, bit rate and, on CAN, that the identifiers are the factory's",
+            f"{self.name}: no reply to {command.name} after {_ATTEMPTS} attempts of {_REPLY_S} s",
+            "check supply, wiring, bit rate and, on CAN, that the sensor has the factory's identifiers",
         )

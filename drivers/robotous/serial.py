@@ -18,11 +18,11 @@ BAUDS = (57_600, 115_200, 230_400, 460_800, 921_600)
 
 
 class SerialLink:
-    """The wire of a Robotous sensor on a serial port."""
+    """The serial port of a Robotous sensor."""
 
     def __init__(self, path: str, *, baud: int = 115_200, clock: Clock = REAL) -> None:
         if baud not in BAUDS:
-            raise ValueError(f"baud is {baud}; the sensor knows {', '.join(map(str, BAUDS))}")
+            raise ValueError(f"baud is {baud}; choose one of {', '.join(map(str, BAUDS))}")
         self.name = f"Robotous sensor on {path}"
         self.clock = clock
         # 1 kHz needs 921600 baud (manual); below, a frame of 19 bytes takes 190 bits
@@ -32,12 +32,12 @@ class SerialLink:
 
     @property
     def damaged(self) -> int:
-        """Frames thrown away."""
+        """Frames dropped."""
         return self._frames.damaged
 
     @property
     def unpaired(self) -> bool:
-        """Never: a frame is whole or none."""
+        """Never: a frame holds a whole field."""
         return False
 
     def open(self) -> None:
@@ -50,11 +50,11 @@ class SerialLink:
         self._port.write(codec.encode_frame(field))
 
     def stream(self, _rate_Hz: int, /) -> None:
-        """Start the stream; a UART needs no rate to tell frames apart."""
+        """Start the stream; on a UART the rate is not needed."""
         self.send(codec.encode(Command.START))
 
     def receive(self) -> list[Field]:
-        """Take the fields that have come, waiting up to 0.05 s for the first."""
+        """Return the fields that have arrived; wait up to 0.05 s for the first."""
         frames = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))
         t_host_ns = self.clock.now_ns()
         return [Field(number, t_host_ns, frame[1:-2]) for number, frame in frames]

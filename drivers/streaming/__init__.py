@@ -1,4 +1,4 @@
-"""What a sensor driver in another package builds on: see "A driver in another package" in README.md."""
+"""The base of every sensor driver; see "A driver in another package" in README.md."""
 
 from drivers.streaming.sensor import NOTHING, StreamingSensor, StreamLimits, scale_facts
 

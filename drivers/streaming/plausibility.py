@@ -1,4 +1,4 @@
-"""What the samples of a living sensor look like: three checks, each with a memory of what came before."""
+"""Plausibility of samples: frozen readings, the device's clock, the rate. Each check remembers earlier samples."""
 
 import logging
 import math
@@ -13,29 +13,29 @@ log = logging.getLogger(__name__)
 
 _FROZEN_S = 0.2
 _FROZEN_SAMPLES = (20, 50)
-"""A living sensor has noise: identical readings over so long a time are none, if they are as many as come in that time,
-but at least and at most so many. README.md says why, under Decisions."""
+"""A sensor is frozen after identical readings for this time, if they are as many as arrive in it, within these bounds.
+README.md gives the reason under Decisions."""
 _CLOCK_JUMP_S = 0.5
-"""How far the device's clock may gain on ours from one block to the next; a late block makes it fall behind only."""
+"""The most that the device's clock may gain on ours between two blocks; a late block only makes it fall behind."""
 _CLOCK_DRIFT = 0.02
-"""How much slower than ours the device's clock may run before its samples are taken for late ones."""
+"""The device's clock may run slower than ours by this fraction; beyond it, its samples count as late."""
 _RATE_TOLERANCE, _RATE_WINDOW_S = 0.1, 2.0
 
 
 class Liveness:
-    """Numbers that are numbers, and not the same ones again and again."""
+    """Checks that readings are finite and change."""
 
     def __init__(self, name: str) -> None:
         self._name = name
         self.forget()
 
     def forget(self) -> None:
-        """Compare the next samples with none before them."""
+        """Forget earlier samples."""
         self._last = np.zeros(0)
         self._same_rows, self._same_since_ns = 0, 0
 
     def judge(self, samples: FtSamples, nominal_Hz: float) -> None:
-        """Raise on a wrench that is not finite, and on one that has not changed for too long."""
+        """Raise when a wrench is not finite, or has not changed for too long."""
         wrench, t_host_ns = samples.wrench, samples.t_host_ns
         if not np.isfinite(wrench).all():
             raise ProtocolError(f"{self._name}: the sensor sends a wrench that is not finite", "power it off and on")
@@ -52,7 +52,7 @@ class Liveness:
         enough = most if math.isnan(nominal_Hz) else min(most, max(fewest, _FROZEN_S * nominal_Hz))
         if self._same_rows >= enough and same_s >= _FROZEN_S:
             raise Frozen(
-                f"{self._name}: frozen, {self._same_rows} identical samples in {same_s:.2f} s, and a sensor that "
+                f"{self._name}: frozen, {self._same_rows} identical samples in {same_s:.2f} s, although a sensor that "
                 "measures has noise",
                 "power it off and on",
             )
@@ -67,9 +67,9 @@ class DeviceClock:
         self._lead_s = 0.0
 
     def late_s(self, t_device_s: Array, heard_s: float) -> Array:
-        """Return how late each sample is, compared with the quickest so far; 0 where the device tells no time.
+        """Return how late each sample is, compared with the quickest so far; 0 where the device has no clock.
 
-        Raises when the device's clock goes back, or gains on ours in a step.
+        Raises `StreamBroken` when the device's clock jumps back or ahead.
         """
         newest_s = float(t_device_s[-1])
         if math.isnan(newest_s):
@@ -82,7 +82,7 @@ class DeviceClock:
         leads_s = (t_device_s - self._first[0]) - (heard_s - self._first[1])
         lead_s = float(leads_s[-1])
         step_s = lead_s - self._lead_s
-        # a clock slower than ours falls behind for ever, and its samples are not late
+        # a slow clock falls behind steadily, and its samples are not late
         self._lead_s = max(lead_s, self._lead_s - _CLOCK_DRIFT * (heard_s - heard_before_s))
         back_s = -float(np.diff(t_device_s, prepend=before_s).min())
         if back_s > 0:
@@ -98,20 +98,20 @@ class DeviceClock:
 
 
 class Rate:
-    """Samples per second against what the device says of itself; `why` says what to do about a wrong rate in Hz."""
+    """Compares samples per second with the nominal rate; `fix` gives the fix for a wrong rate in Hz."""
 
-    def __init__(self, name: str, why: Callable[[float], str]) -> None:
+    def __init__(self, name: str, fix: Callable[[float], str]) -> None:
         self._name = name
-        self._why = why
+        self._fix = fix
         self._is_wrong = False
         self.forget()
 
     def forget(self) -> None:
-        """Count anew, from the next samples on."""
+        """Restart the count with the next samples."""
         self._since_ns, self._samples = 0, 0
 
     def judge(self, samples: int, t_host_ns: int, nominal_Hz: float) -> str | None:
-        """Return a note when the rate turns out to be wrong, and when it is right again."""
+        """Return a note when the rate becomes wrong, and when it is right again."""
         if math.isnan(nominal_Hz):
             return None
         self._samples += samples
@@ -128,6 +128,6 @@ class Rate:
             return f"rate {rate_Hz:.1f} Hz, right again"
         if not self._is_wrong and error > _RATE_TOLERANCE:
             self._is_wrong = True
-            log.warning("%s: %.1f Hz instead of %g Hz; %s", self._name, rate_Hz, nominal_Hz, self._why(rate_Hz))
+            log.warning("%s: %.1f Hz instead of %g Hz; %s", self._name, rate_Hz, nominal_Hz, self._fix(rate_Hz))
             return f"rate {rate_Hz:.1f} Hz instead of {nominal_Hz:g} Hz"
         return None

@@ -1,4 +1,4 @@
-"""The far side of a recorded wire: a transcript, played to the unmodified driver."""
+"""The far side of a recorded wire: it plays a transcript to the unmodified driver."""
 
 import contextlib
 import os
@@ -16,15 +16,15 @@ from drivers.transcript.recorder import Page, Passage, Transcript, asked_for
 from drivers.wires.parity import leave_marks_to_far_side, marks_asked_for
 
 _EARLY_S: Final = 0.05
-"""A driver may ask this much earlier than it did; what the device had sent before is then sent at once."""
+"""A driver may send a request this much earlier than recorded; earlier data of the device is then sent at once."""
 
 
 class Player:
-    """The recorded device as it seems to one driver that opens it once: a pseudo-terminal, or ports of this computer.
+    """Replays a recorded device to one driver that opens it once, on a pseudo-terminal or on ports of this computer.
 
-    A request is answered as it was in the recording, with the recorded delays; what the device sent by itself comes
-    with the recorded timing. A request that is not in the rest of the recording is a divergence: silence follows.
-    Pages are asked for at any time; of one that was asked for several times the answers come in their order.
+    Replies have the recorded delays, and unsolicited data the recorded timing. A request that is not in the rest of the
+    recording is a divergence: silence follows. Pages may be requested at any time; repeated requests for one page get
+    the recorded replies in order.
     """
 
     def __init__(self, transcript: Transcript, clock: Clock = REAL) -> None:
@@ -39,16 +39,16 @@ class Player:
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
         self.divergence: str | None = None
-        """What the driver asked that the recording cannot answer."""
+        """The request of the driver that is not in the recording."""
 
     @property
     def left_s(self) -> float:
-        """How much of the recording is not yet played, in its own time."""
+        """How much of the recording is left, in its own time."""
         left = self._passages[self._next :]
         return (left[-1].t_ns - left[0].t_ns) / 1e9 if left else 0.0
 
     def __enter__(self) -> str:
-        """Open the far side and return what `Transcript.url_at` takes: of a pseudo-terminal the path."""
+        """Open the far side and return the argument of `Transcript.url_at`, such as the path of a pseudo-terminal."""
         place = self._far.open()
         self._thread = threading.Thread(target=self._serve, name=f"player on {place}", daemon=True)
         self._thread.start()
@@ -67,7 +67,7 @@ class Player:
         with self._clock.keeping_up():
             self._t = self._clock.now_s()
             while not self._ended.is_set():
-                self._clock.now_ns()  # an emulated cell waits for it
+                self._clock.now_ns()  # an emulated cell waits for this thread
                 wait_s = min(self._clock.poll_s, max(0.0, self._play()))
                 readable, _, _ = select.select([self._far], [], [], wait_s)
                 if readable:
@@ -78,7 +78,7 @@ class Player:
                     self._listen()
 
     def _play(self) -> float:
-        """Send what is due; return the seconds until something else may be."""
+        """Send the data that is due; return the seconds until more may be."""
         if self._far.is_full:
             self._far.send(b"")
         for _ in range(AT_ONCE):
@@ -99,7 +99,7 @@ class Player:
         """Compare what the driver writes with the next request of the recording."""
         while self._asked and not self.divergence:
             first = self._request_from(self._next)
-            if first is None:  # a goodbye, or a recording that was broken off
+            if first is None:  # the driver is closing, or the recording was broken off
                 self._asked.clear()
                 return
             expected = self._passages[first].data
@@ -109,11 +109,9 @@ class Player:
             while found is not None and not self._is_asked(self._passages[found].data):
                 found = self._request_from(found + 1)
             if found is None:
-                self._diverge(
-                    f"the driver sent {self._asked.hex(' ')}, where {expected.hex(' ')} was sent in the recording"
-                )
+                self._diverge(f"the driver sent {self._asked.hex(' ')}, the recording has {expected.hex(' ')}")
                 return
-            if found == first and not self._datagrams:  # datagrams from before belong to a socket that is no more
+            if found == first and not self._datagrams:  # earlier datagrams belong to a closed socket
                 for passage in self._passages[self._next : found]:
                     if self._due_in_s(passage) < _EARLY_S:
                         self._far.send(passage.data)
@@ -133,7 +131,7 @@ class Player:
 
 
 class _Terminal:
-    """A pseudo-terminal; for frames an slcan adapter on it, which takes what it is told and does nothing."""
+    """A pseudo-terminal; for CAN frames an slcan adapter on it, which accepts every command and does nothing."""
 
     def __init__(self, transcript: Transcript) -> None:
         self._parity_marks = transcript.parity_marks
@@ -146,7 +144,7 @@ class _Terminal:
         self._master, slave = os.openpty()
         path = os.ttyname(slave)
         tty.setraw(slave)
-        os.close(slave)  # so that the master tells when a driver opens and leaves
+        os.close(slave)  # so that the master shows when a driver opens and closes
         os.set_blocking(self._master, False)
         return path
 
@@ -154,7 +152,7 @@ class _Terminal:
         os.close(self._master)
 
     def wait_for_driver(self, ended: threading.Event) -> bool:
-        """Return whether it is there; False when `ended` comes first."""
+        """Wait until the driver has opened the port; return False when `ended` comes first."""
         poll = select.poll()
         poll.register(self._master, 0)
         while poll.poll(0):  # "hung up" until a driver has opened the other end
@@ -171,7 +169,7 @@ class _Terminal:
         return self._master
 
     def read(self) -> bytes | None:
-        """Take what the driver has sent; None when it has left."""
+        """Return what the driver has sent; None when it has closed the port."""
         try:
             data = os.read(self._master, 4096)
         except OSError:
@@ -179,12 +177,12 @@ class _Terminal:
         return self._frames_of(data) if self._frames else data
 
     def _frames_of(self, data: bytes) -> bytes:
-        """Leave out what the adapter is told: it was another one in the recording."""
+        """Leave out commands to the adapter, because the recording was made with another one."""
         *lines, self._line = (self._line + data).split(b"\r")
         return b"".join(line + b"\r" for line in lines if line[:1] in {b"t", b"T", b"r", b"R"})
 
     def send(self, data: bytes) -> None:
-        """Give the driver as much as it takes; the rest goes before what comes next, also before nothing."""
+        """Send as much as the driver accepts; the next call sends the rest first."""
         data = self._unsent + data
         try:
             written = os.write(self._master, data)
@@ -198,7 +196,7 @@ class _Terminal:
 
 
 class _Ethernet:
-    """A UDP port, and pages over HTTP at another."""
+    """A UDP port, and a second port with pages over HTTP."""
 
     is_full = False
 
@@ -234,7 +232,7 @@ class _Ethernet:
 
 
 class _PageAnswers(PageServer):
-    """Answers with the recorded bytes after the recorded time."""
+    """Replies with the recorded bytes after the recorded time."""
 
     def __init__(self, pages: tuple[Page, ...], diverge: Callable[[str], None], clock: Clock) -> None:
         super().__init__("player of pages", _PageAnswer)
@@ -248,7 +246,7 @@ class _PageAnswers(PageServer):
         asked = asked_for(request)
         left = self._left.get(asked)
         if not left:
-            self._diverge(f"the driver asked {asked.decode(errors='replace')}, which was not asked in the recording")
+            self._diverge(f"the driver requested {asked.decode(errors='replace')}, which is not in the recording")
             return b""
         page = left.pop(0) if len(left) > 1 else left[0]
         self._clock.wait(self.ended, page.took_s)
@@ -261,5 +259,5 @@ class _PageAnswer(BaseRequestHandler):
     def handle(self) -> None:
         driver: socket.socket = self.request
         driver.settimeout(HTTP_S)
-        with contextlib.suppress(OSError):  # a driver that has hung up wants no answer
+        with contextlib.suppress(OSError):  # a driver that has disconnected needs no reply
             driver.sendall(self.server.answer(driver.recv(65536)))

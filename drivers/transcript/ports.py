@@ -1,4 +1,4 @@
-"""Ports of this computer where a driver is recorded, or played to: what relays and player have in common."""
+"""Ports of this computer that replace a device; shared by relays and player."""
 
 import threading
 from socketserver import BaseRequestHandler, ThreadingTCPServer
@@ -6,14 +6,14 @@ from typing import Final, Self
 
 LOOPBACK: Final = "127.0.0.1"
 LOOK_S: Final = 0.05
-"""How often is looked whether it has ended."""
+"""Period of the check for the end."""
 HTTP_S: Final = 2.0
 AT_ONCE: Final = 64
-"""Datagrams for pynetft in a row, where they are late: its socket has room for about 250."""
+"""The most late datagrams sent to pynetft at once: its socket holds about 250."""
 
 
 class PageServer(ThreadingTCPServer):
-    """Answers over HTTP at a free port while it is entered, one question a connection."""
+    """Serves HTTP at a free port while it is entered, one request a connection."""
 
     def __init__(self, name: str, handler: type[BaseRequestHandler]) -> None:
         super().__init__((LOOPBACK, 0), handler)
@@ -29,4 +29,4 @@ class PageServer(ThreadingTCPServer):
         self.ended.set()
         self.shutdown()
         self._thread.join()
-        self.server_close()  # waits for exchanges under way
+        self.server_close()  # waits for exchanges in progress

@@ -1,22 +1,21 @@
-"""The bytes on the wire of a sensor, kept in a file: `transcript_taps.py` writes it, `transcript_player.py` plays it.
+"""A file with the bytes on the wire of a sensor: `taps.py` records it, `player.py` plays it.
 
-A transcript (``ftdrive.transcript/1``) is JSON lines. The first says which sensor, when and with which versions; then
-come, with the time of the driver's clock as `t_ns`:
+A transcript (``ftdrive.transcript/1``) is JSON lines. The first holds sensor, time and versions. The others have the
+time of the driver's clock as `t_ns`:
 
 {"t_ns", "event": "open", "port", "baudrate", "bytesize", "parity", "stopbits", "parity_marks"}   a serial port
 {"t_ns", "event": "open", "port", "frames": true}                                                 a CAN interface
 {"t_ns", "event": "open", "port", "datagrams": true}                                              UDP
-{"t_ns", "event": "unreachable", "error"}   why a datagram did not get through, which the driver does not see
-{"t_ns", "event": "page", "request", "reply", "took_s", "error"}   one question over HTTP, headers and all, in hex
+{"t_ns", "event": "unreachable", "error"}   why a datagram was lost, which the driver does not notice
+{"t_ns", "event": "page", "request", "reply", "took_s", "error"}   one HTTP request and its reply, with headers, in hex
 {"t_ns", "dir": "tx", "hex"}    one write of the driver
 {"t_ns", "dir": "rx", "hex"}    one datagram, or what the driver read within 2 ms, stamped with its first byte
-{"t_ns", "event": "end", "error"}   the error it ended with; where there was none, what the driver made of it:
-                                    "identity", "samples", "mean_force_N", "mean_torque_Nm" and more
+{"t_ns", "event": "end", "error"}   the error at the end; without one, what the driver decoded: "identity", "samples",
+                                    "mean_force_N", "mean_torque_Nm" and more
 
-Where `parity_marks` is true, the bytes that were read hold the marks of `drivers/wires/parity.py`; older transcripts
-do not say it and hold none. Some CAN adapters, such as those of slcan, are on a serial port too. The frames of any
-other CAN interface are written as the lines that an slcan adapter would carry, and such an adapter plays them; what
-python-can tells it is not compared.
+Where `parity_marks` is true, received bytes contain the marks of `drivers/wires/parity.py`; older transcripts lack the
+field and the marks. An slcan adapter is recorded as a serial port. The frames of other CAN interfaces are written as
+lines of slcan, and an emulated slcan adapter plays them. Commands of python-can to that adapter are not compared.
 """
 
 import json
@@ -36,67 +35,67 @@ FORMAT: Final = "ftdrive.transcript/1"
 
 _TOGETHER_NS: Final = 2_000_000
 INTERRUPTED: Final = "interrupted"
-"""The error of a recording that was broken off by the user."""
+"""The error of a recording that the user has interrupted."""
 _LONGEST_PAGE_S: Final = 60.0
 """Longer than any driver waits for a page."""
 
 
 class BadTranscript(Exception):
-    """The file is not a transcript, or a damaged one."""
+    """The file is not a transcript, or is damaged."""
 
 
 class Writer:
-    """A transcript being written to `path` with ``.partial`` behind it, and renamed by `end`.
+    """Writes a transcript to `path` with the suffix ``.partial``; `end` renames it.
 
     Parameters
     ----------
     path : Path
         Must not exist.
     header : mapping
-        Goes into the first line.
+        Content of the first line.
     clock : Clock
         The driver's.
 
     Raises
     ------
     OSError
-        The file, or one of an unfinished recording, exists already, or cannot be written.
+        The file or its ``.partial`` exists already, or cannot be written.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], clock: Clock = REAL) -> None:
         self.has_port = False
-        """Whether a port of any kind was opened: without one there is nothing to play."""
+        """Whether any port was opened; without one there is nothing to play."""
         self.clock = clock
         self._path = path
         self._partial = path.parent / (path.name + ".partial")
         for existing in (path, self._partial):
             if existing.exists():
-                raise FileExistsError(f"{existing} exists already and is not overwritten: give another name")
+                raise FileExistsError(f"{existing} exists already and is not overwritten; give another name")
         self._lock = threading.Lock()
         self._received = bytearray()
         self._received_ns = 0
         try:
             self._file: IO[str] | None = self._partial.open("x", encoding="utf-8")
         except OSError as error:
-            cure = "give a file in a folder that exists and is yours"
-            raise OSError(f"{path} cannot be written ({error.strerror}): {cure}") from error
+            fix = "choose a folder that exists and is writable"
+            raise OSError(f"{path} cannot be written ({error.strerror}); {fix}") from error
         self._line({"format": FORMAT, **header})
 
     def event(self, name: str, **content: Any) -> None:
-        """Note something that is not bytes."""
+        """Record an event."""
         with self._lock:
             self._flush_received()
             self.has_port |= name == "open"
             self._line({"t_ns": self.clock.now_ns(), "event": name, **content})
 
     def sent(self, data: bytes) -> None:
-        """Note one write of the driver."""
+        """Record one write of the driver."""
         with self._lock:
             self._flush_received()
             self._line({"t_ns": self.clock.now_ns(), "dir": "tx", "hex": data.hex()})
 
     def received(self, data: bytes) -> None:
-        """Note what the driver was given; reads that follow each other closely become one line."""
+        """Record what the driver has read; reads within 2 ms become one line."""
         if not data:
             return
         now_ns = self.clock.now_ns()
@@ -108,13 +107,13 @@ class Writer:
             self._received += data
 
     def received_datagram(self, data: bytes) -> None:
-        """Note one datagram for the driver, which stays one."""
+        """Record one datagram to the driver as one line."""
         with self._lock:
             self._flush_received()
             self._line({"t_ns": self.clock.now_ns(), "dir": "rx", "hex": data.hex()})
 
     def end(self, **content: Any) -> None:
-        """Write the last line, and give the file its name."""
+        """Write the last line and rename the file."""
         self.event("end", **content)
         with self._lock:
             file, self._file = self._file, None
@@ -124,11 +123,11 @@ class Writer:
             file.flush()
             os.fsync(file.fileno())
         if self._path.exists():
-            raise FileExistsError(f"{self._path} appeared meanwhile; the transcript is kept in {self._partial}")
+            raise FileExistsError(f"{self._path} was created meanwhile; find the transcript in {self._partial}")
         self._partial.rename(self._path)
 
     def discard(self) -> None:
-        """Leave no file."""
+        """Delete the file."""
         with self._lock:
             file, self._file = self._file, None
         if file is not None:
@@ -147,26 +146,26 @@ class Writer:
 
 @dataclass(frozen=True, slots=True)
 class Passage:
-    """Bytes that went one way."""
+    """Bytes in one direction."""
 
     t_ns: int
     sent: bool
-    """By the driver."""
+    """Whether the driver sent them."""
     data: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """A question over HTTP and its answer, as they were on the wire."""
+    """An HTTP request and its reply, as they were on the wire."""
 
     request: bytes
     reply: bytes
-    """Empty where none came."""
+    """Empty where none arrived."""
     took_s: float
 
 
 def asked_for(request: bytes) -> bytes:
-    """Take method and path from a request over HTTP: two clients that ask for one page differ in the rest."""
+    """Return method and path of an HTTP request, because the rest differs between clients."""
     return b" ".join(request.split(b"\r\n", 1)[0].split(b" ")[:2])
 
 
@@ -176,21 +175,21 @@ class Transcript:
 
     header: Mapping[str, Any]
     opened_ns: int
-    """When the driver had opened its port."""
+    """When the driver opened its port."""
     passages: tuple[Passage, ...]
     end: Mapping[str, Any]
-    """What the driver made of it; empty if the recording was broken off."""
+    """What the driver decoded; empty if the recording was interrupted."""
     parity_marks: bool = False
-    """Whether what was received holds marks of bytes with wrong parity."""
+    """Whether received bytes contain marks of wrong parity."""
     frames: bool = False
-    """Whether these are frames of a CAN interface, as lines of slcan."""
+    """Whether the passages are frames of a CAN interface, as lines of slcan."""
     datagrams: bool = False
     """Whether each passage is a datagram."""
     pages: tuple[Page, ...] = ()
 
     @property
     def is_broken_off(self) -> bool:
-        """Whether the recording was interrupted, or the file has lost its end."""
+        """Whether the recording was interrupted, or its end is missing."""
         return bool(self.end.get("error", INTERRUPTED) == INTERRUPTED)
 
     @classmethod
@@ -220,16 +219,16 @@ class Transcript:
                         end = _checked_end(line)
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
             raise BadTranscript(
-                f"{path}, line {number}: not a line of a transcript ({error}): record it anew"
+                f"{path}, line {number}: not a line of a transcript ({error}); record it again"
             ) from error
         if not header:
-            raise BadTranscript(f"{path} is empty: record it anew")
+            raise BadTranscript(f"{path} is empty; record it again")
         if opened_ns is None:
-            raise BadTranscript(f"{path}: no port was opened in it, there is nothing to play: {end.get('error')}")
+            raise BadTranscript(f"{path}: nothing to play, the driver opened no port: {end.get('error')}")
         return cls(header, opened_ns, tuple(passages), end, parity_marks, frames, datagrams, tuple(pages))
 
     def url_at(self, port: str) -> str:
-        """Give the sensor's address with the port of a player in it, and with the options which that brings along."""
+        """Return the sensor's address with the port and the options of a player in place of the device."""
         parts = split_url(str(self.header["url"]))
         place, _, own = port.partition("?")
         options = dict(parse_qsl(parts.query)) | dict(parse_qsl(own)) | ({"interface": "slcan"} if self.frames else {})
@@ -239,9 +238,9 @@ class Transcript:
 def _checked_header(path: Path, line: Any) -> Mapping[str, Any]:
     found = line.get("format") if isinstance(line, dict) else None
     if found != FORMAT:
-        raise BadTranscript(f"{path}: the first line must say {FORMAT}, found {found!r}")
+        raise BadTranscript(f"{path}: the format in the first line is {found!r}; give a file with {FORMAT}")
     if not isinstance(line.get("url"), str) or not isinstance(line.get("duration_s"), int | float):
-        raise BadTranscript(f"{path}: the first line must hold url and duration_s")
+        raise BadTranscript(f"{path}: url or duration_s is missing in the first line; record it again")
     split_url(line["url"])
     if not 0 < float(line["duration_s"]) < math.inf:
         raise ValueError(f"duration_s is {line['duration_s']}")
@@ -265,5 +264,5 @@ def _checked_page(line: Mapping[str, Any]) -> Page:
 
 
 def _time_ns(line: Mapping[str, Any]) -> int:
-    float(line["t_ns"])  # beyond its range no time can be told from another
+    float(line["t_ns"])  # beyond its range times cannot be distinguished
     return int(line["t_ns"])

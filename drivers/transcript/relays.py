@@ -1,8 +1,7 @@
-"""How a transcript is taken of a sensor on Ethernet: by relays between the driver and the device.
+"""Relays between driver and device, which record a sensor on Ethernet.
 
-pynetft opens its sockets where Python does not see them. So it is sent to two ports of this computer, and so are the
-questions over HTTP that the driver asks itself. A relay hands on every datagram as it is, and of a question all but
-the name of the host, which it puts right.
+pynetft opens its sockets outside Python. So pynetft and the driver's HTTP requests are redirected to two ports of this
+computer. The relays forward every datagram unchanged, and every request with the host name of the device.
 """
 
 import contextlib
@@ -24,12 +23,12 @@ from drivers.transcript.recorder import Writer
 _CLIENT_CLASS: Final = "Client"
 _CONNECTION_CLASS: Final = "HTTPConnection"
 _ROOM: Final = 4 << 20
-"""Bytes of datagrams that may wait for a relay; the system may grant less."""
+"""Receive buffer of a relay in bytes; the system may grant less."""
 
 
 @contextlib.contextmanager
 def relayed(writer: Writer) -> Iterator[None]:
-    """Put relays in front of what pynetft and HTTP clients ask in the `with` block."""
+    """Redirect pynetft and HTTP clients in the `with` block to relays."""
     plain, plain_connection = pynetft.Client, http.client.HTTPConnection
     with contextlib.ExitStack() as relays:
 
@@ -68,9 +67,9 @@ def relayed(writer: Writer) -> Iterator[None]:
 
 
 class _DatagramRelay:
-    """Hands datagrams on, both ways, between whoever writes to `port` on this computer and a sensor.
+    """Forwards datagrams in both directions between the driver, at `port` of this computer, and a sensor.
 
-    Each socket of the driver has one towards the device, so that nothing comes that an earlier one has asked for.
+    Each socket of the driver gets a new one towards the device, so that it receives no replies to earlier requests.
     """
 
     def __init__(self, writer: Writer, host: str, port: int) -> None:
@@ -99,7 +98,7 @@ class _DatagramRelay:
         far = socket.socket(family, kind)
         far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _ROOM)
         try:
-            far.connect(address)  # so that nobody else's datagrams come
+            far.connect(address)  # reject datagrams of other hosts
         except OSError:
             far.close()
             raise
@@ -110,7 +109,7 @@ class _DatagramRelay:
         while True:
             is_ended = self._ended.is_set()
             readable, _, _ = select.select([self._near, self._far], [], [], 0)
-            if is_ended and self._near not in readable:  # the driver's last request is not left behind
+            if is_ended and self._near not in readable:  # the driver's last request was forwarded
                 return
             at_once += 1
             if not readable:
@@ -132,12 +131,12 @@ class _DatagramRelay:
                     data = self._far.recv(65536)
                     self._writer.received_datagram(data)
                     self._near.sendto(data, self._driver)
-            except OSError as error:  # nobody listens at the device, or no longer here: for the driver that is silence
+            except OSError as error:  # nothing listens at the device, or here any more: the driver sees silence
                 self._writer.event("unreachable", error=str(error))
 
 
 class _PageRelay(PageServer):
-    """Hands questions over HTTP on to a sensor, and its answers back."""
+    """Forwards HTTP requests to a sensor, and its replies back."""
 
     def __init__(self, writer: Writer, host: str, port: int) -> None:
         super().__init__(f"pages of {host}", _PageExchange)
@@ -145,7 +144,7 @@ class _PageRelay(PageServer):
         self.device = host, port
 
     def for_the_device(self, request: bytes) -> bytes:
-        """Put the host right to which the client thinks it is talking."""
+        """Replace the host name of this computer by that of the device."""
         host, port = self.device
         here = f"\r\nHost: {LOOPBACK}:{self.port}\r\n"
         there = f"\r\nHost: {host}\r\n" if port == http.client.HTTP_PORT else f"\r\nHost: {host}:{port}\r\n"

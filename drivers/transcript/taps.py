@@ -1,4 +1,4 @@
-"""Where the bytes of a transcript are taken: inside pyserial and python-can, and in front of pynetft."""
+"""Recording of bytes: inside pyserial and python-can, and by relays in front of pynetft."""
 
 import contextlib
 from collections.abc import Iterator
@@ -18,16 +18,16 @@ _BUS_CLASS: Final = "Bus"
 
 @contextlib.contextmanager
 def recording(writer: Writer) -> Iterator[None]:
-    """Write down what passes through the serial ports, CAN buses and pynetft clients opened in the `with` block.
+    """Record the bytes of all serial ports, CAN buses and pynetft clients opened in the `with` block.
 
-    They have the driver's own settings: the device sees no difference.
+    They keep the driver's settings, so the device sees no difference.
     """
     with _ports_and_buses(writer), _ethernet(writer):
         yield
 
 
 def _ethernet(writer: Writer) -> AbstractContextManager[None]:
-    """Record pynetft; nothing where it is not installed, for then nobody uses it."""
+    """Record pynetft, where it is installed."""
     try:
         relays = import_module("drivers.transcript.relays")
     except ModuleNotFoundError as error:
@@ -43,43 +43,43 @@ def _ports_and_buses(writer: Writer) -> Iterator[None]:
     opened: list[serial.Serial] = []
 
     class RecordedPort(serial.Serial):
-        _told = False
+        _noted = False
 
         def open(self) -> None:
             super().open()
-            self._told = False
+            self._noted = False
             opened.append(self)
 
-        def _tell(self) -> None:
-            """Note how the port is set: at its first use, for who opens it sets the marks after pyserial is done."""
-            if not self._told:
-                self._told = True
+        def _note(self) -> None:
+            """Record the port's settings at its first use, because the driver sets the marks after opening."""
+            if not self._noted:
+                self._noted = True
                 settings = {key: getattr(self, key) for key in ("baudrate", "bytesize", "parity", "stopbits")}
                 marks = marks_asked_for(self)
                 writer.event("open", port=self.port, **settings, parity_marks=marks)
 
         def read(self, size: int = 1, /) -> bytes:
-            self._tell()
+            self._note()
             data: bytes = super().read(size)
             writer.received(data)
             return data
 
         def write(self, data: Any, /) -> int | None:
-            self._tell()
+            self._note()
             writer.sent(bytes(data))
             written: int | None = super().write(data)
             return written
 
         def reset_input_buffer(self) -> None:
-            self._tell()
-            if waiting := self.in_waiting:  # they were on the wire although the driver does not want them
+            self._note()
+            if waiting := self.in_waiting:  # they were on the wire although the driver drops them
                 writer.received(super().read(waiting))
             super().reset_input_buffer()
 
     def recorded_bus(channel: str, **options: Any) -> can.BusABC:
         before = len(opened)
         bus = plain_bus(channel, **options)
-        if len(opened) > before:  # it is on a recorded port, like slcan
+        if len(opened) > before:  # it is on a recorded serial port, like slcan
             return bus
         writer.event("open", port=channel, frames=True)
         receive, send = bus.recv, bus.send
@@ -106,7 +106,7 @@ def _ports_and_buses(writer: Writer) -> Iterator[None]:
 
 
 def _slcan_line(frame: can.Message) -> bytes:
-    """Write a frame as an slcan adapter does; nothing for one that it cannot carry."""
+    """Write a frame as an slcan adapter does; empty for one that it cannot carry."""
     if frame.is_error_frame or frame.is_fd:
         return b""
     kind, data = ("r", "") if frame.is_remote_frame else ("t", frame.data.hex().upper())

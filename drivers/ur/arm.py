@@ -1,7 +1,7 @@
 """A Universal Robots arm.
 
-Reading happens in this process (`reading.py`), moving in a disposable one (`control.py`), and stopping has a second
-way that needs neither of them: the dashboard server.
+This process reads (`reading.py`), a disposable one moves the arm (`control.py`). The dashboard server can stop the arm
+without either.
 
 Ref: ur_rtde 1.6.5, API reference; Universal Robots, "Dashboard Server, e-Series" manual; `is_steady` in the URScript
 manual.
@@ -32,10 +32,10 @@ log = logging.getLogger(__name__)
 
 _ARRIVED_RAD: Final = 1e-3
 _STANDING_RAD_S: Final = 1e-6
-"""Of the set-point, which is exactly zero at rest."""
+"""Speed of the set-point, which is exactly zero at rest."""
 _STILL_RAD_S: Final = 0.002
 _SIMULATORS: Final = ("localhost", "127.0.0.1", "192.168.56.101")
-"""Addresses at which ur_rtde itself does not ask for remote control, because URSim runs there."""
+"""Addresses of URSim, at which ur_rtde does not require remote control."""
 
 
 class UrArm(RobotArm):
@@ -46,14 +46,13 @@ class UrArm(RobotArm):
     host
         Address of the controller.
     model
-        Such as "UR5e", for the comparison of poses with nominal kinematics; None takes what the controller says.
+        Such as "UR5e", to compare poses with nominal kinematics; None takes the model that the controller reports.
     speed_rad_s, acceleration_rad_s2
-        Of the leading joint in `move_to`, where it is not told others. The speed slider of the pendant scales them
-        down further.
+        Defaults of the leading joint in `move_to`. The speed slider of the pendant scales them down further.
     clock
-        Measures and waits; that of an emulated cell belongs to the cell.
+        Measures and waits; an emulated cell has its own.
     timing
-        Every limit of time.
+        Every time limit.
     """
 
     def __init__(
@@ -68,7 +67,7 @@ class UrArm(RobotArm):
     ) -> None:
         _check_speed(speed_rad_s, acceleration_rad_s2)
         if model is not None and model_named(model, 0) is None:
-            raise ValueError(f"model {model!r} is not known: choose one of {', '.join(MODELS)}.")
+            raise ValueError(f"model {model!r} is unknown; choose one of {', '.join(MODELS)}.")
         self._host = host
         self._model = None if model is None else model_named(model, 0)
         self._speed_rad_s = float(speed_rad_s)
@@ -78,8 +77,8 @@ class UrArm(RobotArm):
         self._moves_at_rad_s = self._speed_rad_s
         self._reader: Reader | None = None
         self._control: ControlProcess | None = None
-        self._left_behind = False  # a program of ours may be on the controller without us
-        self._starting = False  # one was sent, and nobody has seen it play: it may begin after it was told to stop
+        self._left_behind = False  # a program of ours may run on the controller without a control process
+        self._starting = False  # it was sent and has not been seen to play: it may still start after a stop
         self._goal: list[float] | None = None
         self._stop_requested = threading.Event()
         self._stop_wanted = threading.Event()  # by an attempt in the background
@@ -87,20 +86,19 @@ class UrArm(RobotArm):
     # ------------------------------------------------------------------ opening and closing
 
     def open(self, *, control: bool = False) -> None:
-        """Connect, read-only unless `control` is asked for; what was lost since the last time is opened again.
+        """Connect, read-only unless `control` is requested; reopen lost connections.
 
         Reading disturbs nothing and needs no remote control. Taking control starts a program on the controller, which
-        zeroes the sensor in an e-Series wrist anew. A program that plays or is paused there is never ended for it, but
-        for one that this object has started itself before. After a stop of the safety system it works once the operator
-        has cleared it; the interrupted move is gone. Raises `ConnectError`, and the arm is closed then. Within 5 s, all
-        in all.
+        zeroes the sensor in an e-Series wrist. It never stops another program that plays or is paused, except one that
+        this object has started before. After a safety stop the operator has to clear it first; the interrupted move is
+        gone. Takes 5 s at most. Raises `ConnectError`, and then the arm is closed.
         """
         try:
             self._drop_what_is_lost(control)
             self._connect(control)
         except (StreamBroken, DeviceTimeout, DeviceFault, ProtocolError) as error:
             self.close()
-            raise ConnectError(f"cannot open the arm at {self._host}: {error.found}", error.cure) from error
+            raise ConnectError(f"cannot open the arm at {self._host}: {error.found}", error.fix) from error
         except BaseException:
             self.close()
             raise
@@ -111,11 +109,11 @@ class UrArm(RobotArm):
         try:
             look = self._reader.look()
         except DriverError as error:
-            log.info("%s is opened again: %s", self._host, error)
+            log.info("%s is reopened: %s", self._host, error)
             self.close()
             return
         if look.program_state == PROGRAM_STOPPED:
-            self._left_behind = self._starting  # what runs later is not ours
+            self._left_behind = self._starting  # a program that runs later is not ours
         if not control or self._control is None:
             return
         plays = self._control.alive and not look.program_fault()
@@ -130,7 +128,7 @@ class UrArm(RobotArm):
         if control and self._control is None:
             self._open_control(self._reader)
         if self._reader.look().robot_mode == ROBOT_RUNNING and (self._reader.reports_tcp or self._control is not None):
-            self.state()  # is it the right model?
+            self.state()  # checks the model
 
     def _open_control(self, reader: Reader) -> None:
         self._require_version()
@@ -138,7 +136,7 @@ class UrArm(RobotArm):
 
         def look_out() -> None:
             if fault := reader.look().safety_fault():
-                raise ConnectError(f"the arm at {self._host} cannot move: {fault.found}", fault.cure)
+                raise ConnectError(f"the arm at {self._host} cannot move: {fault.found}", fault.fix)
 
         def prepare(dashboard: Dashboard) -> None:
             asks = major == 5 and minor > 5 and self._host not in _SIMULATORS
@@ -149,15 +147,15 @@ class UrArm(RobotArm):
                     "System, Remote Control)",
                 )
             if self._left_behind and reader.look().program_state != PROGRAM_STOPPED:
-                log.warning("ending the program of ours that was left on %s", self._host)
+                log.warning("%s still runs our earlier control program; stopping it", self._host)
                 dashboard.stop()
 
         look_out()
         find_script_port(self._host, timeout_s=self._timing.connect_s)
-        self._claim_nothing_of_others()
-        self._stop_wanted.clear()  # an attempt that is still on its way would stop the new program
+        self._wait_for_registers()
+        self._stop_wanted.clear()  # an attempt in the background would stop the new program
         self._ask_dashboard(prepare)
-        self._end_nothing_of_others(reader)
+        self._require_no_program(reader)
         self._left_behind = self._starting = True
         self._control = ControlProcess(self._host, FREQUENCY_HZ, clock=self._clock, timing=self._timing)
         try:
@@ -176,8 +174,8 @@ class UrArm(RobotArm):
                 f"update it to {major}.4 or later",
             )
 
-    def _claim_nothing_of_others(self) -> None:
-        """Raise `ConnectError` when somebody else has the registers, before anything of theirs is stopped."""
+    def _wait_for_registers(self) -> None:
+        """Raise `ConnectError` when another client keeps the registers, before any of its programs is stopped."""
         deadline_s = self._clock.now_s() + self._timing.release_s
         connect_s = self._timing.connect_s
         while taken := registers_in_use(self._host, CONTROL_REGISTERS, timeout_s=connect_s, clock=self._clock):
@@ -185,20 +183,20 @@ class UrArm(RobotArm):
                 raise _taken(self._host, f"{taken[0]} and {len(taken) - 1} more")
             self._clock.sleep(0.05)
 
-    def _end_nothing_of_others(self, reader: Reader) -> None:
-        """Raise `ConnectError` when a program stays on the controller: ur_rtde would end it, or wait 300 s for it."""
+    def _require_no_program(self, reader: Reader) -> None:
+        """Raise `ConnectError` when a program stays on the controller: ur_rtde would stop it, or wait 300 s for it."""
         deadline_s = self._clock.now_s() + self._timing.release_s
         while reader.look().program_state != PROGRAM_STOPPED:
             if self._clock.now_s() > deadline_s:
-                told = self.reported_program()
+                program = self.reported_program()
                 raise ConnectError(
-                    f"a program that this one has not started is on {self._host}{f' ({told})' if told else ''} and is "
-                    "not ended",
+                    f"another program is on {self._host}{f' ({program})' if program else ''} and is not stopped "
+                    "automatically",
                     "stop it at the pendant, then start again",
                 )
 
     def close(self) -> None:
-        """Let the arm go, stopping it and its control script first. Idempotent; within 1.5 s even when all is lost."""
+        """Stop the arm and its control script, then disconnect. Idempotent; takes 1.5 s at most."""
         control, self._control = self._control, None
         reader, self._reader = self._reader, None
         self._goal = None
@@ -210,48 +208,46 @@ class UrArm(RobotArm):
             reader.close()
 
     def _end_program(self, control: ControlProcess, reader: Reader | None) -> None:
-        """End our program in its own way, if it can be confirmed that this works."""
+        """End our program through ur_rtde, if that can be confirmed to work."""
         try:
             look = None if reader is None else reader.look(limit_s=self._timing.glance_s)
             if look and control.alive and look.program_state == PROGRAM_PLAYING and not look.safety_fault():
                 if self._is_ours(control, timeout_s=self._timing.ours_closing_s):
                     self._left_behind = not control.quit(timeout_s=self._timing.quit_s)
                 elif not self._left_behind:
-                    log.warning("%s runs a program of somebody else: it is left alone", self._host)
+                    log.warning("%s runs another program; it is not stopped", self._host)
         except DriverError as error:
             log.info("%s: %s", self._host, error)
         finally:
             control.kill()
 
     def identify(self) -> DeviceInfo:
-        """Tell model, serial number and PolyScope version, as read when the arm was opened."""
+        """Return model, serial number and PolyScope version, as read when the arm was opened."""
         return self._reading().info
 
     def state(self) -> ArmState:
-        """Read a fresh, consistent state; the flange pose is that of the mechanical flange, whatever TCP is active.
+        """Read a new, consistent state; the pose is that of the mechanical flange, whatever TCP is active.
 
         Raises `DeviceTimeout` when the controller's clock stands still for 0.2 s, `StreamBroken` when the connection is
         lost, `DeviceFault` when the joints are not measured (no power) or the pose does not fit the model, and
-        `ConnectError` when the controller is too old to tell its TCP and the arm was opened without control.
+        `ConnectError` when the controller is too old to report its TCP and the arm was opened without control.
         """
         reader = self._reading()
         if not reader.reports_tcp and self._control is None:
             raise ConnectError(
-                f"the controller {self._host} is too old to tell its active TCP, without which its poses say nothing "
-                "about the flange",
-                "update it, or take control of the arm, as a calibration does",
+                f"the controller {self._host} is too old to report its active TCP, so the flange pose is unknown",
+                "update it, or open the arm with control, as a calibration does",
             )
         return reader.state(lambda: self._in_control().call("tcp_offset"))
 
     def status(self) -> ArmStatus:
-        """Tell the controller's modes and settings; see `RobotArm`. 125 times a second there is something new."""
+        """Return the controller's modes and settings, updated 125 times a second; see `RobotArm`."""
         return self._reading().status()
 
     def in_remote_control(self) -> bool | None:
-        """Ask the dashboard server, which takes some milliseconds.
+        """Ask the dashboard server, which takes some milliseconds. Raises `NoDashboard`.
 
-        None before PolyScope 5.6, which does not tell, and at the addresses of URSim, where it does not matter. Raises
-        `NoDashboard`.
+        None before PolyScope 5.6, which does not report it, and at the addresses of URSim, which does not need it.
         """
         if self._reading().version[:2] < (5, 6) or self._host in _SIMULATORS:
             return None
@@ -260,14 +256,14 @@ class UrArm(RobotArm):
     def reported_program(self) -> str | None:
         """Ask the dashboard server for the program's state and name; None where it does not answer.
 
-        A program that a client has sent may come under the name of one that is loaded: not tried on hardware.
+        A program that a client has sent may be reported with the name of the loaded one: not checked on hardware.
         """
         try:
-            told = self._ask_dashboard(lambda dashboard: dashboard.programState())
+            program = self._ask_dashboard(lambda dashboard: dashboard.programState())
         except DriverError as error:
-            log.info("%s does not tell its program: %s", self._host, error)
+            log.info("%s does not report its program: %s", self._host, error)
             return None
-        return told.strip() or None
+        return program.strip() or None
 
     def diagnose(self) -> list[Finding]:
         """Check what control needs: the version of PolyScope, free RTDE registers, an open port for programs."""
@@ -276,7 +272,7 @@ class UrArm(RobotArm):
             try:
                 require()
             except DriverError as error:
-                return Finding(name, False, error.found, error.cure)
+                return Finding(name, False, error.found, error.fix)
             return Finding(name, True, found)
 
         version = "PolyScope {}.{} can be controlled".format(*self._reading().version)
@@ -284,7 +280,7 @@ class UrArm(RobotArm):
         is_open = f"port {SCRIPT_PORT}, which takes programs, is open"
         return [
             finding("version", self._require_version, version),
-            finding("registers", self._claim_nothing_of_others, free),
+            finding("registers", self._wait_for_registers, free),
             finding("programs", lambda: find_script_port(self._host, timeout_s=self._timing.connect_s), is_open),
         ]
 
@@ -297,7 +293,7 @@ class UrArm(RobotArm):
         """Ask the controller whether it would accept these joint angles (6,). Needs control.
 
         The controller knows its own limits and planes, not the obstacles around it. Raises `DeviceFault` or
-        `StreamBroken` rather than to take "not asked" for "no".
+        `StreamBroken` when it cannot be asked.
         """
         q = _joints(q_rad)
         control = self._in_control()
@@ -322,8 +318,7 @@ class UrArm(RobotArm):
         `guard` is called about 100 times a second. Whatever ends the wait early stops the arm first and is raised then:
         `DeviceFault` (protective, emergency or safeguard stop, program ended, not arrived), `StreamBroken`,
         `DeviceTimeout` (silent controller, or `timeout_s` is over), an exception of the guard, KeyboardInterrupt.
-        A stop of the safety system is never reset; what is left of the move is taken from the controller, so that
-        nobody can resume it.
+        A safety stop is never reset. The program is ended, so that the rest of the move cannot be resumed.
         """
         q = _joints(q_rad)
         speed = self._speed_rad_s if speed_rad_s is None else float(speed_rad_s)
@@ -334,13 +329,15 @@ class UrArm(RobotArm):
         self._goal = None
         with self._stopping_on_error():
             self._look_out()
-        self._check_ours(control)  # a program of somebody else is not stopped
+        self._check_ours(control)  # another program is not stopped
         guard()
         self._moves_at_rad_s = speed
         with self._stopping_on_error():
             with self._reporting_stop():
                 if not control.call("move", q, speed, acceleration, look_out=self._look_out):
-                    raise self._fault() or DeviceFault(f"the controller did not accept the move to {_degrees(q)}")
+                    raise self._fault() or DeviceFault(
+                        f"the controller rejected the move to {_degrees(q)}", "read the pendant's log"
+                    )
             checked_s = self._clock.now_s()
             for look in self._watch(
                 timeout_s, guard, f"the move to {_degrees(q)} has not ended", self._look_out_moving
@@ -360,30 +357,30 @@ class UrArm(RobotArm):
         ended, unwatched = control.call("progress", timeout_s=self._timing.progress_s, look_out=self._look_out)
         if unwatched:
             raise DeviceTimeout(
-                f"nothing was heard from this program for {self._timing.unwatched_s} s of a move, so the arm was "
-                "stopped",
-                "keep the computer awake and give it less to do, then move on",
+                f"this program did not watch the move for {self._timing.unwatched_s} s, so the control process stopped "
+                "the arm",
+                "keep the computer awake and give it less to do, then move again",
             )
         return bool(ended)
 
     def _check_arrival(self, look: Sample, q: list[float]) -> None:
-        # The control process may report the end before the last set-points come by the other connection.
+        # The control process may report the end before the last set-points arrive over RTDE.
         deadline_s = self._clock.now_s() + self._timing.reason_s
         while not _near(look.target_q_rad, q):
             if self._clock.now_s() > deadline_s:
                 raise self._fault() or DeviceFault(
                     f"the move ended at {_degrees(look.target_q_rad)} instead of {_degrees(q)}",
-                    "see the pendant for what ended it",
+                    "read the reason at the pendant",
                 )
             look = self._reading().look()
 
     def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
         """Return when the joints have been at rest long enough for the structure to stop ringing.
 
-        That is when the arm is where `move_to` sent it, its target velocity is zero and every measured joint speed is
-        below 0.002 rad/s, all of that for 0.3 s without a break. (The controller's own `is_steady` waits for 0.5 s of
-        zero target velocity; the difference cannot be seen in the mean over a second of force.) Errors as in
-        `move_to`; without control, safety stops are not errors.
+        For 0.3 s without a break, the arm is at the target of `move_to`, its target velocity is zero and every measured
+        joint speed is below 0.002 rad/s. (The controller's own `is_steady` waits for 0.5 s of zero target velocity; the
+        mean force over 1 s does not show the difference.) Errors as in `move_to`; without control, safety stops are not
+        errors.
         """
         still_since_s: float | None = None
         with self._stopping_on_error():
@@ -401,13 +398,13 @@ class UrArm(RobotArm):
                     return
 
     def stop(self) -> None:
-        """Stop the arm, and a `move_to` with `DeviceFault`. From any thread, any time; does nothing without control."""
+        """Stop the arm and end `move_to` with `DeviceFault`. From any thread, at any time; needs control."""
         if self._control is not None:
             self._stop_requested.set()
             self._halt()
 
     def _watch(self, timeout_s: float, guard: Guard, what: str, look_out: Callable[[], Sample]) -> Iterator[Sample]:
-        """Yield each new look, raising whatever is wrong with the arm, until the time is over."""
+        """Yield each new sample until the time is over; raise any fault of the arm."""
         deadline_s = self._clock.now_s() + timeout_s
         while True:
             look = look_out()
@@ -421,7 +418,7 @@ class UrArm(RobotArm):
 
     @contextmanager
     def _reporting_stop(self) -> Iterator[None]:
-        """What fails after `stop` was called in another thread failed because of it."""
+        """Report any failure after `stop` in another thread as that stop."""
         try:
             yield
         except DriverError as error:
@@ -430,7 +427,7 @@ class UrArm(RobotArm):
             raise
 
     def _look_out(self) -> Sample:
-        """Look, and raise whatever is wrong with the arm, its program or the connections."""
+        """Return a new sample; raise any fault of the arm, its program or the connections."""
         look = self._reading().look()
         if self._control is not None:
             if fault := self._fault(look):
@@ -443,7 +440,7 @@ class UrArm(RobotArm):
             return self._look_out()
 
     def _fault(self, look: Sample | None = None) -> DeviceFault | None:
-        """Say why the arm does not move, if the controller knows a reason."""
+        """Return why the arm does not move, if the controller reports a reason."""
         reader = self._reading()
         look = look or reader.look()
         deadline_s = self._clock.now_s() + self._timing.reason_s
@@ -452,7 +449,7 @@ class UrArm(RobotArm):
         fault = look.safety_fault() or look.program_fault()
         if fault is None:
             return None
-        return DeviceFault(f"the arm at {self._host} stopped: {fault.found}", f"{fault.cure}, then open the arm again")
+        return DeviceFault(f"the arm at {self._host} stopped: {fault.found}", f"{fault.fix}, then open the arm again")
 
     @contextmanager
     def _stopping_on_error(self) -> Iterator[None]:
@@ -463,16 +460,16 @@ class UrArm(RobotArm):
             raise
 
     def _halt(self) -> None:
-        """Stop the arm: softly where that works, else by ending its program; never fails."""
+        """Stop the arm with `stopJ`, or else by ending its program; never raises."""
         control = self._control
         if control is None:
             return
         stopped = False
         try:
             stopped = self._stop_softly(control)
-        finally:  # a second Ctrl-C is no reason to let the arm move on
+        finally:  # also after a second Ctrl-C
             if not stopped:
-                control.kill()  # on a lost link ur_rtde would start the program again and again
+                control.kill()  # on a lost link ur_rtde would restart the program repeatedly
                 silent = self._reader is not None and self._reader.silent
                 self._stop_program(timeout_s=self._timing.stop_silent_s if silent else self._timing.stop_s)
 
@@ -486,11 +483,11 @@ class UrArm(RobotArm):
                 return False
             limit_s = self._timing.braking_s + self._moves_at_rad_s / DECELERATION_RAD_S2
             control.call("stop", timeout_s=limit_s, look_out=self._look_out)
-            for _ in range(10):  # ur_rtde does not say whether it was done
+            for _ in range(10):  # ur_rtde does not report success
                 if max(map(abs, self._reading().look(limit_s=glance_s).target_qd_rad_s)) <= _STANDING_RAD_S:
                     return True
         except DriverError as error:
-            log.info("%s: cannot be stopped softly: %s", self._host, error)
+            log.info("%s: stopJ failed: %s", self._host, error)
         return False
 
     def _stop_program(self, *, timeout_s: float) -> None:
@@ -505,15 +502,15 @@ class UrArm(RobotArm):
             ask_dashboard(self._host, stop, timeout_s=timeout_s, connect_s=self._timing.reach_s, clock=self._clock)
             self._left_behind = self._starting
         except DriverError as error:
-            log.warning("%s could not be told to stop, press the emergency stop if it moves: %s", self._host, error)
+            log.warning("%s did not receive the stop; press the emergency stop if it moves: %s", self._host, error)
 
     def _check_ours(self, control: ControlProcess) -> None:
-        """Raise `DeviceFault` when the program that runs is not ours: its registers would say nothing."""
+        """Raise `DeviceFault` when another program runs, whose registers mean nothing to us."""
         if not self._is_ours(control, timeout_s=self._timing.ours_s, look_out=self._look_out):
             raise self._fault() or DeviceFault(
-                f"the control program on {self._host} does not answer: another program may have been started, or "
-                "controller or computer are too busy",
-                "look at the pendant, then open the arm again",
+                f"the control program on {self._host} does not answer: another program may be running, or "
+                "controller or computer are overloaded",
+                "check the program at the pendant, then open the arm again",
             )
 
     def _is_ours(
@@ -523,9 +520,9 @@ class UrArm(RobotArm):
             control.call("tcp_offset", timeout_s=timeout_s, look_out=look_out)
         except DeviceTimeout as error:
             if control.alive:
-                raise  # said by `look_out`: the controller is silent, whosever program it runs
+                raise  # of `look_out`: the controller sends nothing, whatever program it runs
             log.info("%s: the control program does not answer: %s", self._host, error)
-            self._left_behind = False  # another has taken its place, as far as anybody can tell
+            self._left_behind = False  # another program has probably replaced it
             return False
         except DriverError as error:
             log.info("%s: the control program cannot be asked: %s", self._host, error)
@@ -536,37 +533,37 @@ class UrArm(RobotArm):
         if self._control is None:
             raise ConnectError(f"the arm at {self._host} was opened for reading only", "open it with control")
         if not self._control.alive:
-            raise StreamBroken(f"the control of {self._host} has ended", "see to the robot, then open the arm again")
+            raise StreamBroken(f"the control of {self._host} has ended", "check the robot, then open the arm again")
         return self._control
 
     def _reading(self) -> Reader:
-        reader = self._reader  # once: another thread may close the arm between two looks
+        reader = self._reader  # once: another thread may close the arm meanwhile
         if reader is None:
             raise ConnectError(f"the arm at {self._host} is not open", "open it first")
         return reader
 
 
 def _stopped() -> DeviceFault:
-    return DeviceFault("the arm was told to stop before it had arrived")
+    return DeviceFault("a stop was requested before the arm arrived")
 
 
 def _check_speed(speed_rad_s: float, acceleration_rad_s2: float) -> None:
     if not radians(0.5) <= speed_rad_s <= radians(180):
-        raise ValueError(f"speed_rad_s is {speed_rad_s}: choose 0.0087 to 3.14 (0.5 to 180 degrees per second).")
+        raise ValueError(f"speed_rad_s is {speed_rad_s}; choose 0.0087 to 3.14 (0.5 to 180 degrees per second).")
     if not radians(1) <= acceleration_rad_s2 <= radians(300):
         raise ValueError(
-            f"acceleration_rad_s2 is {acceleration_rad_s2}: choose 0.0175 to 5.24 (1 to 300 degrees per second "
-            f"squared)."
+            f"acceleration_rad_s2 is {acceleration_rad_s2}; choose 0.0175 to 5.24 (1 to 300 degrees per second "
+            "squared)."
         )
 
 
 def _joints(q_rad: Sequence[float]) -> list[float]:
-    """Joint angles fit to be sent: ur_rtde checks neither their number nor their values."""
+    """Check joint angles, because ur_rtde checks neither their number nor their values."""
     q = [float(angle) for angle in q_rad]
     if len(q) != 6 or not all(math.isfinite(angle) for angle in q):
-        raise ValueError(f"q_rad is {q}: six finite angles in radians are needed.")
+        raise ValueError(f"q_rad is {q}; give six finite angles in radians.")
     if max(map(abs, q)) > 2 * math.pi + 1e-9:
-        raise ValueError(f"q_rad is {_degrees(q)}: every joint ends at 360 degrees; are these radians?")
+        raise ValueError(f"q_rad is {_degrees(q)}, every joint ends at 360 degrees; give radians.")
     return q
 
 
@@ -579,7 +576,7 @@ def _degrees(q_rad: Sequence[float]) -> str:
 
 
 def _refusal(host: str, words: str) -> ConnectError:
-    """Turn ur_rtde's words into what to do."""
+    """Convert a message of ur_rtde to an error with a fix."""
     if "already in use" in words:
         return _taken(host, "registers")
     if "remote control" in words:
@@ -588,13 +585,12 @@ def _refusal(host: str, words: str) -> ConnectError:
         )
     return ConnectError(
         f"ur_rtde cannot control {host}: {words}",
-        "check at the pendant that no message waits for an answer and that no other program starts by itself",
+        "check at the pendant that no dialog is open and that no other program starts automatically",
     )
 
 
 def _taken(host: str, what: str) -> ConnectError:
     return ConnectError(
         f"another client controls {host} and holds its RTDE registers ({what})",
-        "end it, or disable EtherNet/IP, PROFINET and other fieldbuses on the controller; after a cut cable wait for "
-        "half a minute",
+        "end it, or disable EtherNet/IP, PROFINET and other fieldbuses on the controller; wait 30 s after a cut cable",
     )

@@ -1,4 +1,4 @@
-"""The parent's side of the process that moves the arm: requests with a time-out, and SIGKILL for one that hangs.
+"""The parent's side of the process that moves the arm: requests with a time-out, and SIGKILL if it hangs.
 
 Ref: ur_rtde 1.6.5. Its control interface hangs for 301 s on a lost link, or ends its process with SIGSEGV, so it must
 not live in ours.
@@ -22,16 +22,16 @@ log = logging.getLogger(__name__)
 
 
 class ControlProcess:
-    """A disposable process with ur_rtde's control interface in it. Any thread may call."""
+    """A disposable process with ur_rtde's control interface. Any thread may call."""
 
     def __init__(self, host: str, frequency_Hz: float, *, clock: Clock, timing: UrTiming) -> None:
-        """Start the process; `wait_until_ready` before the first call."""
+        """Start the process; call `wait_until_ready` before `call`."""
         self._host = host
         self._clock = clock
         self._timing = timing
         limits = (timing.child_starting_s, timing.child_leaving_s, timing.unwatched_s)
-        # By path and not by forking or importing, so that nothing of the application runs again; in a session of its
-        # own, so that Ctrl-C or a closed terminal cannot end it before it has stopped the arm.
+        # Started by path, so that no code of the application runs in it. In its own session, so that Ctrl-C or a closed
+        # terminal cannot end it before it has stopped the arm.
         self._process = subprocess.Popen(
             [sys.executable, "-P", control_child.__file__, host, *map(str, (frequency_Hz, *limits))],
             stdin=subprocess.PIPE,
@@ -44,13 +44,13 @@ class ControlProcess:
         self._requests = cast(IO[str], self._process.stdin)
         self._changed = threading.Condition()
         self._replies: dict[int, dict[str, Any]] = {}
-        self._lock = threading.RLock()  # re-entrant: a signal handler may stop the arm in the middle of a call
+        self._lock = threading.RLock()  # re-entrant: a signal handler may stop the arm during a call
         self._last_id = 0
         self._ended = False  # its last reply has been read
         self._killed = False
         self._readers = [
             threading.Thread(target=read, args=(pipe,), name=f"ur-control-{read.__name__}", daemon=True)
-            for read, pipe in ((self._read_replies, self._process.stdout), (self._read_talk, self._process.stderr))
+            for read, pipe in ((self._read_replies, self._process.stdout), (self._log_output, self._process.stderr))
         ]
         for reader in self._readers:
             reader.start()
@@ -62,7 +62,7 @@ class ControlProcess:
 
     @property
     def alive(self) -> bool:
-        """Whether it can still be called."""
+        """Whether it accepts calls."""
         return not (self._ended or self._killed)
 
     def wait_until_ready(self, look_out: Callable[[], object]) -> None:
@@ -81,8 +81,8 @@ class ControlProcess:
     ) -> Any:
         """Call one of `control_child.Calls`, within `call_s` of the timing where no time-out is given.
 
-        Raises `StreamBroken` when the process is gone or says that the call failed, `DeviceTimeout` after killing
-        one that hangs, and what `look_out` raises, which is called about 20 times a second until the answer comes.
+        Calls `look_out` about 20 times a second until the reply arrives. Raises `StreamBroken` when the process is gone
+        or the call failed, `DeviceTimeout` after killing a process that hangs, and the errors of `look_out`.
         """
         while not self._lock.acquire(timeout=0.02):
             self._clock.now_ns()  # an emulated cell may wait for this thread
@@ -99,7 +99,7 @@ class ControlProcess:
             self._lock.release()
 
     def quit(self, *, timeout_s: float) -> bool:
-        """Stop the arm, end its script and the process; whether all that was confirmed in time."""
+        """Stop the arm, end its script and the process; return whether that was confirmed in time."""
         try:
             self.call("quit", timeout_s=timeout_s)
         except DriverError as error:
@@ -110,7 +110,7 @@ class ControlProcess:
         return True
 
     def kill(self) -> None:
-        """End the process at once, whatever it does. The arm goes on with what it was told: stop it another way."""
+        """Kill the process. The arm finishes its last command, so stop it through the dashboard server."""
         self._killed = True
         self._process.kill()
         self._process.wait()
@@ -118,7 +118,7 @@ class ControlProcess:
             reader.join()  # the pipes have ended with the process
         for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
             if pipe is not None:
-                with suppress(OSError):  # a request that was never read
+                with suppress(OSError):  # an unread request
                     pipe.close()
 
     def _answer(self, to: int, timeout_s: float, look_out: Callable[[], object]) -> Any:
@@ -131,23 +131,22 @@ class ControlProcess:
                 ended = self._ended
             if reply is not None:
                 if "error" in reply:
-                    # of the start, `UrArm` knows the cure
-                    cure = "check the robot and the cable, then open the arm again" if to else ""
-                    raise StreamBroken(f"ur_rtde says: {reply['error']}", cure)
+                    fix = "check the robot and the cable, then open the arm again" if to else ""  # `UrArm` adds one
+                    raise StreamBroken(f"ur_rtde reports: {reply['error']}", fix)
                 return reply["value"]
             if ended:
                 raise self._loss()
             if patience.is_over:
                 self.kill()
                 raise DeviceTimeout(
-                    f"ur_rtde did not answer within {timeout_s:.1f} s and its process was ended",
+                    f"ur_rtde did not answer within {timeout_s:.1f} s, so its process was killed",
                     "check the robot and the network, then open the arm again",
                 )
             look_out()
 
     def _loss(self) -> StreamBroken:
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(0.2)  # its pipe may close a moment before it is dead
+            self._process.wait(0.2)  # its pipe may close before the process ends
         return StreamBroken(
             f"the process that controls {self._host} ended (exit code {self._process.returncode})",
             "check the robot, then open the arm again",
@@ -157,7 +156,7 @@ class ControlProcess:
         for line in pipe:
             try:
                 reply = json.loads(line)
-            except ValueError:  # something at the interpreter's start-up may print
+            except ValueError:  # a module may print when the interpreter starts
                 log.info("not a reply: %s", line.rstrip())
                 continue
             with self._changed:
@@ -167,6 +166,6 @@ class ControlProcess:
             self._ended = True
             self._changed.notify_all()
 
-    def _read_talk(self, pipe: IO[str]) -> None:
+    def _log_output(self, pipe: IO[str]) -> None:
         for line in pipe:
             log.info("ur_rtde: %s", line.rstrip())

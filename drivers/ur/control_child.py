@@ -1,8 +1,8 @@
 """The process that holds ur_rtde's `RTDEControlInterface`. Run by its path; imports nothing of ours.
 
-Requests and replies are lines of JSON on stdin and stdout. When stdin ends, for whatever reason, the arm is stopped,
-the control script is ended and the process exits; SIGALRM ends it when ur_rtde hangs, whatever locks it holds. When the
-parent lives but asks nothing for too long of a move (it is suspended, or hangs), the arm is stopped.
+Requests and replies are lines of JSON on stdin and stdout. When stdin ends, this process stops the arm, ends the
+control script and exits. SIGALRM ends it when ur_rtde hangs. It also stops the arm when the parent, suspended or
+hanging, sends no request for too long during a move.
 
 Arguments: host, frequency in Hz, and three limits in seconds of `UrTiming`: `child_starting_s`, `child_leaving_s` and
 `unwatched_s`.
@@ -51,34 +51,34 @@ class _Control(Protocol):
 
 
 class Calls:
-    """What the parent may ask for."""
+    """The calls of the parent."""
 
     def __init__(self, control: _Control) -> None:
         self._control = control
         self._before = 0
         self._unwatched = False
         self.moving = False
-        """Whether the parent has to go on asking for `progress`."""
+        """Whether the parent has to keep calling `progress`."""
 
     def move(self, q_rad: list[float], speed_rad_s: float, acceleration_rad_s2: float) -> bool:
-        """Begin a move; whether it was accepted."""
+        """Begin a move; return whether it was accepted."""
         self._before = self._control.getAsyncOperationProgressEx().operationId()
         self._unwatched = False
         self.moving = self._control.moveJ(q_rad, speed_rad_s, acceleration_rad_s2, True)
         return self.moving
 
     def progress(self) -> tuple[bool, bool]:
-        """Whether the move has ended, and whether it was stopped because nobody watched it."""
+        """Return whether the move has ended, and whether it was stopped because the parent did not watch it."""
         progress = self._control.getAsyncOperationProgressEx()
-        if not self._control.isConnected():  # a lost link looks like an arm that has arrived
+        if not self._control.isConnected():  # a lost link looks like arrival
             raise RuntimeError("the control connection was lost")
         ended = progress.operationId() != self._before and not progress.isAsyncOperationRunning()
         self.moving = self.moving and not ended
         return ended, self._unwatched
 
     def stop_unwatched(self) -> None:
-        """Stop a move that nobody has asked about for too long."""
-        time.sleep(0.02)  # when this process was suspended as well, ur_rtde has to catch up
+        """Stop a move that the parent has not watched for too long."""
+        time.sleep(0.02)  # after a suspension of this process ur_rtde has to catch up
         ended, _ = self.progress()
         if not ended:
             self._unwatched = True
@@ -87,25 +87,25 @@ class Calls:
     def stop(self) -> None:
         """Decelerate all joints and wait for standstill.
 
-        Not the asynchronous way: that decelerates the tool instead of the joints, which a singularity forbids.
+        The asynchronous stop would decelerate the tool instead of the joints, which fails at a singularity.
         """
         self.moving = False
         self._control.stopJ(DECELERATION_RAD_S2)
 
     def within_safety_limits(self, q_rad: list[float]) -> bool:
-        """Ask the controller."""
+        """Return whether the controller accepts these joint angles."""
         if self._control.isProgramRunning() and self._control.isJointsWithinSafetyLimits(q_rad):
             return True
         if self._control.isProgramRunning() and self._control.isConnected():
             return False
-        raise RuntimeError("the control program is not running")  # ur_rtde would say False
+        raise RuntimeError("the control program is not running")  # ur_rtde would return False
 
     def tcp_offset(self) -> list[float]:
-        """Active TCP in the flange."""
+        """Return the active TCP in the flange."""
         return self._control.getTCPOffset()
 
     def quit(self) -> None:
-        """Stop the arm and end the script, which would otherwise go on running on the controller."""
+        """Stop the arm and end the script, which would otherwise stay on the controller."""
         if self._control.getAsyncOperationProgressEx().isAsyncOperationRunning():
             self.stop()
         self._control.stopScript()
@@ -116,18 +116,18 @@ def main() -> None:
     host = sys.argv[1]
     frequency_Hz, starting_s, leaving_s, unwatched_s = map(float, sys.argv[2:])
     replies = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what the C++ library prints must not reach the replies
+    os.dup2(2, 1)  # the output of the C++ library must not mix with the replies
 
     def reply(**content: object) -> None:
-        with suppress(OSError):  # the parent is gone: the end of stdin will say so
+        with suppress(OSError):  # the parent is gone, so stdin will end
             replies.write(json.dumps(content) + "\n")
             replies.flush()
 
     signal.setitimer(signal.ITIMER_REAL, starting_s)
     try:
         interface = import_module("rtde_control").RTDEControlInterface
-        # rt_priority: the library's default would put this thread under real-time scheduling, where it spins.
-        # FLAG_NO_EXT_FT: that input may well belong to whoever feeds a wrist sensor's readings to the controller.
+        # rt_priority: by default the library would put this thread under real-time scheduling, where it spins.
+        # FLAG_NO_EXT_FT: another client may use that input to send wrist-sensor readings to the controller.
         flags = int(interface.FLAG_UPLOAD_SCRIPT) | int(interface.FLAG_NO_EXT_FT)
         control = cast(_Control, interface(hostname=host, frequency=frequency_Hz, flags=flags, rt_priority=-1))
     except Exception as error:
@@ -142,7 +142,7 @@ def main() -> None:
     serve(calls, requests, reply, unwatched_s)
     with suppress(Exception):
         calls.quit()
-    os._exit(0)  # the library's own way out takes half a second and may crash
+    os._exit(0)  # the exit of the library takes 0.5 s and may crash
 
 
 def serve(calls: Calls, requests: "SimpleQueue[str | None]", reply: Callable[..., None], unwatched_s: float) -> None:
@@ -151,7 +151,7 @@ def serve(calls: Calls, requests: "SimpleQueue[str | None]", reply: Callable[...
         try:
             line = requests.get(timeout=unwatched_s if calls.moving else None)
         except Empty:
-            with suppress(Exception):  # then the parent will stop it in its own way, once it is back
+            with suppress(Exception):  # then the parent will stop the arm when it resumes
                 calls.stop_unwatched()
             continue
         if line is None:
@@ -160,7 +160,7 @@ def serve(calls: Calls, requests: "SimpleQueue[str | None]", reply: Callable[...
         call = cast(Callable[..., object], getattr(calls, request["call"]))
         try:
             reply(id=request["id"], value=call(*request["args"]))
-        except Exception as error:  # whatever the library raises: the parent decides
+        except Exception as error:  # the library may raise anything; the parent decides
             reply(id=request["id"], error=str(error))
 
 

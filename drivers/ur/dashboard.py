@@ -3,8 +3,7 @@
 Ref: ur_rtde 1.6.5, API reference; Universal Robots, "Dashboard Server, e-Series" manual.
 Checked on hardware: no.
 
-A call of `DashboardClient` always returns, but only after up to five seconds when the controller is dead. So each
-question is asked in a thread of its own.
+A call of `DashboardClient` takes up to 5 s when the controller is dead. So every request runs in its own thread.
 """
 
 import platform
@@ -20,12 +19,12 @@ from drivers.errors import ConnectError, NoDashboard
 T = TypeVar("T")
 
 _NO_DASHBOARD: Final = (
-    "enable the dashboard server at the pendant under Settings, Security, Services; restart the controller if it is"
+    "enable the dashboard server at the pendant under Settings, Security, Services; if it is, restart the controller"
 )
 
 
 class Dashboard(Protocol):
-    """What is used of `DashboardClient`. Every refusal is a RuntimeError with the controller's words."""
+    """The used part of `DashboardClient`. Every refusal is a RuntimeError with the controller's message."""
 
     def connect(self, timeout_ms: int) -> None:
         """Connect and read the banner, the latter within 2.5 s."""
@@ -37,19 +36,19 @@ class Dashboard(Protocol):
         """Stop the program, and the arm with it."""
 
     def getRobotModel(self) -> str:
-        """Model without its generation, such as UR5."""
+        """Return the model without its generation, such as UR5."""
 
     def getSerialNumber(self) -> str:
-        """Digits."""
+        """Return the serial number, in digits."""
 
     def polyscopeVersion(self) -> str:
-        """Such as 5.15.0.1261331."""
+        """Return the version, such as 5.15.0.1261331."""
 
     def programState(self) -> str:
-        """Such as "PLAYING pick.urp"."""
+        """Return state and name, such as "PLAYING pick.urp"."""
 
     def isInRemoteControl(self) -> bool:
-        """Whether programs sent over the network are accepted (e-Series from 5.6 on)."""
+        """Return whether programs sent over the network are accepted (e-Series from 5.6 on)."""
 
 
 def ask_dashboard(
@@ -62,8 +61,8 @@ def ask_dashboard(
 ) -> T:
     """Connect to the dashboard server, ask, disconnect.
 
-    What is not done within `timeout_s` goes on in a thread: for `connect_s`, which is `timeout_s` where not given, it
-    tries to connect, then it waits 2.5 s for the banner.
+    After `timeout_s` the request continues in its thread: it tries to connect for `connect_s` (default `timeout_s`),
+    then it waits 2.5 s for the banner.
 
     Raises
     ------
@@ -82,7 +81,7 @@ def ask_dashboard(
         finally:
             dashboard.disconnect()
 
-    pool = ThreadPoolExecutor(1, "ur-dashboard")  # no daemon: leaving the interpreter in the middle of C++ would abort
+    pool = ThreadPoolExecutor(1, "ur-dashboard")  # no daemon: an exit of the interpreter during C++ code would abort
     answered = threading.Event()
     future = pool.submit(session)
     future.add_done_callback(lambda _: answered.set())
@@ -92,7 +91,7 @@ def ask_dashboard(
     try:
         return future.result()
     except RuntimeError as error:
-        raise NoDashboard(f"the dashboard server of {host} says: {str(error).rstrip('.')}", _NO_DASHBOARD) from error
+        raise NoDashboard(f"the dashboard server of {host} reports: {str(error).rstrip('.')}", _NO_DASHBOARD) from error
 
 
 def _client() -> Callable[[str], Dashboard]:

@@ -3,8 +3,8 @@
 Ref: Universal Robots, "DH parameters for calculations of kinematics and dynamics"; ROS 2 description of the arms,
 `default_kinematics.yaml` of each model, version 2.4.5.
 
-A real arm is calibrated in the factory and misses its nominal pose by one or two millimetres: this is a check of the
-model and of the active TCP, never a source of flange poses.
+The calibrated pose of a real arm differs from the nominal one by 1 to 2 mm. So this checks the model and the active
+TCP, and is never a source of flange poses.
 """
 
 from collections.abc import Sequence
@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from math import cos, pi, sin
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from drivers.interfaces import Array
+
+__all__ = ["MODELS", "Array", "Geometry", "Pose", "forward", "model_named"]
 
 _ALPHA_RAD = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
 
@@ -52,7 +53,7 @@ MODELS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """Where a frame b stands in a frame a: `p_a = R @ p_b + p_m`."""
+    """Pose of a frame b in a frame a: `p_a = R @ p_b + p_m`."""
 
     R: Array
     """(3, 3)"""
@@ -67,19 +68,19 @@ class Pose:
         )
 
     def inverse(self) -> "Pose":
-        """Where a stands in b."""
+        """Return the pose of a in b."""
         return Pose(self.R.T, -self.R.T @ self.p_m)
 
     def __matmul__(self, other: "Pose") -> "Pose":
         return Pose(self.R @ other.R, self.R @ other.p_m + self.p_m)
 
     def angle_to_rad(self, other: "Pose") -> float:
-        """Angle between the two orientations."""
+        """Return the angle between the two orientations."""
         return float(Rotation.from_matrix(self.R.T @ other.R).magnitude())
 
 
 def forward(geometry: Geometry, q_rad: Sequence[float] | Array) -> Pose:
-    """Flange in base for the joint angles `q_rad` (6,), by the nominal lengths."""
+    """Return the flange in base for the joint angles `q_rad` (6,), by the nominal lengths."""
     lengths = (
         (geometry.d1_m, 0.0),
         (0.0, geometry.a2_m),
@@ -101,12 +102,12 @@ def forward(geometry: Geometry, q_rad: Sequence[float] | Array) -> Pose:
     return flange
 
 
-def model_named(told: str, controller_major: int) -> str | None:
-    """Name in `MODELS` of what a person or a dashboard calls an arm, or None.
+def model_named(name: str, controller_major: int) -> str | None:
+    """Find the key of `MODELS` for the name of an arm in a configuration or on the dashboard, or None.
 
-    The dashboard drops the e of e-Series arms ("UR5" may be a UR5e): the controller's generation decides.
+    The dashboard drops the e of e-Series arms ("UR5" may be a UR5e), so the controller's generation decides.
     """
-    key = told.strip().lower()
+    key = name.strip().lower()
     names = {name.lower(): name for name in MODELS}
     if controller_major >= 5 and key + "e" in names:
         key += "e"

@@ -1,8 +1,8 @@
-"""Looking at a Universal Robots arm: samples that are new, and a flange pose that no TCP setting can spoil.
+"""The reader of a Universal Robots arm: new samples, and a flange pose that does not depend on the TCP setting.
 
 One RTDE subscription carries everything. After a suspension of this process the socket holds seconds of old samples,
-whose time stamps advance like new ones: a sample is believed only if the reader had to wait for it. The TCP offset of
-the same sample is taken off its pose, and the flange pose is compared with the nominal forward kinematics.
+whose time stamps advance like new ones. So only a sample for which the reader had to wait is used. The TCP offset of
+the same sample is removed from its pose, and the flange pose is compared with nominal forward kinematics.
 
 Checked on hardware: no.
 """
@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.clock import Clock
+from drivers.clock import Clock, Follower
 from drivers.errors import (
     ConnectError,
     DeviceFault,
@@ -36,9 +36,9 @@ from drivers.ur.timing import Patience, UrTiming
 log = logging.getLogger(__name__)
 
 FREQUENCY_HZ: Final = 125.0
-"""The full rate of the CB3 generation; e-Series arms send every fourth cycle."""
+"""The full rate of the CB3 generation, and every fourth cycle of the e-Series."""
 _WAITED_S: Final = (0.002, 0.1)
-"""The reader waits 8 ms for a sample that has just been taken. What has piled up comes without waiting."""
+"""The reader waits 8 ms for a new sample. Accumulated samples come without waiting."""
 _MODEL_POSITION_M: Final = 0.005
 _MODEL_ANGLE_RAD: Final = radians(0.5)
 
@@ -59,17 +59,17 @@ class Reader:
         self._t_device_s = math.nan
         self._failure: DriverError | None = None
         self.silent = False
-        """Whether nothing has come since `DeviceTimeout` was raised."""
+        """Whether no sample has arrived since `DeviceTimeout` was raised."""
         self._stream = Subscription(host, OUTPUTS, FREQUENCY_HZ, timeout_s=timing.connect_s, clock=clock)
         self.version = self._stream.version
         """Of the controller: major, minor, bugfix, build."""
         missing = set(self._stream.missing)
         self._names = [name for name in OUTPUTS if name not in missing]
         self.reports_tcp = "tcp_offset" in self._names
-        """Whether the controller reports its TCP offset without being controlled; old ones do not."""
-        self._thread = threading.Thread(target=self._run, name="ur-reader", daemon=True)
-        self._thread.start()
+        """Whether the controller reports its TCP offset over RTDE; old ones do not."""
+        self._thread = Follower(clock, self._run, "ur-reader")
         try:
+            self._thread.start()
             self.info = self._identify(model, missing - OPTIONAL)
         except BaseException:
             self.close()
@@ -83,8 +83,8 @@ class Reader:
     def look(self, *, limit_s: float | None = None) -> Sample:
         """Wait for a sample taken after this call.
 
-        Raises `StreamBroken` when the connection is lost and `DeviceTimeout` when the controller is silent for
-        `limit_s` (`stale_s` of the timing where not given).
+        Raises `StreamBroken` when the connection is lost and `DeviceTimeout` when no sample arrives for `limit_s`
+        (default `stale_s` of the timing).
         """
         before = self._live
         return self._wait(lambda: self._live is not before, self._timing.stale_s if limit_s is None else limit_s)
@@ -98,7 +98,7 @@ class Reader:
         """Read a state; `ask_tcp` asks for the TCP offset (6,) if samples lack it. Errors as `UrArm.state`."""
         sample, tcp_offset = self._look_with_tcp(ask_tcp)
         if not sample.measures and (fault := sample.safety_fault()):
-            raise DeviceFault(f"{self._host} does not measure its joints: {fault.found}", fault.cure)
+            raise DeviceFault(f"{self._host} does not measure its joints: {fault.found}", fault.fix)
         flange = sample.flange(tcp_offset)
         self._check_model(sample, flange)
         return ArmState(
@@ -118,7 +118,7 @@ class Reader:
                 return sample, sample.tcp_offset
             if before is not None and before == tuple(ask_tcp()):  # so it was active when the sample was taken
                 return sample, before
-        raise DeviceFault(f"the TCP of {self._host} changes all the time", "find out what sets it")
+        raise DeviceFault(f"the TCP of {self._host} changes repeatedly", "stop the program or client that sets it")
 
     def _check_model(self, sample: Sample, flange: Pose) -> None:
         nominal = forward(MODELS[self.info.model], sample.q_rad)
@@ -126,10 +126,9 @@ class Reader:
         angle_rad = flange.angle_to_rad(nominal)
         if distance_m > _MODEL_POSITION_M or angle_rad > _MODEL_ANGLE_RAD:
             raise DeviceFault(
-                f"the flange is {1e3 * distance_m:.1f} mm and {math.degrees(angle_rad):.2f} degrees from where a "
-                f"{self.info.model} has it with these joint angles: the arm at {self._host} is another model, or its "
-                "TCP was changed this moment",
-                "check both and read again",
+                f"the flange is {1e3 * distance_m:.1f} mm and {math.degrees(angle_rad):.2f} degrees from the nominal "
+                f"pose of a {self.info.model}: the arm at {self._host} is another model, or its TCP is changing",
+                "check model and TCP, then read again",
             )
 
     def _identify(self, model: str | None, lacking: set[str]) -> DeviceInfo:
@@ -137,38 +136,40 @@ class Reader:
         if major > 5:
             raise ConnectError(
                 f"{self._host} runs PolyScope X (version {major}), which has no dashboard server to stop the arm with",
-                "PolyScope 5 or the CB3 generation is needed",
+                "use a controller of PolyScope 5 or the CB3 generation",
             )
         if lacking:
             raise ConnectError(
-                f"{self._host} does not tell {', '.join(sorted(lacking))} over RTDE", "update its PolyScope"
+                f"{self._host} does not report {', '.join(sorted(lacking))} over RTDE", "update its PolyScope"
             )
 
         def ask(dashboard: Dashboard) -> tuple[str, str, str]:
-            told = dashboard.getRobotModel().strip()
+            reported = dashboard.getRobotModel().strip()
             try:
                 serial = dashboard.getSerialNumber()
-            except RuntimeError as error:  # the question is younger than some controllers
-                log.info("%s does not tell its serial number: %s", self._host, error)
+            except RuntimeError as error:  # some controllers are older than this request
+                log.info("%s does not report its serial number: %s", self._host, error)
                 serial = NOT_REPORTED
-            return told, serial, dashboard.polyscopeVersion().strip()
+            return reported, serial, dashboard.polyscopeVersion().strip()
 
-        told, serial, polyscope = ask_dashboard(self._host, ask, timeout_s=self._timing.connect_s, clock=self._clock)
-        says = model_named(told, major)
-        if model is None and says is None:
+        reported, serial, polyscope = ask_dashboard(
+            self._host, ask, timeout_s=self._timing.connect_s, clock=self._clock
+        )
+        known = model_named(reported, major)
+        if model is None and known is None:
             raise ModelUnknown(
-                f"{self._host} says {told!r} to the question for its model, which is no known one (CB3 before 3.12 "
-                "and e-Series before 5.6 do not tell it)",
-                "name the model of the arm",
+                f"{self._host} reports the model {reported!r}, which is unknown (CB3 before 3.12 and e-Series before "
+                "5.6 do not report it)",
+                "set the model of the arm",
             )
-        if model is not None and says is not None and MODELS[says] != MODELS[model]:
-            raise ConnectError(f"{self._host} is a {says}, not a {model}", "check the address and the model")
-        return DeviceInfo(model=model or says or told, serial=serial, firmware=polyscope)
+        if model is not None and known is not None and MODELS[known] != MODELS[model]:
+            raise ConnectError(f"{self._host} is a {known}, not a {model}", "check the address and the model")
+        return DeviceInfo(model=model or known or reported, serial=serial, firmware=polyscope)
 
     # ------------------------------------------------------------------ following the stream
 
     def _wait(self, is_new: Callable[[], bool], limit_s: float) -> Sample:
-        """Return the newest live sample as soon as it `is_new`."""
+        """Return the newest sample as soon as it `is_new`."""
         patience = Patience(self._clock, limit_s)
         with self._changed:
             while True:
@@ -186,12 +187,11 @@ class Reader:
                 patience.wait(self._changed)
 
     def _run(self) -> None:
-        with self._clock.keeping_up():
-            while self._follow():
-                pass
+        while self._follow():
+            pass
 
     def _follow(self) -> bool:
-        """Read the next sample; whether to go on. What ends the stream is raised at the next look."""
+        """Read the next sample; return whether to continue. An error is raised at the next look."""
         try:
             outputs = dict(zip(self._names, self._stream.read(self._clock.poll_s), strict=True))
         except TimeoutError:

@@ -1,8 +1,8 @@
-"""A small RTDE client of our own: all that is read from a controller comes through it.
+"""A small RTDE client: everything that is read from a controller passes through it.
 
-ur_rtde's receiving side freezes the whole interpreter when the controller accepts and stays silent, repeats its last
-values when a link is lost, has no snapshot, and cannot parse `tcp_offset`, without which a TCP pose says nothing about
-the flange. Nothing is ever written to the controller's registers here: this client cannot disturb a program.
+The receiving side of ur_rtde freezes the interpreter when the controller accepts and sends nothing. It repeats its last
+values when a link is lost, has no snapshot, and cannot parse `tcp_offset`, which the flange pose needs. This client
+never writes to the controller's registers, so it cannot disturb a program.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
 Checked on hardware: no.
@@ -49,17 +49,17 @@ _FORMATS: Final = {
 
 
 def encode(kind: int, payload: bytes = b"") -> bytes:
-    """Frame one package."""
+    """Build one package."""
     return _HEADER.pack(_HEADER.size + len(payload), kind) + payload
 
 
 def encode_setup_outputs(frequency_Hz: float, names: tuple[str, ...]) -> bytes:
-    """Frame the request for one recipe of outputs."""
+    """Build the request for one recipe of outputs."""
     return encode(SETUP_OUTPUTS, struct.pack(">d", frequency_Hz) + ",".join(names).encode("ascii"))
 
 
 def encode_setup_inputs(names: tuple[str, ...]) -> bytes:
-    """Frame the request for one recipe of inputs."""
+    """Build the request for one recipe of inputs."""
     return encode(SETUP_INPUTS, ",".join(names).encode("ascii"))
 
 
@@ -73,7 +73,7 @@ def take_package(buffer: bytearray) -> tuple[int, bytes] | None:
     size, kind = _HEADER.unpack_from(buffer)
     if size < _HEADER.size:
         raise ProtocolError(
-            f"RTDE package of {size} bytes, at least {_HEADER.size} expected", "is this an RTDE server?"
+            f"RTDE package of {size} bytes, at least {_HEADER.size} expected", "check that this is an RTDE server"
         )
     if len(buffer) < size:
         return None
@@ -92,7 +92,7 @@ def decode_version(payload: bytes) -> tuple[int, int, int, int]:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How the controller packs the outputs that were asked for."""
+    """How the controller packs the requested outputs."""
 
     id: int
     types: tuple[str, ...]
@@ -118,9 +118,9 @@ class Recipe:
 
 @lru_cache(maxsize=16)
 def _layout(types: tuple[str, ...]) -> tuple[struct.Struct, list[slice]]:
-    """Lay out a data package: all of it, the recipe's number first, and where in it each output is."""
+    """Return the layout of a data package, which begins with the recipe's number, and the place of each output."""
     if unknown := [kind for kind in types if kind not in _FORMATS]:
-        raise ProtocolError(f"RTDE output of unknown type: {', '.join(unknown)}")
+        raise ProtocolError(f"RTDE outputs have unknown types: {', '.join(unknown)}")
     formats = [_FORMATS[kind] for kind in types]
     ends = list(accumulate((int(one[:-1] or 1) for one in formats), initial=1))
     return struct.Struct(">B" + "".join(formats)), [slice(*pair) for pair in pairwise(ends)]
@@ -146,9 +146,9 @@ class _Connection:
         return package
 
     def ask(self, request: bytes) -> bytes:
-        """Send a request and return the payload of its answer; an answer has the type of its request.
+        """Send a request and return the payload of its answer, which has the type of the request.
 
-        All of them have to come within the time-out of the connection.
+        All answers have to arrive within the time-out of the connection.
         """
         self._socket.sendall(request)
         while True:
@@ -165,7 +165,7 @@ class _Connection:
 
 
 class Subscription:
-    """Outputs of one controller, sent `frequency_Hz` times a second; connected while it exists.
+    """Outputs of one controller, sent `frequency_Hz` times a second; connected while the object exists.
 
     Parameters
     ----------
@@ -174,16 +174,16 @@ class Subscription:
     outputs : mapping of str to str
         Name and type of every output, such as ``{"timestamp": "DOUBLE"}``.
     frequency_Hz : float
-        How often; at most the controller's own rate.
+        At most the controller's own rate.
     timeout_s : float
-        For the whole greeting.
+        Limit of the whole start-up.
     clock : Clock
         Measures it.
 
     Raises
     ------
     Unreachable
-        Nobody there.
+        Nothing answers at the address.
     ConnectError
         No RTDE, or outputs of other types.
     """
@@ -195,7 +195,7 @@ class Subscription:
         self.version = (0, 0, 0, 0)
         """Of the controller: major, minor, bugfix, build."""
         self.missing: list[str] = []
-        """Outputs this controller does not know: the samples come without them."""
+        """Outputs that this controller does not know; samples lack them."""
         try:
             self._connection = _Connection(host, timeout_s, clock)
         except OSError as error:
@@ -218,7 +218,7 @@ class Subscription:
     def read(self, timeout_s: float) -> list[tuple[float, ...]]:
         """Read the next sample: one tuple for each output.
 
-        Raises `TimeoutError` when none comes, `OSError` or `StreamBroken` when the connection is lost, `ProtocolError`.
+        Raises `TimeoutError` when none arrives, `OSError` or `StreamBroken` on a lost connection, `ProtocolError`.
         """
         while True:
             kind, payload = self._connection.read(timeout_s)
@@ -226,13 +226,13 @@ class Subscription:
                 return self._recipe.unpack(payload)
 
     def close(self) -> None:
-        """Let the connection go, and wake a thread that reads. Idempotent."""
+        """Close the connection, and wake a thread that reads. Idempotent."""
         self._connection.close()
 
     def _greet(self, outputs: Mapping[str, str], frequency_Hz: float) -> None:
         ask = self._connection.ask
         if ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02")) != b"\x01":
-            raise ProtocolError("protocol version 2 is refused")
+            raise ProtocolError("the controller refuses protocol version 2")
         self.version = decode_version(ask(encode(GET_CONTROLLER_VERSION)))
         self._recipe = Recipe.decode(ask(encode_setup_outputs(frequency_Hz, tuple(outputs))))
         if len(self._recipe.types) == len(outputs):
@@ -243,7 +243,7 @@ class Subscription:
         if self.missing:
             self._recipe = Recipe.decode(ask(encode_setup_outputs(frequency_Hz, tuple(known))))
         if self._recipe.types != tuple(known.values()):
-            raise ProtocolError(f"{', '.join(known)} come as {', '.join(self._recipe.types)}")
+            raise ProtocolError(f"{', '.join(known)} have the types {', '.join(self._recipe.types)}")
         if ask(encode(START)) != b"\x01":
             raise ProtocolError("the controller does not start the stream")
 
@@ -252,7 +252,7 @@ CONTROL_REGISTERS: Final = (
     *(f"input_int_register_{k}" for k in range(8)),
     *(f"input_double_register_{k}" for k in range(18)),
 )
-"""What ur_rtde's control interface writes to, and nobody else may."""
+"""The inputs that ur_rtde's control interface writes, exclusively."""
 
 
 def _fix_of(error: OSError, host: str) -> str:
@@ -268,7 +268,7 @@ def _fix_of(error: OSError, host: str) -> str:
 
 
 def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float, clock: Clock = REAL) -> list[str]:
-    """Tell which of these inputs belong to another client or a fieldbus, leaving all of them as they are.
+    """Return which of these inputs belong to another client or a fieldbus; change none.
 
     Raises `StreamBroken`, `DeviceTimeout` or `ProtocolError`.
     """
@@ -287,11 +287,11 @@ def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float, clo
 
 
 def find_script_port(host: str, *, timeout_s: float) -> None:
-    """See whether the controller takes programs, sending none. Raises `ConnectError`."""
+    """Check that the controller accepts programs, without sending one. Raises `ConnectError`."""
     try:
         socket.create_connection((host, SCRIPT_PORT), timeout=timeout_s).close()
     except OSError as error:
         raise ConnectError(
-            f"{host}:{SCRIPT_PORT}, which takes programs, cannot be reached ({error})",
-            "enable the real-time client interface under Settings, Security, Services, and look for a firewall between",
+            f"{host}:{SCRIPT_PORT}, which accepts programs, cannot be reached ({error})",
+            "enable the real-time client interface under Settings, Security, Services, and check the firewall",
         ) from error

@@ -1,4 +1,4 @@
-"""One sample of a Universal Robots controller, and what its numbers mean.
+"""One sample of a Universal Robots controller, and the meaning of its numbers.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide" (outputs, modes, states and safety status bits).
 Checked on hardware: no.
@@ -32,9 +32,9 @@ OUTPUTS: Final = MappingProxyType(
         "payload_cog": "VECTOR3D",
     }
 )
-"""Names and types of what is subscribed to."""
+"""Names and types of the subscribed outputs."""
 OPTIONAL: Final = frozenset({"tcp_offset", "payload", "payload_cog"})
-"""Some controllers do not know these yet."""
+"""Older controllers do not know these."""
 
 PROGRAM_STOPPED: Final = 1
 PROGRAM_PLAYING: Final = 2
@@ -67,7 +67,7 @@ _SAFETY_MODES: Final = {
     10: "joint identification",
     11: "undefined",
 }
-_SAFETY: Final = (  # the first that applies says most
+_SAFETY: Final = (  # the first that applies is the most specific
     (0b0_1110_0000, "emergency stop", "make the cell safe, release the button, power the arm on at the pendant"),
     (0b0_0000_0100, "protective stop", "find and remove its cause, then clear it at the pendant"),
     (0b0_0001_0000, "safeguard stop", "close the safeguard and reset it"),
@@ -79,7 +79,7 @@ _SAFETY: Final = (  # the first that applies says most
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What the controller reported once. Vectors are tuples of radians, m and rotation vectors."""
+    """One report of the controller. Vectors are tuples of radians, m and rotation vectors."""
 
     t_host_ns: int
     t_device_s: float
@@ -100,7 +100,7 @@ class Sample:
 
     @classmethod
     def of(cls, t_host_ns: int, outputs: Mapping[str, tuple[float, ...]]) -> Self:
-        """Take a sample from outputs by their names; those of `OPTIONAL` may be missing."""
+        """Build a sample from outputs by their names; those of `OPTIONAL` may be missing."""
         return cls(
             t_host_ns,
             outputs["timestamp"][0],
@@ -122,28 +122,28 @@ class Sample:
 
     @property
     def measures(self) -> bool:
-        """Whether the joints are measured, which needs power."""
+        """Whether the controller measures the joints, which needs power."""
         return self.robot_mode in _MEASURING
 
     def safety_fault(self) -> DeviceFault | None:
-        """Say why the arm may not move, as far as the arm itself is concerned."""
-        for bits, meaning, cure in _SAFETY:
+        """Return why safety system or robot mode forbid motion."""
+        for bits, meaning, fix in _SAFETY:
             if self.safety_bits & bits:
-                return DeviceFault(f"{meaning} (safety status bits 0x{self.safety_bits:x})", cure)
+                return DeviceFault(f"{meaning} (safety status bits 0x{self.safety_bits:x})", fix)
         if self.robot_mode != ROBOT_RUNNING:
             mode = _ROBOT_MODES.get(self.robot_mode, "unknown")
-            cure = "release its brakes" if self.robot_mode == ROBOT_IDLE else "power the arm on and release its brakes"
-            return DeviceFault(f"robot mode {self.robot_mode} ({mode})", f"{cure} at the pendant")
+            fix = "release its brakes" if self.robot_mode == ROBOT_IDLE else "power the arm on and release its brakes"
+            return DeviceFault(f"robot mode {self.robot_mode} ({mode})", f"{fix} at the pendant")
         return None
 
     def program_fault(self) -> DeviceFault | None:
-        """Say why our program on the controller does not move the arm."""
+        """Return why our program on the controller does not move the arm."""
         if self.program_state == PROGRAM_PLAYING:
             return None
         state = _PROGRAM_STATES.get(self.program_state, "unknown")
         return DeviceFault(
-            f"the control program was ended or paused by somebody else (state {self.program_state}, {state})",
-            "leave the arm to this program",
+            f"the control program was stopped or paused from outside (state {self.program_state}, {state})",
+            "end other programs for this arm",
         )
 
     def flange(self, tcp_offset: Sequence[float]) -> Pose:
@@ -151,7 +151,7 @@ class Sample:
         return Pose.from_ur(self.tcp_pose) @ Pose.from_ur(tcp_offset).inverse()
 
     def status(self) -> ArmStatus:
-        """Return modes and settings in words."""
+        """Return modes and settings as text."""
         return ArmStatus(
             t_host_ns=self.t_host_ns,
             t_device_s=self.t_device_s,

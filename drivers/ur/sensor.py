@@ -1,11 +1,10 @@
-"""The force/torque sensor inside an e-Series wrist, as far as it can honestly be read.
+"""The force/torque sensor inside an e-Series wrist.
 
-The controller tells two wrenches. `actual_TCP_force` is what is left after the controller has subtracted the payload it
-was told and the reading at its last zeroing, in base axes at the active TCP: it contains nothing a gravity calibration
-could find, and nobody can take the subtraction back. `ft_raw_wrench` (PolyScope 5.9 and later) is not compensated and
-is not touched by zeroing; its axes are those of the tool flange. Universal Robots documents neither its unit nor its
-reference point, and a user has seen values above 20 000. So this driver reads `ft_raw_wrench` and nothing else, and
-insists on being told the scale by somebody who has hung a known weight on the flange.
+The controller reports two wrenches. `actual_TCP_force` is in base axes at the active TCP. The controller has already
+subtracted the configured payload and the reading at its last zeroing. This cannot be undone, so a gravity calibration
+has nothing to find in it. `ft_raw_wrench` (PolyScope 5.9 and later) is in flange axes, neither compensated nor zeroed.
+Universal Robots documents neither its unit nor its reference point, and a user has seen values above 20 000. So this
+driver reads only `ft_raw_wrench`, and requires a scale that the user has measured with a known weight.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": `ft_raw_wrench`, `actual_TCP_force`.
 Checked on hardware: no. Verified against: tests/unit/drivers/ur/test_wrist_sensor.py.
@@ -32,21 +31,20 @@ _RATE_Hz = 500.0
 class UrWristSensor(StreamingSensor):
     """The wrist sensor of an e-Series arm through its controller, 500 Hz.
 
-    The wrench is `ft_raw_wrench` divided by the scale given, in flange axes; that it is taken at the flange is an
-    assumption. `counts` are empty, because the controller tells floating-point numbers. `t_device_s` is the
-    controller's time and `seq` counts its cycles of 2 ms, so that gaps are visible. `status` is 0: whether the sensor
-    measures well is not told.
+    The wrench is `ft_raw_wrench` divided by the given scale, in flange axes; the flange is assumed as reference point.
+    `counts` are empty, because the controller sends floating-point numbers. `t_device_s` is the controller's time and
+    `seq` counts its cycles of 2 ms, so that gaps are visible. `status` is 0, because the controller reports none.
 
     Parameters
     ----------
     host : str
         Address of the controller.
     counts_per_N, counts_per_Nm : float
-        What `ft_raw_wrench` tells for 1 N and for 1 N·m. Measure them: see drivers/README.md.
+        `ft_raw_wrench` at 1 N and at 1 N·m. Measure them: see drivers/README.md.
     sign : int
         -1 for a sensor that reports the reaction.
     clock : Clock
-        Measures and waits; that of an emulated cell belongs to the cell.
+        Measures and waits; an emulated cell has its own.
     """
 
     def __init__(
@@ -61,7 +59,7 @@ class UrWristSensor(StreamingSensor):
     @classmethod
     def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``ur-ft://192.168.1.10?counts_per_N=…&counts_per_Nm=…``; both are required."""
-        why = "the unit of ft_raw_wrench is not documented, measure it as drivers/README.md says"
+        why = "measure the undocumented unit of ft_raw_wrench as described in drivers/README.md"
         return cls(
             address,
             counts_per_N=options.positive("counts_per_N", why),
@@ -77,8 +75,8 @@ class UrWristSensor(StreamingSensor):
         version = ".".join(map(str, self._stream.version))
         if self._stream.missing:
             raise ConnectError(
-                f"{self.name}: PolyScope {version} does not tell {', '.join(self._stream.missing)}",
-                "it needs an e-Series arm with PolyScope 5.9 or later",
+                f"{self.name}: PolyScope {version} does not report {', '.join(self._stream.missing)}",
+                "use an e-Series arm with PolyScope 5.9 or later",
             )
         self._seq: int | None = None
         self._nominal_Hz = _RATE_Hz
@@ -92,7 +90,7 @@ class UrWristSensor(StreamingSensor):
     def _read_block(self) -> FtSamples:
         stream = self._stream
         if stream is None:
-            raise StreamBroken(f"{self.name}: closed")
+            raise StreamBroken(f"{self.name}: the sensor is closed", "open it first")
         try:
             (t_device_s,), raw = stream.read(self._clock.poll_s)
         except TimeoutError:
@@ -103,7 +101,7 @@ class UrWristSensor(StreamingSensor):
             ) from exc
         t_host_ns = self._clock.now_ns()
         if not (math.isfinite(t_device_s) and all(map(math.isfinite, raw))):
-            raise ProtocolError(f"{self.name}: at {t_device_s} s the controller tells {raw}, which is no wrench")
+            raise ProtocolError(f"{self.name}: the wrench at {t_device_s} s is not finite: {raw}")
         seq = round(t_device_s * _RATE_Hz)
         if self._seq is not None:
             if seq <= self._seq:
@@ -112,14 +110,7 @@ class UrWristSensor(StreamingSensor):
                 )
             self._lost += seq - self._seq - 1
         self._seq = seq
-        return FtSamples(
-            t_host_ns=np.array([t_host_ns], np.int64),
-            t_device_s=np.array([t_device_s]),
-            seq=np.array([seq], np.int64),
-            counts=np.zeros((1, 0), np.int32),
-            wrench=(np.array(raw) / self._counts_per_unit)[np.newaxis],
-            status=np.zeros(1, np.uint32),
-        )
+        return FtSamples.of(t_host_ns, seq, [np.array(raw) / self._counts_per_unit], t_device_s=t_device_s)
 
     def _disconnect(self) -> None:
         stream, self._stream = self._stream, None

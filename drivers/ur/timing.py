@@ -1,4 +1,4 @@
-"""Every limit of time that a Universal Robots arm is held to, and the one way to wait for something within one."""
+"""Every time limit of a Universal Robots arm, and a wait that does not count a suspension of this process."""
 
 from dataclasses import dataclass
 from typing import Final, Self
@@ -10,66 +10,66 @@ _TURN_NS: Final = 50_000_000
 
 @dataclass(frozen=True)
 class UrTiming:
-    """Limits in seconds. The defaults are for a real cell: `drivers/ur/README.md` says what depends on them."""
+    """Limits in seconds. The defaults are for a real cell; `drivers/ur/README.md` describes their effects."""
 
-    # What the controller's samples prove: the same for every cell.
+    # Limits on samples of the controller, the same in every cell.
     stale_s: float = 0.2
-    """The longest silence of the controller."""
+    """The longest time without a sample."""
     status_s: float = 0.05
     """The greatest age of a status."""
     glance_s: float = 0.1
-    """What a stop waits for a sample before it takes the way that needs none."""
+    """The wait of a stop for a sample, before it uses the dashboard server."""
     reason_s: float = 0.05
-    """A program may end some cycles before the controller reports why."""
+    """A program may end some cycles before the controller reports the reason."""
     still_s: float = 0.3
     """Rest without a break, after which the structure no longer rings."""
     ours_every_s: float = 0.1
-    """During a move, the control program is asked a question after so long."""
+    """Period of the question to the control program during a move."""
 
-    # What another process, thread or server may take: generous in an emulated cell.
+    # Limits on other processes, threads and servers: generous in an emulated cell.
     connect_s: float = 2.0
-    """Greeting of RTDE, one question to the dashboard server, connection to the script port."""
+    """Start-up of RTDE, one request to the dashboard server, connection to the script port."""
     release_s: float = 1.0
-    """Until another client has let registers and program go; one whose parent was killed needs half of that."""
+    """Until another client releases registers and program; one whose parent was killed takes 0.5 s."""
     starting_s: float = 4.5
     """Start of the control process, until its program plays."""
     call_s: float = 2.0
-    """An answer of the control process; it takes 10 ms, and motion is watched meanwhile."""
+    """A reply of the control process, which takes 10 ms. Motion is watched meanwhile."""
     progress_s: float = 0.4
-    """The same for the progress of a move, which takes 0.03 ms; the guard is not called meanwhile."""
+    """The same for the progress of a move, which takes 0.03 ms. The guard is not called meanwhile."""
     ours_s: float = 0.4
     """A question to the control program, which answers within two control cycles."""
     ours_again_s: float = 1.0
-    """The same when the arm is opened again, where nothing hurries."""
+    """The same when the arm is reopened."""
     ours_closing_s: float = 0.3
     """The same when the arm is closed."""
     quit_s: float = 0.7
     """End of the control program and of its process when the arm is closed."""
     braking_s: float = 0.5
-    """A soft stop, beyond the time the joints need to decelerate."""
+    """A `stopJ`, beyond the time in which the joints decelerate."""
     stop_s: float = 0.4
-    """A stop through the dashboard server, which takes 0.02 s; it goes on in the background afterwards."""
+    """A stop through the dashboard server, which takes 0.02 s; it continues in the background afterwards."""
     stop_silent_s: float = 0.15
-    """The same when the controller has been silent for `stale_s`."""
+    """The same when no sample has arrived for `stale_s`."""
     reach_s: float = 1.5
     """How long the attempt in the background tries to connect: one retransmission of TCP."""
     unwatched_s: float = 0.5
-    """The control process stops a move about which it was not asked for so long."""
+    """The control process stops a move after this time without a request."""
     child_starting_s: float = 9.0
-    """The control process ends itself when ur_rtde, which gives up after 5 s, has not started it by then."""
+    """The control process ends itself when ur_rtde, which gives up after 5 s, has not connected by then."""
     child_leaving_s: float = 3.0
-    """The same when its parent has gone."""
+    """The same for its exit after the parent has gone."""
 
     @classmethod
     def emulated(cls) -> Self:
-        """Limits of an emulated cell, whose processes may have to wait for the computer."""
+        """Return the limits of an emulated cell, whose processes may be starved."""
         return cls(
             connect_s=30.0,
-            release_s=5.0,  # silence is the answer here: whoever holds on is waited for as long
+            release_s=5.0,  # another client gives no answer, so this wait always ends at its limit
             starting_s=30.0,
             call_s=30.0,
             progress_s=30.0,
-            ours_s=5.0,  # the same: a program of another client never answers
+            ours_s=5.0,  # the same for another program
             ours_again_s=5.0,
             ours_closing_s=5.0,
             quit_s=30.0,
@@ -87,9 +87,9 @@ STRICT: Final = UrTiming()
 
 
 class Patience:
-    """Waits in turns, `limit_s` in all. A turn in which this process was itself suspended counts as two at most.
+    """Waits in turns, `limit_s` in total. A turn in which this process was suspended counts as two at most.
 
-    A suspended process has not listened, so what it has not heard proves nothing.
+    A suspended process cannot receive, so its silence proves nothing.
     """
 
     def __init__(self, clock: Clock, limit_s: float) -> None:
@@ -103,7 +103,7 @@ class Patience:
         return self._left_ns <= 0
 
     def wait(self, changed: Waitable) -> None:
-        """Wait until `changed` is notified, a turn at most; what was done since the last turn counts too."""
+        """Wait until `changed` is notified, for one turn at most; the time since the last turn counts too."""
         self._clock.wait(changed, min(self._left_ns, _TURN_NS) / 1e9)
         now_ns = self._clock.now_ns()
         self._left_ns -= min(now_ns - self._counted_ns, 2 * _TURN_NS)

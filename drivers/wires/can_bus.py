@@ -1,4 +1,4 @@
-"""A CAN bus that fails in our words, on any adapter python-can knows."""
+"""A CAN bus on any adapter of python-can; it raises our errors."""
 
 import contextlib
 import fcntl
@@ -17,25 +17,25 @@ from drivers.wires.serial_port import LINK_ERRORS, refusal
 BUS_ERRORS = (can.CanError, ValueError, *LINK_ERRORS)
 _SEND_S, _LOOK_S = 0.1, 0.05
 _PATIENCE_S = 30.0
-"""In place of `_SEND_S` where the cell is emulated: that its far side is starved is no loss."""
+"""Replaces `_SEND_S` in an emulated cell, whose far side may be starved."""
 _DISCARD_S = 0.1
 
 
 class CanBus:
-    """The way to one device on a CAN bus with 11-bit identifiers.
+    """The connection to one device on a CAN bus with 11-bit identifiers.
 
     Parameters
     ----------
     owner : str
-        The device as the user knows it; begins every error message.
+        Name of the device; begins every error message.
     channel, interface : str
         As python-can names them: ``can0`` and ``socketcan``, or a serial port and ``slcan``.
     bitrate : int
-        Bit/s; on socketcan it is set with ``ip link`` and this value is not used.
+        Bit/s; not used on socketcan, where ``ip link`` sets it.
     identifiers : iterable of int
-        What the device sends; everything else is ignored. None of them: nothing is ignored.
+        Identifiers that the device sends; others are ignored. An empty one accepts all.
     clock : Clock
-        What waits are measured by.
+        Measures the waits.
     """
 
     def __init__(
@@ -55,9 +55,9 @@ class CanBus:
         self._clock = clock
         self._bus: can.BusABC | None = None
         self._lock: int | None = None
-        """What keeps the serial port of an slcan adapter ours, a file descriptor."""
+        """File descriptor that locks the serial port of an slcan adapter."""
         self.malformed = 0
-        """Lines of an slcan adapter that are no frame."""
+        """Lines of an slcan adapter that are not frames."""
 
     def open(self) -> None:
         """Join the bus. Raises `ConnectError`."""
@@ -70,12 +70,12 @@ class CanBus:
         if self._interface == "slcan":
             # python-can waits 2 s for adapters that reboot when their port is opened; a pseudo-terminal does not
             tty = tty.split("@", maxsplit=1)[0]
-            with contextlib.suppress(OSError):  # the link to an adapter may vanish while it is followed
+            with contextlib.suppress(OSError):  # the link to an adapter may vanish meanwhile
                 tty = os.path.realpath(tty)
             if not os.access(tty, os.R_OK | os.W_OK):
                 raise ConnectError(
-                    f"{self._owner}: there is no {self._channel} that may be read and written",
-                    "is the adapter plugged in, and are you in the group of its port?",
+                    f"{self._owner}: {self._channel} does not exist, or may not be read and written",
+                    "plug the adapter in, and join the group of its port",
                 )
             if tty.startswith("/dev/pts/"):
                 options["sleep_after_open"] = 0.0
@@ -90,18 +90,18 @@ class CanBus:
                 ignore_config=True,
                 **options,
             )
-        except Exception as exc:  # an adapter whose library is missing fails in a way of its own
+        except Exception as exc:  # an adapter whose library is missing may raise anything
             self.close()
-            cure = "is the adapter plugged in, and is what python-can needs for it installed?"
+            fix = "plug the adapter in, and install what python-can needs for it"
             if "/" in self._channel and self._interface == "socketcan":
-                cure = "this is no CAN interface: an adapter on a serial port wants interface=slcan in its address"
+                fix = "add interface=slcan to the address of an adapter on a serial port"
             elif self._interface == "socketcan":
                 up = f"sudo ip link set {self._channel} up type can bitrate {self._bitrate}"
-                cure = f"is the adapter plugged in, and '{up}' done?"
-            raise refusal(self._owner, tty, exc, f"the bus does not open ({exc})", cure) from exc
+                fix = f"plug the adapter in, then run {up}"
+            raise refusal(self._owner, tty, exc, f"the bus does not open ({exc})", fix) from exc
 
     def _take(self, tty: str) -> None:
-        """Take a serial port for this process alone, before python-can speaks to the adapter: it would not ask."""
+        """Lock a serial port before python-can opens it, because python-can itself does not."""
         self._lock = os.open(tty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
@@ -111,7 +111,7 @@ class CanBus:
         if bus is not None:
             with contextlib.suppress(*BUS_ERRORS):
                 bus.shutdown()
-            # the slcan bus says goodbye before it closes its port, and skips the second when the first fails
+            # the slcan bus does not close its port when its last command to the adapter fails
             if port := getattr(bus, "serialPortOrig", None):
                 with contextlib.suppress(*LINK_ERRORS):
                     port.close()
@@ -121,20 +121,20 @@ class CanBus:
                 os.close(lock)
 
     def send(self, identifier: int, data: bytes) -> None:
-        """Send one data frame; one that a busy adapter does not take in time is lost. Raises `StreamBroken`."""
+        """Send one data frame; it is lost when a busy adapter does not accept it in time. Raises `StreamBroken`."""
         if self._bus is None:
-            raise StreamBroken(f"{self._owner}: closed")
+            raise StreamBroken(f"{self._owner}: the bus is closed", "open it first")
         timeout_s = _PATIENCE_S if self._clock.emulated else _SEND_S
         try:
             self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=timeout_s)
         except BUS_ERRORS as exc:
-            if not isinstance(exc.__cause__, serial.SerialTimeoutException):  # it also comes of a computer that stalls
+            if not isinstance(exc.__cause__, serial.SerialTimeoutException):  # a stalled computer causes it too
                 raise self._broken(exc) from exc
 
     def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
         """Wait for the next data frame of the device as (identifier, data). Raises `StreamBroken`.
 
-        It blocks for long even in an emulated cell: the time that passes there before an answer comes is lost to polls.
+        It also blocks in an emulated cell, where shorter waits would delay the polls.
         """
         for left_s in self._clock.looks(timeout_s):
             if frame := self.look(left_s):
@@ -142,9 +142,9 @@ class CanBus:
         return None
 
     def look(self, wait_s: float) -> tuple[int, bytes] | None:
-        """Take the next data frame; wait for it in real time, at most 0.05 s. Raises `StreamBroken`."""
+        """Return the next data frame; wait for it in real time, at most 0.05 s. Raises `StreamBroken`."""
         if self._bus is None:
-            raise StreamBroken(f"{self._owner}: closed")
+            raise StreamBroken(f"{self._owner}: the bus is closed", "open it first")
         while True:
             try:
                 message = self._bus.recv(timeout=min(wait_s, _LOOK_S))
@@ -160,10 +160,10 @@ class CanBus:
                 return message.arbitration_id, bytes(message.data)
 
     def discard(self) -> None:
-        """Throw away what has arrived. Raises `StreamBroken`."""
+        """Drop the frames that have arrived. Raises `StreamBroken`."""
         if isinstance(self._bus, slcanBus):
-            with contextlib.suppress(*BUS_ERRORS):  # `send` will tell
-                self._bus.flush()  # its `recv` sits out 1 ms before it says that there is nothing
+            with contextlib.suppress(*BUS_ERRORS):  # `send` will raise
+                self._bus.flush()  # its `recv` would wait 1 ms before it returns nothing
             return
         for _ in self._clock.looks(_DISCARD_S):
             if self.look(0.0) is None:

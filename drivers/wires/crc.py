@@ -1,4 +1,4 @@
-"""The two checksums of the serial protocols. Both are reflected, start at 0xFFFF and travel low byte first."""
+"""The two checksums of the serial protocols. Both are reflected, start at 0xFFFF and are sent low byte first."""
 
 
 def _table(polynomial: int) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""Finding frames of fixed size in a stream of bytes whose header may also occur in the data."""
+"""Frames of fixed size in a stream of bytes, whose header may also occur in the data."""
 
 from collections.abc import Callable
 
@@ -6,18 +6,18 @@ from collections.abc import Callable
 class Deframer:
     """Cuts a byte stream into intact frames and numbers them.
 
-    A header alone proves nothing: a candidate that is not intact costs one byte, not its length, so the frame that
-    hides behind a false header is still found. Bytes thrown away are counted in whole frames, at least one for each
-    interruption; what comes before the first frame is not counted, for a stream is often joined in its middle.
+    Behind a false header the search continues one byte later, so the next true frame is still found. Dropped bytes are
+    counted as whole frames, at least one for each interruption. Bytes before the first frame are not counted, because a
+    stream is often joined in its middle.
 
     Parameters
     ----------
     header : bytes
-        How every frame begins.
+        First bytes of every frame.
     size : int
         Length of a whole frame.
     is_intact : callable
-        Whether `size` bytes that begin with the header are a frame: checksum, end mark.
+        Returns whether `size` bytes that begin with the header are a frame: checksum, end mark.
     """
 
     def __init__(self, header: bytes, size: int, is_intact: Callable[[bytes], bool]) -> None:
@@ -27,11 +27,11 @@ class Deframer:
         self._buffer = bytearray()
         self._skipped = 0
         self.number = 0
-        """Of the newest frame; damaged ones are counted too."""
+        """Number of the newest frame; damaged frames are counted too."""
         self.damaged = 0
 
     def feed(self, data: bytes) -> list[tuple[int, bytes]]:
-        """Take bytes as they came; returns the frames they complete as (number, frame)."""
+        """Take received bytes and return the frames that they complete as (number, frame)."""
         buffer, at = self._buffer, 0
         buffer += data
         frames = []

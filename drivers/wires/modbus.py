@@ -1,4 +1,4 @@
-"""The master of Modbus RTU, for sensors that speak it until they stream: frames, a question and its answer.
+"""A master of Modbus RTU, for sensors that use it until they stream: frames, requests and replies.
 
 Ref: Modbus over Serial Line 1.02, section 2.5; Modbus Application Protocol 1.1b3, sections 6.3, 6.12 and 7.
 """
@@ -24,7 +24,7 @@ _EXCEPTIONS: Mapping[int, str] = MappingProxyType(
 
 
 class Refused(ProtocolError):
-    """The device understood a request and refused it; asking again does not help."""
+    """The device refuses a request; a repetition does not help."""
 
 
 def frame(address: int, function: int, payload: bytes) -> bytes:
@@ -45,9 +45,9 @@ def write_registers(address: int, register: int, values: Sequence[int]) -> bytes
 
 
 def reply_size(request: bytes) -> int:
-    """Length in bytes of the success reply to `request`: with one byte of data, where the function is a vendor's.
+    """Return the length in bytes of the success reply to `request`. A vendor's function replies one byte of data.
 
-    A refusal (Modbus exception) has 5.
+    A refusal (Modbus exception) has 5 bytes.
     """
     match request[1]:
         case 0x03:
@@ -64,26 +64,26 @@ def check_reply(request: bytes, reply: bytes) -> bytes:
     Raises
     ------
     ProtocolError
-        Damaged, not the reply to this request, or a refusal (`Refused`).
+        The reply is damaged, belongs to another request, or is a refusal (`Refused`).
     """
     text = reply.hex(" ")
     if len(reply) < 5 or crc16_modbus(reply[:-2]) != int.from_bytes(reply[-2:], "little"):
-        raise ProtocolError(f"reply is damaged ({text or 'empty'})")
+        raise ProtocolError(f"the reply is damaged ({text or 'empty'})")
     address, function = request[:2]
     if len(reply) == 5 and reply[:2] == bytes([address, function | 0x80]):
         reason = _EXCEPTIONS.get(reply[2], "unknown reason")
         raise Refused(f"the sensor refused function 0x{function:02X} with Modbus exception {reply[2]} ({reason})")
-    alien = f"reply {text} does not belong to request {request.hex(' ')}"
+    foreign = f"the reply {text} does not belong to the request {request.hex(' ')}"
     if reply[:2] != request[:2] or len(reply) != reply_size(request):
-        raise ProtocolError(alien)
+        raise ProtocolError(foreign)
     payload = reply[2:-2]
     if function == READ_HOLDING:
         if payload[0] != len(payload) - 1:
-            raise ProtocolError(f"reply announces {payload[0]} bytes and carries {len(payload) - 1}")
+            raise ProtocolError(f"the reply announces {payload[0]} bytes and contains {len(payload) - 1}")
         return payload[1:]
     if function == WRITE_MULTIPLE:
         if payload != request[2:6]:
-            raise ProtocolError(f"{alien}: it confirms other registers")
+            raise ProtocolError(f"{foreign}: it confirms other registers")
         return b""
     return payload
 
@@ -97,14 +97,14 @@ def ask(
     timeout_s: float,
     before_again: Callable[[], object],
 ) -> T:
-    """Send a request, and return what `check` finds in its reply; up to three times, `before_again` between them.
+    """Send a request and return what `check` decodes from its reply. Try three times, with `before_again` between them.
 
     Raises
     ------
     DeviceTimeout
-        The last reply is not whole within `timeout_s`.
+        The last reply is not complete within `timeout_s`.
     ProtocolError
-        What `check` raises, with the name of the device before it and what to do behind; a refusal at once.
+        The error of `check`, with the name of the device and a fix. A refusal is raised at once.
     """
     for _ in range(_ATTEMPTS - 1):
         try:
@@ -135,5 +135,5 @@ def _exchange(
     try:
         return check(request, reply)
     except ProtocolError as exc:
-        cure = "is it the sensor that its address names? Check its wiring, power it off and on"
-        raise type(exc)(f"{name}: {exc.found}", cure) from exc
+        fix = "check that the address names this sensor, check its wiring, power it off and on"
+        raise type(exc)(f"{name}: {exc.found}", fix) from exc

@@ -1,10 +1,11 @@
-"""A serial port that fails in our words: opened once, every wait bounded."""
+"""A serial port that raises our errors; every wait is bounded."""
 
 import contextlib
 import errno
 import os
 import shlex
 import termios
+from collections.abc import Iterator
 
 import serial
 
@@ -13,21 +14,21 @@ from drivers.errors import ConnectError, PortInUse, StreamBroken
 from drivers.wires.parity import Unmarker, ask_for_marks
 
 LINK_ERRORS = (OSError, termios.error)
-"""What a vanished serial port raises; `termios.error` is not an `OSError`."""
+"""Raised by a vanished serial port; `termios.error` is not an `OSError`."""
 
 _WRITE_S = 0.2
 _PATIENCE_S = 30.0
-"""In place of it where the cell is emulated: that its far side is starved is no loss."""
+"""Replaces `_WRITE_S` in an emulated cell, whose far side may be starved."""
 _DRAIN_BYTES = 416
-"""5 ms of the quickest sensor."""
+"""5 ms of the fastest sensor."""
 
 
-def refusal(owner: str, path: str, error: Exception, found: str, cure: str) -> ConnectError:
-    """Say that another program has a port, where the error of opening it tells so; else what is given."""
+def refusal(owner: str, path: str, error: Exception, found: str, fix: str) -> ConnectError:
+    """Convert the error of opening a port: `PortInUse` where another program has it, else `found` and `fix`."""
     if isinstance(error, OSError) and error.errno in {errno.EAGAIN, errno.EBUSY}:
         holder = f"`fuser -v {shlex.quote(path)}` names it"
         return PortInUse(f"{owner}: the port is in use by another program", f"end it, {holder}")
-    return ConnectError(f"{owner}: {found}", cure)
+    return ConnectError(f"{owner}: {found}", fix)
 
 
 class SerialPort:
@@ -36,17 +37,17 @@ class SerialPort:
     Parameters
     ----------
     owner : str
-        The device as the user knows it; begins every error message.
+        Name of the device; begins every error message.
     path : str
         Such as ``/dev/serial/by-id/…``.
     baud : int
-        Bit/s; always 8 data bits and one stop bit.
+        Bit/s; always 8 data bits and 1 stop bit.
     even_parity : bool
-        Without it no parity. With it the system marks bytes of wrong parity, where it can; the marks are undone here.
+        Else no parity. The system marks bytes of wrong parity, where it can; this class undoes the marks.
     read_s : float
-        What one read waits at most, in real time.
+        The longest that one read waits, in real time.
     clock : Clock
-        What a silence is measured by.
+        Measures silences.
     """
 
     def __init__(
@@ -70,9 +71,9 @@ class SerialPort:
         """While the system marks damaged bytes."""
 
     def open(self) -> None:
-        """Take the port for this process alone. Raises `ConnectError`."""
-        # A pseudo-terminal refuses even parity at the second look, but can mark bytes. Everything is set here, never
-        # later: pyserial would take the marks off again.
+        """Open the port and lock it. Raises `ConnectError`."""
+        # A pseudo-terminal rejects even parity on the second configuration, but can mark bytes. Everything is set here,
+        # because pyserial clears the marks whenever it configures the port.
         emulated = os.path.realpath(self._path).startswith("/dev/pts/")
         try:
             self._port = serial.Serial(
@@ -86,13 +87,13 @@ class SerialPort:
             self._marks = Unmarker() if self._even_parity and ask_for_marks(self._port) else None
         except (ValueError, *LINK_ERRORS) as exc:
             self.close()
-            cure = "is it plugged in, free, and are you in its group?"
-            raise refusal(self._owner, self._path, exc, f"the port does not open ({exc})", cure) from exc
+            fix = "plug it in, end other programs that use it, and join its group"
+            raise refusal(self._owner, self._path, exc, f"the port does not open ({exc})", fix) from exc
         with contextlib.suppress(ValueError, NotImplementedError, *LINK_ERRORS):
-            self._port.set_low_latency_mode(True)  # a courtesy of some adapters: 1 ms instead of 16 ms
+            self._port.set_low_latency_mode(True)  # some adapters can: 1 ms instead of 16 ms
 
     def close(self) -> None:
-        """Free the port. Idempotent."""
+        """Close the port. Idempotent."""
         port, self._port = self._port, None
         if port is not None:
             with contextlib.suppress(*LINK_ERRORS):
@@ -100,34 +101,28 @@ class SerialPort:
 
     @property
     def is_open(self) -> bool:
-        """Whether the port is ours at this moment."""
+        """Whether the port is open."""
         return self._port is not None
 
     def read(self, size: int) -> bytes:
-        """Read `size` bytes, or fewer: after `read_s`, or where marks were among them. Raises `StreamBroken`."""
+        """Read `size` bytes, fewer after `read_s` or with marks among them. Raises `StreamBroken`."""
         return self.read_marked(size)[0]
 
     def read_marked(self, size: int) -> tuple[bytes, list[int]]:
-        """Read like `read`, and tell at which places in it a byte was received with wrong parity or framing."""
-        port = self._open_or_broken()
-        try:
+        """Read like `read`; also return the places of bytes received with wrong parity or framing."""
+        with self._in_use() as port:
             data = port.read(size)
-        except (TypeError, *LINK_ERRORS) as exc:  # TypeError: closed under a blocked read
-            raise self._broken(exc) from exc
         return self._undo(data)
 
     def read_all(self, at_least: int) -> bytes:
-        """Read `at_least` bytes, or fewer as in `read`, and whatever else has arrived. Raises `StreamBroken`."""
-        port = self._open_or_broken()
-        try:
+        """Read `at_least` bytes, or fewer as in `read`, and all others that have arrived. Raises `StreamBroken`."""
+        with self._in_use() as port:
             data = port.read(at_least)
             data += port.read(port.in_waiting)
-        except (TypeError, *LINK_ERRORS) as exc:
-            raise self._broken(exc) from exc
         return self._undo(data)[0]
 
     def drain(self, silence_s: float, at_most_s: float) -> None:
-        """Throw away what arrives, until nothing has come for so long. Raises `StreamBroken`."""
+        """Drop what arrives until a silence of `silence_s`, for `at_most_s`. Raises `StreamBroken`."""
         heard_ns = self._clock.now_ns()
         for _ in self._clock.looks(at_most_s):
             if self.read(_DRAIN_BYTES):
@@ -136,24 +131,23 @@ class SerialPort:
                 return
 
     def write(self, data: bytes, *, discard: bool = False) -> None:
-        """Send bytes, on request after throwing away what has arrived so far. Raises `StreamBroken`."""
-        port = self._open_or_broken()
-        try:
+        """Send bytes; `discard` drops what has arrived before. Raises `StreamBroken`."""
+        with self._in_use() as port:
             if discard:
                 port.reset_input_buffer()
                 if self._marks is not None:
                     self._marks.forget()
             port.write(data)
-        except (TypeError, *LINK_ERRORS) as exc:
-            raise self._broken(exc) from exc
 
     def _undo(self, data: bytes) -> tuple[bytes, list[int]]:
         return (data, []) if self._marks is None else self._marks.undo(data)
 
-    def _open_or_broken(self) -> serial.Serial:
+    @contextlib.contextmanager
+    def _in_use(self) -> Iterator[serial.Serial]:
+        """Give the open port, and raise `StreamBroken` when it is gone."""
         if self._port is None:
-            raise StreamBroken(f"{self._owner}: closed")
-        return self._port
-
-    def _broken(self, exc: Exception) -> StreamBroken:
-        return StreamBroken(f"{self._owner}: the port is gone ({exc})", "plug it in and open it again")
+            raise StreamBroken(f"{self._owner}: the port is closed", "open it first")
+        try:
+            yield self._port
+        except (TypeError, *LINK_ERRORS) as exc:  # TypeError: closed under a blocked read
+            raise StreamBroken(f"{self._owner}: the port is gone ({exc})", "plug it in and open it again") from exc

@@ -124,7 +124,7 @@ def check_sensor_error(name: str, error: DriverError, address: SensorAddress, pe
     neither names one, it is the usual fix for errors of this kind.
     """
     kind = error.__cause__ if isinstance(error, ConnectError) and isinstance(error.__cause__, DriverError) else error
-    fix = error.cure
+    fix = error.fix
     permission = next((check.fix for check in permissions if check.state == "failed"), None)
     if permission is not None and not isinstance(kind, PortInUse | DeviceFault) and (_not_reached(kind) or not fix):
         fix = permission
@@ -259,7 +259,7 @@ def check_level(wrench: Array) -> Check:
 
 def check_unreachable(error: DriverError, host: str) -> Check:
     """Return why an arm could not be opened, and what to do about it."""
-    fix = error.cure or f"ping {host}"
+    fix = error.fix or f"ping {host}"
     if isinstance(error, ModelUnknown):
         fix = f'write model = "ur5e" under [robot] in ftdrive.toml, or give --model: one of {", ".join(MODELS)}'
     return Check("robot.reachable", "failed", error.found, fix)
@@ -286,7 +286,7 @@ def check_remote(arm: RobotArm) -> Check:
     try:
         remote = arm.in_remote_control()
     except DriverError as error:
-        return Check(name, "failed", error.found, error.cure or None)
+        return Check(name, "failed", error.found, error.fix or None)
     if remote is None:
         return Check(name, "skipped", "this controller does not report whether it accepts programs from the network")
     if remote:
@@ -297,7 +297,7 @@ def check_remote(arm: RobotArm) -> Check:
 def check_safety(status: ArmStatus) -> Check:
     """Check that the safety system lets the arm move."""
     if status.fault is not None:
-        return Check("robot.safety", "failed", status.fault.found, status.fault.cure)
+        return Check("robot.safety", "failed", status.fault.found, status.fault.fix)
     if status.safety_mode != "normal":
         fix = "check at the pendant that this mode is intended; calibrate asks for it"
         return Check("robot.safety", "warning", f"safety mode {status.safety_mode}", fix)
@@ -374,7 +374,7 @@ def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> 
             with clock.keeping_up():
                 took_s = _answers_s(arm, clock)
         except DriverError as error:
-            return Check(name, "failed", error.found, error.cure or "check the robot and the network")
+            return Check(name, "failed", error.found, error.fix or "check the robot and the network")
         median_s = float(np.median(took_s))
         found = f"the arm answers within {1e3 * median_s:.0f} ms, at worst {1e3 * max(took_s):.0f} ms"
         if median_s < usual_s and np.quantile(took_s, 0.9) < gap_s:

@@ -152,7 +152,7 @@ def _check_poses(arm: RobotArm, status: ArmStatus, clock: Clock) -> list[Check]:
     try:
         p_mm = 1e3 * arm.state().p_base_flange_m
     except DriverError as error:
-        return [Check(name, "failed", error.found, error.cure or "check the robot and the network")]
+        return [Check(name, "failed", error.found, error.fix or "check the robot and the network")]
     where = ", ".join(f"{value:.0f}" for value in p_mm)
     limits = Limits.emulated() if clock.emulated else Limits()
     return [
@@ -172,7 +172,7 @@ def _check_clock(arm: RobotArm, clock: Clock) -> Check:
                 host_ns.append(status.t_host_ns)
                 device_s.append(status.t_device_s)
     except DriverError as error:
-        return Check("clock.pace", "failed", error.found, error.cure or "check the robot and the network")
+        return Check("clock.pace", "failed", error.found, error.fix or "check the robot and the network")
     return devices.check_clock(host_ns, device_s)
 
 

@@ -421,7 +421,7 @@ def arm_lost(error: DriverError, *, moving: bool) -> Tripped:
         f"{error.found}; a stop was sent, but the arm may not have heard it: then it ends the one move it was given, "
         "which is proven clear, and goes no further"
     )
-    return Tripped(Hazard.CONTROLLER_LOST, type(error)(found, error.cure))
+    return Tripped(Hazard.CONTROLLER_LOST, type(error)(found, error.fix))
 
 
 def by_safety(status: ArmStatus, words: str) -> Tripped:

@@ -85,7 +85,7 @@ def one_core_for_us(*others: int) -> Iterator[None]:
 
 
 def missing(samples: FtSamples) -> tuple[int, int]:
-    """Count the samples that were measured and have not come, and those that nobody has measured."""
+    """Count the samples that were measured and did not arrive, and those that were never measured."""
     number, right = numbers_in(samples.wrench)
     return int((np.diff(number) % 160_000 - 1).sum()), int((~right).sum())
 
@@ -216,7 +216,7 @@ def decode_speed() -> bool:
                 times.append(time.perf_counter() - begin)
             best[name] = min(times) / batch
         ratio = best["loop"] / best["batch"]
-        target = f">= {DECODE_TARGET:g} x" if batch == 8192 else "(told only)"
+        target = f">= {DECODE_TARGET:g} x" if batch == 8192 else "(for information)"
         passed &= report(
             f"decoding {batch} records at once, against a loop",
             f"{1e-6 / best['batch']:.2f} M/s, {ratio:.1f} x",
@@ -288,10 +288,10 @@ def all_faults(laboratory: Laboratory, folder: Path, scheme: str, samples: int, 
         for emulator in emulators:
             emulator.unplug()
         received, wrong, undocumented = count.pop("received", 0), count.pop("wrong", 0), count["UNDOCUMENTED"]
-        told = "".join(f", {number} {error}" for error, number in count.items() if number)
+        errors = "".join(f", {number} {error}" for error, number in count.items() if number)
         passed &= report(
             f"{scheme}, {fault}" + (f" ({size} at a time)" if size > 1 else ""),
-            f"{wrong} wrong of {received}{told}",
+            f"{wrong} wrong of {received}{errors}",
             "0 wrong",
             not wrong and not undocumented and received > 0,
         )

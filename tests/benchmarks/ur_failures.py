@@ -1,10 +1,10 @@
-"""How soon a failure of arm, links or processes is told, the arm stands, and works again, at the pace of a real arm.
+"""How soon a failure of arm, links or processes is reported, and the arm stands and works again, at real speed.
 
     python tests/benchmarks/ur_failures.py [--repeats 3] [--only silent]
 
-The events are those of tests/wire/test_ur_failures.py, which shows what is told. They befall an emulated UR5e in the
-middle of a move of 1.3 s. Three times, each the worst of the repeats: from the event until the caller is told, from
-the event until the arm stands, and from its cure until the arm has been opened again and has made a small move. Exit
+The events are those of tests/wire/test_ur_failures.py, which shows what is raised. They befall an emulated UR5e in the
+middle of a move of 1.3 s. Three times, each the worst of the repeats: from the event until the error is raised, from
+the event until the arm stands, and from its fix until the arm has been opened again and has made a small move. Exit
 code 1 when a target is missed.
 """
 
@@ -40,9 +40,9 @@ from tests.wire.test_ur_failures import (
 ROOT = Path(__file__).parents[2]
 FROZEN = "freeze"
 SPEED_RAD_S = radians(60)
-TOLD_S, USABLE_S = 0.5, 2.0
+REPORTED_S, USABLE_S = 0.5, 2.0
 ENDED_S = defaultdict(lambda: 5.0, stopped=1.0, closed=1.5)
-"""Stopped: told, and the braking of the move."""
+"""Stopped: the report, and the braking of the move."""
 
 Do = Callable[[Station, UrArm], object]
 Act = Callable[[Station], object]
@@ -50,9 +50,9 @@ Act = Callable[[Station], object]
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one event; nan where nobody was told, or nothing ended."""
+    """The times of one event; nan where no error was raised, or no move ended."""
 
-    told_s: float
+    reported_s: float
     ended_s: float
     how: str
     usable_s: float
@@ -60,19 +60,19 @@ class Row:
     @property
     def passed(self) -> bool:
         """Whether every time is within its target."""
-        return not (self.told_s >= TOLD_S or self.ended_s >= ENDED_S[self.how] or self.usable_s >= USABLE_S)
+        return not (self.reported_s >= REPORTED_S or self.ended_s >= ENDED_S[self.how] or self.usable_s >= USABLE_S)
 
     def __str__(self) -> str:
-        told, ended = ("" if isnan(t_s) else f"{t_s:.2f} s" for t_s in (self.told_s, self.ended_s))
-        return f"{told:>7}   {self.how:25} {ended:>7}   {self.usable_s:6.2f} s"
+        reported, ended = ("" if isnan(t_s) else f"{t_s:.2f} s" for t_s in (self.reported_s, self.ended_s))
+        return f"{reported:>7}   {self.how:25} {ended:>7}   {self.usable_s:6.2f} s"
 
 
 def worst(rows: list[Row]) -> Row:
     """Take the longest of each time; they have to end alike."""
     (how,) = {row.how for row in rows}
-    times = ((row.told_s, row.ended_s, row.usable_s) for row in rows)
-    told_s, ended_s, usable_s = map(max, zip(*times, strict=True))
-    return Row(told_s, ended_s, how, usable_s)
+    times = ((row.reported_s, row.ended_s, row.usable_s) for row in rows)
+    reported_s, ended_s, usable_s = map(max, zip(*times, strict=True))
+    return Row(reported_s, ended_s, how, usable_s)
 
 
 def new_arm(host: str) -> UrArm:
@@ -80,7 +80,7 @@ def new_arm(host: str) -> UrArm:
 
 
 def stands(station: Station, since_s: float, goal_rad: float) -> tuple[float, str]:
-    """Wait until the arm stands; tell how long after `since_s` that was, and whether its move was over."""
+    """Wait until the arm stands; return how long after `since_s` that was, and whether its move was over."""
     station.wait_for(lambda state: not state["moving"])
     state = station.ask("state")
     t_ns = [event["t_host_ns"] for event in state["events"] if event["what"] == "stands"][-1]
@@ -89,15 +89,15 @@ def stands(station: Station, since_s: float, goal_rad: float) -> tuple[float, st
 
 
 def usable(arm: UrArm) -> float:
-    """Open it and move a little; tell how long that took."""
+    """Open it and move a little; return how long that took."""
     begin = time.monotonic()
     arm.open(control=True)
     arm.move_to(away(arm, 0.05), timeout_s=10, guard=no_guard)
     return time.monotonic() - begin
 
 
-def befall(do: Do, cure: Act, *, later_s: float = 0.0, frozen: bool = False) -> Row:
-    """Let it happen in a move, and cure it `later_s` after it was told and the arm stands."""
+def befall(do: Do, fix: Act, *, later_s: float = 0.0, frozen: bool = False) -> Row:
+    """Let it happen in a move, and fix it `later_s` after the error is raised and the arm stands."""
     with Station() as station, closing(new_arm(station.host)) as arm:
         arm.open(control=True)
         q = away(arm)
@@ -106,12 +106,12 @@ def befall(do: Do, cure: Act, *, later_s: float = 0.0, frozen: bool = False) -> 
             arm.move_to(q, timeout_s=10, guard=provoke)
             raise AssertionError("the arm arrived")
         except DriverError:
-            told_s = provoke.ago_s()
+            reported_s = provoke.ago_s()
         assert provoke.t_s is not None
         stood = (nan, "frozen itself") if frozen else stands(station, provoke.t_s, q[5])
         time.sleep(later_s)
-        cure(station)
-        return Row(told_s, *stood, usable(arm))
+        fix(station)
+        return Row(reported_s, *stood, usable(arm))
 
 
 def controller_restarted() -> Row:
@@ -190,14 +190,14 @@ def second_client() -> Row:
 
 
 def program_of_others() -> Row:
-    """Begin beside a program of somebody else; tell when that is refused."""
+    """Begin beside another program; return when that is refused."""
     with Station() as station, closing(new_arm(station.host)) as arm:
         station.ask("foreign-program", seconds=1000)
         station.wait_for(lambda state: state["runtime_state"] == "PLAYING")
         begin = time.monotonic()
         with suppress(ConnectError):
             arm.open(control=True)
-            raise AssertionError("a program of somebody else was ended")
+            raise AssertionError("another program was ended")
         refused_s = time.monotonic() - begin
         station.ask("dashboard-stop")
         return Row(nan, refused_s, "it is refused", usable(arm))
@@ -210,7 +210,7 @@ def of_the_cell(do: Act) -> Do:
 def rows() -> dict[str, Callable[[], Row]]:
     """Every event by name."""
     named: dict[str, Callable[[], Row]] = {
-        event.name: partial(befall, of_the_cell(event.do), event.cure, frozen=event.name == FROZEN) for event in EVENTS
+        event.name: partial(befall, of_the_cell(event.do), event.fix, frozen=event.name == FROZEN) for event in EVENTS
     }
     silent, silent_ends = (on("silent", what="rtde", on=state) for state in (True, False))
     foreign = on("foreign-program")  # the tests wait until it plays
@@ -234,12 +234,12 @@ def rows() -> dict[str, Callable[[], Row]]:
 
 def main() -> int:
     """Run the benchmark; returns 1 when a target is missed."""
-    parser = argparse.ArgumentParser(description="How soon failures of the arm are told and over.")
+    parser = argparse.ArgumentParser(description="How soon failures of the arm are reported and over.")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--only", default="", metavar="TEXT", help="events with this in their name")
     options = parser.parse_args()
     passed = True
-    sys.stdout.write(f"{'event':42} {'told':>7}   {'the arm':25} {'after':>7}   usable after\n")
+    sys.stdout.write(f"{'event':42} {'error':>7}   {'the arm':25} {'after':>7}   usable after\n")
     for name, run in rows().items():
         if options.only not in name:
             continue
@@ -247,7 +247,7 @@ def main() -> int:
         passed &= row.passed
         sys.stdout.write(f"{name:42} {row}   {'pass' if row.passed else 'FAIL'}\n")
         sys.stdout.flush()
-    sys.stdout.write(f"targets: told < {TOLD_S} s, stopped < {ENDED_S['stopped']} s, usable < {USABLE_S} s\n")
+    sys.stdout.write(f"targets: error < {REPORTED_S} s, stopped < {ENDED_S['stopped']} s, usable < {USABLE_S} s\n")
     return 0 if passed else 1
 
 

@@ -400,16 +400,16 @@ def mended(emulator: Emulator, before_s: float) -> list[Watched]:
     with emulator.sensor("recover=1") as sensor:
         watched = Watched(sensor, before_s)
         emulator.unplug()
-        with pytest.raises(StreamBroken, match="connecting again"):
+        with pytest.raises(StreamBroken, match="reconnecting"):
             sensor.collect(60.0)
         emulator.plug_in()
         while (failure := sensor._failure) is not None:  # it gives up by itself
-            assert "connecting again" in str(failure), emulator.kind.scheme
+            assert "reconnecting" in str(failure), emulator.kind.scheme
             emulator.clock.sleep(0.05)
         sensor.collect(0.1)
         health = sensor.health()
     assert health.reconnects >= 1
-    assert [what for _, what in health.events][-1] == "connected again"
+    assert [what for _, what in health.events][-1] == "reconnected"
     assert (np.diff(watched.samples().seq) >= 1).all()
     return [watched]
 

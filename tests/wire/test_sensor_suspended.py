@@ -29,7 +29,7 @@ from drivers.registry import sensor_from_url
 
 one_line = threading.Lock()
 
-def tell(**what):
+def send(**what):
     with one_line:
         print(json.dumps(what), flush=True)
 
@@ -39,11 +39,11 @@ def report(what, call):
         try:
             samples = call()
             push_N = np.linalg.norm(samples.wrench[:, :3] - still_N, axis=1)
-            told = {"rows": len(samples), "unpushed_ns": samples.t_host_ns[push_N < 90].tolist()}
+            outcome = {"rows": len(samples), "unpushed_ns": samples.t_host_ns[push_N < 90].tolist()}
         except DriverError as exc:
-            told = {"error": type(exc).__name__, "says": str(exc)}
-        tell(what=what, begin_ns=begin_ns, end_ns=time.monotonic_ns(), **told)
-        if what == "latest" or "error" in told:
+            outcome = {"error": type(exc).__name__, "says": str(exc)}
+        send(what=what, begin_ns=begin_ns, end_ns=time.monotonic_ns(), **outcome)
+        if what == "latest" or "error" in outcome:
             time.sleep(0.01)
 
 sensor = sensor_from_url(sys.argv[1])
@@ -53,7 +53,7 @@ still_N = still.wrench[:, :3].mean(axis=0)
 threading.Thread(target=report, args=("latest", lambda: sensor.latest(timeout_s=0.5)), daemon=True).start()
 threading.Thread(target=report, args=("collect", lambda: sensor.collect(0.2)), daemon=True).start()
 sys.stdin.readline()
-tell(what="health", stale=sensor.health().stale, events=sensor.health().events)
+send(what="health", stale=sensor.health().stale, events=sensor.health().events)
 sensor.close()
 """
 pytestmark = pytest.mark.realtime
@@ -88,7 +88,7 @@ class Child:
             self.process.kill()
             self._listener.join()
 
-    def tell(self) -> None:
+    def ask_health(self) -> None:
         """Ask it to end."""
         assert self.process.stdin
         self.process.stdin.write("\n")
@@ -134,7 +134,7 @@ def test_nothing_old_after_a_pause(name: str) -> None:
         os.kill(child.process.pid, signal.SIGCONT)
         for _ in range(3):  # the second and the third see a stream in its stride
             child.listen_until(lambda line: is_collected(line, pushed_ns))
-        child.tell()
+        child.ask_health()
         health = child.listen_until(lambda line: line["what"] == "health")
 
     later = [line for line in child.said if line.get("end_ns", 0) > pushed_ns]
@@ -148,4 +148,4 @@ def test_nothing_old_after_a_pause(name: str) -> None:
     assert collected[-1] > 0.3 * rows
     assert {line["error"] for line in later if "error" in line} <= {"DeviceTimeout"}
     assert health["stale"] >= 1
-    assert any("thrown away" in what for _, what in health["events"])
+    assert any("dropped" in what for _, what in health["events"])

@@ -257,9 +257,7 @@ def test_a_datagram_that_was_not_recorded_ends_in_silence_with_a_reason(foreign:
         driver.settimeout(0.3)
         with pytest.raises(TimeoutError):
             driver.recv(100)
-    assert player.divergence == (
-        f"the driver sent {foreign.hex(' ')}, where {START.hex(' ')} was sent in the recording"
-    )
+    assert player.divergence == (f"the driver sent {foreign.hex(' ')}, the recording has {START.hex(' ')}")
 
 
 def page(path: str, reply: bytes) -> Page:
@@ -279,7 +277,7 @@ def test_pages_are_answered_in_their_order_and_the_last_one_again() -> None:
         assert [ask(path) for path in ("/a", "/a", "/b", "/a", "/mute")] == [b"1", b"2", b"other", b"2", b""]
         assert player.divergence is None
         assert ask("/c") == b""
-        assert player.divergence == "the driver asked GET /c, which was not asked in the recording"
+        assert player.divergence == "the driver requested GET /c, which is not in the recording"
         assert ask("/b") == b"other"
 
 

@@ -1,6 +1,6 @@
 """What can go wrong with the controller, its links and our processes, at every moment of using the arm.
 
-Required of every row: reported as below, with a cure; the arm stopped, or known to be finishing the one move it was
+Required of every row: reported as below, with a fix; the arm stopped, or known to be finishing the one move it was
 given; no crash; after the operator has cleared it, `open(control=True)` on the same object moves the arm again. We
 never unlock and never play. On a real clock (`pytest -m realtime -n0`): reported within half a second, usable again
 within 2 s. The limits themselves are proved in `tests/unit/drivers/ur`.
@@ -10,7 +10,7 @@ event                   what is raised    arm                            test of
 ======================  ================  =============================  ==========================================
 protective stop,        `DeviceFault`     stopped by the controller;     `test_in_move`,
 emergency stop,                           what is left of the program    settling and idle: `test_at_rest`;
-safeguard, power lost,                    is ended, so that nobody can   opening: `test_while_opening`;
+safeguard, power lost,                    is ended: no client can        opening: `test_while_opening`;
 brakes closed                             resume it                      closing: `test_while_closing`
 program stopped,        `DeviceFault`     stopped by the controller      the same
 paused or crashed,
@@ -28,11 +28,11 @@ the child killed, hung  `StreamBroken`,   stopped through the dashboard  `test_u
 both killed             -                 finishes its move; its         `test_both_processes_killed`
                                           program is for the operator
                                           to stop
-program of others       `ConnectError`    goes on: nothing of theirs     `test_a_program_of_somebody_else_is_never…`,
+program of others       `ConnectError`    goes on: nothing of theirs     `test_a_program_of_another_client_is_never…`,
 at a start              of the opening    is touched                     `test_a_program_that_took_the_place_of_ours…`
-program of others       `DeviceFault`     goes on: nothing of theirs     `test_a_program_of_somebody_else_found_before…`
+program of others       `DeviceFault`     goes on: nothing of theirs     `…_of_another_client_found_before…`
 before a move                             is touched
-end told off the goal   `DeviceFault`     stopped                        `test_an_end_told_before_the_goal…`
+end off the goal        `DeviceFault`     stopped                        `test_an_end_before_the_goal…`
 our process suspended   `DeviceTimeout`   stopped by the child           `test_suspended_in_a_move`
 both suspended          as the arm is     finishes its move              `test_both_processes_suspended`
 suspended while idle    -                 stands                         `test_nothing_old_is_believed`
@@ -75,7 +75,7 @@ slow, realtime = pytest.mark.slow, pytest.mark.realtime
 NewArm = Callable[..., UrArm]
 
 
-# ---------------------------------------------------------------------- the events and their cures
+# ---------------------------------------------------------------------- the events and their fixes
 
 Act = Callable[[Station], object]
 
@@ -106,7 +106,7 @@ def release(station: Station) -> None:
 
 
 def cut(station: Station, *, connected: bool) -> None:
-    """Pull all cables, as far as TCP can tell, or plug them in."""
+    """Pull all cables, as TCP sees it, or plug them in."""
     for what in ("rtde", "dashboard", "script"):
         station.ask("listen", what=what, on=connected)
         if not connected:
@@ -128,11 +128,11 @@ def plays_another(station: Station) -> bool:
 class Event:
     name: str
     do: Act
-    cure: Act
+    fix: Act
     error: type[DriverError] | tuple[type[DriverError], ...]
     says: str
     reachable: bool = True
-    """Whether the controller can still be told to stop."""
+    """Whether the controller can still receive a stop."""
     hits_opening: bool = True
     """Whether it matters before a program of ours runs."""
     reported_s: float = REPORTED_S
@@ -165,7 +165,7 @@ EVENTS = [
         on("dashboard-stop"),
         nothing,
         DeviceFault,
-        "ended or paused",
+        "stopped or paused",
         hits_opening=False,
     ),
     Event(
@@ -173,10 +173,10 @@ EVENTS = [
         lambda s: s.dashboard("pause"),
         nothing,
         DeviceFault,
-        "ended or paused",
+        "stopped or paused",
         hits_opening=False,
     ),
-    Event("crash-script", on("crash-script"), nothing, DeviceFault, "ended or paused", hits_opening=False),
+    Event("crash-script", on("crash-script"), nothing, DeviceFault, "stopped or paused", hits_opening=False),
     Event(
         "foreign-program",
         another_takes_over,
@@ -306,7 +306,7 @@ def test_in_move_in_time(station: Station, in_time: NewArm, event: Event) -> Non
 
 
 def befall_move(station: Station, arm: UrArm, event: Event) -> tuple[float, float]:
-    """Let it happen in a move, and cure it; return after how long it was reported, and the arm usable again."""
+    """Let it happen in a move, and fix it; return after how long it was reported, and the arm usable again."""
     q = away(arm)
     provoke = Once(lambda: event.do(station), wait_until_moving(arm))
     with pytest.raises(event.error, match=event.says):
@@ -315,7 +315,7 @@ def befall_move(station: Station, arm: UrArm, event: Event) -> tuple[float, floa
     if event.reachable:
         state = station.wait_for(lambda state: not state["moving"] and state["runtime_state"] == "STOPPED")
         assert abs(state["q_rad"][5] - q[5]) > 0.1
-    event.cure(station)
+    event.fix(station)
     where = station.wait_for(lambda state: not state["moving"])["q_rad"]  # whatever it was, it is one move long
     begin_s = REAL.now_s()
     moves_again(arm)
@@ -330,13 +330,13 @@ def test_at_rest(station: Station, new_arm: NewArm, event: Event) -> None:
     if event.name != "foreign-program":  # while it stands, it may be anybody's program
         with pytest.raises(event.error, match=event.says):
             arm.wait_until_still(timeout_s=30, guard=Once(lambda: event.do(station)))
-        event.cure(station)
+        event.fix(station)
         moves_again(arm)
     q = away(arm, 0.05)
-    event.do(station)  # nobody looks
+    event.do(station)  # without a watcher
     with pytest.raises(event.error, match=event.says):
         arm.move_to(q, timeout_s=MOVE_S, guard=no_guard)
-    event.cure(station)
+    event.fix(station)
     moves_again(arm)
 
 
@@ -353,7 +353,7 @@ def test_while_opening(station: Station, new_arm: NewArm, event: Event, monkeypa
     arm = new_arm()
     with pytest.raises(ConnectError, match=event.says):
         arm.open(control=True)
-    event.cure(station)
+    event.fix(station)
     moves_again(arm)
 
 
@@ -369,13 +369,13 @@ def test_while_closing(station: Station, new_arm: NewArm, event: Event) -> None:
     arm.close()
     if event.reachable and event.name != "foreign-program":
         station.wait_for(lambda state: not state["moving"] and state["runtime_state"] == "STOPPED")
-    event.cure(station)
+    event.fix(station)
     moves_again(arm)
 
 
 @slow
 @pytest.mark.parametrize(
-    ("do", "cure"),
+    ("do", "fix"),
     [
         (on("reduced", on=True), on("reduced", on=False)),
         (on("remote-control", on=False), on("remote-control", on=True)),
@@ -386,12 +386,12 @@ def test_while_closing(station: Station, new_arm: NewArm, event: Event) -> None:
     ],
     ids=["reduced", "local-mode", "dashboard-fin", "script-reset", "dashboard-refused", "dashboard-silent"],
 )
-def test_what_disturbs_no_move(station: Station, arm: UrArm, do: Act, cure: Act) -> None:
+def test_what_disturbs_no_move(station: Station, arm: UrArm, do: Act, fix: Act) -> None:
     q = away(arm, 0.5)
     arm.move_to(q, timeout_s=MOVE_S, guard=Once(lambda: do(station), wait_until_moving(arm)))
     arm.wait_until_still(timeout_s=30, guard=no_guard)
     assert np.allclose(arm.state().q_rad, q, atol=1e-4)
-    cure(station)
+    fix(station)
 
 
 @realtime
@@ -416,13 +416,13 @@ def test_an_old_attempt_to_stop_does_not_end_the_next_move(station: Station, in_
     with pytest.raises(LOST):
         arm.move_to(q, timeout_s=MOVE_S, guard=no_guard)
     station.ask("silent", what="rtde", on=False)
-    station.ask("dashboard-stop")  # somebody else has stopped it meanwhile
+    station.ask("dashboard-stop")  # another client has stopped it meanwhile
     before = len(station.ask("state")["events"])
     threading.Timer(0.8, lambda: station.ask("silent", what="dashboard", on=False)).start()
     moves_again(arm)
     arm.close()
-    told = [event["what"] for event in station.ask("state", since=before)["events"] if event["by"] == "dashboard"]
-    assert "stop" not in told
+    sent = [event["what"] for event in station.ask("state", since=before)["events"] if event["by"] == "dashboard"]
+    assert "stop" not in sent
 
 
 @slow
@@ -439,9 +439,7 @@ def test_a_slider_at_zero(station: Station, arm: UrArm) -> None:
 
 
 @slow
-def test_an_end_told_before_the_goal_is_no_arrival(
-    station: Station, arm: UrArm, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_end_before_the_goal_is_no_arrival(station: Station, arm: UrArm, monkeypatch: pytest.MonkeyPatch) -> None:
     where, q = arm.state().q_rad, away(arm)
     station.ask("slider", fraction=0.0)
     call = ControlProcess.call
@@ -485,12 +483,12 @@ def test_a_new_arm_moves_after_a_protective_stop(station: Station, arm: UrArm, n
 
 
 @slow
-def test_a_program_of_somebody_else_is_not_stopped_by_leaving(
+def test_a_program_of_another_client_is_not_stopped_by_leaving(
     station: Station, arm: UrArm, caplog: pytest.LogCaptureFixture
 ) -> None:
     another_takes_over(station)
     arm.close()
-    assert "left alone" in caplog.text
+    assert "is not stopped" in caplog.text
     assert plays_another(station)
     arm.open()  # reading is fine
     arm.state()
@@ -498,7 +496,7 @@ def test_a_program_of_somebody_else_is_not_stopped_by_leaving(
 
 
 @slow
-def test_a_program_of_somebody_else_found_before_a_move_is_left_alone(station: Station, arm: UrArm) -> None:
+def test_a_program_of_another_client_found_before_a_move_is_left_alone(station: Station, arm: UrArm) -> None:
     q = away(arm)
     another_takes_over(station)
     with pytest.raises(DeviceFault, match="does not answer: another program"):
@@ -523,7 +521,7 @@ def test_a_program_that_cannot_be_asked_is_ended_by_leaving(
 
 @slow
 @pytest.mark.parametrize("paused", [False, True], ids=["playing", "paused"])
-def test_a_program_of_somebody_else_is_never_ended_for_a_start(station: Station, paused: bool) -> None:
+def test_a_program_of_another_client_is_never_ended_for_a_start(station: Station, paused: bool) -> None:
     q = station.ask("state")["q_rad"]
     q[5] += -STEP_RAD if q[5] > 0.5 else STEP_RAD
     station.ask("foreign-program", q_rad=q, speed_rad_s=0.5 / TIME_SCALE)
@@ -533,8 +531,8 @@ def test_a_program_of_somebody_else_is_never_ended_for_a_start(station: Station,
         station.wait_for(lambda state: state["runtime_state"] == "PAUSED")
     before = len(station.ask("state")["events"])
     error = refused(station)
-    assert re.search(r"\((PLAYING|PAUSED) .*\) and is not ended", error.found)
-    assert "stop it at the pendant" in error.cure
+    assert re.search(r"\((PLAYING|PAUSED) .*\) and is not stopped", error.found)
+    assert "stop it at the pendant" in error.fix
     state = station.ask("state", since=before)
     assert not [event for event in state["events"] if event["by"] in ("script port", "program")]
     assert not [event for event in state["events"] if event["by"] == "dashboard" and event["what"] == "stop"]
@@ -557,7 +555,7 @@ def test_a_program_that_took_the_place_of_ours_is_not_ended_when_the_arm_is_open
 @slow
 def test_what_runs_after_ours_was_seen_to_have_ended_is_not_ours(station: Station, arm: UrArm) -> None:
     assert arm._control is not None
-    os.kill(arm._control.pid, signal.SIGKILL)  # so that nobody can ask it whose program it runs
+    os.kill(arm._control.pid, signal.SIGKILL)  # so that it cannot be asked whose program it runs
     station.wait_for(lambda _: arm._control is not None and not arm._control.alive)
     station.ask("dashboard-stop")
     arm.open()
@@ -584,7 +582,7 @@ def test_registers_of_a_fieldbus(station: Station, new_arm: NewArm) -> None:
     station.ask("claim-registers", range="lower", on=True)
     error = refused(station)
     station.ask("claim-registers", range="lower", on=False)
-    assert "EtherNet/IP" in error.cure
+    assert "EtherNet/IP" in error.fix
     assert "input_int_register_0" in error.found
     station.ask("claim-registers", range="upper", on=True)
     moves_again(new_arm())  # these are not ours
@@ -606,35 +604,35 @@ def test_a_second_client_does_not_stop_the_first(station: Station, arm: UrArm) -
 def test_local_mode_keeps_the_running_program(station: Station) -> None:
     another_takes_over(station)
     station.ask("remote-control", on=False)
-    assert "press Local, Remote Control" in refused(station).cure
+    assert "press Local, Remote Control" in refused(station).fix
     assert plays_another(station)
     station.ask("remote-control", on=True)
     station.ask("dashboard-stop")
 
 
 @slow
-@pytest.mark.parametrize(("mode", "cure"), [(3, "power the arm on"), (5, "release its brakes")])
-def test_an_arm_that_is_not_ready(station: Station, mode: int, cure: str) -> None:
+@pytest.mark.parametrize(("mode", "fix"), [(3, "power the arm on"), (5, "release its brakes")])
+def test_an_arm_that_is_not_ready(station: Station, mode: int, fix: str) -> None:
     station.ask("mode", robot=mode)
-    assert cure in refused(station).cure
+    assert fix in refused(station).fix
     station.ask("mode", robot=7)
 
 
 @slow
 @pytest.mark.parametrize(
-    ("what", "found", "cure"),
+    ("what", "found", "fix"),
     [
-        ("rtde", "cannot be reached", "the address and the cable"),
+        ("rtde", "cannot be reached", "address, cable"),
         ("dashboard", "dashboard server", "Settings, Security, Services"),
         ("script", "30003", "Settings, Security, Services"),
     ],
 )
-def test_services_that_are_off(station: Station, what: str, found: str, cure: str) -> None:
+def test_services_that_are_off(station: Station, what: str, found: str, fix: str) -> None:
     station.ask("listen", what=what, on=False)
     error = refused(station)
     station.ask("listen", what=what, on=True)
     assert found in error.found
-    assert cure in error.cure
+    assert fix in error.fix
 
 
 @slow
@@ -697,9 +695,9 @@ def application(station: Station, tmp_path: Path) -> Iterator[Application]:
 def test_both_processes_killed(station: Station, application: Application, in_time: NewArm) -> None:
     os.kill(application.child, signal.SIGKILL)
     application.process.kill()
-    assert station.ask("state")["moving"]  # nobody is left to stop it
-    error = refused(station, clock=REAL, timing=STRICT)  # nobody can tell it from a program of somebody else
-    assert "is not ended" in error.found
+    assert station.ask("state")["moving"]  # no process is left to stop it
+    error = refused(station, clock=REAL, timing=STRICT)  # it cannot be distinguished from another program
+    assert "is not stopped" in error.found
     state = station.wait_for(lambda state: not state["moving"])
     assert state["runtime_state"] == "PLAYING"
     station.ask("dashboard-stop")
@@ -766,8 +764,8 @@ def test_nothing_old_is_believed(station: Station, arm: UrArm) -> None:
         watcher.stdin.write("\n")  # it is asked the moment it wakes up, with seconds of old samples in its sockets
         watcher.stdin.flush()
         os.kill(watcher.pid, signal.SIGCONT)
-        told = [float(word) for word in watcher.stdout.readline().split()]
-        assert told == pytest.approx([q[5], q[5]], abs=1e-3)
+        q_rad = [float(word) for word in watcher.stdout.readline().split()]
+        assert q_rad == pytest.approx([q[5], q[5]], abs=1e-3)
     finally:
         watcher.kill()
         watcher.communicate()
@@ -781,7 +779,7 @@ def test_a_guard_that_hangs(station: Station, in_time: NewArm) -> None:
         station.wait_for(lambda state: not state["moving"])
 
     q = away(arm)
-    with pytest.raises(DeviceTimeout, match=r"0\.5 s of a move"):
+    with pytest.raises(DeviceTimeout, match=r"0\.5 s"):
         arm.move_to(q, timeout_s=MOVE_S, guard=Once(hang, wait_until_moving(arm)))
     assert abs(arm.state().q_rad[5] - q[5]) > 0.1
     arm.move_to(q, timeout_s=MOVE_S, guard=no_guard)  # and it is still ours

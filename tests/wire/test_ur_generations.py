@@ -95,7 +95,7 @@ def use(arm: UrArm, station: Station, polyscope: str, model: str, tcp: str) -> N
             stopping.start()
 
     stopping = threading.Thread(target=arm.stop)
-    with pytest.raises(DeviceFault, match="told to stop"):
+    with pytest.raises(DeviceFault, match="stop was requested"):
         arm.move_to(q.tolist(), timeout_s=30, guard=stop_on_the_way)
     stopping.join()
     assert not station.ask("state")["moving"]
@@ -103,19 +103,19 @@ def use(arm: UrArm, station: Station, polyscope: str, model: str, tcp: str) -> N
 
 
 @pytest.mark.parametrize(
-    ("polyscope", "control", "found", "cure"),
+    ("polyscope", "control", "found", "fix"),
     [
         ("5.3.0", True, "PolyScope 5.3", "5.4"),
         ("10.7.0", False, "PolyScope X", "PolyScope 5 or the CB3 generation"),
     ],
 )
 def test_versions_that_cannot_be_used(
-    start_station: Callable[..., Station], polyscope: str, control: bool, found: str, cure: str
+    start_station: Callable[..., Station], polyscope: str, control: bool, found: str, fix: str
 ) -> None:
     station = start_station("--polyscope", polyscope)
     with pytest.raises(ConnectError) as error:
         station.arm(model="UR5e").open(control=control)
     assert found in error.value.found
-    assert cure in error.value.cure
+    assert fix in error.value.fix
     assert station.ask("state")["runtime_state"] == "STOPPED"
     station.kill()

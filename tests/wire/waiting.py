@@ -19,7 +19,7 @@ def wait_until(condition: Callable[[], bool], limit_s: float = LIMIT_S) -> None:
 def drain(port: serial.Serial, quiet_s: float = 0.05) -> bytes:
     """Read what was on its way from a device that sends nothing more: a full terminal would lose its next answer.
 
-    The port's time-out stays as it is, as pyserial sets all flags of the terminal anew with it.
+    The port's time-out stays as it is, as pyserial sets all flags of the terminal again with it.
     """
     data = b""
     deadline_s = time.monotonic() + quiet_s

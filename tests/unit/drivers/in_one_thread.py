@@ -1,4 +1,4 @@
-"""A stream on a fake clock: the reader takes its turns in the test's thread whenever somebody waits."""
+"""A stream on a fake clock: the reader takes its turns in the test's thread whenever a caller waits."""
 
 from drivers.streaming.sensor import StreamingSensor
 from tests.fake_clock import FakeClock

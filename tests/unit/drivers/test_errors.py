@@ -1,4 +1,4 @@
-"""The errors of the drivers: what is in them, and that nothing of it is lost on the way to whoever tells it."""
+"""The errors of the drivers: their parts, which survive copies and conversions."""
 
 import copy
 import pickle
@@ -13,15 +13,13 @@ KINDS = [kind for kind in vars(errors).values() if isinstance(kind, type) and is
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("cure", ["check supply; try again", ""])
+@pytest.mark.parametrize("fix", ["check supply; try again", ""])
 @pytest.mark.parametrize("via", [copy.copy, copy.deepcopy, lambda error: pickle.loads(pickle.dumps(error))])
-def test_an_error_keeps_its_parts(
-    kind: type[DriverError], cure: str, via: Callable[[DriverError], DriverError]
-) -> None:
-    error = via(kind("silent for 0.4 s (a; b)", cure))
+def test_an_error_keeps_its_parts(kind: type[DriverError], fix: str, via: Callable[[DriverError], DriverError]) -> None:
+    error = via(kind("silent for 0.4 s (a; b)", fix))
     assert type(error) is kind
-    assert (error.found, error.cure) == ("silent for 0.4 s (a; b)", cure)
-    assert str(error) == ("silent for 0.4 s (a; b); check supply; try again" if cure else "silent for 0.4 s (a; b)")
+    assert (error.found, error.fix) == ("silent for 0.4 s (a; b)", fix)
+    assert str(error) == ("silent for 0.4 s (a; b); check supply; try again" if fix else "silent for 0.4 s (a; b)")
 
 
 def test_a_time_out_is_no_error_of_the_system() -> None:

@@ -84,9 +84,9 @@ def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: st
     [
         ("can0", "unknown sensor ''; known: ati-can, ati-serial"),
         ("kms40://dev", "unknown sensor 'kms40'"),
-        ("ati-can://", "which device"),
-        ("ati-can:can0", "which device"),
-        ("ati-can://can0#1", "which device"),
+        ("ati-can://", "names no device"),
+        ("ati-can:can0", "names no device"),
+        ("ati-can://can0#1", "names no device"),
         ("ati-can://[can0", "write it like"),
         (
             "ati-can://can0?bitrat=1",
@@ -94,11 +94,11 @@ def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: st
         ),
         (
             "ati-can://can0?units=lbf",
-            "units are 'lbf'; they are one of lbf N klbf kN kgf gf, a comma, and one of lbf-in",
+            "units are 'lbf'; give one of lbf N klbf",
         ),
         ("ati-can://can0?units=N,Nm", "units are 'N,Nm'"),
         ("ati-can://can0?units=", "empty"),
-        ("ati-can://can0?counts=1000000", "counts are '1000000'; they are two whole numbers"),
+        ("ati-can://can0?counts=1000000", "counts are '1000000'; give two"),
         ("ati-can://can0?counts=1e6,1e6", "two whole numbers"),
         ("ati-can://can0?counts=0,1000000", "two whole numbers"),
         ("ati-can://can0?bitrate=fast", "whole number"),
@@ -107,9 +107,9 @@ def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: st
         ("ati-can://can0?base", "key=value"),
         ("ati-can://can0?base=1&base=2", "twice"),
         ("ati-serial:///dev/x?calibration=0", "allowed are 1 to 16"),
-        ("robotous-can://can0?rate=123", "rate is 123 Hz; the sensor knows 10, 20"),
-        ("robotous-serial:///dev/x?rate=1000", "at this baud rate 500 Hz is the most"),
-        ("robotous-serial:///dev/x?baud=60000", "baud is 60000; the sensor knows"),
+        ("robotous-can://can0?rate=123", "rate is 123 Hz; choose one of 10, 20"),
+        ("robotous-serial:///dev/x?rate=1000", "choose at most 500 Hz"),
+        ("robotous-serial:///dev/x?baud=60000", "baud is 60000; choose"),
         ("robotiq-ft300:///dev/x?rate=1", "unknown option rate; known: range, recover, serial"),
         ("bota:///dev/x?sinc=513", "allowed are 0 to 512"),
         ("bota:///dev/x?range=300", "such as 300,30 or"),
@@ -253,7 +253,7 @@ def test_a_driver_that_is_no_stream_of_ours_takes_no_options_of_ours(install: In
     install("plain_ft", "[ftdrive.sensors]\nplain = plain_ft:Sensor\n", PLAIN)
     assert type(sensor_from_url("plain://x")).__module__ == "plain_ft"
     for option in ("recover=1", "range=1,1", "serial=A"):
-        with pytest.raises(BadUrl, match="knows none of the options recover, serial and range"):
+        with pytest.raises(BadUrl, match="no options recover, serial and range"):
             sensor_from_url(f"plain://x?{option}")
 
 
@@ -294,5 +294,5 @@ def test_a_package_that_cannot_be_imported_is_named(install: Install, source: st
 
 def test_a_class_that_is_no_driver_is_named(install: Install) -> None:
     install("odd_ft", "[ftdrive.sensors]\nodd = odd_ft:Sensor\n", "class Sensor:\n    pass\n")
-    with pytest.raises(BadUrl, match=r"odd://x: odd_ft:Sensor has no from_url, .*: reinstall odd_ft"):
+    with pytest.raises(BadUrl, match=r"odd://x: odd_ft:Sensor has no from_url, .*; reinstall odd_ft"):
         sensor_from_url("odd://x")

@@ -138,7 +138,7 @@ def test_bus_that_echoes_does_not_fake_the_slot_echo(table: Table, talk: Talk) -
 def test_calibration_that_is_none_names_device_slot_and_cure(talk: Talk, answers: dict[str, Answer]) -> None:
     with pytest.raises(ConnectError, match=r"^ATI CAN sensor 0x20 on .*: calibration slot 0: ") as caught:
         opened(talk(answers)).open()
-    assert "slot=0 to 15" in caught.value.cure
+    assert "slot=0 to 15" in caught.value.fix
 
 
 OLD: Mapping[str, Answer | None] = {"20F": ["20F 03060001"], "207": None, "208": None}
@@ -327,5 +327,5 @@ def test_bus_that_does_not_open(interface: str, channel: str) -> None:
 def test_an_adapter_on_a_serial_port_wants_its_interface() -> None:
     with pytest.raises(ConnectError) as caught:
         AtiCanSensor("/dev/ttyACM0").open()
-    assert "interface=slcan" in caught.value.cure
+    assert "interface=slcan" in caught.value.fix
     assert "ip link" not in str(caught.value)

@@ -191,32 +191,32 @@ def test_what_was_thrown_away_is_counted_since_open() -> None:
     with Box(*map(record, [1, 2, 2, 3, 5, 4, 6]), RECORD[:-1]) as box:
         sensor = box.sensor()
         sensor.recover = True
-        told: list[tuple[int, int, int]] = []
+        counted: list[tuple[int, int, int]] = []
 
         def wait_for(condition: Callable[[Health], bool]) -> None:
             while not condition(health := sensor.health()):
-                told.append((health.duplicated, health.out_of_order, health.malformed))
+                counted.append((health.duplicated, health.out_of_order, health.malformed))
                 time.sleep(0.002)
 
         with sensor:
             wait_for(lambda health: (health.duplicated, health.out_of_order, health.malformed) == (1, 1, 1))
-            told.clear()
+            counted.clear()
             box.mute_and_then = [*map(record, [1, 2, 2, 3])]
             wait_for(lambda health: health.reconnects > 0)
             wait_for(lambda health: health.duplicated == 2)
             sensor.latest(timeout_s=1.0)
         after = sensor.health()
         assert (after.duplicated, after.out_of_order, after.malformed) == (2, 1, 1)
-        assert set(told) <= {(1, 1, 1), (2, 1, 1)}  # nothing is forgotten while there is no stream
+        assert set(counted) <= {(1, 1, 1), (2, 1, 1)}  # nothing is forgotten while there is no stream
         sensor.open()
         assert sensor.health().duplicated == 0
         sensor.close()
 
 
 def test_nobody_there() -> None:
-    with pytest.raises(ConnectError, match="does not tell its configuration"):
+    with pytest.raises(ConnectError, match="configuration cannot be read"):
         NetFtSensor("127.0.0.1", http_port=1).open()
-    with pytest.raises(ConnectError, match="does not tell its configuration"):
+    with pytest.raises(ConnectError, match="configuration cannot be read"):
         NetFtSensor("no such host").open()
     for nowhere in ("no such host", " "):
         with pytest.raises(ConnectError, match="check"):
@@ -264,12 +264,12 @@ def test_range_in_a_page(page: bytes, expected: tuple[float, ...] | None) -> Non
 def test_rate_and_range_are_the_devices() -> None:
     pages = PAGE.replace(b"</netft>", b"<cfgcalsel>3</cfgcalsel><comrdtrate>500</comrdtrate></netft>"), CALIBRATION
     with Box(pages=pages) as box, box.sensor() as sensor:
-        told = sensor.identify().facts["range"]
-        assert told.source == "device"
-        assert told.value == pytest.approx((25, 25, 50, 0.25, 0.25, 0.25))
+        rating = sensor.identify().facts["range"]
+        assert rating.source == "device"
+        assert rating.value == pytest.approx((25, 25, 50, 0.25, 0.25, 0.25))
         assert sensor.health().nominal_rate_Hz == 500
         assert "/netftcalapi.xml?index=3" in box.asked
-    with Box() as box, box.sensor() as sensor:  # a page that tells neither
+    with Box() as box, box.sensor() as sensor:  # a page without either
         assert "range" not in sensor.identify().facts
         assert math.isnan(sensor.health().nominal_rate_Hz)
         assert set(box.asked) == {"/netftapi2.xml"}

@@ -253,8 +253,8 @@ def test_error_bit_that_nothing_critical_explains_is_no_damage(
     table: Table, status: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Such as of a NETCANOEM whose CAN side is not connected."""
-    told = read_reply(status.to_bytes(2, "big"))
-    with table.serial(start_up(None, told, stream=flagged(BATCH))) as wire, Sensor(wire.clock) as sensor:
+    status_reply = read_reply(status.to_bytes(2, "big"))
+    with table.serial(start_up(None, status_reply, stream=flagged(BATCH))) as wire, Sensor(wire.clock) as sensor:
         samples = sensor.collect(0.1)
         assert (samples.status == status).all()
         assert (samples.counts == COUNTS).all()
@@ -361,7 +361,7 @@ def test_refusals_end_the_start_up_at_once(table: Table, request_: bytes, reply:
     wire = table.serial([*turns[:at], (request_, bytes.fromhex(reply)), BYE])
     with wire, pytest.raises(ConnectError, match=rf"^ATI serial sensor on .*{message}") as caught:
         Sensor(wire.clock).open()
-    assert "is it " in caught.value.cure
+    assert "address" in caught.value.fix
 
 
 def test_nobody_there_is_known_within_a_second(table: Table) -> None:

@@ -30,7 +30,7 @@ def frames(times_us: Iterable[int]) -> Iterator[bytes]:
 
 
 def stream(*times_us: int) -> Stream:
-    """Tell these times, then go on in steps of 10 ms."""
+    """Send these times, then go on in steps of 10 ms."""
     last = times_us[-1] if times_us else 1_000_000
     return Stream(frames(chain(times_us, count(last + 10_000, 10_000))), 0.01)
 

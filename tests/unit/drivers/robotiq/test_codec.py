@@ -40,7 +40,7 @@ def test_a_changed_byte_is_noticed(at: int) -> None:
     damaged = bytearray(FRAME)
     damaged[at] ^= 0x01
     assert not codec.is_frame(bytes(damaged))
-    with pytest.raises(ProtocolError, match="no stream frame"):
+    with pytest.raises(ProtocolError, match="not a stream frame"):
         codec.decode_frame(bytes(damaged))
 
 

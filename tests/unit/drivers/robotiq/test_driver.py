@@ -91,8 +91,8 @@ def test_nobody_there(table: Table) -> None:
     assert wire.clock.now_s() - start_s == pytest.approx(3 * (0.05 + 0.2), abs=0.2)
 
 
-@pytest.mark.parametrize(("rate_Hz", "hint"), [(62.5, "latency_timer"), (80.0, "are lost"), (100.0, "")])
-def test_slow_usb_adapter_is_named_with_its_cure(rate_Hz: float, hint: str, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(("rate_Hz", "hint"), [(62.5, "latency_timer"), (80.0, "lost"), (100.0, "")])
+def test_slow_usb_adapter_is_named_with_its_fix(rate_Hz: float, hint: str, caplog: pytest.LogCaptureFixture) -> None:
     sensor = RobotiqFt300("/dev/ttyUSB0")
     sensor._nominal_Hz = 100.0
     note = [sensor._rate.judge(1, round(1e9 * (5 + n / rate_Hz)), 100.0) for n in range(round(5 * rate_Hz))]

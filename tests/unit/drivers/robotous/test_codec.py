@@ -109,7 +109,7 @@ def test_text() -> None:
     assert codec.decode_text(b"\x01RFT60-HA01\0\0\0\0\0") == "RFT60-HA01"
     assert codec.decode_text(b"\x02A1 " + b" " * 12) == "A1"
     for bad in (bytes(16), b"\x01\xff" + bytes(14)):
-        with pytest.raises(ProtocolError, match="no text"):
+        with pytest.raises(ProtocolError, match="not text"):
             codec.decode_text(bad)
 
 

@@ -195,7 +195,7 @@ def test_a_silence_while_halves_come_is_not_the_fault_of_cable_or_supply(monkeyp
     clock = FakeClock()
     link = CanLink("can0", clock=clock)
     sensor = RobotousCan(link)
-    assert "cable" in sensor._stale(0.4).cure
+    assert "cable" in sensor._stale(0.4).fix
 
     def look(_: float) -> tuple[int, bytes]:
         clock.stall(0.001)
@@ -203,6 +203,6 @@ def test_a_silence_while_halves_come_is_not_the_fault_of_cable_or_supply(monkeyp
 
     monkeypatch.setattr(link._bus, "look", look)
     assert link.receive() == []
-    assert "cannot be paired" in sensor._stale(0.4).cure
+    assert "to be paired" in sensor._stale(0.4).fix
     clock.stall(0.2)
-    assert "cable" in sensor._stale(0.4).cure
+    assert "cable" in sensor._stale(0.4).fix

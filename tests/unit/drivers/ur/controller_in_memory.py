@@ -122,7 +122,7 @@ class Controller:
                 self._sent.append([sample[name] for name in OUTPUTS if name not in self.unknown])
             if not self.held_back:
                 receive(max(1, len(self._sent) // 2))
-                if self._sent:  # a backlog is read in no time, and somebody may look on the way
+                if self._sent:  # a backlog is read in no time, and a caller may look meanwhile
                     self.clock.at(1e-4, lambda: receive(len(self._sent)))
             self.clock.at(CYCLE_S, cycle)
 
@@ -241,7 +241,7 @@ class ControlInMemory(ControlProcess):
         self._replies[0] = {"id": 0, "value": None}
 
     def _take(self, line: str) -> None:
-        """Answer as `control_child.serve` does, later; and stop a move that nobody watches."""
+        """Answer as `control_child.serve` does, later; and stop a move that the parent does not watch."""
         request = json.loads(line)
         self._asked += 1
         asked, far = self._asked, self._far
@@ -276,7 +276,7 @@ class ControlInMemory(ControlProcess):
     def _read_replies(self, pipe: object) -> None:
         pass  # a fake clock is for one thread
 
-    def _read_talk(self, pipe: object) -> None:
+    def _log_output(self, pipe: object) -> None:
         pass
 
 

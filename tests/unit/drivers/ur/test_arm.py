@@ -139,17 +139,17 @@ def test_without_ur_rtde_the_error_says_where_it_exists(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
-    ("words", "found", "cure"),
+    ("words", "found", "fix"),
     [
         ("ur_rtde: One of the RTDE input registers are already in use! Currently", "another client", "end it"),
         ("ur_rtde: Please enable remote control on the robot!", "remote control", "press Local"),
         ("Failed to start control script, before timeout of 5 seconds", "Failed to start", "pendant"),
     ],
 )
-def test_the_librarys_words_become_advice(words: str, found: str, cure: str) -> None:
+def test_the_librarys_words_become_advice(words: str, found: str, fix: str) -> None:
     error = arm_module._refusal(HOST, words)
     assert found in error.found
-    assert cure in error.cure
+    assert fix in error.fix
 
 
 # ---------------------------------------------------------------------- opening
@@ -237,7 +237,7 @@ def test_what_rtde_may_not_say_refuses_the_opening_too(monkeypatch: pytest.Monke
     monkeypatch.setattr(arm_module, "Reader", damaged)
     with pytest.raises(ConnectError, match="recipe cannot be read: 01") as error:
         UrArm(HOST).open()
-    assert error.value.cure == "is this an RTDE server?"
+    assert error.value.fix == "is this an RTDE server?"
 
 
 # ---------------------------------------------------------------------- moving
@@ -389,14 +389,14 @@ def test_a_control_process_that_ends_is_reported_at_once(arm: UrArm, controller:
 
 
 @pytest.mark.parametrize(("hangs_s", "stopped"), [(0.45, False), (0.55, True)])
-def test_a_move_that_nobody_watches_is_stopped_after_half_a_second(
+def test_a_move_that_the_parent_does_not_watch_is_stopped_after_half_a_second(
     arm: UrArm, controller: Controller, clock: FakeClock, hangs_s: float, stopped: bool
 ) -> None:
     provoke = After(clock, 0.3, lambda: clock.sleep(hangs_s))
     if not stopped:
         move(arm, controller, provoke)
         return
-    with pytest.raises(DeviceTimeout, match=r"0\.5 s of a move"):
+    with pytest.raises(DeviceTimeout, match=r"0\.5 s"):
         move(arm, controller, provoke)
     assert controller.did[-1] == "stop softly"
     move(arm, controller)  # and it is still ours
@@ -411,7 +411,7 @@ def test_a_safety_stop_is_the_reason_of_an_ended_program(arm: UrArm, controller:
     with pytest.raises(DeviceFault, match="protective stop"):
         move(arm, controller, provoke)
     assert provoke.ago_s() < 0.1
-    assert controller.did[-1] == "dashboard stop"  # nobody can resume what is left
+    assert controller.did[-1] == "dashboard stop"  # the rest cannot be resumed
 
 
 # ---------------------------------------------------------------------- stopping
@@ -444,7 +444,7 @@ def test_the_ways_to_stop(
     "trouble", [{}, {"stopping_works": False}, {"hanging": {"stop", "tcp_offset"}}, {"hanging": {"stop", "progress"}}]
 )
 @pytest.mark.parametrize("delay_s", [0.3, 0.311, 0.333, 0.347, 0.402, 0.404])
-def test_a_move_that_was_told_to_stop_says_so(
+def test_a_move_that_is_stopped_reports_the_stop(
     arm: UrArm, controller: Controller, clock: FakeClock, trouble: dict[str, Any], delay_s: float
 ) -> None:
     """Wherever the move is when another thread stops the arm, and however that ends."""
@@ -454,7 +454,7 @@ def test_a_move_that_was_told_to_stop_says_so(
         arm.stop()
 
     clock.at(delay_s, stop)
-    with pytest.raises(DeviceFault, match="told to stop"):
+    with pytest.raises(DeviceFault, match="stop was requested"):
         move(arm, controller)
     assert controller.goal_rad is None
     if not trouble:
@@ -463,7 +463,7 @@ def test_a_move_that_was_told_to_stop_says_so(
 
 def test_a_stop_just_before_a_move_ends_it(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
     where = controller.q_rad[5]
-    with pytest.raises(DeviceFault, match="told to stop"):
+    with pytest.raises(DeviceFault, match="stop was requested"):
         move(arm, controller, After(clock, 0.0, arm.stop))
     assert controller.goal_rad is None
     assert controller.q_rad[5] == pytest.approx(where, abs=0.05)
@@ -479,7 +479,7 @@ def test_a_guard_says_why_it_has_stopped_the_arm(arm: UrArm, controller: Control
 
 
 def test_a_stop_of_old_is_not_the_reason_of_a_fault(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
-    with pytest.raises(DeviceFault, match="told to stop"):
+    with pytest.raises(DeviceFault, match="stop was requested"):
         move(arm, controller, After(clock, 0.3, arm.stop))
     clock.at(0.1, setting(controller, safety_bits=0x404))
     with pytest.raises(DeviceFault, match="protective stop"):

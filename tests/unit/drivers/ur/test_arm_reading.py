@@ -238,7 +238,7 @@ def test_another_model_is_refused(controller: Controller) -> None:
 
 
 @pytest.mark.parametrize(
-    ("different", "found", "cure"),
+    ("different", "found", "fix"),
     [
         ({"safety_bits": 0x404}, "protective stop", "clear it"),
         ({"safety_bits": 0x4C0, "robot_mode": 3}, "emergency stop", "release the button"),
@@ -252,12 +252,12 @@ def test_another_model_is_refused(controller: Controller) -> None:
         ({"robot_mode": 42}, "unknown", "power the arm on"),
     ],
 )
-def test_every_safety_stop_has_a_cure(reader: Reader, different: dict[str, int], found: str, cure: str) -> None:
+def test_every_safety_stop_has_a_fix(reader: Reader, different: dict[str, int], found: str, fix: str) -> None:
     sample: Sample = replace(reader.look(), **different)  # type: ignore[arg-type]
     fault = sample.safety_fault()
     assert fault is not None
     assert found in fault.found
-    assert cure in fault.cure
+    assert fix in fault.fix
     assert sample.status().fault is not None
 
 

@@ -92,7 +92,7 @@ def test_what_the_library_says_comes_with_a_cure(tmp_path: Path, monkeypatch: py
         control.wait_until_ready(lambda: None)
         with pytest.raises(StreamBroken, match="was lost") as error:
             control.call("progress")
-        assert error.value.cure
+        assert error.value.fix
     finally:
         control.kill()
 

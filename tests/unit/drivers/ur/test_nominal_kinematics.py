@@ -73,7 +73,7 @@ def test_a_pose_moves_a_point_like_a_rotation_and_a_shift(pose: list[float], poi
 
 
 @pytest.mark.parametrize(
-    ("told", "major", "name"),
+    ("reported", "major", "name"),
     [
         ("UR5", 5, "UR5e"),
         ("UR5", 3, "UR5"),
@@ -83,5 +83,5 @@ def test_a_pose_moves_a_point_like_a_rotation_and_a_shift(pose: list[float], poi
         ("UR99", 5, None),
     ],
 )
-def test_model_names(told: str, major: int, name: str | None) -> None:
-    assert model_named(told, major) == name
+def test_model_names(reported: str, major: int, name: str | None) -> None:
+    assert model_named(reported, major) == name

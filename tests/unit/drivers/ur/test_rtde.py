@@ -200,7 +200,7 @@ def test_inputs_of_others_are_told(types: bytes, taken: list[str]) -> None:
     ("replace", "says"),
     [
         ({"V": b""}, "did not answer within 0.2 s"),
-        ({"V": bytes.fromhex("00045600")}, "protocol version 2 is refused"),
+        ({"V": bytes.fromhex("00045600")}, "refuses protocol version 2"),
         ({"V": b"HTTP/1.1 400 Bad Request\r\n"}, "did not answer"),
         ({"V": b"\x00\x01\x00"}, "does not speak RTDE"),
         ({"S": bytes.fromhex("00045300")}, "does not start"),
@@ -231,7 +231,7 @@ def test_the_greeting_has_one_time_out_in_all() -> None:
 def test_nobody_there() -> None:
     with pytest.raises(Unreachable, match="cannot be reached") as error:
         rtde.Subscription("127.83.7.2", OUTPUTS, 125.0, timeout_s=0.5)
-    assert "switched on" in error.value.cure
+    assert "switched on" in error.value.fix
 
 
 @pytest.mark.parametrize(
@@ -252,4 +252,4 @@ def test_each_reason_for_no_connection_has_its_own_fix(
     monkeypatch.setattr(rtde, "_Connection", refuse)
     with pytest.raises(Unreachable) as raised:
         rtde.Subscription("ur5", OUTPUTS, 125.0, timeout_s=0.5)
-    assert fix in raised.value.cure
+    assert fix in raised.value.fix

@@ -117,12 +117,12 @@ def test_old_controllers_do_not_report_it(controller: SubscriptionInMemory, sens
     with pytest.raises(ConnectError) as error:
         sensor.open()
     assert "ft_raw_wrench" in error.value.found
-    assert "5.9" in error.value.cure
+    assert "5.9" in error.value.fix
 
 
 def test_a_wrench_that_is_no_number_ends_the_stream(controller: SubscriptionInMemory, sensor: Wrist) -> None:
     controller.raw = [math.nan] * 6
-    with pytest.raises(ConnectError, match="no wrench"):
+    with pytest.raises(ConnectError, match="not finite"):
         sensor.open()
 
 

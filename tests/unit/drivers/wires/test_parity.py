@@ -85,7 +85,7 @@ def every_change(record: bytes) -> Iterable[bytes]:
 @settings(max_examples=20)
 @given(st.sampled_from(RECORDS) | st.binary(min_size=12, max_size=12).map(lambda b: b + bytes([sum(b) & 0x7F])))
 def test_no_single_damaged_byte_makes_a_record_that_is_believed(record: bytes) -> None:
-    """Either its parity tells, or the sum: of 13 x 255 changes only those of bit 7 pass the sum."""
+    """Either its parity shows it, or the sum: of 13 x 255 changes only those of bit 7 pass the sum."""
     arrived = list(every_change(record))
     on_the_line = b"".join(received(record, other) for other in arrived)
     true, damaged = undone(on_the_line[at : at + 416] for at in range(0, len(on_the_line), 416))

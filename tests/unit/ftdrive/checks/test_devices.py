@@ -346,7 +346,7 @@ FORBIDDEN = Check("permissions.port", "failed", "may not", "sudo usermod")
 
 def wrapped(error: DriverError) -> ConnectError:
     """As a driver raises an error that occurred while it was opened."""
-    outer = ConnectError(error.found, error.cure)
+    outer = ConnectError(error.found, error.fix)
     outer.__cause__ = error
     return outer
 
@@ -373,7 +373,7 @@ def not_opened(found: str, cure: str = "") -> ConnectError:
 @pytest.mark.parametrize("address", [PORT, BY_NETWORK, BY_PCAN])
 def test_the_cure_that_a_message_names_is_the_one_shown(error: DriverError, address: SensorAddress) -> None:
     check = diagnosis.check_sensor_error("sensor.stream", error, address, [ALLOWED])
-    assert check == Check("sensor.stream", "failed", error.found, error.cure)
+    assert check == Check("sensor.stream", "failed", error.found, error.fix)
 
 
 @pytest.mark.parametrize(
@@ -417,7 +417,7 @@ def test_another_cure_is_shown_where_the_way_to_a_sensor_is_wrong_or_its_message
 def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable() -> None:
     error = PortInUse("the port is in use", "end it, `fuser -v /dev/ttyUSB7` names it")
     found = diagnosis.check_sensor_error("sensor.identity", error, PORT, [FORBIDDEN])
-    assert (found.found, found.fix) == (error.found, error.cure)
+    assert (found.found, found.fix) == (error.found, error.fix)
 
 
 @pytest.mark.parametrize(("own", "shown"), [("check the robot", "check the robot"), ("", "ping ur5")])
@@ -429,4 +429,4 @@ def test_the_error_of_an_arm_that_names_no_cure_gets_one(own: str, shown: str) -
 def test_what_a_dashboard_server_says_is_not_lost() -> None:
     error = NoDashboard("ur5 says: Timeout connecting", "enable the dashboard server")
     check = diagnosis.check_unreachable(error, "ur5")
-    assert (check.found, check.fix) == (error.found, error.cure)
+    assert (check.found, check.fix) == (error.found, error.fix)
