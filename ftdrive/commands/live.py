@@ -52,8 +52,9 @@ class Look:
 @click.option(
     "--calibration",
     "path",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="FILE; with --simulate one is made first where none is given.",
+    metavar="PATH",
+    type=click.Path(exists=True, path_type=Path),
+    help="A calibration.json or its run folder. With --simulate the default is a new one.",
 )
 @CELL
 @simulate("An emulated cell: that which the calibration is of, or that of --sensor emulated://NAME.")
@@ -80,6 +81,8 @@ def live(
     the sensor's origin, along the axes asked for. The arm is only read, never moved. With --json, one object a line.
     """
     check_simulate(simulate, real={"--config": config, "--robot": robot, "--replay": replay})
+    if path is not None and path.is_dir():
+        path = Run(path).calibration_path
     calibration = None if path is None else CalibrationResult.load(path)
     with ExitStack() as stack:
         if simulate:

@@ -25,12 +25,10 @@ from calib.routine import DriftCheck
 from ftdrive.errors import Declined
 from ftdrive.session.events import (
     Asked,
-    Checked,
     Estimated,
     Event,
     GuardTripped,
     Noted,
-    Planned,
     PoseTaken,
     RunOpened,
     State,
@@ -40,17 +38,9 @@ from ftdrive.session.live_fit import GREEN
 from ftdrive.session.operator import Key, Operator, Question
 from ftdrive.terminal.console import hanging, talk
 from ftdrive.terminal.keyboard import Keyboard
-from ftdrive.terminal.operators import (
-    JsonOperator,
-    PlainOperator,
-    head_and_words,
-    in_words,
-    match,
-    prompt,
-    read_line,
-    rms_sigma,
-)
+from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, prompt, read_line
 from ftdrive.terminal.report import drift_in_words
+from ftdrive.terminal.session_text import Line, SessionText, in_words, rms_sigma
 
 Array = NDArray[np.float64]
 
@@ -72,10 +62,12 @@ _FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _CUBE_WIDTH = 25
 _NUMBER_WIDTH = 9
 _TABLE_WIDTH = 53
+_NARROWEST_BAR = 8
 _ROUNDED = 1e-9
 """A standard deviation below this, N or N·m, is one of rounding: what it belongs to is no part of the fit."""
 _ASCII = str.maketrans(
-    dict(zip("┌┐└┘├┤┬┴┼─│", "+++++++++-|", strict=True)) | {"±": "+-", "°": " deg", "·": ".", "…": "~"}
+    dict(zip("┌┐└┘├┤┬┴┼─│━", "+++++++++-|=", strict=True))
+    | {"±": "+-", "°": " deg", "·": ".", "…": "~", "✔": "ok", "✘": "FAIL"}
 )
 
 
@@ -160,7 +152,7 @@ def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Gro
 
 def _title(view: View, now_s: float, width: int) -> Text:
     times_s = sorted(at_s for _, at_s in view.taken.values())
-    kept = max(len(view.taken), view.estimated.poses if view.estimated else 0)  # those of a resumed run were not told
+    kept = max(len(view.taken), view.estimated.poses if view.estimated else 0)  # more if resumed
     right = f"{kept} kept"
     left = view.last.stops - kept if view.last else 0
     if len(times_s) > 2 and left > 0:
@@ -168,7 +160,14 @@ def _title(view: View, now_s: float, width: int) -> Text:
         rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)  # nothing goes on in a hold
         right += f", about {_minutes(rest_s)} left"
     name = "ftdrive calibrate"
-    return Text.assemble((name, "bold"), " " * max(width - len(name) - len(right), 2), right)
+    room = width - len(name) - len(right)
+    if view.last is None or room < _NARROWEST_BAR + 4:
+        return Text.assemble((name, "bold"), " " * max(room, 2), right)
+    done = min(kept / view.last.stops, 1.0)
+    filled = round((room - 4) * done)
+    return Text.assemble(
+        (name, "bold"), "  ", ("━" * filled, "green"), ("━" * (room - 4 - filled), "bright_black"), "  ", right
+    )
 
 
 def _state(view: View, now_s: float, width: int) -> list[Text]:
@@ -307,7 +306,7 @@ def _keys(view: View) -> list[Text]:
     end = "Ctrl-C ends, poses are kept" if view.folder else "Ctrl-C ends"
     if view.keys != "live":
         return [Text(f"Enter sends the answer; {end}", "dim")] if view.keys == "asking" else []
-    useful: set[Key] = set()  # before and after the poses nobody listens
+    useful: set[Key] = set()  # before and after the poses no key is read
     if view.now is not None and view.now.stop is not None:
         useful = set(KEYS) if view.now.stops is None else set(KEYS) - {Key.KEEP}  # by hand there is no last one
     line = Text()
@@ -339,7 +338,7 @@ def _folded(view: View, text: str, width: int, style: str = "") -> list[Text]:
 
 
 def _end_of(text: str, width: int) -> str:
-    """Shorten a path at its beginning: the end tells runs apart."""
+    """Shorten a path at its beginning: its end distinguishes runs."""
     return text if len(text) <= width else "…" + text[len(text) - width + 1 :]
 
 
@@ -355,7 +354,9 @@ class Screen:
     console : rich Console
         Where it is drawn; a terminal.
     keyboard : Keyboard, optional
-        None: no keys; questions are answered by lines all the same.
+        Without it there are no keys; questions are still answered by lines.
+    verbose : bool
+        Print every check, the table of the plan and each pose above the frame.
     """
 
     def __init__(
@@ -364,11 +365,13 @@ class Screen:
         keyboard: Keyboard | None = None,
         *,
         stdin: TextIO | None = None,
+        verbose: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._console, self._keyboard, self._stdin = console, keyboard, stdin or sys.stdin
         self._clock = clock
         self._view = View()
+        self._text = SessionText(verbose=verbose, poses=False)
         self._lock = RLock()
         self._live = self._new_live()
         self._stack = ExitStack()
@@ -386,19 +389,22 @@ class Screen:
     ) -> None:
         self._view.keys = "over"
         with self._stack:
+            self._print(self._text.pending())
+            self._live.transient = kind is None  # after an error the frame stays: it has the command to resume
             self._live.stop()
+        if kind is None and self._view.folder:
+            self._print([Line(" ✔ ", f"{len(self._view.taken)} averages kept in {self._view.folder}", "green")])
 
     def show(self, event: Event) -> None:
         """Show an event."""
         with self._lock:
             self._view.update(event, self._clock())
-        head, words = head_and_words(event)
-        if words and _history(event, self._view):
-            style = "bold red" if isinstance(event, GuardTripped) else ""
-            self._console.print(hanging(head, self._plain(words), self._console), style=style)
+        if _history(event, self._view):
+            self._print(self._text.lines(event))
 
     def ask(self, question: Question) -> str:
-        """Ask below the frame, which stands still meanwhile."""
+        """Ask below the frame, which is not redrawn until the answer is there."""
+        self._print(self._text.pending())
         self._view.keys = "asking"
         self._live.stop()
         with self._keyboard.suspended() if self._keyboard is not None else nullcontext():
@@ -417,6 +423,11 @@ class Screen:
         """Take the oldest key that was pressed and not yet taken."""
         return None if self._keyboard is None else self._keyboard.pressed()
 
+    def _print(self, lines: Sequence[Line]) -> None:
+        for line in lines:
+            head = self._plain(line.head)
+            self._console.print(hanging(head, self._plain(line.words), self._console), style=line.style)
+
     def _new_live(self) -> Live:
         return Live(console=self._console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
 
@@ -432,7 +443,7 @@ class Screen:
             try:
                 typed = read_line(self._stdin, question)
             except (KeyboardInterrupt, Declined):
-                self._console.file.write("\n")  # what is told next begins a line
+                self._console.file.write("\n")  # the next message begins on a new line
                 raise
             used += len(lines) + (last.cell_len + 1 + cell_len(typed.rstrip("\n"))) // width + 1
             if (answer := match(question, typed)) is not None:
@@ -457,27 +468,34 @@ class Screen:
 
 
 def _history(event: Event, view: View) -> bool:
-    """Tell whether an event is worth a line above the frame."""
-    if isinstance(event, StateChanged):
-        return event.state is State.HOLD and event.words not in view.note  # which stands there already
-    if isinstance(event, Asked):
-        return event.answer != ""
-    return isinstance(event, Checked | Noted | Planned | PoseTaken | GuardTripped)
+    """Whether an event is printed above the frame, where the frame does not show it already."""
+    match event:
+        case StateChanged():
+            return event.state is State.HOLD and event.words not in view.note
+        case Asked():
+            return event.answer != ""
+        case Estimated():
+            return False
+        case _:
+            return True
 
 
 @contextmanager
 def open_operator(*, as_json: bool = False) -> Iterator[Operator]:
-    """Give the operator that fits: JSON where asked for, a live screen at a terminal, else plain lines.
+    """Choose the operator: JSON if requested, a live screen in a terminal, otherwise plain lines.
 
-    The screen goes to stderr, like everything said to a person; a dumb terminal gets plain lines, and so does who wants
-    it quiet.
+    The screen is drawn on stderr. A dumb terminal and `-q` get plain lines.
     """
     if as_json:
         yield JsonOperator()
         return
     if talk.quiet or not talk.is_terminal or talk.is_dumb_terminal or not os.isatty(0):
-        yield PlainOperator(quiet=talk.quiet)
+        operator = PlainOperator(quiet=talk.quiet, verbose=talk.verbose)
+        try:
+            yield operator
+        finally:
+            operator.finish()
         return
     keyboard = Keyboard(0) if Keyboard.usable(0) else None
-    with Screen(talk, keyboard) as screen:
+    with Screen(talk, keyboard, verbose=talk.verbose) as screen:
         yield screen
