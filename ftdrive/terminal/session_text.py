@@ -47,7 +47,6 @@ class SessionText:
     def __init__(self, *, verbose: bool = False, poses: bool = True) -> None:
         self._verbose, self._poses = verbose, verbose or poses
         self._sections = list[str]()
-        self._starting = False
         self._passed = list[str]()
 
     def lines(self, event: Event) -> list[Line]:
@@ -92,10 +91,7 @@ class SessionText:
                 return []
             case Estimated(hint="") if not self._verbose:
                 return []
-            case Noted(warning=False) if self._starting and not self._sections and not self._verbose:
-                return []  # how the computer is kept awake
             case StateChanged(state=State.PREFLIGHT | State.CLOSE, words="") if not self._verbose:
-                self._starting = True
                 return []
         head, words = head_and_words(event)
         if not words:

@@ -28,8 +28,8 @@ def test_the_run_of_a_demo_is_solved_by_another_method(demo: dict[str, Any], ftd
 @pytest.mark.parametrize("source", ["--simulate", "--replay"])
 def test_the_calibration_of_a_demo_compensates_live(source: str, demo: dict[str, Any], ftdrive: CommandLine) -> None:
     run = Path(demo["run"])
-    wrenches = [source] if source == "--simulate" else [source, run]
-    look = ftdrive.json("live", "--calibration", run / "calibration.json", *wrenches, "--once", "--axes", "base")
+    wrenches, path = ([source], run) if source == "--simulate" else ([source, run], run / "calibration.json")
+    look = ftdrive.json("live", "--calibration", path, *wrenches, "--once", "--axes", "base")
     assert look["about"] == "sensor origin"
     for key, limit in (("force_N", 0.05), ("torque_Nm", 0.005)):
         assert np.abs(look["compensated"][key]).max() < limit
