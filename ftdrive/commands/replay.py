@@ -1,4 +1,4 @@
-"""`ftdrive replay`: a recorded run once more, through the same routine and solver, without any driver."""
+"""`ftdrive replay`: a recorded run, repeated by the same routine and solver without a driver."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -26,11 +26,11 @@ from ftdrive.terminal.report import print_result
 
 @click.command()
 @click.argument("folder", metavar="RUN", required=False, type=click.Path(exists=True, file_okay=False, path_type=Path))
-@simulate("Record a short run of an emulated cell first, and repeat that.")
+@simulate("Record a short run of an emulated cell, then repeat it.")
 @EMULATED_SENSOR
 @JSON
 def replay(folder: Path | None, simulate: bool, sensor: str | None, as_json: bool) -> None:
-    """Repeat the recorded RUN and compare the result with the one it saved: they must agree to the last digit."""
+    """Repeat the recorded RUN and compare the result with the saved one: they must be equal to the last digit."""
     check_simulate(simulate, real={"RUN": folder}, emulated={"--sensor": sensor})
     if simulate:
         with rehearsed_run(sensor) as recorded:
@@ -38,7 +38,7 @@ def replay(folder: Path | None, simulate: bool, sensor: str | None, as_json: boo
     elif folder is not None:
         _repeat(Run(folder), as_json)
     else:
-        raise ConfigError("which run? Give its folder, or --simulate")
+        raise ConfigError("no run: give its folder, or --simulate")
 
 
 def _repeat(run: Run, as_json: bool) -> None:

@@ -6,6 +6,7 @@ Runs the real command in tmux, copies its screen about once a second, and draws 
 import re
 import subprocess
 import time
+from io import StringIO
 from pathlib import Path
 
 from rich.console import Console
@@ -62,7 +63,7 @@ def chosen(found: list[str]) -> list[str]:
 
 def svg(strip: list[str]) -> str:
     """Draw all screens in one column; the animation shows one at a time. Without animation the last one is shown."""
-    console = Console(width=COLUMNS, record=True, file=Path("/dev/null").open("w"), force_terminal=True)
+    console = Console(width=COLUMNS, record=True, file=StringIO(), force_terminal=True)
     for screen in strip:
         lines = screen.split("\n")[:ROWS]
         for line in [*lines, *[""] * (ROWS - len(lines))]:
