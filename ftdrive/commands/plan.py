@@ -128,9 +128,7 @@ def plan(
     if not described:  # described by options, or nothing but arm and mounting
         cell = replace(cell, workcell=replace(cell.workcell, measured=True))
     if not cell.workcell.measured:
-        talk.print(
-            f"{', '.join(sorted(described))} has placeholders (measured = false): this plan is for the eye only."
-        )
+        talk.print(f"Placeholders in {', '.join(sorted(described))} (measured = false): this plan is for the eye only.")
     certifier = certifier_for(cell, cell.robot.model)
     q_rad = np.array([*np.radians(numbers("--posture", posture, ",", (3,))), *USUAL_POSTURE_RAD[3:]])
     made = plan_for(

@@ -1,5 +1,6 @@
 """The demo recovers the truth within its own sigmas, and its run can be replayed, solved again and shown live."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -35,3 +36,15 @@ def test_the_calibration_of_a_demo_compensates_live(source: str, demo: dict[str,
         assert np.abs(look["compensated"][key]).max() < limit
         assert np.abs(np.divide(look["compensated"][key], look["sigma"][key])).max() < 5
     assert np.linalg.norm(look["raw"]["force_N"]) > 1
+
+
+def test_the_python_of_the_readme_runs(
+    demo: dict[str, Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(Path(demo["run"]).parents[1])
+    exec(program, {})
+    verdict, left = capsys.readouterr().out.splitlines()
+    assert verdict.startswith("good: ")
+    assert float(left.split()[-2]) < 0.05
