@@ -20,7 +20,7 @@ from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.runs.replay_source import RecordedRun
 from ftdrive.runs.run import Run
 from ftdrive.session import solve_records
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import hanging, talk
 from ftdrive.terminal.report import print_result
 
 
@@ -49,7 +49,8 @@ def _repeat(run: Run, as_json: bool) -> None:
         recorded.go_on_to(kept.pose.q_rad)
         again = take_pose(recorded, recorded, kept.stop, kept.pose, sampling)
         records.append(replace(again, clock_offset_ns=kept.clock_offset_ns))
-        talk.print(f"{kept.stop:2d}  R{kept.pose.number:02d}  {len(kept.samples.t_host_ns)} samples")
+        if talk.verbose:
+            talk.print(f"{kept.stop:2d}  R{kept.pose.number:02d}  {len(kept.samples.t_host_ns)} samples")
     outcome = solve_records(run, records)
     if as_json:
         write_json(outcome.result.to_dict())
@@ -58,7 +59,7 @@ def _repeat(run: Run, as_json: bool) -> None:
     stop_unless_accepted(outcome.result)
     if run.calibration_path.exists():
         _compare(outcome.result, CalibrationResult.load(run.calibration_path))
-        talk.print(f" Equal to {run.calibration_path}, to the last digit")
+        talk.print(hanging(" ✔ ", f"equal to the last digit: {run.calibration_path}"))
 
 
 def _compare(again: CalibrationResult, saved: CalibrationResult) -> None:

@@ -399,8 +399,7 @@ class Screen:
         """Show an event."""
         with self._lock:
             self._view.update(event, self._clock())
-        if _history(event, self._view):
-            self._print(self._text.lines(event))
+        self._print(self._text.lines(event) if _history(event, self._view) else self._text.pending())
 
     def ask(self, question: Question) -> str:
         """Ask below the frame, which is not redrawn until the answer is there."""

@@ -55,10 +55,10 @@ class SessionText:
             heading = [] if self._passed else self._heading("Checks")
             self._passed.append(event.name)
             return heading
-        body = self._body(event)
+        body, waiting = self._body(event), self.pending()
         if not body and not isinstance(event, RunOpened):
-            return []
-        return self.pending() + self._heading_before(event) + body
+            return waiting
+        return waiting + self._heading_before(event) + body
 
     def pending(self) -> list[Line]:
         """Return the line of the checks that have passed so far."""
@@ -101,6 +101,8 @@ class SessionText:
             style = "bold red"
         elif isinstance(event, Noted) and event.warning:
             style = "yellow"
+        elif isinstance(event, StateChanged) and event.state is State.HOLD:
+            style = "bold yellow"
         return [Line(f" {head}" if head.strip() else "   ", words, style)]
 
 
@@ -144,7 +146,8 @@ def head_and_words(event: Event) -> tuple[str, str]:
         case GuardTripped():
             return "", f"STOPPED by guard {event.hazard}: {event.words}"
         case Asked():
-            return "", f"{event.question} {event.answer}{' (--yes)' if event.by == '--yes' else ''}"
+            colon = "" if event.question.endswith("?") else ":"
+            return "", f"{event.question}{colon} {event.answer}{' (--yes)' if event.by == '--yes' else ''}"
         case _:
             return "", ""
 
