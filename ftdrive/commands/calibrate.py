@@ -1,8 +1,7 @@
 """`ftdrive calibrate`: a guided calibration."""
 
-from collections.abc import Collection
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,23 +96,7 @@ def calibrate(
     from ftdrive.terminal.report import print_result
     from ftdrive.terminal.screen import open_operator
 
-    given = {
-        "--step": step,
-        "--manual": manual,
-        "--listen": listen,
-        "--quick": quick,
-        "--minimal": minimal,
-        "--output": output,
-        "--png": png,
-        "--view": view,
-        "--plan": plan,
-        "--resume": resume,
-        "--simulate": simulate,
-        "--config": config,
-        "--robot": robot,
-        "--tool": tool,
-    }
-    _refuse_contradictions([option for option, value in given.items() if value])
+    _refuse_contradictions(click.get_current_context())
     mode: Mode = "step" if step else "manual" if manual else "listen" if listen else "auto"
     with ExitStack() as stack:
         description: dict[str, Any] = {}
@@ -126,7 +109,7 @@ def calibrate(
             description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
         else:
             said = Said(str(config.absolute()) if config else None, robot, sensor, tool)
-            description = {"said": said.to_dict()}
+            description = {"said": asdict(said)}
             cell = said.cell() if resume is None else _cell_to_resume(resume, said)
         options = Options(
             runs,
@@ -165,9 +148,10 @@ def calibrate(
     stop_unless_accepted(outcome.result, to_be_saved=True)
 
 
-def _refuse_contradictions(given: Collection[str]) -> None:
+def _refuse_contradictions(context: click.Context) -> None:
     from ftdrive.errors import ConfigError
 
+    given = [f"--{name.replace('_', '-')}" for name, value in context.params.items() if value]
     for group in _EXCLUDE_ONE_ANOTHER:
         both = [option for option in group if option in given]
         if len(both) > 1:
@@ -182,10 +166,6 @@ class Said:
     robot: str | None = None
     sensor: str | None = None
     tool: tuple[str, ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what run.json keeps."""
-        return {"config": self.config, "robot": self.robot, "sensor": self.sensor, "tool": list(self.tool)}
 
     def settings(self) -> dict[str, Any]:
         """Return options, environment and files, in this order of precedence; see `cell.config.settings`."""
@@ -216,7 +196,7 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
     from ftdrive.terminal.console import talk
 
     header = Run(folder).header()
-    begun: dict[str, Any] = {**Said().to_dict(), **header.get("said", {})}
+    begun: dict[str, Any] = {**asdict(Said()), **header.get("said", {})}
     if begun["config"] is not None and not Path(begun["config"]).is_file():
         begun["config"] = None
     said = Said(

@@ -48,7 +48,17 @@ def read_line(stdin: TextIO, question: Question) -> str:
     return line
 
 
-class JsonOperator:
+class _Keyless:
+    """An operator without keys: SIGINT stops a session."""
+
+    has_keys = False
+
+    def pressed(self) -> Key | None:
+        """Return None."""
+        return None
+
+
+class JsonOperator(_Keyless):
     """One JSON object a line on stdout: every event, and every question before it is answered from stdin.
 
     A question is the object `{"event": "question", "text", "answers", "error"}`. The next line of stdin is its answer.
@@ -81,15 +91,6 @@ class JsonOperator:
                 return answer
             error = f"'{typed.strip()}' is none of the answers"
 
-    @property
-    def has_keys(self) -> bool:
-        """False: there are no keys."""
-        return False
-
-    def pressed(self) -> Key | None:
-        """Return None: a script stops a session with SIGINT."""
-        return None
-
     def _write(self, value: Mapping[str, Any]) -> None:
         line = json.dumps(value, allow_nan=False) + "\n"
         with self._lock:
@@ -97,7 +98,7 @@ class JsonOperator:
             self._stdout.flush()
 
 
-class PlainOperator:
+class PlainOperator(_Keyless):
     """Plain lines on stderr, without colour and without keys.
 
     Parameters
@@ -149,15 +150,6 @@ class PlainOperator:
     def finish(self) -> None:
         """Write the checks that wait for others on their line."""
         self._write_lines(self._text.pending())
-
-    @property
-    def has_keys(self) -> bool:
-        """False: there are no keys."""
-        return False
-
-    def pressed(self) -> Key | None:
-        """Return None: Ctrl-C stops a session."""
-        return None
 
     def _write_lines(self, lines: Sequence[Line]) -> None:
         if self._quiet:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ftdrive.commands import reference
+from tests.house import commands_page
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -23,8 +23,8 @@ def test_checker_is_content(command: list[str]) -> None:
 
 
 def test_the_page_of_commands_is_up_to_date() -> None:
-    assert reference.PAGE.read_text(encoding="utf-8") == reference.page(), (
-        "an option has changed: uv run python -m ftdrive.commands.reference"
+    assert commands_page.PAGE.read_text(encoding="utf-8") == commands_page.page(), (
+        "an option has changed: uv run python tests/house/commands_page.py"
     )
 
 

@@ -1,4 +1,4 @@
-"""Write README.md of this folder from the commands themselves: `python -m ftdrive.commands.reference`."""
+"""Write `ftdrive/commands/README.md` from the commands: `uv run python tests/house/commands_page.py`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,12 +7,12 @@ import click
 
 from ftdrive.cli import cli
 
-PAGE = Path(__file__).with_name("README.md")
+PAGE = Path(__file__).parents[2] / "ftdrive/commands/README.md"
 
 _HEAD = """\
 # Commands
 
-This page is generated: run `uv run python -m ftdrive.commands.reference` after a change of an option. A module here
+This page is generated: run `uv run python tests/house/commands_page.py` after a change of an option. A module here
 reads the options of one command, makes one call and prints text or JSON. Configuration, exit codes and file formats are
 described in [../README.md](../README.md).
 """
