@@ -85,9 +85,7 @@ def live(
     along the chosen axes. The arm is only read, never moved. With --json, one object per line.
     """
     check_simulate(simulate, real={"--config": config, "--robot": robot, "--replay": replay})
-    if path is not None and path.is_dir():
-        path = Run(path).calibration_path
-    calibration = None if path is None else CalibrationResult.load(path)
+    calibration = None if path is None else _load(path)
     with ExitStack() as stack:
         if simulate:
             calibration, cell = _emulated(calibration, sensor, stack)
@@ -118,6 +116,10 @@ def live(
                     shown = _screen(_reading(look, calibration, beyond, axes), made)
                     screen.update(Group(shown, "Ctrl-C ends"))
                 screen.update(Group(shown, "The recording has ended."))
+
+
+def _load(path: Path) -> CalibrationResult:
+    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path)
 
 
 def _emulated(

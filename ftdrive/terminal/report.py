@@ -55,35 +55,8 @@ def print_result(
     saved : Path, optional
         The calibration file, printed in the last line.
     """
-    data = result.to_dict()
     talk.print(Text.assemble(("Result", "bold cyan"), f"  {result.n_poses} poses, method {result.method}"))
-    errors = {} if truth is None else errors_in_sigma(result, truth)
-    fixed_below = _ROUNDED * float(np.sqrt(np.diag(result.covariance).max()))
-    table = Table(box=None, padding=(0, 1))
-    for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
-        if truth is not None or title not in {"truth", "error / sigma"}:
-            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may be folded
-    for label, scale, unit, key in _ROWS:
-        if key in _DERIVED and not talk.verbose:
-            continue
-        estimates, sigmas = (_values(source[key], key) * scale for source in (data, data["sigma"]))
-        truths = None if truth is None else _values(truth[key], key) * scale
-        fixed = sigmas <= fixed_below * scale
-        least = sigmas[~fixed].min(initial=np.inf)
-        # two digits of the smallest sigma
-        digits = 4 if fixed.all() else int(np.clip(1 - np.floor(np.log10(max(least, 1e-9))), 0, 7))
-        for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
-            spread = "fixed" if fixed[i] else f"{sigmas[i]:.{digits}f}"
-            cells: list[str | Text] = [
-                f"{label} {axis}".strip() + f", {unit}",
-                f"{estimates[i]:.{digits}f}",
-                spread,
-            ]
-            if truths is not None:
-                cells.insert(1, f"{truths[i]:.{digits}f}")
-                cells.append(Text(f"{errors[key][i]:+.1f}", _error_style(errors[key][i])))
-            table.add_row(*cells)
-    talk.print(table)
+    talk.print(_table(result, truth))
     talk.print(
         hanging(
             Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  "),
@@ -109,6 +82,32 @@ def print_result(
             talk.print(hanging(" ? ", hint), style="yellow")
     if saved is not None:
         talk.print(f" Saved {saved}")
+
+
+def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
+    data = result.to_dict()
+    errors = {} if truth is None else errors_in_sigma(result, truth)
+    fixed_below = _ROUNDED * float(np.sqrt(np.diag(result.covariance).max()))
+    table = Table(box=None, padding=(0, 1))
+    for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
+        if truth is not None or title not in {"truth", "error / sigma"}:
+            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may be folded
+    for label, scale, unit, key in _ROWS:
+        if key in _DERIVED and not talk.verbose:
+            continue
+        estimates, sigmas = (_values(source[key], key) * scale for source in (data, data["sigma"]))
+        truths = None if truth is None else _values(truth[key], key) * scale
+        fixed = sigmas <= fixed_below * scale
+        least = sigmas[~fixed].min(initial=np.inf)
+        # two digits of the smallest sigma
+        digits = 4 if fixed.all() else int(np.clip(1 - np.floor(np.log10(max(least, 1e-9))), 0, 7))
+        for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
+            spread = "fixed" if fixed[i] else f"{sigmas[i]:.{digits}f}"
+            known = [] if truths is None else [f"{truths[i]:.{digits}f}"]
+            error = [Text(f"{errors[key][i]:+.1f}", _error_style(errors[key][i]))] if known else []
+            name = f"{label} {axis}".strip() + f", {unit}"
+            table.add_row(name, *known, f"{estimates[i]:.{digits}f}", spread, *error)
+    return table
 
 
 def _error_style(error_sigma: float) -> str:

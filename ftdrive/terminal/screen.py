@@ -1,4 +1,4 @@
-"""The live screen of a session: where it stands, what it knows by now, what it lacks, and the keys."""
+"""The live screen of a session: state, progress, estimates, coverage, keys."""
 
 import os
 import sys
@@ -47,7 +47,7 @@ Array = NDArray[np.float64]
 REFRESH_HZ = 4
 KEYS = {Key.KEEP: "finish", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "stop"}
 
-# Label and unit, factor from SI to it, name; and what goes first where there is no room, see `frame`.
+# Label and unit, factor from SI, name, and rank in `frame`: higher ranks are omitted first.
 _ROWS = (
     ("mass kg", 1.0, "mass_kg", 1),
     ("centre mm", 1e3, "p_sensor_com_m", 2),
@@ -64,7 +64,7 @@ _NUMBER_WIDTH = 9
 _TABLE_WIDTH = 53
 _NARROWEST_BAR = 8
 _ROUNDED = 1e-9
-"""A standard deviation below this, N or N·m, is one of rounding: what it belongs to is no part of the fit."""
+"""A standard deviation below this, N or N·m, comes from rounding: its value was not fitted."""
 _ASCII = str.maketrans(
     dict(zip("┌┐└┘├┤┬┴┼─│━", "+++++++++-|=", strict=True))
     | {"±": "+-", "°": " deg", "·": ".", "…": "~", "✔": "ok", "✘": "FAIL"}
@@ -73,11 +73,11 @@ _ASCII = str.maketrans(
 
 @dataclass
 class View:
-    """What the screen knows."""
+    """The state that the screen draws."""
 
     now: StateChanged | None = None
     since_s: float = 0.0
-    """When the state began, of the clock that `frame` is given."""
+    """Start of the state, in the clock of `frame`."""
     folder: str = ""
     resume: str = ""
     taken: dict[int, tuple[PoseTaken, float]] = field(default_factory=dict)
@@ -88,12 +88,12 @@ class View:
     note: str = ""
     waiting: tuple[Key, ...] = ()
     ascii_only: bool = False
-    """Whether the terminal knows nothing else."""
+    """The terminal's encoding is ASCII."""
     keys: Literal["live", "asking", "over"] = "live"
-    """Whether keys do anything now."""
+    """Whether keys are read now."""
 
     def update(self, event: Event, now_s: float) -> None:
-        """Take an event in."""
+        """Update the state from an event."""
         match event:
             case RunOpened():
                 self.folder, self.resume = event.folder, event.resume
@@ -107,7 +107,7 @@ class View:
                 self.note = in_words(event)
 
     def shown(self, text: str) -> str:
-        """Replace what the terminal's encoding lacks; before anything is measured or cut, for it gets longer."""
+        """Replace what the terminal's encoding lacks, which lengthens the text: call it before measuring or cutting."""
         return text.translate(_ASCII) if self.ascii_only else text
 
     def _take(self, event: PoseTaken, now_s: float) -> None:
@@ -122,7 +122,7 @@ class View:
 def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Group:
     """Draw the screen: never wider than `width`, never higher than `height` less one line for the cursor.
 
-    Blocks of lines go by their number where there is not enough room, the highest first; those of 0 stay.
+    If there is not enough room, blocks are omitted, the highest rank first. Blocks of rank 0 stay.
     """
     wide = width >= _TABLE_WIDTH + 1 + _CUBE_WIDTH
     blocks: list[tuple[int, list[Text]]] = [(0, [_title(view, now_s, width), *_state(view, now_s, width)])]
@@ -156,8 +156,8 @@ def _title(view: View, now_s: float, width: int) -> Text:
     right = f"{kept} kept"
     left = view.last.stops - kept if view.last else 0
     if len(times_s) > 2 and left > 0:
-        usual_s = median(b - a for a, b in pairwise(times_s))  # a stop with questions is not usual
-        rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)  # nothing goes on in a hold
+        usual_s = median(b - a for a, b in pairwise(times_s))  # a stop with questions takes longer than usual
+        rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)  # a hold does not shorten the rest
         right += f", about {_minutes(rest_s)} left"
     name = "ftdrive calibrate"
     room = width - len(name) - len(right)
@@ -175,7 +175,7 @@ def _state(view: View, now_s: float, width: int) -> list[Text]:
     if now is None:
         return [Text("starting")]
     if view.keys == "asking" and now.state in {State.MOVE, State.SETTLE, State.SAMPLE}:
-        return [Text("WAITS for an answer", "bold cyan")]  # what was done before is over
+        return [Text("WAITS for an answer", "bold cyan")]  # the motion before the question is over
     line = Text()
     if now.stop is not None:
         line.append(f"pose {now.stop}/{now.stops}" if now.stops is not None else f"pose {now.stop}", "bold")
@@ -213,7 +213,7 @@ def _last(view: View) -> list[Text]:
 
 
 def _estimates(view: View, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
-    """Estimates at the left; the cube beside them, or its counts in a line below."""
+    """Return the estimates, with the cube beside them or its counts in a line below."""
     fit = view.estimated
     rows = [Text(f"{'estimate':<13}{'':27}{'± 1 sigma':>12}", "dim")]
     rows += [_estimate(fit, label, factor, name) for label, factor, name, _ in _ROWS]
@@ -247,7 +247,7 @@ def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Te
 
 
 def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
-    """Unfold the cube of the flange axes: how many poses had gravity along each."""
+    """Draw the unfolded cube of the flange axes, with the number of poses that had gravity along each."""
     face = None
     if newest is not None:
         axis = int(np.abs(newest).argmax())
@@ -347,12 +347,12 @@ def _minutes(seconds: float) -> str:
 
 
 class Screen:
-    """An operator at a terminal: the frame below, what happened above it, questions in between.
+    """An operator at a terminal: messages scroll above a frame, questions are asked below it.
 
     Parameters
     ----------
     console : rich Console
-        Where it is drawn; a terminal.
+        A terminal.
     keyboard : Keyboard, optional
         Without it there are no keys; questions are still answered by lines.
     verbose : bool
@@ -409,17 +409,17 @@ class Screen:
         with self._keyboard.suspended() if self._keyboard is not None else nullcontext():
             answer = self._answer(question)
         self._view.keys = "live"
-        self._live = self._new_live()  # the old one would erase as many lines as it had drawn
+        self._live = self._new_live()  # the old one would erase the lines of its last frame
         self._live.start(refresh=True)
         return answer
 
     @property
     def has_keys(self) -> bool:
-        """Whether the terminal's keys are ours."""
+        """Whether keys are read."""
         return self._keyboard is not None
 
     def pressed(self) -> Key | None:
-        """Take the oldest key that was pressed and not yet taken."""
+        """Return the oldest unread key, or None."""
         return None if self._keyboard is None else self._keyboard.pressed()
 
     def _print(self, lines: Sequence[Line]) -> None:
@@ -431,7 +431,7 @@ class Screen:
         return Live(console=self._console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
 
     def _answer(self, question: Question) -> str:
-        """Ask until there is an answer, then take questions and frame away: the next one is drawn in their place."""
+        """Ask until there is an answer, then erase question and frame: the next frame is drawn in their place."""
         used = len(self._frame().renderables)
         while True:
             width = self._console.width

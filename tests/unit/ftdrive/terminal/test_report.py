@@ -107,6 +107,17 @@ def test_too_few_poses_to_do_without_what_is_known_blame_nothing() -> None:
     assert not any("given as known" in reason for reason in solve(few, known=known).reasons)
 
 
+def test_beside_the_truth_the_report_says_what_a_free_tool_reads(capsys: pytest.CaptureFixture[str]) -> None:
+    result = solve(tilted())
+    print_result(result, truth=result.to_dict())
+    printed = capsys.readouterr().err
+    (words,) = re.findall(r"a free tool reads (0\.0000) N, 0\.00000 N·m rms; before (.*) N, 0\.\d\d N·m", printed)
+    weight_and_bias_N = np.hypot(np.linalg.norm(TILTED.gravity_force_base_N), np.linalg.norm(TILTED.force_bias_N))
+    assert float(words[1]) == pytest.approx(weight_and_bias_N, rel=0.02)
+    assert printed.count(" +0.0\n") + printed.count(" +0.0 \n") == 15
+    assert "residuals" not in printed, "details are for -v and for findings"
+
+
 def terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
     state: Any = {"_force_terminal": True, "_width": width, "_height": 25, "_color_system": None, "soft_wrap": False}
     for name, value in state.items():
