@@ -109,12 +109,13 @@ class SessionText:
 def plan_in_brief(plan: Plan) -> tuple[str, str]:
     """Describe a plan in two lines: its moves and clearance, and the room to keep free."""
     nearest = min(plan.steps, key=lambda step: step.clearance_m)
-    count, seconds = len(plan.steps), sum(step.duration_s for step in plan.steps)
-    proven = "all proven clear" if plan.certified else "NOT ALL PROVEN CLEAR"
+    count = len(plan.steps)
+    clear = f"{1e3 * nearest.clearance_m:.0f} mm"
+    proven = f"proven clear by {clear}" if plan.certified else f"NOT ALL PROVEN CLEAR (nearest: {clear})"
     moving = "only the wrist moves" if plan.arm_rests else "the whole arm moves"
     room = "" if plan.arm_rests else ", and the room of the whole arm"
     return (
-        f"{count} poses, {proven} by {1e3 * nearest.clearance_m:.0f} mm; {moving}, for {seconds:.0f} s",
+        f"{count} poses, {count} moves {proven}; {moving}",
         f"keep free: ball of {plan.ball_m:.2f} m around {point_in_words(plan)}{room}",
     )
 

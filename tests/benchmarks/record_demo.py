@@ -39,8 +39,8 @@ STRIP = """\
 
 def screens() -> list[str]:
     """Run the demo; return its distinct screens with their colours, the last one when the prompt is back."""
-    command = "uv run ftdrive demo; echo READY; sleep 60"
-    subprocess.run([*TMUX, "new-session", "-d", "-x", str(COLUMNS), "-y", str(ROWS), f"sh -c '{command}'"], check=True)
+    command = 'echo "$ uv run ftdrive demo"; uv run -q ftdrive demo; printf READY; sleep 60'
+    subprocess.run([*TMUX, "new-session", "-d", "-x", str(COLUMNS), "-y", str(ROWS), command], check=True)
     found: list[str] = []
     try:
         while not (found and "READY" in found[-1]):
