@@ -1,4 +1,4 @@
-"""Every method on the same data, side by side."""
+"""Comparison of all methods on the same data."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,27 +18,27 @@ from calib.result import CalibrationResult, Method
 from calib.solver import estimator_of, solve
 
 _MOST_FOLDS = 50
-"""More poses are left out in this many groups instead of one by one."""
+"""Largest number of folds: more poses are left out in groups."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compared:
-    """One method's outcome, or the reason why there is none."""
+    """Result of one method, or the reason why it has none."""
 
     method: Method
     reason: str | None = None
     parameters: Parameters | None = None
     mass_kg: float = np.nan
     rotation_difference_rad: float = np.nan
-    """Angle to the mounting that the default method finds."""
+    """Angle to the mounting that the default method estimates."""
     force_rms_N: float = np.nan
     torque_rms_Nm: float = np.nan
     cv_force_rms_N: float = np.nan
-    """Cross-validated: each pose predicted from all others; NaN where the method cannot do without a pose."""
+    """Cross-validated: each pose predicted from all others; NaN if the method needs every pose."""
     cv_torque_rms_Nm: float = np.nan
 
     def to_dict(self) -> dict[str, JSON]:
-        """Give what `ftdrive solve --method all --json` prints of a method."""
+        """Return the JSON object that `ftdrive solve --method all --json` prints for a method."""
         if self.parameters is None:
             return {"method": self.method, "reason": self.reason}
         cross_validated = (self.cv_force_rms_N, self.cv_torque_rms_Nm)
@@ -65,18 +65,18 @@ def compare(
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
     up_in_base: ArrayLike = UP_IN_BASE,
 ) -> list[Compared]:
-    """Run all methods; those that cannot run on these data say why.
+    """Run all methods; a method that cannot use these data gives a reason instead.
 
     Parameters
     ----------
     dataset : CalibrationDataset
     drift, known, g_m_s2, up_in_base
-        As for `solve`. The published methods that take gravity as known find it in `known`, or assume a level base.
+        As for `solve`. The published methods that need gravity take it from `known`, or assume a level base.
 
     Raises
     ------
     NotObservable
-        Not even the default method can be used.
+        The default method cannot use these data.
     """
     default = solve(dataset, "ml", drift=drift, known=known, g_m_s2=g_m_s2)
     compared = []

@@ -1,10 +1,10 @@
-"""What can go wrong in a calibration.
+"""Errors of the solver core.
 
 CalibError
-├── BadDataset       the data are not what they should be: the message names the row and the reason
+├── BadDataset       the data are invalid: the message names the row and the reason
 ├── BadCalibration   a file is not a calibration that this version can read
-├── TooFewSamples    the sensor sends too slowly to be averaged
-└── NotObservable    the poses cannot determine the parameters: the message says what is missing
+├── TooFewSamples    the sensor sends too few samples for an average
+└── NotObservable    the poses do not determine the parameters: the message names what is missing
 """
 
 
@@ -13,7 +13,7 @@ class CalibError(Exception):
 
 
 class BadDataset(CalibError):
-    """The data are not what they should be."""
+    """The data are invalid."""
 
 
 class BadCalibration(CalibError):
@@ -21,8 +21,8 @@ class BadCalibration(CalibError):
 
 
 class TooFewSamples(CalibError):
-    """The sensor sends too slowly to be averaged."""
+    """The sensor sends too few samples for an average."""
 
 
 class NotObservable(CalibError):
-    """The poses cannot determine what was asked."""
+    """The poses do not determine the parameters."""

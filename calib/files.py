@@ -1,4 +1,4 @@
-"""Files that are whole or absent, never overwritten, and say what they are."""
+"""Files that are complete or absent, never overwritten, and name their format."""
 
 import json
 import os
@@ -23,9 +23,9 @@ def write_new(path: Path, content: str | bytes) -> None:
     Raises
     ------
     FileExistsError
-        The file is there already.
+        The file exists.
     OSError
-        The folder is missing, the disk is full, …; nothing is left behind.
+        The folder is missing, the disk is full, …; no partial file remains.
     """
     require_new(path)
     partial = path.with_name(path.name + ".partial")
@@ -39,7 +39,7 @@ def write_new(path: Path, content: str | bytes) -> None:
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
-    if os.name == "posix":  # the new name must survive a power cut too
+    if os.name == "posix":  # so that the new name survives a power failure
         folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
@@ -48,7 +48,7 @@ def write_new(path: Path, content: str | bytes) -> None:
 
 
 def require_new(path: Path) -> None:
-    """Raise an `OSError` unless the file is not there yet, and its folder is."""
+    """Raise an `OSError` if the file exists or its folder does not."""
     _refuse_existing(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"the folder {path.parent} does not exist: create it first")
@@ -60,24 +60,24 @@ def _refuse_existing(path: Path) -> None:
 
 
 def read_object(path: Path, error: type[Exception]) -> dict[str, Any]:
-    """Read a JSON file that holds one object; raise `error`, one sentence without the file's name, when it does not."""
+    """Read a JSON file with one object; raise `error`, one sentence without the file name, if it has none."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as exc:
         raise error(f"this is not a text file (byte {exc.start} is not UTF-8): is it the right file?") from exc
     if not text.strip():
-        raise error("the file is empty: the run that wrote it left nothing to read.")
+        raise error("the file is empty: repeat the run that wrote it.")
     try:
         document = json.loads(text)
-    except (ValueError, RecursionError) as exc:  # the latter from thousands of brackets in brackets
+    except (ValueError, RecursionError) as exc:  # RecursionError from deeply nested brackets
         raise error(f"this is not valid JSON ({exc}): the file is damaged or of another kind.") from exc
     if not isinstance(document, dict):
-        raise error(f"the file holds a JSON {type(document).__name__}, not an object: is it the right file?")
+        raise error(f"the file contains a JSON {type(document).__name__}, not an object: is it the right file?")
     return document
 
 
 def check_format(document: Mapping[str, object], expected: str, error: type[Exception]) -> None:
-    """Check the field `format`, for example 'ftdrive.dataset/1'; raise `error` when it is another one."""
+    """Check the field `format`, for example 'ftdrive.dataset/1'; raise `error` if it differs."""
     found = document.get("format")
     kind, _, version = expected.partition("/")
     if found is None:
@@ -86,7 +86,7 @@ def check_format(document: Mapping[str, object], expected: str, error: type[Exce
         return
     found_kind, _, found_version = str(found).partition("/")
     if found_kind != kind:
-        raise error(f"the format is '{found}', not '{expected}': this is another kind of file.")
+        raise error(f"the format is '{found}', not '{expected}': choose a file of that format.")
     raise error(
         f"version '{found_version}' of {kind} is unknown, this program reads version {version}: use a newer program."
     )

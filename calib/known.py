@@ -1,4 +1,4 @@
-"""What is known before the calibration, exactly or within a tolerance."""
+"""Values that are known before the calibration, exactly or within a tolerance."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from calib.assessment.faults import force_unit
 from calib.model import Array, Parameters, is_rotation, read_only
 
 
@@ -17,21 +16,21 @@ class Known:
     Raises
     ------
     ValueError
-        A rotation that is none, a direction of length zero, a mass or a tolerance that is negative.
+        An invalid rotation, a direction of length zero, a mass that is not positive, or a negative tolerance.
     """
 
     R_flange_sensor: ArrayLike | None = None
-    """(3, 3) how the sensor is mounted; with `yaw_only` but for a turn about the flange z axis (else the identity)."""
+    """(3, 3) mounting of the sensor; with `yaw_only` except for a turn about flange z, default the identity."""
     R_tolerance_rad: float = 0.0
     """Of each of the three angles; with `yaw_only` of the two tilts."""
     yaw_only: bool = False
     """The sensor is mounted flat: only its turn about the flange z axis is unknown."""
     gravity_direction_base: ArrayLike | None = None
-    """(3,) where things fall, of any length: (0, 0, -1) for a level robot."""
+    """(3,) down, of any length: (0, 0, -1) for a level robot."""
     direction_tolerance_rad: float = 0.0
     """Of each of the two tilt angles."""
     mass_kg: float | None = None
-    """Of what hangs on the sensor."""
+    """Of the load on the sensor."""
     mass_tolerance_kg: float = 0.0
 
     def __post_init__(self) -> None:
@@ -52,48 +51,9 @@ class Known:
             if not 0 <= getattr(self, name) < np.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}, expected 0 (exactly known) or more")
 
-    def contradictions(self, found: Parameters, covariance: Array, g_m_s2: float, sigmas: float) -> list[str]:
-        """Say what of this is off by more than so many standard deviations, with what the data say instead.
-
-        Parameters
-        ----------
-        found : Parameters
-            Of a fit with nothing taken as known.
-        covariance : array, shape (15, 15)
-            Of it.
-        g_m_s2 : float
-        sigmas : float
-        """
-        words = []
-        if self.mass_kg is not None:
-            weight_N = float(np.linalg.norm(found.gravity_force_base_N))
-            along = found.gravity_force_base_N / (weight_N or 1.0)
-            mass_kg, sigma_kg = weight_N / g_m_s2, float(np.sqrt(along @ covariance[3:6, 3:6] @ along)) / g_m_s2
-            if abs(mass_kg - self.mass_kg) > sigmas * np.hypot(sigma_kg, self.mass_tolerance_kg):
-                unit = force_unit(self.mass_kg / mass_kg) if mass_kg else None
-                why = f", as if the forces were in {unit}" if unit else ""
-                words.append(f"mass {self.mass_kg:g} kg, they say {_with_sigma(mass_kg, sigma_kg)} kg{why}")
-        if self.gravity_direction_base is not None:
-            direction = np.asarray(self.gravity_direction_base)
-            turn = _turn(direction, _unit(found.gravity_force_base_N))
-            across = np.cross(_unit(turn), direction)
-            sigma = float(np.sqrt(across @ covariance[3:6, 3:6] @ across / np.sum(found.gravity_force_base_N**2)))
-            if np.linalg.norm(turn) > sigmas * np.hypot(sigma, self.direction_tolerance_rad):
-                words.append(f"the direction of gravity in base, they say {_angle(turn, sigma)} off that")
-        if self.R_flange_sensor is not None:
-            turn = Rotation.from_matrix(found.R_flange_sensor @ np.asarray(self.R_flange_sensor).T).as_rotvec()
-            if self.yaw_only:
-                z = np.array([0.0, 0.0, 1.0])
-                turn = _turn(z, Rotation.from_rotvec(turn).apply(z))
-            axis = _unit(turn)
-            sigma = float(np.sqrt(axis @ covariance[:3, :3] @ axis))
-            if np.linalg.norm(turn) > sigmas * np.hypot(sigma, self.R_tolerance_rad):
-                words.append(f"the mounting of the sensor, they say {_angle(turn, sigma)} off that")
-        return words
-
 
 class Constraints:
-    """A `Known` as the solver needs it: free directions, and pseudo-measurements in units of their tolerance."""
+    """A `Known` in the form of the solver: free directions, and pseudo-measurements in units of their tolerance."""
 
     def __init__(self, known: Known, g_m_s2: float) -> None:
         self.R = None if known.R_flange_sensor is None else np.asarray(known.R_flange_sensor)
@@ -107,7 +67,7 @@ class Constraints:
         self._tilts = 2 if self.yaw_only else 3
 
     def rotations(self, minima: list[Array], cost: Array) -> list[Array]:
-        """Choose starting rotations (3, 3) R_flange_sensor: the minima given, or those that respect what is known.
+        """Choose starting rotations (3, 3) R_flange_sensor: the given minima, or those that respect the known mounting.
 
         Parameters
         ----------
@@ -128,7 +88,7 @@ class Constraints:
         return [*turned[low][np.argsort(value[low])][:4], *(minima if self.R_tolerance > 0 else [])]
 
     def satisfied(self, p: Parameters) -> Parameters:
-        """Put the gravity force onto what is exactly known of it."""
+        """Replace the exactly known direction and size of the gravity force."""
         b = np.array(p.gravity_force_base_N)
         if self.direction is not None and self.direction_tolerance == 0:
             b = float(np.linalg.norm(b)) * self.direction
@@ -142,7 +102,7 @@ class Constraints:
         fixed = []
         if self.R is not None and self.R_tolerance == 0:
             fixed += [keep[k] for k in range(self._tilts)]
-        b_hat = _unit(p.gravity_force_base_N)
+        b_hat = unit_vector(p.gravity_force_base_N)
         if self.direction is not None and self.direction_tolerance == 0:
             fixed += [np.concatenate([np.zeros(3), t, np.zeros(9)]) for t in _across(b_hat)]
         if self.weight_N is not None and self.weight_tolerance_N == 0:
@@ -154,12 +114,12 @@ class Constraints:
 
     @property
     def dof(self) -> int:
-        """Number of exact constraints and of pseudo-measurements: what they add to the residual degrees of freedom."""
+        """Residual degrees of freedom that exact constraints and pseudo-measurements add."""
         rotation = 0 if self.R is None else self._tilts
         return rotation + 2 * (self.direction is not None) + (self.weight_N is not None)
 
     def measurements(self, p: Parameters) -> tuple[Array, Array]:
-        """Give derivative (k, 15) and residual (k,), known minus estimated, of the inexact knowledge."""
+        """Derivative (k, 15) and residual (k,), known minus estimated, of the values known within a tolerance."""
         rows, residuals = [np.zeros((0, 15))], [np.zeros(0)]
 
         def add(at: int, derivative: Array, residual: Array, tolerance: float) -> None:
@@ -172,21 +132,21 @@ class Constraints:
             turn = p.R_flange_sensor @ self.R.T
             if self.yaw_only:
                 z = np.array([0.0, 0.0, 1.0])
-                add(0, np.eye(2, 3), _turn(z, turn @ z)[:2], self.R_tolerance)
+                add(0, np.eye(2, 3), turn_between(z, turn @ z)[:2], self.R_tolerance)
             else:
                 add(0, np.eye(3), Rotation.from_matrix(turn).as_rotvec(), self.R_tolerance)
         b = p.gravity_force_base_N
         length = max(float(np.linalg.norm(b)), 1e-300)
         if self.direction is not None and self.direction_tolerance > 0:
             across = _across(self.direction)
-            off = across @ np.cross(_turn(self.direction, b / length), self.direction)
+            off = across @ np.cross(turn_between(self.direction, b / length), self.direction)
             add(3, across / length, -off, self.direction_tolerance)
         if self.weight_N is not None and self.weight_tolerance_N > 0:
             add(3, b[None] / length, np.array([self.weight_N - length]), self.weight_tolerance_N)
         return np.concatenate(rows), np.concatenate(residuals)
 
 
-def _turn(a: Array, b: Array) -> Array:
+def turn_between(a: Array, b: Array) -> Array:
     """Smallest rotation vector that takes unit vector a to b."""
     axis = np.cross(a, b)
     sine = float(np.linalg.norm(axis))
@@ -196,16 +156,8 @@ def _turn(a: Array, b: Array) -> Array:
     return np.asarray(axis * (angle / sine))
 
 
-def _angle(turn_rad: Array, sigma_rad: float) -> str:
-    return f"{_with_sigma(float(np.degrees(np.linalg.norm(turn_rad))), float(np.degrees(sigma_rad)))}°"
-
-
-def _with_sigma(value: float, sigma: float) -> str:
-    digits = int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 6))
-    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
-
-
-def _unit(v: Array) -> Array:
+def unit_vector(v: Array) -> Array:
+    """Vector (3,) divided by its length; -z for a zero vector."""
     length = float(np.linalg.norm(v))
     return v / length if length > 0 else np.array([0.0, 0.0, -1.0])
 

@@ -1,4 +1,4 @@
-"""The forward model: what a rigid tool at rest makes a wrist sensor read.
+"""The forward model: the reading of a wrist sensor that carries a rigid tool at rest.
 
     force_N   = R_flange_sensor.T @ R_base_flange.T @ gravity_force_base_N + force_bias_N
     torque_Nm = p_sensor_com_m x (force_N - force_bias_N) + torque_bias_Nm
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 STANDARD_GRAVITY_M_S2 = 9.80665
 ROUNDING = 2e-3  # rounding to three decimals moves an entry of R^T R by at most 1.8e-3
 UP_IN_BASE = np.array([0.0, 0.0, 1.0])
-"""Of a robot on a table."""
+"""For a robot on a table."""
 
 PARAMETER_NAMES = tuple(
     f"{name}.{axis}"
@@ -31,12 +31,12 @@ PARAMETER_NAMES = tuple(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parameters:
-    """All that is estimated."""
+    """The estimated quantities."""
 
     R_flange_sensor: Array
     """(3, 3) maps sensor coordinates to flange coordinates."""
     gravity_force_base_N: Array
-    """(3,) weight of what hangs on the sensor, in base."""
+    """(3,) weight of the load on the sensor, in base."""
     force_bias_N: Array
     """(3,) in the sensor frame."""
     p_sensor_com_m: Array
@@ -70,7 +70,7 @@ class Parameters:
         )
 
     def difference(self, other: Self) -> Array:
-        """Give the error vector (15,) that `moved` would need to reach `other` from here."""
+        """Return the error vector (15,) with which `moved` gives `other`."""
         return np.concatenate(
             [
                 -Rotation.from_matrix(other.R_flange_sensor @ self.R_flange_sensor.T).as_rotvec(),
@@ -102,7 +102,7 @@ def gravity_wrench(parameters: Parameters, R_base_flange: Array) -> Array:
 
 
 def predict(parameters: Parameters, R_base_flange: Array) -> Array:
-    """Wrench the sensor reads with nothing in contact: weight and bias, Yu eqs 12-13.
+    """Wrench that the sensor reads without contact: weight and bias, Yu eqs 12-13.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def skew(v: Array) -> Array:
 
 
 def rotation_of(vector: Array) -> Array:
-    """Rotation matrix of a rotation vector (3,): scipy's in a tenth of the time, for inner loops."""
+    """Rotation matrix of a rotation vector (3,), ten times faster than scipy's."""
     angle = math.sqrt(float(vector @ vector))
     K = skew(vector)
     if angle < 1e-4:  # series: both coefficients lose their digits
@@ -170,19 +170,19 @@ def angle_between(R1: Array, R2: Array) -> Array:
 
 
 def nearest_rotation(M: Array) -> Array:
-    """Give the rotations closest to the matrices M (..., 3, 3) in the Frobenius norm: U diag(1, 1, ±1) V^T."""
+    """Return the rotations closest to the matrices M (..., 3, 3) in the Frobenius norm: U diag(1, 1, ±1) V^T."""
     U, _, Vt = np.linalg.svd(M)
     U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     return np.asarray(U @ Vt)
 
 
 def is_rotation(R: Array) -> bool:
-    """Tell whether a matrix is a rotation (3, 3), entries of which may be rounded to three decimals."""
+    """Check whether a matrix is a rotation (3, 3); its entries may be rounded to three decimals."""
     return R.shape == (3, 3) and bool(np.abs(R.T @ R - np.eye(3)).max() < ROUNDING and np.linalg.det(R) > 0)
 
 
 def read_only(value: ArrayLike) -> Array:
-    """Copy to a float64 array that cannot be written to."""
+    """Copy to a read-only float64 array."""
     array = np.array(value, dtype=np.float64)
     array.setflags(write=False)
     return array

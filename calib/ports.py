@@ -1,4 +1,4 @@
-"""What the calibration routine asks of the outside world: a driver, a recording or a fake of this shape fits."""
+"""Interfaces of sensor and arm for the calibration routine: drivers, recordings and fakes implement them."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from calib.model import Array
 
 
 class WrenchSamples(Protocol):
@@ -22,7 +22,7 @@ class WrenchSamples(Protocol):
 
     @property
     def seq(self) -> NDArray[np.int64]:
-        """(n,) running number; gaps are lost samples."""
+        """(n,) sequence number; gaps are lost samples."""
 
     @property
     def counts(self) -> NDArray[np.int32]:
@@ -41,14 +41,14 @@ class Sensor(Protocol):
     """A source of wrenches."""
 
     def collect(self, duration_s: float, /) -> WrenchSamples:
-        """Every sample of the next `duration_s` seconds, or an exception."""
+        """Return every sample of the next `duration_s` seconds, or raise."""
 
     def check(self) -> None:
         """Raise if the stream has failed."""
 
 
 class ArmReading(Protocol):
-    """One look at the arm."""
+    """State of the arm at one moment."""
 
     @property
     def t_host_ns(self) -> int:
@@ -64,7 +64,7 @@ class ArmReading(Protocol):
 
 
 class Arm(Protocol):
-    """An arm that stands at a pose, or comes to rest there."""
+    """An arm at a pose, or about to come to rest there."""
 
     def state(self) -> ArmReading:
         """Read a fresh state, or raise."""

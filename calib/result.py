@@ -1,4 +1,4 @@
-"""The outcome of a calibration: estimates, their uncertainty, what they were made from, and a verdict."""
+"""The result of a calibration: estimates, their uncertainty, provenance and verdict."""
 
 import json
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ from calib.published.yu import weight_and_tilt
 FORMAT = "ftdrive.calibration/1"
 
 COMMON_GAIN = float(np.sqrt(5 / 3 / 3))
-"""Sigma of the mean of three gains over that of one; five numbers tell that one, hence 5/3 as for Student's t."""
+"""Sigma of the mean of three gains over that of one; five numbers determine that one, so 5/3 as in Student's t."""
 
 LATER = (
     "p_value",
@@ -35,7 +35,7 @@ LATER = (
     "second_basin_chi2",
     "quality",
 )
-"""Fields that the first files of this format do not have."""
+"""Fields that the first files of this format lack."""
 
 Method = Literal[
     "ml",
@@ -55,7 +55,7 @@ NoiseSource = Literal["measured", "residuals"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftResult:
-    """How the bias moved while the poses were taken; arrays are read-only."""
+    """Change of the bias during the tour; arrays are read-only."""
 
     change: Array
     """(6,) bias at the last pose minus bias at the first, N and N·m."""
@@ -76,42 +76,42 @@ class CalibrationResult:
 
     parameters: Parameters
     covariance: Array
-    """(15, 15) of the error coordinates `PARAMETER_NAMES`, from the noise and from what `components` add to it."""
+    """(15, 15) of the error coordinates `PARAMETER_NAMES`, from the noise and the `components`."""
     residuals: Array
     """(n, 6) measured minus predicted wrench, N and N·m, in the sensor frame: `response` included, drift not."""
     chi2: float
-    """Least squares of the residuals of the poses that count, weighted by the measured noise alone: without drift or
-    `components`. When nobody measured the noise, weighted by what was estimated from them."""
+    """Weighted sum of squared residuals of the used poses, with the measured noise alone, without drift or
+    `components`. If the noise was not measured, with the noise estimated from the residuals."""
     dof: int
     noise_source: NoiseSource
-    """Where the noise comes from: the spread inside each pose, or the residuals of the fit."""
+    """Source of the noise: the spread within each pose, or the residuals of the fit."""
     g_m_s2: float
     method: Method
     verdict: Verdict
     reasons: tuple[str, ...]
-    """Plain words: why the verdict is not better, and what else is worth knowing."""
+    """Reasons for a verdict below good, then notes."""
     provenance: Mapping[str, JSON] = field(default_factory=dict)
     p_value: float | None = None
-    """Probability of a chi2 as large or larger if the measured noise were all there is; None = nobody measured it."""
+    """Probability of a larger chi2 if there is only the measured noise; None if the noise was not measured."""
     measured_sigma: Array | None = None
     """(6,) measured standard deviation of a pose's mean, root mean square over the poses, N and N·m; None = unknown."""
     weights: Array | None = None
-    """(n,) 1 = used, 0 = rejected: it fits none of what the other poses tell. None = all are used."""
+    """(n,) 1 = used, 0 = rejected because it does not fit the others. None = all are used."""
     components: Mapping[str, float] = field(default_factory=dict)
-    """Standard deviations of what the residuals show, by name and unit: beyond the measured noise, or all of the noise
-    when nobody measured it. `walk_…` is the random walk of the bias per mean interval between poses, `slope_…` its
+    """Standard deviations of the variance components, by name and unit: beyond the measured noise, or all of the noise
+    if it was not measured. `walk_…` is the random walk of the bias per mean interval between poses, `slope_…` its
     linear change over the session, `rotation_rad` the error of each pose's orientation per axis, `gain` and
     `cross_talk` the size of the entries of `response`, relative and relative to a lever of 50 mm."""
     drift: DriftResult | None = None
-    """None: no drift was found, or none was looked for."""
+    """None: no drift was found, or `drift="none"`."""
     response: Response | None = None
-    """Gain and cross-talk of the sensor; None: none were found, or none were looked for."""
+    """Gain and cross-talk of the sensor; None: none were found, or the method does not estimate them."""
     gain_sigma: float = 0.0
-    """Standard deviation of the entries of the gain, as far as the data leave room for it."""
+    """Standard deviation of the gain entries that the data do not exclude."""
     second_basin_chi2: float | None = None
-    """How much worse the second best solution fits, under the noise model; None: there is no other."""
+    """Increase of chi2 at the second best solution, under the noise model; None: there is no other."""
     quality: Mapping[str, JSON] = field(default_factory=dict)
-    """What the verdict rests on: `loo_force_rms_N` and `loo_torque_rms_Nm` (each pose predicted from all others),
+    """Statistics behind the verdict: `loo_force_rms_N` and `loo_torque_rms_Nm` (each pose predicted from all others),
     `worst_pose` (row from 1), `residual_sigma` (n; 1 expected), `lag1` (correlation of successive residuals),
     `correlations` (pairs of parameters above 0.9)."""
 
@@ -149,17 +149,17 @@ class CalibrationResult:
 
     @property
     def n_poses(self) -> int:
-        """Number of poses behind the result."""
+        """Number of poses, rejected ones included."""
         return len(self.residuals)
 
     @property
     def noise_factor(self) -> float:
-        """Goodness of fit: how much larger the residuals are than the measured noise alone explains."""
+        """Ratio of the residuals to the measured noise: about 1 for a good fit."""
         return float(np.sqrt(self.chi2 / self.dof))
 
     @property
     def rejected_poses(self) -> tuple[int, ...]:
-        """Rows, counted from 1, that were left out."""
+        """Rows, counted from 1, that were rejected."""
         return () if self.weights is None else tuple(int(i) + 1 for i in np.flatnonzero(self.weights == 0))
 
     @property
@@ -174,7 +174,7 @@ class CalibrationResult:
 
     @property
     def gravity_force_base_N(self) -> Array:
-        """(3,) weight of what hangs on the sensor, in base."""
+        """(3,) weight of the load on the sensor, in base."""
         return self.parameters.gravity_force_base_N
 
     @property
@@ -194,7 +194,7 @@ class CalibrationResult:
 
     @property
     def weight_N(self) -> float:
-        """Weight of what hangs on the sensor."""
+        """Weight of the load on the sensor."""
         return weight_and_tilt(self.gravity_force_base_N)[0]
 
     @property
@@ -216,7 +216,7 @@ class CalibrationResult:
     def sigma(self) -> Mapping[str, Array | float]:
         """One standard deviation of every quantity, by its name; `R_flange_sensor`: (3,) rad about the flange axes.
 
-        Weight and mass include the gain common to all axes, which no orientation shows.
+        Those of weight and mass include the gain common to all axes, which no orientation reveals.
         """
         std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, self.covariance[3:6, 3:6])
@@ -235,7 +235,7 @@ class CalibrationResult:
         }
 
     def compensate(self, wrench: Array, R_base_flange: Array, *, response: bool = True) -> Array:
-        """Remove weight and bias: what is left is contact.
+        """Subtract weight and bias to give the contact wrench.
 
         Parameters
         ----------
@@ -243,8 +243,8 @@ class CalibrationResult:
             As measured, N and N·m, in the sensor frame.
         R_base_flange : array, shape (3, 3) or (n, 3, 3)
         response : bool
-            Whether gain and cross-talk of the sensor are applied to the weight. False: as a program does that knows
-            only mounting, weight, centre of mass and bias.
+            Whether to apply gain and cross-talk of the sensor to the weight. False gives the result of a program that
+            knows only mounting, weight, centre of mass and bias.
 
         Returns
         -------
@@ -256,11 +256,11 @@ class CalibrationResult:
 
     @cached_property
     def compensator(self) -> Compensator:
-        """The same for those in a hurry: one sample, into a buffer, or a million at once."""
+        """The fast form of `compensate`: one sample, into a buffer, or a recording."""
         return Compensator(self.parameters, response=self.response)
 
     def wrench_covariance(self, R_base_flange: Array) -> Array:
-        """Covariance of the predicted wrench that the uncertainty of the estimates causes.
+        """Covariance of the predicted wrench due to the uncertainty of the estimates.
 
         Parameters
         ----------
@@ -274,7 +274,7 @@ class CalibrationResult:
         return predicted_covariance(self.parameters, self.covariance, self.response, R)
 
     def predicted_error(self) -> tuple[float, float]:
-        """Root mean square error of `compensate` over all orientations, N and N·m, as far as noise explains it."""
+        """Expected root mean square error of `compensate` over all orientations, N and N·m, from noise alone."""
         return expected_error(self.parameters, self.covariance, self.response)
 
     def residual_summary(self) -> dict[str, float]:
@@ -288,7 +288,7 @@ class CalibrationResult:
         }
 
     def to_dict(self) -> dict[str, JSON]:
-        """Give the content of a calibration file."""
+        """Return the content of a calibration file."""
         force_N, torque_Nm = self.predicted_error()
         return {
             "format": FORMAT,
@@ -352,12 +352,12 @@ class CalibrationResult:
             raise BadCalibration(f"the calibration cannot be read ({exc}): the file is damaged.") from exc
 
     def save(self, path: Path) -> None:
-        """Write a new file; raises `FileExistsError` rather than overwrite."""
+        """Write a new file; raises `FileExistsError` if it exists."""
         write_new(path, json.dumps(self.to_dict(), allow_nan=False, indent=1) + "\n")
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what `save` wrote. Raises `BadCalibration` or `OSError`."""
+        """Read a calibration file. Raises `BadCalibration` or `OSError`."""
         try:
             return cls.from_dict(read_object(path, BadCalibration))
         except BadCalibration as exc:
@@ -367,7 +367,7 @@ class CalibrationResult:
 def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]:
     """Propagate the covariance of the gravity force to weight (N), alpha and beta (rad).
 
-    Angles cannot be worse known than not at all, which is where the linear formula stops: at pi.
+    Sigma of an angle is limited to pi, where the linear formula loses its meaning.
     """
     weight, _, _ = weight_and_tilt(F_b)
     if weight == 0.0:
@@ -377,7 +377,7 @@ def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]
     out = np.array([x, 0.0, z]) / h if h > 0 else np.array([1.0, 0.0, 0.0])  # away from the base y axis
     gradients = np.array([F_b / weight, (h * np.array([0.0, 1.0, 0.0]) - y * out) / weight**2])
     variance = np.einsum("ki,ij,kj->k", gradients, cov, gradients)
-    weight_sigma, alpha = np.sqrt(np.maximum(variance, 0.0)).tolist()  # below 0 is rounding of what is exactly known
+    weight_sigma, alpha = np.sqrt(np.maximum(variance, 0.0)).tolist()  # below 0 only by rounding, if exactly known
     along_beta = np.array([z, 0.0, -x])
     beta = float(np.sqrt(max(along_beta @ cov @ along_beta, 0.0))) / h**2 if h > 0 else float("inf")
     return weight_sigma, min(alpha, float(np.pi)), min(beta, float(np.pi))

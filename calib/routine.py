@@ -1,7 +1,7 @@
-"""The calibration routine at one pose: wait until still, average, again if need be; and what many poses become.
+"""The calibration routine at one pose (wait until still, average, repeat if necessary) and the dataset of a tour.
 
-It knows the outside world only through `calib.ports`, prints nothing, and can be driven by a cell or by a recording of
-one: what it decides depends only on what the arm and the sensor tell it.
+It reaches devices only through `calib.ports` and prints nothing, so that a cell or a recording can drive it. Its
+decisions depend only on the readings of arm and sensor.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -9,23 +9,20 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.data.dataset import CalibrationDataset
 from calib.data.dwell_mean import LEAST_SAMPLES, PoseMean, is_quiet, is_stationary, mean_and_covariance
 from calib.errors import CalibError, TooFewSamples
+from calib.model import Array
 from calib.ports import Arm, ArmReading, Sensor, WrenchSamples
-
-Array = NDArray[np.float64]
 
 Stage = Literal["settle", "sample"]
 
 MOVED_RAD = float(np.radians(0.05))
-"""The flange may turn this much while a pose is averaged: a tenth of the noise of a good sensor at 1 kg."""
-
+"""Largest turn of the flange during a dwell: a tenth of the noise of a good sensor at 1 kg."""
 
 LONGER = (1, 2, 4)
-"""How many times as long to average until there are enough samples: a sensor that is asked for each may be slow."""
+"""Factors on the averaging time, tried in turn until there are enough samples: polled sensors may be slow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,37 +30,37 @@ class TourPose:
     """One stop of a tour."""
 
     number: int
-    """Of the orientation: 1 to 24 as in Yu et al., Fig. 3; above 100 for one that was chosen otherwise."""
+    """Of the orientation: 1 to 24 as in Yu et al., Fig. 3; above 100 for all others."""
     q_rad: Array
     """(6,) joint angles."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """How long to look at each pose."""
+    """Time limits and repetitions at each pose."""
 
     average_s: float = 2.0
     still_timeout_s: float = 10.0
     attempts: int = 2
-    """A pose that moves or drifts while it is averaged is averaged again, this often in all, and then kept as noisy."""
+    """Dwells at a pose, at most: a dwell with motion or drift is repeated, and the last one is kept as noisy."""
     noise_record_s: float = 12.0
-    """Before a tour, listen to the sensor so long and choose from it how long to average; 0 takes `average_s`."""
+    """Length of the record before a tour from which the averaging time is chosen; 0 uses `average_s`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseRecord:
-    """Everything that was seen at one pose; raw means raw."""
+    """Raw readings of arm and sensor at one pose."""
 
     stop: int
-    """Position in the tour, from 1; the return to the first pose comes last."""
+    """Position in the tour, from 1; the return to the first pose is last."""
     pose: TourPose
     before: ArmReading
     after: ArmReading
     samples: WrenchSamples
     steady: bool
-    """Neither the flange nor the mean wrench moved while the samples were taken."""
+    """Neither flange nor mean wrench changed during the dwell."""
     clock_offset_ns: int = 0
-    """From the host's clock to one that all parts of a run share: a resumed run may have seen a restart between."""
+    """From the host clock to the clock of the run, which may span a restart of the computer."""
     mean: PoseMean = field(init=False)
     """Mean wrench and the covariance of the mean."""
 
@@ -78,14 +75,14 @@ class PoseRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftCheck:
-    """The first pose seen again at the end of the tour: from it to its return."""
+    """Change from the first pose to its repetition at the end of the tour."""
 
     change: Array
     """(6,) N and N·m."""
     sigma: Array
     """(6,) standard deviation of the change expected from the noise alone."""
     elapsed_s: float
-    """Negative where the first pose was taken anew after the return."""
+    """Negative if the first pose was retaken after the return."""
 
 
 def take_pose(
@@ -99,25 +96,25 @@ def take_pose(
     on_stage: Callable[[Stage], None] = lambda _: None,
     quiet_std: Array | None = None,
 ) -> PoseRecord:
-    """Wait until arm and sensor are still where the arm was moved to, and average; again if something moved meanwhile.
+    """Wait until the arm is still, and average; repeat if arm or wrench changed during the dwell.
 
     Parameters
     ----------
     stop : int
         Place in the tour.
     pose : TourPose
-        Where the arm was moved to.
+        Pose of the arm.
     guard : callable
-        Called between two looks at the arm; raises to break off. Default: the sensor's own check.
+        Called between readings of the arm; raises to abort. Default: the check of the sensor.
     on_stage : callable
-        Is told of each stage as it begins.
+        Called at the start of each stage.
     quiet_std : array, shape (6,), optional
-        Standard deviation of the samples of an arm at rest: twice that is not steady.
+        Standard deviation of the samples of an arm at rest. A dwell with more than twice that is not steady.
 
     Raises
     ------
     TooFewSamples
-        The sensor is too slow for the time given to a pose.
+        The sensor is too slow for the averaging time.
     Exception
         Whatever the arm, the sensor or the guard raises.
     """
@@ -140,12 +137,12 @@ def take_pose(
 
 
 def collect_enough(sensor: Sensor, average_s: float) -> WrenchSamples:
-    """Collect for `average_s` seconds; where that gives too few samples, again and for longer.
+    """Collect for `average_s` seconds; if that gives too few samples, repeat for longer.
 
     Raises
     ------
     TooFewSamples
-        It never gave enough.
+        The longest time gave too few samples.
     """
     for times in LONGER:
         samples = sensor.collect(times * average_s)
@@ -156,10 +153,10 @@ def collect_enough(sensor: Sensor, average_s: float) -> WrenchSamples:
 
 
 def require_enough(samples: WrenchSamples, average_s: float) -> None:
-    """Raise `TooFewSamples` where this many of them are no average."""
+    """Raise `TooFewSamples` if there are too few samples to average."""
     if len(samples.wrench) < LEAST_SAMPLES:
         raise TooFewSamples(
-            f"the sensor gave {len(samples.wrench)} samples in {average_s} s, at least {LEAST_SAMPLES} are needed: "
+            f"the sensor sent {len(samples.wrench)} samples in {average_s} s, at least {LEAST_SAMPLES} are needed: "
             "check its rate, or average longer"
         )
 
@@ -172,17 +169,17 @@ def turned_rad(before: ArmReading, after: ArmReading) -> float:
 
 
 def is_return(record: PoseRecord, records: Sequence[PoseRecord]) -> bool:
-    """Tell whether a record is the return to the first pose of its tour."""
+    """Check whether a record is the return to the first pose of its tour."""
     return record.stop != records[0].stop and record.pose.number == records[0].pose.number
 
 
 def dataset_from(records: Sequence[PoseRecord], meta: Mapping[str, Any]) -> CalibrationDataset:
-    """Turn the records of a tour, whole or broken off, into the solver's input.
+    """Turn the records of a complete or aborted tour into a dataset.
 
-    The return to the first pose is left out: it serves `drift_check`.
+    The return to the first pose is left out, because `drift_check` uses it.
     """
     if not records:
-        raise CalibError("the run holds no pose yet: nothing to solve")
+        raise CalibError("the run contains no pose: record poses first")
     kept = [record for record in records if not is_return(record, records)]
     t_ns = np.array([record.t_mid_ns for record in kept])
     return CalibrationDataset(
@@ -196,7 +193,7 @@ def dataset_from(records: Sequence[PoseRecord], meta: Mapping[str, Any]) -> Cali
 
 
 def drift_check(records: Sequence[PoseRecord]) -> DriftCheck | None:
-    """Compare the first pose with its repetition at the end; None when the tour was broken off before."""
+    """Compare the first pose with its repetition at the end; None if the tour was aborted before."""
     if len(records) < 2 or not is_return(records[-1], records):
         return None
     first, last = records[0], records[-1]

@@ -1,4 +1,4 @@
-"""From a dataset to a calibration."""
+"""Solve a dataset for a calibration."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -7,7 +7,8 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.assessment.cross_validation import Evidence, IndependentFit
+from calib.assessment.contradictions import contradictions
+from calib.assessment.cross_validation import AssessedFit, IndependentFit
 from calib.assessment.faults import faults
 from calib.assessment.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
 from calib.assessment.verdict import SIGNIFICANT_SIGMAS, judge
@@ -22,11 +23,11 @@ from calib.published.methods import PUBLISHED, Estimator, published
 from calib.result import CalibrationResult, DriftResult, Method
 
 SIMULATIONS = 400
-UNFELT_N = 1e-12
-"""No sensor tells forces apart that differ by less."""
+UNRESOLVED_N = 1e-12
+"""No sensor resolves smaller differences of force."""
 
-_TOLD = ("carlson-relaxation", "carlson-cayley")
-"""Published methods that take the direction of gravity, or the weight, as known."""
+_NEED_GRAVITY = ("carlson-relaxation", "carlson-cayley")
+"""Published methods that need the direction of gravity, or the weight."""
 
 
 def solve(
@@ -39,51 +40,50 @@ def solve(
     up_in_base: ArrayLike = UP_IN_BASE,
     provenance: Mapping[str, Any] | None = None,
 ) -> CalibrationResult:
-    """Calibrate.
+    """Calibrate from a dataset.
 
     Parameters
     ----------
     dataset : CalibrationDataset
     method : Method
         "ml": maximum likelihood, from 4 poses on; "known-rotation", "yaw-only": the same for a sensor whose mounting is
-        known (`known`, default: axes of sensor and flange agree), or known but for its turn about the flange z axis.
+        known (`known`, default: axes of sensor and flange agree), or known except for its turn about flange z.
         Or, for comparison, one of `calib.published.methods.PUBLISHED`.
     drift : {"auto", "none", "linear", "random-walk"}
-        How the bias may move while the poses are taken: as the data decide, not at all, or surely so. Poses without
-        time count as equally spaced in their order.
+        Model of the bias during the tour: chosen from the data, constant, or as given. Poses without time count as
+        equally spaced in their order.
     known : Known, optional
-        What is known of mounting, direction of gravity and mass. Of the published methods only those take it that ask
-        for gravity.
+        Known mounting, direction of gravity and mass. Of the published methods, only those that need gravity use it.
     g_m_s2 : float
-        Gravity, by which the weight is divided to give the mass.
+        Gravity; mass is weight divided by it.
     up_in_base : array_like, shape (3,)
-        Where up should be, in base: +z for a robot on a table. For the judgement, and for those published methods that
-        take gravity as known.
+        Expected up direction in base: +z for a robot on a table. For the verdict, and for the published methods that
+        need gravity.
     provenance : mapping, optional
-        Kept with the result, beside the hash of the dataset. Must be writable as JSON.
+        Stored with the result, beside the hash of the dataset. Must be valid JSON.
 
     Raises
     ------
     NotObservable
-        The poses do not determine the parameters; the message says what is missing and what to add.
+        The poses do not determine the parameters; the message names what is missing and what to add.
     """
     for name, value, choices in (("method", method, get_args(Method)), ("drift", drift, get_args(Drift))):
         if value not in choices:
             raise ValueError(f"{name} is '{value}', expected one of {', '.join(choices)}")
     if not (np.isfinite(g_m_s2) and g_m_s2 > 0):
         raise ValueError(f"g_m_s2 is {g_m_s2}, expected about 9.8")
-    if method in PUBLISHED and method not in _TOLD and known is not None:
-        raise ValueError(f"{method} cannot use what is known before: use 'ml'")
+    if method in PUBLISHED and method not in _NEED_GRAVITY and known is not None:
+        raise ValueError(f"{method} cannot use known values: use 'ml'")
     known = _constrained(method, known)
     require_orientations(dataset.R_base_flange, 5 if method == "lrom" else 4 if known is None else 3)
-    if np.ptp(dataset.wrench[:, :3], axis=0).max() < UNFELT_N:
-        raise NotObservable("the force is the same in all poses: the sensor is stuck, or nothing hangs on it.")
+    if np.ptp(dataset.wrench[:, :3], axis=0).max() < UNRESOLVED_N:
+        raise NotObservable("the force is the same in all poses: check that the sensor works and carries a load.")
 
     estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, up_in_base) if method in PUBLISHED else None
     wrench_cov = dataset.wrench_cov
     if wrench_cov is not None:
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
-    # The fit also tells whether the poses are enough, and how large the noise is where it was not measured.
+    # Published methods use this fit too: for observability, and for the noise if it was not measured.
     try:
         best = fit(
             dataset.R_base_flange,
@@ -99,15 +99,15 @@ def solve(
         if mixed_up := faults(dataset.R_base_flange, dataset.wrench, up_in_base):
             raise NotObservable(f"{mixed_up[0]}.") from exc
         raise
-    evidence: Evidence = best
+    assessed: AssessedFit = best
     if estimator:
         parameters = estimator(dataset.wrench)
         noise = wrench_cov
-        if noise is None:  # what a method cannot explain is noise to it
+        if noise is None:  # take the residuals of the method as its noise
             residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
             square = (residuals**2).reshape(-1, 2, 3).mean(axis=(0, 2)) * 6 * len(dataset) / best.dof
             noise = np.broadcast_to(np.diag(np.repeat(np.maximum(square, 1e-24), 3)), (len(dataset), 6, 6))
-        evidence = IndependentFit(
+        assessed = IndependentFit(
             parameters,
             _simulated_covariance(estimator, parameters, dataset.R_base_flange, noise),
             dataset.R_base_flange,
@@ -121,25 +121,25 @@ def solve(
     unconstrained = best if estimator else None if known is None else _unconstrained(dataset, wrench_cov, drift)
     contradicted: list[str] = []
     if known is not None and unconstrained is not None:
-        contradicted = known.contradictions(
-            unconstrained.parameters, unconstrained.covariance, g_m_s2, SIGNIFICANT_SIGMAS
+        contradicted = contradictions(
+            known, unconstrained.parameters, unconstrained.covariance, g_m_s2, SIGNIFICANT_SIGMAS
         )
     quality = judge(
-        evidence,
+        assessed,
         t_s=dataset.t_s,
         measured_sigma=measured_sigma,
         up_in_base=up_in_base,
         unconstrained=unconstrained,
         contradicted=contradicted,
     )
-    chi2 = evidence.chi2 if wrench_cov is None else evidence.measured_chi2
+    chi2 = assessed.chi2 if wrench_cov is None else assessed.measured_chi2
     drifted = best.drift if estimator is None else None
     return CalibrationResult(
-        parameters=evidence.parameters,
-        covariance=evidence.covariance,
-        residuals=evidence.residuals,
+        parameters=assessed.parameters,
+        covariance=assessed.covariance,
+        residuals=assessed.residuals,
         chi2=chi2,
-        dof=evidence.dof,
+        dof=assessed.dof,
         noise_source="residuals" if wrench_cov is None else "measured",
         g_m_s2=g_m_s2,
         method=method,
@@ -148,11 +148,11 @@ def solve(
         provenance={**(provenance or {}), "dataset_sha256": dataset.sha256()},
         p_value=quality.chi2_p,
         measured_sigma=measured_sigma,
-        weights=evidence.weights,
-        components=evidence.components,
+        weights=assessed.weights,
+        components=assessed.components,
         drift=None if drifted is None else DriftResult(drifted.change, drifted.sigma),
-        response=evidence.response,
-        gain_sigma=evidence.gain_sigma,
+        response=assessed.response,
+        gain_sigma=assessed.gain_sigma,
         second_basin_chi2=best.second_basin_chi2,
         quality={
             "loo_force_rms_N": quality.loo_force_rms_N,
@@ -174,7 +174,7 @@ def _constrained(method: Method, known: Known | None) -> Known | None:
 
 
 def _unconstrained(dataset: CalibrationDataset, wrench_cov: Array | None, drift: Drift) -> Fit | None:
-    """Fit with nothing taken as known; None where the poses do not determine everything."""
+    """Fit without known values; None if the poses do not determine all parameters."""
     try:
         require_orientations(dataset.R_base_flange, 4)
         found = fit(dataset.R_base_flange, dataset.wrench, wrench_cov, t_s=dataset.t_s, drift=drift)
@@ -187,7 +187,7 @@ def _unconstrained(dataset: CalibrationDataset, wrench_cov: Array | None, drift:
 def estimator_of(
     method: Method, R_base_flange: Array, known: Known | None, g_m_s2: float, up_in_base: ArrayLike
 ) -> Estimator:
-    """Prepare a published method; gravity is taken from `known` where the method needs it. Raises `NotObservable`."""
+    """Prepare a published method, with gravity from `known` if the method needs it. Raises `NotObservable`."""
     level = -np.asarray(up_in_base, dtype=np.float64)
     direction = level if known is None or known.gravity_direction_base is None else known.gravity_direction_base
     weight_N = None if known is None or known.mass_kg is None else known.mass_kg * g_m_s2
@@ -195,7 +195,7 @@ def estimator_of(
 
 
 def _require_determined(R_base_flange: Array, best: Fit, known: Known | None) -> None:
-    """Refuse what the poses leave open, in words wherever the poses alone are the reason."""
+    """Raise `NotObservable` for undetermined parameters, with advice if the poses alone are the reason."""
     Z = best.free
     information = Z.T @ best.information @ Z
     scale = column_scale(information)
@@ -208,16 +208,16 @@ def _require_determined(R_base_flange: Array, best: Fit, known: Known | None) ->
         share = ((Z @ V[:, free]) ** 2).sum(axis=1).reshape(5, 3).sum(axis=1) / free.sum()
         names = [PARAMETER_NAMES[3 * k].partition(".")[0] for k in np.flatnonzero(share > 0.05)]
         raise NotObservable(
-            f"the poses leave {free.sum()} of {len(free)} parameters free, mixing {', '.join(names)}: add poses that "
-            "tilt the tool about two different horizontal axes, and turn it about its own."
+            f"the poses do not determine {free.sum()} of {len(free)} combinations of {', '.join(names)}: add poses "
+            "that tilt the tool about two different horizontal axes, and turn it about its own."
         )
 
 
 def _simulated_covariance(estimator: Estimator, truth: Parameters, R_base_flange: Array, wrench_cov: Array) -> Array:
-    """Mean square error of a closed form around its own estimate, by repeating it with simulated noise.
+    """Mean square error of a closed form around its own estimate, from repetitions with simulated noise.
 
-    SROM's cube roots have no derivative where a component of the gravity force vanishes, so errors are not propagated
-    linearly. The seed is fixed: the same data give the same numbers.
+    Linear propagation fails, because SROM's cube roots have no derivative if a component of the gravity force is zero.
+    The seed is fixed, so that the same data give the same numbers.
     """
     rng = np.random.default_rng(20210)
     L = np.linalg.cholesky(wrench_cov)

@@ -152,6 +152,17 @@ class ArmStatus:
     """(6,) active TCP in the flange: m, then a rotation vector in rad."""
 
 
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A check that a driver makes of its own device, beyond what every device of its kind reports."""
+
+    name: str
+    """What was checked, such as "registers"."""
+    passed: bool
+    found: str
+    fix: str = ""
+
+
 class _Device(ABC):
     @abstractmethod
     def close(self) -> None:
@@ -232,6 +243,13 @@ class RobotArm(_Device):
     def reported_program(self) -> str | None:
         """What the controller calls the program it runs, in its own words; None where it does not tell."""
         return None
+
+    def diagnose(self) -> list[Finding]:
+        """Check what only this kind of controller has and a program needs, such as its ports.
+
+        Only reads. Errors become findings. The default has nothing to check.
+        """
+        return []
 
     @abstractmethod
     def within_safety_limits(self, q_rad: Sequence[float]) -> bool:

@@ -4,7 +4,8 @@ import argparse
 import sys
 from collections.abc import Callable
 
-from mocks.kinematics import MODELS, Array
+from mocks.arrays import Array
+from mocks.kinematics import MODELS
 from mocks.sensors.catalogue import CHOICES
 from mocks.station import Station, parse_vector
 from mocks.world import MOUNTS_RAD

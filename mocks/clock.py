@@ -1,8 +1,8 @@
-"""The clock of an emulated cell: it follows real time, and waits for everything that has to keep up with it.
+"""The clock of an emulated cell: it follows real time, and waits for every thread that must keep up with it.
 
-The time is published in a page of shared memory. A client that must not miss a stretch of it, such as the thread that
-reads a stream, claims a slot in the page and writes there the time up to which it need not be waited for. The clock
-never passes the slowest slot by more than `LEAD_NS`: a computer that stalls makes an emulated cell slow, never late.
+A page of shared memory holds the time. A client that must not miss a stretch of it, such as the thread that reads a
+stream, claims a slot in the page and writes there the time up to which it has followed. The clock never passes the
+slowest slot by more than `LEAD_NS`: a computer that stalls makes an emulated cell slow, never late.
 
 The page holds signed 64-bit integers in native order:
 
@@ -34,15 +34,15 @@ SLOTS = 30
 LEAD_NS = 10_000_000
 """Less than any limit a client may have, and no less than the period of the slowest sensor."""
 DEBT_NS = 200_000_000
-"""Of the real time in which the clock was held, so much is made up for."""
+"""The clock makes up for at most so much of the real time in which it was held."""
 PATIENCE_S = 10.0
-"""The clock stops waiting for a living process that has not followed for so long, until it follows again."""
+"""The clock no longer waits for a process that has not followed for so long, until it follows again."""
 SUSPECT_S = 0.1
-"""When a slot has held the clock for so long, and again after each such time, its owner is looked up."""
+"""After each such time in which a slot holds the clock, the clock checks whether its owner lives."""
 LOOK_S = 0.005
-"""A thread that keeps up looks at the clock at least this often."""
+"""A thread that keeps up reads the clock at least this often."""
 REST_S = 0.0005
-"""It waits at least so long in between, or it would spin while the clock is held."""
+"""It waits at least so long between two readings, or it would spin while the clock is held."""
 _HEAD = 4
 
 
@@ -56,7 +56,8 @@ class CellClock:
     """
 
     def __init__(self, real_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self._real_ns = real_ns
+        self.real_ns = real_ns
+        """The computer's clock, for limits of clients that count in real time."""
         self._descriptor = os.memfd_create("emulated-cell-clock")
         os.ftruncate(self._descriptor, 8 * (_HEAD + 2 * SLOTS))
         fcntl.flock(self._descriptor, fcntl.LOCK_EX)
@@ -66,7 +67,7 @@ class CellClock:
         self._page[2] = SLOTS
         self._page[0] = PAGE_VERSION
         self._lost_ns = 0
-        """How much later the real clock is, but for the debt."""
+        """How far the real clock is ahead, without the time to be made up for."""
         self._lock = threading.Lock()
         self._own: dict[int, int] = {}
         """Time up to which the station's own threads have followed, by thread."""
@@ -76,7 +77,7 @@ class CellClock:
 
     @property
     def path(self) -> str:
-        """Where a process of the same user opens the page, as long as this one lives."""
+        """Path under which a process of the same user opens the page, until this process ends."""
         return f"/proc/{os.getpid()}/fd/{self._descriptor}"
 
     def now_ns(self) -> int:
@@ -117,7 +118,7 @@ class CellClock:
         self._end()
 
     def _move_on(self) -> int:
-        real_ns = self._real_ns()
+        real_ns = self.real_ns()
         target_ns = real_ns - self._lost_ns
         slowest_ns = min((*self._own.values(), *self._slots(real_ns)), default=target_ns)
         now_ns = max(self._now_ns, min(target_ns, slowest_ns + LEAD_NS))
@@ -126,7 +127,7 @@ class CellClock:
         return now_ns
 
     def _slots(self, real_ns: int) -> list[int]:
-        """Return how far the owners of the slots have followed, but for those who are not waited for."""
+        """Return how far the owners of the slots have followed, without those the clock has given up."""
         # A stall of this process is not a delay of the others.
         elapsed_ns = min(real_ns - self._looked_ns, round(SUSPECT_S * 1e9))
         self._looked_ns = real_ns

@@ -1,4 +1,4 @@
-"""What touches the tool besides gravity, and what changes the sensor's zero: pushes, cables, drift.
+"""Disturbances: pushes and cables that touch the tool, and drift of the sensor's zero.
 
 Does not model: masses on springs, friction, anything that depends on how fast the arm moves.
 """
@@ -9,7 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
-from mocks.kinematics import Array, Vector6, cross
+from mocks.arrays import Array
+from mocks.kinematics import Vector6, cross
 
 FOREVER_S = math.inf
 
@@ -23,7 +24,7 @@ class Contact(Protocol):
 
 @dataclass(frozen=True)
 class Push:
-    """A constant wrench about the sensor's origin, for a while.
+    """A constant wrench about the sensor's origin, for a limited time.
 
     Parameters
     ----------
@@ -53,9 +54,9 @@ class Cable:
     Parameters
     ----------
     force_base_N
-        (3,) in base axes: per degree of `joint` beyond its threshold, or as it stands with `towards`.
+        (3,) in base axes: per degree of `joint` beyond its threshold; constant with `towards`.
     p_sensor_m
-        Where it is fixed, (3,) in the sensor frame.
+        Where the cable is fixed, (3,) in the sensor frame.
     joint, beyond_rad
         Number 0 to 5 of a joint, and the angle at which the cable becomes taut: beyond it upwards for a positive one,
         downwards for a negative one.
@@ -87,13 +88,13 @@ class Cable:
 
 @dataclass(frozen=True)
 class Drift:
-    """A zero that moves linearly by `total` (6,), N and N·m in sensor axes, in so many seconds, and stays there."""
+    """A zero that moves linearly by `total` (6,), N and N·m in sensor axes, in `seconds`, and stays there."""
 
     total: Array
     start_s: float
     seconds: float
 
     def at(self, now_s: float) -> Array:
-        """What it has come to, (6,)."""
+        """Return the drift so far, (6,)."""
         share = (now_s - self.start_s) / self.seconds if self.seconds > 0.0 else 1.0
         return self.total * min(1.0, share)

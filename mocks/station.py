@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from mocks.arrays import Array
 from mocks.clock import CellClock
-from mocks.kinematics import MODELS, Array, Vector6, rotation, vector3, vector6
+from mocks.kinematics import MODELS, Vector6, rotation, vector3, vector6
 from mocks.sensors.catalogue import WRIST, Sensor
 from mocks.ur.operator import Operator
 from mocks.ur.robot import Robot, RobotSettings
@@ -33,11 +34,11 @@ START_Q_DEG = (45.0, -100.0, 60.0, -50.0, 90.0, 45.0)
 """Near the first pose of the tour: q4 = -90° - q2 - q3."""
 
 START_SCATTER_DEG = 5.0
-"""The wrist starts this far off at most, so that a first move is a real one."""
+"""The wrist starts this far off at most, so that the arm moves to the first pose."""
 
 
 def truth_from(options: Namespace) -> Truth:
-    """The seed's truth, with every quantity that was given on the command line in place of the drawn one."""
+    """Draw the truth from the seed, then replace every quantity given on the command line."""
     truth = Truth.drawn(options.seed, options.mount)
     changes: dict[str, Any] = {}
     if options.mass is not None:
@@ -68,7 +69,7 @@ def truth_from(options: Namespace) -> Truth:
 
 
 def start_posture(options: Namespace) -> Vector6:
-    """Joint angles (rad) at power-up: as given, or near the tour's first pose with a seeded offset of the wrist."""
+    """Return joint angles (rad) at power-up: as given, or near the tour's first pose with the wrist off by chance."""
     if options.start_q_deg is not None:
         return vector6(np.radians(options.start_q_deg))
     scatter = np.random.default_rng([options.seed, 3]).uniform(-START_SCATTER_DEG, START_SCATTER_DEG, 3)
@@ -76,7 +77,7 @@ def start_posture(options: Namespace) -> Vector6:
 
 
 def free_hosts() -> Iterator[str]:
-    """Loopback addresses to try, different for every process."""
+    """Yield loopback addresses to try, different for every process."""
     rng = np.random.default_rng([os.getpid(), 4])
     yield f"127.{64 + os.getpid() // 64516 % 64}.{1 + os.getpid() // 254 % 254}.{1 + os.getpid() % 254}"
     for _ in range(HOST_TRIALS):
@@ -136,11 +137,11 @@ class Station:
         try:
             self._start_sensors()
             for request in self._options.do:
-                if "error" in (answer := self._obey(request.encode())):
+                if "error" in (answer := self._answer(request.encode())):
                     sys.stderr.write(f"--do {request}: {answer['error']}\n")
                     return 2
             self._selector.register(sys.stdin.fileno(), selectors.EVENT_READ, self._on_stdin)
-            self._say(self._hello())
+            self._print(self._hello())
             self.server.run(lambda: self._ended)
         finally:
             for sensor in self._sensors.values():
@@ -185,7 +186,7 @@ class Station:
 
     # -- control channel ----------------------------------------------------------------------------------------------
 
-    def _say(self, message: dict[str, Any]) -> None:
+    def _print(self, message: dict[str, Any]) -> None:
         try:
             sys.stdout.write(json.dumps(message) + "\n")
             sys.stdout.flush()
@@ -201,15 +202,15 @@ class Station:
         self._line = bytearray(rest)
         for line in lines:
             if line.strip():
-                self._say(self._obey(line))
+                self._print(self._answer(line))
 
-    def _obey(self, line: bytes) -> dict[str, Any]:
+    def _answer(self, line: bytes) -> dict[str, Any]:
         try:
             request = json.loads(line)
             verb = self._verbs[request["do"].replace("_", "-")]
         except (ValueError, TypeError, KeyError, AttributeError):
             known = ", ".join(self._verbs)
-            return {"error": f'not understood: {line.decode("utf-8", "replace")}; say {{"do": …}} with {known}'}
+            return {"error": f'not understood: {line.decode("utf-8", "replace")}; send {{"do": …}} with {known}'}
         try:
             return verb(request)
         except (ValueError, TypeError, KeyError, OSError) as error:
@@ -241,7 +242,7 @@ class Station:
 
 
 def parse_vector(text: str, length: int) -> Array:
-    """Numbers separated by commas.
+    """Read numbers separated by commas.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What happens to the tool and to the sensor: the verbs of the control channel that are not about the arm."""
+"""Control requests that act on the tool and on the sensor: the verbs that are not about the arm."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields
@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from mocks.arrays import Array
 from mocks.disturbances import FOREVER_S, Cable, Drift, Push
-from mocks.kinematics import Array
 from mocks.sensors.catalogue import Sensor
 from mocks.wires.faults import Faults
 from mocks.world import World
@@ -21,7 +21,7 @@ NO_NUMBER: Array = np.full(6, np.nan)
 
 
 class Workcell:
-    """Everybody who touches the tool, and what becomes of the sensor.
+    """Control requests that act on the tool and on the sensor.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class Workcell:
 
     def _nan(self, request: Request) -> dict[str, Any]:
         for sensor in self._chosen(request):
-            if not sensor.says_nan:
+            if not sensor.carries_nan:
                 raise ValueError(f"the wire of {sensor.name} carries whole numbers only")
         self._world.read_always(NO_NUMBER if request.get("on", True) else None)
         return {"done": "nan"}

@@ -1,8 +1,8 @@
 """The truth of one robot cell: arm, gravity, payload, sensor mounting, bias and noise.
 
-Everything a calibration has to find out is drawn or set here and nowhere else. Model and signs: a wrench is what is
-exerted *on the sensor* by what hangs on it or pushes on it, about the sensor origin, force first. A sensor whose z axis
-points down reads ``+m g`` on z.
+Every quantity that a calibration has to find is drawn or set here and nowhere else. A wrench is exerted *on the sensor*
+by what hangs on it or pushes on it, about the sensor origin, force first. A sensor whose z axis points down reads
+``+m g`` on z.
 """
 
 import math
@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from mocks.arrays import Array
 from mocks.clock import CellClock
 from mocks.disturbances import Contact, Drift
-from mocks.kinematics import Array, Dh, Vector6, cross, forward, rotation
+from mocks.kinematics import Dh, Vector6, cross, forward, rotation
 
 MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
 """Tilt beta of the base for each mounting."""
@@ -29,7 +30,7 @@ def _zero3() -> Array:
 
 @dataclass(frozen=True)
 class Truth:
-    """What is really there. Angles in rad, SI units, axes in the names; noise is the deviation of one reading."""
+    """The true quantities of the cell. Angles in rad, SI units, axes in the names; noise per reading."""
 
     mass_kg: float
     p_sensor_com_m: Array
@@ -46,7 +47,7 @@ class Truth:
 
     @classmethod
     def drawn(cls, seed: int, mount: str = "floor") -> "Truth":
-        """A plausible cell: 0.5 to 2.5 kg, centre of mass 30 to 100 mm away, any yaw, base up to 2 degrees off."""
+        """Draw a plausible cell: 0.5 to 2.5 kg, centre of mass 30 to 100 mm away, any yaw, base up to 2 degrees off."""
         rng = np.random.default_rng([seed, 1])
         reach = rng.uniform(0.030, 0.100)
         direction = np.append(rng.normal(scale=0.15, size=2), 1.0)
@@ -107,12 +108,12 @@ def _on_circle(rng: np.random.Generator) -> Array:
 class World:
     """The cell at this instant. The arm emulator writes `q`; sensor emulators call `measure` from their own threads.
 
-    What can change while others read is replaced as a whole, so that they see one instant.
+    A change replaces a value as a whole, so that other threads read one instant.
 
     Parameters
     ----------
     truth
-        What is really there.
+        The true quantities.
     dh
         The real arm, calibration deviations included.
     q
@@ -130,9 +131,9 @@ class World:
         self.q = q
         """Actual joint angles (rad)."""
         self.contacts: dict[str, Contact] = {}
-        """What touches the tool, by any name."""
+        """What touches the tool, by name."""
         self.drifts: tuple[Drift, ...] = ()
-        """How the zero moves besides the drift of the truth."""
+        """Drifts of the zero besides the drift of the truth."""
         self._t0_s = self.now_s
         self._lock = threading.Lock()
         self._noise = np.random.default_rng([seed, 2])
@@ -146,7 +147,7 @@ class World:
         return self.clock.now_s()
 
     def true_wrench(self) -> Array:
-        """Wrench on the sensor without noise, (6,): N and N·m, sensor axes, bias and drift included."""
+        """Return the wrench on the sensor without noise, (6,): N and N·m, sensor axes, bias and drift included."""
         return self.load_wrench() + self.contact_wrench() + self._bias()
 
     def _bias(self) -> Array:
@@ -157,7 +158,7 @@ class World:
         return np.concatenate((force_bias_N, torque_bias_Nm)) + sum((d.at(now_s) for d in self.drifts), _NOTHING)
 
     def load_wrench(self) -> Array:
-        """What gravity alone does to the sensor, (6,), sensor axes, about the sensor origin."""
+        """Return the wrench of gravity alone, (6,), sensor axes, about the sensor origin."""
         q, truth, known = self.q, self.truth, self._load
         if known is not None and known[0] is q and known[1] is truth:
             return known[2]
@@ -168,7 +169,7 @@ class World:
         return load
 
     def contact_wrench(self) -> Array:
-        """What touches the tool besides gravity, (6,): sensor axes, about the sensor origin."""
+        """Return the wrench of all contacts, (6,), sensor axes, about the sensor origin."""
         contacts = self.contacts
         if not contacts:
             return _NOTHING
@@ -178,7 +179,7 @@ class World:
         return sum((wrench for wrench in felt.values() if wrench is not None), _NOTHING)
 
     def measure(self, n: int) -> Array:
-        """`n` successive noisy readings at this instant, (n, 6): N and N·m, sensor axes. Thread-safe."""
+        """Return `n` successive noisy readings at this instant, (n, 6): N and N·m, sensor axes. Thread-safe."""
         override = self._override
         if override is not None:
             return np.tile(override, (n, 1))
@@ -188,17 +189,17 @@ class World:
         return readings
 
     def touch(self, name: str, contact: Contact | None) -> None:
-        """Let something touch the tool in place of what had that name; None lets go."""
+        """Set the contact of that name; None removes it."""
         others = {key: value for key, value in self.contacts.items() if key != name}
         self.contacts = others if contact is None else {**others, name: contact}
 
     def shift_payload(self, mass_kg: float | None, p_sensor_com_m: Array | None) -> None:
-        """Something was lost, screwed on or slipped: from now on this is the truth."""
+        """Change the true payload from now on, as when a part is lost, added or slips."""
         if mass_kg is not None:
             self.truth = replace(self.truth, mass_kg=mass_kg)
         if p_sensor_com_m is not None:
             self.truth = replace(self.truth, p_sensor_com_m=p_sensor_com_m)
 
     def read_always(self, reading: Array | None) -> None:
-        """Let every reading be this one, (6,); None measures again."""
+        """Fix every reading to this one, (6,); None measures again."""
         self._override = reading

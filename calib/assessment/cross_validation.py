@@ -1,4 +1,4 @@
-"""What a judgement looks at: a fit, and how well each pose is predicted by all others."""
+"""The interface of a fit that can be assessed, and leave-one-out cross-validation of independent poses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,8 +14,8 @@ from calib.likelihood.variance_components import left_out
 from calib.model import Array, Parameters, jacobian, predict
 
 
-class Drifted(Protocol):
-    """How the bias moved."""
+class BiasDrift(Protocol):
+    """Change of the bias during the tour."""
 
     @property
     def change(self) -> Array:
@@ -26,8 +26,8 @@ class Drifted(Protocol):
         """(6,) standard deviation of that."""
 
 
-class Evidence(Protocol):
-    """What is judged: estimates and how they fit. Left-out poses count nowhere but in arrays with n rows."""
+class AssessedFit(Protocol):
+    """Estimates and how they fit. Rejected poses count only in arrays with n rows."""
 
     @property
     def parameters(self) -> Parameters:
@@ -47,7 +47,7 @@ class Evidence(Protocol):
 
     @property
     def weights(self) -> Array:
-        """(n,) 1 = used, 0 = left out because it fits none of the others."""
+        """(n,) 1 = used, 0 = rejected because it does not fit the others."""
 
     @property
     def chi2(self) -> float:
@@ -59,27 +59,27 @@ class Evidence(Protocol):
 
     @property
     def measured_chi2(self) -> float:
-        """Weighted by the measured noise alone; NaN when nobody measured it."""
+        """Weighted by the measured noise alone; NaN if the noise was not measured."""
 
     @property
     def second_basin_chi2(self) -> float | None:
-        """How much larger chi2 is at the best other solution; None if there is none."""
+        """Increase of chi2 at the best other solution; None if there is none."""
 
     @property
     def components(self) -> Mapping[str, float]:
-        """Standard deviations of what was found beyond the measured noise, by name with unit."""
+        """Standard deviations of the variance components beyond the measured noise, by name with unit."""
 
     @property
-    def drift(self) -> Drifted | None:
-        """How the bias moved, where it did."""
+    def drift(self) -> BiasDrift | None:
+        """Drift of the bias; None if none was found."""
 
     @property
     def response(self) -> Response | None:
-        """Gain and cross-talk of the sensor, where they were found."""
+        """Gain and cross-talk of the sensor; None if none were found."""
 
     @property
     def gain_sigma(self) -> float:
-        """Standard deviation of the entries of the gain, as far as the data leave room for it."""
+        """Standard deviation of the gain entries that the data do not exclude."""
 
     @property
     def residuals(self) -> Array:
@@ -96,7 +96,7 @@ class Evidence(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class IndependentFit:
-    """A fit to poses with independent noise, for methods that do not cross-validate themselves."""
+    """A fit to poses with independent noise, for methods without cross-validation of their own."""
 
     parameters: Parameters
     covariance: Array
@@ -110,7 +110,7 @@ class IndependentFit:
     second_basin_chi2: float | None = None
     components: Mapping[str, float] = field(default_factory=dict)
     response: Response | None = None
-    drift: Drifted | None = None
+    drift: BiasDrift | None = None
     gain_sigma: float = 0.0
 
     @cached_property
@@ -146,38 +146,13 @@ class IndependentFit:
 
     @cached_property
     def _left_out(self) -> tuple[Array, Array]:
-        J = jacobian(self.parameters, self.R_base_flange)
-        return leave_one_out(self.residuals, J, self.wrench_cov, self.weights)
-
-
-def leave_one_out(
-    residuals: Array, jacobian: Array, wrench_cov: Array, weights: Array | None = None
-) -> tuple[Array, Array]:
-    """Predict every pose from all others without fitting again: (I - H_kk)^-1 r_k, exact for a linear model.
-
-    Parameters
-    ----------
-    residuals : array, shape (n, 6)
-        Of the fit to all poses.
-    jacobian : array, shape (n, 6, p)
-    wrench_cov : array, shape (n, 6, 6)
-        Noise, independent between poses.
-    weights : array, shape (n,), optional
-        0 for poses that the fit did not use; 1 for the others and by default.
-
-    Returns
-    -------
-    left_out : array, shape (n, 6)
-        Measured minus what the other poses predict.
-    covariance : array, shape (n, 6, 6)
-        Of these. Very large where the others determine nothing.
-    """
-    noise = Noise(wrench_cov, kept=None if weights is None else weights > 0)
-    WJ = noise.solve(jacobian)
-    information = summed_products(jacobian, WJ)
-    scale = column_scale(information)
-    C = np.asarray(np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)) / np.outer(scale, scale)
-    return left_out(noise, WJ, noise.solve(residuals[..., None])[..., 0], C)
+        """(I - H_kk)^-1 r_k without fitting again, exact for a linear model, and its covariance."""
+        J, noise = jacobian(self.parameters, self.R_base_flange), Noise(self.wrench_cov, kept=self.weights > 0)
+        WJ = noise.solve(J)
+        information = summed_products(J, WJ)
+        scale = column_scale(information)
+        C = np.asarray(np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)) / np.outer(scale, scale)
+        return left_out(noise, WJ, noise.solve(self.residuals[..., None])[..., 0], C)
 
 
 def standardized(residuals: Array, covariance: Array) -> Array:

@@ -1,7 +1,7 @@
-"""What a set of poses can tell: rank, what is mixed with what, the second solution, and the poses to add.
+"""Observability of a set of poses: rank, parameters that cannot be separated, second solution, and poses to add.
 
-The Fisher information knows the neighbourhood of one solution only. Two questions more are asked of a set of poses: is
-there a second solution elsewhere that explains everything as well, and which motion would end the doubt.
+The Fisher information covers the neighbourhood of one solution only. So two further checks follow: whether a second
+solution elsewhere explains the data as well, and which motion removes the ambiguity.
 """
 
 from dataclasses import dataclass, replace
@@ -14,61 +14,61 @@ from calib.likelihood.rotation_minima import Minimum, force_cost, minima
 from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, gravity_wrench, jacobian
 
 LEAST_POSES = 4
-"""Three different orientations have 4 or 8 exact solutions, though their Fisher information has full rank."""
+"""Three different orientations have 4 or 8 exact solutions, although their Fisher information has full rank."""
 RECOMMENDED_POSES = 6
 RANK_TOLERANCE = 1e-9
 POOR_CONDITION = 1e4
 WEAK_GAP = 0.02
-"""Eight poses of a tool of ten times the noise still tell the two solutions apart."""
+"""Eight poses distinguish the two solutions even if the tool weighs only ten times the noise."""
 AMBIGUOUS_GAP = 1e-6
 ACCEPTED_DELTA_CHI2 = 12.0
-"""A second solution this much worse was never the right one in 7361 simulated calibrations."""
+"""In 7361 simulated calibrations, a second solution with chi2 larger by this was never the right one."""
 SAME_ORIENTATION_RAD = np.deg2rad(0.5)
 LEVER_M = 0.025
 """Usual ratio of torque noise to force noise."""
 MOST_ADVISED = 5
 
 NOMINAL = Parameters(np.eye(3), -STANDARD_GRAVITY_M_S2 * UP_IN_BASE, np.zeros(3), np.array([0, 0, 0.08]), np.zeros(3))
-"""Before any data: 1 kg, 80 mm from a sensor on an upright robot. Rank and gap hardly depend on it."""
+"""Tool before any data: 1 kg, 80 mm from a sensor on an upright robot. Rank and gap hardly depend on it."""
 
 _SAME_MINIMUM_RAD = np.deg2rad(1.0)
 _ALIGNED = np.cos(np.deg2rad(5.0))
 _NARROW_DEG = 30.0
 _THIN = 0.02
-"""Spread of unit vectors below this is none: about one degree."""
+"""Smaller spreads of unit vectors count as zero: about one degree."""
 _GROUPS = ("the mounting of the sensor", "gravity", "force bias", "centre of mass", "torque bias")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observability:
-    """What the poses determine."""
+    """Which parameters the poses determine."""
 
     orientations: int
-    """Different ones, counted up to 24."""
+    """Number of different orientations, counted up to 24."""
     rank: int
-    """Of the 15 parameters, this many combinations."""
+    """Number of determined combinations of the 15 parameters."""
     condition: float
     """Ratio of the extreme eigenvalues of the scaled Fisher information; infinite below rank 15."""
-    gauges: tuple[str, ...]
-    """In words: what is mixed and why. Empty for a sound set."""
+    ambiguities: tuple[str, ...]
+    """Sentences: the reason, then the parameters that cannot be separated. Empty for a sound set."""
     advice: tuple[str, ...]
-    """Poses to add, one phrase each, each from the last pose of the set."""
+    """Poses to add, one phrase each, starting from the last pose of the set."""
     advised_R_base_flange: Array
-    """(k, 3, 3) the same poses as orientations; with them the set is sound, as far as five poses can do it."""
+    """(k, 3, 3) orientations of these poses; they make the set sound, if five poses suffice."""
     second_gap: float
-    """Mean squared force residual of the best other solution, over the squared weight: at best 8/9, 0 if ambiguous."""
+    """Mean squared force residual of the best other solution, over weight squared: at best 8/9, 0 if ambiguous."""
 
     @property
     def sound(self) -> bool:
-        """Four orientations, full rank, fair condition, and a second solution that is clearly worse."""
+        """True for four orientations, full rank, a fair condition, and a clearly worse second solution."""
         enough = self.orientations >= LEAST_POSES and self.rank == 15
         return enough and self.condition <= POOR_CONDITION and self.second_gap >= WEAK_GAP
 
     def sentence(self) -> str:
-        """Say what is wrong and what to do about it."""
-        if not self.gauges:
+        """One sentence with the reason and the poses to add."""
+        if not self.ambiguities:
             return f"the poses determine all parameters (condition {self.condition:.2g}, gap {self.second_gap:.2g})."
-        text = self.gauges[0] + (": " + ", and ".join(self.gauges[1:]) if self.gauges[1:] else "")
+        text = self.ambiguities[0] + (": " + ", and ".join(self.ambiguities[1:]) if self.ambiguities[1:] else "")
         if len(self.advice) == 1:
             text += f"; add a pose: from the last one, {self.advice[0]}"
         elif self.advice:
@@ -79,15 +79,15 @@ class Observability:
 def assess(
     R_base_flange: Array, parameters: Parameters = NOMINAL, wrench_cov: Array | None = None, *, advise: bool = True
 ) -> Observability:
-    """Tell what a set of poses determines.
+    """Assess which parameters a set of poses determines.
 
     Parameters
     ----------
     R_base_flange : array, shape (n, 3, 3)
     parameters : Parameters
-        As estimated or, before any data, as guessed.
+        Estimated or, before any data, guessed.
     wrench_cov : array, shape (n, 6, 6), optional
-        Noise of each pose; equal for all poses if not given.
+        Noise of each pose; equal for all poses by default.
     advise : bool
         Whether to look for poses to add.
     """
@@ -101,18 +101,18 @@ def assess(
     if found.sound:
         return found
     weak = V[:, free] if rank < 15 else V[:, :1]
-    gauges = _gauges(R_base_flange, parameters, information / eigenvalues[-1], weak, found)
+    ambiguities = _ambiguities(R_base_flange, parameters, information / eigenvalues[-1], weak, found)
     words, poses = _advice(R_base_flange, parameters) if advise else ((), found.advised_R_base_flange)
-    return replace(found, gauges=gauges, advice=words, advised_R_base_flange=poses)
+    return replace(found, ambiguities=ambiguities, advice=words, advised_R_base_flange=poses)
 
 
 def require_orientations(R_base_flange: Array, least: int = LEAST_POSES) -> None:
-    """Refuse fewer than `least` different orientations.
+    """Raise `NotObservable` for fewer than `least` different orientations.
 
     Raises
     ------
     NotObservable
-        One sentence: how many there are, and what to add.
+        The message gives their number and the poses to add.
     """
     n, different = len(R_base_flange), different_orientations(R_base_flange)
     if n < least:
@@ -130,19 +130,19 @@ def require_orientations(R_base_flange: Array, least: int = LEAST_POSES) -> None
 
 
 def require_observable(R_base_flange: Array, parameters: Parameters, wrench_cov: Array | None = None) -> None:
-    """Refuse poses that cannot determine the parameters.
+    """Raise `NotObservable` for poses that do not determine the parameters.
 
     Parameters
     ----------
     R_base_flange : array, shape (n, 3, 3)
     parameters : Parameters
-        As estimated: what a set of poses can tell depends on where gravity points.
+        Estimated, because observability depends on the direction of gravity.
     wrench_cov : array, shape (n, 6, 6), optional
 
     Raises
     ------
     NotObservable
-        One sentence: what is mixed and which poses to add.
+        The message names the reason and the poses to add.
     """
     require_orientations(R_base_flange)
     found = assess(R_base_flange, parameters, wrench_cov, advise=False)
@@ -155,8 +155,8 @@ def scaled_information(
 ) -> Array:
     """Fisher information (15, 15) in units of 1 rad, weight, weight, lever and weight times lever.
 
-    The lever is the distance of the centre of mass, 25 mm at least. Without noise that of the forces is taken as the
-    weight and that of the torques as 25 mm times it, so the entries count poses.
+    The lever is the distance of the centre of mass, 25 mm at least. By default the noise of the forces
+    is the weight and that of the torques 25 mm times it, so that the entries count poses.
     """
     weight_N = float(np.linalg.norm(parameters.gravity_force_base_N)) or 1.0
     lever_m = max(float(np.linalg.norm(parameters.p_sensor_com_m)), LEVER_M)
@@ -172,14 +172,14 @@ def scaled_information(
 def second_basin_gap(R_base_flange: Array, parameters: Parameters = NOMINAL) -> float:
     """Mean squared force residual, over the squared weight, of the best solution with another mounting of the sensor.
 
-    Without noise, and from the forces alone: torques rarely decide. With white force noise sigma the wrong solution
+    Without noise and from forces alone, because torques rarely decide. With white force noise sigma the wrong solution
     of n poses is worse by n (weight / sigma)² times the gap. Infinite if there is no other minimum.
     """
     return second_minimum(R_base_flange, parameters)[0]
 
 
 def second_minimum(R_base_flange: Array, parameters: Parameters) -> tuple[float, Minimum | None]:
-    """Give the gap of `second_basin_gap` and the best solution with another mounting of the sensor, if there is one."""
+    """Return the gap of `second_basin_gap` and the best solution with another mounting of the sensor, None if none."""
     force_N = gravity_wrench(parameters, R_base_flange)[:, :3]
     found = minima(force_cost(R_base_flange, force_N, np.ones(len(force_N))))
     others = (m for m in found if angle_between(m.R.T, parameters.R_flange_sensor) > _SAME_MINIMUM_RAD)
@@ -190,9 +190,9 @@ def second_minimum(R_base_flange: Array, parameters: Parameters) -> tuple[float,
 
 
 def wrong_basin_probability(delta_chi2: float) -> float:
-    """Odds that the second-best solution is the right one, when its chi2 is larger by `delta_chi2`.
+    """Probability that the second-best solution is the right one if its chi2 is larger by `delta_chi2`.
 
-    Calibrated on 8954 simulated calibrations; from `ACCEPTED_DELTA_CHI2` on the best one is accepted.
+    Calibrated on 8954 simulated calibrations; from `ACCEPTED_DELTA_CHI2` on, the best one is accepted.
     """
     return float(1 / (1 + np.exp(delta_chi2 / 2)))
 
@@ -213,20 +213,20 @@ def different_orientations(R_base_flange: Array) -> int:
     return len(kept)
 
 
-def _gauges(
+def _ambiguities(
     R_base_flange: Array, parameters: Parameters, information: Array, weak: Array, found: Observability
 ) -> tuple[str, ...]:
-    """Name the reason, then what is mixed."""
+    """Sentences: the reason, then the parameters that cannot be separated."""
     different = found.orientations
     if different == 1:
         return (
-            "there is only one orientation: weight, bias, centre of mass and mounting of the sensor cannot be told "
-            "apart",
+            "there is only one orientation: weight, bias, centre of mass and mounting of the sensor cannot be "
+            "separated",
         )
     if different < LEAST_POSES:
         return (
-            f"there are only {different} different orientations: several solutions explain them exactly, bias, weight "
-            "and mounting of the sensor are mixed",
+            f"there are only {different} different orientations: several solutions explain them exactly, and bias, "
+            "weight and mounting of the sensor cannot be separated",
         )
     weight_N = float(np.linalg.norm(parameters.gravity_force_base_N))
     gravity_flange = parameters.gravity_force_base_N @ R_base_flange / weight_N  # unit vectors
@@ -239,13 +239,15 @@ def _gauges(
     _, spread, normals = np.linalg.svd(gravity_flange - gravity_flange.mean(axis=0))
     thin = _THIN * np.sqrt(len(gravity_flange))
     if spread[1] < thin and spread[0] > 2 * thin:
-        return ("gravity pulls along one line of the tool only: bias, weight and mounting of the sensor are mixed",)
+        return (
+            "gravity acts along one line of the tool only: bias, weight and mounting of the sensor cannot be separated",
+        )
     if spread[2] < min(thin, 0.05 * spread[1]):
         normal = normals[2]
         angle = np.rad2deg(np.arccos(np.clip(abs(float(gravity_flange.mean(axis=0) @ normal)), 0, 1)))
         return (
             f"all poses keep {_axis(normal)} at one angle to gravity, {angle:.0f}° from the vertical",
-            "with gravity reversed and the sensor turned by 180° about that axis they are explained as well",
+            "reversed gravity with the sensor turned by 180° about that axis explains them as well",
         )
     mean = gravity_flange.mean(axis=0)
     length = float(np.linalg.norm(mean))  # zero for balanced sets, which point everywhere
@@ -253,23 +255,23 @@ def _gauges(
     if widest < _NARROW_DEG:
         return (
             f"gravity stays within {widest:.0f}° of one direction in the tool: mounting of the sensor, weight and bias "
-            "are hard to tell apart",
+            "are hard to separate",
         )
     if found.rank == 15 and found.condition <= POOR_CONDITION:
         return (
-            "a quite different mounting of the sensor explains these poses nearly as well if the tool is light "
+            "a very different mounting of the sensor explains these poses almost as well if the tool is light "
             f"(gap {found.second_gap:.2g}, {WEAK_GAP:g} is sound)",
         )
     share = (weak**2).sum(axis=1).reshape(5, 3).sum(axis=1) / weak.shape[1]
     names = ", ".join(name for name, part in zip(_GROUPS, share, strict=True) if part > 0.05)
-    how = "cannot be told apart" if found.rank < 15 else f"are hard to tell apart (condition {found.condition:.1g})"
+    how = "cannot be separated" if found.rank < 15 else f"are hard to separate (condition {found.condition:.1g})"
     return (f"{names} {how}",)
 
 
 def _one_axis(
     axis_flange: Array, R_base_flange: Array, parameters: Parameters, information: Array, *, steady: bool
 ) -> tuple[str, ...]:
-    """Turning about one axis: a mixture is named only if its change of the parameters hardly changes a reading."""
+    """Turns about one axis only: name each change of the parameters that hardly changes a reading."""
     R, P, b = parameters.R_flange_sensor.T, parameters.p_sensor_com_m, parameters.gravity_force_base_N
     axis_base, axis_sensor = R_base_flange @ axis_flange, R @ axis_flange
     weight_N, zero = float(np.linalg.norm(b)), np.zeros(3)
@@ -280,26 +282,28 @@ def _one_axis(
         x = np.concatenate(change) / scale
         return bool(x @ information @ x < x @ x / POOR_CONDITION)
 
-    mixed = []
+    inseparable = []
     if steady:
-        reason = "the tool was turned about the vertical only, its weight always pulls the same way"
+        reason = "the tool was turned about the vertical only, so its weight always has the same direction"
         gravity_flange = b @ R_base_flange
         force_N = R @ gravity_flange
         delta = np.cross(gravity_flange, np.eye(3)[np.abs(gravity_flange).argmin()]) / weight_N
         dF0 = R @ np.cross(gravity_flange, delta)
         if unseen(delta, zero, dF0, zero, np.cross(P, dF0)):
-            mixed.append("the sensor's mounting is mixed with the force bias")
+            inseparable.append("the sensor mounting cannot be separated from the force bias")
         dP = lever_m * np.cross(force_N, np.eye(3)[np.abs(force_N).argmin()]) / weight_N
         if unseen(zero, zero, zero, dP, np.cross(force_N, dP)):
-            mixed.append("the centre of mass is mixed with the torque bias")
+            inseparable.append("the centre of mass cannot be separated from the torque bias")
     else:
         last = abs(axis_flange[2]) > _ALIGNED
         reason = "only the last joint was turned" if last else f"the tool was turned about {_axis(axis_flange)} only"
         if unseen(-axis_flange, np.cross(axis_base, b), zero, zero, zero):
-            mixed.append("the sensor's angle about that axis is mixed with the direction of gravity about it")
+            inseparable.append(
+                "the sensor angle about that axis cannot be separated from the direction of gravity about it"
+            )
     if unseen(zero, axis_base, -axis_sensor, zero, -np.cross(P, axis_sensor)):
-        mixed.append("the weight along the axis is mixed with the force bias along it")
-    return (reason, *mixed)
+        inseparable.append("the weight along the axis cannot be separated from the force bias along it")
+    return (reason, *inseparable)
 
 
 def _axis(axis_flange: Array) -> str:
@@ -310,7 +314,7 @@ def _axis(axis_flange: Array) -> str:
 
 
 def _motions() -> list[tuple[str, Array]]:
-    """What can be asked of somebody who stands before the last pose, simple things first."""
+    """Motions of the tool from the last pose, as phrases and rotations, simple ones first."""
 
     def turn(axis: str, angle_deg: int) -> tuple[str, Array]:
         words = "turn the last joint by" if axis == "z" else "tilt the tool about the flange's"
@@ -324,9 +328,9 @@ def _motions() -> list[tuple[str, Array]]:
 
 
 def _advice(R_base_flange: Array, parameters: Parameters) -> tuple[tuple[str, ...], Array]:
-    """Look for few and simple motions from the last pose that make the set sound.
+    """Search for few and simple motions from the last pose that make the set sound.
 
-    The first that does so, else the most informative one and on from there.
+    Each step takes the first motion that does so, or else the most informative one.
     """
     poses, words, motions = R_base_flange, list[str](), _motions()
     while len(words) < MOST_ADVISED:
@@ -342,7 +346,7 @@ def _advice(R_base_flange: Array, parameters: Parameters) -> tuple[tuple[str, ..
 
 
 def _worth(R_base_flange: Array, parameters: Parameters) -> float:
-    """Volume of the information, and how far gravity in the tool is from a plane, where a second solution hides."""
+    """Volume of the information, and distance of gravity directions from a plane, which has a second solution."""
     information = scaled_information(R_base_flange, parameters)
     gravity_flange = parameters.gravity_force_base_N @ R_base_flange
     spread = np.linalg.svd(gravity_flange - gravity_flange.mean(axis=0), compute_uv=False)

@@ -1,4 +1,4 @@
-"""What a fit is worth, in plain words: how well it predicts, whether it is plausible, and what looks reversed."""
+"""The verdict on a fit, with reasons: how well it predicts, whether it is plausible, and which signs look reversed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from scipy.special import chdtrc as chi2_sf
 from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtr as normal_cdf
 
-from calib.assessment.cross_validation import Drifted, Evidence, standardized
+from calib.assessment.cross_validation import AssessedFit, BiasDrift, standardized
 from calib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, torque_units
 from calib.assessment.load_shift import lasting_change
 from calib.assessment.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
@@ -27,20 +27,20 @@ NEAREST_COM_M = 5e-4
 NOISE_FACTOR = 3.0
 USABLE_SHARE, REJECTED_SHARE = 0.02, 0.10
 SENSELESS_SHARE = 0.5
-"""With residuals of half the weight, neither gravity nor centre of mass mean anything."""
+"""If residuals reach half the weight, neither gravity nor centre of mass mean anything."""
 NOISY_SHARE = 0.01
-"""The cross-validated error allowed to a good result whose residuals exceed the measured noise."""
+"""Largest error of a good result whose residuals exceed the measured noise."""
 USUAL_LEVER_M = 0.1
-"""Torque errors are compared with the weight at this lever, or at the centre of mass where that is farther."""
+"""Torque errors are compared with the weight at this lever, or at the centre of mass if that is farther."""
 NOTED_TILT_DEG, REVERSED_TILT_DEG = 10.0, 135.0
 INSIDE_M = 0.01
-"""A centre of mass may lie this far on the robot's side of the sensor origin: adapter plates do."""
+"""A centre of mass may lie this far on the robot's side of the sensor origin, because adapter plates do."""
 NOISELESS = 1e-6
-"""Simulated without noise: equal readings are no copies."""
+"""Below this chi2 per degree of freedom the data are simulated without noise, and equal readings are no copies."""
 CORRELATED = 0.9
 FEW_LEFT_OUT = 0.1
 SURE = 1e-3
-"""Probability of a false remark."""
+"""Probability of a false reason."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,18 +49,18 @@ class Quality:
 
     verdict: Verdict
     reasons: tuple[str, ...]
-    """What made it worse than good, most important first; then what else is worth knowing."""
+    """Reasons for a verdict below good, most important first, then notes."""
     chi2_p: float | None
-    """Probability of a worse chi2 if the measured noise were all there is; None when nobody measured it."""
+    """Probability of a larger chi2 if there is only the measured noise; None if the noise was not measured."""
     noise_factor: float | None
-    """Residuals over measured noise; None when nobody measured it."""
+    """Residuals over measured noise; None if the noise was not measured."""
     loo_force_rms_N: float
-    """Cross-validated: root mean square error in predicting each used pose from all others."""
+    """Cross-validated: root mean square error of predicting each used pose from all others."""
     loo_torque_rms_Nm: float
     worst_pose: int
-    """Row of the pose that the others predict worst."""
+    """Row of the used pose with the largest cross-validated residual."""
     residual_sigma: Array
-    """(n,) left-out residual of each pose, root mean square over the channels, in standard deviations: 1 expected."""
+    """(n,) cross-validated residual of each pose in sigma, root mean square over the channels: 1 expected."""
     lag1: float
     """Correlation of the residuals of successive used poses; near 0 without drift."""
     correlations: tuple[tuple[str, str, float], ...]
@@ -68,123 +68,147 @@ class Quality:
 
 
 def judge(
-    fit: Evidence,
+    fit: AssessedFit,
     *,
     t_s: Array | None = None,
     measured_sigma: Array | None = None,
     farthest_com_m: float = FARTHEST_COM_M,
     up_in_base: ArrayLike = UP_IN_BASE,
-    unconstrained: Evidence | None = None,
+    unconstrained: AssessedFit | None = None,
     contradicted: Sequence[str] = (),
 ) -> Quality:
     """Judge a fit.
 
-    Errors count relative to the weight, torques at a lever: the residual, the error in predicting left-out poses, which
-    few poses cannot make look small, and the error expected over all orientations. Up to three times the measured noise
-    is good if they stay below 1 %: orientations and cables always add something to the noise of a good sensor.
+    Errors count relative to the weight, torques at a lever: the residual, the cross-validated error, which few poses
+    cannot make look small, and the error expected over all orientations. Residuals up to three times the measured noise
+    are good if the errors stay below 1 %, because orientations and cables always add to the noise of a good sensor.
 
     Parameters
     ----------
-    fit : Evidence
+    fit : AssessedFit
     t_s : array, shape (n,), optional
-        When each pose was measured; the order of rows counts where it is missing or not finite.
+        When each pose was measured; the order of rows counts if it is missing or not finite.
     measured_sigma : array, shape (6,), optional
-        Noise of a pose, as measured. With it, a load that shifted in mid-run is found.
+        Measured noise of a pose. With it, a load that shifted during the tour is detected.
     farthest_com_m : float
-        How far from the sensor the centre of mass of the tool can be.
+        Largest plausible distance of the centre of mass from the sensor.
     up_in_base : array_like, shape (3,)
-        Where up should be, in base: +z for a robot on a table.
-    unconstrained : Evidence, optional
-        The best fit to the same poses with nothing taken as known, where `fit` is another.
+        Expected up direction in base: +z for a robot on a table.
+    unconstrained : AssessedFit, optional
+        The best fit to the same poses without known values, if `fit` used some.
     contradicted : sequence of str
-        What was taken as known and that fit contradicts, as `Known.contradictions` has it.
+        Known values that the unconstrained fit contradicts, from `calib.assessment.contradictions`.
     """
-    rejected: list[str] = []
-    usable: list[str] = []
-    notes: list[str] = []
-    parameters, used = fit.parameters, fit.weights > 0.5
-    n = int(used.sum())
-    weight_N = float(np.linalg.norm(parameters.gravity_force_base_N))
-    residuals = standardized(fit.left_out_residuals, fit.left_out_cov)
-    residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
-    worst = int(np.argmax(np.where(used, residual_sigma, -1.0)))
-    lag1, lag1_p = successive_correlation(residuals[used], None if t_s is None else t_s[used])
-    shares, cross_validated = _shares(fit, used, weight_N)
-    largest = shares[0][1]
-
-    inexact = [words for words, share in shares if share > USABLE_SHARE]
-    few = n >= (1 - FEW_LEFT_OUT) * len(used)
-    explanation = [] if few and not inexact else _faults(fit, used, t_s, up_in_base)
-    if fit.chi2 > NOISELESS * fit.dof:
-        rejected += broken_channels(fit.wrench, fit.R_base_flange)
-    rejected += explanation + _weight_reasons(fit, weight_N) + _second_solution_reasons(fit)
-    _com_reasons(parameters, farthest_com_m, rejected, usable)
-    (rejected if largest > REJECTED_SHARE else usable).extend(inexact)
-    if unconstrained is not None and largest > NOISY_SHARE and not contradicted:
-        usable += _contradiction_reasons(fit, unconstrained)
-    sensible = not explanation and largest < SENSELESS_SHARE
-    if sensible:
-        usable += reversed_signs(parameters, fit.covariance, up_in_base, farthest_com_m)
-    noise_factor, chi2_p = None, None
-    if np.isfinite(fit.measured_chi2):
-        noise_factor = float(np.sqrt(fit.measured_chi2 / fit.dof))
-        chi2_p = float(chi2_sf(fit.dof, fit.measured_chi2))
-        if chi2_p < SURE:
-            good = noise_factor <= NOISE_FACTOR and largest <= NOISY_SHARE
-            (notes if good else usable).append(_noise_reason(fit, noise_factor))
-    changed: list[str] = []
-    if measured_sigma is not None and chi2_p is not None and (chi2_p < SURE or not used.all()):
-        changed = _change_reasons(fit, residual_sigma, measured_sigma, t_s)
-        rejected += changed
-    if not used.all():
-        listed = ", ".join(str(k + 1) for k in np.flatnonzero(~used))
-        (notes if few else usable).append(
-            f"{len(used) - n} of {len(used)} poses were left out, they fit none of the others: repeat {listed}"
-        )
-    if n < RECOMMENDED_POSES:
-        usable.append(f"there are only {n} poses: {RECOMMENDED_POSES} or more can be checked against each other")
-    usable += _indispensable_reasons(fit, used, weight_N)
-
-    if fit.response is not None:
-        notes.append(f"{fit.response.in_words()}: the calibration corrects this for its own weight")
-    if lag1_p < SURE:
-        notes.append(
-            f"successive poses have similar residuals (correlation {lag1:.2f}): most likely the bias drifted, so let "
-            "the sensor warm up and mix the order of the poses"
-        )
-    typical = float(np.median(residual_sigma[used] ** 2))
-    if n >= RECOMMENDED_POSES and residual_sigma[worst] ** 2 > chi2_isf(6, SURE / n) / 6 * max(typical, 1.0):
-        notes.append(f"pose {worst + 1} is out of line, {residual_sigma[worst]:.1f} sigma: consider repeating it")
-    if sensible:
-        notes += _tilt_notes(parameters, up_in_base)
-    if chi2_p is None:
-        notes.append("the noise was not measured but estimated from the residuals: chi2 says nothing about the fit")
+    at = _statistics(fit, t_s)
+    parameters, weight_N, n = fit.parameters, at.weight_N, int(at.used.sum())
+    few_rejected = n >= (1 - FEW_LEFT_OUT) * len(at.used)
+    inexact = [words for words, share in at.shares if share > USABLE_SHARE]
+    explanation = [] if few_rejected and not inexact else _faults(fit, at.used, t_s, up_in_base)
+    plausible = not explanation and at.largest_share < SENSELESS_SHARE
+    com_too_far = _com_too_far(parameters, farthest_com_m)
+    noise, left_out = _noise_reasons(fit, at), _left_out_reasons(at.used)
+    noise_is_minor = (at.noise_factor or 0) <= NOISE_FACTOR and at.largest_share <= NOISY_SHARE
+    changed = _change_reasons(fit, at, measured_sigma, t_s)
     drifted = _drift_reasons(fit.drift)
-    matters = fit.drift is not None and _drift_share(fit.drift.change, weight_N) > USABLE_SHARE
-    if drifted and matters and not explanation and not changed:
-        (rejected or usable)[:0] = drifted  # before what it causes
+
+    rejected = [
+        *(broken_channels(fit.wrench, fit.R_base_flange) if fit.chi2 > NOISELESS * fit.dof else []),
+        *explanation,
+        *_weight_reasons(fit, weight_N),
+        *_second_solution_reasons(fit),
+        *com_too_far,
+        *(inexact if at.largest_share > REJECTED_SHARE else []),
+        *changed,
+    ]
+    usable = [
+        *([] if com_too_far else _com_too_near(parameters)),
+        *(inexact if at.largest_share <= REJECTED_SHARE else []),
+        *([] if contradicted or at.largest_share <= NOISY_SHARE else _contradiction_reasons(fit, unconstrained)),
+        *(reversed_signs(parameters, fit.covariance, up_in_base, farthest_com_m) if plausible else []),
+        *([] if noise_is_minor else noise),
+        *([] if few_rejected else left_out),
+        *([] if n >= RECOMMENDED_POSES else [f"there are only {n} poses: take {RECOMMENDED_POSES} or more"]),
+        *_unchecked_pose_reasons(fit, at.used, weight_N),
+    ]
+    notes = [
+        *(noise if noise_is_minor else []),
+        *(left_out if few_rejected else []),
+        *([f"{fit.response.in_words()}: the calibration corrects this for its own weight"] if fit.response else []),
+        *_pose_notes(at),
+        *(_tilt_notes(parameters, up_in_base) if plausible else []),
+        *([] if at.chi2_p is not None else ["the noise was estimated from the residuals: chi2 does not test the fit"]),
+    ]
+    drift_matters = fit.drift is not None and _drift_share(fit.drift.change, weight_N) > USABLE_SHARE
+    if drift_matters and not explanation and not changed:
+        (rejected or usable)[:0] = drifted  # before its consequences
     else:
         notes += drifted
-    if contradicted and (chi2_p is None or chi2_p < SURE):
-        known = "; ".join(contradicted)
-        cause = f"what was given as known does not agree with the data: {known}: correct it, or leave it out"
-        (rejected or usable or notes).insert(0, cause)  # before what it causes
+    if contradicted and not at.fits_measured_noise:
+        cause = f"the known values contradict the data: {'; '.join(contradicted)}: correct them, or leave them out"
+        (rejected or usable or notes).insert(0, cause)  # before its consequences
     return Quality(
         verdict="rejected" if rejected else "usable" if usable else "good",
         reasons=(*rejected, *usable, *notes),
-        chi2_p=chi2_p,
-        noise_factor=noise_factor,
-        loo_force_rms_N=cross_validated[0],
-        loo_torque_rms_Nm=cross_validated[1],
-        worst_pose=worst,
-        residual_sigma=residual_sigma,
-        lag1=lag1,
+        chi2_p=at.chi2_p,
+        noise_factor=at.noise_factor,
+        loo_force_rms_N=at.loo_force_rms_N,
+        loo_torque_rms_Nm=at.loo_torque_rms_Nm,
+        worst_pose=at.worst_pose,
+        residual_sigma=at.residual_sigma,
+        lag1=at.lag1,
         correlations=strong_correlations(fit.covariance),
     )
 
 
-def _faults(fit: Evidence, used: NDArray[np.bool_], t_s: Array | None, up_in_base: ArrayLike) -> list[str]:
-    """Look for faults in all poses, and where there are none in those that were used."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Statistics:
+    """The numbers that the reasons rest on; those with the names of `Quality` have its meaning."""
+
+    used: NDArray[np.bool_]
+    weight_N: float
+    residual_sigma: Array
+    worst_pose: int
+    lag1: float
+    lag1_p: float
+    """Probability of a larger correlation by chance."""
+    shares: list[tuple[str, float]]
+    """Errors relative to the weight, each with its sentence, largest first."""
+    loo_force_rms_N: float
+    loo_torque_rms_Nm: float
+    noise_factor: float | None
+    chi2_p: float | None
+
+    @property
+    def largest_share(self) -> float:
+        return self.shares[0][1]
+
+    @property
+    def fits_measured_noise(self) -> bool:
+        return self.chi2_p is not None and self.chi2_p >= SURE
+
+
+def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
+    used = fit.weights > 0.5
+    weight_N = float(np.linalg.norm(fit.parameters.gravity_force_base_N))
+    residuals = standardized(fit.left_out_residuals, fit.left_out_cov)
+    residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
+    shares, left_out_rms = _shares(fit, used, weight_N)
+    measured = bool(np.isfinite(fit.measured_chi2))
+    return _Statistics(
+        used,
+        weight_N,
+        residual_sigma,
+        int(np.argmax(np.where(used, residual_sigma, -1.0))),
+        *successive_correlation(residuals[used], None if t_s is None else t_s[used]),
+        shares,
+        *left_out_rms,
+        noise_factor=float(np.sqrt(fit.measured_chi2 / fit.dof)) if measured else None,
+        chi2_p=float(chi2_sf(fit.dof, fit.measured_chi2)) if measured else None,
+    )
+
+
+def _faults(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None, up_in_base: ArrayLike) -> list[str]:
+    """Look for faults in all poses, and if there are none, in the used poses."""
     order = np.arange(len(used)) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
     found = faults(fit.R_base_flange[order], fit.wrench[order], up_in_base)
     return found if found or used.all() else faults(fit.R_base_flange[used], fit.wrench[used], up_in_base)
@@ -233,7 +257,7 @@ def reversed_signs(
     up_in_base: ArrayLike = UP_IN_BASE,
     farthest_com_m: float = FARTHEST_COM_M,
 ) -> list[str]:
-    """Say what a weight that pulls upwards means, and a centre of mass on the robot's side of the sensor."""
+    """Explain a weight that pulls upwards, and a centre of mass on the robot's side of the sensor."""
     angle_deg, inside_m = _tilt_deg(parameters, up_in_base), _inside_m(parameters, covariance)
     if angle_deg < REVERSED_TILT_DEG:
         if not 0 < inside_m <= farthest_com_m:
@@ -270,7 +294,7 @@ def _drift_share(change: Array, weight_N: float) -> float:
     return float(max(sizes) / weight_N) if weight_N else float("inf")
 
 
-def _drift_reasons(drift: Drifted | None) -> list[str]:
+def _drift_reasons(drift: BiasDrift | None) -> list[str]:
     if drift is None or not (np.abs(drift.change) > 3 * drift.sigma).any():
         return []
     force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
@@ -281,24 +305,24 @@ def _drift_reasons(drift: Drifted | None) -> list[str]:
 
 
 def _tilt_deg(parameters: Parameters, up_in_base: ArrayLike) -> float:
-    """Angle between the weight and where down should be."""
+    """Angle between the weight and the expected down direction."""
     up, F_b = np.asarray(up_in_base, dtype=np.float64), parameters.gravity_force_base_N
     cosine = -float(F_b @ up) / float(np.linalg.norm(F_b) * np.linalg.norm(up) or 1.0)
     return float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def _inside_m(parameters: Parameters, covariance: Array) -> float:
-    """How far the centre of mass lies behind the sensor as seen from outside; 0 where it is not sure."""
+    """Distance of the centre of mass behind the sensor, towards the robot; 0 if it is not significant."""
     outwards = parameters.R_flange_sensor[2]  # flange z in the sensor frame
     inside_m = -float(outwards @ parameters.p_sensor_com_m)
     sigma_m = float(np.sqrt(outwards @ covariance[9:12, 9:12] @ outwards))
     return inside_m if inside_m > max(INSIDE_M, 3 * sigma_m) else 0.0
 
 
-def _weight_reasons(fit: Evidence, weight_N: float) -> list[str]:
+def _weight_reasons(fit: AssessedFit, weight_N: float) -> list[str]:
     along = fit.parameters.gravity_force_base_N / (weight_N or 1.0)
     variance = float(along @ fit.covariance[3:6, 3:6] @ along)
-    sigma_N = np.sqrt(max(variance, 0.0))  # below 0 is rounding of a weight that is exactly known
+    sigma_N = np.sqrt(max(variance, 0.0))  # below 0 only by rounding, if the weight is exactly known
     if weight_N > SIGNIFICANT_SIGMAS * sigma_N:
         return []
     if given_in_base := constant_weight(fit.wrench):
@@ -309,7 +333,7 @@ def _weight_reasons(fit: Evidence, weight_N: float) -> list[str]:
     ]
 
 
-def _second_solution_reasons(fit: Evidence) -> list[str]:
+def _second_solution_reasons(fit: AssessedFit) -> list[str]:
     if fit.second_basin_chi2 is None:
         return []
     delta = fit.second_basin_chi2 / max(1.0, fit.chi2 / fit.dof)
@@ -317,24 +341,26 @@ def _second_solution_reasons(fit: Evidence) -> list[str]:
         return []
     odds = 100 * wrong_basin_probability(max(delta, 0.0))
     return [
-        "a quite different mounting of the sensor explains the data almost as well "
-        f"(it is the right one with {odds:.2g} %): add poses with another angle between the tool and the vertical"
+        f"a very different mounting of the sensor explains the data almost as well (probability {odds:.2g} %): "
+        "add poses with another angle between the tool and the vertical"
     ]
 
 
 def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
-    """Rows that were left out, or that the others predict badly."""
+    """Rows of poses that were rejected, or that the others predict badly."""
     typical = max(float(np.median(residual_sigma[used] ** 2)), 1.0)
     limit = chi2_isf(6, SURE / len(residual_sigma)) / 6 * typical
     return np.flatnonzero(~used | (residual_sigma**2 > limit)).tolist()
 
 
-def _change_reasons(fit: Evidence, residual_sigma: Array, measured_sigma: Array, t_s: Array | None) -> list[str]:
-    """Refuse poses of two different loads. White noise cannot stand for that: half the poses are off the same way.
+def _change_reasons(fit: AssessedFit, at: _Statistics, measured_sigma: Array | None, t_s: Array | None) -> list[str]:
+    """Report poses of two different loads, which no white noise explains: all poses after the change deviate alike.
 
-    Where all poses before the change were left out, the rest tells of the load as it is now.
+    If all poses before the change were rejected, the others describe the present load, and nothing is reported.
     """
-    n, used = len(fit.wrench), fit.weights > 0.5
+    if measured_sigma is None or at.chi2_p is None or (at.fits_measured_noise and at.used.all()):
+        return []
+    n = len(fit.wrench)
     times = np.arange(n, dtype=np.float64) if t_s is None or not np.isfinite(t_s).all() else t_s
     order = np.argsort(times, kind="stable")
     change = lasting_change(
@@ -343,34 +369,63 @@ def _change_reasons(fit: Evidence, residual_sigma: Array, measured_sigma: Array,
         fit.residuals[order],
         measured_sigma,
         times[order],
-        np.flatnonzero(np.isin(order, out_of_line(residual_sigma, used))).tolist(),
+        np.flatnonzero(np.isin(order, out_of_line(at.residual_sigma, at.used))).tolist(),
     )
-    if change is None or not change.of_the_tool or not used[order[: change.position]].any():
+    if change is None or not change.of_the_tool or not at.used[order[: change.position]].any():
         return []
     return [f"the poses do not belong to one tool: {change.in_words(f'pose {order[change.position] + 1}')}"]
 
 
-def _com_reasons(parameters: Parameters, farthest_com_m: float, rejected: list[str], usable: list[str]) -> None:
+def _left_out_reasons(used: NDArray[np.bool_]) -> list[str]:
+    if used.all():
+        return []
+    listed = ", ".join(str(k + 1) for k in np.flatnonzero(~used))
+    return [
+        f"{np.count_nonzero(~used)} of {len(used)} poses were rejected because they do not fit the others: "
+        f"repeat {listed}"
+    ]
+
+
+def _pose_notes(at: _Statistics) -> list[str]:
+    """Name drift from pose to pose, and the pose that deviates most from the others."""
+    notes = []
+    if at.lag1_p < SURE:
+        notes.append(
+            f"successive poses have similar residuals (correlation {at.lag1:.2f}): most likely the bias drifted, so "
+            "let the sensor warm up and mix the order of the poses"
+        )
+    n, worst = int(at.used.sum()), float(at.residual_sigma[at.worst_pose])
+    typical = float(np.median(at.residual_sigma[at.used] ** 2))
+    if n >= RECOMMENDED_POSES and worst**2 > chi2_isf(6, SURE / n) / 6 * max(typical, 1.0):
+        notes.append(f"pose {at.worst_pose + 1} deviates from the others by {worst:.1f} sigma: consider repeating it")
+    return notes
+
+
+def _com_too_far(parameters: Parameters, farthest_com_m: float) -> list[str]:
     com_m = float(np.linalg.norm(parameters.p_sensor_com_m))
-    if com_m > farthest_com_m:
-        units = torque_units(com_m)
-        advice = f"the torques are in {' or '.join(units)}, not N·m" if units else "check the units of force and torque"
-        rejected.append(
-            f"the centre of mass lies {com_m:.2f} m from the sensor, farther than {farthest_com_m:g} m: {advice}"
-        )
-    elif com_m < NEAREST_COM_M:
-        usable.append(
-            f"the centre of mass lies only {1e3 * com_m:.2g} mm from the sensor: torques 1000 times too small, or "
-            "forces in mN, would look like this: check the units"
-        )
+    if com_m <= farthest_com_m:
+        return []
+    units = torque_units(com_m)
+    advice = f"the torques are in {' or '.join(units)}, not N·m" if units else "check the units of force and torque"
+    return [f"the centre of mass is {com_m:.2f} m from the sensor, farther than {farthest_com_m:g} m: {advice}"]
+
+
+def _com_too_near(parameters: Parameters) -> list[str]:
+    com_m = float(np.linalg.norm(parameters.p_sensor_com_m))
+    if com_m >= NEAREST_COM_M:
+        return []
+    return [
+        f"the centre of mass is only {1e3 * com_m:.2g} mm from the sensor, as if torques were 1000 times too small or "
+        "forces were in mN: check the units"
+    ]
 
 
 def _shares(
-    fit: Evidence, used: NDArray[np.bool_], weight_N: float
+    fit: AssessedFit, used: NDArray[np.bool_], weight_N: float
 ) -> tuple[list[tuple[str, float]], tuple[float, float]]:
-    """Errors relative to the weight with the sentence for each, larger of force and torque first, and the left-out rms.
+    """Errors relative to the weight, each with a sentence, largest first, and the cross-validated rms.
 
-    Of residual, left-out and expected error the first is named that breaks the highest limit.
+    Of residual, cross-validated and expected error the sentence names the first that exceeds the highest limit.
     """
     lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
     left_out = _rms(fit.left_out_residuals[used, :3]), _rms(fit.left_out_residuals[used, 3:])
@@ -396,33 +451,37 @@ def _shares(
     return sorted(shares, key=lambda pair: -pair[1]), left_out
 
 
-def _contradiction_reasons(fit: Evidence, unconstrained: Evidence) -> list[str]:
+def _contradiction_reasons(fit: AssessedFit, unconstrained: AssessedFit | None) -> list[str]:
+    if unconstrained is None:
+        return []
     used = unconstrained.weights > 0.5
     return [
-        f"with nothing taken as known the {kind}s fit to {best:.2g} {unit} instead of {ours:.2g} {unit} (method ml): "
-        "check the mass and the level base, if they were taken as known"
+        f"without known values the {kind}s fit to {best:.2g} {unit} instead of {ours:.2g} {unit} (method ml): "
+        "check the known mass and the assumption of a level base"
         for kind, unit, columns in (("force", "N", slice(0, 3)), ("torque", "N·m", slice(3, 6)))
         for ours, best in [(_rms(fit.residuals[used, columns]), _rms(unconstrained.residuals[used, columns]))]
         if best < COLLAPSE * ours
     ][:1]
 
 
-def _noise_reason(fit: Evidence, noise_factor: float) -> str:
+def _noise_reasons(fit: AssessedFit, at: _Statistics) -> list[str]:
+    if at.chi2_p is None or at.fits_measured_noise:
+        return []
     found = ", ".join(f"{name} {value:.2g}" for name, value in fit.components.items() if value > 0)
     included = f": found {found}" if found else ", and the stated uncertainties do not include them"
-    return (
-        f"residuals are {noise_factor:.1f} times the measured noise: drift, cables, contact or inexact orientations "
+    return [
+        f"residuals are {at.noise_factor:.1f} times the measured noise: drift, cables, contact or inexact orientations "
         f"add to it{included}"
-    )
+    ]
 
 
-def _indispensable_reasons(fit: Evidence, used: NDArray[np.bool_], weight_N: float) -> list[str]:
+def _unchecked_pose_reasons(fit: AssessedFit, used: NDArray[np.bool_], weight_N: float) -> list[str]:
     uncertain = np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > weight_N**2
     rows = np.flatnonzero(uncertain & used)
     if not 0 < rows.size <= used.sum() / 2:
         return []
     listed = ", ".join(str(k + 1) for k in rows)
-    return [f"pose {listed} cannot be checked, without it the others do not determine everything: add poses like it"]
+    return [f"pose {listed} cannot be checked because the others do not determine all parameters: add similar poses"]
 
 
 def _rms(vectors: Array) -> float:

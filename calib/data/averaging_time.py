@@ -1,4 +1,4 @@
-"""How long to average at a pose: as long as it helps, no longer than needed."""
+"""Choice of the averaging time at a pose."""
 
 from dataclasses import dataclass
 
@@ -13,48 +13,48 @@ SHORTEST_S, LONGEST_S = 1.0, 10.0
 # Averages are compared in steps that hold whole periods of 50 Hz and of 60 Hz mains.
 STEP_S = 0.1
 
-# Faster than this nothing matters to an average of a second: the record is first reduced to means of so many seconds.
+# Block means of this length lose nothing for averages of a second or more.
 BLOCK_S = 0.02
 
-# A record says how much an average scatters only when it holds several of them.
+# The scatter of an average needs a record that is several averages long.
 AVERAGES_IN_RECORD = 3
 
-# The curve is flat near its minimum, and noisy: a shorter average that is this little worse is taken.
+# The curve is flat and noisy near its minimum: a shorter average may be worse by this factor.
 FLAT = 1.05
 
-# So much larger than white noise predicts from the shortest average, that of the longest is drift and not chance.
+# If sigma of the longest average exceeds the prediction for white noise by this factor, the cause is drift.
 DRIFTS = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AveragingTime:
-    """How long to average, and what that gives."""
+    """An averaging time and the sigma that it gives."""
 
     seconds: float
     """1 to 10, a multiple of 0.1."""
     sigma: Array
     """(6,) standard deviation of a mean over that time, N and N·m."""
     floor: Array
-    """(6,) the smallest that any time up to the longest judged gives, channel by channel, N and N·m."""
+    """(6,) smallest sigma of all examined times, per channel, N and N·m."""
     reached: bool
     """Whether every channel meets its target."""
     words: str
-    """The same in a sentence, with the reason when a target is out of reach."""
+    """The same in a sentence, with the reason if a target is not reached."""
 
 
 def allan_deviation(wrench: Array, lengths: Array | list[int]) -> Array:
-    """Overlapping Allan deviation: how much the means of successive stretches of a record differ.
+    """Overlapping Allan deviation: scatter of the means of successive intervals of a record.
 
     ``sigma²(m) = sum_j (S_j+2m - 2 S_j+m + S_j)² / (2 m² (N - 2m + 1))`` with S the cumulative sum. For white noise it
-    is the standard deviation of a mean over m samples; unlike that, it stays finite and grows again where drift
-    outweighs the averaging.
+    is the standard deviation of a mean over m samples. With drift it stays finite, and grows again
+    where drift dominates.
 
     Parameters
     ----------
     wrench : array, shape (N, 6)
         Consecutive samples, evenly spaced.
     lengths : array of int, shape (k,)
-        Samples in a stretch, each 1 to N / 2.
+        Samples in an interval, each 1 to N / 2.
 
     Returns
     -------
@@ -80,37 +80,37 @@ def allan_deviation(wrench: Array, lengths: Array | list[int]) -> Array:
 
 
 def averaging_time(wrench: Array, rate_Hz: float, *, target_force_N: float, target_torque_Nm: float) -> AveragingTime:
-    """Choose the shortest average that is good enough, from a record of the sensor at rest.
+    """Choose the shortest averaging time that meets the targets, from a record of the sensor at rest.
 
     Parameters
     ----------
     wrench : array, shape (N, 6)
-        Consecutive samples, N and N·m; 3 s at least. 30 s judge all times up to 10 s; 60 s judge them well.
+        Consecutive samples, N and N·m; at least 3 s. 30 s cover all times up to 10 s; 60 s cover them well.
     rate_Hz : float
         Sampling rate.
     target_force_N, target_torque_Nm : float
-        Standard deviation wanted of the mean of one pose. Biases come out of n poses with about ``sqrt(3 / n)`` of
-        it, so 0.02 N of bias from 24 poses ask for 0.057 N here.
+        Wanted standard deviation of the mean of one pose. Sigma of the biases from n poses is about ``sqrt(3 / n)``
+        times that, so 0.02 N from 24 poses need 0.057 N here.
 
     Raises
     ------
     BadDataset
-        The record is shorter than 3 s, or holds a value that is not finite.
+        The record is shorter than 3 s, or contains a value that is not finite.
 
     Notes
     -----
-    The scatter of a mean is its Allan deviation, and where a channel's noise does not reach the step of its numbers,
-    the rounding that no average removes. All six channels must meet their targets. When one cannot, the time is the
-    one that brings the worst channel closest. Chance in the record lengthens the time, seldom shortens it: 3 s of white
-    noise come out as 2.8 to 6.1 s from a record of 60 s (5 to 95 %), as 3.0 to 4.6 s from 120 s.
+    Sigma of a mean is its Allan deviation, plus the rounding error that averaging does not remove if the noise is
+    smaller than the resolution. All six channels must meet their targets. If one cannot, the time is chosen that brings
+    the worst channel closest. Chance lengthens the time more often than it shortens it: for white noise that needs 3 s,
+    a record of 60 s gives 2.8 to 6.1 s (5 to 95 %), a record of 120 s gives 3.0 to 4.6 s.
     """
     if not (target_force_N > 0 and target_torque_Nm > 0):
-        raise ValueError(f"targets are {target_force_N} N and {target_torque_Nm} N·m: choose both above zero.")
+        raise ValueError(f"targets are {target_force_N} N and {target_torque_Nm} N·m: choose positive values.")
     wrench = checked(wrench)
     if not rate_Hz > 0 or len(wrench) / rate_Hz < (1 - 1e-3) * AVERAGES_IN_RECORD * SHORTEST_S:
         raise BadDataset(
-            f"a record of {len(wrench)} samples at {rate_Hz:g} Hz is too short to choose an averaging time from: "
-            f"record {AVERAGES_IN_RECORD * SHORTEST_S:.0f} s at least."
+            f"a record of {len(wrench)} samples at {rate_Hz:g} Hz is too short for choosing an averaging time: "
+            f"record at least {AVERAGES_IN_RECORD * SHORTEST_S:.0f} s."
         )
     size = max(1, int(BLOCK_S * rate_Hz))
     blocks = wrench[: len(wrench) // size * size].reshape(-1, size, 6).mean(axis=1)
@@ -124,18 +124,18 @@ def averaging_time(wrench: Array, rate_Hz: float, *, target_force_N: float, targ
     best = int(np.argmax(excess <= max(1.0, FLAT * excess.min())))
     reached = bool(excess[best] <= 1)
     floor = sigma.min(axis=0)
-    words = f"average {times_s[best]:.1f} s at each pose: known to {_in_words(sigma[best])} then"
+    words = f"average {times_s[best]:.1f} s at each pose: sigma {_in_words(sigma[best])}"
     if not reached:
         c = int(np.argmax(sigma[best] / target))
-        words += f". {CHANNELS[c]} does not come to the {target[c]:.2g} {'N' if c < 3 else 'N·m'} wanted: "
+        words += f". {CHANNELS[c]} does not reach the target of {target[c]:.2g} {'N' if c < 3 else 'N·m'}: "
         if rounding[c] > sigma[best, c] ** 2 / 2:
-            words += "its numbers are too coarse"
+            words += "its resolution is too coarse"
         elif sigma[-1, c] > DRIFTS * sigma[0, c] * np.sqrt(times_s[0] / times_s[-1]):
-            words += "it drifts, and longer averages are no better; let the sensor warm up, or take more poses"
+            words += "it drifts, and longer averages do not help. Let the sensor warm up, or take more poses"
         elif (needed_s := times_s[best] * (sigma[best, c] / target[c]) ** 2) > LONGEST_S:
-            words += f"that would take {needed_s:.2g} s; take more poses"
+            words += f"that needs {needed_s:.2g} s. Take more poses"
         else:
-            words += f"a record of {len(wrench) / rate_Hz:.0f} s judges no longer averages; take 30 s or more"
+            words += f"a record of {len(wrench) / rate_Hz:.0f} s is too short for longer averages. Record 30 s or more"
     return AveragingTime(round(float(times_s[best]), 1), sigma[best], floor, reached, words)
 
 

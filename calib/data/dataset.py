@@ -1,4 +1,4 @@
-"""What was measured: one orientation and one mean wrench per pose."""
+"""The dataset of a calibration: one orientation and one mean wrench per pose."""
 
 import csv
 import hashlib
@@ -20,8 +20,8 @@ from calib.model import ROUNDING, Array, nearest_rotation, read_only
 
 FORMAT = "ftdrive.dataset/1"
 
-LARGEST = 1e9  # N, N·m or their squares: nothing measures more, and the powers taken of it must not overflow
-LEAST_VARIANCE = 1e-18  # N² or (N·m)²: a sensor of 1 nN; with much less, products of inverses lose all digits
+LARGEST = 1e9  # N, N·m or their squares: no sensor measures more, and powers of it must not overflow
+LEAST_VARIANCE = 1e-18  # N² or (N·m)²: sigma 1 nN; with much less, products of inverses lose all digits
 SIGMA_COLUMNS = tuple(f"sigma_{name}" for name in CHANNELS)
 MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
 VECTOR_COLUMNS = ("rx", "ry", "rz")
@@ -32,12 +32,12 @@ LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
 class CalibrationDataset:
     """n poses, one row each. Arrays are read-only copies.
 
-    Orientations rounded to three or more decimals are put back onto SO(3); everything else must be exact.
+    Orientations rounded to three or more decimals are projected onto SO(3).
 
     Raises
     ------
     BadDataset
-        Names the row, counted from 1, and what is wrong with it.
+        The message names the row, counted from 1, and the fault.
     """
 
     R_base_flange: Array
@@ -45,20 +45,20 @@ class CalibrationDataset:
     wrench: Array
     """(n, 6) mean wrench in N and N·m as measured, in the sensor frame: no bias, tare or compensation applied."""
     wrench_cov: Array | None
-    """(n, 6, 6) covariance of that mean; None = unknown."""
+    """(n, 6, 6) covariance of the mean; None = unknown."""
     n_samples: NDArray[np.int64]
     """(n,) samples behind each mean; 0 = unknown."""
     t_s: Array
     """(n,) seconds since the first pose; NaN = unknown."""
     meta: Mapping[str, JSON] = field(default_factory=dict)
-    """Anything worth keeping: serial numbers, versions, events."""
+    """Further data, such as serial numbers, versions and events."""
 
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(np.asarray(self.R_base_flange)))
         if n == 0:
-            raise BadDataset("there is no pose: record at least four.")
-        wrench = _numbers("wrench", self.wrench, (n, 6))
-        R_base_flange = _rotations(_numbers("R_base_flange", self.R_base_flange, (n, 3, 3)))
+            raise BadDataset("the dataset has no pose: record at least four.")
+        wrench = _measured("wrench", self.wrench, (n, 6))
+        R_base_flange = _rotations(_measured("R_base_flange", self.R_base_flange, (n, 3, 3)))
         t_s = _shaped("t_s", self.t_s, (n,))
         for i in np.flatnonzero(np.isinf(t_s)):
             raise BadDataset(f"row {i + 1}: t_s is {t_s[i]}, expected seconds or NaN for unknown.")
@@ -72,7 +72,7 @@ class CalibrationDataset:
         object.__setattr__(self, "t_s", read_only(t_s))
         object.__setattr__(self, "n_samples", n_samples)
         if self.wrench_cov is not None:
-            cov = _covariances(_numbers("wrench_cov", self.wrench_cov, (n, 6, 6)))
+            cov = _covariances(_measured("wrench_cov", self.wrench_cov, (n, 6, 6)))
             object.__setattr__(self, "wrench_cov", read_only(cov))
         try:
             meta = json.loads(json.dumps(dict(self.meta), allow_nan=False))
@@ -85,7 +85,7 @@ class CalibrationDataset:
         return len(self.wrench)
 
     def to_dict(self) -> dict[str, JSON]:
-        """Give the content of a dataset file."""
+        """Return the content of a dataset file."""
         return {
             "format": FORMAT,
             "R_base_flange": self.R_base_flange.tolist(),
@@ -114,12 +114,12 @@ class CalibrationDataset:
         )
 
     def save(self, path: Path) -> None:
-        """Write a new file; raises `FileExistsError` rather than overwrite."""
+        """Write a new file; raises `FileExistsError` if it exists."""
         write_new(path, json.dumps(self.to_dict(), allow_nan=False) + "\n")
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what `save` wrote. Raises `BadDataset` or `OSError`."""
+        """Read a dataset file. Raises `BadDataset` or `OSError`."""
         try:
             return cls.from_dict(read_object(path, BadDataset))
         except BadDataset as exc:
@@ -128,8 +128,8 @@ class CalibrationDataset:
     def sha256(self) -> str:
         """Hash the content, independent of spacing and order of fields in the file.
 
-        Over the meta data as JSON with sorted keys, then each array: its name, shape, and numbers as little-endian
-        float64 row by row (a covariance that is not known has no shape and no numbers).
+        It covers the meta data as JSON with sorted keys, then each array: name, shape, and numbers as little-endian
+        float64 row by row (an unknown covariance has no shape and no numbers).
         """
         digest = hashlib.sha256(json.dumps(dict(self.meta), allow_nan=False, sort_keys=True).encode())
         for name in ("R_base_flange", "wrench", "wrench_cov", "n_samples", "t_s"):
@@ -145,20 +145,20 @@ def read_csv(
     """Read poses from a comma-separated table with one header row.
 
     Columns: r11..r33 (rotation matrix, row by row) or rx, ry, rz (rotation vector in rad), fx, fy, fz (N), tx, ty, tz
-    (N·m), and optionally t (s) and sigma_fx .. sigma_tz, the standard error of each pose's mean. With both a matrix and
-    a vector the matrix counts. Other columns are ignored.
+    (N·m), and optionally t (s) and sigma_fx .. sigma_tz, the standard error of each pose's mean. If both are
+    present, the matrix is used. Other columns are ignored.
 
     Parameters
     ----------
     path : Path
     orientation : {"R_base_flange", "R_flange_base"}
-        What the rotation maps: flange to base coordinates, as a robot pose does, or base to flange coordinates, as
-        the papers' e_bR does.
+        Whether the rotation maps flange to base coordinates, like a robot pose, or base to flange coordinates, like
+        e_bR in the papers.
 
     Raises
     ------
     BadDataset
-        Names the column or the row, counted from 1 below the header, and the reason.
+        The message names the column or the row, counted from 1 below the header, and the reason.
     """
     if orientation not in ("R_base_flange", "R_flange_base"):
         raise ValueError(f"orientation is '{orientation}', expected 'R_base_flange' or 'R_flange_base'")
@@ -185,7 +185,7 @@ def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
     if repeated:
         raise BadDataset(f"column {', '.join(repeated)} appears more than once: keep one.")
     if not rows:
-        raise BadDataset("the table has a header and no row below it: nothing to calibrate from.")
+        raise BadDataset("the table has a header but no row: add one row per pose.")
 
     table = np.empty((len(rows), len(wanted)))
     for i, row in enumerate(rows):
@@ -228,8 +228,15 @@ def _table(path: Path) -> list[list[str]]:
     except (UnicodeDecodeError, csv.Error) as exc:
         raise BadDataset(f"this is not a text table ({exc}): save it as UTF-8 CSV.") from exc
     if not rows:
-        raise BadDataset("the file is empty: nothing to calibrate from.")
+        raise BadDataset("the file is empty: choose a table with poses.")
     return rows
+
+
+def finite(name: str, value: object, shape: tuple[int, ...]) -> Array:
+    """Convert to an array of this shape, one row per pose; raises `BadDataset` naming the row that is not finite."""
+    array = _shaped(name, value, shape)
+    _reject(name, array, ~np.isfinite(array), "not a finite number.")
+    return array
 
 
 def _shaped(name: str, value: object, shape: tuple[int, ...]) -> Array:
@@ -242,15 +249,14 @@ def _shaped(name: str, value: object, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def _numbers(name: str, value: object, shape: tuple[int, ...]) -> Array:
-    array = _shaped(name, value, shape)
-    _refuse(name, array, ~np.isfinite(array), "not a finite number.")
-    _refuse(name, array, np.abs(array) > LARGEST, f"more than any sensor measures ({LARGEST:g}): check the units.")
+def _measured(name: str, value: object, shape: tuple[int, ...]) -> Array:
+    array = finite(name, value, shape)
+    _reject(name, array, np.abs(array) > LARGEST, f"more than any sensor measures ({LARGEST:g}): check the units.")
     return array
 
 
-def _refuse(name: str, array: Array, wrong: NDArray[np.bool_], why: str) -> None:
-    """Raise `BadDataset` for the first entry that is wrong."""
+def _reject(name: str, array: Array, wrong: NDArray[np.bool_], why: str) -> None:
+    """Raise `BadDataset` for the first wrong entry."""
     for row, *rest in np.argwhere(wrong):
         entry = "".join(f"[{j}]" for j in rest)
         raise BadDataset(f"row {row + 1}: {name}{entry} is {array[(row, *rest)]:.3g}, {why}")
@@ -268,7 +274,7 @@ def _rotations(R: Array) -> Array:
             f"row {i + 1}: the orientation is a reflection (determinant {np.linalg.det(R[i]):.3f}), not a rotation: "
             "check the sign of one axis."
         )
-    rounded = error > 1e-12  # exact ones stay as they are, bit for bit: a loaded file has the hash of the saved one
+    rounded = error > 1e-12  # exact ones stay unchanged, so that a loaded file has the hash of the saved one
     R[rounded] = nearest_rotation(R[rounded])
     return R
 
@@ -284,7 +290,7 @@ def _covariances(cov: Array) -> Array:
 def _covariance_problem(C: Array) -> str | None:
     variance = np.diag(C)
     if variance.min() < LEAST_VARIANCE:
-        return f"the variance of {CHANNELS[variance.argmin()]} is {variance.min():g}, less than any sensor has"
+        return f"the variance of {CHANNELS[variance.argmin()]} is {variance.min():g}, less than that of any sensor"
     correlation = C / np.outer(np.sqrt(variance), np.sqrt(variance))
     asymmetry = np.abs(correlation - correlation.T).max()
     if asymmetry > 1e-9:

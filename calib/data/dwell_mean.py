@@ -1,4 +1,4 @@
-"""How well the mean of a dwell is known, and whether the dwell was quiet."""
+"""Mean of a dwell, its covariance, and tests whether the dwell was quiet."""
 
 from dataclasses import dataclass
 
@@ -13,18 +13,18 @@ LEAST_SAMPLES = 20
 
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
 
-# What a sensor that shows no noise at all is still trusted to: 1 mN, and as much torque at 25 mm, the usual ratio.
+# Assumed sigma of a sensor without visible noise: 1 mN, and the torque of that at 25 mm, the usual ratio.
 RESOLUTION = np.repeat([1e-3, 2.5e-5], 3)
 
-# Halves of a quiet dwell differ by more than this many standard errors in less than 1 % of dwells, six channels taken
-# together. Student's t with 18 degrees of freedom asks for 3.7; the rest is for noise that is correlated in time. With
-# 3 standard errors 4 % of quiet dwells of 2 s fail, 13 % behind a 5 Hz filter: a pose or more of nearly every tour.
+# In less than 1 % of quiet dwells the halves differ by more than this many standard errors in any of six channels.
+# Student's t with 18 degrees of freedom gives 3.7; the rest is for noise that is correlated in time. With 3 standard
+# errors, 4 % of quiet dwells of 2 s fail, and 13 % behind a 5 Hz filter: one pose or more in nearly every tour.
 QUIET = 4.5
 
-# A dwell that scatters more than so many times the sensor's own noise is not quiet, whatever its halves say.
+# A dwell that scatters more than this factor times the noise of the sensor is not quiet, even if its halves agree.
 RESTLESS = 2.0
 
-# Differences of this size, relative to the largest value, are rounding of the arithmetic.
+# Differences of this size, relative to the largest value, are rounding errors.
 ROUNDING = 1e-9
 
 
@@ -37,16 +37,16 @@ class PoseMean:
     covariance: Array
     """(6, 6) of the mean, positive definite."""
     n_effective: float
-    """Number of independent samples that would be worth as much, for the worst channel."""
+    """Number of independent samples with the same information, for the worst channel."""
 
 
 def mean_and_covariance(wrench: Array) -> PoseMean:
-    """Average a dwell, with an honest covariance when samples are correlated in time or coarsely quantised.
+    """Average a dwell, with a covariance that allows for correlation in time and coarse quantisation.
 
     The variance of a mean is tau s² / N with tau the integrated autocorrelation time, here from Geyer's initial
     monotone sequence (Practical Markov Chain Monte Carlo, Stat. Sci. 7, 1992) with Wolff's correction for the
-    subtracted mean (Comput. Phys. Commun. 156, 2004). Channels keep the correlation the samples have. Where the noise
-    is smaller than the step of a quantised channel, averaging does not help and the step counts instead.
+    subtracted mean (Comput. Phys. Commun. 156, 2004). The mean has the correlation of the samples between channels. If
+    the noise of a channel is smaller than its quantisation step, averaging does not help, and the step counts instead.
 
     Parameters
     ----------
@@ -67,11 +67,11 @@ def mean_and_covariance(wrench: Array) -> PoseMean:
     std = np.sqrt(np.diag(S))
     tau = _autocorrelation_time(noise)
     variance = tau * std**2 / N + quantisation_variance(wrench, std)
-    for kind in (slice(0, 3), slice(3, 6)):  # a channel without noise is trusted like its noisiest neighbour
+    for kind in (slice(0, 3), slice(3, 6)):  # a channel without noise gets the variance of its noisiest neighbour
         silent = variance[kind] == 0
         variance[kind][silent] = variance[kind].max() or RESOLUTION[kind][silent] ** 2
     safe = np.where(std > 0, std, 1.0)
-    shrink = min(1.0, 6 / N)  # keeps the matrix positive definite when channels copy each other
+    shrink = min(1.0, 6 / N)  # keeps the matrix positive definite if channels are copies
     correlation = (1 - shrink) * S / np.outer(safe, safe)
     np.fill_diagonal(correlation, 1.0)
     sigma = np.sqrt(variance)
@@ -79,11 +79,11 @@ def mean_and_covariance(wrench: Array) -> PoseMean:
 
 
 def is_stationary(wrench: Array) -> bool:
-    """Tell whether the two halves of a dwell have the same mean in every channel, as far as noise allows.
+    """Check whether the two halves of a dwell have the same mean in every channel, within the noise.
 
-    Their difference is compared with its standard error from 20 batch means, ten in each half, so that filtered noise
-    is judged rightly. Pure noise fails in less than 1 % of dwells. A jolt much shorter than half the dwell widens the
-    standard error as much as the difference and passes.
+    The standard error of their difference comes from 20 batch means, ten in each half, so that it holds for filtered
+    noise. Pure noise fails in less than 1 % of dwells. A jolt much shorter than half the dwell increases the standard
+    error as much as the difference, and passes.
 
     Parameters
     ----------
@@ -105,14 +105,14 @@ def is_stationary(wrench: Array) -> bool:
 
 
 def noise_level(wrench: Array, window: int) -> Array:
-    """Standard deviation (6,) of a sensor left alone: the median over windows, so that a touch or drift counts little.
+    """Standard deviation (6,) of an untouched sensor: the median over windows, little affected by contact or drift.
 
     Parameters
     ----------
     wrench : array, shape (N, 6)
         Consecutive samples of the arm at rest, N and N·m.
     window : int
-        Samples in a window, 20 to N; as many as in the dwells that will be compared with it.
+        Samples in a window, 20 to N; as many as in the dwells to compare with it.
 
     Raises
     ------
@@ -127,18 +127,18 @@ def noise_level(wrench: Array, window: int) -> Array:
 
 
 def is_quiet(wrench: Array, level: Array) -> bool:
-    """Tell whether a dwell is stationary and scatters no more than twice as much as the sensor left alone.
+    """Check whether a dwell is stationary and scatters at most twice as much as the untouched sensor.
 
-    The scatter shows what equal halves hide: a vibration, a hand on the tool, a short jolt. Pure noise never doubles,
-    so quiet dwells fail as seldom as in `is_stationary`: of 2 s at 500 Hz 0.15 % of white noise, 0.4 % behind a
-    low-pass of 10 Hz, 0.9 % of 5 Hz, 6 % of 2 Hz, where 2 s hold few independent samples.
+    The scatter shows vibration, a hand on the tool and short jolts, which equal halves hide. Pure noise never doubles,
+    so quiet dwells fail as rarely as in `is_stationary`: of 2 s at 500 Hz 0.15 % of white noise, 0.4 % behind a
+    low-pass of 10 Hz, 0.9 % of 5 Hz, 6 % of 2 Hz, because 2 s contain few independent samples.
 
     Parameters
     ----------
     wrench : array, shape (N, 6)
         Consecutive samples, N and N·m; N >= 20.
     level : array, shape (6,)
-        As `noise_level` gives it.
+        From `noise_level`.
 
     Raises
     ------
@@ -149,14 +149,14 @@ def is_quiet(wrench: Array, level: Array) -> bool:
 
 
 def restless_channels(wrench: Array, level: Array) -> NDArray[np.bool_]:
-    """Tell which channels (6,) of a dwell scatter more than twice as much as the sensor left alone."""
+    """Find the channels (6,) of a dwell that scatter more than twice as much as the untouched sensor."""
     wrench = checked(wrench)
-    flicker = _step(wrench) / 2  # between two neighbouring numbers, as a sensor with coarse steps may at any time
+    flicker = _step(wrench) / 2  # between two neighbouring values, normal for a sensor with coarse steps
     return np.asarray(wrench.std(axis=0, ddof=1) > RESTLESS * level + flicker + ROUNDING * np.abs(wrench).max(axis=0))
 
 
 def checked(wrench: Array) -> Array:
-    """Give (N, 6) samples that can be judged, N >= 20 and all finite; raises `BadDataset`."""
+    """Check (N, 6) samples: N >= 20 and all finite. Raises `BadDataset`."""
     wrench = np.asarray(wrench, dtype=np.float64)
     if wrench.ndim != 2 or wrench.shape[1] != 6 or len(wrench) < LEAST_SAMPLES:
         raise BadDataset(f"a dwell has shape {wrench.shape}, expected (N, 6) with N >= {LEAST_SAMPLES}: record longer.")
@@ -181,10 +181,10 @@ def _autocorrelation_time(noise: Array) -> Array:
 
 
 def quantisation_variance(wrench: Array, std: Array) -> Array:
-    """Variance (6,) of the error that rounding to steps leaves in a mean: q²/12 without noise, none with enough of it.
+    """Variance (6,) of the rounding error in a mean: q²/12 without noise, zero with enough noise.
 
     Gaussian noise of sigma dithers the error away by exp(-4 pi² sigma² / q²) (Widrow, Kollar, Quantization Noise,
-    2008); the rounded samples themselves may add q²/4 to the variance that is seen.
+    2008); the rounded samples may add q²/4 to the observed variance.
     """
     step = _step(wrench)
     dither = np.maximum(std**2 - step**2 / 4, 0) / np.where(step > 0, step, 1.0) ** 2
@@ -192,7 +192,7 @@ def quantisation_variance(wrench: Array, std: Array) -> Array:
 
 
 def _step(wrench: Array) -> Array:
-    """Smallest difference (6,) between two numbers of a channel, 0 for a constant one."""
+    """Smallest difference (6,) between two values of a channel, 0 for a constant channel."""
     gaps = np.diff(np.sort(wrench, axis=0), axis=0)
     step = np.where(gaps > ROUNDING * np.abs(wrench).max(axis=0), gaps, np.inf).min(axis=0)
     return np.where(np.isfinite(step), step, 0.0)

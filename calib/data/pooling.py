@@ -6,22 +6,22 @@ from numpy.typing import NDArray
 from calib.model import Array
 
 TRUSTED_SAMPLES = 100.0
-"""With this many samples a pose's own covariance counts as much as the shape common to all poses."""
+"""With this many samples, the covariance of a pose counts as much as the common shape."""
 
 
 def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
-    """Shrink each covariance to the shape common to all poses, times a size of its own.
+    """Shrink each covariance towards the shape common to all poses, times a size of its own.
 
-    From N samples a 6 x 6 covariance is so uncertain that weighting with it does harm: with N = 10 the mean square
-    error of the calibration is 3 times what the data allow, with 50 samples 1.15 times. The common shape has no such
-    error; the size keeps what differs from pose to pose beyond the scatter that N samples explain.
+    A 6 x 6 covariance from N samples is so uncertain that weighting with it increases the mean square error of the
+    calibration: 3 times with N = 10, 1.15 times with N = 50. The common shape has no such error. The size keeps the
+    differences between poses that exceed the scatter of N samples.
 
     Parameters
     ----------
     wrench_cov : array, shape (n, 6, 6)
         Covariance of the mean of each pose.
     n_samples : int array, shape (n,)
-        Samples behind each; 0 = unknown: that covariance is taken as it is.
+        Samples of each; 0 = unknown: that covariance is not changed.
 
     Returns
     -------
@@ -37,7 +37,7 @@ def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
         before, size = size, np.einsum("ij,nji->n", np.linalg.inv(shape), S) / 6
         if np.abs(size - before).max() <= 1e-12 * size.max():
             break
-    # Sizes scatter by 2 / (6 freedom) in the logarithm when nothing differs: remove that share.
+    # Equal sizes scatter by 2 / (6 freedom) in the logarithm: remove that share.
     log_size = np.log(size)
     scatter = 2 / (6 * freedom)
     mean = float(np.average(log_size, weights=freedom))

@@ -1,4 +1,4 @@
-"""Is something touching the tool? A test that knows how well the calibration knows the free tool."""
+"""Test for contact of the tool, with the uncertainty of the calibration taken into account."""
 
 import numpy as np
 from scipy.special import chdtri as chi2_isf
@@ -15,10 +15,10 @@ def contact_chi2(
     *,
     tare: tuple[Array, Array] | None = None,
 ) -> Array:
-    """Squared distance of a wrench from what the free tool should give, in standard deviations: chi-square, 6 dof.
+    """Squared distance of a wrench from the prediction for a free tool, in standard deviations: chi-square, 6 dof.
 
-    The uncertainty of the calibration counts besides the noise. Judged by the noise alone, 16 % of readings of a free
-    tool calibrated with six poses break a limit meant for 1 %.
+    It includes the uncertainty of the calibration. With the noise alone, 16 % of the readings of a free tool calibrated
+    with six poses would exceed the limit for 1 %.
 
     Parameters
     ----------
@@ -31,8 +31,8 @@ def contact_chi2(
     noise_cov : array, shape (6, 6) or (..., 6, 6)
         Of one reading of `wrench`.
     tare : tuple of array (..., 6) and array (..., 3, 3), optional
-        Wrench, with the same noise, and R_base_flange of a pose in which nothing touched the tool. Errors common to
-        both poses, such as a drifted bias, cancel.
+        Wrench, with the same noise, and R_base_flange of a pose without contact. Errors common to both poses cancel,
+        such as drift of the bias.
 
     Returns
     -------
@@ -49,5 +49,5 @@ def contact_chi2(
 
 
 def contact_threshold(false_alarm_rate: float = 0.01) -> float:
-    """Limit for `contact_chi2` that a free tool breaks at this rate."""
+    """Limit for `contact_chi2` that a free tool exceeds at this rate."""
     return float(chi2_isf(6, false_alarm_rate))

@@ -1,12 +1,12 @@
-"""When the sensor's own calibration is wrong: gains that gravity can identify, and what it needs for that.
+"""Gain of a sensor whose own calibration is wrong, identified from known weights.
 
 Force gain, 3x3: F_i = M A_i b + F0 with A = R_base_flange.T and M = K R_sensor_flange. Only M and b are identifiable,
-up to a scale that moves between them, so one known weight is needed. Splitting M into a gain K and a rotation is a
+up to a common scale, so one known weight is needed. Splitting M into a gain K and a rotation is a
 convention: here the polar one, K symmetric and positive.
 
 Wrench gain, 6x6: y_i = C (f_i, p_k x f_i) + y0 with f_i = w_k R_sensor_flange A_i d, d the direction of gravity and k
-the payload of pose i. Three known payloads whose centres of mass are not on one line are needed: the torques of one
-payload are a fixed combination of its forces, whatever the pose.
+the payload of pose i. Three known payloads whose centres of mass are not on one line are needed, because in all
+poses the torques of one payload are the same combination of its forces.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,12 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.data.dataset import finite
 from calib.errors import BadDataset, NotObservable
 from calib.model import Array, Parameters, skew
 
 RANK_TOLERANCE = 1e-9  # of eigenvalues of the Fisher information, columns scaled
 MAX_STEPS = 30
-SETTLED = 1e-6  # standard deviations of the noise
+CONVERGED = 1e-6  # standard deviations of the noise
 
 Linearised = Callable[[Array], tuple[Array, Array]]
 """Parameters to Jacobian (n, k, parameters) and residual (n, k)."""
@@ -27,7 +28,7 @@ Linearised = Callable[[Array], tuple[Array, Array]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForceGain:
-    """A 3x3 force gain beside the rigid part that belongs to it."""
+    """A 3x3 force gain with the gravity force and bias that belong to it."""
 
     M: Array
     """(3, 3) true force in flange axes to measured force, dimensionless; `gain @ R_flange_sensor.T`."""
@@ -53,7 +54,7 @@ class ForceGain:
         return np.asarray((U @ Vt).T)
 
     def compensate_force(self, force_N: Array, R_base_flange: Array) -> Array:
-        """Give the true contact force in the sensor axes of `R_flange_sensor`.
+        """Return the true contact force in the sensor axes of `R_flange_sensor`.
 
         Parameters
         ----------
@@ -72,16 +73,16 @@ class ForceGain:
 
 @dataclass(frozen=True, slots=True)
 class Payload:
-    """What was weighed and measured before it was hung on the sensor, everything below the sensor included."""
+    """A known load on the sensor, everything below the sensor included."""
 
     weight_N: float
     p_sensor_com_m: tuple[float, float, float] | None
-    """Centre of mass in the sensor frame; None when it is not known."""
+    """Centre of mass in the sensor frame; None if unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WrenchGain:
-    """A 6x6 gain in the sensor axes of the calibration it started from."""
+    """A 6x6 gain in the sensor axes of the starting calibration."""
 
     gain: Array
     """(6, 6) C: true wrench to measured wrench; blocks in 1, 1/m, m, 1."""
@@ -111,22 +112,22 @@ def estimate_force_gain(
     force_cov : array, shape (n, 3, 3)
         Covariance of those means.
     weight_N : float or None
-        True weight of all that hangs on the sensor's measuring side, taken as exact.
+        True weight of the load on the measuring side, assumed exact.
 
     Raises
     ------
     BadDataset
         Shapes that do not fit each other.
     NotObservable
-        The weight is not known, or the poses leave something free.
+        The weight is unknown, or the poses do not determine all parameters.
     """
     n = len(force_N)
-    R_base_flange = _finite("R_base_flange", R_base_flange, (n, 3, 3))
-    force_N, force_cov = _finite("force_N", force_N, (n, 3)), _finite("force_cov", force_cov, (n, 3, 3))
+    R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
+    force_N, force_cov = finite("force_N", force_N, (n, 3)), finite("force_cov", force_cov, (n, 3, 3))
     if weight_N is None:
         raise NotObservable(
-            "without a known weight the scale is free: twice the gain and half the weight read the same. Weigh all "
-            "that hangs on the sensor and give its weight."
+            "the scale is undetermined without a known weight, because twice the gain and half the weight give the "
+            "same readings: weigh the load on the sensor and pass its weight."
         )
     _require_weight(weight_N)
     if 3 * n < 14:
@@ -146,10 +147,10 @@ def estimate_force_gain(
         np.concatenate([start.R_flange_sensor.T.ravel(), _unit(start.gravity_force_base_N), start.force_bias_N]),
         slice(9, 12),
         force_cov,
-        "a force gain: tilt the tool about two axes and turn it about its own, over as wide a range as possible.",
+        "force gain: tilt the tool about two axes and turn it about its own, over as wide a range as possible.",
     )
     if np.linalg.det(x[:9].reshape(3, 3)) <= 0:
-        raise NotObservable("the gain came out as a mirror image: start from a calibration of the same poses.")
+        raise NotObservable("the estimated gain is a reflection: start from a calibration of the same poses.")
     scale = np.concatenate([np.ones(9), np.full(3, weight_N), np.ones(3)])
     return ForceGain(
         x[:9].reshape(3, 3), weight_N * x[9:12], x[12:], covariance * np.outer(scale, scale), chi2, 3 * n - 14
@@ -187,8 +188,8 @@ def estimate_wrench_gain(
         Fewer than three payloads, their centres of mass unknown or on one line, or too few poses.
     """
     n = len(wrench)
-    R_base_flange = _finite("R_base_flange", R_base_flange, (n, 3, 3))
-    wrench, wrench_cov = _finite("wrench", wrench, (n, 6)), _finite("wrench_cov", wrench_cov, (n, 6, 6))
+    R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
+    wrench, wrench_cov = finite("wrench", wrench, (n, 6)), finite("wrench_cov", wrench_cov, (n, 6, 6))
     index = np.asarray(payload_of_pose)
     if index.shape != (n,) or not np.isin(index, np.arange(len(payloads))).all():
         raise BadDataset(f"payload_of_pose must give one of 0..{len(payloads) - 1} for each of the {n} poses.")
@@ -197,8 +198,8 @@ def estimate_wrench_gain(
     unknown = [k for k, payload in enumerate(payloads) if payload.p_sensor_com_m is None]
     if unknown:
         raise NotObservable(
-            f"the centre of mass of payload {', '.join(str(k) for k in unknown)} is not known. When none is, 4 numbers "
-            "stay free, the origin of torques (3) and their scale (1): measure the centres of mass."
+            f"the centre of mass of payload {', '.join(str(k) for k in unknown)} is unknown. Without any of them, 4 "
+            "parameters are undetermined, the origin of torques (3) and their scale (1): measure the centres of mass."
         )
     weight_N = np.array([payload.weight_N for payload in payloads])
     p_sensor_com_m = np.array([payload.p_sensor_com_m for payload in payloads])
@@ -206,8 +207,8 @@ def estimate_wrench_gain(
     free = 6 * (6 - _wrenches_spanned(p_sensor_com_m[used]))
     if free:
         raise NotObservable(
-            f"{len(used)} known payload{'s' if len(used) > 1 else ''} leave {free} of 44 numbers free: use three whose "
-            "centres of mass are not on one line."
+            f"{len(used)} known payload{'s' if len(used) > 1 else ''} do not determine {free} of 44 "
+            "parameters: use three whose centres of mass are not on one line."
         )
 
     def linearised(x: Array) -> tuple[Array, Array]:
@@ -222,7 +223,7 @@ def estimate_wrench_gain(
         ),
         slice(36, 39),
         wrench_cov,
-        "a wrench gain: tilt the tool about two axes and turn it about its own with each payload.",
+        "wrench gain: tilt the tool about two axes and turn it about its own with each payload.",
     )
     return WrenchGain(x[:36].reshape(6, 6), x[36:39], x[39:], covariance, chi2, 6 * n - 44)
 
@@ -230,7 +231,7 @@ def estimate_wrench_gain(
 def _wrenches_spanned(p_sensor_com_m: Array) -> int:
     """Dimension of the wrenches that weights at these points (k, 3) can exert: 3, 5 or 6 of 6."""
     arms = np.linalg.svd(p_sensor_com_m - p_sensor_com_m.mean(axis=0), compute_uv=False)
-    significant = int((arms > 1e-3).sum())  # points closer than 1 mm to each other, or to one line, are as one
+    significant = int((arms > 1e-3).sum())  # points within 1 mm of each other, or of one line, count as coincident
     return (3, 5, 6, 6)[significant]
 
 
@@ -251,7 +252,7 @@ def wrench_gain_linearised(
 
 
 def _fit(linearised: Linearised, x: Array, unit: slice, cov: Array, advice: str) -> tuple[Array, Array, float]:
-    """Gauss-Newton on parameters of which `unit` is a unit vector; gives parameters, covariance and chi2."""
+    """Gauss-Newton on parameters of which `unit` is a unit vector; returns parameters, covariance and chi2."""
     whiten = np.linalg.inv(np.linalg.cholesky(cov))
     for _ in range(MAX_STEPS):
         J, residual = linearised(x)
@@ -266,17 +267,17 @@ def _fit(linearised: Linearised, x: Array, unit: slice, cov: Array, advice: str)
         eigenvalues, V = np.linalg.eigh(JN.T @ JN / np.outer(scale, scale))
         free = int((eigenvalues < RANK_TOLERANCE * eigenvalues[-1]).sum())
         if free:
-            raise NotObservable(f"the poses leave {free} of {JN.shape[1]} numbers free of {advice}")
+            raise NotObservable(f"the poses do not determine {free} of {JN.shape[1]} parameters of the {advice}")
         root = V / np.sqrt(eigenvalues)  # of the inverse information
         projected = root.T @ (JN.T @ e / scale)
         x = x + N @ (root @ projected / scale)
         x[unit] = _unit(x[unit])
         moved = float(np.linalg.norm(projected))  # in standard deviations of the noise
-        if moved <= SETTLED:
+        if moved <= CONVERGED:
             break
     if moved > 0.1:
         raise NotObservable(
-            f"the fit has not settled in {MAX_STEPS} steps: start from a calibration of the same poses."
+            f"the fit did not converge in {MAX_STEPS} steps: start from a calibration of the same poses."
         )
     root = N @ (root / scale[:, None])
     residual = linearised(x)[1]
@@ -294,10 +295,3 @@ def _unit(v: Array) -> Array:
 def _require_weight(weight_N: float) -> None:
     if not (np.isfinite(weight_N) and weight_N > 0):
         raise BadDataset(f"a known weight is {weight_N} N, expected a positive number.")
-
-
-def _finite(name: str, value: Array, shape: tuple[int, ...]) -> Array:
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise BadDataset(f"{name} has shape {array.shape}, expected {shape} finite numbers.")
-    return array

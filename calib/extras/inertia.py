@@ -1,7 +1,7 @@
 """Ten inertial parameters of a load from a recording in motion: mass, centre of mass, inertia.
 
 With s = gravity minus the acceleration of the sensor origin, all in the sensor frame, and the inertia I about that
-origin, what hangs on the sensor exerts on it
+origin, the load exerts on the sensor
 
     force_N   = m s - alpha x (m p) - omega x (omega x (m p))
     torque_Nm = (m p) x s - I alpha - omega x (I omega)
@@ -12,12 +12,14 @@ weighted least squares.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
+from calib.data.dataset import finite
 from calib.errors import BadDataset, NotObservable
 from calib.model import Array, Parameters, read_only, skew
 
@@ -29,7 +31,7 @@ INERTIA_NAMES = (
 
 LEAST_SAMPLES = 100
 LEAST_ROTATION_RAD_S2 = 0.1  # angular acceleration, rms, about the weakest axis
-LEAST_SHARE = 0.1  # of the weakest axis in the strongest: less may be noise of differentiated angles
+LEAST_SHARE = 0.1  # weakest over strongest axis: less may be noise of differentiated angles
 RANK_TOLERANCE = 1e-8  # of eigenvalues of the Fisher information, columns scaled
 LEVER_M = 0.025  # usual ratio of torque noise to force noise, to start with
 DELAY_GRID = 21
@@ -38,9 +40,24 @@ DELAY_STEP_S = 1e-4  # for the derivative by the delay
 GROUPS = (("mass", 0, 1), ("centre of mass", 1, 4), ("inertia", 4, 10), ("force bias", 10, 13), ("torque bias", 13, 16))
 
 
+class Motion(NamedTuple):
+    """Motion of the flange and the sensor against the base, n samples."""
+
+    t_s: Array
+    """(n,) increasing."""
+    R_base_flange: Array
+    """(n, 3, 3)"""
+    angular_velocity_rad_s: Array
+    """(n, 3) of the flange, in sensor axes."""
+    angular_acceleration_rad_s2: Array
+    """(n, 3) of the flange, in sensor axes."""
+    linear_acceleration_m_s2: Array
+    """(n, 3) of the sensor origin, in sensor axes, gravity not included."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadInertia:
-    """What hangs on the sensor, in the sensor frame."""
+    """The load on the sensor, in the sensor frame."""
 
     mass_kg: float
     p_sensor_com_m: Array
@@ -50,9 +67,9 @@ class LoadInertia:
     bias: Array
     """(6,) N and N·m."""
     delay_s: float
-    """By which the wrench comes later than the motion; 0 when it was not estimated."""
+    """Delay of the wrench after the motion; 0 if not estimated."""
     delay_sigma_s: float
-    """One standard deviation; 0 when it was not estimated."""
+    """One standard deviation; 0 if not estimated."""
     covariance: Array
     """(10, 10) in the order of `INERTIA_NAMES`, for residuals that are uncorrelated in time."""
     residual_rms_N: float
@@ -67,7 +84,7 @@ class LoadInertia:
 
     @property
     def implausibilities(self) -> tuple[str, ...]:
-        """What no body of positive mass can have, in words; empty when there is nothing to say."""
+        """Sentences about values that no rigid body can have; empty if plausible."""
         found = []
         if self.mass_kg <= 0:
             found.append(f"the mass is {self.mass_kg:.3g} kg: check the sign of the wrench")
@@ -77,23 +94,14 @@ class LoadInertia:
             found.append(f"the principal moments {listed} kg·m² are not all positive: move faster about all axes")
         elif moments[0] + moments[1] < moments[2]:
             found.append(
-                f"of the principal moments {listed} kg·m² the largest exceeds the sum of the others, which no body "
-                "does: move faster about all axes"
+                f"of the principal moments {listed} kg·m² the largest exceeds the sum of the others, which is "
+                "impossible: move faster about all axes"
             )
         return tuple(found)
 
 
 def estimate_inertia(
-    parameters: Parameters,
-    t_s: ArrayLike,
-    R_base_flange: ArrayLike,
-    angular_velocity_rad_s: ArrayLike,
-    angular_acceleration_rad_s2: ArrayLike,
-    linear_acceleration_m_s2: ArrayLike,
-    wrench: ArrayLike,
-    *,
-    g_m_s2: float,
-    most_delay_s: float = 0.0,
+    parameters: Parameters, motion: Motion, wrench: ArrayLike, *, g_m_s2: float, most_delay_s: float = 0.0
 ) -> LoadInertia:
     """Estimate mass, centre of mass and inertia.
 
@@ -103,36 +111,28 @@ def estimate_inertia(
     ----------
     parameters : Parameters
         An ordinary calibration: its `R_flange_sensor` and the direction of its gravity are used.
-    t_s : array, shape (n,)
-        Increasing; n >= 100.
-    R_base_flange : array, shape (n, 3, 3)
-    angular_velocity_rad_s, angular_acceleration_rad_s2 : array, shape (n, 3)
-        Of the flange against the base, in sensor axes.
-    linear_acceleration_m_s2 : array, shape (n, 3)
-        Of the sensor origin against the base, gravity not included, in sensor axes.
+    motion : Motion
+        100 samples or more.
     wrench : array, shape (n, 6)
         As measured, N and N·m, in the sensor frame.
     g_m_s2 : float
         Gravity.
     most_delay_s : float
-        Estimate by how much the wrench comes later than the motion, up to this much either way. 0 takes them as
-        simultaneous: 5 ms that are not accounted for already cost more than the noise of a good sensor.
+        Estimate the delay of the wrench after the motion, up to this much in either direction. 0 assumes none; an
+        ignored delay of 5 ms already costs more than the noise of a good sensor.
 
     Raises
     ------
     BadDataset
         Shapes that do not fit each other, or times that do not increase.
     NotObservable
-        The motion does not excite all ten; the message says what is missing.
+        The motion does not excite all ten parameters; the message names what is missing.
     """
-    t_s = np.asarray(t_s, dtype=np.float64)
-    n = t_s.size
-    R_base_flange = _finite("R_base_flange", R_base_flange, (n, 3, 3))
-    omega = _finite("angular_velocity_rad_s", angular_velocity_rad_s, (n, 3))
-    alpha = _finite("angular_acceleration_rad_s2", angular_acceleration_rad_s2, (n, 3))
-    acceleration = _finite("linear_acceleration_m_s2", linear_acceleration_m_s2, (n, 3))
-    wrench = _finite("wrench", wrench, (n, 6))
-    t_s = _finite("t_s", t_s, (n,))
+    n = len(motion.t_s)
+    shapes = (n,), (n, 3, 3), (n, 3), (n, 3), (n, 3)
+    arrays = (finite(name, value, shape) for (name, value), shape in zip(motion._asdict().items(), shapes, strict=True))
+    t_s, R_base_flange, omega, alpha, acceleration = arrays
+    wrench = finite("wrench", wrench, (n, 6))
     if n < LEAST_SAMPLES or not (np.diff(t_s) > 0).all():
         raise BadDataset(f"t_s has {n} times, expected {LEAST_SAMPLES} or more, each later than the one before.")
     if not 0 <= most_delay_s < (t_s[-1] - t_s[0]) / 4:
@@ -172,7 +172,7 @@ def estimate_inertia(
 
 
 class _Fit:
-    """Least squares for a given delay; all delays are judged on the same samples."""
+    """Least squares for a given delay; all delays use the same samples."""
 
     def __init__(self, t_s: Array, signals: Array, wrench: Array, most_delay_s: float) -> None:
         margin_s = most_delay_s + DELAY_STEP_S if most_delay_s > 0 else 0.0
@@ -181,7 +181,7 @@ class _Fit:
         self._signals, self._at = signals, CubicSpline(t_s, signals) if most_delay_s > 0 else None
 
     def design(self, delay_s: float) -> Array:
-        """Regressor (n, 6, 16) of a wrench that comes `delay_s` after the motion."""
+        """Regressor (n, 6, 16) of a wrench `delay_s` after the motion."""
         return regressor(self._at(self._t_s - delay_s) if self._at else self._signals)
 
     def solve(self, delay_s: float) -> tuple[Array, Array, Array]:
@@ -203,7 +203,7 @@ class _Fit:
         return phi, residual, np.repeat([sigma_N, sigma_Nm], 3)
 
     def best_delay(self, most_delay_s: float) -> float:
-        """Where the profile likelihood is highest: on a grid first, because it may have several maxima."""
+        """Maximise the profile likelihood, first on a grid, because it may have several maxima."""
 
         def cost(delay_s: float) -> float:
             return float(np.log(self.solve(delay_s)[2]).sum())
@@ -212,7 +212,7 @@ class _Fit:
         i = int(np.argmin([cost(delay_s) for delay_s in grid.tolist()]))
         if i in (0, DELAY_GRID - 1):
             raise NotObservable(
-                f"no delay within {1e3 * most_delay_s:g} ms fits best: allow a longer one, or check the clocks."
+                f"no delay within {1e3 * most_delay_s:g} ms fits best: increase most_delay_s, or check the clocks."
             )
         found = minimize_scalar(cost, bounds=(grid[i - 1], grid[i + 1]), method="bounded", options={"xatol": 1e-7})
         return float(found.x)
@@ -266,7 +266,7 @@ def _physical(phi: Array) -> Array:
 
 
 def _solve(information: Array, right: Array) -> Array:
-    """Solve the normal equations, or say which parameters the motion cannot tell apart."""
+    """Solve the normal equations; raise `NotObservable` with the parameters that the motion does not separate."""
     scale = np.sqrt(np.diag(information))
     scale[scale == 0] = 1.0
     eigenvalues, V = np.linalg.eigh(information / np.outer(scale, scale))
@@ -275,34 +275,27 @@ def _solve(information: Array, right: Array) -> Array:
         share = (V[:, free] ** 2).sum(axis=1) / free.sum()
         names = [name for name, start, stop in GROUPS if share[start:stop].sum() > 0.05]
         raise NotObservable(
-            f"the motion leaves {free.sum()} of 16 numbers free, mixing {', '.join(names)}: tilt the tool about two "
-            "axes while it moves, and turn it about all three."
+            f"the motion does not determine {free.sum()} of 16 combinations of {', '.join(names)}: tilt the tool "
+            "about two axes while it moves, and turn it about all three."
         )
     return np.asarray(V @ (V.T @ (right / scale) / eigenvalues) / scale)
 
 
 def _require_rotation(alpha: Array) -> None:
-    """Refuse a motion without angular acceleration about some axis, naming it."""
+    """Raise `NotObservable` for a motion without angular acceleration about an axis, and name the axis."""
     squares, axes = np.linalg.eigh(alpha.T @ alpha / len(alpha))
     weakest, strongest = np.sqrt(np.maximum(squares[[0, 2]], 0.0))
     if weakest >= max(LEAST_ROTATION_RAD_S2, LEAST_SHARE * strongest):
         return
     if strongest < LEAST_ROTATION_RAD_S2:
         raise NotObservable(
-            f"the tool hardly turns ({strongest:.2g} rad/s² rms), so its inertia stays free: turn it to and fro about "
-            "all three axes."
+            f"the tool hardly turns ({strongest:.2g} rad/s² rms), so its inertia is undetermined: turn it back and "
+            "forth about all three axes."
         )
     lacking = axes[:, squares < max(LEAST_ROTATION_RAD_S2, LEAST_SHARE * strongest) ** 2]
     named = [axis for axis, part in zip("xyz", (lacking**2).sum(axis=1), strict=True) if part > 0.3]
     raise NotObservable(
         f"the tool hardly turns about {' and '.join(named)} of the sensor ({weakest:.2g} rad/s² rms, at least "
-        f"{max(LEAST_ROTATION_RAD_S2, LEAST_SHARE * strongest):.2g} needed), so the inertia about it stays free: turn "
-        "it to and fro about that axis as well."
+        f"{max(LEAST_ROTATION_RAD_S2, LEAST_SHARE * strongest):.2g} needed), so the inertia about it is undetermined: "
+        "turn it back and forth about that axis too."
     )
-
-
-def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise BadDataset(f"{name} has shape {array.shape}, expected {shape} finite numbers.")
-    return array

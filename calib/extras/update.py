@@ -1,7 +1,7 @@
-"""Small changes to a calibration without a new one: another payload on the same sensor, or a bias that has moved.
+"""Update a calibration after a change of payload or bias.
 
-What is not estimated is kept, and so is its uncertainty: it counts as an error common to all readings, both in the
-weights (generalised least squares) and in the covariance of the result.
+Parameters that are not estimated keep their values and their uncertainty. The uncertainty counts as an error common to
+all readings, both in the weights (generalised least squares) and in the covariance of the result.
 """
 
 from collections.abc import Sequence
@@ -12,20 +12,21 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtri as chi2_isf
 
+from calib.data.dataset import finite
 from calib.data.dwell_mean import is_stationary, mean_and_covariance
 from calib.errors import BadDataset, NotObservable
 from calib.model import Array, Parameters, jacobian, predict, read_only, skew
 
 LEAST_SPREAD = 0.025  # of the gravity directions in the sensor frame, rms; two poses 3° apart have it
 SIGNIFICANT_SIGMAS = 5.0
-FALSE_ALARMS = 1e-3  # share of good tares that are refused
+FALSE_ALARMS = 1e-3  # share of good tares that are rejected
 USUAL_DRIFT_N, USUAL_DRIFT_NM = 1.0, 0.03  # a wrist sensor over hours: temperature, mounting, wear
 
 BIASES = np.r_[6:9, 12:15]  # where force and torque bias stand in `PARAMETER_NAMES`
 
 
 class Calibrated(Protocol):
-    """What is updated: a calibration, or an earlier update of it."""
+    """A calibration, or an earlier update of it."""
 
     @property
     def parameters(self) -> Parameters:
@@ -38,15 +39,15 @@ class Calibrated(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Update:
-    """Parameters after an update; can be updated again."""
+    """Parameters after an update, which can be updated again."""
 
     parameters: Parameters
     covariance: Array
-    """(15, 15) of the error coordinates `PARAMETER_NAMES`, what was kept included."""
+    """(15, 15) of the error coordinates `PARAMETER_NAMES`, kept parameters included."""
     chi2: float
-    """Misfit of the new readings; about `dof` when only noise and the old uncertainty are at work."""
+    """Misfit of the new readings; about `dof` if only noise and the old uncertainty act."""
     dof: int
-    """0 when nothing is left to check with."""
+    """0 if no reading is left for a check."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", read_only(self.covariance))
@@ -55,7 +56,7 @@ class Update:
 def update_payload(
     calibration: Calibrated, R_base_flange: Array, wrench: Array, wrench_cov: Array, *, retare: bool = False
 ) -> Update:
-    """Weight and centre of mass of another payload; mounting, tilt and (unless `retare`) biases are kept.
+    """Estimate weight and centre of mass of another payload; keep mounting, tilt and (unless `retare`) biases.
 
     With u_i the unit vector of gravity in the sensor frame, the readings are linear in the weight w and in w P:
     F_i = w u_i + F0, T_i = (w P) x u_i + T0.
@@ -70,17 +71,18 @@ def update_payload(
     wrench_cov : array, shape (n, 6, 6)
         Covariance of those means.
     retare : bool
-        Estimate the biases as well: needed when the sensor has drifted since the calibration.
+        Estimate the biases too, if the sensor has drifted since the calibration.
 
     Raises
     ------
     BadDataset
         Shapes that do not fit each other.
     NotObservable
-        Too few poses, gravity along one line in all of them, or no weight to speak of.
+        Too few poses, gravity along one line in all of them, or a weight that is not significant.
     """
-    R_base_flange, wrench, wrench_cov = _checked(R_base_flange, wrench, wrench_cov)
     old, n = calibration.parameters, len(wrench)
+    R_base_flange, wrench = finite("R_base_flange", R_base_flange, (n, 3, 3)), finite("wrench", wrench, (n, 6))
+    wrench_cov = finite("wrench_cov", wrench_cov, (n, 6, 6))
     old_weight_N = float(np.linalg.norm(old.gravity_force_base_N))
     if old_weight_N == 0:
         raise NotObservable("the calibration has no weight, so the direction of gravity is unknown: calibrate first.")
@@ -97,7 +99,7 @@ def update_payload(
     bias = np.concatenate([old.force_bias_N, old.torque_bias_Nm])
     y = (wrench if retare else wrench - bias).ravel()
 
-    kept = np.zeros((15, 15))  # how the errors of the old parameters enter the new ones
+    kept = np.zeros((15, 15))  # derivative of the new errors by the old ones
     kept[:3, :3] = np.eye(3)
     if not retare:
         kept[BIASES, BIASES] = 1.0
@@ -118,13 +120,13 @@ def update_payload(
         K = jacobian(new, R_base_flange).reshape(6 * n, 15) @ kept
         S = noise + K @ calibration.covariance @ K.T
 
-    estimated = np.zeros((15, size))  # how the errors of the estimates enter the new ones
+    estimated = np.zeros((15, size))  # derivative of the new errors by those of the estimates
     estimated[3:6, 0] = direction
     estimated[9:12, 0] = -new.p_sensor_com_m / weight_N
     estimated[9:12, 1:4] = np.eye(3) / weight_N
     if retare:
         estimated[BIASES, np.arange(4, 10)] = 1.0
-    return _update(new, calibration.covariance, estimated @ _gain(H, S), kept, K, S, noise, y - H @ x, 6 * n - size)
+    return _update(new, calibration.covariance, estimated @ _gain(H, S), kept, K, noise, y - H @ x, 6 * n - size)
 
 
 def tare(
@@ -135,12 +137,12 @@ def tare(
     drift_N: float = USUAL_DRIFT_N,
     drift_Nm: float = USUAL_DRIFT_NM,
 ) -> Update:
-    """Biases anew, with the weight of the tool accounted for; refused under load.
+    """Estimate the biases again, with the weight of the tool subtracted; reject readings under load.
 
-    The statistic is the Mahalanobis distance d² of each reading from its prediction, with everything in its covariance
-    that is known to move a reading: its noise, the uncertainty of the calibration, and a bias that has drifted by
-    `drift_N`, `drift_Nm` (one standard deviation an axis). It is compared with the 99.9 % quantile of chi-square with 6
-    degrees of freedom, 22.5. From two poses on, the readings must also agree on one bias, to the same probability.
+    The test is the Mahalanobis distance d² of each reading from its prediction. Its covariance holds the noise of the
+    reading, the uncertainty of the calibration, and a bias drift of `drift_N`, `drift_Nm` (one standard deviation an
+    axis). The limit is the 99.9 % quantile of chi-square with 6 degrees of freedom, 22.5. From two poses on, the
+    readings must also agree on one bias, with the same probability.
 
     Parameters
     ----------
@@ -150,25 +152,24 @@ def tare(
     dwells : sequence of n arrays, shape (N, 6)
         Consecutive samples in each pose, N >= 20, as measured, N and N·m, in the sensor frame.
     drift_N, drift_Nm : float
-        How far the biases may have moved since the calibration. A push of up to about four times this passes for
-        drift: one pose cannot tell them apart.
+        Expected drift of the biases since the calibration. A push of up to about four times this passes for drift,
+        because one pose does not distinguish them.
 
     Raises
     ------
     BadDataset
-        The reading moves during a dwell, is too far from the prediction for a tare to explain, or differs between
-        poses: something touches the tool, or the payload has changed.
+        The reading changes during a dwell, is too far from the prediction, or differs between poses: the tool is in
+        contact, or the payload has changed.
     """
+    if len(dwells) == 0:
+        raise BadDataset("there is no dwell: record at least one pose.")
     for i, dwell in enumerate(dwells):
         if not is_stationary(dwell):
-            raise BadDataset(
-                f"pose {i + 1}: the reading moves during the dwell: wait until the arm is still, hands off."
-            )
+            raise BadDataset(f"pose {i + 1}: the reading changes during the dwell: keep arm and tool still.")
     means = [mean_and_covariance(dwell) for dwell in dwells]
-    R_base_flange, wrench, wrench_cov = _checked(
-        R_base_flange, np.array([m.mean for m in means]), np.array([m.covariance for m in means])
-    )
-    old, n = calibration.parameters, len(wrench)
+    wrench, wrench_cov = np.array([m.mean for m in means]), np.array([m.covariance for m in means])
+    old, n = calibration.parameters, len(means)
+    R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
     residual = wrench - predict(old, R_base_flange)
     J = jacobian(old, R_base_flange)
     drift = np.diag(np.repeat([drift_N**2, drift_Nm**2], 3))
@@ -179,7 +180,7 @@ def tare(
         if distance > limit:
             raise BadDataset(
                 f"pose {i + 1}: the reading is {np.linalg.norm(residual[i, :3]):.2g} N and "
-                f"{np.linalg.norm(residual[i, 3:]):.2g} N·m from the prediction, more than a tare explains "
+                f"{np.linalg.norm(residual[i, 3:]):.2g} N·m from the prediction, more than drift explains "
                 f"(d² {distance:.0f}, limit {limit:.1f}): free the tool, or calibrate again if the payload has changed."
             )
 
@@ -201,11 +202,11 @@ def tare(
     estimated = np.zeros((15, 6))
     estimated[BIASES, np.arange(6)] = 1.0
     left = (residual - change).ravel()
-    update = _update(new, calibration.covariance, estimated @ G, kept, K, S, noise, left, 6 * n - 6)
+    update = _update(new, calibration.covariance, estimated @ G, kept, K, noise, left, 6 * n - 6)
     if update.dof and update.chi2 > chi2_isf(update.dof, FALSE_ALARMS):
         raise BadDataset(
             f"the {n} poses do not agree on one bias (chi2 {update.chi2:.0f} for {update.dof} degrees of freedom): "
-            "something touches the tool in one of them, or the payload has changed."
+            "free the tool, or calibrate again if the payload has changed."
         )
     return update
 
@@ -217,40 +218,26 @@ def _gain(H: Array, S: Array) -> Array:
 
 
 def _update(
-    new: Parameters, old_cov: Array, G: Array, kept: Array, K: Array, S: Array, noise: Array, left: Array, dof: int
+    new: Parameters, old_cov: Array, G: Array, kept: Array, K: Array, noise: Array, left: Array, dof: int
 ) -> Update:
     """Propagate: error of the new parameters = G (noise - K old error) + kept old error."""
-    mixed = kept - G @ K
+    S, mixed = noise + K @ old_cov @ K.T, kept - G @ K
     covariance = G @ noise @ G.T + mixed @ old_cov @ mixed.T
     return Update(new, (covariance + covariance.T) / 2, float(left @ np.linalg.solve(S, left)), dof)
 
 
 def _require_tilt(u: Array, retare: bool) -> None:
-    """Refuse poses whose gravity directions u (n, 3), in the sensor frame, leave something free."""
+    """Raise `NotObservable` if the gravity directions u (n, 3), in the sensor frame, leave a parameter free."""
     n, least = len(u), 3 if retare else 2
     if n < least:
-        free = {(1, False): "1 of 4", (1, True): "4 of 10", (2, True): "1 of 10"}[n, retare]
         raise NotObservable(
-            f"{n} pose{'s leave' if n > 1 else ' leaves'} {free} numbers free (the centre of mass along gravity"
-            f"{' and the biases' if retare else ''}): add {least - n} or more with the tool tilted differently."
+            f"{n} {'pose is' if n == 1 else 'poses are'} too few, at least {least} are needed: add {least - n} or more "
+            "with other tilts of the tool."
         )
     spread = np.linalg.svd(u - u.mean(axis=0) if retare else u, compute_uv=False)[1] / np.sqrt(n)
     if spread < LEAST_SPREAD:
+        found = "fewer than three clearly different directions" if retare else "nearly one line"
         raise NotObservable(
-            f"gravity has nearly the same line through the sensor in all {n} poses (spread {spread:.3f}, at least "
-            f"{LEAST_SPREAD:g} needed), so the centre of mass along it stays free: tilt the tool by 30° or more."
-            if not retare
-            else f"gravity has fewer than three clearly different directions in the sensor in these {n} poses (spread "
-            f"{spread:.3f}, at least {LEAST_SPREAD:g} needed): tilt the tool to two sides by 30° or more."
+            f"gravity has {found} in the sensor in these {n} poses (spread {spread:.3f}, at least {LEAST_SPREAD:g} "
+            f"needed): tilt the tool {'to two sides ' if retare else ''}by 30° or more."
         )
-
-
-def _checked(R_base_flange: Array, wrench: Array, wrench_cov: Array) -> tuple[Array, Array, Array]:
-    arrays = [np.asarray(a, dtype=np.float64) for a in (R_base_flange, wrench, wrench_cov)]
-    n = len(arrays[1])
-    for name, array, shape in zip(
-        ("R_base_flange", "wrench", "wrench_cov"), arrays, ((n, 3, 3), (n, 6), (n, 6, 6)), strict=True
-    ):
-        if array.shape != shape or n == 0 or not np.isfinite(array).all():
-            raise BadDataset(f"{name} has shape {array.shape}, expected {shape} finite numbers of one or more poses.")
-    return arrays[0], arrays[1], arrays[2]

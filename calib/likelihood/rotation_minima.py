@@ -10,11 +10,10 @@ that no rotation costs less.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from calib.errors import BadDataset
-
-Array = NDArray[np.float64]
+from calib.model import Array
 
 _CHUNK = 4096
 """Rows per matrix product: 0.4 MB, so that a chunk stays in the cache."""

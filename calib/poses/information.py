@@ -1,8 +1,8 @@
-"""What a set of poses will be worth, before anything has moved, and sets that are known to be good.
+"""Predicted information of a set of poses before any measurement, and pose sets that are known to be good.
 
-The Fisher information of the model depends on the orientations, on a guess of the tool and on the noise, not on any
-reading. Designs hardly depend on the guess; predictions in newtons and radians do. Which poses to take from those an
-arm can reach is the matter of `calib.poses.selection`.
+The Fisher information of the model depends on the orientations, a guess of the tool and the noise, not on readings.
+Pose sets hardly depend on the guess; predictions in newtons and radians do. `calib.poses.selection` selects poses from
+those that an arm can reach.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,16 +19,16 @@ from calib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, pred
 from calib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
 OBSERVABLE = 1e-9
-"""Smallest eigenvalue of the scaled information, as a share of the largest, that still counts."""
+"""Smaller eigenvalues of the scaled information, as a share of the largest, count as zero."""
 
 TOOL_DOWN_R_base_flange = np.diag([1.0, -1.0, -1.0])
 
 T12 = (1, 2, 5, 6, 11, 12, 15, 16, 17, 18, 21, 22)
 """Numbers of the tetrahedral subgroup of the paper's 24 orientations: per pose as good as all 24, for every tool."""
 SUBSET_12 = (2, 4, 5, 7, 10, 12, 13, 15, 18, 20, 21, 23)
-"""A-optimal for the forces; with torques 0.96 to 1 of `T12`, depending on where the centre of mass lies."""
+"""A-optimal for the forces; with torques 0.96 to 1 of `T12`, depending on the centre of mass."""
 SUBSET_8 = (2, 3, 6, 8, 17, 19, 22, 23)
-"""As good as eight of the 24 can be: second-basin gap 0.5."""
+"""The best eight of the 24: second-basin gap 0.5."""
 SUBSET_6 = (9, 10, 16, 19, 21, 22)
 """Nearly the best six of the 24 that have one solution, second-basin gap 0.28; `optimised(6)` is better."""
 AMBIGUOUS_6 = (4, 6, 9, 15, 18, 23)
@@ -59,10 +59,10 @@ _OPTIMISED: Mapping[int, tuple[tuple[float, float, float], ...]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guess:
-    """What is expected of tool, noise and base. Angles and offsets as in a calibration file."""
+    """Expected tool, noise and base. Angles and offsets as in a calibration file."""
 
     mass_kg: float
-    """Of all that hangs on the measuring side."""
+    """Of the load on the measuring side."""
     sigma_force_N: float
     """Standard deviation of one axis in the mean of one pose."""
     sigma_torque_Nm: float
@@ -71,7 +71,7 @@ class Guess:
     tilt_alpha_rad: float = 0.0
     tilt_beta_rad: float = 0.0
     walk_force_N: float = 0.0
-    """Standard deviation of how far each axis of the force bias wanders from one pose to the next."""
+    """Standard deviation of the random walk of each axis of the force bias from pose to pose."""
     walk_torque_Nm: float = 0.0
     g_m_s2: float = STANDARD_GRAVITY_M_S2
 
@@ -79,7 +79,7 @@ class Guess:
         for name in ("mass_kg", "sigma_force_N", "sigma_torque_Nm", "g_m_s2"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name} is {value}, expected a guess above zero")
+                raise ValueError(f"{name} is {value}, expected a positive number")
         for name in ("walk_force_N", "walk_torque_Nm"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
@@ -92,7 +92,7 @@ class Guess:
 
     @property
     def parameters(self) -> Parameters:
-        """The guess as parameters, without bias: information does not depend on it."""
+        """The guess as parameters, without bias, because information does not depend on bias."""
         alpha, beta = self.tilt_alpha_rad, self.tilt_beta_rad
         down = -np.array([np.cos(alpha) * np.sin(beta), -np.sin(alpha), np.cos(alpha) * np.cos(beta)])
         R_flange_sensor = np.asarray(self.R_flange_sensor, dtype=np.float64)
@@ -103,7 +103,7 @@ class Guess:
     def scale(self) -> Array:
         """(15,) units that make the error coordinates comparable: 1 rad, weight, weight, lever, weight times lever.
 
-        The lever is |P|, or the ratio of torque to force noise where that is longer.
+        The lever is |P|, or the ratio of torque to force noise if that is longer.
         """
         lever_m = max(float(np.linalg.norm(self.p_sensor_com_m)), self.sigma_torque_Nm / self.sigma_force_N)
         return np.repeat([1.0, self.weight_N, self.weight_N, lever_m, self.weight_N * lever_m], 3)
@@ -116,11 +116,11 @@ class Guess:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """What a calibration from given poses will reach, as far as noise explains it."""
+    """Expected accuracy of a calibration from given poses, from noise alone."""
 
     n_poses: int
     sigma: Mapping[str, Array | float]
-    """One standard deviation under the names of `CalibrationResult.sigma`; infinite where the poses do not tell."""
+    """Standard deviations, named as in `CalibrationResult.sigma`; infinite if not determined by the poses."""
     force_rms_N: float
     """Error of the compensation (norm), root mean square over all orientations."""
     torque_rms_Nm: float
@@ -146,15 +146,15 @@ class Efficiency(NamedTuple):
 
 
 def special(numbers: Sequence[int]) -> Array:
-    """Give the orientations R_base_flange (n, 3, 3) of these numbers, 1 to 24, of the paper (Yu, eq. 14)."""
+    """Return the orientations R_base_flange (n, 3, 3) with these numbers, 1 to 24, of the paper (Yu, eq. 14)."""
     return np.swapaxes(SPECIAL_R_flange_base[np.asarray(numbers) - 1], 1, 2)
 
 
 def optimised(n: int) -> Array:
-    """Give n orientations R_base_flange (n, 3, 3), n = 6 or 8, nearly as good per pose as the special 24.
+    """Return n orientations R_base_flange (n, 3, 3), n = 6 or 8, nearly as good per pose as the special 24.
 
-    They have the least mean of inverse efficiencies for centres of mass in all directions. The first has the tool
-    straight down. Turning the whole set about the vertical, or by one rotation of the flange, keeps its worth.
+    They have the least mean inverse efficiency for centres of mass in all directions. The first has the tool straight
+    down. A turn of the whole set about the vertical, or by one rotation of the flange, keeps its information.
     """
     if n not in _OPTIMISED:
         raise ValueError(f"there is no stored set of {n} poses: take {' or '.join(map(str, _OPTIMISED))}, or `choose`")
@@ -169,7 +169,7 @@ def whitened_jacobian(R_base_flange: Array, guess: Guess) -> Array:
 def information(J: Array, guess: Guess) -> Array:
     """Fisher information (15, 15) of a whitened Jacobian (n, 6, 15) whose rows are in the order of measuring.
 
-    With a wandering bias the bias parameters are those at the last pose.
+    With a random walk of the bias, the bias parameters are those at the last pose.
     """
     n = len(J)
     before_last = np.arange(n)[::-1]
@@ -191,11 +191,11 @@ def predicted_sigma(R_base_flange: Array, guess: Guess, t_s: ArrayLike | None = 
     Parameters
     ----------
     R_base_flange : array, shape (n, 3, 3)
-        In the order of measuring, which matters where the guess lets the bias wander.
+        In the order of measuring, which matters if the guess has a random walk of the bias.
     guess : Guess
     t_s : array_like, shape (n,), optional
-        When the poses are taken: a linear drift of all six channels is then estimated too, and biases are those at
-        the mean time.
+        Times of the poses. If given, a linear drift of all six channels is estimated too, and biases are those at the
+        mean time.
 
     Returns
     -------
@@ -244,14 +244,14 @@ def efficiency(R_base_flange: Array, guess: Guess) -> Efficiency:
     R_base_flange : array, shape (n, 3, 3)
         A set that determines all parameters.
     guess : Guess
-        Its noise only matters through the ratio of torque to force noise.
+        Only the ratio of its torque and force noise matters.
     """
     own, best = (_per_pose(R, guess) for R in (np.asarray(R_base_flange, dtype=np.float64), special(range(1, 25))))
     return Efficiency(*(b / o for o, b in zip(own, best, strict=True)))
 
 
 def _per_pose(R_base_flange: Array, guess: Guess) -> tuple[float, float, float, float]:
-    """Give the variances whose inverses are D, A, I_F and I_T, for the information of one average pose."""
+    """Variances whose inverses are D, A, I_F and I_T, for the information of one average pose."""
     J = whitened_jacobian(R_base_flange, guess)
     covariance = np.linalg.inv(np.einsum("nki,nkj->ij", J, J) / len(J))
     _, log_det = np.linalg.slogdet(covariance)
@@ -260,7 +260,7 @@ def _per_pose(R_base_flange: Array, guess: Guess) -> tuple[float, float, float, 
 
 
 def prediction_weights(R_base_flange: Array, guess: Guess) -> tuple[Array, Array]:
-    """Matrices (15, 15) whose sum with a covariance is the mean square error over these orientations.
+    """Matrices (15, 15) whose scalar product with a covariance is the mean square error over these orientations.
 
     In the units of `Guess.scale`; of force, in sigma_force_N², and of torque, in sigma_torque_Nm².
     """
@@ -270,19 +270,20 @@ def prediction_weights(R_base_flange: Array, guess: Guess) -> tuple[Array, Array
 
 
 def second_basin_gap(R_base_flange: Array, guess: Guess) -> float:
-    """Say how clearly the forces decide between the true mounting and the best other one.
+    """Compute the separation of the true mounting from the best other one by the forces.
 
-    Fit exact forces of the guessed tool with every rotation: the gap is the lowest residual sum of squares of a second
-    minimum, divided by n weight². 8/9 for the special 24, below 0.05 weak, 0 exactly ambiguous (all tool axes at one
-    angle to the vertical, or too few poses). The second solution's chi2 is larger by gap n (weight / sigma_force_N)².
+    The gap is the lowest residual sum of squares of a second minimum over the rotations, fitted to exact forces of the
+    guessed tool and divided by n weight². It is 8/9 for the special 24, weak below 0.05, and 0 if exactly
+    ambiguous (all tool axes at one angle to the vertical, or too few poses). The chi2 of the
+    second solution is larger by gap n (weight / sigma_force_N)².
     """
     return second_basin(R_base_flange, guess)[0]
 
 
 def second_basin(R_base_flange: Array, guess: Guess) -> tuple[float, Parameters | None]:
-    """Give the gap of `second_basin_gap` and the other solution, None where there is not just one; infinite if none."""
+    """Return the gap of `second_basin_gap` and the other solution or None."""
     if len(R_base_flange) < 3:
-        return 0.0, None  # there is a continuum of solutions
+        return 0.0, None  # the solutions form a continuum
     gap, other = second_minimum(R_base_flange, guess.parameters)
     if other is None:
         return gap, None
@@ -298,7 +299,7 @@ def force_rows(R_base_flange: Array, guess: Guess) -> Array:
 
 
 class _Variance:
-    """Variances of linear functions of the error coordinates; infinite where the information has no answer."""
+    """Variances of linear functions of the error coordinates; infinite if undetermined."""
 
     def __init__(self, information: Array, scale: Array) -> None:
         eigenvalues, V = np.linalg.eigh(information)
@@ -315,7 +316,7 @@ class _Variance:
 
 
 def _drift_columns(t_s: ArrayLike) -> Array:
-    """Derivative (n, 6, 6) of the whitened wrench by a linear drift of each channel; zero without passing of time."""
+    """Derivative (n, 6, 6) of the whitened wrench by a linear drift of each channel; zero if all times are equal."""
     t = np.asarray(t_s, dtype=np.float64)
     since = t - t.mean()
     return np.asarray(np.multiply.outer(since / (np.abs(since).max() or 1.0), np.eye(6)))
@@ -335,7 +336,7 @@ def _weight_and_tilt_rows(guess: Guess) -> Array:
 
 
 def _condition(M: Array) -> float:
-    """Condition number; infinite where a column is not determined."""
+    """Condition number; infinite if a column is not determined."""
     singular = np.linalg.svd(M, compute_uv=False)
     columns = M.shape[1]
     if len(singular) < columns or singular[-1] <= OBSERVABLE * singular[0]:

@@ -1,7 +1,7 @@
-"""Which poses to take from those the arm can reach: a whole set at once, or the next one, and in which order.
+"""Selection of poses from those that the arm can reach: a whole set, the next pose, and their order.
 
 Criteria are traces of a covariance C: a pose with whitened Jacobian J lowers trace(M C) by
-trace((1 + J C J^T)^-1 J C M C J^T), so all candidates are judged at once. Everything is deterministic.
+trace((1 + J C J^T)^-1 J C M C J^T), so one array operation ranks all candidates. All functions are deterministic.
 """
 
 from collections.abc import Callable
@@ -27,11 +27,11 @@ Indices = NDArray[np.intp]
 Criterion = Literal["parameters", "prediction"]
 
 PRIOR = 1e-4
-"""Information about every parameter, in the units of `Guess.scale`, before the first pose: nearly none."""
+"""Information about every parameter before the first pose, in the units of `Guess.scale`: almost none."""
 WEIGHT_OF_PLANE = 0.3
-"""Of the second term of the parameter criterion: gravity directions must not lie in one plane."""
+"""Weight of the second term of the parameter criterion, against gravity directions in one plane."""
 FEWEST = 4
-"""Poses that can determine all parameters."""
+"""Smallest number of poses that determines all parameters."""
 LEAST_GAP = 0.05
 MOST_SWEEPS = 20
 LEAST_GAIN = 1e-6
@@ -88,19 +88,19 @@ def choose(
         4 or more.
     guess : Guess
     criterion : {"parameters", "prediction"}
-        What to make small. "parameters": the summed variances of rotation, weight and force bias, plus a term that
-        keeps the gravity directions out of one plane, which LROM needs. "prediction": the error of force and torque
-        compensation in `R_workspace`, each in units of its noise.
+        What to minimise. "parameters": the summed variances of rotation, weight and force bias, plus a term against
+        gravity directions in one plane, for LROM. "prediction": the error of force and torque compensation in
+        `R_workspace`, each in units of its noise.
     R_workspace : array, shape (k, 3, 3), optional
-        Where compensation is wanted, everywhere by default. Only for "prediction".
+        Orientations for the compensation, all by default. Only for "prediction".
     least_gap : float
-        Gap to the second solution (`second_basin_gap`) to keep: poses that contradict that solution are put in until
-        it is reached, in a cone those near its centre. A narrow cone cannot reach it: then the widest gap found.
+        Smallest gap to the second solution (`second_basin_gap`): poses that contradict that solution are added until
+        it is reached. If a narrow cone cannot reach it, the set with the widest gap is returned.
 
     Returns
     -------
     int array, shape (n,)
-        Indices of candidates, all different, in the order of choice.
+        Indices of candidates, all different, in the order of selection.
     """
     R_candidates = np.asarray(R_candidates, dtype=np.float64)
     if not FEWEST <= n <= len(R_candidates):
@@ -130,33 +130,33 @@ def next_pose(
     R_workspace: Array | None = None,
     least_gap: float = LEAST_GAP,
 ) -> tuple[Indices, Array]:
-    """Rank candidates by how much one more pose there would improve the compensation of forces and torques.
+    """Rank candidates for the next pose by the improvement of force and torque compensation.
 
-    As long as the poses taken fit a second solution almost as well, the improvement is multiplied by how much the
-    candidate contradicts that solution.
+    While the completed poses fit a second solution almost as well, the improvement is multiplied by the contradiction
+    of the candidate to that solution.
 
     Parameters
     ----------
     R_done : array, shape (n, 3, 3)
-        Orientations R_base_flange already taken; n may be 0.
+        Orientations R_base_flange of the completed poses; n may be 0.
     R_candidates : array, shape (m, 3, 3)
     guess : Guess
     R_workspace : array, shape (k, 3, 3), optional
-        Where compensation is wanted, everywhere by default.
+        Orientations for the compensation, all by default.
     least_gap : float
-        From this gap on (`second_basin_gap`) the second solution is no concern.
+        From this gap on (`second_basin_gap`), the second solution is ignored.
 
     Returns
     -------
     ranked : int array, shape (m,)
         Indices of candidates, the best first.
     force_rms_N : array, shape (m,)
-        Error of force compensation in the workspace with that pose added, in the order of `ranked`; huge as long as
-        the poses do not determine the parameters.
+        Error of force compensation in the workspace with that pose added, in the order of `ranked`; very large
+        until the poses determine the parameters.
     """
     R_done, R_candidates = np.asarray(R_done, dtype=np.float64), np.asarray(R_candidates, dtype=np.float64)
     if not len(R_candidates):
-        raise ValueError("there are no candidates for the next pose: give orientations that the arm can reach")
+        raise ValueError("no candidates for the next pose: pass orientations that the arm can reach")
     force, torque = prediction_weights(special(range(1, 25)) if R_workspace is None else R_workspace, guess)
     done = whitened_jacobian(R_done, guess).reshape(-1, 15)
     C = _inverse(PRIOR * np.eye(15) + done.T @ done)
@@ -172,10 +172,10 @@ def next_pose(
 
 
 def order(R_base_flange: Array, guess: Guess) -> Indices:
-    """Find an order of poses in which the wandering bias of the guess is least confused with the other parameters.
+    """Find the order of poses that best separates the random walk of the bias from the other parameters.
 
-    Pairs are exchanged as long as the variances of rotation and gravity force, in the units of `Guess.scale`, fall:
-    from the given order on, and from a few random ones.
+    Pairs are exchanged while the variances of rotation and gravity force decrease, in the units of `Guess.scale`. The
+    search starts from the given order and from some random ones.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def _exchange_pairs(best: Indices, cost: Callable[[Indices], float]) -> Indices:
 
 
 class _Term:
-    """A criterion trace(M C), C the covariance of some parameters, over a choice of candidates."""
+    """A criterion trace(M C), C the covariance of some parameters, over a selection of candidates."""
 
     def __init__(self, rows: Array, M: Array) -> None:
         """Take the candidates' whitened rows (m, r, p) and the weight M (p, p)."""
@@ -222,7 +222,7 @@ class _Term:
         self._prior = PRIOR * np.eye(rows.shape[2])
 
     def gains(self, chosen: list[int]) -> Array:
-        """(m,) how much each candidate would lower the criterion of the poses chosen."""
+        """(m,) decrease of the criterion by each candidate, added to the chosen poses."""
         rows = self._rows[chosen].reshape(-1, self._rows.shape[2])
         return _gains(self._rows, _inverse(self._prior + rows.T @ rows), self._M)[0]
 
@@ -269,7 +269,7 @@ def _contradiction(R_candidates: Array, guess: Guess, other: Parameters) -> Arra
 
 
 def _gains(rows: Array, C: Array, *weights: Array) -> list[Array]:
-    """How much each candidate's rows (m, r, p) lower trace(M C), for each of the weights M."""
+    """Decrease of trace(M C) by the rows (m, r, p) of each candidate, for each of the weights M."""
     JC = rows @ C
     solved = np.linalg.solve(JC @ np.swapaxes(rows, 1, 2) + np.eye(rows.shape[1]), JC)
     return [np.einsum("mrp,mrp->m", solved, JC @ M) for M in weights]

@@ -8,9 +8,9 @@ The paper's letters: `A_i = R_TF^RB = R_base_flange[i].T`, `X = R_TF^S = R_flang
 columns: `vec(X) = R_flange_sensor.T.ravel()`. Without noise all methods find the same solution. With noise they do so
 (section 4.2) only when the forces point equally in all directions: prefer `polynomial`, which is least squares.
 
-The paper has no sensor bias. Every method here has two forms:
+The paper has no sensor bias. Every method has two forms:
 
-* `bias=False` is the paper's model. A bias then enters the result unnoticed: with 20 N of weight, 24 random poses and
+* `bias=False` is the paper's model. A bias then causes an unreported error: with 20 N of weight, 24 random poses and
   0.05 N of noise, a bias of 0, 0.1, 1, 5 and 20 N makes the rotation wrong by 0.07, 0.10, 0.75, 3.7 and 10 to 20 deg
   (rms) and the gravity force by 0.1, 0.14, 1.0, 5 and 21 %, much the same for all methods.
 * `bias=True` estimates the bias too: `X f_i = A_i g + h` with `h = X f_0`. Subtracting the mean over the poses
@@ -20,40 +20,36 @@ The paper has no sensor bias. Every method here has two forms:
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import BadDataset, NotObservable
 from calib.likelihood import rotation_minima
-from calib.model import nearest_rotation, skew
-
-Array = NDArray[np.float64]
+from calib.model import Array, nearest_rotation, skew
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForceFit:
-    """What forces alone can tell: how the sensor is turned, the weight it carries, and its force bias."""
+    """Result of a method that uses forces only: mounting of the sensor, weight and force bias."""
 
     R_flange_sensor: Array
     """(3, 3) maps sensor to flange coordinates."""
     gravity_force_base_N: Array
-    """(3,) weight of what hangs on the sensor, in base axes."""
+    """(3,) weight of the load on the sensor, in base axes."""
     force_bias_N: Array
     """(3,) in sensor axes; zero in the form without bias."""
     converged: bool = True
-    """False when an iteration was stopped before it settled; closed forms always converge."""
+    """False if an iteration stopped before convergence; closed forms always converge."""
     certificate_gap: float | None = None
-    """From the method that proves global optimality (`calib.likelihood.rotation_minima.certificate`): the proof is
-    complete below 1e-8."""
+    """From `calib.likelihood.rotation_minima.certificate`, which proves global optimality: complete below 1e-8."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForceEquations:
-    """The equations `X f_i = A_i g` of all poses, with a bias less their mean."""
+    """The equations `X f_i = A_i g` of all poses, minus their mean in the form with bias."""
 
     A: Array
-    """(n, 3, 3) base to flange; in the form with bias less `A_mean`."""
+    """(n, 3, 3) base to flange; in the form with bias minus `A_mean`."""
     f: Array
-    """(n, 3) N in sensor axes; in the form with bias less `f_mean`."""
+    """(n, 3) N in sensor axes; in the form with bias minus `f_mean`."""
     A_mean: Array
     """(3, 3), zero in the form without bias."""
     f_mean: Array
@@ -76,7 +72,7 @@ class ForceEquations:
     def fit(
         self, R_flange_sensor: Array, gravity_N: Array, *, converged: bool = True, certificate_gap: float | None = None
     ) -> ForceFit:
-        """Complete a solution with the bias that the means leave."""
+        """Add the bias that follows from the means."""
         bias_N = self.f_mean - R_flange_sensor.T @ self.A_mean @ gravity_N
         return ForceFit(R_flange_sensor, gravity_N, bias_N, converged, certificate_gap)
 
@@ -90,9 +86,9 @@ def force_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method:
     force_N : array, shape (n, 3)
         Sensor axes.
     bias : bool
-        Whether the force bias is among the unknowns; it costs one more pose.
+        Whether to estimate the force bias, which needs one more pose.
     method : str
-        Named in the error.
+        Name for the error message.
     min_poses : int
         Poses the method needs without bias.
 
@@ -126,11 +122,11 @@ def eigen(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
     """Unknown gravity by eigendecomposition (theorem 1).
 
     vec(X) is the eigenvector of `K = F^+ D D^+ F` with the largest eigenvalue, which is 1 without noise. That is the
-    smallest principal angle between the ranges of F and D, and it is computed so. It minimises `|F r - D g| / |F r|`;
-    the noise in the denominator makes the method inconsistent when the forces do not point equally in all directions:
-    with 8 orientations within 40 deg, each 2000 times at a signal-to-noise ratio of 10, R remains wrong by 3.5 deg
-    where `nullspace` has 0.3 deg. (With the bias as columns `[D, I]` instead of by centring, a bias as large as
-    the weight is in that denominator too, and R remains wrong by 30 deg.)
+    smallest principal angle between the ranges of F and D, the form computed here. It minimises `|F r - D g| / |F r|`.
+    The noise in the denominator makes it inconsistent if the forces do not point equally in all directions: with 8
+    orientations within 40 deg, each 2000 times at a signal-to-noise ratio of 10, R remains wrong by 3.5 deg where
+    `nullspace` has 0.3 deg. (With the bias as columns `[D, I]` instead of centring, a bias as large as the weight is
+    in that denominator too, and R remains wrong by 30 deg.)
 
     Corrections: the eigenvector is that of the largest eigenvalue (appendix B takes the first, which Julia from 1.2 on
     sorts to be the least), with length sqrt(3) and positive determinant. That the eigenvalue 1 is single does not
@@ -142,15 +138,14 @@ def eigen(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
     force_N : array, shape (n, 3)
         Sensor axes.
     bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+        Whether to estimate the force bias, or to assume zero like the paper (see the module).
 
     Raises
     ------
     NotObservable
         Fewer than 4 poses (5 with bias), or poses that leave a family of solutions.
     """
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the eigendecomposition", min_poses=4)
-    _require_spread(eq)
+    eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the eigendecomposition")
     Q_F, R_F = np.linalg.qr(eq.F)
     Q_D = np.linalg.qr(eq.D)[0]
     principal = np.linalg.svd(Q_F.T @ Q_D)[0][:, 0]
@@ -166,19 +161,15 @@ def nullspace(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
 
     Parameters
     ----------
-    R_base_flange : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-        Sensor axes.
-    bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+    R_base_flange, force_N, bias
+        As in `eigen`.
 
     Raises
     ------
     NotObservable
-        Fewer than 4 poses (5 with bias), or poses that leave a family of solutions.
+        As in `eigen`.
     """
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the nullspace method", min_poses=4)
-    _require_spread(eq)
+    eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the nullspace method")
     return _fit_vec(eq, _least_singular_vector(eq.D, eq.F))
 
 
@@ -191,19 +182,15 @@ def nullspace_all_pairs(R_base_flange: Array, force_N: Array, *, bias: bool) -> 
 
     Parameters
     ----------
-    R_base_flange : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-        Sensor axes.
-    bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+    R_base_flange, force_N, bias
+        As in `eigen`.
 
     Raises
     ------
     NotObservable
-        Fewer than 4 poses (5 with bias), or poses that leave a family of solutions.
+        As in `eigen`.
     """
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the nullspace method", min_poses=4)
-    _require_spread(eq)
+    eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the nullspace method")
     i, k = np.triu_indices(len(force_N), 1)
     A_k_i = R_base_flange[k].transpose(0, 2, 1) @ R_base_flange[i]
     F = kron_identity(force_N).reshape(-1, 3, 9)
@@ -225,34 +212,30 @@ def iterative(
     Alternates between the rotation of a given gravity, projected onto SO(3), and the gravity of a given rotation. The
     error shrinks in each step by the second eigenvalue of K: 0.04 for 100 random orientations, but without bias 0.78,
     0.90 and 0.98 for orientations within 60, 40 and 20 deg (about 0.5 with bias, thanks to the centring). So it runs
-    until the rotation rests, not the 6 times of appendix B.
+    until the rotation converges, instead of 6 times as in appendix B.
 
-    Corrections: a matrix with negative determinant is turned to its negative before the projection. As printed, the
+    Corrections: a matrix with negative determinant is negated before the projection. As printed, the
     limit is the truth in only 39 % (start at R = I) or 52 % (random gravity) of cases with 100 random orientations;
-    with the flip, in all. With few poses there are false resting points even so: from a random gravity, without
+    with the negation, in all. With few poses there are still false fixed points: from a random gravity, without
     noise, 37, 12, 3 and 0.3 % of cases with 5, 8, 12 and 24 random poses (and bias) end there. From the gravity of
     theorem 1, the default, 1 % with 5 poses and none with more. (A start at zero, which the paper recommends, is the
     start R = I by accident of the singular value decomposition.)
 
     Parameters
     ----------
-    R_base_flange : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-        Sensor axes.
-    bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+    R_base_flange, force_N, bias
+        As in `eigen`.
     gravity_start_base : array, shape (3,), optional
         A direction, of any length and sign. The default is the gravity of theorem 1.
     max_iterations : int
-        When they do not suffice, the fit says `converged=False`.
+        If they do not suffice, the fit has `converged=False`.
 
     Raises
     ------
     NotObservable
-        Fewer than 4 poses (5 with bias), or poses that leave a family of solutions.
+        As in `eigen`.
     """
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the iterative method", min_poses=4)
-    _require_spread(eq)
+    eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the iterative method")
     rotation_of_gravity = np.linalg.lstsq(eq.F, eq.D)[0]
     gravity_of_rotation = np.linalg.lstsq(eq.D, eq.F)[0]
     if gravity_start_base is None:
@@ -283,11 +266,8 @@ def polynomial(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
 
     Parameters
     ----------
-    R_base_flange : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-        Sensor axes.
-    bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+    R_base_flange, force_N, bias
+        As in `eigen`.
 
     Raises
     ------
@@ -318,6 +298,14 @@ def kron_identity(f: Array) -> Array:
     return np.asarray(np.einsum("nj,ik->nijk", f, np.eye(3)).reshape(-1, 9))
 
 
+def _linear_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method: str) -> ForceEquations:
+    """Form the equations of a method that is linear in all nine entries of the rotation, if the poses suffice."""
+    eq = force_equations(R_base_flange, force_N, bias=bias, method=method, min_poses=4)
+    _require_turns_and_weight(eq)
+    _require_varied_forces(eq.f, 0)
+    return eq
+
+
 def _rotation_of_vec(r: Array) -> Array:
     """Rotation closest to the matrix with columns in r (9,), times a factor of either sign (theorem 1, eqs. 28-29)."""
     X = r.reshape(3, 3).T
@@ -332,7 +320,7 @@ def _fit_vec(eq: ForceEquations, r: Array) -> ForceFit:
 
 
 def _complement(eliminated: Array, kept: Array) -> Array:
-    """Few rows with the Gram matrix of `kept` less its projection on the columns of `eliminated`."""
+    """Few rows with the Gram matrix of `kept` minus its projection on the columns of `eliminated`."""
     k = eliminated.shape[1]
     return np.linalg.qr(np.hstack([eliminated, kept])).R[k:, k:]
 
@@ -341,10 +329,10 @@ def _least_singular_vector(eliminated: Array, kept: Array) -> Array:
     return np.asarray(np.linalg.svd(_complement(eliminated, kept))[2][-1])
 
 
-# --- what the poses can determine ---
-# Judged on the forces `A_i g` that the fitted gravity would cause: noise lifts the singular values of the measured ones
-# above any bound, and a degenerate pose set would pass. One kind still does: when all poses tilt the tool equally,
-# noise in the fitted direction hides it, and only a comparison with the second solution, as in `polynomial`, shows it.
+# --- observability ---
+# The checks use the forces `A_i g` of the fitted gravity, because noise lifts the singular values of measured forces
+# above any bound, and degenerate pose sets would pass. One kind still passes: if all poses tilt the tool equally, noise
+# in the fitted direction hides it. Only a comparison with the second solution, as in `polynomial`, detects that.
 
 
 def spanned_dimensions(rows: Array, size: float) -> int:
@@ -354,25 +342,20 @@ def spanned_dimensions(rows: Array, size: float) -> int:
 
 
 def require_weight(eq: ForceEquations) -> None:
-    """Refuse forces that are zero or, with a bias, constant.
+    """Reject forces that are zero or, with a bias, constant.
 
     Raises
     ------
     NotObservable
     """
     if not spanned_dimensions(eq.f, float(np.linalg.norm(eq.f + eq.f_mean))):
-        raise NotObservable("the forces show no weight: hang a tool or a mass on the sensor")
-
-
-def _require_spread(eq: ForceEquations) -> None:
-    _require_turns_and_weight(eq)
-    _require_varied_forces(eq.f, 0)
+        raise NotObservable("the forces show no weight: attach a tool or a mass to the sensor")
 
 
 def _require_turns_and_weight(eq: ForceEquations) -> None:
     if spanned_dimensions(eq.D, len(eq.A) ** 0.5) < 3:
         raise NotObservable(
-            "all poses turn about one base axis, and a weight along it looks like a bias: add poses turned about "
+            "all poses turn about one base axis, and a weight along it resembles a bias: add poses turned about "
             "another axis"
         )
     require_weight(eq)
@@ -395,7 +378,7 @@ def _require_single_null_vector(eq: ForceEquations, gravity: Array) -> None:
     missing = 8 - spanned_dimensions(_complement(eq.D, kron_identity(f)), size)
     if missing > 0:
         raise NotObservable(
-            f"the poses leave {missing} more unknowns than the linear equations determine: add poses turned about "
+            f"the poses leave {missing} unknowns of the linear equations undetermined: add poses turned about "
             "other axes"
         )
 
@@ -407,5 +390,6 @@ def _require_locally_unique(eq: ForceEquations, gravity: Array) -> None:
     missing = 6 - spanned_dimensions(J, len(eq.A) ** 0.5 * weight)
     if missing > 0:
         raise NotObservable(
-            f"the poses leave {missing} of 6 unknowns of rotation and weight open: add poses turned about another axis"
+            f"the poses leave {missing} of 6 unknowns of rotation and weight undetermined: "
+            "add poses turned about another axis"
         )

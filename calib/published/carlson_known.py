@@ -1,19 +1,18 @@
 """Carlson's methods for a known gravity vector, from forces alone, and Umeyama's solution of the same problem.
 
 F. Bagge Carlson, "On the Calibration of Force/Torque Sensors in Robotics", 2019, section 2. Letters and the two forms,
-without and with a bias, are those of `calib.published.carlson`; a bias that the form without bias does not know has
-the same effect here (Cayley transform: 22 deg when the bias is as large as the weight).
+without and with a bias, are those of `calib.published.carlson`. A bias has the same effect on the form without bias
+(Cayley transform: 22 deg if the bias is as large as the weight).
 
-"Known" means exact: when the base is tilted by 2 deg more than assumed, the result is wrong and nothing shows it.
+"Known" means exact: if the base is tilted by 2 deg more than assumed, the result is wrong without any sign of it.
 """
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.errors import BadDataset, NotObservable
-from calib.model import nearest_rotation, skew
+from calib.model import Array, nearest_rotation, skew
 from calib.published.carlson import (
-    Array,
     ForceEquations,
     ForceFit,
     force_equations,
@@ -28,7 +27,7 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     The linear unknown is the matrix `X / weight`, nine free numbers, with `(X / weight) f_i = A_i d`. (Eq. 3 calls it
     mR; it is (1/m) R_TF^S, and R_TF^S is the inverse of the R_S^TF of eq. 1.) The noise of the regressor f shrinks it
     by a symmetric factor, which the projection on SO(3) removes; the weight is then the least-squares one given X.
-    Consistent, but `similarity` is better when the tool cannot be turned all ways.
+    Consistent, but `similarity` is better if the tool cannot be turned in all directions.
 
     Parameters
     ----------
@@ -38,7 +37,7 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     gravity_direction_base : array, shape (3,)
         Down, in base axes, of any length.
     bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+        Whether to estimate the force bias, or to assume zero like the paper (see the module).
 
     Raises
     ------
@@ -47,13 +46,9 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     BadDataset
         The forces point against the given gravity.
     """
-    down = _direction(gravity_direction_base)
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the relaxation", min_poses=3)
+    eq, down = _equations(R_base_flange, force_N, gravity_direction_base, 3, bias=bias, method="the relaxation")
     a = eq.A @ down
-    _require_usable(eq, a, 3)
-    R_sensor_flange = nearest_rotation(np.asarray(np.linalg.lstsq(eq.f, a)[0], dtype=np.float64))
-    weight_N = _weight(eq.f, a, R_sensor_flange)
-    return eq.fit(R_sensor_flange.T, weight_N * down)
+    return _with_weight(eq, down, nearest_rotation(np.asarray(np.linalg.lstsq(eq.f, a)[0], dtype=np.float64)))
 
 
 def cayley(
@@ -72,9 +67,9 @@ def cayley(
     force_N : array, shape (n, 3)
         Sensor axes.
     gravity_force_base_N : array, shape (3,)
-        Weight of what hangs on the sensor, in base axes; returned as given.
+        Weight of the load on the sensor, in base axes; returned unchanged.
     bias : bool
-        Estimate the force bias too, or take it to be zero as the paper does (see the module).
+        Whether to estimate the force bias, or to assume zero like the paper (see the module).
     total : bool
         Total least squares, as the paper recommends, or ordinary.
 
@@ -86,10 +81,8 @@ def cayley(
         The forces point against the given gravity.
     """
     gravity = np.array(gravity_force_base_N, dtype=np.float64)
-    down = _direction(gravity)
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the Cayley transform", min_poses=2)
+    eq, _ = _equations(R_base_flange, force_N, gravity, 2, bias=bias, method="the Cayley transform")
     a = eq.A @ gravity
-    _require_usable(eq, eq.A @ down, 2)
     turns = [np.diag(signs) for signs in ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))]
     candidates = [cayley_rotation(eq.f, a @ turn, total=total) @ turn for turn in turns]
     R_sensor_flange = min(candidates, key=lambda R: float(np.sum((eq.f - a @ R.T) ** 2)))
@@ -107,7 +100,7 @@ def cayley_rotation(f: Array, a: Array, *, total: bool) -> Array:
     Parameters
     ----------
     f, a : array, shape (n, 3)
-        With a bias, both less their means.
+        With a bias, both minus their means.
     total : bool
         Total or ordinary least squares; noise makes the latter's s too small.
 
@@ -131,17 +124,12 @@ def similarity(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     1991, eqs. 39-42. Not in Carlson's paper and better: the exact least-squares solution for rotation, weight and bias.
     With the tool within 40 deg of straight down its mean square error of R is the smallest possible (0.95-1.02 times
     the bound), that of `relaxation` 4 to 6 times as large, and that of the total least squares with a bias column in
-    Carlson's Robotlib 6 to 4000 times, depending on the mass it is told and on the size of the bias.
+    Carlson's Robotlib 6 to 4000 times, depending on the configured mass and the size of the bias.
 
     Parameters
     ----------
-    R_base_flange : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-        Sensor axes.
-    gravity_direction_base : array, shape (3,)
-        Down, in base axes, of any length.
-    bias : bool
-        Estimate the force bias too, or take it to be zero (see the module).
+    R_base_flange, force_N, gravity_direction_base, bias
+        As in `relaxation`.
 
     Raises
     ------
@@ -150,13 +138,36 @@ def similarity(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     BadDataset
         The forces point against the given gravity.
     """
-    down = _direction(gravity_direction_base)
-    eq = force_equations(R_base_flange, force_N, bias=bias, method="the similarity solution", min_poses=2)
-    a = eq.A @ down
-    _require_usable(eq, a, 2)
-    R_sensor_flange = nearest_rotation(eq.f.T @ a)
-    weight_N = _weight(eq.f, a, R_sensor_flange)
-    return eq.fit(R_sensor_flange.T, weight_N * down)
+    method = "the similarity solution"
+    eq, down = _equations(R_base_flange, force_N, gravity_direction_base, 2, bias=bias, method=method)
+    return _with_weight(eq, down, nearest_rotation(eq.f.T @ (eq.A @ down)))
+
+
+def _equations(
+    R_base_flange: Array, force_N: Array, gravity_base: Array, needed: int, *, bias: bool, method: str
+) -> tuple[ForceEquations, Array]:
+    """Form the equations of a method that needs as many poses and gravity axes; also the unit vector (3,) of gravity.
+
+    The spread is judged on the known directions, because noise of the forces would hide a degenerate pose set.
+    """
+    length = np.linalg.norm(gravity_base)
+    if not length > 0:
+        raise ValueError(f"a gravity direction must have a length, got {gravity_base}")
+    down = np.asarray(gravity_base / length)
+    eq = force_equations(R_base_flange, force_N, bias=bias, method=method, min_poses=needed)
+    spanned = spanned_dimensions(eq.A @ down, len(eq.A) ** 0.5)
+    if spanned < needed:
+        raise NotObservable(
+            f"gravity changes along only {spanned} of the {needed} flange axes needed: add poses that tilt the tool "
+            "about another axis"
+        )
+    require_weight(eq)
+    _require_pull_downwards(eq.f, eq.A @ down)
+    return eq, down
+
+
+def _with_weight(eq: ForceEquations, down: Array, R_sensor_flange: Array) -> ForceFit:
+    return eq.fit(R_sensor_flange.T, _weight(eq.f, eq.A @ down, R_sensor_flange) * down)
 
 
 def _weight(f: Array, a: Array, R_sensor_flange: Array) -> float:
@@ -164,32 +175,13 @@ def _weight(f: Array, a: Array, R_sensor_flange: Array) -> float:
     return float(np.sum(f * (a @ R_sensor_flange.T)) / np.sum(a**2))
 
 
-def _direction(vector: Array) -> Array:
-    length = np.linalg.norm(vector)
-    if not length > 0:
-        raise ValueError(f"a gravity direction must have a length, got {vector}")
-    return np.asarray(vector / length)
-
-
-def _require_usable(eq: ForceEquations, a: Array, needed: int) -> None:
-    """The spread is judged on the known directions a (n, 3): noise of the forces would hide a degenerate pose set."""
-    spanned = spanned_dimensions(a, len(a) ** 0.5)
-    if spanned < needed:
-        raise NotObservable(
-            f"gravity changes along only {spanned} of the {needed} flange axes needed: add poses that tilt the tool "
-            "about another axis"
-        )
-    require_weight(eq)
-    _require_pull_downwards(eq.f, a)
-
-
 def _require_pull_downwards(f: Array, a: Array) -> None:
-    """No rotation may explain the forces f (n, 3) much better with gravity -a than the best one does with a (n, 3)."""
+    """Reject forces f (n, 3) that a rotation explains much better with gravity -a than with a (n, 3)."""
     residual, reversed_residual = (
         float(np.sum((f - _weight(f, side, R) * side @ R.T) ** 2))
         for side, R in ((a, nearest_rotation(f.T @ a)), (-a, nearest_rotation(-f.T @ a)))
     )
     if residual > 4 * reversed_residual + 1e-12 * float(np.sum(f**2)):
         raise BadDataset(
-            "the forces point against the given gravity: check the sign of the sensor and how the base is mounted"
+            "the forces point against the given gravity: check the sign of the sensor and the mounting of the base"
         )

@@ -38,14 +38,14 @@ def published(
         One of `PUBLISHED`.
     R_base_flange : array, shape (n, 3, 3)
     gravity_direction_base : array, shape (3,)
-        For carlson-relaxation and carlson-cayley, which take it as known.
+        For carlson-relaxation and carlson-cayley.
     weight_N : float, optional
-        For carlson-cayley, which takes it as known too.
+        For carlson-cayley.
 
     Raises
     ------
     NotObservable
-        The method needs other poses, or needs to be told something.
+        The method needs other poses, or a weight.
     """
     if method == "srom":
         number, Y = special_numbers(R_base_flange)
@@ -58,7 +58,7 @@ def published(
         )
     if method == "carlson-cayley":
         if weight_N is None:
-            raise NotObservable("carlson-cayley takes the weight as known: give the mass on the sensor (--mass-kg).")
+            raise NotObservable("carlson-cayley needs the weight: give the mass on the sensor (--mass-kg).")
         gravity_N = weight_N * gravity_direction_base / np.linalg.norm(gravity_direction_base)
         return _with_torques(partial(carlson_known.cayley, gravity_force_base_N=gravity_N), R_base_flange)
     return _with_torques(_GRAVITY_UNKNOWN[method], R_base_flange)

@@ -2,7 +2,7 @@
 
 Source: "Bias Estimation and Gravity Compensation for Wrist-Mounted Force/Torque Sensor", eqs 14-48. In this module
 A (n, 3, 3) is the paper's e_bR, base to flange, which is `R_base_flange` transposed, and the estimated R is s_eR,
-flange to sensor. Where the paper has a misprint the docstring says so.
+flange to sensor. Docstrings name the misprints of the paper.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ SPECIAL_R_flange_base = _special_orientations()
 """(24, 3, 3) the paper's e_bR_1 … e_bR_24 (Fig. 3, Table of special orientations): the rotation group of the cube."""
 
 TOLERANCE_RAD = np.deg2rad(0.1)
-"""How far an orientation may be from its nominal one to count as one of the 24."""
+"""Largest deviation of an orientation from one of the 24."""
 
 # Numbers of the orientations whose forces are added and subtracted: p_kj for k, j = 1, 2, 3 (eqs 17-23).
 _SUMS = (
@@ -59,7 +59,7 @@ def srom(R_base_flange: Array, wrench: Array) -> Parameters:
 
 
 def srom_numbered(R_base_flange: Array, wrench: Array, number: Indices, Y: Array) -> Parameters:
-    """Do what `srom` does, with the outcome of `special_numbers` at hand."""
+    """`srom` with the result of `special_numbers`."""
     force_N = np.empty((24, 3))
     force_N[number] = wrench[:, :3]
     # With A_i = R_i Y.T the published formulas see the gravity force in the turned base, Y.T F_b.
@@ -78,7 +78,7 @@ def lrom(R_base_flange: Array, wrench: Array) -> Parameters:
     Raises
     ------
     NotObservable
-        Fewer than five poses, or poses between which the linear equations cannot choose.
+        Fewer than five poses, or poses for which the linear equations have several solutions.
     """
     A = np.swapaxes(R_base_flange, 1, 2)
     return _remaining_steps(R_base_flange, wrench, lrom_gravity_force(A, wrench[:, :3]))
@@ -109,7 +109,7 @@ def special_numbers(R_base_flange: Array) -> tuple[Indices, Array]:
     Raises
     ------
     NotObservable
-        The 24 are not there, each once and within 0.1°; the message gives their numbers.
+        An orientation is missing, repeated or more than 0.1° off; the message gives the numbers.
     """
     best = _Match(R_base_flange, np.eye(3))
     if not best.complete:
@@ -134,7 +134,7 @@ class _Match:
 
     def refusal(self) -> str:
         if not self.found:
-            return "SROM needs its 24 orientations and none of these poses is one of them: use LROM or ML."
+            return "SROM needs its 24 orientations, and no pose has one of them: use LROM or ML."
         problems = []
         if self.found < 24:
             problems.append(f"missing {_listed(np.flatnonzero(self.times_seen == 0))}")
@@ -144,19 +144,19 @@ class _Match:
         if strays.size:
             worst = strays[self.angle_rad[strays].argmax()]
             problems.append(
-                f"row {_listed(strays)} none of them (row {worst + 1} is {np.rad2deg(self.angle_rad[worst]):.2f}° from "
-                f"orientation {self.number[worst] + 1}, 0.1° is allowed)"
+                f"row {_listed(strays)} not among them (row {worst + 1} is {np.rad2deg(self.angle_rad[worst]):.2f}° "
+                f"from orientation {self.number[worst] + 1}, 0.1° is allowed)"
             )
         return f"SROM needs its 24 orientations once each: {'; '.join(problems)}. Use LROM or ML instead."
 
 
 def _common_rotation(R_base_flange: Array, seed: Array) -> Array:
-    """Estimate Y from all poses that lie in the group of `seed`; of its 24 equivalents the smallest rotation."""
+    """Estimate Y from all poses in the group of `seed`, and return the smallest of its 24 equivalents."""
     match = _Match(R_base_flange, seed)
     near = match.angle_rad < 3 * TOLERANCE_RAD
     pairs = R_base_flange[near], SPECIAL_R_flange_base[match.number[near]]
     equivalents = nearest_rotation(np.einsum("nij,njk->ik", *pairs)) @ SPECIAL_R_flange_base
-    rounded = equivalents.round(4)  # so that a tie, as at 45°, is broken alike in every order of rows
+    rounded = equivalents.round(4)  # so that a tie, as at 45°, has the same result in every order of rows
     smallest = min(range(24), key=lambda i: (-np.trace(rounded[i]), *rounded[i].ravel()))
     return np.asarray(equivalents[smallest])
 
@@ -190,8 +190,8 @@ def srom_gravity_force(force_N: Array) -> Array:
 def lrom_gravity_force(A: Array, force_N: Array) -> Array:
     """Gravity force in base from any orientations: eqs 24-34.
 
-    The sign rule of eq 34 contradicts itself (its alpha is not that of eqs 46-48); det R > 0 decides without knowing
-    how the robot is mounted.
+    The sign rule of eq 34 contradicts itself (its alpha is not that of eqs 46-48). det R > 0 replaces it and needs no
+    knowledge of the mounting of the robot.
 
     Parameters
     ----------
@@ -207,16 +207,14 @@ def lrom_gravity_force(A: Array, force_N: Array) -> Array:
     Raises
     ------
     NotObservable
-        Fewer than five poses, or poses between which the linear equations cannot choose.
+        Fewer than five poses, or poses for which the linear equations have several solutions.
     """
     if len(A) < 5:
         raise NotObservable(f"LROM needs at least 5 poses, there are {len(A)}: record more, or use ML, which needs 4.")
     H, x6_of_x9 = reduced_equations(A, force_N)
     _, singular, Vt = np.linalg.svd(H)
     if singular[7] <= 1e-9 * singular[0]:
-        raise NotObservable(
-            "LROM has more than one solution for these poses: tilt the tool in more directions, or use ML."
-        )
+        raise NotObservable("LROM has several solutions for these poses: tilt the tool in more directions, or use ML.")
     x9 = np.sqrt(3) * Vt[8]
     if np.linalg.det(x9.reshape(3, 3)) < 0:
         x9 = -x9

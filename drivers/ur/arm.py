@@ -18,13 +18,13 @@ from typing import Final
 
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
-from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, Guard, RobotArm
+from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, Finding, Guard, RobotArm
 from drivers.ur.control import ControlProcess
 from drivers.ur.control_child import DECELERATION_RAD_S2
 from drivers.ur.dashboard import Dashboard, T, ask_dashboard
 from drivers.ur.kinematics import MODELS, model_named
 from drivers.ur.reading import FREQUENCY_HZ, Reader
-from drivers.ur.rtde import CONTROL_REGISTERS, find_script_port, registers_in_use
+from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
 from drivers.ur.sample import PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Sample
 from drivers.ur.timing import STRICT, UrTiming
 
@@ -133,12 +133,8 @@ class UrArm(RobotArm):
             self.state()  # is it the right model?
 
     def _open_control(self, reader: Reader) -> None:
+        self._require_version()
         major, minor = reader.version[:2]
-        if minor < 4:
-            raise ConnectError(
-                f"{self._host} runs PolyScope {major}.{minor}, which ur_rtde cannot control",
-                f"update it to {major}.4 or later",
-            )
 
         def look_out() -> None:
             if fault := reader.look().safety_fault():
@@ -170,6 +166,15 @@ class UrArm(RobotArm):
         except (StreamBroken, DeviceTimeout) as error:
             look_out()  # ur_rtde seldom knows the reason
             raise _refusal(self._host, error.found) from error
+
+    def _require_version(self) -> None:
+        """Raise `ConnectError` for a PolyScope that ur_rtde can read but not control."""
+        major, minor = self._reading().version[:2]
+        if minor < 4:
+            raise ConnectError(
+                f"{self._host} runs PolyScope {major}.{minor}, which ur_rtde cannot control",
+                f"update it to {major}.4 or later",
+            )
 
     def _claim_nothing_of_others(self) -> None:
         """Raise `ConnectError` when somebody else has the registers, before anything of theirs is stopped."""
@@ -263,6 +268,25 @@ class UrArm(RobotArm):
             log.info("%s does not tell its program: %s", self._host, error)
             return None
         return told.strip() or None
+
+    def diagnose(self) -> list[Finding]:
+        """Check what control needs: the version of PolyScope, free RTDE registers, an open port for programs."""
+
+        def finding(name: str, require: Callable[[], None], found: str) -> Finding:
+            try:
+                require()
+            except DriverError as error:
+                return Finding(name, False, error.found, error.cure)
+            return Finding(name, True, found)
+
+        version = "PolyScope {}.{} can be controlled".format(*self._reading().version)
+        free = "the RTDE registers are free: no other client controls the arm"
+        is_open = f"port {SCRIPT_PORT}, which takes programs, is open"
+        return [
+            finding("version", self._require_version, version),
+            finding("registers", self._claim_nothing_of_others, free),
+            finding("programs", lambda: find_script_port(self._host, timeout_s=self._timing.connect_s), is_open),
+        ]
 
     def _ask_dashboard(self, ask: Callable[[Dashboard], T]) -> T:
         return ask_dashboard(self._host, ask, timeout_s=self._timing.connect_s, clock=self._clock)

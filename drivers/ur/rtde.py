@@ -199,11 +199,7 @@ class Subscription:
         try:
             self._connection = _Connection(host, timeout_s, clock)
         except OSError as error:
-            raise Unreachable(
-                f"{where} cannot be reached ({error})",
-                "check the address and the cable, that the robot controller is switched on, and that no firewall "
-                "stands between",
-            ) from error
+            raise Unreachable(f"{where} cannot be reached ({error})", _fix_of(error, host)) from error
         try:
             self._greet(outputs, frequency_Hz)
         except TimeoutError as error:
@@ -257,6 +253,18 @@ CONTROL_REGISTERS: Final = (
     *(f"input_double_register_{k}" for k in range(18)),
 )
 """What ur_rtde's control interface writes to, and nobody else may."""
+
+
+def _fix_of(error: OSError, host: str) -> str:
+    """Return what to do when a controller cannot be reached."""
+    if isinstance(error, ConnectionRefusedError):
+        return (
+            f"check that {host} is the robot controller, switched on and started; enable RTDE at the pendant under "
+            "Settings, Security, Services"
+        )
+    if isinstance(error, socket.gaierror):
+        return "give the controller's IPv4 address: at the pendant, Settings, System, Network shows it"
+    return f"ping {host}; check that the controller is switched on, its cable, and firewalls between"
 
 
 def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float, clock: Clock = REAL) -> list[str]:

@@ -1,118 +1,176 @@
-"""One cell: which arm, sensor, tool and surroundings; where each value comes from, and whether it can be used.
+# ruff: noqa: RUF009 - `entry` returns a new field for each key
+"""The configuration of one cell: its keys with their rules, and the source of each value.
 
-A value is taken from the first of these that tells it: an option of the command; the environment, where
-FTDRIVE_ROBOT_HOST is the key `host` of `[robot]`; the project's file, `ftdrive.toml` where the command is run, or
-`--config`; the user's file, `$XDG_CONFIG_HOME/ftdrive/ftdrive.toml`; the default. What must be measured has none. How
-long to average at a pose is chosen from a record of the sensor at rest, unless `average_s` is said and no
-`noise_record_s` is.
+The first of these that sets a value counts: an option of the command; the environment, where FTDRIVE_ROBOT_HOST is the
+key `host` of `[robot]`; the project's file, `ftdrive.toml` in the working directory, or `--config`; the user's file,
+`$XDG_CONFIG_HOME/ftdrive/ftdrive.toml`; the default. Values that must be measured have no default. The averaging time
+is chosen from a record of the sensor at rest, unless `average_s` is set and `noise_record_s` is not.
 """
 
 import json
 import os
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, asdict, dataclass, field, fields
-from math import isfinite
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from calib.routine import Sampling
 from drivers.clock import REAL, Clock
+from ftdrive.cell import rules
+from ftdrive.cell.rules import Rows, Rule, entry, rule_of
 from ftdrive.errors import ConfigError
 
 FORMAT = "ftdrive.config/1"
 FILE = "ftdrive.toml"
 PREFIX = "FTDRIVE_"
-
-Rows = tuple[tuple[float, ...], ...]
+CLOCK = "FTDRIVE_CLOCK"
 
 USUAL_KG = 1.0
-"""What a tool is expected to weigh that nobody has weighed."""
+"""Expected mass of a tool whose mass is not configured."""
 
 
 @dataclass(frozen=True, slots=True)
 class RobotConfig:
     """The arm."""
 
-    host: str
-    """Name or IPv4 address of the controller; empty where no arm is needed."""
-    model: str | None = None
-    """Such as "ur5e"; checked against the controller where it can tell."""
-    speed_deg_s: float = 60.0
-    """Of the fastest joint in a move; 60 at most."""
-    acceleration_deg_s2: float = 80.0
-    tip_speed_mm_s: float = 250.0
-    """Of the tool's farthest points; 250 at most, the reduced speed of ISO 10218-1."""
-    driver: str = "ur"
-    """Of another package, by its entry point: drivers/README."""
-    serial: str | None = None
-    """Of the arm, as its controller tells it; where it is said, nothing moves on another."""
+    host: str = entry("name or IPv4 address of the controller", option="--robot", reject=rules.reject_host)
+    model: str | None = entry(
+        'such as "ur5e"; compared with the controller where it reports one',
+        None,
+        option="--model",
+        reject=rules.reject_model,
+    )
+    speed_deg_s: float = entry(
+        "of the fastest joint; the first run of a plan is slower", 60.0, "deg/s", (0.5, 60), option="--speed"
+    )
+    acceleration_deg_s2: float = entry("of the fastest joint", 80.0, "deg/s²", (1, 300))
+    tip_speed_mm_s: float = entry(
+        "of the tool's farthest point; 250 is the reduced speed of ISO 10218-1", 250.0, "mm/s", (1, 250)
+    )
+    driver: str = entry("ur, or the entry point of an arm of another package", "ur", reject=rules.reject_empty)
+    serial: str | None = entry("serial number; if set, nothing moves on another arm", None, reject=rules.reject_empty)
 
 
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
     """The force/torque sensor."""
 
-    url: str
-    """Such as "ati-can://can0?bitrate=250000"; empty where no sensor is needed."""
-    sign: int = 1
-    """-1 for a sensor that reports the reaction."""
-    height_mm: float | None = None
-    """Of the sensor's origin above the flange face; gravity cannot tell it."""
-    mass_kg: float | None = None
-    """Of sensor and adapter, which the sensor cannot weigh."""
+    url: str = entry("such as ati-can://can0?bitrate=250000", option="--sensor", reject=rules.reject_empty)
+    sign: int = entry(
+        "1, or -1 for a sensor that reports the reaction; `ftdrive doctor --push` finds it", 1, reject=rules.reject_sign
+    )
+    height_mm: float | None = entry(
+        "of the sensor's origin above the flange face; gravity cannot identify it",
+        None,
+        "mm",
+        (0, 500),
+        option="--height",
+        reject=rules.reject_height,
+    )
+    mass_kg: float | None = entry(
+        "of sensor and adapter, from scale or datasheet; the sensor cannot weigh itself",
+        None,
+        "kg",
+        (0, 20),
+        option="--sensor-mass",
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class ToolConfig:
-    """Everything mounted on the flange, the sensor included."""
+    """Everything mounted on the flange, the sensor included. What is not described here may collide."""
 
-    name: str = "tool"
-    cylinders_mm: Rows = ()
-    """(from, to, diameter[, x, y]) along the flange z axis from the flange face; x, y put the axis aside."""
-    mass_kg: float | None = None
-    """Of what hangs on the sensor, about. The payload told by the controller and the sensor's range are checked against
-    it, and until six poses are taken a change by more than it can weigh counts as contact."""
+    name: str = entry("of the tool", "tool", option="--tool-name", reject=rules.reject_empty)
+    cylinders_mm: Rows = entry(
+        "[from, to, diameter] along the flange z axis from the flange face; [from, to, diameter, x, y] puts the axis "
+        "aside; measure cables, cameras and screws too",
+        (),
+        "mm",
+        option="--tool",
+        reject=rules.reject_cylinders,
+    )
+    mass_kg: float | None = entry(
+        "of what hangs on the sensor, about; compared with the controller's payload and the sensor's range; until six "
+        "poses are taken, a larger change of the wrench counts as contact",
+        None,
+        "kg",
+        (0.001, 100),
+        option="--tool-mass",
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class WorkcellConfig:
-    """What stands around the arm, base axes."""
+    """Base and surroundings, in base axes, mm from the centre of the base. PLACEHOLDERS until measured."""
 
-    mounting: str = "floor"
-    """floor, wall, ceiling, or degrees the base leans towards its -x: 90 is wall."""
-    planes_mm: Rows = ()
-    """(nx, ny, nz, place): the arm stays where normal times point is place or more."""
-    boxes_mm: Rows = ()
-    """(x, y, z, x, y, z): two opposite corners."""
-    measured: bool = False
-    """Whether a person has measured the tool, planes and boxes; nothing moves before."""
+    mounting: str = entry(
+        "floor, wall, ceiling, or degrees the base leans towards its -x; 90 is wall",
+        "floor",
+        option="--mounting",
+        reject=rules.reject_mounting,
+    )
+    planes_mm: Rows = entry(
+        "[nx, ny, nz, place]: the arm stays where normal times point is place or more; [-1, 0, 0, -800] is a wall 800 "
+        "mm away towards +x; the plane under the base is always there",
+        (),
+        "mm",
+        option="--plane",
+        reject=rules.reject_planes,
+    )
+    boxes_mm: Rows = entry(
+        "[x, y, z, x, y, z], two opposite corners of a block", (), "mm", option="--box", reject=rules.reject_boxes
+    )
+    measured: bool = entry("set it to true when tool, planes and boxes are measured; nothing moves before", False)
+
+
+_ROUTINE = {item.name: item.default for item in fields(Sampling)}
+
+
+@dataclass(frozen=True, slots=True)
+class SamplingConfig(Sampling):
+    """How long each pose is averaged."""
+
+    average_s: float = entry(
+        "at each pose; if set alone, no noise record is taken", _ROUTINE["average_s"], "s", (0.05, 600)
+    )
+    still_timeout_s: float = entry("until the arm rests at a pose", _ROUTINE["still_timeout_s"], "s", (1, 600))
+    attempts: int = entry(
+        "averages of a pose that moves or drifts; the last is kept as noisy", _ROUTINE["attempts"], between=(1, 100)
+    )
+    noise_record_s: float = entry(
+        "record of the sensor at rest before the tour, which chooses the averaging time; 0 for none",
+        _ROUTINE["noise_record_s"],
+        "s",
+        (0, 600),
+        reject=rules.reject_record,
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class SiteConfig:
-    """Where the cell stands."""
+    """The place of the cell."""
 
-    g_m_s2: float = 9.80665
-    """Local gravity; it scales the mass and nothing else."""
+    g_m_s2: float = entry("local gravity; it scales the mass and nothing else", 9.80665, "m/s²", (9.7, 9.9))
 
 
 @dataclass(frozen=True, slots=True)
 class CellConfig:
-    """Everything a calibration needs to know before it starts."""
+    """Everything that is configured."""
 
     robot: RobotConfig
     sensor: SensorConfig
     tool: ToolConfig = field(default_factory=ToolConfig)
     workcell: WorkcellConfig = field(default_factory=WorkcellConfig)
-    sampling: Sampling = field(default_factory=Sampling)
+    sampling: Sampling = field(default_factory=SamplingConfig)
     site: SiteConfig = field(default_factory=SiteConfig)
     clock: Clock = field(default=REAL, compare=False, repr=False)
-    """By which everything in the cell is timed; an emulated cell has its own. It is in no file."""
+    """Times everything in the cell; an emulated cell has its own. It is in no file."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Give the sections as files have them."""
-        return {name: asdict(getattr(self, name)) for name in _SECTIONS}
+        """Return the sections as files have them."""
+        return {name: asdict(getattr(self, name)) for name in SECTIONS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,27 +178,41 @@ class Setting:
     """One value of the configuration."""
 
     value: Any
-    """None where nothing was said and there is no default."""
+    """None where it is not set and has no default."""
     origin: str
-    """The option, variable or file that says it; "default" or "not set"."""
+    """The option, variable or file that sets it; "default" or "not set"."""
 
 
 Flag = tuple[str, Any]
-"""An option of a command as it is called there, and its value; None where it was not given."""
+"""An option of a command, and its value; None where it was not given."""
 
-_SECTIONS: Mapping[str, Any] = {
+SECTIONS: Mapping[str, Any] = {
     "robot": RobotConfig,
     "sensor": SensorConfig,
     "tool": ToolConfig,
     "workcell": WorkcellConfig,
-    "sampling": Sampling,
+    "sampling": SamplingConfig,
     "site": SiteConfig,
 }
-_KEYS = {f"{name}.{item.name}": item for name, kind in _SECTIONS.items() for item in fields(kind)}
+_KEYS = {f"{name}.{item.name}": item for name, kind in SECTIONS.items() for item in fields(kind)}
+
+RULES: Mapping[str, Rule] = {key: rule_of(item) for key, item in _KEYS.items()}
+
+
+def clock_in_force() -> Clock:
+    """Return the clock of the emulated cell whose page FTDRIVE_CLOCK names, else the computer's.
+
+    An emulated cell of another process looks like a real one, but only its own clock waits for a busy computer.
+    """
+    if page := os.environ.get(CLOCK):
+        from ftdrive.cell.emulated_clock import EmulatedClock
+
+        return EmulatedClock(page)
+    return REAL
 
 
 def load(config: Path | None = None, flags: Mapping[str, Flag] | None = None, *, devices: bool = True) -> CellConfig:
-    """Put a cell together from all that is said about it.
+    """Read a cell from all sources.
 
     Parameters
     ----------
@@ -149,12 +221,12 @@ def load(config: Path | None = None, flags: Mapping[str, Flag] | None = None, *,
     flags : mapping
         Options of the command by key, such as ``{"robot.host": ("--robot", "10.0.0.2")}``.
     devices : bool
-        Whether arm and sensor must be named; where not, their addresses may be empty.
+        Whether arm and sensor are needed; if not, their addresses may be empty.
 
     Raises
     ------
     ConfigError
-        With the place, the section, the key, the value and what to do.
+        With source, section, key, value and what to do.
     """
     return cell_of(settings(config, flags), devices=devices)
 
@@ -162,28 +234,31 @@ def load(config: Path | None = None, flags: Mapping[str, Flag] | None = None, *,
 def settings(
     config: Path | None = None, flags: Mapping[str, Flag] | None = None, *, cell: CellConfig | None = None
 ) -> dict[str, Setting]:
-    """Every key, such as "robot.host", with its value and where it comes from; errors as `load`.
+    """Return every key, such as "robot.host", with its value and origin; errors as `load`.
 
     Parameters
     ----------
     config, flags
         As in `load`.
     cell : CellConfig, optional
-        An emulated one, which counts in place of all files and variables.
+        An emulated one, which replaces all files and variables.
     """
     found: dict[str, Setting] = {}
     if cell is not None:
         found = _from_cell(cell)
     else:
-        for path in _files(config):
-            found |= _from_file(path)
+        for path in (user_file(), config or Path(FILE)):
+            if path == config or path.is_file():
+                found |= _from_file(path)
         found |= _from_environment()
     for key, (option, value) in (flags or {}).items():
         if value is not None:
             found[key] = Setting(checked(option, key, value), option)
-    if "sampling.average_s" in found:  # who says how long to average does not want it chosen
+    if "sampling.average_s" in found:  # a set averaging time is not chosen again
         found.setdefault("sampling.noise_record_s", Setting(0.0, found["sampling.average_s"].origin))
-    return {key: found.get(key) or _default(key) for key in _KEYS}
+    defaults = {key: None if item.default is MISSING else item.default for key, item in _KEYS.items()}
+    unset = {key: Setting(value, "not set" if value is None else "default") for key, value in defaults.items()}
+    return unset | found
 
 
 def cell_of(values: Mapping[str, Setting], *, devices: bool = True) -> CellConfig:
@@ -193,47 +268,35 @@ def cell_of(values: Mapping[str, Setting], *, devices: bool = True) -> CellConfi
         section, key = missing[0].split(".")
         raise ConfigError(
             f"[{section}] {key} is not set: write it into {FILE} (`ftdrive init` asks for it), set "
-            f"{variable(missing[0])} or give --{section}; --simulate takes an emulated cell"
+            f"{variable(missing[0])} or give {RULES[missing[0]].option}; --simulate takes an emulated cell"
         )
-    said = {key: setting.value for key, setting in values.items()} | dict.fromkeys(missing, "")
+    found = {key: setting.value for key, setting in values.items()} | dict.fromkeys(missing, "")
     return CellConfig(
         **{
-            name: kind(**{item.name: said[f"{name}.{item.name}"] for item in fields(kind)})
-            for name, kind in _SECTIONS.items()
-        }
+            name: kind(**{item.name: found[f"{name}.{item.name}"] for item in fields(kind)})
+            for name, kind in SECTIONS.items()
+        },
+        clock=clock_in_force(),
     )
 
 
 def variable(key: str) -> str:
-    """Name of the environment variable of a key."""
+    """Return the environment variable of a key."""
     return PREFIX + key.replace(".", "_").upper()
 
 
 def as_toml(value: Any) -> str:
-    """Write a value as it stands in a file."""
+    """Return a value as a file has it."""
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return json.dumps(value)
 
 
 def user_file() -> Path:
-    """Where a user keeps what holds for all projects; it need not exist."""
+    """Return the file for all projects of a user; it need not exist."""
     home = os.environ.get("XDG_CONFIG_HOME", "")
     folder = Path(home) if Path(home).is_absolute() else Path("~/.config").expanduser()
     return folder / "ftdrive" / FILE
-
-
-def project_file() -> Path:
-    """Where a project keeps its cell; it need not exist."""
-    return Path(FILE)
-
-
-def _files(config: Path | None) -> list[Path]:
-    """The later one wins."""
-    found = [path for path in (user_file(), project_file()) if path.is_file()]
-    if config is None:
-        return found
-    return [*(path for path in found if path == user_file()), config]
 
 
 def _from_cell(cell: CellConfig) -> dict[str, Setting]:
@@ -245,12 +308,12 @@ def _from_file(path: Path) -> dict[str, Setting]:
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not a TOML file: {error}; mend it there") from error
+        raise ConfigError(f"{path} is not a TOML file: {error}; correct it") from error
     if (found := document.pop("format", None)) != FORMAT:
         instead = "" if found is None else f", found {found!r}"
         raise ConfigError(f'{path}: the first line must be format = "{FORMAT}"{instead}')
-    if unknown := sorted(document.keys() - _SECTIONS.keys()):
-        raise ConfigError(f"{path}: unknown section [{unknown[0]}]: the sections are {', '.join(_SECTIONS)}")
+    if unknown := sorted(document.keys() - SECTIONS.keys()):
+        raise ConfigError(f"{path}: unknown section [{unknown[0]}]: {_known(unknown[0], 'sections', SECTIONS)}")
     values: dict[str, Setting] = {}
     for section, content in document.items():
         if not isinstance(content, dict):
@@ -259,7 +322,7 @@ def _from_file(path: Path) -> dict[str, Setting]:
             )
         for key, value in content.items():
             if f"{section}.{key}" not in _KEYS:
-                raise ConfigError(f"{path}: [{section}] has no key '{key}': {_known(section)}")
+                raise ConfigError(f"{path}: [{section}] has no key '{key}': {_known(key, 'keys', _names(section))}")
             values[f"{section}.{key}"] = Setting(checked(str(path), f"{section}.{key}", value), str(path))
     return values
 
@@ -271,14 +334,15 @@ def _from_environment() -> dict[str, Setting]:
         if name in names:
             values[names[name]] = Setting(checked(name, names[name], _parsed(name, names[name], text)), name)
             continue
-        for section in _SECTIONS:
-            if name.startswith(variable(section) + "_"):
-                raise ConfigError(f"{name} is set, but [{section}] has no such key: {_known(section)}; unset it")
+        for section in SECTIONS:
+            if name.startswith(start := variable(section) + "_"):
+                known = _known(name.removeprefix(start).lower(), "keys", _names(section))
+                raise ConfigError(f"{name} is set, but [{section}] has no such key: {known}; unset it")
     return values
 
 
 def _parsed(name: str, key: str, text: str) -> Any:
-    """Texts stand as they are; everything else is written as in the file."""
+    """Read a text as it is, and everything else as a file has it."""
     if not text:
         raise ConfigError(f"{name} is empty: give [{key.replace('.', '] ')} a value, or unset it")
     if _KEYS[key].type in {str, str | None}:
@@ -290,194 +354,40 @@ def _parsed(name: str, key: str, text: str) -> Any:
     return document["value"] if document.keys() == {"value"} else text
 
 
-def _default(key: str) -> Setting:
-    item = _KEYS[key]
-    if item.default is MISSING or item.default is None:
-        return Setting(None, "not set")
-    return Setting(item.default, "default")
+def _names(section: str) -> list[str]:
+    return [item.name for item in fields(SECTIONS[section])]
 
 
-def _known(section: str) -> str:
-    return f"the keys are {', '.join(item.name for item in fields(_SECTIONS[section]))}"
-
-
-# What a value may be. ----------------------------------------------------------------------------------------------
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
-
-
-def _rows(value: Any) -> bool:
-    return isinstance(value, list | tuple) and all(
-        isinstance(row, list | tuple) and all(map(_number, row)) for row in value
-    )
-
-
-_TYPES: Mapping[Any, tuple[str, Callable[[Any], bool]]] = {
-    str: ("a text: put it in quotes", lambda value: isinstance(value, str)),
-    float: ("a number: give one such as 1.5, without quotes and unit", _number),
-    int: (
-        "a whole number: give one such as 1, without quotes and point",
-        lambda value: isinstance(value, int) and not isinstance(value, bool),
-    ),
-    bool: ("true or false: give one of them, without quotes", lambda value: isinstance(value, bool)),
-    Rows: ("a list of lists of numbers: give one such as [[0, 60, 90]], also for a single row", _rows),
-}
-_TYPES = {**_TYPES, str | None: _TYPES[str], float | None: _TYPES[float]}
-
-_RANGES: Mapping[str, tuple[float, float]] = {
-    "robot.speed_deg_s": (0.5, 60),
-    "robot.acceleration_deg_s2": (1, 300),
-    "robot.tip_speed_mm_s": (1, 250),
-    "sensor.height_mm": (0, 500),
-    "sensor.mass_kg": (0, 20),
-    "tool.mass_kg": (0.001, 100),
-    "sampling.average_s": (0.05, 600),
-    "sampling.still_timeout_s": (1, 600),
-    "sampling.attempts": (1, 100),
-    "sampling.noise_record_s": (0, 600),
-    "site.g_m_s2": (9.7, 9.9),
-}
+def _known(unknown: str, kind: str, names: Iterable[str]) -> str:
+    """Return what may have been meant, and all names."""
+    near = get_close_matches(unknown, names, 1)
+    return f"{f'did you mean {near[0]}? ' if near else ''}the {kind} are {', '.join(names)}"
 
 
 def recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return what a run has kept of its cell; raises `ConfigError` for a value of a wrong type.
+    """Return the cell that a run has recorded; raises `ConfigError` for a value of a wrong type.
 
-    What this version does not know is left out. Ranges are not looked at: those were of another version, too.
+    Keys that this version does not know are left out. Ranges are not checked: another version may have had others.
     """
     return {
         section: {
-            item.name: _as_kept(
-                item, _typed(f"[{section}] {item.name} = {values[item.name]!r}", item, values[item.name])
-            )
-            for item in fields(_SECTIONS[section])
+            item.name: rules.typed(f"[{section}] {item.name} = {values[item.name]!r}", item, values[item.name])
+            for item in fields(SECTIONS[section])
             if item.name in values
         }
         for section, values in config.items()
-        if section in _SECTIONS
+        if section in SECTIONS
     }
 
 
 def recorded_cell(config: Mapping[str, Mapping[str, Any]]) -> CellConfig:
-    """Put the cell of a run together from what `recorded` returns."""
-    return CellConfig(**{name: kind(**config.get(name, {})) for name, kind in _SECTIONS.items()})
-
-
-def _typed(said: str, item: Field[Any], value: Any) -> Any:
-    words, fits = _TYPES[item.type]
-    if not fits(value) and not (value is None and item.default is None):
-        raise ConfigError(f"{said} is not {words}")
-    return value
-
-
-def _as_kept(item: Field[Any], value: Any) -> Any:
-    if value is not None and item.type in {float, float | None}:
-        return float(value)
-    return tuple(tuple(map(float, row)) for row in value) if item.type == Rows else value
+    """Return the cell of a run from what `recorded` returns."""
+    return CellConfig(**{name: kind(**config.get(name, {})) for name, kind in SECTIONS.items()}, clock=clock_in_force())
 
 
 def checked(place: str, key: str, value: Any) -> Any:
     """Return the value of a key such as "robot.host" as its section takes it, or raise `ConfigError`."""
-    said = f"{place}: [{key.replace('.', '] ')} = {value!r}"
-    if key == "workcell.mounting" and _number(value):  # degrees
+    where = f"{place}: [{key.replace('.', '] ')} = {value!r}"
+    if key == "workcell.mounting" and rules.is_number(value):  # degrees
         value = str(value)
-    _typed(said, _KEYS[key], value)
-    if key in _RANGES:
-        low, high = _RANGES[key]
-        if not low <= value <= high:
-            raise ConfigError(f"{said} is out of range: give {low:g} to {high:g}")
-    if cure := _WRONG.get(key, lambda _: None)(value):
-        raise ConfigError(f"{said} cannot be used: {cure}")
-    return _as_kept(_KEYS[key], value)
-
-
-def _wrong_text(value: str) -> str | None:
-    return None if value.strip() else "it is empty, give one or leave it out"
-
-
-def _wrong_model(value: str) -> str | None:
-    from drivers.ur.kinematics import MODELS, model_named
-
-    return None if model_named(value, controller_major=0) else f"the models are {', '.join(MODELS)}"
-
-
-def _wrong_sign(value: int) -> str | None:
-    return None if value in {-1, 1} else "give 1, or -1 for a sensor that reports the reaction"
-
-
-def _wrong_record(value: float) -> str | None:
-    return None if value == 0 or value >= 3 else "give 3 or more, or 0 for none: a shorter one judges no average"
-
-
-def _wrong_mounting(value: str) -> str | None:
-    try:
-        usable = value in {"floor", "wall", "ceiling"} or abs(float(value)) <= 180
-    except ValueError:
-        usable = False
-    return None if usable else "give floor, wall, ceiling, or degrees the base leans to -x, -180 to 180"
-
-
-def _wrong_host(value: str) -> str | None:
-    return "give name or IPv4 address alone, such as 192.168.0.10" if "/" in value else _wrong_text(value)
-
-
-def _wrong_height(value: float) -> str | None:
-    return "is it mm? Give the height in mm, such as 33, or 0" if 0 < value < 1 else None
-
-
-_THINNEST_MM = 5.0
-"""What is given in metres or inches is thinner."""
-
-
-def _wrong_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
-    for row in rows:
-        if len(row) not in {3, 5} or not (0 <= row[0] < row[1] <= 2000 and 0 < row[2] <= 1000):
-            return (
-                f"{list(row)} is no cylinder of the tool: give [from, to, diameter] or [from, to, diameter, x, y], mm "
-                "from the flange face, from 0 up, to at most 2000, diameter at most 1000"
-            )
-        if min(row[1] - row[0], row[2]) < _THINNEST_MM:
-            return (
-                f"{list(row)} is shorter or thinner than {_THINNEST_MM:g} mm, are these mm? Give from, to and diameter "
-                f"in mm, and {_THINNEST_MM:g} mm for what is thinner"
-            )
-    return None
-
-
-def _wrong_planes(rows: Sequence[Sequence[float]]) -> str | None:
-    for row in rows:
-        if len(row) != 4:
-            return f"{list(row)} is no plane: give [nx, ny, nz, mm], such as [-1, 0, 0, -800]"
-        if not any(row[:3]):
-            return f"the normal of {list(row)} has no direction: give for example [-1, 0, 0, -800]"
-    return None
-
-
-def _wrong_boxes(rows: Sequence[Sequence[float]]) -> str | None:
-    for row in rows:
-        if len(row) != 6 or any(row[i] == row[i + 3] for i in range(3)):
-            return f"{list(row)} is no box: give two opposite corners [x, y, z, x, y, z] in mm"
-        if min(abs(row[i] - row[i + 3]) for i in range(3)) < _THINNEST_MM:
-            return (
-                f"{list(row)} is thinner than {_THINNEST_MM:g} mm, are these mm? Give two opposite corners in mm, "
-                f"{_THINNEST_MM:g} mm apart for what is thinner"
-            )
-    return None
-
-
-_WRONG: Mapping[str, Callable[[Any], str | None]] = {
-    "robot.host": _wrong_host,
-    "robot.model": _wrong_model,
-    "robot.driver": _wrong_text,
-    "robot.serial": _wrong_text,
-    "sensor.url": _wrong_text,
-    "sensor.sign": _wrong_sign,
-    "sensor.height_mm": _wrong_height,
-    "sampling.noise_record_s": _wrong_record,
-    "tool.name": _wrong_text,
-    "tool.cylinders_mm": _wrong_cylinders,
-    "workcell.mounting": _wrong_mounting,
-    "workcell.planes_mm": _wrong_planes,
-    "workcell.boxes_mm": _wrong_boxes,
-}
+    return rules.ruled(where, _KEYS[key], value)

@@ -19,7 +19,7 @@ def build_arm(cell: CellConfig) -> RobotArm:
         build = cast("Callable[..., RobotArm]", arm_class(cell.robot.driver))
     except ValueError as error:
         raise ConfigError(f"[robot] driver: {error}") from error
-    # A real arm, perhaps of another package, is not given what only an emulated one needs.
+    # Only an emulated arm takes clock and timing: an arm of another package may not know them.
     emulated = {"clock": cell.clock, "timing": ur_timing(cell)} if cell.clock.emulated else {}
     arm = build(
         cell.robot.host,

@@ -1,4 +1,4 @@
-"""An emulated cell as a child process: the real drivers talk to it over real wires."""
+"""An emulated cell as a child process; the real drivers reach it over real wires."""
 
 import atexit
 import json
@@ -16,7 +16,7 @@ from ftdrive.cell.emulated_clock import EmulatedClock
 from ftdrive.errors import ConfigError
 
 TIME_SCALE = 20
-"""The emulated arm lives this many times faster; nothing else differs from a real cell."""
+"""The emulated arm moves this many times faster; nothing else differs from a real cell."""
 
 SENSORS = {
     "can": "ATI sensor on CAN",
@@ -31,13 +31,13 @@ SENSORS = {
 """Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm."""
 EMULATED = "emulated://"
 MOVED_BY: Mapping[str, tuple[Mapping[str, Any], str]] = {
-    "manual": ({"do": "hand-guide"}, "somebody guides its arm by hand from orientation to orientation"),
-    "listen": ({"do": "pendant-program"}, "somebody starts a program on its pendant, which turns the wrist"),
+    "manual": ({"do": "hand-guide"}, "its arm is guided by hand from orientation to orientation"),
+    "listen": ({"do": "pendant-program"}, "a program is started on its pendant, which turns the wrist"),
 }
-"""Who moves the emulated arm where a session does not, by its mode: what the cell is asked for, and words for it."""
+"""How the emulated arm moves in modes in which the session does not move it: the request to the cell, and words."""
 
 _PAYLOAD_COG_M = "0,0,0.06"
-"""What its controller is told about the tool, as somebody should have; it knows the mass."""
+"""Payload centre that is set in its controller, beside the mass."""
 TOOL_MM = (0.0, 200.0, 100.0)
 
 
@@ -82,7 +82,7 @@ class Station:
 
     @property
     def truth(self) -> Mapping[str, Any]:
-        """What a perfect calibration of this cell would find."""
+        """The values that a perfect calibration of this cell finds."""
         truth: Mapping[str, Any] = self.endpoints["truth"]
         return truth
 
@@ -101,13 +101,13 @@ class Station:
     def _answer(self) -> Mapping[str, Any]:
         line = self._process.stdout.readline() if self._process and self._process.stdout else ""
         if not line:
-            raise ConnectError("the emulated cell has ended: its message stands above")
+            raise ConnectError("the emulated cell has ended: read its message above")
         answer: Mapping[str, Any] = json.loads(line)
         return answer
 
     @property
     def mounting(self) -> str:
-        """As its options say."""
+        """As set by its options."""
         return self.options[self.options.index("--mount") + 1] if "--mount" in self.options else "floor"
 
     @property
@@ -126,9 +126,9 @@ class Station:
 
 
 def sensor_url(url: str) -> str:
-    """Return the address a driver understands: for emulated://NAME that of a sensor which is started for it.
+    """Return the address for a driver: for emulated://NAME that of a sensor, which is started once.
 
-    Its orientation is constant; emulated:// alone is an ATI sensor on CAN. Any other address is returned as it is.
+    Its orientation is constant; emulated:// alone is an ATI sensor on CAN. Any other address is returned unchanged.
 
     Raises
     ------
@@ -144,17 +144,17 @@ def sensor_clock(url: str, clock: Clock = REAL) -> Clock:
 
 
 def sensor_name(url: str | None) -> str:
-    """Return the name in emulated://NAME; the first one where none is named. Raises `ConfigError`."""
+    """Return the name in emulated://NAME, by default the first one. Raises `ConfigError`."""
     name = (url or EMULATED).removeprefix(EMULATED) or next(iter(SENSORS))
     if name not in SENSORS:
         known = ", ".join(EMULATED + name for name in SENSORS)
-        raise ConfigError(f"{url} is no emulated sensor: leave --sensor out, or give one of {known}")
+        raise ConfigError(f"{url} is not an emulated sensor: leave --sensor out, or give one of {known}")
     return name
 
 
 @cache
 def _emulated_alone(name: str) -> CellConfig:
-    """Start one, which lives as long as this process."""
+    """Start a sensor without an arm for the life of this process."""
     station = Station(name, ["--time-scale", "1"])
     atexit.register(station.__exit__)
     return station.__enter__().cell

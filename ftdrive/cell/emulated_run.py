@@ -1,4 +1,4 @@
-"""A calibration of an emulated cell: what `demo` shows, and what other commands need first with `--simulate`."""
+"""A calibration of an emulated cell, for `demo` and for commands with `--simulate`."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,7 +14,7 @@ from ftdrive.terminal.screen import open_operator
 
 
 class _Unkept:
-    """An operator who is not told of a folder that is gone when the command ends."""
+    """An operator without the events that name a temporary folder."""
 
     def __init__(self, operator: Operator, folder: Path) -> None:
         self._operator, self._folder = operator, str(folder)
@@ -35,7 +35,7 @@ class _Unkept:
 
 
 def rehearse(station: Station, runs: Path, name: str, *, poses: int = 24, kept: bool = True) -> Outcome:
-    """Take an emulated cell through a calibration without a question; the run is in `runs`, whether `kept` or not."""
+    """Calibrate an emulated cell without questions; `kept` says whether the folder `runs` outlives the command."""
     description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
     options = Options(runs, name, poses=poses, real=False, questions=False, description=description)
     with open_operator() as operator:
@@ -47,7 +47,7 @@ def rehearse(station: Station, runs: Path, name: str, *, poses: int = 24, kept: 
 
 @contextmanager
 def rehearsed_run(sensor: str | None) -> Iterator[Path]:
-    """Make a short run of an emulated cell; yields its folder, which is gone afterwards.
+    """Make a short run of an emulated cell; yields its folder, which is deleted afterwards.
 
     Parameters
     ----------

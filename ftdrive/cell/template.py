@@ -1,79 +1,61 @@
-"""The text of a new `ftdrive.toml`: what was found and asked, and in comments what is still to be measured."""
+"""A configuration as a TOML file with comments: of `ftdrive init` and of `ftdrive config show`."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from inspect import getdoc
+from itertools import groupby
+from textwrap import wrap
+from typing import Any
 
-from ftdrive.cell.config import FORMAT, CellConfig, Rows, as_toml
+from ftdrive.cell.config import FORMAT, RULES, SECTIONS, CellConfig, as_toml
+
+_WIDTH = 120
 
 
 def cell_file(cell: CellConfig, found: Sequence[str]) -> str:
-    """Write a cell as a file with comments; `workcell.measured` is false in it, whatever the cell says.
+    """Return a cell as a file; `workcell.measured` is false in it, whatever the cell has.
 
     Parameters
     ----------
     cell : CellConfig
-        What stays at its default is written as a comment, so that the user's file still counts.
+        Keys that `init` does not ask for are commented out, so that the user's file still counts.
     found : sequence of str
-        What the devices said of themselves.
+        What the devices report about themselves.
     """
-    robot, sensor, tool, workcell = cell.robot, cell.sensor, cell.tool, cell.workcell
+    values = {f"{section}.{key}": value for section, keys in cell.to_dict().items() for key, value in keys.items()}
+    values["workcell.measured"] = False
+    asked = {key for key, rule in RULES.items() if rule.option} | {"workcell.measured"}
     lines = [
-        f'format = "{FORMAT}"',
-        "",
-        *(f"# {_one_line(words)}" for words in found),
-        "# What counts in the end, and where it comes from: ftdrive config show --origin",
-        "",
-        "[robot]",
-        _line("host", robot.host),
-        _line("model", robot.model, "checked against the controller where it can tell"),
-        _line("serial", robot.serial, "of the arm: where it is said, nothing moves on another"),
-        _line("speed_deg_s", robot.speed_deg_s, "of the fastest joint, 60 at most; the first run of a plan is slower"),
-        _line("# acceleration_deg_s2", robot.acceleration_deg_s2),
-        _line("# tip_speed_mm_s", robot.tip_speed_mm_s, "of the tool's farthest point, 250 at most"),
-        "",
-        "[sensor]",
-        _line("url", sensor.url),
-        _line("# sign", sensor.sign, "-1 for a sensor that reports the reaction: ftdrive doctor --push tells"),
-        _line("height_mm", sensor.height_mm, "of its origin above the flange face"),
-        _line("mass_kg", sensor.mass_kg, "of sensor and adapter: scale or datasheet; the sensor cannot weigh itself"),
-        "",
-        "[tool]",
-        _line("name", tool.name),
-        "# Everything mounted on the flange: from, to, diameter in mm from the flange face; two more numbers put the",
-        "# axis aside (x, y). Measure cables, cameras and screws too: what is not in here may collide.",
-        *_rows("cylinders_mm", tool.cylinders_mm),
-        "# Of what hangs on the sensor, about. Checked against it: the controller's payload, the sensor's range, and",
-        "# until the tool is known every change of the wrench: one that is more than it can weigh stops the arm.",
-        _line("mass_kg", tool.mass_kg),
-        "",
-        "[workcell]",
-        _line("mounting", workcell.mounting, "floor, wall, ceiling, or degrees it leans towards its -x: 90 is wall"),
-        "# PLACEHOLDERS until measured: mm from the centre of the base, in its axes; what it stands on is known.",
-        "# Planes, [nx, ny, nz, mm]: the arm stays where normal times point is mm or more; [-1, 0, 0, -800] is a wall",
-        "# 800 mm away towards +x. Boxes, [x, y, z, x, y, z]: two opposite corners of a block.",
-        *_rows("planes_mm", workcell.planes_mm),
-        *_rows("boxes_mm", workcell.boxes_mm),
-        "# Set it to true when cylinders, planes and boxes are measured and complete: nothing moves before.",
-        "measured = false",
-        "",
-        "[sampling]",
-        "# How long to average at each pose is chosen from a record of the sensor at rest, before the tour.",
-        _line("# noise_record_s", cell.sampling.noise_record_s, "how long that record is; 0 for none"),
-        _line("# average_s", cell.sampling.average_s, "said alone: average so long, without a record"),
-        "",
-        "[site]",
-        _line("# g_m_s2", cell.site.g_m_s2, "local gravity"),
+        *(f"# {''.join(c if c.isprintable() else '?' for c in words)}" for words in found),
+        "# To print the values in force and their origins: ftdrive config show --origin",
     ]
+    return document(values, lambda key: RULES[key].description, head=["", *lines], active=lambda key: key in asked)
+
+
+def document(
+    values: Mapping[str, Any],
+    comment: Callable[[str], str],
+    *,
+    head: Sequence[str] = (),
+    active: Callable[[str], bool] = lambda _: True,
+) -> str:
+    """Return values by key, such as "robot.host", as a file; those that are None or not active are commented out."""
+    lines = [f'format = "{FORMAT}"', *head]
+    for section, keys in groupby(values, lambda key: key.split(".")[0]):
+        lines += ["", f"# {getdoc(SECTIONS[section])}", f"[{section}]"]
+        for key in keys:
+            lines += _entry(key.split(".")[1], values[key], comment(key), active(key))
     return "".join(f"{line}\n" for line in lines)
 
 
-def _line(key: str, value: object, why: str = "") -> str:
-    text = f"# {key} =" if value is None else f"{key} = {as_toml(value)}"
-    return f"{text:<32} # {why}" if why else text
-
-
-def _rows(key: str, rows: Rows) -> list[str]:
-    return [f"{key} = [", *(f"  {as_toml(row)}," for row in rows), "]"] if rows else [f"{key} = []"]
-
-
-def _one_line(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)
+def _entry(name: str, value: Any, comment: str, active: bool) -> Iterator[str]:
+    """Yield the lines of one value: its comment behind it where there is room, else above it."""
+    text = f"{name} =" if value is None else f"{name} = {as_toml(value)}"
+    line = f"{text if active and value is not None else f'# {text}':<32} # {comment}".removesuffix(" # ").rstrip()
+    if len(line) <= _WIDTH:
+        yield line
+        return
+    yield from (f"# {part}" for part in wrap(comment, _WIDTH - 2))
+    if len(text) > _WIDTH and isinstance(value, tuple | list):
+        yield from (f"{name} = [", *(f"  {as_toml(row)}," for row in value), "]")
+    else:
+        yield line.removesuffix(f" # {comment}").rstrip()

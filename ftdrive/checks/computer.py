@@ -1,7 +1,7 @@
-"""What a check is, and those of this computer: disk, permissions, serial ports, CAN interfaces.
+"""Checks of this computer: disk, permissions, serial ports, CAN interfaces; and of the described tool and workcell.
 
-Each finding comes with the exact words that mend it. Nothing here opens a device. Where Linux keeps its facts (/sys,
-/dev) is a parameter. A computer without them is told "not applicable", which is never a failure.
+Each finding names the exact command or action that fixes it. Nothing here opens a device. The places where Linux keeps
+its facts (/sys, /dev) are parameters. On a computer without them a check is skipped, which is never a failure.
 """
 
 import json
@@ -9,18 +9,17 @@ import os
 import shutil
 import stat
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, Literal
+from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 from drivers.registry import BadUrl, in_url, split_url
 from ftdrive.cell.config import CellConfig
+from ftdrive.checks.check import Check, State
 from ftdrive.errors import ConfigError
-
-State = Literal["ok", "warning", "failed", "skipped"]
 
 SYS = Path("/sys")
 DEV = Path("/dev")
@@ -31,31 +30,10 @@ _ON_SERIAL = ("ati-serial", "bota", "robotiq-ft300", "robotous-serial")
 _ON_ETHERNET = ("ati-netft", "ur-ft")
 _LEAST_BYTES, _FEW_BYTES = 200_000_000, 1_000_000_000
 
-RATE_TOLERANCE = 0.1
-"""A sensor that is further from its rate is not set, or not connected, as it should be."""
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One thing looked at."""
-
-    name: str
-    """Subject and what about it, such as "sensor.rate"."""
-    state: State
-    found: str
-    fix: str | None = None
-    """The command, or the sentence, that mends it."""
-
-
-def verdict(checks: Sequence[Check]) -> State:
-    """Give the worst state of all."""
-    states = {check.state for check in checks}
-    return "failed" if "failed" in states else "warning" if "warning" in states else "ok"
-
 
 @dataclass(frozen=True, slots=True)
 class SensorAddress:
-    """What the address of a sensor says about the way to it."""
+    """A sensor's address in parts: protocol, port or host, options."""
 
     scheme: str
     address: str
@@ -63,7 +41,7 @@ class SensorAddress:
 
     @classmethod
     def of(cls, url: str) -> "SensorAddress":
-        """Take a sensor's address apart. Raises `ConfigError` for what is none."""
+        """Split a sensor's address. Raises `ConfigError` where it is not one."""
         try:
             parts = split_url(url)
         except BadUrl as error:
@@ -72,25 +50,25 @@ class SensorAddress:
 
     @property
     def serial_port(self) -> Path | None:
-        """The serial port it is on, behind an slcan adapter too."""
+        """Its serial port, also that of an slcan adapter."""
         if self.scheme.endswith("-can") and self.options.get("interface") == "slcan":
             return Path(self.address.split("@")[0])
         return Path(self.address) if self.scheme in _ON_SERIAL or self.address.startswith("/") else None
 
     @property
     def can_interface(self) -> str | None:
-        """The interface of the kernel it is on."""
+        """Its CAN interface of the kernel."""
         on_socketcan = self.scheme.endswith("-can") and self.options.get("interface", "socketcan") == "socketcan"
         return self.address if on_socketcan else None
 
     @property
     def host(self) -> str | None:
-        """Whom it is asked from over Ethernet."""
+        """The host that sends its samples over Ethernet."""
         return self.address.partition("/")[0] if self.scheme in _ON_ETHERNET else None
 
     @property
     def place(self) -> str | None:
-        """What `ftdrive devices --probe` takes to ask who is there; None where it cannot."""
+        """The argument with which `ftdrive devices --probe` looks for it; None where that is not possible."""
         if not self.scheme.endswith("-can"):
             return None if self.serial_port is None else str(self.serial_port)
         base = {key: self.options[key] for key in ("base",) if key in self.options}
@@ -100,14 +78,14 @@ class SensorAddress:
 
     @property
     def bitrate(self) -> int:
-        """Bit/s its bus must have."""
+        """Required bit rate of its bus, bit/s."""
         if self.scheme == "robotous-can":
             return 1_000_000
         return int(self.options.get("bitrate", "250000"), 0)
 
 
 def check_disk(folder: Path) -> Check:
-    """See whether runs can be written into a folder, which need not exist yet, and whether there is room for them."""
+    """Check that runs can be written into a folder, which need not exist yet, and that there is room for them."""
     name, there = "disk.runs", folder.absolute()
     while not there.exists():
         there = there.parent
@@ -117,30 +95,28 @@ def check_disk(folder: Path) -> Check:
             file.flush()
         free = shutil.disk_usage(there).free
     except OSError as error:
-        return Check(
-            name, "failed", f"nothing can be written in {there} ({error})", "give --runs DIR, a folder of yours"
-        )
+        return Check(name, "failed", f"{there} cannot be written to ({error})", "give another folder with --runs DIR")
     state: State = "failed" if free < _LEAST_BYTES else "warning" if free < _FEW_BYTES else "ok"
     fix = None if state == "ok" else "make room, or give --runs DIR on another disk"
     return Check(name, state, f"{free / 1e9:.1f} GB free in {there}", fix)
 
 
 def check_workcell(cell: CellConfig, model: str | None) -> Check:
-    """See whether tool and surroundings can be as they are described for an arm, and are as a person measured them."""
+    """Check that tool and surroundings are described, possible for this arm, and measured."""
     from ftdrive.planning.cell_plan import require_possible
 
     name = "workcell.measured"
     if not cell.tool.cylinders_mm:
-        cure = "describe what is mounted: [tool] cylinders_mm in ftdrive.toml, or --tool of calibrate"
-        return Check(name, "warning", "no tool is described", cure)
+        fix = "describe what is mounted: [tool] cylinders_mm in ftdrive.toml, or --tool of calibrate"
+        return Check(name, "warning", "no tool is described", fix)
     try:
         require_possible(cell, model)
     except ConfigError as error:
-        found, _, cure = str(error).rpartition(": ")
-        return Check(name, "failed", found, cure)
+        found, _, fix = str(error).rpartition(": ")
+        return Check(name, "failed", found, fix)
     if not cell.workcell.measured:
-        cure = "measure tool, planes and boxes, then set measured = true in [workcell] of ftdrive.toml"
-        return Check(name, "failed", "tool and surroundings are placeholders", cure)
+        fix = "measure tool, planes and boxes, then set measured = true in [workcell] of ftdrive.toml"
+        return Check(name, "failed", "tool and surroundings are placeholders", fix)
     rows = (cell.tool.cylinders_mm, "cylinder"), (cell.workcell.planes_mm, "plane"), (cell.workcell.boxes_mm, "box")
     cylinders, planes, boxes = (_counted(len(row), one) for row, one in rows)
     return Check(name, "ok", f"tool of {cylinders}, {planes}, {boxes}, measured")
@@ -151,23 +127,22 @@ def _counted(count: int, one: str) -> str:
 
 
 def check_permissions(address: SensorAddress, *, sys: Path = SYS, dev: Path = DEV) -> list[Check]:
-    """See whether this user may use the sensor's port, and whether the port is set up for it."""
+    """Check that this user may use the sensor's port, and that the port is set up for it."""
     if (port := address.serial_port) is not None:
         return check_serial_port(port, sys=sys, dev=dev)
     if (interface := address.can_interface) is not None:
         return [check_can_interface(interface, address.bitrate, can_details(interface), sys=sys)]
-    found = f"not applicable: {address.scheme} at {address.address} is on no serial port and no CAN interface of Linux"
+    found = f"not applicable: {address.scheme} at {address.address} uses no serial port and no CAN interface of Linux"
     return [Check("permissions.port", "skipped", found)]
 
 
 def check_serial_port(port: Path, *, sys: Path = SYS, dev: Path = DEV) -> list[Check]:
-    """Judge a serial port: there, permitted, named so that it survives replugging, and quick."""
+    """Check a serial port: present, permitted, with a name that survives replugging, and fast."""
     if not dev.is_dir():
         return [Check("permissions.port", "skipped", f"not applicable: {port} has no file on this system")]
     if not port.exists():
-        return [
-            Check("permissions.port", "failed", f"there is no {port}", "plug it in; ftdrive devices lists the ports")
-        ]
+        fix = "plug it in; ftdrive devices lists the ports"
+        return [Check("permissions.port", "failed", f"{port} does not exist", fix)]
     real = Path(os.path.realpath(port))
     checks = [_check_access(port)]
     name = name_by_id(port, dev=dev)
@@ -183,33 +158,27 @@ def check_serial_port(port: Path, *, sys: Path = SYS, dev: Path = DEV) -> list[C
         checks.append(Check("permissions.latency_timer", "skipped", "not applicable: the port has no latency timer"))
         return checks
     latency_ms = timer.read_text(encoding="ascii").strip()
-    slow = latency_ms != "1"
-    checks.append(
-        Check(
-            "permissions.latency_timer",
-            "warning" if slow else "ok",
-            f"the adapter holds data back for up to {latency_ms} ms",
-            latency_command(real.name) if slow else None,
-        )
-    )
-    return checks
+    found = f"the adapter delays data by up to {latency_ms} ms"
+    state: State = "ok" if latency_ms == "1" else "warning"
+    command = None if state == "ok" else latency_command(real.name)
+    return [*checks, Check("permissions.latency_timer", state, found, command)]
 
 
 def name_by_id(port: Path, *, dev: Path = DEV) -> Path | None:
-    """Find the name of a serial port that survives replugging; None where it has none."""
+    """Return the name of a serial port that survives replugging; None where it has none."""
     by_id, real = dev / "serial" / "by-id", os.path.realpath(port)
     links = sorted(by_id.iterdir()) if by_id.is_dir() else []
     return next((link for link in links if os.path.realpath(link) == real), None)
 
 
 def latency_command(tty: str) -> str:
-    """Say how to tell a USB serial adapter not to wait, until the next plugging."""
+    """Return the command that sets a USB serial adapter's delay to 1 ms until it is unplugged."""
     return f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{tty}/latency_timer"
 
 
 def _check_access(port: Path) -> Check:
     if os.access(port, os.R_OK | os.W_OK):
-        return Check("permissions.port", "ok", f"{port} may be read and written")
+        return Check("permissions.port", "ok", f"{port} is readable and writable")
     info = port.stat()
     try:
         import grp
@@ -222,11 +191,11 @@ def _check_access(port: Path) -> Check:
     else:
         install = _udev_command(Path(os.path.realpath(port)).name)
         fix = f"{install}    (then log out and in again; until the next plugging: sudo chmod a+rw {port})"
-    return Check("permissions.port", "failed", f"{port} may not be read and written", fix)
+    return Check("permissions.port", "failed", f"{port} is not readable and writable", fix)
 
 
 def _udev_command(tty: str) -> str:
-    """Say how to install a rule that gives ports of this kind to the group dialout, and to join it."""
+    """Return the command that gives ports of this kind to the group dialout and adds the user to it."""
     rule = f'SUBSYSTEM=="tty", KERNEL=="{tty.rstrip("0123456789")}[0-9]*", GROUP="dialout", MODE="0660"'
     return (
         f"echo '{rule}' | sudo tee /etc/udev/rules.d/60-ftdrive.rules && sudo udevadm control --reload && "
@@ -235,13 +204,13 @@ def _udev_command(tty: str) -> str:
 
 
 def can_interfaces(sys: Path = SYS) -> list[str]:
-    """List the names of the kernel's CAN interfaces."""
+    """Return the names of the kernel's CAN interfaces."""
     found = sorted((sys / "class" / "net").glob("*/type"))
     return [path.parent.name for path in found if path.read_text(encoding="ascii").strip() == _CAN_INTERFACE]
 
 
 def can_details(interface: str) -> Mapping[str, Any]:
-    """Ask `ip`, which only reads, for kind, state and bitrate of a CAN interface; empty where it cannot tell."""
+    """Read kind, state and bitrate of a CAN interface with `ip`; empty where `ip` does not report them."""
     if (ip := shutil.which("ip", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")) is None:
         return {}
     command = [ip, "-details", "-json", "link", "show", interface]
@@ -252,16 +221,13 @@ def can_details(interface: str) -> Mapping[str, Any]:
         return {}
     info = (links[0] if links else {}).get("linkinfo", {})
     data = info.get("info_data", {})
-    details = {
-        "kind": info.get("info_kind"),
-        "state": data.get("state"),
-        "bitrate": data.get("bittiming", {}).get("bitrate"),
-    }
+    bitrate = data.get("bittiming", {}).get("bitrate")
+    details = {"kind": info.get("info_kind"), "state": data.get("state"), "bitrate": bitrate}
     return {key: value for key, value in details.items() if value is not None}
 
 
 def check_can_interface(interface: str, bitrate: int, details: Mapping[str, Any], *, sys: Path = SYS) -> Check:
-    """Judge an interface of the kernel: there, up, not bus-off, and at the sensor's bitrate.
+    """Check an interface of the kernel: present, up, not bus-off, and at the sensor's bitrate.
 
     Parameters
     ----------
@@ -272,14 +238,12 @@ def check_can_interface(interface: str, bitrate: int, details: Mapping[str, Any]
     up = f"sudo ip link set {interface} up type can bitrate {bitrate}"
     if "/" in interface or interface.startswith("tty"):
         port = interface if "/" in interface else f"/dev/{interface}"
-        fix = (
-            f"a sensor on a serial port is asked at {port}, a bus behind an adapter at slcan://{port}?bitrate={bitrate}"
-        )
-        return Check(name, "failed", f"{interface} is no CAN interface", fix)
+        fix = f"for a sensor on a serial port give {port}, for a bus behind an adapter slcan://{port}?bitrate={bitrate}"
+        return Check(name, "failed", f"{interface} is not a CAN interface", fix)
     folder = sys / "class" / "net" / interface
     if not folder.exists():
         fix = f"plug the adapter in (ftdrive devices lists the interfaces), then {up}"
-        return Check(name, "failed", f"there is no interface {interface}", fix)
+        return Check(name, "failed", f"there is no CAN interface {interface}", fix)
     if (folder / "type").read_text(encoding="ascii").strip() != _CAN_INTERFACE:
         return Check(name, "failed", f"{interface} is not a CAN interface", "ftdrive devices lists them")
     flags = int((folder / "flags").read_text(encoding="ascii"), 16)

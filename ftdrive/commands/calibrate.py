@@ -90,7 +90,7 @@ def calibrate(
     from ftdrive.cell.emulated import MOVED_BY, Station, sensor_name
     from ftdrive.errors import Declined
     from ftdrive.runs.run import Run
-    from ftdrive.session.session import Options, as_begun
+    from ftdrive.session.session import Options, with_recorded_mode
     from ftdrive.session.session import calibrate as guide
     from ftdrive.terminal.console import talk
     from ftdrive.terminal.report import print_result
@@ -127,7 +127,7 @@ def calibrate(
             yes=yes,
             description=description,
         )
-        if simulate and (mover := MOVED_BY.get(as_begun(options).mode)):
+        if simulate and (mover := MOVED_BY.get(with_recorded_mode(options).mode)):
             request, words = mover
             station.control(**request)
             talk.print(f"The cell is emulated: {words}.")

@@ -1,4 +1,4 @@
-"""`ftdrive config`: what counts, and where it comes from."""
+"""`ftdrive config`: the values in force, and the origin of each."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from ftdrive.commands.common import EMULATED_SENSOR, JSON, check_simulate, simul
 
 @click.group()
 def config() -> None:
-    """Show the configuration. `ftdrive init` writes one; any key may be set by its variable, FTDRIVE_ROBOT_HOST."""
+    """Show the configuration. `ftdrive init` writes one; any key may be set by a variable, FTDRIVE_ROBOT_HOST."""
 
 
 @config.command()
@@ -18,19 +18,20 @@ def config() -> None:
     "--config",
     "path",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="In place of ftdrive.toml here.",
+    help="In place of ./ftdrive.toml.",
 )
-@click.option("--origin", is_flag=True, help="Where each value comes from.")
-@simulate("Show that of an emulated cell, whose addresses end with this command.")
+@click.option("--origin", is_flag=True, help="Print the origin of each value instead of its meaning.")
+@simulate("Show that of an emulated cell. Its addresses are valid until this command ends.")
 @EMULATED_SENSOR
 @JSON
 def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as_json: bool) -> None:
-    """Print the configuration that counts, as a file that could be used in its place.
+    """Print the configuration in force, as a file that could be used in its place.
 
-    An option of a command comes first, then the environment, then ftdrive.toml here, then the user's file, then the
+    An option of a command comes first, then the environment, then ./ftdrive.toml, then the user's file, then the
     default.
     """
-    from ftdrive.cell.config import FORMAT, as_toml, settings
+    from ftdrive.cell.config import RULES, settings
+    from ftdrive.cell.template import document
 
     check_simulate(simulate, real={"--config": path}, emulated={"--sensor": sensor})
     if simulate:
@@ -49,12 +50,5 @@ def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as
             origins.setdefault(section, {})[key] = setting.origin
         write_json({"schema_version": 1, "config": values} | ({"origin": origins} if origin else {}))
         return
-    lines, section = [f'format = "{FORMAT}"'], ""
-    for name, setting in found.items():
-        if name.split(".")[0] != section:
-            section = name.split(".")[0]
-            lines += ["", f"[{section}]"]
-        key = name.split(".")[1]
-        line = f"# {key} =" if setting.value is None else f"{key} = {as_toml(setting.value)}"
-        lines.append(f"{line:<40} # {setting.origin}" if origin else line)
-    click.echo("\n".join(lines))
+    comment = (lambda key: found[key].origin) if origin else (lambda key: RULES[key].description)
+    click.echo(document({key: setting.value for key, setting in found.items()}, comment), nl=False)

@@ -1,4 +1,4 @@
-"""`ftdrive devices`: which ports and buses this computer has, and on request which known sensors are there."""
+"""`ftdrive devices`: the ports and buses of this computer, and on request the known sensors on them."""
 
 import sys
 from pathlib import Path
@@ -10,9 +10,12 @@ from rich.text import Text
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
+from drivers.clock import Clock
 from drivers.errors import DriverError
+from ftdrive.cell.config import clock_in_force
 from ftdrive.cell.emulated import Station
-from ftdrive.checks.computer import Check, can_details, can_interfaces, check_serial_port, name_by_id
+from ftdrive.checks.check import Check
+from ftdrive.checks.computer import can_details, can_interfaces, check_serial_port, name_by_id
 from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.terminal.console import hanging
@@ -25,26 +28,25 @@ A PLACE is
 
 
 @click.command(epilog=_PLACES)
-@click.option(
-    "--probe", "places", multiple=True, metavar="PLACE", help="Ask which known sensors are there; may be repeated."
-)
-@simulate("Show the two ports of an emulated cell instead, and ask which sensors are there.")
+@click.option("--probe", "places", multiple=True, metavar="PLACE", help="Look for known sensors there. Repeatable.")
+@simulate("Show and probe the two ports of an emulated cell instead.")
 @JSON
 def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
-    """List serial ports by id and CAN interfaces, and known sensors that answer where you tell it to ask.
+    """List serial ports by id and CAN interfaces; with --probe, the known sensors that answer there.
 
-    Nothing is opened and no byte is sent, except at each PLACE: there it listens, and then sends requests to read in
-    the protocols of the sensors it knows. Do not probe a serial port with something else on it.
+    Nothing is opened and no byte is sent, except at each PLACE: the command listens there, and then sends read requests
+    in the protocols of the known sensors. Do not probe a serial port with another device on it.
 
-    Of CAN adapters only those of the kernel (can0) and slcan can be asked. ATI sensors are looked for at base
-    identifier 0x20 (another: socketcan://can0?base=0x7F), Robotous sensors at 1 Mbit/s only. Where something else sends
-    on the identifiers of a sensor, nothing is sent and you are told. A wrong bit rate disturbs a bus in use.
+    Only CAN adapters of the kernel (can0) and slcan can be probed. ATI sensors are expected at base identifier 0x20
+    (another: socketcan://can0?base=0x7F), Robotous sensors at 1 Mbit/s. If another device uses the identifiers of a
+    sensor, nothing is sent and the output reports it. A wrong bit rate disturbs a bus in use.
     """
     check_simulate(simulate, real={"--probe": places})
     failures: list[Exception] = []
     found = _emulated(failures) if simulate else {"serial": _serial_ports(), "can": _can_interfaces()}
     if places:
-        found["answers"] = [answer for place in places for answer in _answers(place, failures)]
+        clock = clock_in_force()
+        found["answers"] = [answer for place in places for answer in _answers(place, clock, failures)]
     if as_json:
         write_json({"schema_version": 1, **found})
     else:
@@ -78,16 +80,16 @@ def _can_interfaces() -> list[dict[str, Any]]:
     return [{"interface": name, **can_details(name)} for name in can_interfaces()]
 
 
-def _answers(place: str, failures: list[Exception]) -> list[dict[str, Any]]:
-    """Ask at one place; why it cannot be asked is told with the answers of the others, and added to `failures`."""
+def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[str, Any]]:
+    """Probe one place. An error is an answer too, so that other places are probed, and is added to `failures`."""
     from ftdrive.checks.discovery import ask
 
     nothing = {"port": place, "url": None, "what": "no known sensor answers", "error": None}
     try:
-        answers = [{"port": place, "url": answer.url, "what": answer.what, "error": None} for answer in ask(place)]
+        answers = [nothing | {"url": answer.url, "what": answer.what} for answer in ask(place, clock)]
     except (ConfigError, DriverError, OSError) as error:
         failures.append(error)
-        return [nothing | {"what": "could not be asked", "error": str(error)}]
+        return [nothing | {"what": "could not be probed", "error": str(error)}]
     return answers or [nothing]
 
 
@@ -98,7 +100,7 @@ def _emulated(failures: list[Exception]) -> dict[str, Any]:
         return {
             "serial": [_serial_port(ListPortInfo(path)) for path in (serial["port"], can["channel"])],
             "can": [],
-            "answers": [answer for place in places for answer in _answers(place, failures)],
+            "answers": [answer for place in places for answer in _answers(place, station.clock, failures)],
         }
 
 

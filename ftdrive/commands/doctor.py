@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,15 +18,15 @@ from calib import CalibrationResult
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import ArmStatus, ForceTorqueSensor, RobotArm
-from drivers.ur.dashboard import Dashboard, ask_dashboard
-from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
 from ftdrive.cell.config import USUAL_KG, CellConfig
-from ftdrive.cell.devices import build_arm, build_sensor, ur_timing
+from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station, sensor_name, sensor_url
 from ftdrive.checks import computer, devices
-from ftdrive.checks.computer import Check, SensorAddress
+from ftdrive.checks.check import Check, verdict
+from ftdrive.checks.computer import SensorAddress
 from ftdrive.commands.common import CELL, JSON, MODEL, Number, check_simulate, read_cell, runs, simulate, write_json
 from ftdrive.errors import NotAccepted
+from ftdrive.session.guards import Limits
 from ftdrive.terminal.console import hanging, talk
 
 Array = NDArray[np.float64]
@@ -38,7 +38,6 @@ _LOOK_S = 2.0
 _PUSH_S = 3.0
 _PUSH_WINDOW_S = 0.2
 _SIMULATED_PUSH_N, _SIMULATED_PUSH_S = 15.0, 0.6
-_NOT_UR = Check("robot.programs", "skipped", "not applicable: only a UR has dashboard, RTDE registers and port 30003")
 _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "red"), "skipped": ("-", "")}
 
 
@@ -47,7 +46,10 @@ _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "
 @MODEL
 @simulate()
 @click.option(
-    "--calibration", "path", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Does it fit? FILE."
+    "--calibration",
+    "path",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Is it of these devices?",
 )
 @click.option(
     "--mass-kg",
@@ -69,13 +71,13 @@ def doctor(
     runs: Path,
     as_json: bool,
 ) -> None:
-    """Check robot, sensor, noise, clocks, disk and permissions, and say what mends each finding.
+    """Check robot, sensor, noise, clocks, disk and permissions; print a fix for each finding.
 
-    The arm is only read, nothing moves, no program is touched. Exit code 7 if a check fails.
+    Runs every check except the controller's safety limits, which can only be queried with control. The arm is only
+    read, nothing moves, no program is touched. Exit code 7 if a check fails.
     """
     check_simulate(simulate, real={"--config": config, "--robot": robot, "--model": model})
     calibration = None if path is None else CalibrationResult.load(path)
-    found: list[Check] = []
     pushed: dict[str, Any] | None = None
     with ExitStack() as stack:
         station = stack.enter_context(Station(sensor_name(sensor), ["--time-scale", "1"])) if simulate else None
@@ -83,12 +85,14 @@ def doctor(
         address = SensorAddress.of(sensor_url(cell.sensor.url))
         device = build_sensor(cell)
 
-        arm = _examine_robot(cell, found, stack)
+        found, arm = _examine_robot(cell, stack)
         permissions = computer.check_permissions(address)
         blame = partial(devices.check_sensor_error, address=address, permissions=permissions)
-        alive = _examine_sensor(device, address, cell, mass_kg or cell.tool.mass_kg or USUAL_KG, found, blame, stack)
-        told = cell.robot.model if arm is None else arm.identify().model
-        found += [computer.check_workcell(cell, told), computer.check_disk(runs), *permissions]
+        of_sensor, alive = _examine_sensor(
+            device, address, cell, mass_kg or cell.tool.mass_kg or USUAL_KG, blame, stack
+        )
+        model = cell.robot.model if arm is None else arm.identify().model
+        found += [*of_sensor, computer.check_workcell(cell, model), computer.check_disk(runs), *permissions]
         if calibration is not None:
             connected = {"sensor": device.identify()} if alive else {}
             if arm is not None:
@@ -98,15 +102,16 @@ def doctor(
             R_flange_sensor = None if calibration is None else calibration.R_flange_sensor
             if station is not None and calibration is None:
                 R_flange_sensor = np.array(station.truth["R_flange_sensor"])
-            pushed = _examine_push(
-                device if alive else None, arm, R_flange_sensor, cell.sensor.sign, station, found, blame
+            check, pushed = _examine_push(
+                device if alive else None, arm, R_flange_sensor, cell.sensor.sign, station, blame
             )
+            found.append(check)
     failed = [check.name for check in found if check.state == "failed"]
     if as_json:
         answer = {
             "schema_version": 1,
             "checks": [asdict(check) for check in found],
-            "verdict": computer.verdict(found),
+            "verdict": verdict(found),
         }
         write_json({**answer, "push": pushed} if push else answer)
     else:
@@ -115,71 +120,48 @@ def doctor(
         raise NotAccepted(f"{len(failed)} of {len(found)} checks failed: {', '.join(failed)}")
 
 
-def _examine_robot(cell: CellConfig, found: list[Check], stack: ExitStack) -> RobotArm | None:
-    host, arm, is_ur = cell.robot.host, build_arm(cell), cell.robot.driver == "ur"
+def _examine_robot(cell: CellConfig, stack: ExitStack) -> tuple[list[Check], RobotArm | None]:
+    """Return the checks of the arm, and the arm where it could be opened."""
+    host, arm = cell.robot.host, build_arm(cell)
     stack.callback(arm.close)
     try:
         arm.open()
         info, status = arm.identify(), arm.status()
-        after = f" in {1e3 * _dashboard_s(cell):.1f} ms" if is_ur else ""
     except DriverError as error:
-        found.append(devices.check_unreachable(error, host))
-        return None
-    found.append(Check("robot.reachable", "ok", f"{host} answers{after}"))
-    found.append(devices.check_arm(info) if is_ur else Check("robot.identity", "ok", devices.who(info)))
-    try:
-        found.append(devices.check_remote(arm.in_remote_control()))
-    except DriverError as error:
-        found.append(replace(devices.check_unreachable(error, host), name="robot.remote"))
-    found += [_registers(cell), _script_port(cell)] if is_ur else [_NOT_UR]
-    found += devices.check_status(status)
-    found.append(_flange(arm, status))
-    found.append(_clock(arm, cell.clock))
-    return arm
+        return [devices.check_unreachable(error, host)], None
+    return [
+        Check("robot.reachable", "ok", f"{host} answers"),
+        devices.check_arm(info, cell.robot),
+        devices.check_remote(arm),
+        *map(devices.check_finding, arm.diagnose()),
+        devices.check_safety(status),
+        devices.check_program(status),
+        devices.check_speed(status),
+        devices.check_payload(status, cell.tool, cell.sensor.mass_kg),
+        *_check_poses(arm, status, cell.clock),
+        _check_clock(arm, cell.clock),
+    ], arm
 
 
-def _dashboard_s(cell: CellConfig) -> float:
-    """Measure a question to the dashboard server and its answer."""
-    clock = cell.clock
-
-    def answer_s(dashboard: Dashboard) -> float:
-        begun_s = clock.now_s()
-        dashboard.polyscopeVersion()
-        return clock.now_s() - begun_s
-
-    return ask_dashboard(cell.robot.host, answer_s, timeout_s=ur_timing(cell).connect_s, clock=clock)
-
-
-def _registers(cell: CellConfig) -> Check:
-    host, limit_s = cell.robot.host, ur_timing(cell).connect_s
-    try:
-        return devices.check_registers(registers_in_use(host, CONTROL_REGISTERS, timeout_s=limit_s, clock=cell.clock))
-    except DriverError as error:
-        return Check("robot.registers", "failed", error.found, error.cure or f"ping {host}")
-
-
-def _script_port(cell: CellConfig) -> Check:
-    host = cell.robot.host
-    try:
-        find_script_port(host, timeout_s=ur_timing(cell).connect_s)
-    except DriverError as error:
-        return Check("robot.programs", "failed", error.found, error.cure or f"ping {host}")
-    return Check("robot.programs", "ok", f"port {SCRIPT_PORT}, which takes programs, is open")
-
-
-def _flange(arm: RobotArm, status: ArmStatus) -> Check:
+def _check_poses(arm: RobotArm, status: ArmStatus, clock: Clock) -> list[Check]:
+    """Check that the arm reports its flange, and how fast."""
     name = "robot.flange"
     if status.tcp_offset is None:
-        return Check(name, "skipped", "the controller is too old to tell its TCP: only a calibration can read poses")
+        found = "the controller does not report its TCP offset: only a calibration, which takes control, can read poses"
+        return [Check(name, "skipped", found)]
     try:
         p_mm = 1e3 * arm.state().p_base_flange_m
     except DriverError as error:
-        return Check(name, "failed", error.found, error.cure or "check the robot and the network")
+        return [Check(name, "failed", error.found, error.cure or "check the robot and the network")]
     where = ", ".join(f"{value:.0f}" for value in p_mm)
-    return Check(name, "ok", f"TCP told; the flange is at ({where}) mm in base, where the model has it")
+    limits = Limits.emulated() if clock.emulated else Limits()
+    return [
+        Check(name, "ok", f"TCP offset read; flange at ({where}) mm in base"),
+        devices.check_link(arm, clock, usual_s=limits.link_usual_s, gap_s=limits.link_gap_s),
+    ]
 
 
-def _clock(arm: RobotArm, clock: Clock) -> Check:
+def _check_clock(arm: RobotArm, clock: Clock) -> Check:
     host_ns: list[int] = []
     device_s: list[float] = []
     try:
@@ -195,27 +177,27 @@ def _clock(arm: RobotArm, clock: Clock) -> Check:
 
 
 def _examine_sensor(
-    device: ForceTorqueSensor,
-    address: SensorAddress,
-    cell: CellConfig,
-    mass_kg: float,
-    found: list[Check],
-    blame: Blame,
-    stack: ExitStack,
-) -> bool:
+    device: ForceTorqueSensor, address: SensorAddress, cell: CellConfig, mass_kg: float, blame: Blame, stack: ExitStack
+) -> tuple[list[Check], bool]:
+    """Return the checks of the sensor, and whether it streams."""
+    found: list[Check] = []
     name = "sensor.identity"
     try:
         stack.enter_context(device)
-        found += devices.check_identity(device.identify())
+        info = device.identify()
+        found += devices.check_identity(info)
         name = "sensor.stream"
         samples = device.collect(_LOOK_S)
         health = device.health()
     except DriverError as error:
-        found.append(blame(name, error))
-        return False
-    found += devices.check_stream(samples, health, address, _LOOK_S)
-    found += devices.check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg)
-    return True
+        return [*found, blame(name, error)], False
+    limits = info.facts.get("range")
+    return [
+        *found,
+        devices.check_load(None if limits is None else limits.value, cell),
+        *devices.check_stream(samples, health, address, _LOOK_S),
+        *devices.check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg),
+    ], True
 
 
 def _examine_push(
@@ -224,16 +206,14 @@ def _examine_push(
     R_flange_sensor: Array | None,
     sign: int,
     station: Station | None,
-    found: list[Check],
     blame: Blame,
-) -> dict[str, Any] | None:
+) -> tuple[Check, dict[str, Any] | None]:
     if device is None:
-        found.append(Check("push.sign", "skipped", "the sensor does not measure"))
-        return None
+        return Check("push.sign", "skipped", "the sensor does not measure"), None
     try:
         R_base_flange = None if arm is None else arm.state().R_base_flange
     except DriverError:
-        R_base_flange = None  # said under robot.flange
+        R_base_flange = None  # robot.flange reports it
     try:
         before = device.collect(1.0).wrench[:, :3].mean(axis=0)
         with ExitStack() as stack:
@@ -241,8 +221,7 @@ def _examine_push(
                 words = f"Push the tool along +X of the base, about 20 N; press Enter and hold for {_PUSH_S:.0f} s"
                 click.echo(words, err=True)
                 if not sys.stdin.readline():
-                    found.append(Check("push.sign", "skipped", "nobody is there to push: the standard input is closed"))
-                    return None
+                    return Check("push.sign", "skipped", "no push: the standard input is closed"), None
             elif R_base_flange is not None and R_flange_sensor is not None:
                 force = (R_base_flange @ R_flange_sensor).T @ [_SIMULATED_PUSH_N, 0.0, 0.0]
                 station.control(do="push", wrench=[*force.tolist(), 0.0, 0.0, 0.0])
@@ -251,12 +230,9 @@ def _examine_push(
             pieces = (device.collect(_PUSH_WINDOW_S).wrench[:, :3] for _ in range(windows))
             changes = [force_N.mean(axis=0) - before for force_N in pieces]
     except DriverError as error:
-        found.append(blame("push.sign", error))
-        return None
+        return blame("push.sign", error), None
     largest = max(changes, key=lambda change: float(np.linalg.norm(change)))
-    check, moved = devices.check_push(largest, R_base_flange, R_flange_sensor, sign)
-    found.append(check)
-    return moved
+    return devices.check_push(largest, R_base_flange, R_flange_sensor, sign)
 
 
 def _print(found: list[Check]) -> None:
@@ -269,5 +245,7 @@ def _print(found: list[Check]) -> None:
         if check.fix is not None and check.state in {"warning", "failed"}:
             data.print(hanging(f"{'':15}fix: ", check.fix, data))
         subject = first
-    worst = computer.verdict(found)
-    talk.print({"ok": " All is well.", "warning": " Usable; see what is marked !", "failed": " Not ready."}[worst])
+    worst = verdict(found)
+    talk.print(
+        {"ok": " All checks passed.", "warning": " Usable; see the lines with !", "failed": " Not ready."}[worst]
+    )

@@ -1,4 +1,4 @@
-"""`ftdrive transcript`: the bytes of a sensor's wire into a file, and back to the driver."""
+"""`ftdrive transcript`: record the bytes on a sensor's wire, and play them to the driver."""
 
 import math
 from dataclasses import asdict
@@ -10,13 +10,14 @@ from typing import Any
 import click
 import numpy as np
 
-from drivers.clock import REAL, Clock
+from drivers.clock import Clock
 from drivers.errors import ConnectError, DeviceTimeout, ProtocolError
 from drivers.interfaces import ForceTorqueSensor
 from drivers.registry import BadUrl, sensor_from_url
 from drivers.transcript.player import Player
 from drivers.transcript.recorder import INTERRUPTED, BadTranscript, Transcript, Writer
 from drivers.transcript.taps import recording
+from ftdrive.cell.config import clock_in_force
 from ftdrive.cell.emulated import EMULATED, sensor_clock, sensor_name, sensor_url
 from ftdrive.checks.computer import SensorAddress
 from ftdrive.commands.common import EMULATED_SENSOR, JSON, NewFile, Number, check_simulate, simulate, write_json
@@ -25,7 +26,7 @@ from ftdrive.runs.run import versions
 from ftdrive.terminal.console import talk
 
 _PIECE_S = 60.0
-"""One `collect` of a million samples would end at 143 s with an ATI sensor on a serial port."""
+"""A `collect` holds a million samples: 143 s of an ATI sensor on a serial port."""
 _TAIL_S = 0.3
 """Recorded beyond the duration, so that a replay which begins a little later still has enough."""
 
@@ -34,7 +35,7 @@ _TAIL_S = 0.3
 def transcript() -> None:
     """Record the bytes on a sensor's wire, or play them to the driver: a bug report becomes a test.
 
-    Sensors on a serial port, on a CAN bus, or on Ethernet if they are Net F/T. The arm's own sensor is not recorded.
+    For sensors on a serial port or a CAN bus, and Net F/T. The arm's own sensor is not recorded.
     """
 
 
@@ -45,14 +46,14 @@ def transcript() -> None:
 @click.option("--duration", "duration_s", type=Number(0.1, 600), default=5.0, show_default=True, help="Seconds.")
 @JSON
 def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as_json: bool) -> None:
-    """Record what the driver and its sensor say to each other, from opening to closing.
+    """Record all bytes between the driver and its sensor, from opening to closing.
 
-    Nothing is sent but what the driver sends anyway. If the sensor fails, the transcript of the failure is kept.
+    Only the driver's own requests are sent. If the sensor fails, the transcript of the failure is kept.
     """
     if simulate:
         sensor = _emulated(sensor)
     if sensor is None:
-        raise ConfigError("which sensor? Give --sensor URL or --simulate")
+        raise ConfigError("no sensor is given: add --sensor URL or --simulate")
     url, seen = _record(sensor, path, duration_s)
     if as_json:
         write_json({"schema_version": 1, "file": str(path), "url": url, "recorded": seen})
@@ -65,8 +66,8 @@ def _emulated(sensor: str | None) -> str:
 
 
 def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) -> tuple[str, dict[str, Any]]:
-    """Record, and name the file if it is kept; returns the address that a driver was given, and what it saw."""
-    if sensor.startswith("ur-ft:") or sensor == f"{EMULATED}ur-ft":  # which need not be started for this
+    """Record; return the address of the driver, and what it received. A file that is `kept` is named on the screen."""
+    if sensor.startswith("ur-ft:") or sensor == f"{EMULATED}ur-ft":  # rejected before an emulated one starts
         raise ConfigError(
             f"{sensor} is read over RTDE, which is not recorded: capture TCP port 30004 of the arm with Wireshark"
         )
@@ -77,7 +78,7 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
             f"{sensor} is neither on a serial port or a CAN bus nor an ati-netft: only these can be recorded; capture "
             "others with Wireshark"
         )
-    clock = sensor_clock(sensor)
+    clock = sensor_clock(sensor, clock_in_force())
     device = _sensor(url, clock)
     header = {
         "url": url,
@@ -116,48 +117,49 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
 @EMULATED_SENSOR
 @JSON
 def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -> None:
-    """Play the transcript FILE to the unmodified driver, and say what the driver makes of it this time.
+    """Play the transcript FILE to the unmodified driver, and print what the driver measures this time.
 
-    A recording that was broken off is played as far as it goes.
+    A recording that was interrupted is played to its end.
     """
     check_simulate(simulate, real={"FILE": file}, emulated={"--sensor": sensor})
-    clock: Clock = REAL
+    clock = clock_in_force()
     if simulate:
         clock = sensor_clock(_emulated(sensor))
         with TemporaryDirectory(prefix="ftdrive-") as folder:
             path = Path(folder) / "sensor.jsonl"
             _record(_emulated(sensor), path, 1.0, kept=False)
-            told = Transcript.load(path)
+            loaded = Transcript.load(path)
     elif file is not None:
-        told = Transcript.load(file)
+        loaded = Transcript.load(file)
     else:
-        raise ConfigError("which transcript? Give its FILE, or --simulate")
-    player = Player(told, clock)
+        raise ConfigError("no transcript is given: add its FILE, or --simulate")
+    player = Player(loaded, clock)
     with player as port:
-        device = _sensor(told.url_at(port), clock)
-        duration_s = float(told.header["duration_s"])
+        device = _sensor(loaded.url_at(port), clock)
+        duration_s = float(loaded.header["duration_s"])
         try:
             with device:
-                if told.is_broken_off:
+                if loaded.is_broken_off:
                     duration_s = min(duration_s, player.left_s - _TAIL_S)
                 played = _watch(device, duration_s)
         except Exception as error:
             if player.divergence:
                 raise ProtocolError(f"{error}; the transcript does not answer: {player.divergence}") from error
             silent = isinstance(error, ConnectError | DeviceTimeout)
-            if silent and told.is_broken_off and player.left_s < _TAIL_S:
+            if silent and loaded.is_broken_off and player.left_s < _TAIL_S:
                 raise BadTranscript(
-                    f"the recording was broken off before there was anything to measure ({error}): record it anew"
+                    f"the recording was broken off before there was anything to measure ({error}): record it again"
                 ) from error
             raise
-    recorded = {key: value for key, value in told.end.items() if key not in {"event", "t_ns"}}
+    recorded = {key: value for key, value in loaded.end.items() if key not in {"event", "t_ns"}}
     if as_json:
-        write_json({"schema_version": 1, "url": told.header["url"], "recorded": recorded, "played": played})
+        write_json({"schema_version": 1, "url": loaded.header["url"], "recorded": recorded, "played": played})
     else:
         talk.print(f" recorded  {_words(recorded)}")
         talk.print(f" played    {_words(played)}")
-    if duration_s < told.header["duration_s"]:
-        talk.print(f" The recording was broken off: {duration_s:.3g} s of {told.header['duration_s']:g} s were played.")
+    if duration_s < loaded.header["duration_s"]:
+        whole_s = loaded.header["duration_s"]
+        talk.print(f" The recording was broken off: {duration_s:.3g} s of {whole_s:g} s were played.")
 
 
 def _sensor(url: str, clock: Clock) -> ForceTorqueSensor:
@@ -168,7 +170,7 @@ def _sensor(url: str, clock: Clock) -> ForceTorqueSensor:
 
 
 def _watch(device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:
-    """Collect from an open sensor, in pieces, for a `collect` is bounded; as measured, with the sign the sensor has."""
+    """Collect from an open sensor, in pieces because a `collect` is bounded; with the sensor's own sign."""
     pieces = math.ceil(duration_s / _PIECE_S)
     samples, total = 0, np.zeros(6)
     for _ in range(pieces):

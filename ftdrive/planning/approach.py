@@ -1,8 +1,8 @@
-"""The way from where the arm stands to the first pose: a straight joint move if it is clear, else through via-poses.
+"""The approach from the present posture to the first pose: a straight joint move if it is clear, else via-poses.
 
-Via-poses come from a roadmap that is proven lazily (Bohlin and Kavraki, Path planning using lazy PRM, ICRA 2000): the
-shortest way through free poses is found first, its moves are judged, and those not clear are taken off the map. All
-of it is deterministic.
+Via-poses come from a roadmap with lazy proofs (Bohlin and Kavraki, Path planning using lazy PRM, ICRA 2000). The
+shortest path through free poses is searched first, then its moves are certified, and moves that are not clear are
+removed from the roadmap. The result is deterministic.
 """
 
 from dataclasses import dataclass
@@ -20,25 +20,25 @@ from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_jo
 from ftdrive.planning.search.nodes import ELBOW_RAD
 
 NEAR_RAD = float(np.radians(30))
-"""A person jogs every joint so near to the first pose where the way is not proven, then lets a program take over."""
+"""If no approach is proven, the operator jogs every joint to within this angle of the first pose."""
 ROOM_RAD = np.radians([120.0, 90.0, 100.0, 120.0, 120.0, 0.0])
-"""How far via-poses may lie beyond what start and end span. Joint 6 needs no detour."""
+"""Via-poses may lie this far beyond the range between start and end. Joint 6 needs no detour."""
 AT_RAD = 1e-3
-"""An arm so near to the first pose stands there."""
+"""An arm within this angle of the first pose needs no approach."""
 STILL_RAD = float(np.radians(0.5))
 """A joint that turns less does not count as moving: no part of any arm moves by 20 mm."""
 NODES = 240
 NEIGHBOURS = 16
 ROUNDS = 80
-"""Of proving; the roadmap is given up afterwards, after about a second."""
+"""Maximum number of proof rounds, about a second; then the search gives up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """k moves, one after the other; the last ends at the first pose. None where the arm stands there already."""
+    """k consecutive moves that end at the first pose; k is 0 if the arm is there already."""
 
     way_rad: Array
-    """(k + 1, 6) from where the arm stands to the first pose; (0, 6) without a move."""
+    """(k + 1, 6) from the present posture to the first pose; (0, 6) without a move."""
     speed_rad_s: Array
     """(k,) of the leading joint of each move."""
     certified: bool
@@ -55,19 +55,19 @@ class Approach:
 
 
 def arm_moves(way_rad: ArrayLike) -> bool:
-    """Tell whether base, shoulder or elbow turn along a way (n, 6)."""
-    way = np.asarray(way_rad)
-    return len(way) > 0 and bool(np.ptp(way[:, :3], axis=0).max() >= STILL_RAD)
+    """Return whether base, shoulder or elbow turn along a path (n, 6)."""
+    path = np.asarray(way_rad)
+    return len(path) > 0 and bool(np.ptp(path[:, :3], axis=0).max() >= STILL_RAD)
 
 
 def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, speeds: Speeds) -> Approach:
-    """Plan the way to the first pose of a tour.
+    """Plan the approach to the first pose of a tour.
 
     Parameters
     ----------
     certifier : Certifier
     q_now : array_like, shape (6,)
-        Where the arm stands. Joints are taken as they are told, within one turn of zero: a way never crosses a limit.
+        Present joint angles as reported, within one turn of zero, so that no move crosses a joint limit.
     q_first : array_like, shape (6,)
         First pose of the tour.
     speeds : Speeds
@@ -79,31 +79,33 @@ def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, sp
     Raises
     ------
     PlanRefused
-        No way was proven clear: where to jog the arm is said.
+        No approach was proven clear; the message says where to jog the arm.
     """
     if np.abs(np.subtract(q_now, q_first)).max() < AT_RAD:
         return Approach(np.zeros((0, 6)), np.zeros(0), certified=True, clearance_m=np.inf, limited_by="")
     now, first = checked_joints(q_now), checked_joints(q_first)
     if certifier.certify(now, first, tight=False).clear[0]:
         return _approach(certifier, now, first[None], speeds)
-    stands = certifier.certify(now, now)
-    if not stands.clear[0]:
-        raise PlanRefused(_too_near(certifier, stands) + _where_to_jog(first))
+    here = certifier.certify(now, now)
+    if not here.clear[0]:
+        raise PlanRefused(_too_near(certifier, here) + _where_to_jog(first))
     if not certifier.free(first)[0]:
-        raise PlanRefused("the first pose of the plan is not clear here: make a new plan with `ftdrive plan`")
+        raise PlanRefused("the first pose of the plan is not clear in this cell: make a new plan with `ftdrive plan`")
     path = _through_roadmap(certifier, now, first, speeds)
     if path is None:
-        raise PlanRefused("no way from where the arm stands to the first pose is proven clear: " + _where_to_jog(first))
+        raise PlanRefused(
+            "no approach from the present posture to the first pose is proven clear: " + _where_to_jog(first)
+        )
     return _approach(certifier, now, path, speeds)
 
 
 def _approach(certifier: Certifier, now: Array, path: Array, speeds: Speeds) -> Approach:
-    way = np.vstack([now, path])
-    certificate = certifier.certify(way[:-1], path)
+    whole = np.vstack([now, path])
+    certificate = certifier.certify(whole[:-1], path)
     nearest = int(np.argmin(certificate.clearance_m))
     return Approach(
-        way,
-        speed_of_leading_joint(certifier.arm, way[:-1], path, speeds),
+        whole,
+        speed_of_leading_joint(certifier.arm, whole[:-1], path, speeds),
         bool(certificate.clear.all()),
         float(certificate.clearance_m[nearest]),
         certificate.limited_by[nearest],
@@ -111,7 +113,7 @@ def _approach(certifier: Certifier, now: Array, path: Array, speeds: Speeds) -> 
 
 
 def _through_roadmap(certifier: Certifier, now: Array, first: Array, speeds: Speeds) -> Array | None:
-    """Via-poses and the first pose (k, 6); None where no way was proven."""
+    """Via-poses and the first pose (k, 6); None if no path was proven."""
     nodes = _nodes(certifier, now, first)
     turn = np.abs(nodes[:, None] - nodes)
     cost = move_duration_s(turn.max(axis=2), speeds.joint_rad_s, speeds.joint_rad_s2) + 0.05 * turn.sum(axis=2)
@@ -124,7 +126,7 @@ def _through_roadmap(certifier: Certifier, now: Array, first: Array, speeds: Spe
     np.fill_diagonal(possible, val=False)
     proven = np.zeros_like(possible)
     for _ in range(ROUNDS):
-        # Two shortest-path trees give the best way through every node: a whole batch is judged at once.
+        # Two shortest-path trees give the best path through every node, so that a whole batch is certified at once.
         distance, before = dijkstra(
             np.where(possible, cost, 0.0), directed=False, indices=[0, 1], return_predecessors=True
         )
@@ -150,7 +152,7 @@ def _through_roadmap(certifier: Certifier, now: Array, first: Array, speeds: Spe
 
 
 def _nodes(certifier: Certifier, now: Array, first: Array) -> Array:
-    """Both ends, the corners of the box they span, and random poses in a larger one; all free."""
+    """Both ends, the corners of the box between them, and random poses in a larger box; all free."""
     corner = (np.arange(1, 63)[:, None] >> np.arange(6)) % 2 == 1
     limit = np.full(6, 2 * np.pi)
     limit[2] = max(ELBOW_RAD, abs(now[2]), abs(first[2]))
@@ -158,7 +160,7 @@ def _nodes(certifier: Certifier, now: Array, first: Array) -> Array:
     high = np.minimum(np.maximum(now, first) + ROOM_RAD, limit)
     spread = np.random.default_rng(0).uniform(low, high, (3 * NODES, 6))
     via = np.unique(np.vstack([np.where(corner, now, first), spread]), axis=0)
-    # Both ends may be given to the same digit in some joints: corners then fall together, or onto an end.
+    # Where some joints of both ends are equal, corners coincide with each other or with an end.
     via = via[(via != now).any(axis=1) & (via != first).any(axis=1)]
     away = np.maximum(np.abs(via - now), np.abs(via - first)).max(axis=1)
     via = via[np.argsort(away, kind="stable")]
@@ -166,21 +168,21 @@ def _nodes(certifier: Certifier, now: Array, first: Array) -> Array:
 
 
 def _walk(before: NDArray[np.int32], node: int) -> list[int]:
-    """Nodes from one back to the root of its tree; only itself where it is not reached."""
+    """Nodes from one back to the root of its tree; only the node itself if it is not reached."""
     way = [node]
     while before[way[-1]] >= 0:
         way.append(int(before[way[-1]]))
     return way
 
 
-def _too_near(certifier: Certifier, stands: Certificate) -> str:
-    found, margins = stands.limited_by[0], certifier.margins
-    within = stands.self_clearance_m[0] - margins.self_m < stands.scene_clearance_m[0] - margins.scene_m
+def _too_near(certifier: Certifier, here: Certificate) -> str:
+    found, margins = here.limited_by[0], certifier.margins
+    within = here.self_clearance_m[0] - margins.self_m < here.scene_clearance_m[0] - margins.scene_m
     distance, margin = (
-        (stands.self_clearance_m[0], margins.self_m) if within else (stands.scene_clearance_m[0], margins.scene_m)
+        (here.self_clearance_m[0], margins.self_m) if within else (here.scene_clearance_m[0], margins.scene_m)
     )
     return (
-        f"where the arm stands it is {1e3 * max(distance, 0.0):.0f} mm from contact ({found}), "
+        f"at its present posture the arm is {1e3 * max(distance, 0.0):.0f} mm from contact ({found}), "
         f"less than the margin of {1e3 * margin:.0f} mm: "
     )
 

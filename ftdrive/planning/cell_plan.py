@@ -1,4 +1,4 @@
-"""From a cell as its configuration describes it, in millimetres and degrees, to what judges moves in it, and a plan."""
+"""From a cell's configuration, in millimetres and degrees, to its speeds, its certifier and a plan."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,11 +17,11 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_box, plan_cone, plan_tour
 
 FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
-"""Nothing goes faster, whatever a plan, or the configuration of an old run, says."""
+"""No move is faster, whatever a plan or an old configuration contains."""
 
 
 def speeds_of(cell: CellConfig) -> Speeds:
-    """Give the speeds in force in a cell."""
+    """Return the speed limits of a cell."""
     robot = cell.robot
     joint_rad_s, joint_rad_s2 = np.radians([robot.speed_deg_s, robot.acceleration_deg_s2])
     return slower(Speeds(float(joint_rad_s), float(joint_rad_s2), robot.tip_speed_mm_s / 1e3), FASTEST)
@@ -37,7 +37,7 @@ def plan_for(
     box_mm: float | None = None,
     tip_unlimited: bool = False,
 ) -> Plan:
-    """Plan for a cell, with what `certifier_for` gives for it, where the arm stands at `q_rad` (6,).
+    """Plan a tour for a cell, with its certifier, from joint angles `q_rad` (6,).
 
     Raises as `plan_cone` with `cone_deg`, `plan_box` with `box_mm`, else `plan_tour`.
     """
@@ -59,18 +59,16 @@ def plan_for(
 def certifier_for(cell: CellConfig, model: str | None) -> Certifier:
     """Describe arm, tool and surroundings of a cell to the certifier.
 
-    Whether somebody has measured them is not asked here.
-
     Parameters
     ----------
     cell : CellConfig
     model : str or None
-        Of the arm, as the controller or the configuration tells it.
+        Model of the arm, as reported by the controller or configured.
 
     Raises
     ------
     ConfigError
-        Arm or tool are not named, a shape is impossible, the arm has no measured shape, or see `require_possible`.
+        The arm or tool is missing, a shape is impossible, the arm has no measured shape, or see `require_possible`.
     """
     if model is None:
         raise ConfigError("which arm? Give --model, or [robot] model in ftdrive.toml")
@@ -84,28 +82,28 @@ def certifier_for(cell: CellConfig, model: str | None) -> Certifier:
 
 
 def require_possible(cell: CellConfig, model: str | None) -> None:
-    """Refuse what no cell looks like: a tool shorter than its sensor, a plane or box with the arm itself inside.
+    """Reject impossible cells: a tool shorter than its sensor, a plane or box that contains the arm itself.
 
-    Judged is the shoulder, which no motion takes away: of what is refused here nothing could be proven clear. What is
-    at the base, such as a table around its plate, stays allowed.
+    The test uses the shoulder, because it is in the same place in every posture. Objects at the base, such as a table
+    around its plate, are allowed.
 
     Parameters
     ----------
     cell : CellConfig
-        Without cylinders the tool is not judged.
+        Without cylinders the tool is not checked.
     model : str or None
-        Of the arm; without a measured shape planes and boxes are not judged.
+        Model of the arm; without a measured shape, planes and boxes are not checked.
 
     Raises
     ------
     ConfigError
-        With the cylinders, plane or box, and what to do after the last colon.
+        The message names the cylinders, plane or box, and the fix after the last colon.
     """
     end_mm, height_mm = max((row[1] for row in cell.tool.cylinders_mm), default=np.inf), cell.sensor.height_mm
     if height_mm is not None and end_mm < height_mm:
         raise ConfigError(
             f"the tool ends {end_mm:g} mm from the flange, before the sensor's origin at {height_mm:g} mm ([sensor] "
-            "height_mm): describe all that is mounted, the sensor too, in mm from the flange"
+            "height_mm): describe everything that is mounted, including the sensor, in mm from the flange"
         )
     name = None if model is None else model_named(model, controller_major=0)
     if name not in SHAPES:
@@ -127,7 +125,7 @@ class _Shoulder:
         self._radius_m, self._margin_m = SHAPES[name].shoulder_radius_m, Margins().scene_m
 
     def against_plane(self, row: Sequence[float]) -> str:
-        """Say what is wrong with a plane, and what it may have been meant to be; empty if nothing is."""
+        """Return what is wrong with a plane and which plane was probably meant; empty if nothing is wrong."""
         gap_m, (x, y, z, place) = self._above_m(row), row
         if gap_m >= self._margin_m:
             return ""
@@ -136,13 +134,13 @@ class _Shoulder:
         if gap_m > -self._radius_m or not same:
             return self._too_near(f"the plane {_words(row)}", gap_m)
         return (
-            f"the arm's own {'base' if place > 0 else 'shoulder'} stands on the wrong side of the plane {_words(row)}, "
-            f"for the arm stays where normal times point is {place:g} mm or more: give {same} if the plane is there"
+            f"the arm's own {'base' if place > 0 else 'shoulder'} is on the wrong side of the plane {_words(row)}: "
+            f"the arm stays where normal times point is at least {place:g} mm: give {same} if the plane is there"
             + (f", {opposite} if it is on the other side of the base" if opposite else "")
         )
 
     def against_box(self, row: Sequence[float]) -> str:
-        """Say what is wrong with a box; empty if nothing is."""
+        """Return what is wrong with a box; empty if nothing is."""
         box = box_from_mm(row)
         away_m = float(np.linalg.norm(self._centre_m - np.clip(self._centre_m, box.low_m, box.high_m)))
         gap_m = away_m - self._radius_m
@@ -154,8 +152,8 @@ class _Shoulder:
 
     def _too_near(self, what: str, gap_m: float) -> str:
         return (
-            f"{what} is {1e3 * max(gap_m, 0.0):.0f} mm from the arm's shoulder, which no motion takes away, and "
-            f"{1e3 * self._margin_m:.0f} mm are kept: measure it again, in mm from the centre of the base, in its axes"
+            f"{what} is {1e3 * max(gap_m, 0.0):.0f} mm from the arm's shoulder, less than the margin of "
+            f"{1e3 * self._margin_m:.0f} mm in every posture: measure it again in base coordinates, in mm"
         )
 
 
@@ -164,12 +162,12 @@ def _words(row: Sequence[float]) -> str:
 
 
 def cylinder_from_mm(values: Sequence[float]) -> Cylinder:
-    """Read from, to, diameter, and x, y of an axis that stands aside."""
+    """Read from, to, diameter, and x, y of an axis beside the flange's."""
     return Cylinder(*_metres("a cylinder of the tool", "from, to, diameter, or these and x, y", values, (3, 5)))
 
 
 def plane_from_mm(values: Sequence[float]) -> Plane:
-    """Read a normal of any length, and the least offset along it."""
+    """Read a normal of any length, and the smallest allowed offset along it."""
     *normal, offset_m = _metres("a plane", "its normal and an offset", values, (4,))
     length = float(np.linalg.norm(normal))
     if not length:

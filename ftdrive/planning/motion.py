@@ -12,7 +12,7 @@ SAMPLE_RAD = np.radians(0.5)
 
 @dataclass(frozen=True, slots=True)
 class Speeds:
-    """Limits of every move: of the joint that turns farthest, and of the tips of the tool."""
+    """Limits of every move: for the joint that turns farthest, and for the tips of the tool."""
 
     joint_rad_s: float = float(np.radians(60))
     joint_rad_s2: float = float(np.radians(80))
@@ -21,12 +21,12 @@ class Speeds:
 
     @classmethod
     def first_run(cls) -> "Speeds":
-        """Give the slow limits for a plan that has not run in its workcell yet."""
+        """Return the slow limits for a plan that has not run in its workcell yet."""
         return cls(float(np.radians(30)), float(np.radians(40)))
 
 
 def slower(one: Speeds, other: Speeds) -> Speeds:
-    """Give the smaller of each limit."""
+    """Return the smaller of each limit."""
     return Speeds(
         min(one.joint_rad_s, other.joint_rad_s),
         min(one.joint_rad_s2, other.joint_rad_s2),
@@ -57,9 +57,9 @@ def speed_of_leading_joint(arm: ArmModel, start_rad: Array, end_rad: Array, spee
 
 
 def durations_s(arm: ArmModel, q_rad: Array, speeds: Speeds) -> Array:
-    """Duration (n, n) of straight moves between joint vectors (n, 6), to compare tours by.
+    """Duration (n, n) of straight moves between joint vectors (n, 6), to compare tours.
 
-    Tips are seen at both ends and in the middle of a move only: they may be a little faster than their limit here.
+    Tips are evaluated only at both ends and the middle of a move: their true speed may be a little higher.
     """
     turn = np.abs(q_rad[:, None] - q_rad).max(axis=2)
     speed = np.full(turn.shape, speeds.joint_rad_s)

@@ -1,4 +1,4 @@
-"""A plan: where the joints go, how fast, how clear of everything, what it will be worth, and what it was made for."""
+"""A plan: joint targets, speeds, clearances, predicted accuracy, and the cell that it was made for."""
 
 import hashlib
 import json
@@ -25,13 +25,13 @@ class Step:
     """One pose, and the move from it to the next one; the last move leads back to the first pose."""
 
     number: int
-    """Of the orientation in the paper, 1 to 24; from 101 on for chosen poses."""
+    """Number of the orientation in the paper, 1 to 24; from 101 on for chosen poses."""
     q_rad: tuple[float, ...]
     R_base_flange: tuple[tuple[float, ...], ...]
     turn_rad: float
-    """Of the leading joint in the move."""
+    """Turn of the leading joint in the move."""
     speed_rad_s: float
-    """Of the leading joint."""
+    """Speed of the leading joint."""
     duration_s: float
     certified: bool
     clearance_m: float
@@ -41,23 +41,23 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """See `to_dict` for the file."""
+    """A closed tour of poses; `to_dict` defines the file."""
 
     kind: str
     """constant, wrist, posture, box, cone or reachable."""
     why: tuple[str, ...]
-    """What was tried, and what the choice costs."""
+    """What was tried, and the loss of accuracy of this choice."""
     made_for: Mapping[str, str]
     """SHA-256 of model, tool, scene (with the margins)."""
     steps: tuple[Step, ...]
     acceleration_rad_s2: float
     ball_m: float
-    """Radius of a ball that all of the wrist and the tool stays in."""
+    """Radius of a ball that contains wrist and tool during the whole tour."""
     ball_centre_m: tuple[float, ...]
     """(3,) in base; where the axes of joints 4 and 5 cross, if base, shoulder and elbow rest."""
     predicted: Mapping[str, Any]
     description: Mapping[str, Any]
-    """Model, tool, scene and speeds in words and numbers; whether a person has `measured` them, see `marked`."""
+    """Model, tool, scene and speeds; `measured` says whether the operator has measured tool and scene, see `marked`."""
 
     @property
     def certified(self) -> bool:
@@ -66,20 +66,20 @@ class Plan:
 
     @property
     def arm_rests(self) -> bool:
-        """Whether base, shoulder and elbow stand still all along the tour."""
+        """Whether base, shoulder and elbow stay at rest during the whole tour."""
         return len({step.q_rad[:3] for step in self.steps}) == 1
 
     @property
     def measured(self) -> bool:
-        """Whether a person has said that tool and scene are as measured; else they may be placeholders."""
+        """Whether the operator has configured tool and scene as measured; else they may be placeholders."""
         return self.description.get("measured") is True
 
     def marked(self, *, measured: bool) -> "Plan":
-        """Say in the description, and so in the file and its hash, whether tool and scene were measured."""
+        """Record in the description, and so in the file and its hash, whether tool and scene were measured."""
         return replace(self, description={**self.description, "measured": measured})
 
     def to_dict(self) -> dict[str, Any]:
-        """Give the contents of the file; its hash over all the rest shows a change by hand."""
+        """Return the contents of the file; its hash over everything else reveals later changes."""
         document: dict[str, Any] = {
             "format": PLAN_FORMAT,
             "kind": self.kind,
@@ -107,7 +107,7 @@ class Plan:
 
     @classmethod
     def load(cls, path: Path) -> "Plan":
-        """Read a file; raises `BadPlan` for what is no plan, `PlanRefused` for one that was changed."""
+        """Read a file; raises `BadPlan` if it is not a plan, `PlanRefused` if it was changed."""
         try:
             document = read_object(path, BadPlan)
             check_format(document, PLAN_FORMAT, BadPlan)
@@ -153,21 +153,21 @@ def make_plan(
     speeds: Speeds,
     guess: Guess,
 ) -> Plan:
-    """Certify and price a closed tour through joint vectors (n, 6).
+    """Certify a closed tour through joint vectors (n, 6) and predict its accuracy.
 
     Parameters
     ----------
     kind : str
     why : sequence of str
-        Sentences; what the choice costs is added.
+        Sentences; the predicted error is appended.
     certifier : Certifier
     numbers : sequence of int
-        Of the orientations.
+        Numbers of the orientations.
     q_rad : array, shape (n, 6)
         In the order of travel.
     speeds : Speeds
     guess : Guess
-        Of the tool and the noise, for the prediction.
+        Expected tool and noise, for the prediction.
     """
     arm, following = certifier.arm, np.roll(q_rad, -1, axis=0)
     certificate: Certificate = certifier.certify(q_rad, following)
@@ -220,7 +220,7 @@ def make_plan(
 
 
 def _ball(certifier: Certifier, start_rad: Array, end_rad: Array) -> tuple[Array, float]:
-    """Centre (3,) and radius of a ball that holds the wrist and the tool all along the moves."""
+    """Centre (3,) and radius of a ball that contains wrist and tool during all moves."""
     share = np.linspace(0, 1, BALL_SAMPLES)[:, None, None]
     wrist_m = certifier.arm.frames(((1 - share) * start_rad + share * end_rad).reshape(-1, 6)).wrist_m
     centre_m = (wrist_m.min(axis=0) + wrist_m.max(axis=0)) / 2
@@ -231,7 +231,7 @@ def _ball(certifier: Certifier, start_rad: Array, end_rad: Array) -> tuple[Array
 
 
 def fingerprints(certifier: Certifier) -> dict[str, str]:
-    """SHA-256 of all that a proof of clearance rests on."""
+    """SHA-256 of everything that a proof of clearance depends on."""
     return {
         "model": digest(certifier.arm.describe()),
         "tool": digest([asdict(part) for part in certifier.arm.tool]),
@@ -245,7 +245,7 @@ def digest(value: Any) -> str:
 
 
 def _as_json(prediction: Prediction) -> dict[str, Any]:
-    """One standard deviation of each estimate; null where the poses do not tell."""
+    """Sigma of each estimate; null if the poses do not determine it."""
     values: dict[str, Any] = {name: np.asarray(sigma).tolist() for name, sigma in prediction.sigma.items()}
     for name in ("force_rms_N", "torque_rms_Nm", "cond9", "cond_u1", "second_basin_gap"):
         values[name] = getattr(prediction, name)

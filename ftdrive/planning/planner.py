@@ -1,7 +1,7 @@
-"""The choice of a plan: the constant tour where it fits, else what comes next, and why.
+"""Chooses a plan and states the reason: the constant tour if it fits, else the next best kind.
 
-All 24 orientations come before anything else, for they tell most; of the ways to reach them, those that keep base,
-shoulder and elbow at rest; where they are out of reach, the most telling poses that are not.
+All 24 orientations are preferred because they are the most informative. Tours that keep base, shoulder and elbow at
+rest come first. If some orientations are out of reach, the most informative reachable poses replace them.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,7 +26,7 @@ from ftdrive.planning.search.postures import with_room
 from ftdrive.planning.search.tours import clear_tour
 
 USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
-"""Where all models have room for the constant tour with usual tools; the wrist is at its first pose."""
+"""All models have room for the constant tour here with usual tools; the wrist is at its first pose."""
 NUMBERS = {24: tuple(range(1, 25)), 12: T12, 6: SUBSET_6}
 BOX_HALF_SIZE_M = 0.1
 FEWEST_CHOSEN = 6
@@ -36,7 +36,7 @@ Found = tuple[Sequence[int], Array]
 
 
 def guess_of(certifier: Certifier, mass_kg: float | None = None) -> Guess:
-    """Expect a tool of this mass, its centre half way down, noise of an averaged pose, and gravity as mounted."""
+    """Return a prior: this tool mass, centre of mass at half the tool length, usual noise, gravity as mounted."""
     length_m = max(part.to_m for part in certifier.arm.tool)
     return Guess(mass_kg or USUAL_KG, 0.05, 0.003, (0.0, 0.0, length_m / 2), tilt_beta_rad=certifier.scene.lean_rad)
 
@@ -44,13 +44,13 @@ def guess_of(certifier: Certifier, mass_kg: float | None = None) -> Guess:
 def plan_tour(
     certifier: Certifier, q_rad: ArrayLike = USUAL_POSTURE_RAD, poses: int = 24, *, speeds: Speeds, guess: Guess
 ) -> Plan:
-    """Plan a tour of the special orientations if there is one, else of the most telling poses in reach.
+    """Plan a tour of the special orientations if one exists, else of the most informative reachable poses.
 
     Parameters
     ----------
     certifier : Certifier
     q_rad : array_like, shape (6,)
-        Where the arm stands.
+        Present joint angles.
     poses : {24, 12, 6}
     speeds : Speeds
     guess : Guess
@@ -64,43 +64,45 @@ def plan_tour(
     Raises
     ------
     PlanRefused
-        There is no tour whose moves are all proven clear.
+        No tour has only moves that are proven clear.
     """
-    stands = checked_joints(q_rad)
+    q_now = checked_joints(q_rad)
     numbers = _numbers(poses)
 
     def made(kind: str, why: Sequence[str], found: Found) -> Plan:
         return make_plan(kind, why, certifier, *found, speeds, guess)
 
     if poses == 24:
-        if (found := _constant(certifier, stands)) is not None:
-            why = ["The constant tour is proven clear where the arm stands; base, shoulder and elbow stay at rest."]
+        if (found := _constant(certifier, q_now)) is not None:
+            why = ["The constant tour is proven clear at the present posture; base, shoulder and elbow stay at rest."]
             return made("constant", why, found)
-        reason = "The constant tour cannot be proven clear where the arm stands"
+        reason = "The constant tour cannot be proven clear at the present posture"
     else:
-        reason = f"{poses} of the 24 orientations were asked for"
-    if (found := _wrist(certifier, stands, numbers, speeds)) is not None:
-        why = [f"{reason}: the wrist visits them in the order that is fastest here, base, shoulder and elbow at rest."]
+        reason = f"{poses} of the 24 orientations were requested"
+    if (found := _wrist(certifier, q_now, numbers, speeds)) is not None:
+        why = [f"{reason}: the wrist visits them in the fastest order that is clear, base, shoulder and elbow at rest."]
         return made("wrist", why, found)
-    for tour in _clear_tours(certifier, stands):
+    for tour in _clear_tours(certifier, q_now):
         elsewhere: Found | None = constant_tour.NUMBERS, tour
-        if poses != 24 or not _winds_little(tour, stands):
-            elsewhere = _wrist(certifier, np.append(tour[0, :5], stands[5]), numbers, speeds)
+        if poses != 24 or not _winds_little(tour, q_now):
+            elsewhere = _wrist(certifier, np.append(tour[0, :5], q_now[5]), numbers, speeds)
         if elsewhere is not None:
             return made(
-                "posture", [f"{reason}, and the wrist alone finds no way there.", _elsewhere_words(tour[0])], elsewhere
+                "posture",
+                [f"{reason}, and the wrist alone has no clear tour there.", _elsewhere_words(tour[0])],
+                elsewhere,
             )
-    nowhere = f"{reason}, and no posture of joints 1 to 3 that was tried lets the wrist alone visit the orientations."
-    for centre_m in _box_centres(certifier, stands):
-        if (found := _box(certifier, stands, numbers, centre_m, BOX_HALF_SIZE_M, speeds)) is not None:
+    nowhere = f"{reason}, and the wrist alone has no clear tour at any posture of joints 1 to 3 that was tried."
+    for centre_m in _box_centres(certifier, q_now):
+        if (found := _box(certifier, q_now, numbers, centre_m, BOX_HALF_SIZE_M, speeds)) is not None:
             return made("box", [nowhere, _box_words(centre_m, BOX_HALF_SIZE_M)], found)
-    chosen = chosen_tour(certifier, stands, poses, np.pi, speeds, guess)
+    chosen = chosen_tour(certifier, q_now, poses, np.pi, speeds, guess)
     if chosen is not None:
-        why = ["Not all of the orientations are in reach: the poses that tell most among those that are.", nowhere]
+        why = ["Some orientations are out of reach: these are the most informative reachable poses.", nowhere]
         return made("reachable", [*why, *_chosen_words(chosen)], (chosen.numbers, chosen.q_rad))
     raise PlanRefused(
-        f"{reason}, and neither another posture, nor room for the flange, nor other poses give a tour that is proven "
-        "clear and different enough to estimate everything: describe the tool more closely, or free the scene"
+        f"{reason}. Another posture, a box for the flange, and other poses were tried: no tour of them is proven clear "
+        "and informative enough to estimate everything. Describe the tool more closely, or clear the surroundings"
     )
 
 
@@ -119,7 +121,7 @@ def plan_cone(
     ----------
     certifier : Certifier
     q_rad : array_like, shape (6,)
-        Where the arm stands.
+        Present joint angles.
     poses : int
         6 or more.
     half_angle_rad : float
@@ -135,20 +137,20 @@ def plan_cone(
     Raises
     ------
     PlanRefused
-        There is no tour whose moves are all proven clear.
+        No tour has only moves that are proven clear.
     """
-    stands = checked_joints(q_rad)
+    q_now = checked_joints(q_rad)
     if not (0 < half_angle_rad <= np.pi and poses >= FEWEST_CHOSEN):
         raise ConfigError(
             f"a cone of {np.degrees(half_angle_rad):g} degrees with {poses} poses cannot be planned: give above 0 to "
             f"180 degrees, and {FEWEST_CHOSEN} poses or more"
         )
-    chosen = chosen_tour(certifier, stands, poses, half_angle_rad, speeds, guess)
+    chosen = chosen_tour(certifier, q_now, poses, half_angle_rad, speeds, guess)
     if chosen is None:
         raise PlanRefused(
-            f"{poses} poses with the tool within {np.degrees(half_angle_rad):.0f} degrees of straight down are not "
-            "in reach of the wrist, not different enough to estimate everything, or no tour of them is proven "
-            "clear: widen the cone, or stand elsewhere"
+            f"no tour of {poses} poses with the tool within {np.degrees(half_angle_rad):.0f} degrees of straight down "
+            "is reachable, proven clear and informative enough to estimate everything: widen the cone, or jog the arm "
+            "to another posture"
         )
     why = [f"The tool axis stays within {np.degrees(half_angle_rad):.0f} degrees of straight down."]
     return make_plan("cone", [*why, *_chosen_words(chosen)], certifier, chosen.numbers, chosen.q_rad, speeds, guess)
@@ -170,12 +172,12 @@ def plan_box(
     ----------
     certifier : Certifier
     q_rad : array_like, shape (6,)
-        Where the arm stands.
+        Present joint angles.
     poses : {24, 12, 6}
     half_size_m : float
         Half the length of the edges of the box, which are along the base axes.
     centre_m : array_like, shape (3,), optional
-        Of the box, in base; where the flange is if not given.
+        Centre of the box, in base; default: the present flange position.
     speeds : Speeds
     guess : Guess
 
@@ -187,13 +189,13 @@ def plan_box(
     Raises
     ------
     PlanRefused
-        There is no tour whose moves are all proven clear.
+        No tour has only moves that are proven clear.
     """
-    stands = checked_joints(q_rad)
+    q_now = checked_joints(q_rad)
     if not 0 <= half_size_m <= 1:
         raise ConfigError(f"the box is {1e3 * half_size_m:g} mm to each side: give 0 to 1000")
-    centre = certifier.arm.frames(stands).flange_m[0] if centre_m is None else np.asarray(centre_m, dtype=np.float64)
-    found = _box(certifier, stands, _numbers(poses), centre, half_size_m, speeds)
+    centre = certifier.arm.frames(q_now).flange_m[0] if centre_m is None else np.asarray(centre_m, dtype=np.float64)
+    found = _box(certifier, q_now, _numbers(poses), centre, half_size_m, speeds)
     if found is None:
         raise PlanRefused(
             f"with the flange within {1e3 * half_size_m:.0f} mm of {_point(centre)} not all {poses} orientations are "
@@ -204,7 +206,7 @@ def plan_box(
 
 def _numbers(poses: int) -> tuple[int, ...]:
     if poses not in NUMBERS:
-        raise ConfigError(f"a plan of {poses} poses is not known: take {', '.join(map(str, NUMBERS))}")
+        raise ConfigError(f"a plan of {poses} poses does not exist: choose {', '.join(map(str, NUMBERS))}")
     return NUMBERS[poses]
 
 
@@ -213,9 +215,9 @@ def _constant(certifier: Certifier, q_rad: Array) -> Found | None:
     return (constant_tour.NUMBERS, q) if _winds_little(q, q_rad) and certifier.clear_around(q) else None
 
 
-def _winds_little(q_rad: Array, stands: Array) -> bool:
-    """Say whether joint 6 stays in its window about where it stands."""
-    return bool(np.abs(q_rad[:, 5] - stands[5]).max() <= WRIST_6_RAD + 1e-9)
+def _winds_little(q_rad: Array, q_now: Array) -> bool:
+    """Return whether joint 6 stays in its window around its present angle."""
+    return bool(np.abs(q_rad[:, 5] - q_now[5]).max() <= WRIST_6_RAD + 1e-9)
 
 
 def _wrist(certifier: Certifier, q_rad: Array, numbers: Sequence[int], speeds: Speeds) -> Found | None:
@@ -239,7 +241,7 @@ def _box(
 
 
 def _box_centres(certifier: Certifier, q_rad: Array) -> Array:
-    """Where the flange is, and where it would be in the usual posture with this pan."""
+    """Flange positions (2, 3): the present one, and that of the usual posture at this pan angle."""
     usual = np.array([q_rad[0], *USUAL_POSTURE_RAD[1:]])
     return certifier.arm.frames([q_rad, usual]).flange_m
 
@@ -251,21 +253,19 @@ def _at_pan(q_rad: Array, numbers: Sequence[int]) -> Array:
 
 def _chosen_words(chosen: Chosen) -> list[str]:
     lost = chosen.force_rms_N / chosen.ideal_force_rms_N
-    words = [
-        f"Their predicted error is {lost:.2f} times that of the poses that would be best if the arm reached every one."
-    ]
+    words = [f"Their predicted error is {lost:.2f} times that of the best poses without limits of reach."]
     return [*words, _elsewhere_words(chosen.q_rad[0])] if chosen.elsewhere else words
 
 
 def _elsewhere_words(q_rad: Array) -> str:
     first = np.degrees(q_rad[:3]).round().astype(int).tolist()
-    return f"With joints 1 to 3 at {first} degrees there is a tour: the way there is not part of the plan."
+    return f"A tour exists with joints 1 to 3 at {first} degrees; the approach to them is not part of the plan."
 
 
 def _box_words(centre_m: Array, half_size_m: float) -> str:
     return (
-        f"The flange goes where it has room within {1e3 * half_size_m:.0f} mm of {_point(centre_m)}: base, shoulder "
-        "and elbow move too, and the whole arm needs its room."
+        f"The flange stays within {1e3 * half_size_m:.0f} mm of {_point(centre_m)}: base, shoulder and elbow move too, "
+        "and the whole arm needs clear space."
     )
 
 

@@ -14,7 +14,7 @@ from ftdrive.runs.run import Run, versions
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What a session leaves."""
+    """A solved run."""
 
     run: Run
     dataset: CalibrationDataset
@@ -23,7 +23,7 @@ class Outcome:
 
 
 def solve_and_save(run: Run) -> Outcome:
-    """Solve a run from its files, not from memory: what is on disk is then enough to repeat it."""
+    """Solve a run from its files, so that the files suffice to repeat it."""
     outcome = solve_records(run, run.records())
     outcome.dataset.save(run.new_path("dataset"))
     if outcome.result.verdict != "rejected":

@@ -1,4 +1,4 @@
-"""What probably happened at poses that fit badly, in words that name them."""
+"""Probable causes of poses that fit badly."""
 
 from collections.abc import Sequence
 
@@ -22,9 +22,9 @@ def names_of(records: Sequence[PoseRecord]) -> tuple[str, ...]:
 
 
 def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[str, ...]:
-    """Explain what stands out, most important first, then what the controller should be told otherwise.
+    """Explain outlying poses, most important first, then controller settings that differ from the result.
 
-    Nothing is said of a quiet run of a level arm that knows its payload.
+    Empty for a quiet run of a level arm whose controller has the right payload.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def _out_of_line(result: CalibrationResult) -> list[int]:
 
 
 def _sigma(result: CalibrationResult) -> Array:
-    """(6,) noise of a pose: as measured, or as the typical residual says where that is more."""
+    """(6,) noise of a pose: as measured, or the typical residual if that is larger."""
     typical = 1.4826 * np.median(np.abs(result.residuals), axis=0)
     least = np.zeros(6) if result.measured_sigma is None else result.measured_sigma
     return np.maximum(np.maximum(typical, least), 1e-9)
@@ -105,7 +105,7 @@ def _pulled(result: CalibrationResult, row: int) -> bool:
 
 
 def _lasting_change(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Change, int] | None:
-    """Find what changed for good, and the row of the first pose after it; poses count as they were taken."""
+    """Find a lasting change, and the row of the first pose after it, in the order of taking."""
     if result.measured_sigma is None:
         return None
     t_ns = np.array([record.t_mid_ns for record in records])

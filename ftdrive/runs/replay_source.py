@@ -1,11 +1,12 @@
-"""A recorded run played back to the routine, in place of an arm and a sensor."""
+"""A recorded run that replaces arm and sensor in the routine."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from calib.model import Array
 from calib.ports import ArmReading, WrenchSamples
-from calib.routine import Array, PoseRecord
+from calib.routine import PoseRecord
 
 
 class RecordedRun:
@@ -27,7 +28,7 @@ class RecordedRun:
         self._collected = False
 
     def state(self) -> ArmReading:
-        """Look at the arm as it was before or after the samples."""
+        """Return the state before or after the samples."""
         record = self._records[self._stop]
         return record.after if self._collected else record.before
 
@@ -37,4 +38,4 @@ class RecordedRun:
         return self._records[self._stop].samples
 
     def check(self) -> None:
-        """Find nothing wrong: a recording cannot fail."""
+        """Do nothing: a recording cannot fail."""

@@ -1,4 +1,4 @@
-"""A run folder: what was planned, every pose with its raw samples, and what came of it.
+"""A run folder: the plan, every pose with its raw samples, and the results.
 
 run.json          ftdrive.run/1: when, with what, command line, versions, configuration, devices
 plan.json         ftdrive.plan/1: the plan the arm followed; not where a person moved it
@@ -43,13 +43,13 @@ RECORDING_FORMAT = "ftdrive.recording/1"
 
 _RESTORE = "take it from a copy"
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
-"""What numpy raises for a file with wrong bytes in it."""
+"""Errors of numpy for a damaged file."""
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 """Of a recording, named as in `FtSamples`."""
 
 Array = NDArray[np.float64]
 Mode = Literal["auto", "step", "manual", "listen"]
-"""How a session goes on from pose to pose."""
+"""How a session moves from pose to pose."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,12 +113,12 @@ class Run:
 
     @property
     def resume_command(self) -> str:
-        """What to type to go on with it."""
+        """Command that continues the run."""
         return f"ftdrive calibrate --resume {shlex.quote(str(self.folder))}"
 
     @property
     def solve_command(self) -> str:
-        """What to type to solve the poses that are there."""
+        """Command that solves the poses taken."""
         return f"ftdrive solve {shlex.quote(str(self.folder))}"
 
     def new_path(self, name: str) -> Path:
@@ -134,7 +134,7 @@ class Run:
                 os.fsync(file.fileno())
 
     def events(self) -> Iterator[Mapping[str, Any]]:
-        """Read events.ndjson; a line that was broken off, as by a power cut, counts for nothing."""
+        """Read events.ndjson; a line cut off by a power failure is ignored."""
         path = self.folder / "events.ndjson"
         for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
             try:
@@ -145,7 +145,7 @@ class Run:
                 yield event
 
     def header(self) -> Mapping[str, Any]:
-        """Read run.json; raises `BadDataset` when it is not one."""
+        """Read run.json; raises `BadDataset` if it is damaged."""
         path = self.folder / "run.json"
         if not path.exists():
             raise BadDataset(f"{self.folder} is not a run folder: it has no run.json")
@@ -160,10 +160,10 @@ class Run:
         return _Whole(path, header)
 
     def header_to_resume(self) -> Mapping[str, Any]:
-        """Read run.json; raises `BadDataset`, also where a plan was followed and is lost."""
+        """Read run.json; raises `BadDataset` also if the plan of the run is lost."""
         header = self.header()
         for section, key in (("robot", "host"), ("sensor", "url")):
-            header["config"][section][key]  # tells where it is missing
+            header["config"][section][key]  # raises if it is missing
         if header.get("mode", "auto") in ("auto", "step") and not self.plan_path.is_file():
             raise BadDataset(
                 f"{self.plan_path} is lost, and without its plan a run cannot go on: {_RESTORE}, or solve the poses "
@@ -172,7 +172,7 @@ class Run:
         return header
 
     def commit(self, record: PoseRecord) -> None:
-        """Put one pose on disk; returns when it is safe."""
+        """Write one pose; returns when it is on disk."""
         buffer = io.BytesIO()
         readings: dict[str, Any] = {
             f"{when}_{name}": np.asarray(getattr(reading, name))
@@ -193,11 +193,11 @@ class Run:
         write_new(_next(self.folder / "poses" / f"{record.stop:02d}.npz"), buffer.getvalue())
 
     def records(self) -> list[PoseRecord]:
-        """Read every pose back, in the order of the tour; of one that was taken again, the last time."""
+        """Read every pose, in the order of the tour; of a pose taken again, the newest."""
         return [_read_record(_newest(self.folder / "poses" / f"{stop:02d}.npz")) for stop in self.stops()]
 
     def stops(self) -> list[int]:
-        """Tell which places of the tour are taken, without reading them."""
+        """Return the stops taken, without reading them."""
         names = {path.stem.partition("-")[0] for path in (self.folder / "poses").glob("*.npz")}
         return sorted(int(name) for name in names if name.isdecimal())
 
@@ -232,7 +232,7 @@ _KINDS: Mapping[str, _Kind] = {
     "station.sensor": _TEXT,
     "station.options": _TEXTS,
 }
-"""What the fields of run.json that somebody reads must be, where they are there; those of config: `recorded`."""
+"""Types of the fields of run.json; `recorded` checks those of config."""
 
 
 def _require_kinds(header: Mapping[str, Any]) -> None:
@@ -246,7 +246,7 @@ def _require_kinds(header: Mapping[str, Any]) -> None:
 
 
 class _Whole(dict[str, Any]):
-    """An object of run.json that says which file is damaged where something is missing."""
+    """An object of run.json; a missing key raises an error that names the file."""
 
     def __init__(self, path: Path, content: Mapping[str, Any]) -> None:
         super().__init__(
@@ -305,6 +305,6 @@ def _record(data: Mapping[str, Any]) -> PoseRecord:
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that had a part in a result."""
+    """Return the versions of the software behind a result."""
     found = {"ftdrive": __version__, "python": platform.python_version(), "platform": platform.platform()}
     return found | {name: version(name) for name in ("numpy", "scipy", "python-can", "pyserial")}

@@ -1,4 +1,4 @@
-"""What a session tells while it runs: the screen shows these, `--json` writes them, the run folder keeps them."""
+"""Events of a session: the screen shows them, `--json` writes them, the run folder keeps them."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -19,7 +19,7 @@ SCHEMA_VERSION = 1
 
 
 class State(StrEnum):
-    """Where a session is. Any guard leads from anywhere to STOP, then HOLD, where a person decides."""
+    """State of a session. A trip leads from any state to STOP, then HOLD, where the operator decides."""
 
     IDLE = "idle"
     PREFLIGHT = "preflight"
@@ -39,12 +39,12 @@ def _now() -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Event:
-    """Anything a session tells."""
+    """Base of all events."""
 
     t_utc: str = field(default_factory=_now)
 
     def to_dict(self) -> dict[str, Any]:
-        """Give what `--json` writes, one object a line; arrays become lists, NaN and infinity null."""
+        """Return what `--json` writes, one object a line; arrays become lists, NaN and infinity null."""
         name = "".join(f"-{c.lower()}" if c.isupper() else c for c in type(self).__name__).lstrip("-")
         return {"schema_version": SCHEMA_VERSION, "event": name} | {
             key: _plain(value) for key, value in asdict(self).items()
@@ -53,7 +53,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RunOpened(Event):
-    """There is a run folder; every pose from here on is kept in it."""
+    """A run folder is open; it keeps every pose from now on."""
 
     folder: str
     resume: str
@@ -62,7 +62,7 @@ class RunOpened(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StateChanged(Event):
-    """The session is in another state."""
+    """The session has entered a state."""
 
     state: State
     stop: int | None = None
@@ -71,37 +71,37 @@ class StateChanged(Event):
     number: int | None = None
     """Of the orientation."""
     words: str = ""
-    """Why, for STOP and HOLD; else what happens or is to be done."""
+    """The cause, for STOP and HOLD; else what happens or what to do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Checked(Event):
-    """A preflight check."""
+    """Result of a preflight check."""
 
     name: str
     passed: bool
     words: str
-    """What was found; for one that failed, what to do."""
+    """What was found; for a failed check, what to do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Planned(Event):
-    """Every motion that is about to happen; told before anything is asked."""
+    """Every motion to come; shown before any question."""
 
     plan: Plan
     """Its file's contents in `to_dict`."""
     way_rad: Array
-    """(k + 1, 6) joint vectors from where the arm stands to the first pose to be taken; (0, 6) where it is there."""
+    """(k + 1, 6) joint vectors from where the arm stands to the first pose; (0, 6) if it stands there."""
     way_words: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Give what `--json` writes, with the plan as its file has it."""
+        """Return what `--json` writes, with the plan as in its file."""
         return Event.to_dict(self) | {"plan": self.plan.to_dict()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Noted(Event):
-    """Something a person should know that has no form of its own."""
+    """A note for the operator without a type of its own."""
 
     words: str
     warning: bool = False
@@ -130,7 +130,7 @@ class PoseTaken(Event):
     def of(
         cls, record: PoseRecord, down_base: Array, *, stops: int, settle_s: float, average_s: float, attempts: int
     ) -> "PoseTaken":
-        """Tell a record that is on disk; `down_base` (3,) is the unit vector down in base, as it is mounted."""
+        """Describe a record on disk; `down_base` (3,) is the unit vector down in base, as mounted."""
         return cls(
             stop=record.stop,
             stops=stops,
@@ -148,7 +148,7 @@ class PoseTaken(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Estimated(Event):
-    """The running fit over the poses so far. Before it is possible, only the coverage is told."""
+    """The running fit over the poses so far; only the coverage before a fit is possible."""
 
     poses: int
     values: Mapping[str, Any]
@@ -166,14 +166,14 @@ class Estimated(Event):
     empty_cap_deg: float
     """Largest angle from any direction of gravity to the nearest one seen."""
     light: str
-    """green, amber or red: is what was seen enough?"""
+    """green, amber or red: whether the poses suffice."""
     hint: str
-    """The next pose that would help most, in words; empty when the light is green, or the arm is not moved by hand."""
+    """The most useful next pose, in words; empty if the light is green or the arm is not moved by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Weighed(Event):
-    """The running fit can be trusted: what hangs on the sensor, beside what the controller was told."""
+    """The running fit is reliable: the identified mass, beside the payload set on the controller."""
 
     mass_kg: float
     """Of what the sensor carries, so without sensor and adapter."""
@@ -182,37 +182,37 @@ class Weighed(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GuardTripped(Event):
-    """A guard has stopped the arm; told after it was stopped."""
+    """A guard has stopped the arm."""
 
     hazard: int
     """Row of the hazard table."""
     words: str
-    """What was seen, with the value, and what to do next."""
+    """What was found, with the value, and what to do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Asked(Event):
-    """A question that the session does not go on without, and its answer."""
+    """A question and its answer."""
 
     question: str
     answer: str
     by: Literal["person", "--yes"]
-    """Who answered: whoever was asked, or nobody but the option, which takes what the question assumes."""
+    """Who answered: the operator, or the option, which gives the assumed answer."""
 
 
-class Witness:
-    """Tells what a sensor has been through, each thing once: interruptions, connections that came back."""
+class SensorEvents:
+    """Shows each event of a sensor once, such as interruptions and reconnections."""
 
     def __init__(self, sensor: ForceTorqueSensor, show: Callable[[Event], None]) -> None:
         self._sensor, self._show = sensor, show
-        self._told = 0
+        self._shown = 0
 
     def show_new(self) -> None:
-        """Tell what has happened since the last time."""
+        """Show the events since the last call."""
         events = self._sensor.health().events
-        for t_host_ns, words in events[self._told :]:
+        for t_host_ns, words in events[self._shown :]:
             self._show(Noted(words=f"sensor: {words} (host clock {t_host_ns / 1e9:.3f} s)", warning=True))
-        self._told = len(events)
+        self._shown = len(events)
 
 
 def _plain(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What a tour will be like before it begins: how fast, how long, and what it is worth with the noise of this sensor."""
+"""Forecast of a tour: its speeds, its duration, and its accuracy with the noise of this sensor."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 def at_most(plan: Plan, certifier: Certifier, speeds: Speeds) -> Plan:
-    """Give a plan as it is driven where these limits hold: it may have been made for others."""
+    """Return a plan with its speeds reduced to these limits."""
     q = np.array([step.q_rad for step in plan.steps])
     allowed = speed_of_leading_joint(certifier.arm, q, np.roll(q, -1, axis=0), speeds)
     steps = (
@@ -31,7 +31,7 @@ def at_most(plan: Plan, certifier: Certifier, speeds: Speeds) -> Plan:
 
 
 def moves_s(plan: Plan, todo: Sequence[int], q_rad: Array, approach: Approach) -> float:
-    """How long the arm is on its way: the approach from `q_rad` to the first stop, then moves of the plan to the rest.
+    """Return the time of all moves: the approach from `q_rad` to the first stop, then moves of the plan to the rest.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def moves_s(plan: Plan, todo: Sequence[int], q_rad: Array, approach: Approach) -
 
 
 def prediction(plan: Plan, certifier: Certifier, mass_kg: float | None, average_s: float, sigma: Array) -> str:
-    """Say what a plan's poses give.
+    """Describe the accuracy that a plan's poses give.
 
     Parameters
     ----------
@@ -73,9 +73,9 @@ def prediction(plan: Plan, certifier: Certifier, mass_kg: float | None, average_
     force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (sigma[:3], sigma[3:]))
     guess = replace(guess_of(certifier, mass_kg), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
     found = predicted_sigma(np.array([step.R_base_flange for step in plan.steps]), guess)
-    assumed = "" if mass_kg else " (assumed: [tool] mass_kg is not told)"
+    assumed = "" if mass_kg else " (assumed: [tool] mass_kg is not set)"
     return (
-        f"this sensor's averages of {average_s:g} s are good to {force_N:.2g} N, {torque_Nm:.2g} N·m; predicted from "
+        f"sigma of {average_s:g} s averages: {force_N:.2g} N, {torque_Nm:.2g} N·m; predicted from "
         f"that for {guess.mass_kg:g} kg{assumed}, one sigma: mass {1e3 * float(found.sigma['mass_kg']):.2g} g, force "
         f"bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
         f"{found.torque_rms_Nm:.2g} N·m"

@@ -1,7 +1,7 @@
-"""What is watched while the arm is under control, row by row of the hazard table; `watchdog.py` has the thread.
+"""Guards that watch the arm under control, by rows of the hazard table; `watchdog.py` runs them in a thread.
 
-A guard looks at one `Seen` and raises `Tripped`. None of them is a safety function: that is the safety system of the
-robot and the user's risk assessment. README.md lists every row, where it is watched and which test injects it.
+A guard judges one `Seen` and raises `Tripped`. No guard is a safety function: safety is the task of the robot's safety
+system and the user's risk assessment. README.md lists every row, its guard and the test that injects it.
 """
 
 from abc import ABC, abstractmethod
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from drivers.errors import DeviceFault, DeviceTimeout, DriverError
 from drivers.interfaces import ArmState, ArmStatus
 from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.session.hazards import Hazard
 
 Array = NDArray[np.float64]
 
@@ -23,22 +24,27 @@ AXES: Final = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 
 class Tripped(Exception):
-    """A guard does not let the session go on; `error` says why, `hazard` is the row of the hazard table."""
+    """Raised by a guard that stops the session; `error` is the cause, `hazard` the row of the hazard table."""
 
-    def __init__(self, hazard: int, error: Exception) -> None:
+    def __init__(self, hazard: Hazard, error: Exception) -> None:
         super().__init__(str(error))
         self.hazard = hazard
         self.error = error
 
 
+def fault(hazard: Hazard, *words: str) -> Tripped:
+    """Return a trip for a `DeviceFault` with these words."""
+    return Tripped(hazard, DeviceFault(*words))
+
+
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Where the guards trip; the numbers of the hazard table."""
+    """Limits at which the guards trip; the numbers of the hazard table."""
 
     frozen_rad: float = float(np.radians(0.5))
-    """For joints that should not move at all."""
+    """Allowed motion of joints that should rest."""
     tracking_rad: float = float(np.radians(2.0))
-    """From the straight line in joint space."""
+    """Allowed distance of a moving joint from the straight line in joint space."""
     flange_m: float = 0.005
     flange_rad: float = float(np.radians(0.5))
     sensor_age_moving_s: float = 0.1
@@ -50,32 +56,32 @@ class Limits:
     contact_Nm: float = 0.8
     contact_sigmas: float = 5.0
     unknown_N: float = 15.0
-    """Beside twice the heaviest tool's weight, as long as the tool is not known."""
+    """Added to twice the heaviest tool's weight while the tool is unknown."""
     unknown_Nm: float = 1.5
     low_pass_Hz: float = 20.0
     skew_s: float = 0.03
-    """How far the times of pose and wrench may be apart."""
+    """Largest time between a pose and the wrench compared with it."""
     stalled_s: float = 10.0
     look_s: float = 0.01
     """Period of the guards."""
     counted_s: float = 0.02
-    """Of the time between two looks, so much counts: when this process gets no time, nothing else is late."""
+    """Longest time between two looks that counts: if this process gets no CPU time, nothing else is late."""
     aside_s: float = 0.05
-    """Between two looks for a stop of the safety system, while nothing else is watched."""
+    """Period of the look for a stop of the safety system while the guards rest."""
     blind_s: float = 1.0
-    """Nobody presses a stop, releases it and has the arm ready again in less."""
+    """The operator needs longer to press a stop, release it and make the arm ready again."""
     hung_s: float = 1.0
-    """Guards that have not looked for so long do not watch."""
+    """Guards that have not looked for this time count as hung."""
     slow_stop_s: float = 0.2
-    """A stop that takes longer is reported meanwhile. An arm that answers brakes from 60 deg/s in 0.26 s."""
+    """A stop that takes longer is reported before it ends. An arm that answers brakes from 60 deg/s in 0.26 s."""
     link_usual_s: float = 0.02
-    """Until the arm answers, as a rule. 8 ms of it are the wait for the next sample."""
+    """Usual time until the arm answers. The wait for the next sample takes 8 ms of it."""
     link_asked_s: float = 0.04
-    """On top of it where a controller reports its TCP only to a program, which is asked twice: 24 ms if all is well."""
+    """Added for a controller that reports its TCP only to a program, which is asked twice: usually 24 ms."""
     link_gap_s: float = 0.1
-    """Until the arm answers, nine times in ten."""
+    """Time within which nine answers in ten arrive."""
     program_ends_s: float = 1.5
-    """What a session that was killed has left on the controller ends by itself within 0.5 s."""
+    """The program of a killed session ends by itself within 0.5 s."""
 
     @classmethod
     def emulated(cls) -> Self:
@@ -85,7 +91,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """What the arm should be doing: a straight move in joint space, or to stand."""
+    """The expected motion: a straight move in joint space, or standing."""
 
     start_rad: Array
     goal_rad: Array
@@ -94,12 +100,12 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """One look at everything."""
+    """One look at arm and sensor."""
 
     t_s: float
     """Of the guards' own clock."""
     dt_s: float
-    """Since the look before, counted as the guards count silence."""
+    """Since the previous look; at most `Limits.counted_s`."""
     motion: Motion
     state: ArmState
     status: ArmStatus
@@ -108,14 +114,14 @@ class Seen:
     sample: int
     """Its running number."""
     turn_rad_s: float
-    """How fast the flange turned between this look and the one before."""
+    """Angular speed of the flange between the previous look and this one."""
 
 
 class Guard(ABC):
-    """One row, or a few that are seen the same way."""
+    """Watches one row of the hazard table, or several rows with the same signal."""
 
     def begin(self, seen: Seen) -> None:
-        """Take the first look of a session, or after a person let it go on, as what is normal."""
+        """Take this look as normal: the first of a session, or the first after the operator resumes."""
         del seen  # most compare with the plan alone
 
     @abstractmethod
@@ -125,7 +131,7 @@ class Guard(ABC):
 
 @dataclass
 class PathGuard(Guard):
-    """Rows 2 and 21: the joints stay on the straight line to the goal, and those that should rest do."""
+    """Rows 2 and 21: moving joints stay on the straight line to the goal, the others rest."""
 
     limits: Limits
 
@@ -143,21 +149,19 @@ class PathGuard(Guard):
         joint = int(np.argmax(off / allowed))
         words = f"joint {joint + 1} is {np.degrees(off[joint]):.1f}° from where it should be"
         if motion.moving:
-            raise Tripped(
-                2,
-                DeviceFault(
-                    f"{words} on the way (allowed: {np.degrees(allowed[joint]):.1f}°): look what holds the arm"
-                ),
+            raise fault(
+                Hazard.SELF_COLLISION,
+                f"{words} on the way (allowed: {np.degrees(allowed[joint]):.1f}°): find what holds the arm",
             )
-        raise Tripped(
-            21,
-            DeviceFault(f"{words} while the arm should stand: something else moves it; end that, then go on"),
+        raise fault(
+            Hazard.OTHER_CLIENT,
+            f"{words} while the arm should stand, so something else moves it: stop that, then resume",
         )
 
 
 @dataclass
 class StallGuard(Guard):
-    """Row 22: a slow arm is waited for, one that stands still on its way is not."""
+    """Row 22: a slow arm is allowed, an arm that stands still during a move is not."""
 
     limits: Limits
     _nearest_rad: float = field(default=np.inf, init=False)
@@ -174,18 +178,18 @@ class StallGuard(Guard):
         self._still_s += seen.dt_s
         if self._still_s > self.limits.stalled_s and left > 1e-3:
             raise Tripped(
-                22,
+                Hazard.STALL,
                 DeviceTimeout(
                     f"the arm has not come nearer to its goal for {self._still_s:.0f} s (speed slider "
                     f"{100 * seen.status.speed_slider:.0f} %, scaling {100 * seen.status.speed_scaling:.0f} %): set "
-                    "the slider at the pendant, or look what holds the arm"
+                    "the slider at the pendant, or find what holds the arm"
                 ),
             )
 
 
 @dataclass
 class ModelGuard(Guard):
-    """Rows 8 and 9: the flange is where this model has it with these joint angles."""
+    """Rows 8 and 9: the reported flange pose matches the kinematics of the arm model."""
 
     limits: Limits
     certifier: Certifier
@@ -201,18 +205,16 @@ class ModelGuard(Guard):
         cosine = (np.trace(at.R_base_flange[0].T @ state.R_base_flange) - 1) / 2
         away_rad = float(np.arccos(np.clip(cosine, -1, 1)))
         if away_m > self.limits.flange_m or away_rad > self.limits.flange_rad:
-            raise Tripped(
-                8,
-                DeviceFault(
-                    f"the flange is {1e3 * away_m:.1f} mm and {np.degrees(away_rad):.2f}° from where a "
-                    f"{self.certifier.arm.name} has it: check the model and the active TCP"
-                ),
+            raise fault(
+                Hazard.WRONG_TCP,
+                f"the flange is {1e3 * away_m:.1f} mm and {np.degrees(away_rad):.2f}° from where a "
+                f"{self.certifier.arm.name} should have it: check the model and the active TCP",
             )
 
 
 @dataclass
 class SettingsGuard(Guard):
-    """Rows 7 and 8: nobody changes payload or TCP meanwhile."""
+    """Rows 7 and 8: payload and TCP stay as they were at the start."""
 
     _before: ArmStatus | None = field(default=None, init=False)
 
@@ -226,21 +228,19 @@ class SettingsGuard(Guard):
         if before is None:
             return
         if _changed(before.tcp_offset, now.tcp_offset):
-            raise Tripped(
-                8,
-                DeviceFault(f"the active TCP was set to {_rounded(now.tcp_offset)}: find out what did, then go on"),
+            raise fault(
+                Hazard.WRONG_TCP,
+                f"the active TCP was changed to {_rounded(now.tcp_offset)}: find what changed it, then resume",
             )
-        for what, was, told in (
+        for what, was, reported in (
             ("payload in kg", before.payload_kg, now.payload_kg),
             ("centre of the payload in m", before.p_flange_payload_m, now.p_flange_payload_m),
         ):
-            if _changed(was, told):
-                raise Tripped(
-                    7,
-                    DeviceFault(
-                        f"the controller's {what} was changed from {_rounded(was)} to {_rounded(told)}: find out what "
-                        "set it, then go on"
-                    ),
+            if _changed(was, reported):
+                raise fault(
+                    Hazard.WRONG_PAYLOAD,
+                    f"the controller's {what} was changed from {_rounded(was)} to {_rounded(reported)}: find "
+                    "what set it, then resume",
                 )
 
 
@@ -251,7 +251,7 @@ class SafetyGuard(Guard):
     _mode: str | None = field(default=None, init=False)
 
     def begin(self, seen: Seen) -> None:
-        """Remember the safety mode: normal, or reduced as a person accepted it."""
+        """Remember the safety mode: normal, or reduced if the operator accepted it."""
         self._mode = seen.status.safety_mode
 
     def look(self, seen: Seen) -> None:
@@ -260,23 +260,21 @@ class SafetyGuard(Guard):
         if status.fault is not None:
             raise by_safety(status, f"the arm stopped: {status.fault}")
         if self._mode is not None and status.safety_mode != self._mode:
-            raise Tripped(
-                12,
-                DeviceFault(f"the safety mode changed from {self._mode} to {status.safety_mode}: see the pendant"),
+            raise fault(
+                Hazard.SAFETY_MODE,
+                f"the safety mode changed from {self._mode} to {status.safety_mode}: check the pendant",
             )
         if status.program != "playing":
-            raise Tripped(
-                21,
-                DeviceFault(
-                    f"the control program is {status.program}: somebody else has ended or paused it; leave the arm to "
-                    "this program, then go on"
-                ),
+            raise fault(
+                Hazard.OTHER_CLIENT,
+                f"the control program is {status.program}: another client ended or paused it; leave the arm to "
+                "this program, then resume",
             )
 
 
 @dataclass
 class SensorGuard(Guard):
-    """Row 15: samples keep coming, and differ."""
+    """Row 15: samples keep arriving, and differ."""
 
     limits: Limits
     _sample: int = field(default=-1, init=False)
@@ -291,9 +289,9 @@ class SensorGuard(Guard):
         self._wrench, self._same_s, self._same = None, 0.0, 0
 
     def look(self, seen: Seen) -> None:
-        """Count silence and sameness."""
+        """Time how long no sample arrives, or all are the same."""
         if not np.isfinite(seen.wrench).all():
-            raise Tripped(15, DeviceFault(f"the sensor says {seen.wrench.tolist()}: check its cable and supply"))
+            raise fault(Hazard.SENSOR_LOST, f"the sensor sent {seen.wrench.tolist()}: check its cable and supply")
         if seen.sample == self._sample:
             self._silent_s += seen.dt_s
         else:
@@ -301,8 +299,8 @@ class SensorGuard(Guard):
         allowed = self.limits.sensor_age_moving_s if seen.motion.moving else self.limits.sensor_age_holding_s
         if self._silent_s > allowed:
             raise Tripped(
-                15,
-                DeviceTimeout(f"the sensor has been silent for {self._silent_s:.2f} s: check its cable and supply"),
+                Hazard.SENSOR_LOST,
+                DeviceTimeout(f"the sensor has sent no sample for {self._silent_s:.2f} s: check its cable and supply"),
             )
         if self._wrench is not None and np.array_equal(seen.wrench, self._wrench):
             self._same_s, self._same = self._same_s + seen.dt_s, self._same + 1
@@ -310,15 +308,14 @@ class SensorGuard(Guard):
             self._same_s, self._same = 0.0, 0
         self._wrench = seen.wrench
         if self._silent_s == 0 and self._same > 10 and self._same_s > self.limits.frozen_samples_s:
-            raise Tripped(
-                15,
-                DeviceFault(f"the sensor repeats one reading for {self._same_s:.2f} s: restart it, then go on"),
+            raise fault(
+                Hazard.SENSOR_LOST, f"the sensor repeats one reading for {self._same_s:.2f} s: restart it, then resume"
             )
 
 
 @dataclass
 class RangeGuard(Guard):
-    """Row 13: no axis near the end of its range. Without a known range the device's own status has to tell."""
+    """Row 13: no axis comes near the end of its range. If the range is unknown, only the device's status shows it."""
 
     limits: Limits
     range: Array | None
@@ -335,46 +332,44 @@ class RangeGuard(Guard):
         share = (np.abs(wrench) / self.range).reshape(-1, 6).max(axis=0)
         if share.max() > self.limits.saturation:
             axis = int(share.argmax())
-            raise Tripped(
-                13,
-                DeviceFault(
-                    f"the sensor reads {100 * share[axis]:.0f} % of its range in {AXES[axis]}: "
-                    "take the load off; a lighter or shorter tool may be needed"
-                ),
+            raise fault(
+                Hazard.OVERLOAD,
+                f"the sensor reads {100 * share[axis]:.0f} % of its range in {AXES[axis]}: "
+                "take the load off, or use a lighter or shorter tool",
             )
 
 
 @dataclass
 class ContactGuard(Guard):
-    """Rows 14 and 1: nothing but the tool's weight on the sensor."""
+    """Rows 14 and 1: the sensor carries only the tool's weight."""
 
     limits: Limits
     heaviest_kg: float
-    """A tool cannot weigh more."""
+    """Mass of the heaviest possible tool."""
     lever_m: float
-    """Nor reach farther."""
+    """Largest reach of a tool."""
     acceleration_rad_s2: float
     quiet_std: Array
     """(6,) of the samples of a resting sensor."""
     predict: Callable[[Array], Array | None] = lambda _: None
-    """Wrench of a free tool at an orientation, once it is known."""
+    """Return the wrench of a free tool at an orientation; None while it is unknown."""
     _start: Array | None = field(default=None, init=False)
     _sample: int = field(default=-1, init=False)
     _residual: Array | None = field(default=None, init=False)
     _turns_rad_s: list[float] = field(default_factory=list, init=False)
 
     def begin(self, seen: Seen) -> None:
-        """Take what is felt first as the free tool, and nothing later: it may push still when a person resumes."""
+        """Take the first wrench as that of the free tool; after a stop the contact may still be there."""
         if self._start is None:
             self._start = seen.wrench
         self._residual = None
 
     def forget(self) -> None:
-        """Take what is felt next as the free tool: the sensor was opened again, and its zero may be another."""
+        """Take the next wrench as that of the free tool: a reopened sensor may have another zero."""
         self._start = None
 
     def look(self, seen: Seen) -> None:
-        """Compare with the running fit; before there is one, with what any tool could weigh."""
+        """Compare with the running fit; before there is one, with the weight of the heaviest tool."""
         self._turns_rad_s = [*self._turns_rad_s[-3:], seen.turn_rad_s]
         if seen.sample == self._sample:
             return
@@ -405,40 +400,39 @@ class ContactGuard(Guard):
         five = self.limits.contact_sigmas * self.quiet_std
         limit_N = max(self.limits.contact_N, float(np.linalg.norm(five[:3]))) + allowance_N
         limit_Nm = max(self.limits.contact_Nm, float(np.linalg.norm(five[3:]))) + allowance_N * self.lever_m
-        self._trip(self._residual, limit_N, limit_Nm, "is", "from what the free tool weighs")
+        self._trip(self._residual, limit_N, limit_Nm, "is", "from the weight of the free tool")
 
     @staticmethod
     def _trip(wrench: Array, limit_N: float, limit_Nm: float, verb: str, than: str) -> None:
         force_N, torque_Nm = float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
         if force_N > limit_N or torque_Nm > limit_Nm:
-            raise Tripped(
-                14,
-                DeviceFault(
-                    f"unexpected contact: the wrench {verb} {force_N:.1f} N, {torque_Nm:.2f} N·m {than} (allowed: "
-                    f"{limit_N:.1f} N, {limit_Nm:.2f} N·m); look at tool, cables and whoever is near, then go on"
-                ),
+            raise fault(
+                Hazard.CONTACT,
+                f"unexpected contact: the wrench {verb} {force_N:.1f} N, {torque_Nm:.2f} N·m {than} (allowed: "
+                f"{limit_N:.1f} N, {limit_Nm:.2f} N·m); check the tool, the cables and people nearby, then resume",
             )
 
 
-def out_of_sight(error: DriverError, *, moving: bool) -> Tripped:
-    """Row 16: nobody sees the arm any more. On its way it may not hear the stop either."""
+def arm_lost(error: DriverError, *, moving: bool) -> Tripped:
+    """Row 16: the arm reports no state. An arm in a move may not receive the stop either."""
     if not moving:
-        return Tripped(16, error)
+        return Tripped(Hazard.CONTROLLER_LOST, error)
     found = (
-        f"{error.found}; the arm was told to stop, but may not have heard it: then it ends the one move it was given, "
+        f"{error.found}; a stop was sent, but the arm may not have heard it: then it ends the one move it was given, "
         "which is proven clear, and goes no further"
     )
-    return Tripped(16, type(error)(found, error.cure))
+    return Tripped(Hazard.CONTROLLER_LOST, type(error)(found, error.cure))
 
 
 def by_safety(status: ArmStatus, words: str) -> Tripped:
-    """Rows 7, 10, 11 and 12: the safety system has stopped the arm, and `words` say so."""
+    """Rows 7, 10, 11 and 12: the safety system has stopped the arm, as `words` report."""
     mode = status.safety_mode
     if mode == "protective stop":
-        told = "" if status.payload_kg is None else f" (it was told {status.payload_kg:.2f} kg)"
-        words += f"; usual causes are contact, and a controller with a wrong payload or centre of mass{told}"
-        return Tripped(10, DeviceFault(words))
-    return Tripped(11 if "emergency" in mode or "safeguard" in mode else 12, DeviceFault(words))
+        payload = "" if status.payload_kg is None else f" (payload set: {status.payload_kg:.2f} kg)"
+        words += f"; usual causes are contact, and a controller with a wrong payload or centre of mass{payload}"
+        return fault(Hazard.PROTECTIVE_STOP, words)
+    stopped = "emergency" in mode or "safeguard" in mode
+    return Tripped(Hazard.EMERGENCY_STOP if stopped else Hazard.SAFETY_MODE, DeviceFault(words))
 
 
 def _changed(before: Any, now: Any) -> bool:

@@ -1,11 +1,11 @@
-"""Poses that somebody else takes the arm to: a person, by hand or pendant, or a program that runs on the pendant.
+"""Poses to which the operator moves the arm, by hand or pendant, or a program on the pendant.
 
-Nothing here commands the arm, which may be open for reading only. Each time it has stood still for a second at an
-orientation that is new, the sensor is averaged and the pose is put on disk.
+Nothing here commands the arm, which may be open for reading only. Each time the arm has stood still for 1 s at a new
+orientation, the sensor is averaged and the pose is written to disk.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import degrees, radians
 from typing import Final, Protocol, TypeVar
 
@@ -29,41 +29,54 @@ from ftdrive.session.events import (
     Estimated,
     Noted,
     PoseTaken,
+    SensorEvents,
     State,
     StateChanged,
-    Witness,
 )
 from ftdrive.session.operator import Key, Operator
 
 STILL_S: Final = 1.0
-"""On the controller's clock. (Its own `is_steady` is of no use here: in freedrive it is always false.)"""
+"""On the controller's clock, because the controller's `is_steady` is always false in freedrive."""
 STILL_RAD_S: Final = 0.002
 LEFT_RAD: Final = radians(1)
-"""Closer than this to where it was, the arm was nudged, not moved."""
+"""A smaller turn counts as a nudge, not as a move."""
 REPEAT_RAD: Final = radians(10)
 RETURN_RAD: Final = radians(0.1)
-"""A program comes back to its first pose as exactly as this."""
+"""A program returns to its first pose within this angle."""
 LOOK_S: Final = 0.1
 BACK_S: Final = 12.0
 """A driver that may recover gives up after 10 s."""
 SURPRISE_SIGMA: Final = 5.0
 SURPRISE_N: Final = 0.5
-"""A pose that differs from the others by both was probably touched."""
+"""A pose that differs from the fit of the others by both was probably touched."""
 LEAST_TO_COMPARE: Final = 6
-"""Poses with this one."""
+"""Number of poses, the new one included."""
 
 
 T = TypeVar("T")
 
 
 class WatchedArm(Protocol):
-    """An arm to look at: nothing here could command it."""
+    """An arm that can only be read."""
 
     def state(self) -> ArmState:
         """Read a fresh state, or raise."""
 
     def status(self) -> ArmStatus:
-        """Tell the controller's modes, or raise."""
+        """Read the controller's modes, or raise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorder:
+    """What happens to each pose."""
+
+    estimate: Callable[[PoseRecord], Estimated]
+    """Takes each pose, in place of one with the same stop; judges whether the poses suffice, and gives a hint.
+    `Running.add` of `ftdrive.session.live_fit`."""
+    commit: Callable[[PoseRecord], None]
+    """Takes each record and returns when it is safe on disk; one with the `stop` of an earlier one replaces it."""
+    earlier: Sequence[PoseRecord] = ()
+    """Poses of the resumed run; `estimate` takes them too."""
 
 
 def collect_manually(
@@ -71,37 +84,29 @@ def collect_manually(
     sensor: ForceTorqueSensor,
     sampling: Sampling,
     operator: Operator,
-    estimate: Callable[[PoseRecord], Estimated],
-    commit: Callable[[PoseRecord], None],
+    recorder: Recorder,
     *,
     down_base: Array,
     listen: bool,
-    earlier: Sequence[PoseRecord] = (),
     clock: Clock = REAL,
 ) -> None:
     """Take poses until there are enough, in place of a tour.
 
     Keys: keep ends it once the light is green; stop ends it at once; redo takes the newest pose again, where the arm
-    stands or is moved to next; skip leaves out where it stands; pause, and pause again. A key is heard within the time
-    of an average. Where the operator has no keys, it ends with the first good pose that finds the light green.
+    stands or is moved to next; skip leaves out the pose where it stands; pause pauses and resumes. A key takes effect
+    within the time of an average. Without keys, it ends with the first good pose that finds the light green.
 
     Parameters
     ----------
     arm, sensor
-        Open; the arm for reading. A sensor with `recover` is waited for when its stream was interrupted.
-    estimate : callable
-        Is given each pose, in place of one with the same stop; judges whether they are enough, and says what would
-        help. `Running.add` of `ftdrive.session.live_fit`.
-    commit : callable
-        Takes each record and returns when it is safe on disk; one with the `stop` of an earlier one replaces it.
+        Open; the arm for reading. An interrupted sensor with `recover` may reconnect.
+    recorder : Recorder
     down_base : array, shape (3,)
-        Unit vector down in base, as it is mounted.
+        Unit vector down in base, as mounted.
     listen : bool
-        A program moves the arm: no advice on where to move it. Poses are taken from its start to its end, or until it
-        comes back to its first pose when there are enough. That return is committed too and serves
-        `calib.routine.drift_check`. A program that passes its first pose before is followed to its end.
-    earlier : sequence of PoseRecord
-        Poses of the run that is continued; `estimate` is given them too.
+        A program moves the arm, so no pose is suggested. Poses are taken from its start to its end, or until it
+        returns to its first pose when there are enough. That return is committed too and serves
+        `calib.routine.drift_check`. A program that passes its first pose earlier is followed to its end.
     clock : Clock
         Of the cell; an emulated one waits for this thread, which must see each standstill.
 
@@ -118,7 +123,7 @@ def collect_manually(
         Whatever the arm or the sensor raises; the poses committed so far stand.
     """
     with clock.keeping_up():
-        _Collection(arm, sensor, sampling, operator, estimate, commit, clock, down_base, listen, earlier).run()
+        _Collection(arm, sensor, sampling, operator, recorder, clock, down_base, listen).run()
 
 
 class _Collection:
@@ -128,45 +133,42 @@ class _Collection:
         sensor: ForceTorqueSensor,
         sampling: Sampling,
         operator: Operator,
-        estimate: Callable[[PoseRecord], Estimated],
-        commit: Callable[[PoseRecord], None],
+        recorder: Recorder,
         clock: Clock,
         down_base: Array,
         listen: bool,
-        earlier: Sequence[PoseRecord],
     ) -> None:
         self._arm, self._sensor, self._sampling = arm, sensor, sampling
-        self._witness = Witness(sensor, operator.show)
-        self._operator, self._estimate, self._commit = operator, estimate, commit
+        self._sensor_events = SensorEvents(sensor, operator.show)
+        self._operator, self._recorder = operator, recorder
         self._clock, self._down_base, self._listen = clock, down_base, listen
-        self._earlier = earlier
         self._taken: dict[int, PoseRecord] = {}
         self._level: Array | None = None
         self._redo: int | None = None
         self._light = "red"
         self._paused = False
         self._rests_at: ArmState | None = None
-        """Where the arm came to rest; None while it moves."""
+        """Where the arm stopped; None while it moves."""
         self._still_since_s = 0.0
         self._dealt_with = False
         """Whether the pose where the arm rests was taken or left out."""
         self._program_ran = False
         self._program = ""
-        """As the controller tells it while listening; empty before its start."""
-        self._passes_first = bool(earlier)
-        """Whether the program comes to its first pose on its way; one that is started again does."""
+        """State of the program, as the controller reports it; empty before its start."""
+        self._passes_first = bool(recorder.earlier)
+        """Whether the program passes its first pose before its end, as a restarted one does."""
         self._fault: str | None = None
         self._over = False
         self._ends_by_itself = not (listen or operator.has_keys)
         self._enough = False
-        """Whether the light is green and the newest pose casts no doubt."""
+        """Whether the light is green and the newest pose is good."""
 
     def run(self) -> None:
         self._greet()
-        for record in self._earlier:
+        for record in self._recorder.earlier:
             self._learn(record)
         if self._ends_by_itself and self._enough:
-            self._note("The poses that are there are enough: it ends with the next one.")
+            self._note("The poses of the run suffice: it ends with the next one.")
         self._show_state(State.MOVE)
         while not self._over:
             state = self._ask(self._arm.state)
@@ -180,15 +182,15 @@ class _Collection:
                 self._end("The program has ended")
 
     def _ask(self, arm: Callable[[], T]) -> T:
-        """Ask the arm; nothing of ours moves it, so its silence is waited out, as a sensor's is."""
+        """Read the arm; wait if it does not answer, because ftdrive does not move it."""
         try:
             return arm()
         except DeviceTimeout as silence:
-            self._note(f"Nothing is measured until the arm is heard again: {silence.found}.", warning=True)
+            self._note(f"Nothing is measured until the arm answers again: {silence.found}.", warning=True)
         return self._wait_out(arm, DeviceTimeout)
 
     def _collect(self, duration_s: float) -> FtSamples | None:
-        """Samples of the time to come; None when they were interrupted and the driver has the sensor back."""
+        """Collect samples; None if the stream was interrupted and the driver has reconnected."""
         try:
             samples = self._sensor.collect(duration_s)
         except (StreamBroken, DeviceTimeout):
@@ -197,11 +199,11 @@ class _Collection:
             self._wait_out(self._sensor.check, StreamBroken, DeviceTimeout)
             return None
         finally:
-            self._witness.show_new()
+            self._sensor_events.show_new()
         return samples
 
     def _collect_enough(self) -> FtSamples | None:
-        """Samples of one pose, collected again for longer where they are too few; None as in `_collect`."""
+        """Collect the samples of one pose, for longer if there are too few; None as in `_collect`."""
         for times in LONGER:
             average_s = times * self._sampling.average_s
             if (found := self._collect(average_s)) is None:
@@ -213,7 +215,7 @@ class _Collection:
         return samples
 
     def _wait_out(self, ask: Callable[[], T], *losses: type[DriverError]) -> T:
-        """Ask until there is an answer, for some seconds."""
+        """Repeat until an answer arrives, for `BACK_S` at most."""
         deadline_s = self._clock.now_s() + BACK_S
         while True:
             try:
@@ -221,11 +223,11 @@ class _Collection:
             except losses:
                 if self._clock.now_s() > deadline_s:
                     raise
-            self._witness.show_new()
+            self._sensor_events.show_new()
             self._clock.sleep(LOOK_S)
 
     def _may_measure(self) -> bool:
-        """Tell whether a standstill now is one to measure at."""
+        """Whether a standstill now may be measured."""
         status = self._ask(self._arm.status)
         fault = str(status.fault or "")
         if fault and fault != self._fault:
@@ -237,7 +239,7 @@ class _Collection:
         return not (self._paused or self._fault) and (not self._listen or self._program in {"playing", "stopped"})
 
     def _at_rest(self, state: ArmState) -> bool:
-        """Tell whether the arm has stood still long enough at a place that was not dealt with."""
+        """Whether the arm has stood still long enough at a pose that was neither taken nor left out."""
         still = float(np.abs(state.qd_rad_s).max()) < STILL_RAD_S
         if self._rests_at is not None and turned_rad(self._rests_at, state) > LEFT_RAD:
             self._rests_at = None
@@ -257,7 +259,7 @@ class _Collection:
         return False
 
     def _take(self, state: ArmState) -> None:
-        """Deal with the pose where the arm stands: take it, or say why not."""
+        """Take the pose where the arm stands, or show why not."""
         others = {stop: turned_rad(record.before, state) for stop, record in self._taken.items() if stop != self._redo}
         nearest = min(others, key=others.__getitem__, default=0)
         first = min(self._taken, default=0)
@@ -282,7 +284,7 @@ class _Collection:
             self._end("These poses are enough")
 
     def _measure(self, stop: int, number: int, *, settle_s: float) -> bool:
-        """Average, again while something is not quiet, and keep the pose; False when the arm moved on."""
+        """Average until the samples are quiet, and keep the pose; False if the arm moved."""
         for attempt in range(1, self._sampling.attempts + 1):
             self._show_state(State.SAMPLE)
             before = self._ask(self._arm.state)
@@ -302,7 +304,7 @@ class _Collection:
             again = "; press r to take it again" if self._operator.has_keys else ""
             advice = f"It is kept and marked{again}." if last else "Let go of tool and cable."
             self._note(f"Pose {stop} is not quiet: {unrest}. {advice}", warning=True)
-        self._obey_keys()  # pressed while this one was not yet shown: r means the one before
+        self._obey_keys()  # r pressed before this pose is shown means the previous one
         if self._over or self._paused or self._dealt_with:
             return False
         if self._redo is not None:
@@ -312,7 +314,7 @@ class _Collection:
         return True
 
     def _keep(self, record: PoseRecord, settle_s: float, attempts: int) -> None:
-        self._commit(record)
+        self._recorder.commit(record)
         self._redo = None
         self._operator.show(
             PoseTaken.of(
@@ -328,7 +330,7 @@ class _Collection:
         self._deal_with()
 
     def _deal_with(self) -> None:
-        """Be done with where the arm stands, and say so: the state must not go on as if something were measured."""
+        """Finish the pose where the arm stands, and show it: nothing is measured there any more."""
         self._dealt_with = True
         words = "the program goes on" if self._listen else "move on to another orientation"
         if self._may_finish:
@@ -337,24 +339,24 @@ class _Collection:
 
     @property
     def _may_finish(self) -> bool:
-        """Whether all that is left to do is to press k."""
+        """Whether the operator may end with k."""
         return self._light == "green" and not (self._listen or self._ends_by_itself)
 
     def _learn(self, record: PoseRecord) -> None:
-        """Take in what a pose that is on disk tells, and tell it."""
+        """Add a pose on disk to the estimate, and show it."""
         self._taken[record.stop] = record
-        if record.steady:  # the quietest tell how much the sensor scatters when left alone
+        if record.steady:  # the quietest pose gives the scatter of the untouched sensor
             std = record.samples.wrench.std(axis=0, ddof=1)
             self._level = std if self._level is None else np.minimum(self._level, std)
-        estimated = self._estimate(record)
+        estimated = self._recorder.estimate(record)
         self._operator.show(replace(estimated, hint="") if self._listen else estimated)
         sigmas, force_N = estimated.residual_sigma or 0.0, estimated.residual_force_N or 0.0
         touched = estimated.poses >= LEAST_TO_COMPARE and sigmas > SURPRISE_SIGMA and force_N > SURPRISE_N
         if touched:
             again = " and press r to take the pose again" if self._operator.has_keys else ""
             self._note(
-                f"Pose {record.stop} is {force_N:.1f} N from what the others tell: if something touched the tool, free "
-                f"it{again}.",
+                f"Pose {record.stop} is {force_N:.1f} N from the fit of the others: if something touched the tool, "
+                f"free it{again}.",
                 warning=True,
             )
         self._enough = estimated.light == "green" and record.steady and not touched
@@ -363,7 +365,7 @@ class _Collection:
         self._light = estimated.light
 
     def _unrest(self, samples: FtSamples) -> str:
-        """Say what is not quiet; empty when all is."""
+        """Describe what is not quiet; empty if all is."""
         if self._level is not None:
             for c in np.flatnonzero(restless_channels(samples.wrench, self._level)):
                 found, unit = samples.wrench[:, c].std(ddof=1), "N" if c < 3 else "N·m"
@@ -402,7 +404,7 @@ class _Collection:
                 f"of them let go of the tool and {self._hold_still()}."
             )
         if self._ends_by_itself:
-            self._note("It ends by itself, and solves, once the coverage is green; Ctrl-C ends it before.")
+            self._note("It ends and solves once the coverage is green. Press Ctrl-C to end it earlier.")
 
     def _hold_still(self) -> str:
         seconds = STILL_S + self._sampling.average_s + 3 * LOOK_S

@@ -1,4 +1,4 @@
-"""Where the session talks to the person and keeps its diary."""
+"""Sends every event of a session to the operator and to the run folder."""
 
 import logging
 import threading
@@ -12,12 +12,12 @@ log = logging.getLogger(__name__)
 
 
 class Journal:
-    """The person, and the diary: every event goes to both, from any thread, one at a time.
+    """Shows and records every event, one at a time, from any thread.
 
     Parameters
     ----------
     yes : bool
-        Take what questions assume, where they assume something; the person is asked the others.
+        Give the assumed answer of questions that have one; the operator answers the others.
     """
 
     def __init__(self, operator: Operator, *, yes: bool = False) -> None:
@@ -27,7 +27,7 @@ class Journal:
         self._early: list[Event] = []
 
     def keep_in(self, run: Run) -> None:
-        """Write what was told so far, and all that follows, into the run."""
+        """Record in the run, starting with the events so far."""
         with self._lock:
             self._run = run
             for event in self._early:
@@ -36,7 +36,7 @@ class Journal:
         self.show(RunOpened(folder=str(run.folder), resume=run.resume_command), sync=True)
 
     def show(self, event: Event, *, sync: bool = False) -> None:
-        """Show and keep an event."""
+        """Show and record an event."""
         with self._lock:
             self._operator.show(event)
             if self._run is None:
@@ -44,26 +44,26 @@ class Journal:
                 return
             try:
                 self._run.append_event(event.to_dict(), sync=sync)
-            except OSError as error:  # the poses' own files say so where it matters
+            except OSError as error:  # a pose that cannot be written raises
                 log.warning("events.ndjson cannot be written: %s", error)
 
     def ask(self, question: Question) -> str:
-        """Ask, and keep the answer, and who gave it."""
+        """Ask; record the answer and who gave it."""
         assumed = question.assumed if self._yes else None
         answer = self._operator.ask(question) if assumed is None else assumed
         self.show(Asked(question=question.text, answer=answer, by="person" if assumed is None else "--yes"))
         return answer
 
     def require(self, text: str, *, assumed: bool) -> None:
-        """Ask a question that only yes answers; raises `Declined`."""
+        """Ask a question; raises `Declined` unless the answer is yes."""
         if self.ask(Question(text, assumed="yes" if assumed else None)) != "yes":
-            raise Declined(f"not confirmed, nothing moves on: {text}")
+            raise Declined(f"not confirmed, nothing moves: {text}")
 
     @property
     def has_keys(self) -> bool:
-        """Whether the person has keys to press."""
+        """Whether the operator has keys to press."""
         return self._operator.has_keys
 
     def pressed(self) -> Key | None:
-        """Take a key."""
+        """Return the next key pressed."""
         return self._operator.pressed()

@@ -1,4 +1,4 @@
-"""The fit over the poses taken so far, and what they cover: whether it is enough, and what would help."""
+"""The fit over the poses so far, their coverage, and the most useful next pose."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -32,20 +32,20 @@ GREEN = {"cond9": 4.0, "cond_u1": 8.0}
 AMBER = {"cond9": 8.0, "cond_u1": 25.0}
 """As within 30 to 45 degrees."""
 TRUSTED_SHARE = 0.05
-"""`Running.predict` is silent where it is less sure of the force than this share of the weight."""
+"""`Running.predict` returns None if its sigma of the force is more than this share of the weight."""
 
 
 class Running:
-    """The calibration so far, and what it lacks.
+    """The calibration so far, and its coverage.
 
     Parameters
     ----------
     g_m_s2 : float
         Local gravity.
     down_base : array_like, shape (3,)
-        Unit vector down in base, for the coverage as long as the fit cannot tell: another one for an arm on a wall.
+        Unit vector down in base, used for the coverage until the fit gives it.
     advise : bool
-        Say which pose would help most; False where a plan has chosen.
+        Suggest the most useful next pose; False if a plan chooses the poses.
     """
 
     def __init__(
@@ -59,19 +59,19 @@ class Running:
 
     @property
     def result(self) -> CalibrationResult | None:
-        """What `calib.solve` makes of the poses so far; None as long as they do not determine it."""
+        """Result of `calib.solve` for the poses so far; None while they do not determine it."""
         return self._result
 
     @property
     def weighed_kg(self) -> float | None:
-        """Mass that the sensor carries; None as long as nobody can know, as in `predict`."""
+        """Mass that the sensor carries; None while it is uncertain, as in `predict`."""
         result = self._trusted()
         if result is None or result.sigma["weight_N"] > TRUSTED_SHARE * result.weight_N:
             return None
         return result.mass_kg
 
     def add(self, record: PoseRecord) -> Estimated:
-        """Take a pose in, in place of one with the same `stop`, and say where the calibration stands."""
+        """Add a pose, in place of one with the same `stop`; return the estimate."""
         self._records.pop(record.stop, None)
         residual = _surprise(self._result, record)
         self._records[record.stop] = record
@@ -79,7 +79,7 @@ class Running:
         R_base_flange, down = self._orientations(), self._down()
         gravity_flange = down @ R_base_flange
         light = _light(coverage)
-        values, sigma = ({}, {}) if self._result is None else _told(self._result)
+        values, sigma = ({}, {}) if self._result is None else _estimates(self._result)
         return Estimated(
             poses=len(R_base_flange),
             values=values,
@@ -95,7 +95,7 @@ class Running:
         )
 
     def remove(self, stop: int) -> None:
-        """Leave a pose out, so that it can be taken again; a stop that was never taken is none to leave out."""
+        """Remove a pose, so that it can be taken again; a stop that was not taken is ignored."""
         if self._records.pop(stop, None) is None:
             return
         if self._records:
@@ -104,10 +104,10 @@ class Running:
             self._result = None
 
     def predict(self, R_base_flange: Array) -> Array | None:
-        """Wrench (6,), N and N·m, that a free tool gives at this orientation (3, 3); None while nobody can know.
+        """Wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain.
 
-        That is before six poses, while a quite different mounting of the sensor fits almost as well, and at
-        orientations far from those taken. Any thread may ask.
+        It is uncertain before six poses, while another mounting of the sensor fits almost as well, and at orientations
+        far from those taken. Any thread may call it.
         """
         result = self._trusted()
         if result is None:
@@ -135,7 +135,7 @@ class Running:
         R_base_flange = self._orientations()
         coverage = predicted_sigma(R_base_flange, self._guess())
         different = different_orientations(R_base_flange)
-        # The poses alone tell that these cannot be solved; the solver would say the same, with advice that takes time.
+        # The poses alone show that the solver would fail; its advice would take time.
         hopeless = different < LEAST_POSES or np.isinf(coverage.cond9) or coverage.second_basin_gap < AMBIGUOUS_GAP
         self._result = None if hopeless else self._solved()
         return coverage
@@ -153,7 +153,7 @@ class Running:
         return result.gravity_force_base_N / result.weight_N
 
     def _guess(self) -> Guess:
-        """Give the tool as estimated, or a usual one, with the noise of the poses as measured."""
+        """Return the tool as estimated, or a usual one, with the measured noise of the poses."""
         variance = np.mean([np.diag(record.mean.covariance) for record in self._records.values()], axis=0)
         _, alpha, beta = weight_and_tilt(self._down())
         noise = {
@@ -190,7 +190,7 @@ def empty_cap_deg(gravity_flange: Array) -> float:
 
 
 def hint(R_base_flange: Array, guess: Guess, down_base: Array) -> str:
-    """Say in words which simple motion from the last pose leads to the most useful next one.
+    """Describe the simple motion from the last pose to the most useful next one.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ def hint(R_base_flange: Array, guess: Guess, down_base: Array) -> str:
 
 
 def _motions(last: Array, down_base: Array) -> tuple[list[str], Array]:
-    """What a person at the pendant can do in one go: in words, and the orientations (m, 3, 3) it leads to."""
+    """Return simple motions at the pendant: in words, and the orientations (m, 3, 3) they lead to."""
     words, candidates = list[str](), list[Array]()
     for axis in "zxy":
         for angle_deg in (90, -90) if axis == "z" else (90, -90, 45, -45):
@@ -238,7 +238,7 @@ def _light(coverage: Prediction) -> str:
 
 
 def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[float, float] | None:
-    """How far a new pose is from what those before it tell: in standard deviations (the worst channel), and in N.
+    """Distance of a new pose from the fit of the earlier ones: in sigmas (the worst channel), and in N.
 
     The noise of the pose counts as larger by as much as the others scatter more than theirs.
     """
@@ -251,7 +251,7 @@ def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[flo
     return float(np.max(np.abs(residual) / sigma)), float(np.linalg.norm(residual[:3]))
 
 
-def _told(result: CalibrationResult) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+def _estimates(result: CalibrationResult) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
     """Estimates and sigmas by name; with `drift` where one was found: last pose minus first, (6,) N and N·m."""
     sigma = dict(result.sigma)
     values = {name: getattr(result, name) for name in sigma}

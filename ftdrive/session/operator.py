@@ -1,4 +1,4 @@
-"""The person beside the robot, as a session sees them: a terminal, a script in a test, or nobody."""
+"""The operator of a session: a terminal, or a script in a test."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -8,7 +8,7 @@ from ftdrive.session.events import Event
 
 
 class Key(Enum):
-    """What a person can ask for at any time; the values are the keys of the live screen."""
+    """Requests of the operator at any time; the values are the keys of the live screen."""
 
     KEEP = "k"
     REDO = "r"
@@ -22,25 +22,25 @@ class Question:
     """A question that the session waits for."""
 
     text: str
-    """Complete, with what the answers mean."""
+    """The question, with the meaning of each answer."""
     answers: tuple[str, ...] = ("yes", "no")
-    """What may be answered; a single one must be typed in full and is never assumed."""
+    """Accepted answers; a single one must be typed in full."""
     assumed: str | None = None
-    """What `--yes` answers in the place of a person; None when a person must."""
+    """Answer of `--yes`; None if the operator must answer."""
 
 
 class Operator(Protocol):
-    """Whoever runs the session."""
+    """The operator as the session sees them."""
 
     def show(self, event: Event) -> None:
         """Show an event; returns at once."""
 
     def ask(self, question: Question) -> str:
-        """Return one of the question's answers, waiting as long as it takes; raises `Declined` when there is nobody."""
+        """Wait for one of the question's answers; raises `Declined` if no operator can answer."""
 
     @property
     def has_keys(self) -> bool:
-        """Whether `pressed` can ever tell one: nobody is told to press what is not heard."""
+        """Whether keys are read; key hints are shown only then."""
 
     def pressed(self) -> Key | None:
-        """Take the oldest key that was pressed and not yet taken; returns at once."""
+        """Return the oldest key not yet returned, or None; returns at once."""

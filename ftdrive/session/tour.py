@@ -1,13 +1,12 @@
-"""The state machine of a tour: (MOVE, SETTLE, SAMPLE) for each pose, CLOSE; anything wrong is STOP, then HOLD.
+"""The state machine of a tour: (MOVE, SETTLE, SAMPLE) for each pose, CLOSE; after an error STOP, then HOLD.
 
-The arm only ever makes moves that are certified: along the plan from one pose to the next or back, or along an approach
-that is planned from where the arm stands, shown and confirmed.
+The arm makes certified moves only: along the plan from one pose to the next or back, or along an approach that is
+planned from where the arm stands, shown and confirmed.
 """
 
 import logging
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
@@ -16,8 +15,7 @@ from numpy.typing import NDArray
 
 from calib.errors import TooFewSamples
 from calib.routine import PoseRecord, Sampling, Stage, TourPose, take_pose
-from drivers.errors import DeviceFault, DriverError
-from drivers.interfaces import ForceTorqueSensor, RobotArm
+from drivers.errors import DriverError
 from ftdrive.checks.controller_settings import payload_in_words
 from ftdrive.checks.devices import SLOWEST_SLIDER
 from ftdrive.errors import Declined, NotAccepted, PlanRefused
@@ -35,13 +33,13 @@ from ftdrive.session.events import (
     StateChanged,
     Weighed,
 )
-from ftdrive.session.guards import RangeGuard, Tripped
-from ftdrive.session.journal import Journal
+from ftdrive.session.guards import RangeGuard, Tripped, fault
+from ftdrive.session.hazards import Hazard
 from ftdrive.session.live_fit import Running
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.preflight import forbidden
-from ftdrive.session.recovery import Recovery
-from ftdrive.session.watchdog import Watcher
+from ftdrive.session.progress import Progress
+from ftdrive.session.recovery import GuardedCell, Recovery
 
 log = logging.getLogger(__name__)
 
@@ -49,16 +47,16 @@ Array = NDArray[np.float64]
 
 APPROACH_RAD_S: Final = float(np.radians(15))
 BACK_RAD_S: Final = float(np.radians(10))
-"""To the pose the arm came from, after it was stopped on its way."""
+"""Speed back to the previous pose, after a stop between two poses."""
 SLOW: Final = Speeds.first_run()
 _AT_RAD: Final = float(np.radians(0.5))
 _NEAR_RAD: Final = float(np.radians(10))
-"""A way that comes so close to a skipped posture passes it."""
+"""An approach that comes closer than this to a skipped posture passes it."""
 _FIRST_WORD: Final = "MOVE"
 
 
 class Stopped(Exception):
-    """A person had the arm stop, to pause or to end, sent it back or said no, and has to say how it goes on."""
+    """The operator paused, stopped, sent the arm back or answered no; the tour holds until the operator decides."""
 
     def __init__(self, words: str, *, for_good: bool = False) -> None:
         super().__init__(words)
@@ -66,7 +64,7 @@ class Stopped(Exception):
 
 
 class Turned(Exception):
-    """A person wants another pose than the one under way: the next, or the last one again."""
+    """The operator wants another pose than the one under way: the next, or the last one again."""
 
     def __init__(self, key: Key) -> None:
         super().__init__(key.name)
@@ -75,66 +73,63 @@ class Turned(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How much of it a person confirms."""
+    """What the operator confirms."""
 
     step: bool
     """Enter for each pose."""
     trusted: bool
-    """This plan has run to its end on this arm, or nothing real moves: `--yes` may answer."""
+    """Whether `--yes` may answer: the plan has run to its end on this arm, or the cell is emulated."""
     asks: bool = True
     yes: bool = False
-    """`--yes` answers where it may."""
+    """Whether `--yes` was given."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measuring:
+    """How the sensor is averaged at a pose."""
+
+    sampling: Sampling
+    quiet_std: Array
+    """(6,) standard deviation of the resting sensor's samples."""
+    load: RangeGuard
+    """Judges every sample of a pose."""
+    sensor_kg: float | None
+    """Mass of sensor and adapter; None if unknown. The payload is compared with it."""
 
 
 class Tour:
-    """One plan on its way.
+    """Takes the arm along one plan.
 
     Parameters
     ----------
-    load
-        The guard that also judges every sample of a pose.
-    quiet_std : array, shape (6,)
-        Of the resting sensor's samples.
-    sensor_kg
-        Mass of sensor and adapter; None where it is not known.
+    cell : GuardedCell
+    plan : Plan
+        With the speeds of this session.
+    certifier : Certifier
+    run : Run
+        Keeps every pose.
+    running : Running
+    recovery : Recovery
+    measuring : Measuring
+    pace : Pace
     """
 
     def __init__(
         self,
-        arm: RobotArm,
-        sensor: ForceTorqueSensor,
-        certifier: Certifier,
+        cell: GuardedCell,
         plan: Plan,
+        certifier: Certifier,
         run: Run,
-        journal: Journal,
         running: Running,
-        watcher: Watcher,
-        *,
         recovery: Recovery,
-        load: RangeGuard,
-        sampling: Sampling,
+        measuring: Measuring,
         pace: Pace,
-        quiet_std: Array,
-        sensor_kg: float | None,
     ) -> None:
-        self._arm, self._sensor, self._certifier = arm, sensor, certifier
-        self._plan, self._run, self._journal, self._running, self._watcher = plan, run, journal, running, watcher
-        self._recovery, self._load, self._sampling, self._pace = recovery, load, sampling, pace
-        self._quiet_std, self._sensor_kg = quiet_std, sensor_kg
+        self._arm, self._sensor, self._journal, self._watcher = cell.arm, cell.sensor, cell.journal, cell.watcher
+        self._plan, self._certifier, self._run, self._running = plan, certifier, run, running
+        self._recovery, self._measuring, self._pace = recovery, measuring, pace
         self._nodes = np.array([step.q_rad for step in plan.steps])
-        self._stops = len(self._nodes) + 1
-        self._todo: deque[int] = deque()
-        self._at: int | None = None  # index of the pose where the arm was left
-        self._stood_at: int | None = None  # index of the pose where it stood last
-        self._back: tuple[int, str] | None = None  # index of the pose to return to, and why the arm was stopped
-        self._moved = False
-        self._under_way: int | None = None  # stop that the arm goes to or stands at to be measured
-        self._last: PoseRecord | None = None  # taken last
-        self._again = False  # the last one is to be taken again
-        self._skipped: set[int] = set()  # indices of postures where the arm should not go
-        self._reopened: set[int] = set()
-        self._payload_kg: float | None = None  # as the controller told it when it was compared
-        self._driven: set[int] = set()  # indices of poses whose move to the next one was driven to its end
+        self._now = Progress(len(plan.steps))
 
     # -------------------------------------------------------------------------------------------- the tour
 
@@ -144,13 +139,13 @@ class Tour:
         Raises
         ------
         Declined
-            A person ended it, or nobody was there to decide.
+            The operator ended it, or no operator answered.
         Tripped, DriverError, OSError
-            What stopped the arm, when a person then ended it.
+            What stopped the arm, if the operator then ended the tour.
         """
-        self._todo = deque(todo)
+        self._now = replace(self._now, todo=tuple(todo))
         self._watcher.begin()
-        while self._todo:
+        while self._now.todo:
             try:
                 self._next()
             except Turned as turned:
@@ -162,50 +157,48 @@ class Tour:
 
     @property
     def undriven(self) -> list[int]:
-        """Poses, from 1, whose move to the next one was not driven as planned, but over an approach or not at all."""
-        return [index + 1 for index in range(len(self._nodes)) if index not in self._driven]
+        """As `Progress.undriven`."""
+        return self._now.undriven
 
     def _next(self) -> None:
-        if self._back is not None:
-            self._go_back(*self._back)
-        self._under_way = None
-        self._hear()
-        stop = self._todo[0]
-        index = self._index(stop)
+        if self._now.back is not None:
+            self._go_back(*self._now.back)
+        self._now = replace(self._now, under_way=None)
+        self._obey_keys()
+        stop = self._now.todo[0]
+        index = self._now.index(stop)
         if self._pace.step and not self._step(stop, index):
             return
-        self._under_way = stop
+        self._now = replace(self._now, under_way=stop)
         self._go(index, stop)
-        self._hear()
-        self._last = self._take(stop, index)
+        self._obey_keys()
+        self._take(stop, index)
+        self._now = replace(self._now, taken_last=stop)
         self._compare_payload()
-        self._todo.popleft()
+        self._now = self._now.finish()
 
     def _compare_payload(self) -> None:
-        """Row 7: say what hangs on the sensor, and where the controller was told otherwise; once for each payload."""
+        """Row 7: show the mass on the sensor, and whether the configured payload differs; once for each payload."""
         mass_kg = self._running.weighed_kg
-        told_kg = None if mass_kg is None else self._arm.status().payload_kg
-        if mass_kg is None or told_kg is None or told_kg == self._payload_kg:
+        payload_kg = None if mass_kg is None else self._arm.status().payload_kg
+        if mass_kg is None or payload_kg is None or payload_kg == self._now.payload_kg:
             return
-        self._payload_kg = told_kg
-        self._journal.show(Weighed(mass_kg=mass_kg, payload_kg=told_kg))
-        if words := payload_in_words(told_kg, mass_kg, self._sensor_kg):
+        self._now = replace(self._now, payload_kg=payload_kg)
+        self._journal.show(Weighed(mass_kg=mass_kg, payload_kg=payload_kg))
+        if words := payload_in_words(payload_kg, mass_kg, self._measuring.sensor_kg):
             self._note(words, warning=True)
 
-    def _index(self, stop: int) -> int:
-        return (stop - 1) % len(self._nodes)
-
     def _step(self, stop: int, index: int) -> bool:
-        """Ask for Enter; whether to go."""
+        """Ask for Enter; return whether to move."""
         answer = self._journal.ask(
             Question(
-                f"Pose {stop} of {self._stops}, orientation {self._plan.steps[index].number:02d}: {self._way(index)}, "
-                "s skips it, r takes the last pose again, q ends",
+                f"Pose {stop} of {self._now.stops}, orientation {self._plan.steps[index].number:02d}: "
+                f"{self._way(index)}, s skips it, r retakes the last pose, q ends",
                 ("", "s", "r", "q"),
             )
         )
         if answer == "q":
-            raise Declined("ended by a person between two poses")
+            raise Declined("ended by the operator between two poses")
         if answer == "s":
             self._skip()
         elif answer == "r" and self._redoable() is not None:
@@ -213,7 +206,7 @@ class Tour:
         return answer == ""
 
     def _way(self, index: int) -> str:
-        """Say what Enter does in step mode."""
+        """Describe what Enter does in step mode."""
         turn_rad = np.abs(self._nodes[index] - self._arm.state().q_rad)
         moving = [str(joint + 1) for joint in np.flatnonzero(turn_rad > _AT_RAD)]
         if not moving:
@@ -226,73 +219,70 @@ class Tour:
             return f"Enter plans the way and shows it{drives}, {joints}, {largest}"
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
 
-    def _hear(self) -> None:
-        """Take the keys. Each means what the screen shows: r the pose taken last, s the one under way.
+    def _obey_keys(self) -> None:
+        """Obey the keys pressed: r refers to the last pose taken, s to the one under way, as on the screen.
 
         Called between two looks, so before another pose is shown.
         """
-        moving = self._under_way is not None and self._at is None
-        if self._again and not moving:
+        moving = self._now.moving
+        if self._now.again and not moving:
             raise Turned(Key.REDO)
         while (key := self._journal.pressed()) is not None:
             if key is Key.PAUSE:
-                raise Stopped("paused by a person")
+                raise Stopped("paused by the operator")
             if key is Key.STOP:
-                raise Stopped("stopped by a person", for_good=True)
+                raise Stopped("stopped by the operator", for_good=True)
             if key is Key.KEEP:
-                self._note("a pose is kept by itself; r takes it again")
+                self._note("every pose is saved without a key; press r to take it again")
             if key is Key.SKIP:
-                if self._under_way is not None:
+                if self._now.under_way is not None:
                     raise Turned(key)
-                self._note("s skips a pose while the arm goes there or measures: none is under way")
+                self._note("s skips the pose that is under way: none is under way")
             if key is Key.REDO and (last := self._redoable()) is not None:
-                self._again = True
+                self._now = replace(self._now, again=True)
                 if not moving:
                     raise Turned(key)
-                self._note(f"the arm ends its move, then goes back to pose {last}")
+                self._note(f"the arm completes its move, then goes back to pose {last}")
 
     def _turn(self, key: Key) -> None:
         if key is Key.REDO:
             self._redo()
             return
-        if self._at is None:
+        if not self._now.standing:
             self._arm.stop()
         self._skip()
 
     def _redoable(self) -> int | None:
-        """Stop that r takes again; None, and why, where there is none."""
-        if self._last is None:
-            self._note("there is no pose yet to be taken again")
-        elif self._todo[0] == self._last.stop:
-            self._note(f"pose {self._last.stop} is being taken again already")
+        """Return the stop that r takes again; None, with a note why, if there is none."""
+        last = self._now.taken_last
+        if last is None:
+            self._note("r takes the last pose again: there is no pose yet")
+        elif self._now.todo[0] == last:
+            self._note(f"pose {last} is being taken again already")
         else:
-            return self._last.stop
+            return last
         return None
 
     def _redo(self) -> None:
-        self._again = False
-        if self._last is None:
+        stop = self._now.taken_last
+        if stop is None:
             return
-        self._running.remove(self._last.stop)
-        self._todo.appendleft(self._last.stop)
-        self._skipped.discard(self._index(self._last.stop))
-        self._note(f"pose {self._last.stop} is taken again")
+        self._running.remove(stop)
+        self._now = self._now.redo(stop)
+        self._note(f"pose {stop} is taken again")
 
     def _skip(self) -> None:
-        """Drop the pose, and the return to it: the arm does not go there. What was to be taken again stays."""
-        index = self._index(self._todo[0])
-        self._skipped.add(index)
-        dropped = [stop for stop in self._todo if self._index(stop) == index]
-        self._todo = deque(stop for stop in self._todo if stop not in dropped)
-        names = {stop: "the return to pose 1" if stop == self._stops else f"pose {stop}" for stop in dropped}
+        """Drop the pose, and the return to it. A pose that was to be taken again keeps its earlier samples."""
+        self._now, dropped = self._now.skip()
+        names = {stop: "the return to pose 1" if stop == self._now.stops else f"pose {stop}" for stop in dropped}
         stay = set(dropped).intersection(self._run.stops())
         for record in self._run.records() if stay else ():
             if record.stop in stay:
                 self._journal.show(self._running.add(record))
-                self._note(f"{names[record.stop]} stays as it was taken", warning=True)
+                self._note(f"{names[record.stop]} stays as it was measured", warning=True)
         if left := [name for stop, name in names.items() if stop not in stay]:
-            way = f"the arm goes on to pose {self._todo[0]}" if self._todo else "it was the last"
-            self._note(f"skipped: {' and '.join(left)}, {way}; --resume takes what was skipped", warning=True)
+            way = f"the arm goes on to pose {self._now.todo[0]}" if self._now.todo else "it was the last"
+            self._note(f"skipped: {' and '.join(left)}, {way}; --resume takes skipped poses", warning=True)
 
     def _take(self, stop: int, index: int) -> PoseRecord:
         step = self._plan.steps[index]
@@ -312,20 +302,20 @@ class Tour:
                 self._sensor,
                 stop,
                 pose,
-                self._sampling,
+                self._measuring.sampling,
                 guard=self._between_looks,
                 on_stage=on_stage,
-                quiet_std=self._quiet_std,
+                quiet_std=self._measuring.quiet_std,
             )
-        self._load.judge(record.samples.wrench)
+        self._measuring.load.judge(record.samples.wrench)
         self._run.commit(record)
         self._journal.show(
             PoseTaken.of(
                 record,
                 self._certifier.scene.down_base,
-                stops=self._stops,
+                stops=self._now.stops,
                 settle_s=settled_s,
-                average_s=self._sampling.average_s,
+                average_s=self._measuring.sampling.average_s,
                 attempts=attempts,
             ),
             sync=True,
@@ -337,8 +327,8 @@ class Tour:
     # -------------------------------------------------------------------------------------------- moving
 
     def _go(self, index: int, stop: int) -> None:
-        """Bring the arm to a pose of the plan, over certified moves only."""
-        at, speed_rad_s = self._at, self._own_speed(index)
+        """Move the arm to a pose of the plan, along certified moves only."""
+        at, speed_rad_s, driven_from = self._now.at, self._own_speed(index), None
         if index == at:
             return
         if at is None or speed_rad_s is None:
@@ -346,20 +336,19 @@ class Tour:
         else:
             self._show_state(State.MOVE, stop)
             self._move(self._nodes[at], self._nodes[index], speed_rad_s, self._plan.acceleration_rad_s2)
-            if index == (at + 1) % len(self._nodes):
-                self._driven.add(at)
-        self._at = self._stood_at = index
+            driven_from = at if index == (at + 1) % len(self._nodes) else None
+        self._now = self._now.arrive(index, driven_from=driven_from)
 
     def _go_back(self, index: int, why: str) -> None:
-        """Return to the pose the arm came from, then raise `Stopped`: a person decides again."""
-        self._back, self._under_way = None, self._todo[0]
+        """Return to the previous pose, then raise `Stopped`: the operator decides again."""
+        self._now = replace(self._now, back=None, under_way=self._now.todo[0])
         self._approach(self._arm.state().q_rad, index, index + 1, back=True)
-        self._at = index
+        self._now = self._now.arrive(index)
         raise Stopped(f"back at pose {index + 1}; what stopped the arm: {why}")
 
     def _own_speed(self, index: int) -> float | None:
-        """Speed of the plan's own move from where the arm was left to a pose, rad/s; None where it has none."""
-        at, n = self._at, len(self._nodes)
+        """Speed of the plan's move from where the arm stands to a pose, rad/s; None if the plan has no such move."""
+        at, n = self._now.at, len(self._nodes)
         if at is None or (index - at) % n not in {1, n - 1}:
             return None
         return self._plan.steps[at if (index - at) % n == 1 else index].speed_rad_s
@@ -380,60 +369,58 @@ class Tour:
         if passed:
             words += f"; it passes close to the skipped pose {' and '.join(passed)} and does not stop there"
         self._show_state(State.APPROACH, stop, words)
-        self._confirm(f"The arm goes {words}.", by_person=back or bool(passed) or arm_moves(way))
+        self._confirm(f"The arm goes {words}.", by_operator=back or bool(passed) or arm_moves(way))
         for goal, speed in zip(approach.q_rad, approach.speed_rad_s, strict=True):
             self._move(q, goal, min(float(speed), most_rad_s), SLOW.joint_rad_s2)
             q = goal
         if stop == 1 and not back:
-            self._confirm(f"The arm stands at the first pose. The tour has {self._stops} stops. Begin?")
+            self._confirm(f"The arm stands at the first pose. The tour has {self._now.stops} stops. Begin?")
 
     def _passed(self, way: Array, goal: int) -> list[str]:
-        """Skipped poses that a way (k, 6), which ends at another one, comes close to."""
+        """Return the skipped poses that an approach (k, 6) to another pose comes close to."""
         share = np.linspace(0.0, 1.0, 181)[:, None]
         points = np.concatenate([start + share * (end - start) for start, end in pairwise(way)])
         return [
             str(index + 1)
-            for index in sorted(self._skipped - {goal})
+            for index in sorted(self._now.skipped - {goal})
             if np.abs(points - self._nodes[index]).max(axis=1).min() < _NEAR_RAD
         ]
 
-    def _confirm(self, text: str, *, by_person: bool = False) -> None:
-        """Ask before a motion; the first one of a workcell wants a word."""
+    def _confirm(self, text: str, *, by_operator: bool = False) -> None:
+        """Ask before a motion; the first motion needs a typed word."""
         if not self._pace.asks:
             return
-        trusted = self._pace.trusted and not by_person
-        if self._moved:
+        trusted = self._pace.trusted and not by_operator
+        if self._now.confirmed:
             if self._journal.ask(Question(text, assumed="yes" if trusted else None)) != "yes":
                 raise Stopped(f"not confirmed: {text}")
             return
         assumed = _FIRST_WORD if trusted else None
         question = Question(f"{text} Hand on the emergency stop. Type {_FIRST_WORD}", (_FIRST_WORD,), assumed)
         if self._journal.ask(question) != _FIRST_WORD:
-            raise Declined("the word was not typed: nothing moves")
-        self._moved = True
+            raise Declined(f"{_FIRST_WORD} was not typed: nothing moves")
+        self._now = replace(self._now, confirmed=True)
 
     def _move(self, start: Array, goal: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
-        """Make one certified move, from nowhere else than where it was certified to begin."""
-        if not self._moved:
+        """Make one certified move, only from where it was certified to begin."""
+        if not self._now.confirmed:
             self._confirm("The arm begins the tour.")
         self._recovery.require_answers()
         off_rad = np.abs(self._arm.state().q_rad - start)
         if off_rad.max() > _AT_RAD:
-            self._at = self._stood_at = None
-            raise Tripped(
-                21,
-                DeviceFault(
-                    f"joint {off_rad.argmax() + 1} is {np.degrees(off_rad.max()):.1f}° from where its move begins: "
-                    "somebody has moved the arm; end that, then go on"
-                ),
+            self._now = self._now.lose_place()
+            raise fault(
+                Hazard.OTHER_CLIENT,
+                f"joint {off_rad.argmax() + 1} is {np.degrees(off_rad.max()):.1f}° from where its move begins: "
+                "something else has moved the arm; stop that, then resume",
             )
         turn = np.abs(goal - start).max()
         duration_s = float(move_duration_s(turn, speed_rad_s, acceleration_rad_s2))
-        self._at = None
+        self._now = self._now.start_move()
         with self._watcher.watching(start, goal, moving=True):
             self._arm.move_to(
                 goal.tolist(),
-                timeout_s=(duration_s + 1.5) / SLOWEST_SLIDER,  # that the arm stands still is seen by its guard
+                timeout_s=(duration_s + 1.5) / SLOWEST_SLIDER,  # `StallGuard` sees an arm that stands still
                 guard=self._between_looks,
                 speed_rad_s=speed_rad_s,
                 acceleration_rad_s2=acceleration_rad_s2,
@@ -441,38 +428,39 @@ class Tour:
 
     def _between_looks(self) -> None:
         self._watcher.check()
-        self._hear()
+        self._obey_keys()
 
     # -------------------------------------------------------------------------------------------- stop and hold
 
     def _hold(self, error: Exception) -> None:
-        """Say why the arm stands, and wait for a person; returns when it may go on. The arm was stopped before."""
+        """Show why the arm has stopped, and wait for the operator; returns when the tour may go on."""
         self._arm.stop()
         if isinstance(error, Stopped) and error.for_good:
             self._show_state(State.STOP, words=str(error))
             raise Declined(str(error))
-        trip = self._recovery.cause(error, moving=self._at is None)
-        if trip is not None and self._mended(trip):
+        trip = self._recovery.cause(error, moving=not self._now.standing)
+        if trip is not None and self._reopened_sensor(trip):
             return
-        stop, back = self._todo[0], self._left_behind()
-        self._at = None
+        stop, back = self._now.todo[0], self._now.came_from
+        self._now = self._now.start_move()
         words = str(error if trip is None else trip).rstrip(".")
-        told, untold = self._watcher.tripped(wait_s=0.0), self._watcher.untold
-        if trip is not None and (trip is not told or untold is not None):
+        reported, report_error = self._watcher.tripped(wait_s=0.0), self._watcher.report_error
+        if trip is not None and (trip is not reported or report_error is not None):
             self._journal.show(GuardTripped(hazard=trip.hazard, words=words))
-        if untold is not None:
-            self._note(f"not told at once, for {untold!r}, see to screen, pipe and disk: {told}", warning=True)
+        if report_error is not None:
+            self._note(f"{reported} (reported late, {report_error!r}: check screen, pipe and disk)", warning=True)
         self._show_state(State.STOP, words=words)
         self._recovery.show_new()
         self._show_state(State.HOLD, words=words)
-        by_person = isinstance(error, Stopped)
-        end = Declined(words) if by_person else error if trip is None else trip.error
-        ways = {"resume": f"resume {'to go on' if by_person else 'when it is mended'}"}
-        ways["skip"] = f"skip to leave pose {stop} out"
+        by_operator = isinstance(error, Stopped)
+        end = Declined(words) if by_operator else error if trip is None else trip.error
+        ways = {"resume": f"go on with pose {stop}{'' if by_operator else ' after fixing the cause'}"}
+        ways["skip"] = f"leave pose {stop} out"
         if back is not None:
-            ways["back"] = f"back to return to pose {back + 1} at {np.degrees(BACK_RAD_S):.0f}°/s"
-        ways["quit"] = "or quit: --resume goes on later"
-        question = Question(f"{len(self._run.stops())} poses are kept. Type {', '.join(ways.values())}", tuple(ways))
+            ways["back"] = f"return to pose {back + 1} at {np.degrees(BACK_RAD_S):.0f}°/s"
+        ways["quit"] = "stop; continue later with --resume"
+        choices = ". ".join(f"{answer}: {effect}" for answer, effect in ways.items())
+        question = Question(f"{len(self._run.stops())} poses are saved. {choices}", tuple(ways))
         while True:
             try:
                 answer = self._journal.ask(question)
@@ -481,40 +469,35 @@ class Tour:
             if answer == "quit":
                 raise end
             try:
-                self._recovery.make_sure()
+                self._recovery.reopen()
             except (Tripped, DriverError, NotAccepted, Declined) as again:
                 self._journal.show(Noted(words=f"not yet: {again}", warning=True))
                 continue
             if answer == "skip":
                 self._skip()
             if answer == "back" and back is not None:
-                self._back = back, words
+                self._now = replace(self._now, back=(back, words))
             return
 
-    def _left_behind(self) -> int | None:
-        """Index of the pose that the arm came from, where it was stopped on its way to another."""
-        gone = {self._index(self._todo[0]), *self._skipped}
-        return None if self._at is not None or self._stood_at in gone else self._stood_at
-
-    def _mended(self, trip: Tripped) -> bool:
-        """Open a sensor that failed while the arm stood at a pose, once for each pose; the pose begins anew."""
-        stop = self._todo[0]
-        if trip.hazard != 15 or self._at is None or stop in self._reopened:
+    def _reopened_sensor(self, trip: Tripped) -> bool:
+        """Reopen a sensor that failed while the arm stood at a pose, once for each pose; the pose is restarted."""
+        stop = self._now.todo[0]
+        if trip.hazard != Hazard.SENSOR_LOST or not self._now.standing or stop in self._now.reopened:
             return False
-        self._reopened.add(stop)
+        self._now = replace(self._now, reopened=self._now.reopened | {stop})
         try:
-            self._recovery.make_sure()
+            self._recovery.reopen()
         except (Tripped, DriverError, NotAccepted, Declined) as error:
-            log.info("the sensor does not come back: %s", error)
+            log.info("the sensor cannot be reopened: %s", error)
             return False
-        self._journal.show(Noted(words=f"{trip}; it is back, pose {stop} begins anew", warning=True))
+        self._journal.show(Noted(words=f"{trip}; the sensor was reopened, pose {stop} restarts", warning=True))
         return True
 
-    # -------------------------------------------------------------------------------------------- telling
+    # -------------------------------------------------------------------------------------------- showing
 
     def _show_state(self, state: State, stop: int | None = None, words: str = "") -> None:
-        number = None if stop is None else self._plan.steps[self._index(stop)].number
-        self._journal.show(StateChanged(state=state, stop=stop, stops=self._stops, number=number, words=words))
+        number = None if stop is None else self._plan.steps[self._now.index(stop)].number
+        self._journal.show(StateChanged(state=state, stop=stop, stops=self._now.stops, number=number, words=words))
 
     def _note(self, words: str, *, warning: bool = False) -> None:
         self._journal.show(Noted(words=words, warning=warning))

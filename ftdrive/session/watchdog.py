@@ -1,6 +1,6 @@
-"""The thread that watches: a hundred looks a second, by its own clock. It stops the arm, then it tells.
+"""The thread of the guards: 100 looks a second on the cell's clock. It stops the arm, then reports the trip.
 
-A stop that nobody answers takes a second or two: that is told while it goes on.
+A stop that the controller does not answer takes 1 to 2 s: the trip is reported before that ends.
 """
 
 import logging
@@ -15,7 +15,8 @@ from calib.routine import turned_rad
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ArmState, ForceTorqueSensor, RobotArm
-from ftdrive.session.guards import Guard, Limits, Motion, Seen, Tripped, by_safety, out_of_sight
+from ftdrive.session.guards import Guard, Limits, Motion, Seen, Tripped, arm_lost, by_safety, fault
+from ftdrive.session.hazards import Hazard
 
 log = logging.getLogger(__name__)
 
@@ -23,17 +24,17 @@ Array = NDArray[np.float64]
 
 
 class Watcher:
-    """The thread. Watches from `begin` on, whenever a `watching` block is open; for row 11 it looks all the time.
+    """Runs the guards while a `watching` block is open, from `begin` on; it looks for row 11 all the time.
 
     Parameters
     ----------
     arm, sensor
-        Asked from the thread.
+        Read from the thread.
     guards : sequence of Guard
     on_trip : callable
-        Is told from the thread, once the arm was stopped or is slow to.
+        Called from the thread once the arm has stopped, or is slow to stop.
     clock
-        Of the cell; it waits for the thread where it can.
+        Of the cell; an emulated clock waits for the thread.
     limits
         Periods and limits of the thread itself.
     """
@@ -51,17 +52,17 @@ class Watcher:
         self.clock, self._limits = clock, limits
         self._arm, self._sensor, self._guards, self._on_trip = arm, sensor, tuple(guards), on_trip
         self._motion: Motion | None = None
-        self._seen: Motion | None = None  # which all guards have looked at
+        self._seen: Motion | None = None  # the motion that all guards have looked at
         self._wake = threading.Event()
         self._end = threading.Event()
-        self._told = threading.Event()
+        self._reported = threading.Event()
         self._tripped: Tripped | None = None
-        self.untold: Exception | None = None
-        """What the last trip could not be told for: whoever holds the arm says both."""
+        self.report_error: Exception | None = None
+        """Why the last trip could not be reported; the hold shows both."""
         self.safety_stop: Tripped | None = None
-        """The last emergency or safeguard stop that was seen, whatever the arm did; one for each, never forgotten."""
+        """The last emergency or safeguard stop, also one while the arm stood; kept until the session ends."""
         self.unseen = False
-        """Whether the arm told nothing for so long that a stop may have come and gone; reset by who asks."""
+        """Whether the arm reported nothing for so long that a stop may have come and gone; the reader resets it."""
         self._blind_since_s: float | None = None
         self._stopped_by_safety = False
         self._judging = threading.RLock()
@@ -80,14 +81,14 @@ class Watcher:
         self._thread.join(timeout=5.0)
 
     def begin(self) -> None:
-        """Forget a trip, and take the next look as what is normal."""
-        self._tripped = self.untold = None
-        self._told.clear()
+        """Forget a trip, and take the next look as normal."""
+        self._tripped = self.report_error = None
+        self._reported.clear()
         self._begun = False
 
     @contextmanager
     def watching(self, start_rad: Array, goal_rad: Array, *, moving: bool) -> Iterator[None]:
-        """Watch while the block runs, after a first look. What trips is raised before it, after it, and by `check`."""
+        """Watch while the block runs, after a first look. A trip is raised before it, after it, and by `check`."""
         self.check()
         self._last = None
         self._looked_s = self.clock.now_s()
@@ -104,54 +105,55 @@ class Watcher:
         self.check()
 
     def look_aside(self) -> None:
-        """Row 11 while the arm stands: who has pressed it may have let go again when a person says how it goes on.
+        """Row 11 while the arm stands: the stop may be released again before the operator answers.
 
-        It is not told from here: a question may stand on the screen.
+        Nothing is shown from here: a question may stand on the screen.
         """
         with self._judging:
             try:
                 status = self._arm.status()
-            except Exception as error:  # whatever the arm of another package raises: it is opened again, and says so
-                log.debug("the arm does not tell how it is: %r", error)
+            except Exception as error:  # another package's arm may raise anything; reopening it reports the cause
+                log.debug("the arm reports no status: %r", error)
                 now_s = self.clock.now_s()
                 self._blind_since_s = self._blind_since_s or now_s
                 self.unseen |= now_s - self._blind_since_s > self._limits.blind_s
                 return
             self._blind_since_s = None
             trip = None if status.fault is None else by_safety(status, f"the arm stopped: {status.fault}")
-            if trip is None or trip.hazard != 11:
+            if trip is None or trip.hazard != Hazard.EMERGENCY_STOP:
                 self._stopped_by_safety = False
             elif not self._stopped_by_safety:
                 self.keep(trip)
 
     def keep(self, trip: Tripped) -> None:
-        """Remember it as `safety_stop` when it is one."""
-        if trip.hazard == 11:
+        """Remember the trip as `safety_stop` if it is one."""
+        if trip.hazard == Hazard.EMERGENCY_STOP:
             with self._judging:
                 self.safety_stop, self._stopped_by_safety = trip, True
 
     def check(self) -> None:
-        """Raise what has tripped, or that nobody watches. Called in the loops that wait for the arm."""
+        """Raise a trip, or that the guards have ended or hung. Called in the loops that wait for the arm."""
         if self._tripped is not None:
             raise self._tripped
         if self._has_ended:
-            raise Tripped(18, DeviceFault("the guards' thread has ended, nothing is watched", "end this session"))
+            raise fault(Hazard.UNGUARDED, "the guards' thread has ended, nothing is watched", "quit this session")
         if self._motion is not None and (late_s := self.clock.now_s() - self._looked_s) > self._limits.hung_s:
-            raise Tripped(
-                18, DeviceFault(f"the guards have not looked for {late_s:.1f} s: give this computer less to do")
+            raise fault(
+                Hazard.UNGUARDED,
+                f"the guards have not looked for {late_s:.1f} s: close other programs on this computer",
             )
 
     def tripped(self, *, wait_s: float) -> Tripped | None:
-        """Tell what has tripped, once the arm was stopped and that was told; None after `wait_s` without."""
+        """Return the trip once the arm has stopped and the trip was reported; None if none occurs within `wait_s`."""
         deadline_s = self.clock.now_s() + wait_s
         while self._tripped is None and self.clock.now_s() < deadline_s:
             self.clock.sleep(0.005)
         if self._tripped is not None:
-            self.clock.wait(self._told, 5.0)
+            self.clock.wait(self._reported, 5.0)
         return self._tripped
 
     def turn(self) -> float:
-        """Look once; return after how many seconds the thread does so again."""
+        """Look once; return the seconds until the next look."""
         motion = self._motion
         if motion is None or self._tripped is not None:
             self.look_aside()
@@ -162,10 +164,10 @@ class Watcher:
         except Tripped as trip:
             self._stop(trip)
         except DriverError as error:
-            self._stop(out_of_sight(error, moving=motion.moving))
+            self._stop(arm_lost(error, moving=motion.moving))
         except Exception as error:
             log.exception("a guard failed")
-            self._stop(Tripped(18, DeviceFault(f"a guard failed ({error!r}): report this, and do not go on")))
+            self._stop(fault(Hazard.UNGUARDED, f"a guard failed ({error!r}): report this bug, and quit"))
         return started_s + self._limits.look_s - self.clock.now_s()
 
     @property
@@ -183,14 +185,16 @@ class Watcher:
         try:
             state = self._arm.state()
         except DeviceFault as error:
-            status = self._arm.status()  # what stopped the arm may have come between the two
-            raise (Tripped(9, error) if status.fault is None else by_safety(status, str(error))) from error
+            status = self._arm.status()  # the stop may have come between the two readings
+            if status.fault is not None:
+                raise by_safety(status, str(error)) from error
+            raise Tripped(Hazard.WRONG_MODEL, error) from error
         try:
             self._sensor.check()
             sample = self._sensor.latest(timeout_s=0.0)
         except DriverError as error:
-            raise Tripped(15, error) from error
-        if motion is not self._motion:  # the block has ended meanwhile: what was seen may belong to the next one
+            raise Tripped(Hazard.SENSOR_LOST, error) from error
+        if motion is not self._motion:  # the block has ended meanwhile: the readings may belong to the next one
             return
         now_s = self.clock.now_s()
         dt_s = min(now_s - self._looked_s, self._limits.counted_s)
@@ -215,22 +219,22 @@ class Watcher:
         self.clock.wait(stopped, self._limits.slow_stop_s)
         try:
             self._on_trip(trip)
-        except Exception as error:  # a screen or a disk: the arm has to be watched all the same
-            log.exception("a stop could not be told")
-            self.untold = error
+        except Exception as error:  # a screen or a disk failed: the arm is watched all the same
+            log.exception("a stop could not be reported")
+            self.report_error = error
         while not self.clock.wait(stopped, 1.0):
             pass
-        self._told.set()
+        self._reported.set()
 
     def _begin_to_stop(self) -> threading.Event:
-        """Stop the arm in a thread of its own; the event is set when that has ended."""
+        """Stop the arm in a separate thread; the event is set when the stop has ended."""
         stopped = threading.Event()
 
         def stop() -> None:
             try:
                 self._arm.stop()
             except Exception:
-                log.exception("the arm could not be told to stop: press the emergency stop")
+                log.exception("no stop could be sent to the arm: press the emergency stop")
             finally:
                 stopped.set()
 

@@ -10,15 +10,15 @@ ignores them).
 import random
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mocks.clock import CellClock
+from mocks.arrays import Array
 from mocks.sensors.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
-from mocks.wires.faults import Faults
 from mocks.wires.slcan import CanFrame
-from mocks.wires.stream import CanSensor, Measure
+from mocks.wires.stream import CanSensor
 
 EMPTY_SLOT_STATUS = 0x8040  # bad active calibration, any error
 NO_ARGUMENT, ONE_ARGUMENT = (0, 1), (1,)  # accepted data lengths; a superfluous byte is tolerated
@@ -44,26 +44,21 @@ def sg_payloads(status: int, gauges: NDArray[np.int16]) -> list[bytes]:
     return [struct.pack(">H3h", status, *even_odd[:3]), struct.pack(">3h", *even_odd[3:])]
 
 
-def matrix_row_payloads(row: NDArray[np.float64]) -> list[bytes]:
+def matrix_row_payloads(row: Array) -> list[bytes]:
     """Answer to "read matrix row": three pairs of float32."""
     return [struct.pack(">2f", *row[i : i + 2]) for i in (0, 2, 4)]
 
 
+@dataclass(eq=False, kw_only=True)
 class AtiCanNode(CanSensor):
     """The sensor's CAN node and the adapter a client opens.
 
-    Public attributes may be changed while the node runs, except `base` and `bitrate`, which show what is in force.
+    `base` and `bitrate` show what is in force.
 
     Parameters
     ----------
-    measure
-        Returns (n, 6) successive noisy readings in N and N·m, sensor axes; thread-safe.
     base, bitrate
         Base identifier (7 bits) and bit rate; a client at another bit rate gets no answer.
-    seed, faults
-        Of the wire.
-    clock
-        Of the cell.
     calibrations
         What each slot 0 to 15 holds; a slot not named is empty.
     serial
@@ -74,8 +69,6 @@ class AtiCanNode(CanSensor):
         Status bits sent as they are, besides those of an empty slot.
     gauge_offset
         (6,) or scalar, added to every gauge, in counts.
-    saturated_gauge
-        Number of a gauge that always reads +32767.
     boot_s
         Silence after a reset.
     reset_applies_settings
@@ -84,38 +77,20 @@ class AtiCanNode(CanSensor):
         Slot number echoed in place of the selected one.
     """
 
-    def __init__(
-        self,
-        measure: Measure,
-        *,
-        base: int = 0x20,
-        bitrate: int = 250_000,
-        seed: int = 0,
-        faults: Faults | None = None,
-        clock: CellClock | None = None,
-        calibrations: Mapping[int, Calibration] | None = None,
-        serial: str = "FT12345",
-        firmware: tuple[int, int, int] = (3, 8, 2),
-        status: int = 0,
-        gauge_offset: float | Sequence[float] = 0.0,
-        saturated_gauge: int | None = None,
-        boot_s: float = 0.2,
-        reset_applies_settings: bool = True,
-        wrong_echo: int | None = None,
-    ) -> None:
-        super().__init__(seed=seed, faults=faults, clock=clock, bitrate=bitrate)
-        self.measure = measure
-        self.base = self._next_base = base
-        self._next_bitrate = bitrate
-        self.calibrations = {0: REFERENCE} if calibrations is None else dict(calibrations)
-        self.serial = serial
-        self.firmware = firmware
-        self.status = status
-        self.gauge_offset = gauge_offset
-        self.saturated_gauge = saturated_gauge
-        self.boot_s = boot_s
-        self.reset_applies_settings = reset_applies_settings
-        self.wrong_echo = wrong_echo
+    base: int = 0x20
+    bitrate: int = 250_000
+    calibrations: Mapping[int, Calibration] = field(default_factory=lambda: {0: REFERENCE})
+    serial: str = "FT12345"
+    firmware: tuple[int, int, int] = (3, 8, 2)
+    status: int = 0
+    gauge_offset: float | Sequence[float] = 0.0
+    boot_s: float = 0.2
+    reset_applies_settings: bool = True
+    wrong_echo: int | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._next_base, self._next_bitrate = self.base, self.bitrate
         self._slot = 0
         self._booted_s = 0.0
 
@@ -182,8 +157,8 @@ class AtiCanNode(CanSensor):
     def _gauges(self) -> NDArray[np.int16]:
         calibration = self.calibrations.get(self._slot, REFERENCE)  # an empty slot does not stop the converter
         gauges: NDArray[np.int16] = calibration.gauges(self.measure(1), shift=np.asarray(self.gauge_offset))[0]
-        if self.saturated_gauge is not None:
-            gauges[self.saturated_gauge] = GAUGE_MAX
+        if self.saturated_axis is not None:
+            gauges[self.saturated_axis] = GAUGE_MAX
         return gauges
 
     def _foreign_frame(self, rng: random.Random) -> CanFrame:

@@ -1,4 +1,4 @@
-"""Six strain gauges and the calibration that gives them meaning, shared by both emulated ATI interfaces.
+"""Six strain gauges and their calibration, shared by both emulated ATI interfaces.
 
 Ref: ATI 9610-05-1030-04 (NETCANOEM): runtime matrix, counts per unit, unit codes; ATI 9620-05-Digital FT, section 8.
 
@@ -11,6 +11,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mocks.arrays import Array
 
 UNIT_N = {1: 4.4482216152605, 2: 1.0, 3: 4448.2216152605, 4: 1000.0, 5: 9.80665, 6: 0.00980665}
 UNIT_NM = {1: 0.1129848290276167, 2: 1.3558179483314004, 3: 1.0, 4: 0.001, 5: 0.0980665, 6: 1000.0}
@@ -36,12 +38,12 @@ class Scale:
     torque_unit: int = 3
 
     @cached_property
-    def units_SI(self) -> NDArray[np.float64]:
+    def units_SI(self) -> Array:
         """(6,) force unit in newtons (three) and torque unit in newton metres (three)."""
         return np.repeat([UNIT_N[self.force_unit], UNIT_NM[self.torque_unit]], 3)
 
     @cached_property
-    def counts_per_SI(self) -> NDArray[np.float64]:
+    def counts_per_SI(self) -> Array:
         """(6,) counts per newton (three) and per newton metre (three)."""
         return np.repeat([self.counts_per_force, self.counts_per_torque], 3) / self.units_SI
 
@@ -62,7 +64,7 @@ class Calibration(Scale):
         (6,) rated load in the calibration's units.
     """
 
-    matrix: NDArray[np.float64]
+    matrix: Array
     gauge_gains: Sequence[int] = (543, 555, 569, 579, 565, 567)
     gauge_offsets: Sequence[int] = (0x8000,) * 6
     serial: str = "FT12345"
@@ -71,16 +73,16 @@ class Calibration(Scale):
     max_rating: Sequence[float] = (130.0, 130.0, 400.0, 10.0, 10.0, 10.0)
 
     @cached_property
-    def gauges_per_SI(self) -> NDArray[np.float64]:
+    def gauges_per_SI(self) -> Array:
         """(6, 6) gauge counts per newton (columns 0 to 2) and per newton metre (columns 3 to 5)."""
         return np.linalg.inv(self.matrix) * self.counts_per_SI
 
     def gauges(
         self,
-        wrench: NDArray[np.float64],
+        wrench: Array,
         *,
-        gain: NDArray[np.float64] | float = 1.0,
-        shift: NDArray[np.float64] | float = 0.0,
+        gain: Array | float = 1.0,
+        shift: Array | float = 0.0,
     ) -> NDArray[np.int16]:
         """Gauge counts of wrenches, rounded and clipped as the converter does.
 

@@ -3,19 +3,21 @@
 Ref: ATI 9620-05-Digital FT, sections 8.1, 8.3, 8.4; ATI 9610-05-1030-04, section 9 (the same port on a NETCANOEM).
 
 Does not model: baud mismatch (a pty has no speed), parity of what the client sends, collisions of a half-duplex line,
-writing calibrations to storage, the power-up time. Unspecified by the sources and chosen here: an empty calibration
-slot reads zeros, the 23 registers between two slots do not exist, a read of more than 64 registers is exception 3.
+writing calibrations to storage, the power-up time.
+
+Chosen here, because the sources leave it open: an empty calibration slot reads zeros. The 23 registers between two
+slots do not exist. A read of more than 64 registers is exception 3.
 """
 
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mocks.clock import CellClock
+from mocks.arrays import Array
 from mocks.sensors.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
-from mocks.wires.faults import Faults, FaultyWire
 from mocks.wires.modbus import (
     DEVICE_FAILURE,
     ILLEGAL_ADDRESS,
@@ -27,12 +29,10 @@ from mocks.wires.modbus import (
     reply,
     written_registers,
 )
-from mocks.wires.pty import PtyDevice
-from mocks.wires.stream import Measure
+from mocks.wires.stream import SerialSensor
 
 ADDRESS = 0x0A
 STREAM_HZ = 7000.0
-BURST_S = 2e-3  # as a USB adapter delivers them
 RECORD_BYTES = 13
 CHARACTER_BITS = 11
 JAM_BYTES = 14
@@ -87,21 +87,15 @@ def calibration_block(calibration: Calibration) -> bytes:
     return block.ljust(2 * CALIBRATION_REGISTERS, b"\0")
 
 
-class AtiSerialBox(PtyDevice):
+@dataclass(eq=False, kw_only=True)
+class AtiSerialBox(SerialSensor):
     """The sensor's RS-485 interface.
 
-    Public attributes may be changed while the box runs; `produced_records` and `dropped_records` count since the
-    stream started.
+    A frame is a reply or a record. The stream has no sync byte: the
+    noise must reach a gauge count, or shifted records validate.
 
     Parameters
     ----------
-    measure
-        Returns (n, 6) successive noisy readings in N and N·m, sensor axes; thread-safe. The stream has no sync byte:
-        the noise must reach a gauge count, or shifted records validate.
-    seed, faults
-        Of the wire; a frame is a reply or a record.
-    clock
-        Of the cell.
     calibrations
         What each slot 1 to 16 holds; a slot not named is empty. The lowest one describes the transducer.
     needs_gains
@@ -110,8 +104,6 @@ class AtiSerialBox(PtyDevice):
         Status word; its bit 15 is the error bit of every record.
     gauge_offset
         (6,) or scalar, added to every gauge, in counts.
-    saturated_gauge
-        Number of a gauge that always reads +32767.
     streaming_at_start
         Streams from power-up on, as after a crash of the last client.
     refuse_start
@@ -122,45 +114,22 @@ class AtiSerialBox(PtyDevice):
 
     has_parity = True
 
-    def __init__(
-        self,
-        measure: Measure,
-        *,
-        seed: int = 0,
-        faults: Faults | None = None,
-        clock: CellClock | None = None,
-        calibrations: Mapping[int, Calibration] | None = None,
-        needs_gains: bool = True,
-        status: int = 0,
-        gauge_offset: float | Sequence[float] = 0.0,
-        saturated_gauge: int | None = None,
-        streaming_at_start: bool = False,
-        refuse_start: bool = False,
-        bad_checksum: float = 0.0,
-    ) -> None:
-        super().__init__(clock)
-        self.measure = measure
-        self.faults = Faults() if faults is None else faults
-        self.calibrations = {1: REFERENCE} if calibrations is None else dict(calibrations)
-        self.needs_gains = needs_gains
-        self.status = status
-        self.gauge_offset = gauge_offset
-        self.saturated_gauge = saturated_gauge
-        self.streaming_at_start = streaming_at_start
-        self.refuse_start = refuse_start
-        self.bad_checksum = bad_checksum
-        self.streaming = False
-        self.produced_records = 0
-        self.dropped_records = 0
-        self._random = np.random.default_rng(seed)
-        self._wire: FaultyWire[bytes] = FaultyWire(self.faults, self.clock, seed)
+    calibrations: Mapping[int, Calibration] = field(default_factory=lambda: {1: REFERENCE})
+    needs_gains: bool = True
+    status: int = 0
+    gauge_offset: float | Sequence[float] = 0.0
+    streaming_at_start: bool = False
+    refuse_start: bool = False
+    bad_checksum: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._random = np.random.default_rng(self.seed)
         self._stored_baud_code = 0
         self._registers: dict[int, int] = {}
         self._unlocked = False
         self._burst = bytearray()
         self._last_byte_s = 0.0
-        self._stream_start_s = 0.0
-        self._stream_hz = STREAM_HZ
 
     def _power_up(self) -> None:
         self._registers = dict.fromkeys(range(GAINS, SESSION + 1), 0)
@@ -172,9 +141,7 @@ class AtiSerialBox(PtyDevice):
             self._registers |= dict(enumerate(words, start=CALIBRATION + (slot - 1) * CALIBRATION_STRIDE))
         self._unlocked = False
         self._burst.clear()
-        self._wire.clear()
-        self._forget_unsent()
-        self.streaming = False
+        self._fall_silent()
         if self.streaming_at_start:
             self._start_streaming()
 
@@ -185,24 +152,15 @@ class AtiSerialBox(PtyDevice):
         self._last_byte_s = now_s
         self._burst += data[: LONGEST_FRAME + 1 - len(self._burst)]  # longer is no frame: remember no more of it
         if self.streaming and len(self._burst) >= JAM_BYTES:
-            self.streaming = False  # and what follows without a pause still belongs to the jam
-            self._wire.clear()
-            self._forget_unsent()
+            self._fall_silent()  # and what follows without a pause still belongs to the jam
 
-    def _tick(self, now_s: float) -> float | None:
-        wait_s = None if self.streaming else self._take_request(now_s)
-        if self.streaming:
-            elapsed_s = max(0.0, now_s - self._stream_start_s)
-            self._stream(elapsed_s)
-            wait_s = BURST_S - elapsed_s % BURST_S
-        for data in self._wire.due(self.clock.now_s()):
-            self.dropped_records += self._send(data, RECORD_BYTES if self.streaming else len(data))
-        on_the_way_s = self._wire.wait_s(now_s)
-        return min((s for s in (wait_s, on_the_way_s) if s is not None), default=None)
+    def _deliver(self, frames: list[bytes]) -> None:
+        for data in frames:
+            self.dropped_frames += self._send(data, RECORD_BYTES if self.streaming else len(data))
 
-    def _take_request(self, now_s: float) -> float | None:
-        """Answer what came before a pause; return the seconds until that can be told."""
-        if not self._burst:
+    def _work(self, now_s: float) -> float | None:
+        """Answer what came before a pause; return the seconds until the pause is long enough."""
+        if self.streaming or not self._burst:
             return None
         wait_s = self._last_byte_s + FRAME_GAP_S - now_s
         if wait_s > 0:
@@ -252,34 +210,27 @@ class AtiSerialBox(PtyDevice):
         return data[:4]
 
     def _start_streaming(self) -> None:
-        self.streaming = True
-        self.produced_records = self.dropped_records = 0
-        self._stream_hz = min(STREAM_HZ, BAUD_RATES[self._registers[BAUD]] / (CHARACTER_BITS * RECORD_BYTES))
-        self._stream_start_s = self.clock.now_s()
+        self.dropped_frames = 0
+        self._pacer.start(min(STREAM_HZ, BAUD_RATES[self._registers[BAUD]] / (CHARACTER_BITS * RECORD_BYTES)))
 
-    def _stream(self, elapsed_s: float) -> None:
-        """Send the records that are due."""
-        count = int(elapsed_s * self._stream_hz) - self.produced_records
-        if count <= 0:
-            return
-        self.produced_records += count
+    def _samples(self, count: int) -> list[bytes]:
         records = stream_records(self._gauges(count), error=bool(self.status & 0x8000))
         if self.bad_checksum:
             records[self._random.random(count) < self.bad_checksum, 12] ^= 0x01
         data = records.tobytes()
         size = RECORD_BYTES if self.faults.harm_frames else len(data)
-        self._wire.put([data[i : i + size] for i in range(0, len(data), size)])
+        return [data[i : i + size] for i in range(0, len(data), size)]
 
     def _gauges(self, count: int) -> NDArray[np.int16]:
         """(count, 6) gauges at the gains and offsets in force, which are right only when they are the calibration's."""
         calibration = self.calibrations[min(self.calibrations)]
-        gain: NDArray[np.float64] | float = 1.0
+        gain: Array | float = 1.0
         shift = np.asarray(self.gauge_offset, dtype=np.float64)
         if self.needs_gains:
             active = np.array([self._registers[address] for address in range(GAINS, SESSION)], dtype=np.float64)
             gain = active[:6] / calibration.gauge_gains
             shift = gain * shift + (active[6:] - calibration.gauge_offsets) / 4
         gauges = calibration.gauges(self.measure(count), gain=gain, shift=shift)
-        if self.saturated_gauge is not None:
-            gauges[:, self.saturated_gauge] = GAUGE_MAX
+        if self.saturated_axis is not None:
+            gauges[:, self.saturated_axis] = GAUGE_MAX
         return gauges

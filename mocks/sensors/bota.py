@@ -3,21 +3,22 @@
 Ref: Bota Systems, SensONE serial user manual and the vendor's Python example (configuration, frame, CRC).
 
 Does not model: line speed, the filters' effect on the readings (only the sampling time follows from the sinc length),
-offsets and tare, raw output. Chosen here, because the sources leave it open: the text around ``App Init``; commands
-need no line ending, CR, LF and spaces between them are ignored; while running, everything but ``C`` is ignored; a
-configuration command with values out of range, or an unknown one, is answered with error 1; settings survive `reset`;
-the CSV format is one line per sample with the fields of the frame; the sinc length may be 51 to 4096.
+offsets and tare, raw output.
+
+Chosen here, because the sources leave it open: the text around ``App Init``. Commands need no line ending; CR, LF and
+spaces between them are ignored. While the sensor streams, it ignores everything but ``C``. A configuration command with
+values out of range, or an unknown one, is answered with error 1. Settings survive `reset`. The CSV format is one line
+per sample with the fields of the frame. The sinc length may be 51 to 4096.
 """
 
 import re
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from mocks.clock import CellClock
-from mocks.wires.faults import Faults
-from mocks.wires.stream import Measure, SerialSensor
+from mocks.wires.stream import SerialSensor
 
 HEADER = b"\xaa"
 LONGEST_COMMAND = len(b"f,4096,0,0,0")
@@ -41,7 +42,7 @@ _X25 = [_x25_entry(byte) for byte in range(256)]
 
 
 def crc16_x25(data: bytes) -> bytes:
-    """CRC-16/X-25 as it goes on the wire, low byte first."""
+    """Return the CRC-16/X-25 as it goes on the wire, low byte first."""
     crc = 0xFFFF
     for byte in data:
         crc = (crc >> 8) ^ _X25[(crc ^ byte) & 0xFF]
@@ -54,59 +55,35 @@ def stream_frame(status: int, wrench: list[float], timestamp_us: int, temperatur
     return HEADER + payload + crc16_x25(payload)
 
 
+@dataclass(eq=False, kw_only=True)
 class BotaBox(SerialSensor):
     """The sensor on its RS-422 or USB line.
 
-    Public attributes may be changed while it runs.
-
     Parameters
     ----------
-    measure
-        Returns (n, 6) successive noisy readings in N and N·m, sensor axes; called for every sample that is made.
-    seed, faults
-        Of the wire.
-    clock
-        Of the cell.
     sinc_length
         Of the filter at power-up: a sample takes 19.53125 µs times this.
     capacity
         (6,) in N and N·m: readings are clipped there and marked as overrange.
     temperature_C
-        Told with every sample.
+        Reported with every sample.
     status
         Status bits set besides those that follow from the readings and the configuration.
-    saturated_axis
-        Number of an axis, 0 to 5, that always reads its capacity.
     streaming_at_start
-        Has been running for long when the client comes; else it powers up at `start` and prints its banner first.
+        Streams already when the client opens it; else it powers up at `start` and sends its banner first.
     boot_s
         Silence before the banner.
     """
 
-    def __init__(
-        self,
-        measure: Measure,
-        *,
-        seed: int = 0,
-        faults: Faults | None = None,
-        clock: CellClock | None = None,
-        sinc_length: int = 512,
-        capacity: Sequence[float] = CAPACITY,
-        temperature_C: float = 25.5,
-        status: int = 0,
-        saturated_axis: int | None = None,
-        streaming_at_start: bool = True,
-        boot_s: float = 0.1,
-    ) -> None:
-        super().__init__(seed=seed, faults=faults, clock=clock)
-        self.measure = measure
-        self.sinc_length = sinc_length
-        self.capacity = capacity
-        self.temperature_C = temperature_C
-        self.status = status
-        self.saturated_axis = saturated_axis
-        self.streaming_at_start = streaming_at_start
-        self.boot_s = boot_s
+    sinc_length: int = 512
+    capacity: Sequence[float] = CAPACITY
+    temperature_C: float = 25.5
+    status: int = 0
+    streaming_at_start: bool = True
+    boot_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self.baud_code = 4
         self.csv = False
         self.calibrated = True
@@ -127,9 +104,7 @@ class BotaBox(SerialSensor):
 
     def _restart(self) -> None:
         self._line = b""
-        self._wire.clear()
-        self._forget_unsent()
-        self._pacer.stop()
+        self._fall_silent()
         self._powered_s = self.clock.now_s()
         self._boots_at_s = self.clock.now_s() + self.boot_s
 
@@ -186,21 +161,15 @@ class BotaBox(SerialSensor):
         self._wire.put([b"r,%d,%b,0\r\n" % (error, letter)])
 
     def _samples(self, count: int) -> list[bytes]:
-        wrench = self.measure(count)
-        capacity = np.asarray(self.capacity)
-        if self.saturated_axis is not None:
-            wrench = wrench.copy()
-            wrench[:, self.saturated_axis] = capacity[self.saturated_axis]
         status = self.status | (0 if self.calibrated else RAW_OUTPUT)
-        overrange = np.any(np.abs(wrench) >= capacity, axis=1)
-        clipped = np.clip(wrench, -capacity, capacity)
+        clipped, overrange = self._readings(count, np.asarray(self.capacity))
         first = self._pacer.made - count
         return [
-            self._sample(status | (OVERRANGE if over else 0), row.tolist(), first + i)
+            self._frame(status | (OVERRANGE if over else 0), row.tolist(), first + i)
             for i, (over, row) in enumerate(zip(overrange, clipped, strict=True))
         ]
 
-    def _sample(self, status: int, wrench: list[float], number: int) -> bytes:
+    def _frame(self, status: int, wrench: list[float], number: int) -> bytes:
         timestamp_us = int(self._stream_start_us + number * 1e6 * self.sample_s) & 0xFFFFFFFF
         if not self.csv:
             return stream_frame(status, wrench, timestamp_us, self.temperature_C)

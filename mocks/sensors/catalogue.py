@@ -1,36 +1,20 @@
-"""The sensors a station can start, by name: which emulator, and the address under which a client finds it.
+"""The sensors a station can start, by name, with the emulator and the address of each.
 
-The addresses are those of the project's drivers (its drivers/README.md); any other client takes the path or port.
+The addresses have the form of drivers/README.md; another client takes the path or port from them.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any
 
 from mocks.clock import CellClock
-from mocks.wires.faults import Faults
-from mocks.wires.stream import Measure
-
-
-class SensorEmulator(Protocol):
-    """What a sensor emulator offers: it opens its end of a wire in `start` and serves it from its own threads."""
-
-    faults: Faults
-
-    def start(self) -> Any:
-        """Open the wire and return what a client opens: a path, or addresses by name."""
-
-    def unplug(self) -> None:
-        """Close the wire, as if the cable were pulled."""
-
-    def stop(self) -> None:
-        """End the threads."""
+from mocks.wires.device import Device, Measure
 
 
 @dataclass(frozen=True)
 class Kind:
-    """One sort of sensor.
+    """One kind of sensor.
 
     Parameters
     ----------
@@ -39,11 +23,11 @@ class Kind:
     scheme, query
         Of its address, around the path of its pseudo-terminal.
     endpoint
-        What a client that knows no such address needs besides.
+        Settings for a client that does not know such addresses.
     options
         Of the emulator.
     floats
-        Whether its wire can say that a reading is no number.
+        Whether its wire can carry NaN.
     """
 
     emulator: str
@@ -83,7 +67,7 @@ WRIST = "ur-ft"
 """The sensor in the arm's wrist, which the controller reports."""
 
 CHOICES = (*KINDS, WRIST, "both", "none")
-"""What a station can be asked for; "both" is can and serial."""
+"""Values of --sensor; "both" is can and serial."""
 
 
 class Sensor:
@@ -104,18 +88,18 @@ class Sensor:
     def __init__(self, name: str, measure: Measure, *, seed: int, host: str, clock: CellClock) -> None:
         self.name = name
         self._kind = KINDS.get(name)
-        self._emulator: SensorEmulator | None = None
+        self._emulator: Device[Any] | None = None
         if self._kind is None:
             self.endpoint = {"url": f"{WRIST}://{host}?counts_per_N=1&counts_per_Nm=1", "host": host}
             return
         module, _, class_name = self._kind.emulator.partition(":")
         options = self._kind.options | ({"host": host} if name == "netft" else {})
-        make: Callable[..., SensorEmulator] = getattr(import_module(module), class_name)
+        make: Callable[..., Device[Any]] = getattr(import_module(module), class_name)
         self._emulator = make(measure, seed=seed, clock=clock, **options)
         self.endpoint = self._endpoint(self._kind, self._emulator.start())
 
     def _endpoint(self, kind: Kind, where: Any) -> dict[str, Any]:
-        """What the station tells about it, its address under "url"."""
+        """Return what the station reports about it, its address under "url"."""
         if isinstance(where, dict):
             ports = "&".join(f"{key}={where[key]}" for key in ("rdt_port", "http_port"))
             return {"url": f"{kind.scheme}://{where['host']}?{ports}", **where}
@@ -123,31 +107,30 @@ class Sensor:
         return {"url": url, "channel" if "interface" in kind.endpoint else "port": where, **kind.endpoint}
 
     @property
-    def says_nan(self) -> bool:
-        """Whether its wire can say that a reading is no number."""
+    def carries_nan(self) -> bool:
+        """Whether its wire can carry NaN."""
         return self._kind is None or self._kind.floats
 
     @property
-    def emulator(self) -> SensorEmulator:
-        """What stands behind the wire.
+    def emulator(self) -> Device[Any]:
+        """The emulator behind the wire.
 
         Raises
         ------
         ValueError
-            For the sensor in the wrist, which has none.
+            For the sensor in the wrist, which has no wire.
         """
         if self._emulator is None:
             raise ValueError(f"{self.name} is part of the arm and has no wire of its own")
         return self._emulator
 
     def saturate(self, axis: int | None) -> None:
-        """Let an axis, or a gauge of a sensor that sends gauges, read the end of its range; None ends it."""
+        """Let an axis, or a gauge where the sensor sends gauges, read the end of its range; None ends it."""
         if axis is not None and not 0 <= axis < 6:
             raise ValueError(f"axis {axis} is not 0 to 5")
-        attribute = "saturated_gauge" if hasattr(self.emulator, "saturated_gauge") else "saturated_axis"
-        setattr(self.emulator, attribute, axis)
+        self.emulator.saturated_axis = axis
 
     def stop(self) -> None:
-        """End it."""
+        """Stop the emulator."""
         if self._emulator is not None:
             self._emulator.stop()

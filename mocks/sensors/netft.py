@@ -3,18 +3,16 @@
 Ref: ATI 9620-05-Net FT, sections "UDP Interface Using RDT" and "XML"; 9610-05-Ethernet Axia, sections 9 and 10.
 
 Does not model: the TCP interface, multi-unit mode, filters, tool transformation, monitor conditions, more than one
-configuration, the web pages, DHCP, and that a real box answers only a few HTTP requests in a row. Chosen here, because
-the sources leave it open: a new request of samples replaces the running one and takes over its address; "one-shot"
-sends its count of samples, one for count 0, at the set rate; a reading at its rating sets the summary and saturation
-bits; what is no request is ignored.
+configuration, the web pages, DHCP, and that a real box answers only a few HTTP requests in a row.
+
+Chosen here, because the sources leave it open: a new request of samples replaces the running one and its address.
+"One-shot" sends its count of samples, one for count 0, at the set rate. A reading at its rating sets the summary and
+saturation bits. A datagram that is no request is ignored.
 """
 
 import contextlib
-import os
-import select
 import socket
 import struct
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -26,10 +24,9 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from mocks.clock import CellClock, time_out_s
+from mocks.arrays import Array
 from mocks.sensors.ati_gauges import Scale
-from mocks.wires.faults import Faults, FaultyWire
-from mocks.wires.stream import Measure, Pacer
+from mocks.wires.device import Device
 
 RDT_PORT = 49152
 REQUEST = struct.Struct(">HHI")
@@ -40,11 +37,10 @@ MAX_BUFFER = 40
 SUMMARY, LATCH, SATURATED = 0x8000_0000, 0x0001_0000, 0x8002_0000
 FORCE_UNITS = {1: "lbf", 2: "N", 3: "klbf", 4: "kN", 5: "kgf", 6: "gf"}
 TORQUE_UNITS = {1: "lbf-in", 2: "lbf-ft", 3: "Nm", 4: "Nmm", 5: "kgf-cm", 6: "kNm"}
-_END, _RESET = b"!", b"r"
 
 
 class Command(IntEnum):
-    """What a request asks for."""
+    """Command code of a request."""
 
     STOP = 0x0000
     ONE_SHOT = 0x0001
@@ -55,7 +51,7 @@ class Command(IntEnum):
 
 
 class Endpoint(TypedDict):
-    """Where a client finds the box."""
+    """Addresses of the box."""
 
     host: str
     rdt_port: int
@@ -64,7 +60,7 @@ class Endpoint(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class Calibration(Scale):
-    """What the box tells over HTTP about its transducer.
+    """What the box reports over HTTP about its transducer.
 
     Parameters
     ----------
@@ -79,8 +75,8 @@ class Calibration(Scale):
     rating: Sequence[float] = (130.0, 130.0, 400.0, 10.0, 10.0, 10.0)
 
 
-def rdt_records(first: int, ft: NDArray[np.int64], status: NDArray[np.int64], counts: NDArray[np.float64]) -> bytes:
-    """Consecutive 36-byte records, big-endian.
+def rdt_records(first: int, ft: NDArray[np.int64], status: NDArray[np.int64], counts: Array) -> bytes:
+    """Return consecutive 36-byte records, big-endian.
 
     Parameters
     ----------
@@ -97,19 +93,12 @@ def rdt_records(first: int, ft: NDArray[np.int64], status: NDArray[np.int64], co
     return records.tobytes()
 
 
-class NetFtBox:
-    """The box: one thread for RDT, one for HTTP.
-
-    Public attributes may be changed while it runs, except addresses.
+@dataclass(eq=False, kw_only=True)
+class NetFtBox(Device[bytes]):
+    """The box: one thread for RDT, one for HTTP. A box whose wire is stalled by `faults` does not answer HTTP either.
 
     Parameters
     ----------
-    measure
-        Returns (n, 6) successive noisy readings in N and N·m, sensor axes; called for every sample that is made.
-    seed, faults
-        Of the UDP datagrams; a stalled box does not answer HTTP either.
-    clock
-        Of the cell; None makes one for this box alone.
     host
         Address to listen at.
     rdt_port, http_port
@@ -126,59 +115,31 @@ class NetFtBox:
         Whether the box answers at its UDP port at all.
     status
         Status bits sent with every sample.
-    saturated_axis
-        Number of an axis, 0 to 5, that always reads its rating.
     streaming_at_start
-        Address and port of a client that asked for a stream before it died.
+        Address and port of the last client, which crashed while it streamed.
     """
 
-    def __init__(
-        self,
-        measure: Measure,
-        *,
-        seed: int = 0,
-        faults: Faults | None = None,
-        clock: CellClock | None = None,
-        host: str = "127.0.0.1",
-        rdt_port: int = RDT_PORT,
-        http_port: int = 0,
-        calibration: Calibration | None = None,
-        product: str = "Net F/T",
-        rate_hz: int = INTERNAL_HZ,
-        buffer_size: int = 5,
-        rdt_enabled: bool = True,
-        status: int = 0,
-        saturated_axis: int | None = None,
-        streaming_at_start: tuple[str, int] | None = None,
-    ) -> None:
-        self.measure = measure
-        self.faults = Faults() if faults is None else faults
-        self.clock = clock or CellClock()
-        self.calibration = calibration or Calibration()
-        self.product = product
-        self.rate_hz = rate_hz
-        self.buffer_size = buffer_size
-        self.rdt_enabled = rdt_enabled
-        self.status = status
-        self.saturated_axis = saturated_axis
-        self.streaming_at_start = streaming_at_start
-        self._ports = (host, rdt_port, http_port)
-        self._wire: FaultyWire[bytes] = FaultyWire(self.faults, self.clock, seed)
-        self._pacer = Pacer(self.clock)
+    host: str = "127.0.0.1"
+    rdt_port: int = RDT_PORT
+    http_port: int = 0
+    calibration: Calibration = Calibration()
+    product: str = "Net F/T"
+    rate_hz: int = INTERNAL_HZ
+    buffer_size: int = 5
+    rdt_enabled: bool = True
+    status: int = 0
+    streaming_at_start: tuple[str, int] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self._client: tuple[str, int] | None = None
         self._left: int | None = None
         self._buffer = b""
         self._buffered = False
-        self._stream_hz = float(rate_hz)
+        self._stream_hz = float(self.rate_hz)
         self._bias = np.zeros(6)
         self._booted_s = 0.0
         self._ft_start = 0
-        self._threads: list[threading.Thread] = []
-
-    @property
-    def streaming(self) -> bool:
-        """Whether samples are being sent."""
-        return self._pacer.running
 
     def start(self) -> Endpoint:
         """Power the box up.
@@ -190,49 +151,25 @@ class NetFtBox:
         OSError
             If a port cannot be had.
         """
-        if self._threads:
-            raise RuntimeError("NetFtBox runs already: stop it before starting it again")
-        host, rdt_port, http_port = self._ports
+        self._require_stopped()
         with contextlib.ExitStack() as stack:
             self._socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-            self._socket.bind((host, rdt_port))
+            self._socket.bind((self.host, self.rdt_port))
             self._socket.setblocking(False)
-            self._http = stack.enter_context(_HttpServer((host, http_port), self))
+            self._http = stack.enter_context(_HttpServer((self.host, self.http_port), self))
             stack.pop_all()
-        self._wake_read, self._wake_write = os.pipe()
-        self._boot()
-        targets = {"RDT": self._serve, "HTTP": lambda: self._http.serve_forever(poll_interval=0.1)}
-        for name, target in targets.items():
-            self._threads.append(threading.Thread(target=target, name=f"NetFtBox {name}", daemon=True))
-            self._threads[-1].start()
-        return {"host": host, "rdt_port": self._socket.getsockname()[1], "http_port": self._http.server_port}
+        self._file = self._socket.fileno()
+        self._launch(lambda: self._http.serve_forever(poll_interval=0.1))
+        return {"host": self.host, "rdt_port": self._socket.getsockname()[1], "http_port": self._http.server_port}
 
-    def unplug(self) -> None:
-        """Take the supply away: nobody listens at the ports; a pulled network cable is `Faults.stall`."""
-        if not self._threads:
-            return
-        os.write(self._wake_write, _END)
+    def _close(self) -> None:
         self._http.shutdown()
-        for thread in self._threads:
-            thread.join()
-        self._threads.clear()
         self._http.server_close()
         self._socket.close()
-        os.close(self._wake_write)
-        os.close(self._wake_read)
-
-    def stop(self) -> None:
-        """End the box; harmless when it has ended already."""
-        self.unplug()
-
-    def reset(self) -> None:
-        """Interrupt the supply for a moment: the stream ends, the bias is gone, sequence numbers begin anew."""
-        if self._threads:
-            os.write(self._wake_write, _RESET)
 
     # -- RDT ----------------------------------------------------------------------------------------------------------
 
-    def _boot(self) -> None:
+    def _power_up(self) -> None:
         self._wire.clear()
         self._pacer.stop()
         self._bias = np.zeros(6)
@@ -240,27 +177,13 @@ class NetFtBox:
         if self.streaming_at_start:
             self._request(Command.REAL_TIME, 0, self.streaming_at_start)
 
-    def _serve(self) -> None:
-        with self.clock.keeping_up():
-            while self._turn():
-                pass
-
-    def _turn(self) -> bool:
-        """Do what is due, then wait for a request and take it; False when the box has been unplugged."""
-        wait_s = time_out_s(self._tick(self.clock.follow() * 1e-9))
-        readable, _, _ = select.select([self._socket.fileno(), self._wake_read], [], [], wait_s)
-        if self._wake_read in readable:
-            if os.read(self._wake_read, 1) == _END:
-                return False
-            self._boot()
-        if self._socket.fileno() in readable:
-            with contextlib.suppress(OSError):  # a client that is gone is reported as a refused connection
-                data, client = self._socket.recvfrom(256)
-                if len(data) == REQUEST.size and self.rdt_enabled:
-                    header, command, count = REQUEST.unpack(data)
-                    if header == REQUEST_HEADER:
-                        self._request(command, count, client)
-        return True
+    def _receive(self) -> None:
+        with contextlib.suppress(OSError):  # a client that is gone is reported as a refused connection
+            data, client = self._socket.recvfrom(256)
+            if len(data) == REQUEST.size and self.rdt_enabled:
+                header, command, count = REQUEST.unpack(data)
+                if header == REQUEST_HEADER:
+                    self._request(command, count, client)
 
     def _request(self, command: int, count: int, client: tuple[str, int]) -> None:
         match command:
@@ -279,16 +202,11 @@ class NetFtBox:
             case Command.BIAS:
                 self._bias = self._counts(1)[0][0]
 
-    def _tick(self, now_s: float) -> float | None:
-        count = self._pacer.due(now_s)
-        if count:
-            self._sample(count)
-        for datagram in self._wire.due(self.clock.now_s()):
-            with contextlib.suppress(OSError):  # no room, or nobody there: a datagram is lost
+    def _deliver(self, frames: list[bytes]) -> None:
+        for datagram in frames:
+            with contextlib.suppress(OSError):  # no room, or nothing listens there: a datagram is lost
                 if self._client is not None:
                     self._socket.sendto(datagram, self._client)
-        waits_s = (self._pacer.wait_s(now_s), self._wire.wait_s(now_s))
-        return min((wait_s for wait_s in waits_s if wait_s is not None), default=None)
 
     def _sample(self, count: int) -> None:
         first = self._pacer.made - count  # of this stream, from 0
@@ -303,15 +221,10 @@ class NetFtBox:
         if self._left is not None and first + count >= self._left:
             self._pacer.stop()
 
-    def _counts(self, count: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def _counts(self, count: int) -> tuple[Array, NDArray[np.bool_]]:
         """(count, 6) counts before bias, and (count,) whether a reading is at its rating."""
-        rating = np.asarray(self.calibration.rating)
-        wrench = self.measure(count)
-        if self.saturated_axis is not None:
-            wrench = wrench.copy()
-            wrench[:, self.saturated_axis] = rating[self.saturated_axis]
-        saturated = np.any(np.abs(wrench) >= rating, axis=1)
-        return np.clip(wrench, -rating, rating) * self.calibration.counts_per_SI, saturated
+        readings, saturated = self._readings(count, np.asarray(self.calibration.rating))
+        return readings * self.calibration.counts_per_SI, saturated
 
     def _send(self, records: bytes, *, last: bool) -> None:
         data = self._buffer + records
@@ -402,4 +315,4 @@ class _HttpHandler(BaseHTTPRequestHandler):
         self.wfile.write(content or b"")
 
     def log_message(self, format: str, *args: object) -> None:
-        """Keep quiet."""
+        """Log nothing."""

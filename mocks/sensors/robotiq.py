@@ -2,21 +2,22 @@
 
 Ref: Robotiq FT 300 instruction manual, section "Control" (registers, data stream).
 
-Does not model: parity and baud mismatch, accelerometer readings (gravity along the sensor's z axis is told). Chosen
-here, because the sources leave it open: requests during a stream are not answered, 50 bytes FF in a row end it and
-nothing less does, a register that does not exist is exception 2, only register 410 can be written, and it starts the
-stream at 0x0200 and takes any other value without effect. The stream has neither status nor overload.
+Does not model: parity and baud mismatch, accelerometer readings (they report gravity along the sensor's z axis).
+
+Chosen here, because the sources leave it open: requests during a stream are not answered. Only 50 bytes FF in a row end
+the stream. A register that does not exist is exception 2. Only register 410 can be written: 0x0200 starts the stream,
+any other value has no effect. The stream has neither status nor overload.
 """
 
 import struct
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mocks.clock import CellClock
+from mocks.arrays import Array
 from mocks.wires import modbus
-from mocks.wires.faults import Faults
-from mocks.wires.stream import Measure, SerialSensor
+from mocks.wires.stream import SerialSensor
 
 ADDRESS = 0x09
 STREAM_HZ = 100.0
@@ -30,9 +31,9 @@ COUNTS_PER_SI = np.array([100.0] * 3 + [1000.0] * 3)
 ONE_G = (0, 0, 1000)
 
 
-def raw_values(wrench: NDArray[np.float64]) -> NDArray[np.int16]:
+def raw_values(wrench: Array) -> NDArray[np.int16]:
     """Counts of (n, 6) wrenches in N and N·m: hundredths of N, thousandths of N·m, clipped."""
-    counts: NDArray[np.float64] = np.rint(wrench * COUNTS_PER_SI)
+    counts: Array = np.rint(wrench * COUNTS_PER_SI)
     return counts.clip(-32768, 32767).astype(np.int16)
 
 
@@ -41,51 +42,29 @@ def stream_frame(raw: list[int]) -> bytes:
     return modbus.with_crc(HEADER + struct.pack("<6h", *raw))
 
 
+@dataclass(eq=False, kw_only=True)
 class RobotiqBox(SerialSensor):
     """The sensor on its RS-485 or USB line.
 
-    Public attributes may be changed while it runs.
-
     Parameters
     ----------
-    measure
-        Returns (n, 6) successive noisy readings in N and N·m, sensor axes; called for every sample that is made.
-    seed, faults
-        Of the wire.
-    clock
-        Of the cell.
     firmware
         Three letters, the first an F, then three numbers.
     serial
         Three letters and a number; 0 means the sensor does not know it.
     year
         Of production.
-    saturated_axis
-        Number of an axis, 0 to 5, that always reads +32767.
     streaming_at_start
-        Streams from power-up on, as some do, and as one does whose client died.
+        Streams from power-up on, as some sensors do, and as after a crash of the last client.
     """
 
-    def __init__(
-        self,
-        measure: Measure,
-        *,
-        seed: int = 0,
-        faults: Faults | None = None,
-        clock: CellClock | None = None,
-        firmware: tuple[str, int, int, int] = ("FTS", 2, 0, 1),
-        serial: tuple[str, int] = ("FTS", 1234),
-        year: int = 2022,
-        saturated_axis: int | None = None,
-        streaming_at_start: bool = False,
-    ) -> None:
-        super().__init__(seed=seed, faults=faults, clock=clock)
-        self.measure = measure
-        self.firmware = firmware
-        self.serial = serial
-        self.year = year
-        self.saturated_axis = saturated_axis
-        self.streaming_at_start = streaming_at_start
+    firmware: tuple[str, int, int, int] = ("FTS", 2, 0, 1)
+    serial: tuple[str, int] = ("FTS", 1234)
+    year: int = 2022
+    streaming_at_start: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self._output = 0
         self._burst = bytearray()
         self._last_byte_s = 0.0
@@ -93,10 +72,8 @@ class RobotiqBox(SerialSensor):
 
     def _power_up(self) -> None:
         self._burst.clear()
-        self._wire.clear()
-        self._forget_unsent()
+        self._fall_silent()
         self._output = self._stop_bytes = 0
-        self._pacer.stop()
         if self.streaming_at_start:
             self._pacer.start(STREAM_HZ)
 

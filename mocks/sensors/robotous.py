@@ -2,27 +2,30 @@
 
 Ref: Robotous RFT series installation and operation manual, revision 1.7 (commands, data field, CAN and UART packets).
 
-Does not model: what the low-pass filter does to the readings (type and code are kept and told), storage wear, line
-speed. Chosen here, because the manual leaves it open: a command that is unknown or whose packet is damaged is met with
-silence; setting what the other wire needs is answered as unsupported; 1000 Hz on a slower line becomes what the
-line carries; a reading at the end of the int16 range, or beyond the capacity, raises the overload bit of its axis; the
-overload counters count the beginnings of overloads and saturate at 255; CAN identifiers and the baud rate, which need
-a reboot, are also taken over by `reset`, all other settings survive it except bias and streaming.
+Does not model: the low-pass filter (its type and code are stored and reported), storage wear, line speed.
+
+Chosen here, because the manual leaves it open: an unknown command or a damaged packet gets no answer. A setting of the
+other wire is answered as unsupported. 1000 Hz on a slower line becomes the rate that the line carries. A reading at the
+end of the int16 range, or beyond the capacity, sets the overload bit of its axis. The overload counters count the
+beginnings of overloads up to 255. CAN identifiers and the baud rate need a reboot; `reset` is one. All other settings
+survive it, except bias and streaming.
 """
 
 import random
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from enum import IntEnum
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mocks.clock import CellClock
-from mocks.wires.faults import Faults
+from mocks.arrays import Array
+from mocks.wires.faults import Frame
+from mocks.wires.pty import PtyDevice
 from mocks.wires.slcan import CanFrame
-from mocks.wires.stream import CanSensor, Measure, Pacer, SerialSensor
+from mocks.wires.stream import CanSensor, SerialSensor
 
 COMMAND_BYTES, RESPONSE_BYTES = 8, 16
 START_OF_PACKET, END_OF_PACKET = 0x55, 0xAA
@@ -72,7 +75,7 @@ class Model:
     capacity: Sequence[float] = (200.0, 200.0, 200.0, 8.0, 8.0, 8.0)
 
 
-def raw_values(wrench: NDArray[np.float64], model: Model) -> NDArray[np.int16]:
+def raw_values(wrench: Array, model: Model) -> NDArray[np.int16]:
     """Counts of wrenches, rounded and clipped.
 
     Parameters
@@ -95,7 +98,7 @@ def packet(field: bytes) -> bytes:
 
 
 def fields(stream: bytearray) -> list[bytes]:
-    """Take the whole command packets out of received bytes, skipping what is none."""
+    """Remove received bytes and return the whole command packets in them."""
     found = []
     size = COMMAND_BYTES + 3
     while (start := stream.find(START_OF_PACKET)) >= 0 and len(stream) >= start + size:
@@ -109,58 +112,42 @@ def fields(stream: bytearray) -> list[bytes]:
     return found
 
 
-class RobotousSensor:
-    """The device behind either wire: commands in, response fields out; no I/O.
-
-    Public attributes may be changed while it runs.
+@dataclass(eq=False)
+class RobotousSensor(PtyDevice[Frame]):
+    """The device behind either wire: commands in, response fields out.
 
     Parameters
     ----------
-    measure
-        Returns (n, 6) successive noisy readings in N and N·m, sensor axes; called for every sample that is made.
-    stream
-        What paces the samples.
     model
         Name, divisors and capacity.
     serial, firmware
         At most 15 ASCII characters each.
+    baud_code
+        Of the UART in force, the index in `BAUD_RATES`; a pty does not notice a client at another rate.
     overload
         Overload bits set besides those of the readings: bit 5 to 0 are Fx to Tz.
-    saturated_axis
-        Number of an axis, 0 to 5, that always reads +32767.
     streaming_at_start
-        Streams from power-up on, as a sensor whose client died.
+        Streams from power-up on, as after a crash of the last client.
     """
 
-    unsupported: frozenset[Command] = frozenset()
+    unsupported: ClassVar[frozenset[Command]] = frozenset()
+    _: KW_ONLY
+    model: Model = Model()
+    serial: str = "A60HA00123"
+    firmware: str = "VER 1.7"
+    baud_code: int = 0
+    overload: int = 0
+    streaming_at_start: bool = False
 
-    def __init__(
-        self,
-        measure: Measure,
-        stream: Pacer,
-        *,
-        model: Model,
-        serial: str,
-        firmware: str,
-        overload: int,
-        saturated_axis: int | None,
-        streaming_at_start: bool,
-    ) -> None:
-        self.measure = measure
-        self.model = model
-        self.serial = serial
-        self.firmware = firmware
-        self.overload = overload
-        self.saturated_axis = saturated_axis
-        self.streaming_at_start = streaming_at_start
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self.rate_code = 0
         self.filter = (0, 0)
         self.ids = self.stored_ids = (0x64, 0x01, 0x02)
-        self.baud_code = self.stored_baud_code = 0
+        self.stored_baud_code = self.baud_code
         self.overload_counts = [0] * 6
         self._overloaded = 0
         self._bias = np.zeros(6)
-        self._stream = stream
 
     @property
     def rate_hz(self) -> float:
@@ -171,41 +158,37 @@ class RobotousSensor:
         """Set the state after power-up."""
         self.ids, self.baud_code = self.stored_ids, self.stored_baud_code
         self._bias = np.zeros(6)
-        self._stream.stop()
+        self._pacer.stop()
         if self.streaming_at_start:
-            self._stream.start(self.rate_hz)
+            self._pacer.start(self.rate_hz)
 
     def execute(self, command: bytes) -> list[bytes]:
         """Return the responses to a command field: one or none."""
         code, *arguments = command
-        if self._stream.running and code not in (Command.STOP, Command.BIAS):
+        if self._pacer.running and code not in (Command.STOP, Command.BIAS):
             return []
+        settings: dict[int, Sequence[int]] = {
+            Command.MODEL_NAME: self.model.name.encode("ascii"),
+            Command.SERIAL_NUMBER: self.serial.encode("ascii"),
+            Command.FIRMWARE_VERSION: self.firmware.encode("ascii"),
+            Command.GET_IDS: (*self.ids, *self.stored_ids),
+            Command.GET_BAUD: (self.baud_code, self.stored_baud_code),
+            Command.GET_FILTER: self.filter,
+            Command.GET_RATE: (self.rate_code,),
+            Command.OVERLOAD_COUNTS: self.overload_counts,
+        }
+        if code in settings:
+            return [self._response(code, *settings[code])]
         match code:
-            case Command.MODEL_NAME:
-                return [self._text(code, self.model.name)]
-            case Command.SERIAL_NUMBER:
-                return [self._text(code, self.serial)]
-            case Command.FIRMWARE_VERSION:
-                return [self._text(code, self.firmware)]
             case Command.SET_IDS | Command.SET_BAUD | Command.SET_FILTER | Command.SET_RATE:
                 error = self._set(code, *arguments[:3])
                 return [self._response(code, FAILURE if error else SUCCESS, error)]
-            case Command.GET_IDS:
-                return [self._response(code, *self.ids, *self.stored_ids)]
-            case Command.GET_BAUD:
-                return [self._response(code, self.baud_code, self.stored_baud_code)]
-            case Command.GET_FILTER:
-                return [self._response(code, *self.filter)]
-            case Command.GET_RATE:
-                return [self._response(code, self.rate_code)]
-            case Command.OVERLOAD_COUNTS:
-                return [self._response(code, *self.overload_counts)]
             case Command.ONE_SAMPLE:
                 return self.samples(1, code)
             case Command.START:
-                self._stream.start(self.rate_hz)
+                self._pacer.start(self.rate_hz)
             case Command.STOP:
-                self._stream.stop()
+                self._pacer.stop()
             case Command.BIAS if arguments[0] in (0, 1):
                 self._bias = self.measure(1)[0] if arguments[0] else np.zeros(6)
         return []
@@ -251,51 +234,12 @@ class RobotousSensor:
     def _response(self, code: int, *values: int) -> bytes:
         return bytes((code, *values)).ljust(RESPONSE_BYTES, b"\0")
 
-    def _text(self, code: int, text: str) -> bytes:
-        return self._response(code, *text.encode("ascii"))
 
-
-class RobotousCanNode(RobotousSensor, CanSensor):
-    """The sensor on a CAN bus: 8 bytes of command, and a response in two frames of 8 bytes.
-
-    Parameters
-    ----------
-    measure, model, serial, firmware, overload, saturated_axis, streaming_at_start
-        As for `RobotousSensor`.
-    seed, faults
-        Of the wire.
-    clock
-        Of the cell.
-    """
+@dataclass(eq=False)
+class RobotousCanNode(RobotousSensor[CanFrame], CanSensor):
+    """The sensor on a CAN bus: 8 bytes of command, and a response in two frames of 8 bytes."""
 
     unsupported = frozenset({Command.SET_BAUD})
-
-    def __init__(
-        self,
-        measure: Measure,
-        *,
-        seed: int = 0,
-        faults: Faults | None = None,
-        clock: CellClock | None = None,
-        model: Model | None = None,
-        serial: str = "A60HA00123",
-        firmware: str = "VER 1.7",
-        overload: int = 0,
-        saturated_axis: int | None = None,
-        streaming_at_start: bool = False,
-    ) -> None:
-        CanSensor.__init__(self, seed=seed, faults=faults, clock=clock, bitrate=1_000_000)
-        RobotousSensor.__init__(
-            self,
-            measure,
-            self._pacer,
-            model=model or Model(),
-            serial=serial,
-            firmware=firmware,
-            overload=overload,
-            saturated_axis=saturated_axis,
-            streaming_at_start=streaming_at_start,
-        )
 
     def _boot(self) -> None:
         self.boot()
@@ -319,51 +263,14 @@ class RobotousCanNode(RobotousSensor, CanSensor):
         return CanFrame(self.ids[1] if extended else identifier, rng.randbytes(8), extended)
 
 
-class RobotousSerialBox(RobotousSensor, SerialSensor):
-    """The sensor on a UART: packets with start byte, checksum and end byte.
-
-    Parameters
-    ----------
-    measure, model, serial, firmware, overload, saturated_axis, streaming_at_start
-        As for `RobotousSensor`.
-    baud_code
-        In force at power-up, the index in `BAUD_RATES`; a pty does not notice a client at another rate.
-    seed, faults
-        Of the wire.
-    clock
-        Of the cell.
-    """
+@dataclass(eq=False)
+class RobotousSerialBox(RobotousSensor[bytes], SerialSensor):
+    """The sensor on a UART: packets with start byte, checksum and end byte."""
 
     unsupported = frozenset({Command.SET_IDS})
 
-    def __init__(
-        self,
-        measure: Measure,
-        *,
-        seed: int = 0,
-        faults: Faults | None = None,
-        clock: CellClock | None = None,
-        model: Model | None = None,
-        serial: str = "A60HA00123",
-        firmware: str = "VER 1.7",
-        baud_code: int = 0,
-        overload: int = 0,
-        saturated_axis: int | None = None,
-        streaming_at_start: bool = False,
-    ) -> None:
-        SerialSensor.__init__(self, seed=seed, faults=faults, clock=clock)
-        RobotousSensor.__init__(
-            self,
-            measure,
-            self._pacer,
-            model=model or Model(),
-            serial=serial,
-            firmware=firmware,
-            overload=overload,
-            saturated_axis=saturated_axis,
-            streaming_at_start=streaming_at_start,
-        )
-        self.stored_baud_code = baud_code
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self._line = bytearray()
 
     @property
@@ -373,8 +280,7 @@ class RobotousSerialBox(RobotousSensor, SerialSensor):
 
     def _power_up(self) -> None:
         self._line.clear()
-        self._wire.clear()
-        self._forget_unsent()
+        self._fall_silent()
         self.boot()
 
     def _received(self, data: bytes) -> None:

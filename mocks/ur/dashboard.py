@@ -34,7 +34,7 @@ _QUERIES: dict[str, Callable[[Robot], str]] = {
     "get loaded program": lambda r: f"Loaded program: {r.loaded_program}" if r.loaded_program else "No program loaded",
 }
 
-_TALK = {
+_FIXED_REPLIES = {
     "popup": "showing popup",
     "close safety popup": "closing safety popup",
     "addtolog": "Added log message",
@@ -111,9 +111,9 @@ def answer(robot: Robot, line: str, *, by: str = "dashboard", trusted: bool = Tr
     Parameters
     ----------
     by
-        Who says it, for the diary.
+        Source of the command, for the event log.
     trusted
-        Whether this connection may do more than ask: since it was opened the pendant was in remote control.
+        Whether this connection may command: the pendant was in remote control since it was opened.
     """
     command = line.strip()
     verb = command.lower()
@@ -121,7 +121,7 @@ def answer(robot: Robot, line: str, *, by: str = "dashboard", trusted: bool = Tr
     since = _SINCE.get(verb)
     if verb in _QUERIES and (since is None or minor >= since.get(major, minor + 1)):
         return _QUERIES[verb](robot)
-    for start, reply in _TALK.items():
+    for start, reply in _FIXED_REPLIES.items():
         if verb == start or verb.startswith(start + " "):
             return reply
     loads = verb.startswith("load ")
@@ -133,9 +133,9 @@ def answer(robot: Robot, line: str, *, by: str = "dashboard", trusted: bool = Tr
     if loads:
         robot.stop_program("another program loaded")
         robot.loaded_program = command[5:].strip()
-        said: str | None = f"Loading program: {robot.loaded_program}"
+        reply_text: str | None = f"Loading program: {robot.loaded_program}"
     else:
-        said = _COMMANDS[verb](robot)
+        reply_text = _COMMANDS[verb](robot)
     refusal = TOO_EARLY if verb == "unlock protective stop" else f"Failed to execute: {verb}"
-    robot.note(by, verb, accepted=said is not None, why=said or refusal)
-    return said or refusal
+    robot.note(by, verb, accepted=reply_text is not None, why=reply_text or refusal)
+    return reply_text or refusal

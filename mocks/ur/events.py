@@ -1,4 +1,4 @@
-"""What happened in the controller, in order, for whoever asserts on it afterwards."""
+"""Entries of the controller's event log."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,25 +6,25 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Event:
-    """One entry of the controller's diary.
+    """One entry of the event log.
 
     Parameters
     ----------
     t_host_ns
-        The cell's clock, which every process on this machine can read.
+        The cell's clock.
     t_robot_s
-        The controller's own clock, as on the wire.
+        The controller's clock, as on the wire.
     by
-        Who: ``dashboard``, ``script port``, ``rtde`` (clients), ``operator``, ``network`` (control channel),
+        Source: ``dashboard``, ``script port``, ``rtde`` (clients), ``operator``, ``network`` (control channel),
         ``program``, ``safety``, ``power``, ``arm`` (the controller itself).
     what
-        What, in fixed words.
+        Name of the event, in fixed words.
     accepted
         False when the controller refused it.
     why
         The reason or the reply, in words.
     detail
-        More, by name.
+        More fields, by name.
     """
 
     t_host_ns: int
@@ -36,7 +36,7 @@ class Event:
     detail: dict[str, Any]
 
     def to_json(self) -> dict[str, Any]:
-        """As one flat JSON object."""
+        """Return one flat JSON object."""
         return {
             "t_host_ns": self.t_host_ns,
             "t_robot_s": self.t_robot_s,

@@ -1,6 +1,6 @@
-"""Somebody who shows the sensor how gravity pulls from all sides: by hand, or with a program on the pendant.
+"""An operator who turns the sensor to all sides: by hand, or with a program on the pendant.
 
-Only the wrist turns, from where the arm stands. A person holds it above the sensor, which feels nothing of the hand.
+Only the wrist turns. The operator holds the arm above the sensor, which does not measure the hand.
 """
 
 import math
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
 SPEED_RAD_S = 0.6
 ACCELERATION_RAD_S2 = 1.5
 REST_S = 3.5
-"""How long each orientation is held, in the cell's time, in which sensors sample, whatever the speed of the arm."""
+"""Rest at each orientation on the cell's clock, independent of the speed of the arm."""
 
 TIPS = ((0, 0), (0, 1), (1, 0), (2, 0), (0, -1), (-1, 0))
 """Quarter turns of joints 4 and 5: the tool points in six directions."""
 SPINS = (0, -1, 1, 2)
 """Quarter turns of joint 6."""
 IN_A_PROGRAM = 12
-"""Of the orientations: all tips, with two of the spins."""
+"""Number of orientations in the program: all tips, with two of the spins."""
 
 
 def orientations(q: Vector6) -> list[Vector6]:
-    """24 postures (rad) near `q` that are all turns of a cube: `q` comes first, but for joint 5 at a right angle."""
+    """Return 24 postures (rad) near `q`: all turns of a cube. The first is `q` with joint 5 at a right angle."""
     q1, q2, q3, q4, q5, q6 = q
     right = math.copysign(math.pi / 2, q5)
     return [
@@ -39,9 +39,9 @@ def orientations(q: Vector6) -> list[Vector6]:
 
 
 def guided_by_hand(robot: "Robot", rest_s: float) -> Iterator[None]:
-    """Move the arm from one of the `orientations` to the next for ever and rest at each, a control cycle at a time.
+    """Move the arm through the `orientations` over and over and rest at each; one control cycle per `next`.
 
-    Whoever finds that the arm cannot be moved waits.
+    The operator waits while the arm cannot be moved.
     """
     for q in cycle(orientations(robot.arm.q)):
         while robot.hand_obstacle or robot.arm.busy:
@@ -54,7 +54,7 @@ def guided_by_hand(robot: "Robot", rest_s: float) -> Iterator[None]:
 
 
 def pendant_program(robot: "Robot", rest_s: float) -> Upload:
-    """Make a program that goes through the first `orientations` and back, and rests at each."""
+    """Return a program that visits the first `orientations`, returns to the first and rests at each."""
     first, *others = orientations(robot.arm.q)[:IN_A_PROGRAM]
     rest = f"  sleep({rest_s * robot.settings.time_scale})\n"
     moves = [f"  movej({list(q)}, a={ACCELERATION_RAD_S2}, v={SPEED_RAD_S})\n" for q in (first, *others, first)]
@@ -62,6 +62,6 @@ def pendant_program(robot: "Robot", rest_s: float) -> Upload:
 
 
 def _turned(angle: float, quarters: int) -> float:
-    """By quarter turns, and within a whole one."""
+    """Turn an angle by quarter turns and keep it within one turn."""
     turned = angle + quarters * math.pi / 2
     return turned if abs(turned) <= 2 * math.pi else math.remainder(turned, 2 * math.pi)

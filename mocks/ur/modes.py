@@ -1,4 +1,4 @@
-"""What the controller says about itself: program, robot and safety modes, and the bits that go with them.
+"""The modes the controller reports: program, robot and safety modes, and their status bits.
 
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", and "Dashboard Server e-Series, port 29999" (names).
 """

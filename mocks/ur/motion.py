@@ -9,9 +9,9 @@ from collections import deque
 from collections.abc import Generator
 from typing import Protocol
 
+from mocks.arrays import Array
 from mocks.kinematics import (
     ZERO6,
-    Array,
     Dh,
     Vector6,
     forward,
@@ -27,10 +27,10 @@ FOLLOW_TIME_S = 0.005
 """Time constant with which the joints follow the set-point."""
 
 PAUSE_TIME_S = 0.15
-"""How long the arm takes to come to rest on its path when the program pauses, and to follow the speed slider."""
+"""Time in which the arm comes to rest on its path when the program pauses, or follows the speed slider."""
 
 IDLE_DECELERATION_RAD_S2 = 8.0
-"""How an arm that nobody commands any more comes to rest."""
+"""Deceleration of an arm that lost its path."""
 
 
 class MotionError(Exception):
@@ -72,21 +72,21 @@ class Trapezoid:
 
 
 class Path(Protocol):
-    """One motion, planned when its turn comes."""
+    """One motion, planned when the arm starts it."""
 
     duration_s: float
     real_time: bool
-    """Whether it runs at its own speed, whatever slider and limiter say."""
+    """Whether it ignores speed slider and limiter."""
 
     def begin(self, q: Vector6, qd: Vector6, /) -> None:
         """Plan from the present set-point: angles (rad) and speeds (rad/s). Sets `duration_s`."""
 
     def at(self, t: float) -> Vector6:
-        """Set-point (rad) at path time `t`, asked for in rising order up to `duration_s`."""
+        """Return the set-point (rad) at path time `t`, called with rising `t` up to `duration_s`."""
 
 
 class JointMove:
-    """movej: all joints start and end together, the one with the longest way leads.
+    """movej: all joints start and end together, the one with the longest travel leads.
 
     Parameters
     ----------
@@ -105,12 +105,12 @@ class JointMove:
     def begin(self, q: Vector6, _qd: Vector6, /) -> None:
         """See `Path`."""
         self._q0 = q
-        self._way = vector6([b - a for a, b in zip(q, self._goal, strict=True)])
-        longest = max(abs(w) for w in self._way)
+        self._travel = vector6([b - a for a, b in zip(q, self._goal, strict=True)])
+        longest = max(abs(w) for w in self._travel)
         speed = self._speed
-        for way, limit in zip(self._way, self._dh.max_speed, strict=True):
-            if abs(way) * speed > limit * longest:
-                speed = limit * longest / abs(way)
+        for travel, limit in zip(self._travel, self._dh.max_speed, strict=True):
+            if abs(travel) * speed > limit * longest:
+                speed = limit * longest / abs(travel)
         self._profile = Trapezoid(longest, speed, self._acceleration)
         self.duration_s = self._profile.duration_s
 
@@ -119,11 +119,11 @@ class JointMove:
         if t >= self.duration_s:
             return self._goal
         share = self._profile.at(t) / self._profile.length
-        return vector6([a + w * share for a, w in zip(self._q0, self._way, strict=True)])
+        return vector6([a + w * share for a, w in zip(self._q0, self._travel, strict=True)])
 
 
 class LineMove:
-    """movel: the TCP moves along a straight line and turns about a fixed axis, on the branch the arm stands in.
+    """movel: the TCP moves along a straight line and turns about a fixed axis, on the present branch of the arm.
 
     Parameters
     ----------
@@ -144,9 +144,9 @@ class LineMove:
         """See `Path`."""
         self._q = q
         self._start = forward(self._dh, q) @ self._X_flange_tcp
-        self._way = self._goal[:3, 3] - self._start[:3, 3]
+        self._travel = self._goal[:3, 3] - self._start[:3, 3]
         self._turn = rotvec(self._goal[:3, :3] @ self._start[:3, :3].T)
-        length = max(math.hypot(*self._way), math.hypot(*self._turn))
+        length = max(math.hypot(*self._travel), math.hypot(*self._turn))
         self._profile = Trapezoid(length, self._speed, self._acceleration)
         self.duration_s = self._profile.duration_s
 
@@ -156,7 +156,7 @@ class LineMove:
             return self._q
         share = self._profile.at(t) / self._profile.length
         X = self._start.copy()
-        X[:3, 3] += share * self._way
+        X[:3, 3] += share * self._travel
         X[:3, :3] = rotation(share * self._turn) @ self._start[:3, :3]
         q = refine(self._dh, X @ self._X_tcp_flange, self._q)
         if q is None:
@@ -166,7 +166,7 @@ class LineMove:
 
 
 class HandMove(JointMove):
-    """Somebody pushes the arm along: as movej, but neither slider nor limiter has a say in it."""
+    """The operator pushes the arm: as movej, but slider and limiter do not act on it."""
 
     real_time = True
 
@@ -209,9 +209,9 @@ class Arm:
         self.speed_fraction = 1.0
         """Speed slider, 0 to 1."""
         self.pushed_rad = ZERO6
-        """How far somebody pushes the joints off their set-points."""
+        """How far the operator pushes the joints off their set-points."""
         self.scaling = 1.0
-        """What the trajectory limiter leaves of the speed, 0 to 1."""
+        """Fraction of the speed that the trajectory limiter allows, 0 to 1."""
         self.paused = False
         """Whether the arm should stand still on its path."""
         self.pace = 1.0
@@ -235,7 +235,7 @@ class Arm:
         return bool(self._paths)
 
     @property
-    def _under_way(self) -> bool:
+    def _under_travel(self) -> bool:
         """Whether there is motion to be ended: a path that has just been finished ended at rest."""
         return self.busy and not self.at_rest
 
@@ -248,7 +248,7 @@ class Arm:
             When another thread of the program controls the arm.
         """
         self._seize(owner)
-        self._follow([self._rundown(), path] if self._under_way else [path])
+        self._follow([self._rundown(), path] if self._under_travel else [path])
 
     def stop_joints(self, deceleration: float, owner: str) -> None:
         """stopj: the fastest joint slows down by `deceleration` (rad/s²)."""
@@ -268,10 +268,10 @@ class Arm:
             self.release(owner)
 
     def release(self, owner: str | None = None) -> None:
-        """Forget the path of `owner` (of anybody without a name); a moving arm comes to rest by itself."""
+        """Drop the path of `owner` (None: of any owner); a moving arm comes to rest by itself."""
         if owner is None or owner == self._owner:
             self._owner = None
-            self._follow([self._rundown()] if self._under_way else [])
+            self._follow([self._rundown()] if self._under_travel else [])
 
     def step(self, dt: float) -> None:
         """Let `dt` seconds pass.
@@ -318,7 +318,7 @@ class Arm:
         if not deceleration > 0.0:
             raise MotionError(f"deceleration {deceleration} must be positive")
         self._seize(owner)
-        self._follow([Stop(speed / deceleration)] if self._under_way else [])
+        self._follow([Stop(speed / deceleration)] if self._under_travel else [])
 
     def _along(self, dt: float) -> Vector6:
         path = self._paths[0]

@@ -1,4 +1,4 @@
-"""What people, other machines and the network do to a controller: the arm's verbs of the control channel."""
+"""Control requests that act on the arm: the operator, other clients and the network."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +21,7 @@ HAND_SPEED_RAD_S = 0.3
 
 
 class Operator:
-    """Everybody but the client under test.
+    """Acts on the arm in place of the operator, of other clients and of the network.
 
     Parameters
     ----------
@@ -62,10 +62,10 @@ class Operator:
         }
         """Requests by the value of "do". A wrong request raises ValueError, TypeError or KeyError and does nothing."""
 
-    # -- people -------------------------------------------------------------------------------------------------------
+    # -- the operator -------------------------------------------------------------------------------------------------
 
     def _protective_stop(self, _request: Request) -> dict[str, Any]:
-        self._robot.protective_stop("asked for")
+        self._robot.protective_stop("requested")
         return {"done": "protective-stop"}
 
     def _emergency_stop(self, request: Request) -> dict[str, Any]:
@@ -90,11 +90,11 @@ class Operator:
             robot.set_mode(robot_mode)
         if safety_mode in PERMITTED:
             robot.reduced_mode(safety_mode == SafetyMode.REDUCED)
-            robot.set_safety(SafetyMode.NORMAL, "asked for")
+            robot.set_safety(SafetyMode.NORMAL, "requested")
         elif safety_mode == SafetyMode.PROTECTIVE_STOP:
-            robot.protective_stop("asked for")
+            robot.protective_stop("requested")
         elif safety_mode is not None:
-            robot.set_safety(safety_mode, "asked for")
+            robot.set_safety(safety_mode, "requested")
         return {"done": "mode", "robot_mode": robot.robot_mode.name, "safety_mode": robot.safety_mode.name}
 
     def _pendant(self, done: str, command: str) -> dict[str, Any]:
@@ -157,13 +157,13 @@ class Operator:
         accepted = self._robot.upload(pendant_program(self._robot, _rest_s(request)), by="operator")
         return {"done": "pendant-program", "accepted": accepted}
 
-    # -- other clients, and the controller's own trouble --------------------------------------------------------------
+    # -- other clients, and faults of the controller ------------------------------------------------------------------
 
     def _dashboard_stop(self, _request: Request) -> dict[str, Any]:
         return {"done": "dashboard-stop", "reply": dashboard.answer(self._robot, "stop", by="another dashboard client")}
 
     def _crash_script(self, _request: Request) -> dict[str, Any]:
-        return {"done": "crash-script", "accepted": self._robot.stop_program("run-time error: asked for")}
+        return {"done": "crash-script", "accepted": self._robot.stop_program("run-time error: requested")}
 
     def _foreign_program(self, request: Request) -> dict[str, Any]:
         does = f"sleep({float(request.get('seconds', FOREIGN_PROGRAM_S))})"

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from mocks.kinematics import ZERO6, Array, Dh, Vector3, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
+from mocks.arrays import Array
+from mocks.kinematics import ZERO6, Dh, Vector3, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
 from mocks.ur.events import Event
 from mocks.ur.modes import PAUSING, PERMITTED, POWERED, POWERLESS, RobotMode, Runtime, SafetyMode
 from mocks.ur.motion import Arm, CannotFollow, HandMove, MotionError
@@ -124,14 +125,14 @@ class Robot:
         self.output_ints = [0] * 48
         self.output_doubles = [0.0] * 48
         self.events: list[Event] = []
-        """What happened, newest last: commands taken and refused, program, safety, the arm starting and stopping."""
+        """The event log, newest last: commands accepted and refused, program, safety, start and end of motion."""
         self.hand: Iterator[None] | None = None
-        """Somebody who guides the arm; moves on once per control cycle."""
+        """The operator who guides the arm by hand; one `next` per control cycle."""
         self._remote_control = True
         self._reduced = False
         self._program: ControlScript | Program | None = None
         self.popup: str | None = None
-        """What a popup of a program shows, until somebody closes it."""
+        """Text of the popup that a program shows, until the operator closes it."""
         self.wrist_sensor: Callable[[int], Array] | None = None
         """Readings (n, 6) of a wrist sensor with bias and noise; without one `ft_raw_wrench` is exact."""
         self._physical_s = 0.0
@@ -182,16 +183,16 @@ class Robot:
         self.world.q = self.arm.actual_q
 
     def note(self, by: str, what: str, *, accepted: bool = True, why: str = "", **detail: Any) -> None:
-        """Write into the diary."""
+        """Add an entry to the event log."""
         self.events.append(Event(self.clock.now_ns(), self.timestamp_s, by, what, accepted, why, detail))
 
     def _leaves_limits(self, before: Vector6) -> bool:
-        """Whether the last step crossed a safety limit outwards; the way back is free."""
+        """Whether the last step crossed a safety limit outwards; a move back inside is allowed."""
         X = self.X_flange_tcp
         return not self.limits.allow(self.arm.q, X) and self.limits.allow(before, X)
 
     def _watch(self) -> None:
-        """Age the watchdog by a cycle; a program whose client is silent is stopped."""
+        """Age the watchdog by a cycle; stop the program when its client has not written in time."""
         if self._watchdog is None or self.runtime != Runtime.PLAYING:
             return
         self._watchdog_age_s += self.period_s
@@ -229,7 +230,7 @@ class Robot:
         return None
 
     def upload(self, upload: Upload, *, by: str = "script port") -> bool:
-        """Take a program from the script port: it replaces the running one. False when it is refused."""
+        """Accept a program from the script port, which replaces the running one; return False when it is refused."""
         if upload.secondary:
             self.note(by, f"secondary program {upload.name}", accepted=False, why="not interpreted")
             return False
@@ -263,7 +264,7 @@ class Robot:
         self.note("program", f"started {program.name}")
 
     def stop_program(self, reason: str) -> bool:
-        """End the program; a moving arm comes to rest by itself. False when there was none."""
+        """End the program; a moving arm comes to rest by itself. Return False when there was none."""
         program, self._program = self._program, None
         if program is not None:
             program.close()
@@ -285,7 +286,7 @@ class Robot:
         return True
 
     def play(self) -> bool:
-        """Go on where the program paused, or start the loaded one; False when it cannot."""
+        """Resume a paused program or start the loaded one; return False when neither is possible."""
         if self.obstacle is not None:
             return False
         if self.runtime == Runtime.PAUSED:
@@ -300,11 +301,11 @@ class Robot:
 
     @property
     def hand_obstacle(self) -> str | None:
-        """Why nobody can move the arm by hand now; None when somebody can."""
+        """Why the arm cannot be moved by hand now; None when it can."""
         return "a program plays" if self.runtime == Runtime.PLAYING else self.obstacle
 
     def hand_move(self, q: Vector6, speed_rad_s: float) -> None:
-        """Somebody moves the arm by hand, as in freedrive: no program plays, and the set-point goes with the joints.
+        """Move the arm by hand, as in freedrive: no program plays, and the set-point follows the joints.
 
         Raises
         ------
@@ -312,7 +313,7 @@ class Robot:
             When a program plays or the arm has no power.
         """
         if self.hand_obstacle:
-            raise ValueError(f"nobody can move the arm by hand: {self.hand_obstacle}")
+            raise ValueError(f"the arm cannot be moved by hand: {self.hand_obstacle}")
         self.arm.start(HandMove(self.arm.dh, q, speed_rad_s, HAND_ACCELERATION_RAD_S2), "hand")
 
     # -- safety and power ---------------------------------------------------------------------------------------------
@@ -333,7 +334,7 @@ class Robot:
         return True
 
     def safeguard_stop(self, on: bool) -> None:
-        """Open or close the safeguard input. Closed again, the paused program goes on by itself."""
+        """Open or close the safeguard input. Closing it resumes the paused program."""
         if on and self.safety_mode in PERMITTED:
             self.set_safety(SafetyMode.SAFEGUARD_STOP, "safeguard opened")
         elif not on and self.safety_mode == SafetyMode.SAFEGUARD_STOP:
@@ -342,26 +343,26 @@ class Robot:
                 self.play()
 
     def reduced_mode(self, on: bool) -> None:
-        """Switch to the reduced safety limits or back; programs go on."""
+        """Switch to the reduced safety limits or back; programs continue."""
         self._reduced = on
         if self.safety_mode in PERMITTED:
             self.set_safety(SafetyMode.NORMAL, "reduced limits" if on else "normal limits")
 
     def emergency_stop(self, pressed: bool) -> None:
-        """Press or release the emergency stop: power is gone, the program has ended."""
+        """Press or release the emergency stop, which cuts the power and ends the program."""
         if pressed:
             self.set_safety(SafetyMode.ROBOT_EMERGENCY_STOP, "emergency stop pressed")
         elif self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP:
             self.set_safety(SafetyMode.NORMAL, "emergency stop released")
 
     def restart_safety(self) -> None:
-        """After a violation or fault: everything starts again, without power."""
+        """Restart the safety system after a violation or fault; the arm has no power then."""
         if self.safety_mode in (SafetyMode.VIOLATION, SafetyMode.FAULT):
             self.set_safety(SafetyMode.NORMAL, "safety restarted")
             self.set_mode(RobotMode.POWER_OFF)
 
     def set_safety(self, mode: SafetyMode, reason: str) -> None:
-        """Enter a safety mode, with what it does to program and power; NORMAL means REDUCED when that is on."""
+        """Enter a safety mode, with its effects on program and power; NORMAL means REDUCED when that is on."""
         if mode in PERMITTED:
             mode = SafetyMode.REDUCED if self._reduced else SafetyMode.NORMAL
         self.safety_mode = mode
@@ -377,7 +378,7 @@ class Robot:
             self.stop_program(mode.name)
 
     def set_mode(self, mode: RobotMode) -> None:
-        """Enter a robot mode; any but RUNNING ends the program, without power nothing that was under way goes on."""
+        """Enter a robot mode; any but RUNNING ends the program, and loss of power cancels what was under way."""
         if mode != RobotMode.RUNNING:
             self.stop_program(f"robot mode {mode.name}")
         if mode not in POWERED:
@@ -390,7 +391,7 @@ class Robot:
         self.set_mode(RobotMode.POWER_OFF)
 
     def power_on(self) -> bool:
-        """From off to idle, brakes still closed; False when safety does not let it."""
+        """Go from off to idle, brakes closed; return False when safety does not allow it."""
         if self.safety_mode in POWERLESS:
             return False
         if self.robot_mode == RobotMode.POWER_OFF:
@@ -399,7 +400,7 @@ class Robot:
         return True
 
     def brake_release(self) -> bool:
-        """Up to running, from wherever it is; False when safety does not let it."""
+        """Go up to running from any mode; return False when safety does not allow it."""
         if not self.power_on():
             return False
         if self.robot_mode == RobotMode.POWER_ON:
@@ -418,7 +419,7 @@ class Robot:
     # -- registers ----------------------------------------------------------------------------------------------------
 
     def write_inputs(self, fields: dict[str, Value]) -> None:
-        """Take over input variables from a client."""
+        """Store input variables from a client."""
         self._note_lost_command(fields)
         self.inputs.update(fields)
         if self._watchdog is not None and self._watchdog[0] in fields:
@@ -428,12 +429,12 @@ class Robot:
             self.arm.speed_fraction = min(1.0, max(0.0, fraction))
 
     def _note_lost_command(self, fields: dict[str, Value]) -> None:
-        """A command that no program will read is worth a line."""
+        """Log a command that no program will read."""
         for name in COMMAND_REGISTERS & fields.keys():
             command = fields[name]
             listening = self.runtime == Runtime.PLAYING and isinstance(self._program, ControlScript)
             if not listening and command not in (0, STOP_SCRIPT, self.inputs.get(name)):
-                why = f"nobody reads it: {self.runtime.name} {self.program_name}"
+                why = f"no control script reads it: {self.runtime.name} {self.program_name}"
                 self.note("rtde", f"command {command}", accepted=False, why=why)
 
     def input_int(self, index: int) -> int:
@@ -483,7 +484,7 @@ class Robot:
         return self.arm.still_s >= STEADY_AFTER_S
 
     def flange_wrench(self) -> Array:
-        """What the arm's own sensor feels, (6,): N and N·m, exerted on the flange, its axes and origin."""
+        """Return the wrench on the arm's own sensor, (6,): N and N·m, exerted on the flange, its axes and origin."""
         R = self.world.truth.R_flange_sensor
         felt = self.world.load_wrench() + self.world.contact_wrench()
         return np.concatenate((R @ felt[:3], R @ felt[3:]))

@@ -1,4 +1,4 @@
-"""What arrives at the script port, and a behavioural twin of the ur_rtde control script.
+"""Programs from the script port, and a behavioural twin of the ur_rtde control script.
 
 The script port takes URScript text. The control script of ur_rtde is recognised by its name and not interpreted: this
 twin runs instead, one step per control cycle, with the same loop, registers and blocking behaviour. Any other program
@@ -13,7 +13,8 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mocks.kinematics import Array, Vector6, forward, inverse, inverse_matrix, matrix_of, pose_of
+from mocks.arrays import Array
+from mocks.kinematics import Vector6, forward, inverse, inverse_matrix, matrix_of, pose_of
 from mocks.ur.motion import JointMove, LineMove, Path
 from mocks.ur.urscript.library import ScriptError
 
@@ -28,8 +29,8 @@ REALTIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 
 MOVING = {1: "moveJ", 2: "moveJ_IK", 3: "moveL", 4: "moveL_FK", 33: "stopL", 34: "stopJ"}
 SETTING = {8: "zeroFtSensor", 17: "setPayload", 29: "setTcp", 31: "triggerProtectiveStop", 35: "setWatchdog"}
 SETTING |= {59: "setGravity", 65: "setTargetPayload", STOP_SCRIPT: "stopScript"}
-DIARY = MOVING | SETTING
-"""Commands that go into the diary: those that move the arm or change something."""
+LOGGED = MOVING | SETTING
+"""Commands that enter the event log: those that move the arm or change a setting."""
 
 Steps = Generator[None, None, None]
 """A thread of a program: one `next()` is one control cycle."""
@@ -172,8 +173,8 @@ class ControlScript:
                 self._write_int(0, READY)
             else:
                 if not executing:
-                    if command in DIARY:
-                        self._robot.note("rtde", f"command {command}", why=DIARY[command])
+                    if command in LOGGED:
+                        self._robot.note("rtde", f"command {command}", why=LOGGED[command])
                     if command == STOP_SCRIPT:
                         return
                     yield from self._execute(command)
@@ -190,7 +191,7 @@ class ControlScript:
             yield from steps
 
     def _accept(self) -> None:
-        """A setting without a counterpart here."""
+        """Ignore a setting that has no counterpart here."""
 
     # -- registers ----------------------------------------------------------------------------------------------------
 
@@ -302,7 +303,7 @@ class ControlScript:
         yield from arm.until_finished(owner)
 
     def _protective_stop(self) -> Steps:
-        self._robot.protective_stop("the program asked for it")
+        self._robot.protective_stop("requested by the program")
         yield  # paused from here on: the command is not reported done
 
     # -- kinematics ---------------------------------------------------------------------------------------------------

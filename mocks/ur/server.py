@@ -18,6 +18,11 @@ from mocks.ur.variables import INPUTS, OUTPUTS, Reader, output_type
 
 PORTS = {30001: "script", 30002: "script", 30003: "script", 30004: "rtde", 29999: "dashboard"}
 BACKLOG_LIMIT_S = 10.0  # a client that does not read for so long is disconnected
+KEEP_ALIVE_NS = 500_000_000
+"""While the cell's clock is held, clients that command the robot get the last sample again after so much real time.
+
+After 2.5 s without a sample ur_rtde reconnects, stops the running program and uploads it again.
+"""
 
 Select = selectors.BaseSelector
 
@@ -27,7 +32,7 @@ class Client(ABC):
 
     kind = ""
     banner = b""
-    """What the port says first."""
+    """What the port sends first."""
 
     def __init__(self, server: "UrServer", connection: socket.socket) -> None:
         self.server = server
@@ -50,7 +55,7 @@ class Client(ABC):
         return bool(self._out)
 
     def on_ready(self) -> None:
-        """Read what is there and act on it."""
+        """Read what has arrived and act on it."""
         try:
             data = self._socket.recv(65536)
         except BlockingIOError:
@@ -68,12 +73,12 @@ class Client(ABC):
         """Consume what is complete at the start of `buffer`."""
 
     def send(self, data: bytes) -> None:
-        """Send now what the socket takes, keep the rest."""
+        """Send what the socket takes, keep the rest."""
         self._out += data
         self.flush()
 
     def flush(self) -> None:
-        """Try again to send what is left; give up on a client that does not read."""
+        """Send what is left; disconnect a client that has not read for `BACKLOG_LIMIT_S`."""
         if not self._out or not self.open:
             return
         try:
@@ -93,7 +98,7 @@ class Client(ABC):
             self._stuck_since = None
 
     def close(self, *, reset: bool = False) -> None:
-        """Hang up: in order, or with a TCP reset."""
+        """Close the connection: in order, or with a TCP reset."""
         if self.open:
             self.open = False
             self.server.forget(self)
@@ -103,7 +108,7 @@ class Client(ABC):
 
 
 class ScriptClient(Client):
-    """Ports 30001 to 30003: takes programs, says nothing."""
+    """Ports 30001 to 30003: receives programs, sends nothing."""
 
     kind = "script"
 
@@ -126,7 +131,7 @@ class DashboardClient(Client):
 
     @property
     def trusted(self) -> bool:
-        """Whether the pendant was in remote control ever since this client connected; else it can only ask."""
+        """Whether the pendant was in remote control since this client connected; else it can only query."""
         return self._opened_remote and self._switches == self.robot.remote_switches
 
     def on_bytes(self, buffer: bytearray) -> None:
@@ -162,9 +167,9 @@ class RtdeClient(Client):
             self.server.reject(str(error))
             self.close()
 
-    def sample(self) -> None:
-        """Send the present outputs if this cycle is due; skip them when the client lags."""
-        due = self.robot.cycle % self._every == 0
+    def sample(self, *, again: bool = False) -> None:
+        """Send the outputs if this cycle is due, or `again` to a client that commands; skip them when it lags."""
+        due = bool(self._inputs) if again else self.robot.cycle % self._every == 0
         if self._started and due and not self.lagging and self._outputs is not None:
             self.send(self._outputs.pack([read(self.robot) for read in self._readers]))
 
@@ -257,14 +262,15 @@ class UrServer:
         self.host = host
         self.input_owners: dict[str, RtdeClient] = {}
         self.claimed: set[str] = set()
-        """Input variables that a fieldbus holds, as far as no client had them before."""
+        """Input variables that a fieldbus holds, without those a client had before."""
         self.bad_inputs: list[str] = []
-        """Packages a well-behaved client would not have sent."""
+        """Packages that break the protocol."""
         self.frozen = False
-        """While true nothing runs and nothing is read or sent, but connections stay."""
+        """While true no cycle runs and no byte is read or sent, but connections stay."""
         self.streaming = True
         """While false RTDE clients are answered, but get no samples."""
         self._silent: set[str] = set()
+        self._sent_real_ns = 0
         self._selector = selector
         self._clients: list[Client] = []
         self._listeners: dict[int, socket.socket] = {}
@@ -309,7 +315,7 @@ class UrServer:
             client.send(client.banner)
 
     def forget(self, client: Client) -> None:
-        """A client hung up: its input variables are free again."""
+        """Remove a client whose connection has ended; its input variables are free again."""
         if client in self._selector.get_map():
             self._selector.unregister(client)
         self._clients.remove(client)
@@ -321,14 +327,14 @@ class UrServer:
         self.bad_inputs.append(what)
 
     def drop(self, kind: str, *, reset: bool = False) -> int:
-        """Hang up on all clients of a kind (rtde, dashboard, script); the port goes on listening."""
+        """Disconnect all clients of a kind (rtde, dashboard, script); the port still listens."""
         clients = self._of_kind(kind)
         for client in clients:
             client.close(reset=reset)
         return len(clients)
 
     def set_listening(self, kind: str, on: bool) -> None:
-        """Open or close the ports of a kind; who is connected stays connected."""
+        """Open or close the ports of a kind; open connections stay."""
         self._of_kind(kind)
         for port in [port for port, its_kind in PORTS.items() if its_kind == kind]:
             if on and port not in self._listeners:
@@ -337,7 +343,7 @@ class UrServer:
                 self._close_listener(port)
 
     def set_silent(self, kind: str, on: bool) -> None:
-        """While on, clients of a kind are accepted, but nothing is read from them or sent; afterwards it is."""
+        """While on, accept clients of a kind without reading or sending; afterwards serve what has waited."""
         clients = self._of_kind(kind)
         if on and kind not in self._silent:
             self._silent.add(kind)
@@ -354,14 +360,14 @@ class UrServer:
         return [client for client in self._clients if client.kind == kind]
 
     def close(self) -> None:
-        """Hang up and stop listening."""
+        """Close all connections and stop listening."""
         for client in list(self._clients):
             client.close()
         for port in list(self._listeners):
             self._close_listener(port)
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Serve until `ended()`: it is asked at least once per control cycle."""
+        """Serve until `ended()`, which is called at least once per control cycle."""
         clock, period_ns = self.robot.clock, round(1e9 * self.robot.period_s)
         with clock.keeping_up():
             due_ns = clock.now_ns() + period_ns
@@ -372,6 +378,8 @@ class UrServer:
                     if not self.frozen:
                         self.robot.tick()
                         self._send_samples()
+                if not self.frozen and clock.real_ns() - self._sent_real_ns >= KEEP_ALIVE_NS:
+                    self._send_samples(again=True)
                 for key in self._ready(time_out_s(1e-9 * (due_ns - now_ns))):
                     key.data()
 
@@ -383,10 +391,11 @@ class UrServer:
         others = {key.fd: key for key in keys if not isinstance(key.fileobj, (Client, socket.socket))}
         return [others[fd] for fd in select.select(list(others), [], [], time_out_s)[0]]
 
-    def _send_samples(self) -> None:
+    def _send_samples(self, *, again: bool = False) -> None:
+        self._sent_real_ns = self.robot.clock.real_ns()
         for client in list(self._clients):
             if client.kind in self._silent:
                 continue
             client.flush()
             if self.streaming and isinstance(client, RtdeClient):
-                client.sample()
+                client.sample(again=again)

@@ -1,4 +1,4 @@
-"""The RTDE variables: name, type, and where a value comes from.
+"""The RTDE variables: names, types and sources.
 
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", tables of controller outputs and inputs.
 """
@@ -25,7 +25,7 @@ def _joint_mode(robot: Robot) -> Value:
 
 
 def _accelerometer(robot: Robot) -> Value:
-    """At rest a tool accelerometer feels the support against gravity, tool axes."""
+    """Return what a tool accelerometer measures at rest: the support against gravity, tool axes."""
     R_base_flange = forward(robot.arm.dh, robot.world.q)[:3, :3]
     x, y, z = (-R_base_flange.T @ robot.world.truth.gravity_m_s2).tolist()
     return (x, y, z)

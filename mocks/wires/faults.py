@@ -1,4 +1,4 @@
-"""What goes wrong between a sensor and its client, the same for every emulated sensor.
+"""Faults between a sensor and its client, the same for every emulated sensor.
 
 Does not model: damaged frames on CAN (its controllers discard them: use `drop`), noise bursts, slow drift of a clock.
 """
@@ -35,8 +35,8 @@ class Faults:
     foreign
         Another node's frame precedes it (CAN).
     delay_s, jitter_s
-        Time on the way, and the largest random time added to it, for each frame anew; neither changes the order, and
-        a stream does not fall behind.
+        Transmission delay, and the largest random delay added to it for each frame. Neither changes the order, and a
+        stream does not fall behind.
     stall
         Nothing is sent, as with a broken wire; the device itself goes on.
     """
@@ -53,37 +53,29 @@ class Faults:
 
     @property
     def harm_frames(self) -> bool:
-        """Whether frames can differ in their fate: if not, many may be sent as one."""
+        """Whether faults act on single frames: if not, many may be sent as one."""
         return any((self.drop, self.duplicate, self.corrupt, self.byte_slip, self.swap, self.foreign, self.jitter_s))
 
 
 class FaultyWire(Generic[Frame]):
-    """The frames on their way to the client, in order, with the faults that befall them.
+    """The frames on their way to the client, in order, with their faults.
 
     Parameters
     ----------
     faults
-        Read anew at every `put`.
+        Read at every `put`.
     clock
         Of the cell, for delays.
     seed
-        Of all chances.
-    foreign
-        Makes another node's frame.
+        Of all random faults.
     """
 
-    def __init__(
-        self,
-        faults: Faults,
-        clock: CellClock,
-        seed: int = 0,
-        *,
-        foreign: Callable[[random.Random], Frame] | None = None,
-    ) -> None:
+    def __init__(self, faults: Faults, clock: CellClock, seed: int = 0) -> None:
         self._faults = faults
         self._clock = clock
         self._random = random.Random(seed)
-        self._foreign: Callable[[random.Random], Frame] | None = foreign
+        self.foreign: Callable[[random.Random], Frame] | None = None
+        """Makes another node's frame."""
         self._outbox: deque[tuple[float, Frame]] = deque()
         self._held: list[Frame] = []
 
@@ -95,7 +87,7 @@ class FaultyWire(Generic[Frame]):
         frames
             In the order of sending.
         stream
-            Whether the last one may be overtaken by the frames of the next call.
+            Whether frames of the next call may overtake the last one.
         """
         if self._faults.stall:
             return
@@ -103,22 +95,22 @@ class FaultyWire(Generic[Frame]):
         if self._held or self._faults.harm_frames:
             frames = self._with_faults(frames, stream)
         for frame in frames:
-            last_s = self._outbox[-1][0] if self._outbox else due_s  # nobody overtakes
+            last_s = self._outbox[-1][0] if self._outbox else due_s  # frames keep their order
             self._outbox.append((max(last_s, due_s + self._faults.jitter_s * self._random.random()), frame))
 
     def due(self, now_s: float) -> list[Frame]:
-        """Take the frames that arrive now."""
+        """Remove and return the frames that arrive now."""
         arrived: list[Frame] = []
         while self._outbox and self._outbox[0][0] <= now_s:
             arrived.append(self._outbox.popleft()[1])
         return arrived
 
     def wait_s(self, now_s: float) -> float | None:
-        """Time until the next frame arrives, None when there is none on its way."""
+        """Return the time until the next frame arrives, None when there is none."""
         return max(0.0, self._outbox[0][0] - now_s) if self._outbox else None
 
     def clear(self) -> None:
-        """Forget what is on its way."""
+        """Discard the frames on their way."""
         self._outbox.clear()
         self._held.clear()
 
@@ -126,8 +118,8 @@ class FaultyWire(Generic[Frame]):
         faults, chance = self._faults, self._random.random
         sent: list[Frame] = []
         for left, frame in zip(range(len(frames) - 1, -1, -1), frames, strict=True):
-            if self._foreign is not None and chance() < faults.foreign:
-                sent.append(self._foreign(self._random))
+            if self.foreign is not None and chance() < faults.foreign:
+                sent.append(self.foreign(self._random))
             if chance() < faults.drop:
                 continue
             copies = [self._damaged(frame)]

@@ -1,4 +1,4 @@
-"""A CAN adapter that speaks ASCII lines over a serial port, with whatever is on the bus behind it.
+"""A CAN adapter on a serial port that exchanges bus frames as ASCII lines.
 
 Ref: LAWICEL CAN232 manual, version 3 ("slcan"): S, O, L, C, t, T, r, R, F, V, N and the empty line; CR accepts, BEL
 refuses, ``z`` and ``Z`` confirm a transmission.

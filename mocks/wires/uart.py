@@ -1,4 +1,4 @@
-"""Wrong parity, from the faulty wire to the client: known of a frame, and marked as a terminal marks it.
+"""Wrong parity of a byte, and its mark as a terminal sends it to the client.
 
 Ref: POSIX.1-2017, section 11.2.2 (INPCK, PARMRK).
 
@@ -9,7 +9,7 @@ from typing import Self, SupportsIndex, overload
 
 
 class WrongParity(bytes):
-    """Bytes of which one arrives with wrong parity; a slice of them knows it too.
+    """Bytes of which one arrives with wrong parity; a slice keeps this property.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ class WrongParity(bytes):
     at: int
 
     def __new__(cls, data: bytes, at: int) -> Self:
-        """Make the bytes, and remember where."""
+        """Make the bytes."""
         self = super().__new__(cls, data)
         self.at = at
         return self

@@ -1,4 +1,4 @@
-"""Every accuracy figure this project claims, measured by simulation against its target.
+"""All accuracy figures that this project states, measured by simulation against their targets.
 
     uv run python tests/benchmarks/accuracy.py [--quick] [--only WORD]
 
@@ -29,19 +29,19 @@ from calib.extras.contact import contact_chi2, contact_threshold
 from calib.known import Known
 from calib.likelihood import fit as likelihood
 from calib.likelihood import rotation_minima
-from calib.model import UP_IN_BASE
+from calib.model import UP_IN_BASE, Array
 from calib.poses.information import optimised
 from calib.published.methods import published
 from calib.published.yu import SPECIAL_R_flange_base, lrom, srom
 from tests.benchmarks import carlson_figures, speed
 from tests.benchmarks import scenarios as sim
-from tests.benchmarks.scenarios import Array, Rng, Truth
+from tests.benchmarks.scenarios import Rng, Truth
 
 GROSS_RAD = np.deg2rad(20.0)
 RANDOM_STARTS = 12
 DELTA_BINS = (0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 12.0)
 ENOUGH_WRONG = 15
-"""Wrong answers to be expected in a bin whose share is judged."""
+"""Smallest expected number of wrong answers in a bin that is tested."""
 SROM_POSES = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
 YU_MOUNT = Rotation.from_euler("ZYX", [45, 7, 3], degrees=True).as_matrix()
 YU_F0, YU_T0, YU_P = np.array([63.0, 5, 21]), np.array([87.0, 45, 6]), np.array([0.1, 0.1, 0.1])
@@ -70,11 +70,11 @@ class Lab:
         self.refused = 0
 
     def count(self, full: int, quick: int) -> int:
-        """Take the number of runs that fits the time."""
+        """Choose the number of runs for the available time."""
         return quick if self.quick else full
 
     def simulate(self, worker: Worker, runs: int, seed: int = 0) -> Record:
-        """Run a worker for consecutive seeds and stack what it gives; runs that were refused count in `refused`."""
+        """Run a worker for consecutive seeds and stack the results; `refused` counts the refused runs."""
         jobs = self.pool.imap(partial(_attempt, worker), range(seed, seed + runs), chunksize=max(1, min(20, runs // 8)))
         records = [record for record in jobs if record is not None]
         self.refused = runs - len(records)
@@ -89,7 +89,7 @@ def _attempt(worker: Worker, seed: int) -> dict[str, object] | None:
 
 
 def band(name: str, value: float, low: float, high: float, runs: int, unit: str = "", digits: int = 3) -> Row:
-    """Compare with an interval; `low` of minus infinity or `high` of infinity leaves that side open."""
+    """Compare with an interval; `low` of minus infinity or `high` of infinity disables that side."""
     if low == -np.inf:
         target = f"<= {high:.{digits}g}"
     elif high == np.inf:
@@ -169,11 +169,11 @@ def yu_table_1() -> dict[str, float]:
     return worst
 
 
-# Efficiency, basins, honesty: one simulation serves them all
+# Efficiency, basins and stated uncertainty, all from one simulation
 
 
 def fit_run(seed: int, name: str, snr: float, starts: int = 0) -> dict[str, object]:
-    """One calibration with known white noise, everything that can be asked of it."""
+    """All figures of one calibration with known white noise."""
     rng = np.random.default_rng([seed, int(snr), sum(name.encode())])
     truth = sim.tool(rng)
     R = SROM_POSES if name == "srom24" else sim.poses(name, rng)
@@ -205,7 +205,7 @@ def fit_run(seed: int, name: str, snr: float, starts: int = 0) -> dict[str, obje
 
 
 def efficiency_of(record: Record) -> Array:
-    """Mean square error over bound (5,), every run counted alike."""
+    """Mean square error over bound (5,), with equal weight for all runs."""
     return np.asarray(np.mean(record["square"] / record["bound"], axis=0))
 
 
@@ -287,7 +287,7 @@ def certificates(lab: Lab) -> Iterator[Row]:
     yield most("60 random starts find a lower force cost", int((agrees == 0).sum()), 0, len(gap))
 
 
-# Noise that nobody told the estimator about
+# Noise that the estimator does not expect
 
 
 def kinematics_run(seed: int, angle_deg: float) -> dict[str, object]:
@@ -400,7 +400,7 @@ def few_samples(lab: Lab) -> Iterator[Row]:
     yield band("  used as they are, for comparison: mean efficiency", direct, 2.5, 4.5, runs)
 
 
-# What poses can tell
+# Observability of poses
 
 
 def degenerate(lab: Lab) -> Iterator[Row]:
@@ -424,7 +424,7 @@ def degenerate(lab: Lab) -> Iterator[Row]:
         yield Row(f"rank, {name}", f"{found.rank} (numeric: {own})", str(rank), found.rank == own == rank, 1)
     rim = sim.leaning(np.full(8, np.deg2rad(40.0)), azimuth, np.zeros(8))
     found = assess(rim, guess, advise=False)
-    flagged = found.rank == 15 and found.second_gap < AMBIGUOUS_GAP and bool(found.gauges)
+    flagged = found.rank == 15 and found.second_gap < AMBIGUOUS_GAP and bool(found.ambiguities)
     yield Row(
         "8 poses on the rim of a cone: flagged",
         f"rank {found.rank}, gap {found.second_gap:.1g}",
@@ -462,14 +462,14 @@ def odds_run(seed: int, name: str, snr: float) -> dict[str, object]:
 
 
 def odds(lab: Lab) -> Record:
-    """Gap to the second minimum, and whether that was the right one, of calibrations with far too much noise."""
+    """Gap to the second minimum, and whether that was right, for calibrations with excessive noise."""
     runs = lab.count(900, 20)
     cells = [lab.simulate(partial(odds_run, name=name, snr=snr), runs) for name, snr in ODDS_CELLS]
     return {key: np.concatenate([cell[key] for cell in cells]) for key in ("gap", "wrong")}
 
 
 def odds_table(record: Record) -> list[tuple[float, float, int, float, float]]:
-    """For each bin of the gap: limits, runs, share of wrong answers, and the share that is stated."""
+    """For each bin of the gap: limits, runs, share of wrong answers, and the stated share."""
     table = []
     for low, high in zip(DELTA_BINS, (*DELTA_BINS[1:], np.inf), strict=True):
         inside = (record["gap"] >= low) & (record["gap"] < high)
@@ -547,7 +547,7 @@ FIG_9_YAW_DEG = 30.0
 
 
 def yaw_run(seed: int, yaw_deg: float, roll_deg: float) -> dict[str, object]:
-    """Yu Fig. 9: squared error of the predicted force of methods that know more or less of the mounting."""
+    """Yu Fig. 9: squared error of the predicted force of methods with more or less knowledge of the mounting."""
     rng = np.random.default_rng(seed)
     R_se = Rotation.from_euler("ZYX", [yaw_deg, 0, roll_deg], degrees=True).as_matrix()
     truth, R, s = sim.tool(rng, R=R_se), sim.poses("cone60_24", rng), sim.sigma(100)
@@ -658,7 +658,7 @@ PEERS = ("10-parameter LS", "relaxation", "LROM", "SROM", "ours")
 def left_out(
     R: Array, y: Array, cov: Array | None, time_s: Array, folds: Sequence[NDArray[np.intp]], *, special: bool = False
 ) -> Array:
-    """Measured minus predicted (5, m, 6) of the peers at poses that they were not told about; NaN without SROM's 24."""
+    """Measured minus predicted (5, m, 6) of the peers at poses left out of their fit; NaN for SROM without its 24."""
     return np.array(
         [
             np.concatenate([_left_out(name, R, y, cov, time_s, fold) for fold in folds])
@@ -676,21 +676,21 @@ def rms(residuals: Array) -> Array:
 
 def _left_out(name: str, R: Array, y: Array, cov: Array | None, time_s: Array, fold: NDArray[np.intp]) -> Array:
     kept = np.setdiff1d(np.arange(len(R)), fold)
-    told = R[kept], y[kept]
+    training = R[kept], y[kept]
     bias = np.zeros((len(fold), 6))
     if name == "10-parameter LS":
-        estimate = sim.ten_parameters(*told)
+        estimate = sim.ten_parameters(*training)
     elif name == "relaxation":
         try:
             estimate = published("carlson-relaxation", R[kept], gravity_direction_base=-UP_IN_BASE)(y[kept])
         except (NotObservable, ValueError):
             return np.full((len(fold), 6), np.inf)
     elif name == "LROM":
-        estimate = lrom(*told)
+        estimate = lrom(*training)
     elif name == "SROM":
-        estimate = srom(*told)
+        estimate = srom(*training)
     else:
-        fit = likelihood.fit(*told, cov, t_s=time_s[kept])
+        fit = likelihood.fit(*training, cov, t_s=time_s[kept])
         estimate = fit.parameters
         if fit.drift is not None:
             bias = np.stack([np.interp(time_s[fold], time_s[kept], column) for column in fit.drift.bias.T], axis=1)
@@ -699,14 +699,14 @@ def _left_out(name: str, R: Array, y: Array, cov: Array | None, time_s: Array, f
 
 @dataclass(frozen=True)
 class Session:
-    """What happens in a simulated session."""
+    """Conditions of a simulated session."""
 
     name: str
     poses: str = "haar24"
     aligned: bool = False
-    """Sensor axes are those of the flange and the base is level: what the ROS packages assume."""
+    """Sensor axes equal those of the flange and the base is level, as the ROS packages assume."""
     mount_deg: float | None = None
-    """Sensor axes off those of the flange by this much; None: any mounting."""
+    """Angle between the axes of sensor and flange; None: any mounting."""
     walk_N: float = 0.0
     orientation_deg: float = 0.0
     bumped: int = 0
@@ -735,10 +735,10 @@ def session_run(seed: int, session: Session) -> dict[str, object]:
     else:
         truth = sim.tool(rng)
     special = session.poses == "srom24"
-    told = rng.permutation(SROM_POSES) if special else sim.poses(session.poses, rng)
-    n = len(told)
+    training = rng.permutation(SROM_POSES) if special else sim.poses(session.poses, rng)
+    n = len(training)
     R = np.empty((2 * n, 3, 3))
-    R[0::2], R[1::2] = told, sim.poses(f"haar{n}" if special else session.poses, rng)
+    R[0::2], R[1::2] = training, sim.poses(f"haar{n}" if special else session.poses, rng)
     s = sim.sigma(400)
     actual = sim.with_inexact_orientations(R, np.deg2rad(session.orientation_deg), rng)
     path, _ = sim.walk(2 * n, session.walk_N / np.sqrt(2), rng)

@@ -1,4 +1,4 @@
-"""Reproduce the figures of Carlson (2019) and what his methods do with a bias, against target numbers.
+"""Reproduce the figures of Carlson (2019) and the effect of a bias on his methods, against target numbers.
 
 Run `python tests/benchmarks/carlson_figures.py [--quick]`: prints tables with pass or fail and exits with 1 if one
 fails. With matplotlib installed, `--png FILE` draws figures 1 and 2.
@@ -12,13 +12,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.model import nearest_rotation, skew
+from calib.model import Array, nearest_rotation, skew
 from calib.published import carlson, carlson_known
-
-Array = NDArray[np.float64]
 
 FIG_1_SIGMA_N = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 FIG_1_CURVES = ("relaxation", "Cayley total", "Cayley ordinary", "Cayley total, 4 turns")
@@ -26,7 +23,7 @@ FIG_2_STEPS = (1, 2, 3, 4, 5, 6)
 
 
 class Report:
-    """Prints lines and remembers failures."""
+    """Prints lines and counts failures."""
 
     def __init__(self) -> None:
         self.failures = 0
@@ -70,7 +67,7 @@ def tilted(rng: np.random.Generator, n: int, angle_deg: float, *, spin: bool) ->
 
 
 def figure_1(trials: int, mass_factor: float, rng: np.random.Generator) -> Array:
-    """(sigma, curve) medians of |R_error|_F^2 with 100 poses and 1 kg; Cayley transforms are told another weight.
+    """(sigma, curve) medians of |R_error|_F^2 with 100 poses and 1 kg; Cayley transforms get another weight.
 
     The published code draws the sensor's rotation vector from a normal distribution, which favours the Cayley
     transform; a uniform rotation makes its plateau 4 times as high.

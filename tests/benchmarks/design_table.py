@@ -1,4 +1,4 @@
-"""Print what sets of poses are worth; with --optimise, search the stored sets of 6 and 8 again (a minute).
+"""Print the information of pose sets; with --optimise, search the stored sets of 6 and 8 again (a minute).
 
 Run: python tests/benchmarks/design_table.py [--optimise]
 """
@@ -112,7 +112,7 @@ def cones() -> None:
 
 
 def against_random() -> None:
-    """Sets chosen in one go, and greedily one after the other, against random ones; I_F and rms in the workspace."""
+    """Sets chosen at once, and greedily, against random ones; I_F and rms in the workspace."""
     rng = np.random.default_rng(0)
     workspace = ball(np.deg2rad(40), 400, rng)
     places = {
@@ -152,7 +152,7 @@ def against_random() -> None:
 
 
 def orders() -> None:
-    """Order of the 24 special poses under a wandering bias."""
+    """Order of the 24 special poses with a random walk of the bias."""
     guess = Guess(20 / 9.80665, 0.02, 0.0005, walk_force_N=0.07, walk_torque_Nm=0.00175)
     R = special(range(1, 25))
     start = time.perf_counter()

@@ -16,8 +16,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, CalibrationResult, NotObservable, solve
+from calib.model import Array
 from tests.benchmarks import scenarios as sim
-from tests.benchmarks.scenarios import Array, Rng, Truth
+from tests.benchmarks.scenarios import Rng, Truth
 
 NOISE = sim.sigma(400)
 Data = tuple[Array, Array]

@@ -84,7 +84,7 @@ def yu_15(lab: Lab) -> Figure:
 def carlson_1(lab: Lab) -> Figure:
     trials = lab.count(400, 40)
     figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained", sharey=True)
-    for axis, factor, title in ((axes[0], 1.0, "weight told right"), (axes[1], 1.1, "weight told 10 % too large")):
+    for axis, factor, title in ((axes[0], 1.0, "correct weight"), (axes[1], 1.1, "weight 10 % too large")):
         table = carlson_figures.figure_1(trials, factor, np.random.default_rng(1))
         for curve, name, style in zip(table.T, carlson_figures.FIG_1_CURVES, ("o-", "s--", "^:", "v-."), strict=True):
             axis.loglog(carlson_figures.FIG_1_SIGMA_N, curve, style, label=name, alpha=0.8)

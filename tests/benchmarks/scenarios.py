@@ -1,4 +1,4 @@
-"""Simulated calibrations whose answer is known: pose sets, tools, readings, and the best that any estimator can do.
+"""Simulated calibrations with known truth: pose sets, tools, readings, and the bound on any estimator.
 
 An implementation of the model of its own, so that a mistake in `calib.model` shows: here R is `s_eR`, flange to sensor,
 and A = `e_bR` is the transpose of a robot pose, as in Yu, Shi, Lou 2021, eqs 12-13. Derivatives are numeric.
@@ -8,12 +8,11 @@ from dataclasses import astuple, dataclass
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib import Parameters
+from calib.model import Array
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 WEIGHT_N, ARM_M, TILT_DEG = 20.0, 0.08, 2.0
@@ -38,7 +37,7 @@ STEP = 1e-5
 
 @dataclass(frozen=True)
 class Truth:
-    """What is to be found."""
+    """The true parameters."""
 
     R: Array
     """(3, 3) flange to sensor."""
@@ -49,7 +48,7 @@ class Truth:
     T0: Array
 
     def moved(self, x: Array) -> "Truth":
-        """Apply an error vector (15,): R <- R exp([x]), the rest is added."""
+        """Apply an error vector (15,): R <- R exp([x]), all others by addition."""
         return Truth(
             self.R @ Rotation.from_rotvec(x[:3]).as_matrix(),
             self.b + x[3:6],
@@ -135,7 +134,7 @@ def error(truth: Truth, estimate: Parameters) -> Array:
 
 
 def as_truth(estimate: Parameters) -> Truth:
-    """Give an estimate the form of this module."""
+    """Convert an estimate to the form of this module."""
     return Truth(
         estimate.R_flange_sensor.T,
         estimate.gravity_force_base_N,
@@ -157,14 +156,14 @@ def blocks(x: Array) -> Array:
 
 
 def with_inexact_orientations(R_base_flange: Array, sigma_rad: float, rng: Rng) -> Array:
-    """What the kinematics say when each axis of each orientation is off by a random angle."""
+    """Reported orientations with a random error about each axis."""
     return np.asarray(
         R_base_flange @ Rotation.from_rotvec(sigma_rad * rng.normal(size=(len(R_base_flange), 3))).as_matrix()
     )
 
 
 def walk(n: int, q_N: float, rng: Rng) -> tuple[Array, Array]:
-    """Random walk (n, 6) less its mean, and that mean, which is what a calibration calls the bias."""
+    """Random walk (n, 6) minus its mean, and that mean, which is the bias of a calibration."""
     path = np.cumsum(rng.normal(size=(n, 6)), axis=0) * q_N * np.repeat([1.0, LEVER_M], 3)
     mean = path.mean(axis=0)
     return path - mean, mean
@@ -182,7 +181,7 @@ def bumps(n: int, rng: Rng) -> Array:
 def lowest(
     R_base_flange: Array, wrench: Array, noise: Array, starts: list[Truth], random: int, rng: Rng
 ) -> tuple[float, Truth]:
-    """Cost and place of the lowest minimum of the plain joint least squares that any start leads to.
+    """Cost and parameters of the lowest minimum of the plain joint least squares over all starts.
 
     Parameters
     ----------
@@ -267,7 +266,7 @@ def _residual(R: Array, linear: Array, triangle: Array, y: Array, noise: Array) 
 
 
 def lowest_quadratic(Q: Array, starts: int, rng: Rng) -> float:
-    """Lowest `r.T @ Q @ r` over the rotations that so many random starts lead to; r is the rotation row by row."""
+    """Lowest `r.T @ Q @ r` over the rotations from so many random starts; r is the rotation row by row."""
     R = Rotation.random(starts, rng=rng).as_matrix()
     half = np.linalg.cholesky(Q + 1e-15 * np.trace(Q) * np.eye(9)).T
     damping = np.full(starts, 1e-3)
@@ -289,7 +288,7 @@ def lowest_quadratic(Q: Array, starts: int, rng: Rng) -> float:
 
 
 def ten_parameters(R_base_flange: Array, wrench: Array) -> Parameters:
-    """Mass, centre of mass and bias by one linear least squares, as the ROS packages do it.
+    """Mass, centre of mass and bias by one linear least squares, like the ROS packages.
 
     Source: D. Vougioukas, "Bias estimation and gravity compensation for force-torque sensors", 2001, with the axes of
     sensor and flange taken as the same and gravity along -z of the base.

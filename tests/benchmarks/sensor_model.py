@@ -20,12 +20,11 @@ from calib.known import Constraints, Known
 from calib.likelihood import fit as likelihood
 from calib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, Response, predicted_covariance
 from calib.likelihood.variance_components import FORCE, RESPONSE, ROTATION, TORQUE, component
-from calib.model import STANDARD_GRAVITY_M_S2, predict
+from calib.model import STANDARD_GRAVITY_M_S2, Array, predict
 from calib.published.yu import lrom
 from calib.result import COMMON_GAIN
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.accuracy import Lab, Row, band, laboratory, most
-from tests.benchmarks.scenarios import Array
 
 Rows = NDArray[np.intp]
 

@@ -11,15 +11,13 @@ from functools import partial
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from calib.likelihood import rotation_minima
-
-Array = NDArray[np.float64]
+from calib.model import Array
 
 SETS = ("srom24", "haar24", "haar12", "haar6", "cone60", "cone40", "cone20", "ball60", "ball40", "ball20")
 TIES = ("3 poses", "4 half turns", "rim of a cone", "diagonal Q", "yaw only", "nearly yaw only", "ball0.5")
@@ -30,7 +28,7 @@ RANDOM_STARTS = 300
 
 
 def orientations(name: str, rng: np.random.Generator) -> Array:
-    """R_base_flange of a pose set: 24 poses where the name gives no number; cones and balls are about straight down."""
+    """R_base_flange of a pose set: 24 poses if the name has no number; cones and balls are about straight down."""
     if name == "srom24":
         signed = [np.diag(s)[list(p)] for p in permutations(range(3)) for s in product((1.0, -1.0), repeat=3)]
         return np.array([R for R in signed if np.linalg.det(R) > 0])
@@ -73,7 +71,7 @@ def tie(name: str, rng: np.random.Generator) -> Array:
 
 
 def generic(name: str, rng: np.random.Generator) -> Array:
-    """Q that no calibration gives."""
+    """Generic Q, unlike those of a calibration."""
     G = rng.normal(size=(9, 9))
     if name == "low rank":
         G = G[:, : rng.integers(1, 9)]
@@ -105,7 +103,7 @@ def problems(n: int) -> list[tuple[str, Array]]:
 
 
 def starts_needed(cases: list[tuple[str, Array]]) -> Table:
-    """Compare fixed starts with the union of all they find and what random starts find."""
+    """Compare fixed starts with the union of all minima from them and from random starts."""
     rng = np.random.default_rng(1)
     missed_best: dict[tuple[str, int], int] = defaultdict(int)
     missed_any: dict[tuple[str, int], int] = defaultdict(int)
@@ -153,9 +151,9 @@ def certificates(cases: list[tuple[str, Array]]) -> Table:
     table = Table("problems", "n", "proved (<= 1e-8)", "largest gap", "median gap", "gap / excess of a worse minimum")
     for name, gaps in at_best.items():
         ratio = at_other[name]
-        told = f"{min(ratio):.6f} .. {max(ratio):.6f} ({len(ratio)})" if ratio else "none worse"
+        excess = f"{min(ratio):.6f} .. {max(ratio):.6f} ({len(ratio)})" if ratio else "none worse"
         share = f"{100 * np.mean(np.array(gaps) <= 1e-8):.2f} %"
-        table.add_row(name, str(len(gaps)), share, f"{max(gaps):.1e}", f"{np.median(gaps):.1e}", told)
+        table.add_row(name, str(len(gaps)), share, f"{max(gaps):.1e}", f"{np.median(gaps):.1e}", excess)
     return table
 
 
@@ -170,7 +168,7 @@ def peer(Q: Array, starts: int) -> float:
 
 
 def timings(cases: list[tuple[str, Array]]) -> Table:
-    """Median CPU time: of one thread, and untouched by what else the machine does."""
+    """Median CPU time of one thread, independent of other load."""
 
     def median_ms(calls: Iterable[Callable[[], object]]) -> float:
         took = []

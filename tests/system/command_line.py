@@ -18,7 +18,6 @@ from ftdrive import cli
 from ftdrive.cell.config import FORMAT
 from ftdrive.cell.emulated import Station
 from ftdrive.terminal.console import talk
-from tests.system.cell_time import keep_time_of
 
 _LONG_S = 90
 """What takes so long hangs; no computer is that busy."""
@@ -30,7 +29,6 @@ class CommandLine:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._environment = {"COLUMNS": "200", "XDG_STATE_HOME": str(folder / "state")}
-        self._clock: str | None = None
         self._started: list[subprocess.Popen[str]] = []
 
     def connect(self, station: Station) -> Path:
@@ -50,7 +48,7 @@ class CommandLine:
 
     def keep_time_of(self, station: Station) -> None:
         """Have the commands keep the time of a station, as the computer's may be too fast for it."""
-        self._clock = station.endpoints["clock"]
+        self._environment["FTDRIVE_CLOCK"] = station.endpoints["clock"]
 
     def run(self, *arguments: str | Path, typed: str = "") -> CompletedProcess[str]:
         """Run it in this process to its end: a process of its own would only import the same modules again."""
@@ -58,8 +56,6 @@ class CommandLine:
         with pytest.MonkeyPatch.context() as here, runner.isolation(typed, self._environment) as (out, err, _):
             here.chdir(self.folder)
             here.setattr(talk, "quiet", False)
-            if self._clock is not None:
-                keep_time_of(self._clock, here.setattr)
             try:
                 code = cli.run([*map(str, arguments)])
             except SystemExit as ended:
@@ -77,11 +73,8 @@ class CommandLine:
 
     def start(self, *arguments: str | Path) -> subprocess.Popen[str]:
         """Start it as a process: for signals, and for what happens while it runs."""
-        program = (
-            ["-m", "ftdrive"] if self._clock is None else [str(Path(__file__).with_name("cell_time.py")), self._clock]
-        )
         process = subprocess.Popen(
-            [sys.executable, *program, *map(str, arguments)],
+            [sys.executable, "-m", "ftdrive", *map(str, arguments)],
             cwd=self.folder,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

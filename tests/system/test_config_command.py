@@ -47,15 +47,15 @@ def test_what_is_shown_can_be_used_in_its_place(monkeypatch: pytest.MonkeyPatch)
             assert load(Path("copy.toml")) == cell
 
 
-def test_origins_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_origins_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     Path("ftdrive.toml").write_text(CELL)
     monkeypatch.setenv("FTDRIVE_ROBOT_HOST", "10.0.0.2")
     lines = run("config", "show", "--origin").stdout.splitlines()
-    told = {line.split("=")[0].strip(): line.rsplit("#", 1)[1].strip() for line in lines[1:] if "=" in line}
-    assert told["host"] == "FTDRIVE_ROBOT_HOST"
-    assert told["speed_deg_s"] == "ftdrive.toml"
-    assert told["average_s"] == "default"
-    assert told["# height_mm"] == "not set"
+    origins = {line.split("=")[0].strip(): line.rsplit("#", 1)[1].strip() for line in lines[1:] if "=" in line}
+    assert origins["host"] == "FTDRIVE_ROBOT_HOST"
+    assert origins["speed_deg_s"] == "ftdrive.toml"
+    assert origins["average_s"] == "default"
+    assert origins["# height_mm"] == "not set"
     assert "FTDRIVE_ROBOT_HOST" not in run("config", "show").stdout
 
     answer = json.loads(run("config", "show", "--origin", "--json").stdout)

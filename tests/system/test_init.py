@@ -44,8 +44,9 @@ def addresses(station: Station) -> list[str]:
 
 
 @pytest.fixture(autouse=True)
-def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, station: Station) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FTDRIVE_CLOCK", station.endpoints["clock"])
 
 
 def run(*arguments: str, typed: str = "") -> Result:
@@ -79,8 +80,9 @@ def test_a_script_needs_no_questions(station: Station) -> None:
     assert cell.workcell.boxes_mm == ((500, 500, 0, 900, 900, 90),)
 
 
-def test_an_arm_that_cannot_be_planned_for_is_said_to_be_one() -> None:
+def test_an_arm_without_a_measured_shape_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     with Station("serial", ["--polyscope", "3.15.0", "--time-scale", "1"]) as old:
+        monkeypatch.setenv("FTDRIVE_CLOCK", old.endpoints["clock"])
         outcome = run("--robot", old.cell.robot.host, "--model", "ur5", "--sensor", old.cell.sensor.url, *TOOL, "--yes")
     assert outcome.exit_code == 0, outcome.output
     assert "calibrate --manual" in outcome.output
@@ -94,7 +96,7 @@ def test_a_bus_is_asked_what_is_there(station: Station) -> None:
     assert load().sensor.url == f"ati-can://{can['channel']}?interface=slcan&bitrate={can['bitrate']}"
 
 
-def test_nothing_counts_as_measured_until_a_person_says_so(addresses: list[str]) -> None:
+def test_nothing_counts_as_measured_until_the_operator_sets_it(addresses: list[str]) -> None:
     assert run(*addresses, *TOOL, "--yes").exit_code == 0
     text = Path("ftdrive.toml").read_text()
     assert load().workcell.measured is False
@@ -144,7 +146,7 @@ def test_a_robot_that_does_not_answer_is_exit_code_3(station: Station) -> None:
     assert not Path("ftdrive.toml").exists()
 
 
-def test_a_folder_that_is_not_there_is_told_before_anything_is_asked(tmp_path: Path) -> None:
+def test_a_missing_folder_is_an_error_before_the_first_question(tmp_path: Path) -> None:
     path = tmp_path / "nowhere" / "cell.toml"
     error = run("--robot", "127.99.99.9", "--sensor", "ati-can://can0", *TOOL, "--yes", "--output", str(path)).exception
     assert isinstance(error, ConfigError)
@@ -166,7 +168,7 @@ def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
         "out of range",
         "3 or 5 numbers",
         "'0:x:33'",
-        "no cylinder",
+        "not a cylinder",
         "are these mm",
         "ends 20 mm from the flange",
         "wrong side of the plane [1, 0, 0, 800]",
@@ -181,7 +183,7 @@ def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
     assert (cell.sensor.height_mm, cell.sensor.mass_kg) == (33, None)
 
 
-def test_a_script_that_answers_too_little_is_told_the_option(station: Station) -> None:
+def test_an_error_names_the_option_that_a_script_left_out(station: Station) -> None:
     outcome = run("--robot", station.cell.robot.host, "--sensor", station.cell.sensor.url, typed="33\n")
     assert outcome.exception is not None
     assert exit_code(outcome.exception) == 2
@@ -189,7 +191,7 @@ def test_a_script_that_answers_too_little_is_told_the_option(station: Station) -
     assert not Path("ftdrive.toml").exists()
 
 
-def test_a_person_may_keep_addresses_that_do_not_answer() -> None:
+def test_the_operator_may_keep_addresses_that_do_not_answer() -> None:
     silent, no_bus = "ati-serial:///dev/no-such-port", "slcan:///dev/no-such-port?bitrate=250000"
     typed = ["127.99.99.9", "", "ur10e", "", no_bus, silent, "", "33", "", "", "0:50:80", "", "", "", "", "", "", ""]
     outcome = run(typed="\n".join(typed) + "\n")
@@ -221,7 +223,7 @@ def test_in_a_terminal(station: Station) -> None:
     screen, decoder = "", codecs.getincrementaldecoder("utf-8")()  # a read may end within a letter
     talk = [
         (r"Robot address: ", station.cell.robot.host),
-        (r"Sensor(, a number| address).*: ", serial_port(station)),
+        (r"Sensor(: choose a number| address).*: ", serial_port(station)),
         (r"measure it\): ", "33"),
         (r"Sensor and adapter, kg .*: ", "0.255"),
         (r"Name of the tool \[tool\]: ", ""),

@@ -22,7 +22,7 @@ from ftdrive.cli import cli
 from ftdrive.planning.search.constant_tour import NUMBERS, constant_tour
 from ftdrive.runs.run import Run
 from ftdrive.session.events import Estimated, Event, PoseTaken
-from ftdrive.session.hand_guided import collect_manually
+from ftdrive.session.hand_guided import Recorder, collect_manually
 from ftdrive.session.operator import Key, Question
 from ftdrive.terminal.report import errors_in_sigma
 
@@ -146,8 +146,7 @@ def watch(station: Station, run: Run, *, commit: Callable[[PoseRecord], None] | 
                 sensor,
                 cell.sampling,
                 person,
-                Fit().add,
-                commit or run.commit,
+                Recorder(Fit().add, commit or run.commit),
                 down_base=np.array([0.0, 0.0, -1.0]),
                 listen=True,
                 clock=cell.clock,

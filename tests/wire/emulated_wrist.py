@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import TypeVar
 
+from mocks.arrays import Array
 from mocks.clock import CellClock
-from mocks.kinematics import MODELS, ZERO6, Array
+from mocks.kinematics import MODELS, ZERO6
 from mocks.station import free_hosts
 from mocks.ur.robot import Robot, RobotSettings
 from mocks.ur.server import UrServer
@@ -59,7 +60,7 @@ class EmulatedWrist:
         return {"host": self._listener.getsockname()[0]}
 
     def reset(self) -> None:
-        """Restart the controller: it hangs up, and its clock begins anew."""
+        """Restart the controller: it hangs up, and its clock restarts."""
         self._controller.stop()
         self._controller = Controller(self._measure, self._clock)
 

@@ -75,7 +75,7 @@ def test_unplugged_is_a_broken_stream_at_once(start: Start, scheme: str) -> None
 
 def test_saturated_gauge_is_a_fault(start: Start, scheme: str) -> None:
     with pytest.raises(DeviceFault, match="gauge G3"):
-        start(scheme, saturated_gauge=3).sensor().open()
+        start(scheme, saturated_axis=3).sensor().open()
 
 
 def test_critical_status_is_a_fault(start: Start, scheme: str) -> None:

@@ -53,8 +53,8 @@ def jam(box: AtiSerialBox, port: serial.Serial) -> None:
 
 def wait_for_drops(box: AtiSerialBox) -> None:
     """Until the terminal is full and records are lost."""
-    dropped = box.dropped_records
-    wait_until(lambda: box.dropped_records > dropped + 10)
+    dropped = box.dropped_frames
+    wait_until(lambda: box.dropped_frames > dropped + 10)
 
 
 def unmarked(port: serial.Serial, count: int) -> tuple[bytes, list[bool]]:

@@ -213,7 +213,7 @@ def test_can_saturation(node: AtiCanNode, client: CanClient) -> None:
     node.measure = constant(np.array([0, 0, 900.0, 0, 0, 0]))
     assert client.ask("200#", 2)[0] == "200#0000 7FFF 7FFF 7FFF"
     node.measure = constant(V1)
-    node.saturated_gauge = 3
+    node.saturated_axis = 3
     assert client.ask("200#", 2)[1] == "201#FF38 7FFF FDA8"
 
 
@@ -473,9 +473,9 @@ def test_serial_requests_in_a_stream_are_not_answered(box: AtiSerialBox, line: S
     assert line.ask(START, 5) == STARTED
     line.port.write(READ_STATUS)
     wait_until(lambda: len(box._burst) == len(READ_STATUS))
-    made = box.produced_records
+    made = box._pacer.made
     assert line.port.read(13 * 200) == V1_RECORD * 200
-    wait_until(lambda: box.produced_records > made + 200)
+    wait_until(lambda: box._pacer.made > made + 200)
     assert line.port.read(13 * 200) == V1_RECORD * 200
 
 
@@ -516,7 +516,7 @@ def test_serial_gains_are_volatile(box: AtiSerialBox) -> None:
 def test_serial_host_that_does_not_read_loses_whole_records(box: AtiSerialBox, line: SerialClient) -> None:
     box.measure = noisy(V1)
     assert line.ask(START, 5) == STARTED
-    wait_until(lambda: box.dropped_records > 100)
+    wait_until(lambda: box.dropped_frames > 100)
     assert len(box._unsent) < 13
     records = line.records(4000)
     assert len(records) == 4000
@@ -538,7 +538,7 @@ def test_serial_status_bit_and_saturated_gauge_show_in_the_stream(box: AtiSerial
     assert line.ask(START, 5) == STARTED
     assert line.port.read(13) == V1_RECORD[:12] + b"\xd0"
     line.stop()
-    box.status, box.saturated_gauge = 0, 4
+    box.status, box.saturated_axis = 0, 4
     assert line.ask(START, 5) == STARTED
     assert line.port.read(6) == bytes.fromhex("00 64 01 2C 7F FF")
 

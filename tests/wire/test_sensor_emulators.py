@@ -92,7 +92,7 @@ def can_client(node: RobotousCanNode, bitrate: int = 1_000_000) -> Iterator[can.
         node.stop()
 
 
-def tell(bus: can.BusABC, command: str, identifier: int = 0x64) -> None:
+def send_command(bus: can.BusABC, command: str, identifier: int = 0x64) -> None:
     data = bytes.fromhex(command).ljust(8, b"\0")
     bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
@@ -113,25 +113,25 @@ CAN_SAMPLE = [(1, "0B01F4FF0603E807"), (2, "D0FC180064000000")]
 
 def test_robotous_can_commands_and_stream(node: RobotousCanNode) -> None:
     with can_client(node) as bus:
-        tell(bus, "01")
+        send_command(bus, "01")
         assert hear(bus, 2) == [(1, "015246543630" + "2D48"), (2, "4130310000000000")]
-        tell(bus, "0A")
+        send_command(bus, "0A")
         assert hear(bus, 2) == [(1, "0A01F4FF0603E807"), CAN_SAMPLE[1]]
-        tell(bus, "0F 08")
+        send_command(bus, "0F 08")
         assert hear(bus, 2)[0] == (1, "0F01000000000000")
-        tell(bus, "0B")
+        send_command(bus, "0B")
         assert hear(bus, 400) == CAN_SAMPLE * 200
-        tell(bus, "01")
-        tell(bus, "0C")
+        send_command(bus, "01")
+        send_command(bus, "0C")
         wait_until(lambda: not node.streaming)
         drain_bus(bus)
-        tell(bus, "10")
+        send_command(bus, "10")
         assert hear(bus, 2)[0] == (1, "1008000000000000")
 
 
 def test_robotous_can_ignores_what_is_no_command(node: RobotousCanNode) -> None:
     with can_client(node) as bus:
-        tell(bus, "01", identifier=0x65)
+        send_command(bus, "01", identifier=0x65)
         bus.send(can.Message(arbitration_id=0x64, data=b"\x01", is_extended_id=False))
         bus.send(can.Message(arbitration_id=0x64, data=b"\x01".ljust(8, b"\0"), is_extended_id=True))
         bus.send(can.Message(arbitration_id=0x64, dlc=8, is_remote_frame=True, is_extended_id=False))
@@ -141,36 +141,36 @@ def test_robotous_can_ignores_what_is_no_command(node: RobotousCanNode) -> None:
 def test_robotous_can_at_another_bit_rate_is_silent(node: RobotousCanNode) -> None:
     node.streaming_at_start = True
     with can_client(node, bitrate=500_000) as bus:
-        tell(bus, "01")
+        send_command(bus, "01")
         assert bus.recv(0.05) is None
 
 
 def test_robotous_can_faults(node: RobotousCanNode) -> None:
     node.faults.swap = 1.0
     with can_client(node) as bus:
-        tell(bus, "0A")
+        send_command(bus, "0A")
         assert [i for i, _ in hear(bus, 2)] == [2, 1]
         node.faults.swap, node.faults.foreign = 0.0, 1.0
-        tell(bus, "0A")
+        send_command(bus, "0A")
         messages = [bus.recv(LIMIT_S) for _ in range(4)]
         seen = [(m.arbitration_id, m.is_extended_id) for m in messages if m]
         assert seen[1::2] == [(1, False), (2, False)]
         assert not {(1, False), (2, False)} & set(seen[::2])
         node.faults.foreign, node.faults.stall = 0.0, True
-        tell(bus, "0A")
+        send_command(bus, "0A")
         assert bus.recv(0.03) is None
 
 
 def test_robotous_can_identifiers_change_with_a_reset(node: RobotousCanNode) -> None:
     with can_client(node) as bus:
-        tell(bus, "04 70 71 72")
+        send_command(bus, "04 70 71 72")
         assert hear(bus, 2) == [(1, "0401000000000000"), (2, "0" * 16)]
-        tell(bus, "0B")
+        send_command(bus, "0B")
         assert hear(bus, 2) == CAN_SAMPLE
         node.reset()
         wait_until(lambda: not node.streaming)
         drain_bus(bus)
-        tell(bus, "0A", identifier=0x70)
+        send_command(bus, "0A", identifier=0x70)
         assert [i for i, _ in hear(bus, 2)] == [0x71, 0x72]
 
 
@@ -489,7 +489,7 @@ def test_rdt_buffered_datagrams(net_box: NetFtBox) -> None:
         assert records["rdt"].tolist() == list(range(1, 121))
 
 
-def test_rdt_ignores_what_is_no_request_and_a_new_request_starts_anew(net_box: NetFtBox) -> None:
+def test_rdt_ignores_what_is_no_request_and_a_new_request_restarts_the_stream(net_box: NetFtBox) -> None:
     with rdt_client(net_box) as client:
         for junk in (
             b"",

@@ -94,7 +94,7 @@ def test_a_hand_moves_the_arm(station: StationProcess) -> None:
     assert what == ["hand-move", "moves", "stands"], "and no program"
 
 
-def test_somebody_guides_the_arm_and_lets_go(station: StationProcess) -> None:
+def test_the_operator_guides_the_arm_and_lets_go(station: StationProcess) -> None:
     before = station.ask("state")
     try:
         assert station.ask("hand-guide", rest_s=0.05) == {"done": "hand-guide"}
@@ -106,7 +106,7 @@ def test_somebody_guides_the_arm_and_lets_go(station: StationProcess) -> None:
     station.wait_for(lambda s: s["steady"])
 
 
-def test_somebody_starts_a_program_on_the_pendant(station: StationProcess) -> None:
+def test_the_operator_starts_a_program_on_the_pendant(station: StationProcess) -> None:
     assert station.ask("pendant-program", rest_s=0.05)["accepted"]
     station.wait_for(lambda s: s["program"] == "turns" and s["moving"])
     station.ask("dashboard-stop")

@@ -33,7 +33,7 @@ def _cell_time(cell_time: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(transcript, "sensor_from_url", build)
     monkeypatch.setattr(transcript, "Writer", lambda path, header, *_: Writer(path, header, clock))
-    monkeypatch.setattr(transcript, "Player", lambda told, *_: Player(told, clock))
+    monkeypatch.setattr(transcript, "Player", lambda loaded, *_: Player(loaded, clock))
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def run(*arguments: str) -> Result:
     return CliRunner().invoke(transcript.transcript, arguments)
 
 
-def told(outcome: Result) -> dict[str, Any]:
+def answer_of(outcome: Result) -> dict[str, Any]:
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)
     answer: dict[str, Any] = json.loads(outcome.stdout)
     return answer
@@ -86,7 +86,8 @@ def test_a_file_that_cannot_be_made_is_refused_before_the_sensor_is_opened(
 def recorded(url: str, tmp_path: Path) -> list[str]:
     path = tmp_path / "whole.jsonl"
     assert (
-        told(run("record", "--sensor", url, "-o", str(path), "--duration", "1", "--json"))["recorded"]["samples"] > 50
+        answer_of(run("record", "--sensor", url, "-o", str(path), "--duration", "1", "--json"))["recorded"]["samples"]
+        > 50
     )
     return path.read_text().splitlines(keepends=True)
 
@@ -110,7 +111,7 @@ def test_a_recording_that_was_broken_off_is_played_as_far_as_it_goes(
     cut: Any, recorded: list[str], tmp_path: Path
 ) -> None:
     outcome = play(cut(recorded), tmp_path)
-    played = told(outcome)["played"]
+    played = answer_of(outcome)["played"]
     assert 0.2 < played["duration_s"] < 0.8
     assert played["samples"] > 10
     assert played["mean_force_N"] == pytest.approx(WRENCH[:3], abs=0.02)
@@ -119,7 +120,7 @@ def test_a_recording_that_was_broken_off_is_played_as_far_as_it_goes(
 
 def test_a_whole_recording_is_not_called_broken_off(recorded: list[str], tmp_path: Path) -> None:
     outcome = play(recorded, tmp_path)
-    assert told(outcome)["played"]["duration_s"] == 1
+    assert answer_of(outcome)["played"]["duration_s"] == 1
     assert outcome.stderr == ""
 
 

@@ -307,7 +307,7 @@ def test_wrong_packages_are_noted_and_do_no_harm(worn: StationProcess) -> None:
     assert len(worn.ask("state")["bad_inputs"]) == known + 3
 
 
-def test_garbage_on_any_port_harms_nobody(worn: StationProcess) -> None:
+def test_garbage_on_any_port_does_no_harm(worn: StationProcess) -> None:
     noise, known = Random(1), len(worn.ask("state")["events"])
     for port in (29999, 30002, 30003, 30004):
         for _ in range(5):
@@ -440,7 +440,7 @@ def test_link(station: StationProcess) -> None:
 # -- the station process ----------------------------------------------------------------------------------------------
 
 
-def test_the_first_line_tells_where_and_what(station: StationProcess) -> None:
+def test_the_first_line_reports_addresses_and_truth(station: StationProcess) -> None:
     hello = station.hello
     assert hello["format"] == "mocks.station/1"
     assert hello["arm"]["model"] == "UR5e"

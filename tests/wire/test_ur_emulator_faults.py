@@ -47,7 +47,7 @@ def station() -> Iterator[StationProcess]:
 
 @dataclass
 class Played:
-    """What a client told, and how it ended: its return code, or None when it had to be killed after the limit."""
+    """What a client reported, and how it ended: its return code, or None when it had to be killed after the limit."""
 
     facts: dict[str, Any] = field(default_factory=dict)
     ended: int | None = None
@@ -202,7 +202,7 @@ def test_silent_rtde_stops_streaming_and_answers_only_if_asked_to(station: Stati
         assert ("U" if answers else "v") in kinds(client), "what was asked in the silence is answered"
 
 
-def test_connections_come_and_go_in_the_diary(start: Callable[..., StationProcess]) -> None:
+def test_connections_come_and_go_in_the_event_log(start: Callable[..., StationProcess]) -> None:
     station = start()
     with station.connect(30004) as client:
         station.wait_for(lambda state: [e["what"] for e in state["events"]] == ["connected"])
@@ -385,7 +385,7 @@ def test_a_new_client_ends_an_asynchronous_move_at_once(start: Callable[..., Sta
 
 
 @pytest.mark.slow
-def test_a_new_client_hangs_behind_a_blocking_move_until_somebody_stops_the_program(
+def test_a_new_client_hangs_behind_a_blocking_move_until_the_program_is_stopped(
     start: Callable[..., StationProcess],
 ) -> None:
     station = start()

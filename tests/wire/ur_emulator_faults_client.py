@@ -41,7 +41,7 @@ def ask(**request: Any) -> dict[str, Any]:
     return answer
 
 
-def tell(**facts: Any) -> None:
+def report(**facts: Any) -> None:
     sys.stdout.write("@fact " + json.dumps(facts) + "\n")
     sys.stdout.flush()
 
@@ -76,7 +76,7 @@ class Move(threading.Thread):
         self.returned: bool | None = None
         self.start()
         if wait:
-            tell(moving=wait_for(lambda: abs(receive.getTargetQd()[5]) > 1e-3))
+            report(moving=wait_for(lambda: abs(receive.getTargetQd()[5]) > 1e-3))
 
     def run(self) -> None:
         self.returned = self._control.moveJ(self.goal, self._speed_rad_s, 2.0)
@@ -98,11 +98,11 @@ def killed(host: str) -> None:
     r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
     q, stamp = r.getActualQ(), r.getTimestamp()
     ask(do="kill")
-    tell(receive_lost=wait_for(lambda: not r.isConnected()), control_lost=wait_for(lambda: not c.isConnected()))
-    tell(last_values=r.getActualQ() == q and r.getTimestamp() >= stamp, program_seems_to_run=c.isProgramRunning())
+    report(receive_lost=wait_for(lambda: not r.isConnected()), control_lost=wait_for(lambda: not c.isConnected()))
+    report(last_values=r.getActualQ() == q and r.getTimestamp() >= stamp, program_seems_to_run=c.isProgramRunning())
     ask(do="restart")
-    tell(receive_back=r.reconnect(), control_back=c.reconnect())
-    tell(moves=c.moveJ([*q[:5], q[5] + 0.1], 1.0, 2.0))
+    report(receive_back=r.reconnect(), control_back=c.reconnect())
+    report(moves=c.moveJ([*q[:5], q[5] + 0.1], 1.0, 2.0))
 
 
 def killed_moving(host: str) -> None:
@@ -110,10 +110,10 @@ def killed_moving(host: str) -> None:
     r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
     move = Move(r, c)
     ask(do="kill")
-    tell(receive_lost=wait_for(lambda: not r.isConnected()))
-    tell(hangs_after_the_kill=move.hangs())
+    report(receive_lost=wait_for(lambda: not r.isConnected()))
+    report(hangs_after_the_kill=move.hangs())
     ask(do="restart")
-    tell(hangs_after_the_restart=move.hangs())
+    report(hangs_after_the_restart=move.hangs())
 
 
 def command_after_loss(host: str) -> None:
@@ -125,7 +125,7 @@ def command_after_loss(host: str) -> None:
     call = threading.Thread(target=lambda: c.moveJ(goal), daemon=True)
     call.start()
     call.join(HANGS_S)
-    tell(connected=c.isConnected(), hangs=call.is_alive())
+    report(connected=c.isConnected(), hangs=call.is_alive())
 
 
 # -- trouble on the link ----------------------------------------------------------------------------------------------
@@ -137,9 +137,9 @@ def dropped_moving(host: str) -> None:
     move = Move(r, c, 0.4, 0.2)
     ask(do="listen", what="rtde", on=False)
     ask(do="drop", what="rtde", reset=True)
-    tell(lost=wait_for(lambda: not r.isConnected()))
-    tell(robot_finishes=wait_for(lambda: abs(ask(do="state")["q_rad"][5] - move.goal[5]) < 1e-3))
-    tell(hangs=move.hangs())
+    report(lost=wait_for(lambda: not r.isConnected()))
+    report(robot_finishes=wait_for(lambda: abs(ask(do="state")["q_rad"][5] - move.goal[5]) < 1e-3))
+    report(hangs=move.hangs())
 
 
 def dropped_without_dashboard(host: str) -> None:
@@ -148,21 +148,21 @@ def dropped_without_dashboard(host: str) -> None:
     ask(do="listen", what="dashboard", on=False)
     ask(do="drop", what="dashboard")
     ask(do="drop", what="rtde")
-    tell(lost=wait_for(lambda: not r.isConnected() and not c.isConnected()))
+    report(lost=wait_for(lambda: not r.isConnected() and not c.isConnected()))
     ask(do="listen", what="dashboard", on=True)
-    tell(back=r.reconnect() and c.reconnect(), moves=c.moveJ(r.getTargetQ()))
+    report(back=r.reconnect() and c.reconnect(), moves=c.moveJ(r.getTargetQ()))
 
 
 def briefly_silent(host: str) -> None:
-    """No samples for 1.5 s: nobody minds, a blocking move ends well."""
+    """No samples for 1.5 s: no client notices, a blocking move ends well."""
     r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
     move = Move(r, c, 0.4, 0.2)
     ask(do="silent", what="rtde", on=True)
     stamp = r.getTimestamp()
     time.sleep(1.5)
-    tell(same_stamp=r.getTimestamp() - stamp < 0.05, connected=[r.isConnected(), c.isConnected()])
+    report(same_stamp=r.getTimestamp() - stamp < 0.05, connected=[r.isConnected(), c.isConnected()])
     ask(do="silent", what="rtde", on=False)
-    tell(ended=move.ends(), returned=move.returned)
+    report(ended=move.ends(), returned=move.returned)
 
 
 def silent(host: str) -> None:
@@ -171,9 +171,9 @@ def silent(host: str) -> None:
     move = Move(r, c)
     begun = time.monotonic()
     ask(do="silent", what="rtde", on=True, answers=True)
-    tell(ended=move.ends(), returned=move.returned, after_s=time.monotonic() - begun)
-    tell(receive_lost=wait_for(lambda: not r.isConnected()))
-    tell(control_says_connected=c.isConnected(), program_runs=c.isProgramRunning())
+    report(ended=move.ends(), returned=move.returned, after_s=time.monotonic() - begun)
+    report(receive_lost=wait_for(lambda: not r.isConnected()))
+    report(control_says_connected=c.isConnected(), program_runs=c.isProgramRunning())
 
 
 def frozen(host: str) -> None:
@@ -182,10 +182,10 @@ def frozen(host: str) -> None:
     move = Move(r, c)
     begun = time.monotonic()
     ask(do="freeze", on=True)
-    tell(receive_lost=wait_for(lambda: not r.isConnected()), after_s=time.monotonic() - begun)
+    report(receive_lost=wait_for(lambda: not r.isConnected()), after_s=time.monotonic() - begun)
     time.sleep(2.8)  # the banner of its one attempt to reconnect must not come within 2.5 s
     ask(do="freeze", on=False)
-    tell(hangs=move.hangs(), receive_back=r.reconnect())
+    report(hangs=move.hangs(), receive_back=r.reconnect())
 
 
 # -- the program goes away --------------------------------------------------------------------------------------------
@@ -203,7 +203,7 @@ def broken_program(host: str) -> None:
         wait_for(lambda: r.getRuntimeState() != 2)
         facts["state"] = [r.getRuntimeState(), r.getSafetyMode(), r.getRobotMode(), r.getSafetyStatusBits()]
         facts["next"] = [c.moveJ(move.goal), c.isJointsWithinSafetyLimits(move.goal), failure(c.getTCPOffset)]
-        tell(**{verb: facts})
+        report(**{verb: facts})
         if verb == "emergency-stop":
             ask(do="emergency-stop", on=False)
             d.powerOn()
@@ -215,12 +215,12 @@ def broken_program(host: str) -> None:
         if verb == "safeguard":
             wait_for(lambda: not any(r.getTargetQd()))
             ask(do="safeguard", on=False)
-            tell(goes_on_by_itself=wait_for(lambda: any(r.getTargetQd())))
+            report(goes_on_by_itself=wait_for(lambda: any(r.getTargetQd())))
         wait_for(lambda: r.getRobotMode() == 7 and r.getSafetyMode() == 1)
         d.stop()
         c.reuploadScript()
         if not wait_for(c.isProgramRunning):
-            tell(stuck_after=verb)
+            report(stuck_after=verb)
             return
 
 
@@ -229,10 +229,10 @@ def foreign_program(host: str) -> None:
     r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
     move = Move(r, c)
     ask(do="foreign-program", seconds=1000)
-    tell(ended=move.ends(), returned=move.returned)
-    tell(seems_to_run=wait_for(c.isProgramRunning), stands=wait_for(lambda: not any(r.getTargetQd())))
+    report(ended=move.ends(), returned=move.returned)
+    report(seems_to_run=wait_for(c.isProgramRunning), stands=wait_for(lambda: not any(r.getTargetQd())))
     call = Move(r, c, wait=False)
-    tell(hangs=call.hangs(), moves=any(r.getTargetQd()))
+    report(hangs=call.hangs(), moves=any(r.getTargetQd()))
 
 
 def stop_of_a_blocking_move(host: str) -> None:
@@ -240,7 +240,7 @@ def stop_of_a_blocking_move(host: str) -> None:
     r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
     move = Move(r, c, 0.15, 0.2)
     c.stopJ(2.0)
-    tell(arrived=wait_for(lambda: abs(r.getActualQ()[5] - move.goal[5]) < 1e-3), ended=move.ends())
+    report(arrived=wait_for(lambda: abs(r.getActualQ()[5] - move.goal[5]) < 1e-3), ended=move.ends())
 
 
 def protective_stop_of_an_async_move(host: str) -> None:
@@ -252,11 +252,11 @@ def protective_stop_of_an_async_move(host: str) -> None:
     wait_for(lambda: abs(r.getTargetQd()[5]) > 1e-3)
     ask(do="protective-stop")
     wait_for(lambda: r.getRuntimeState() == 4 and not any(r.getTargetQd()))
-    tell(still_running=c.getAsyncOperationProgressEx().isAsyncOperationRunning())
+    report(still_running=c.getAsyncOperationProgressEx().isAsyncOperationRunning())
     wait_for(lambda: ask(do="unlock")["accepted"])
     time.sleep(0.1)
-    tell(stands_after_unlock=r.getRuntimeState() == 4 and not any(r.getTargetQd()))
-    tell(play=ask(do="play")["accepted"], goes_on=wait_for(lambda: abs(r.getTargetQd()[5]) > 1e-3))
+    report(stands_after_unlock=r.getRuntimeState() == 4 and not any(r.getTargetQd()))
+    report(play=ask(do="play")["accepted"], goes_on=wait_for(lambda: abs(r.getTargetQd()[5]) > 1e-3))
     c.stopJ(2.0)
     c.stopScript()
 
@@ -266,24 +266,24 @@ def protective_stop_of_an_async_move(host: str) -> None:
 
 def constructor(host: str) -> None:
     """Just make one."""
-    tell(begun=True)
-    tell(error=failure(lambda: RTDEControlInterface(host)))
+    report(begun=True)
+    report(error=failure(lambda: RTDEControlInterface(host)))
 
 
 def registers(host: str) -> None:
     """The fieldbus has the lower registers, then the upper ones too."""
     ask(do="claim-registers", range="lower", on=True)
-    tell(lower=failure(lambda: RTDEControlInterface(host)))
-    tell(io=failure(lambda: import_module("rtde_io").RTDEIOInterface(host)))
+    report(lower=failure(lambda: RTDEControlInterface(host)))
+    report(io=failure(lambda: import_module("rtde_io").RTDEIOInterface(host)))
     upper = RTDEControlInterface.FLAG_UPPER_RANGE_REGISTERS | RTDEControlInterface.FLAG_UPLOAD_SCRIPT
     c = RTDEControlInterface(host, 500.0, upper)
-    tell(upper_works=c.isProgramRunning() and c.getTCPOffset() == [0.0] * 6)
+    report(upper_works=c.isProgramRunning() and c.getTCPOffset() == [0.0] * 6)
     c.stopScript()
     c.disconnect()
     ask(do="claim-registers", range="upper", on=True)
-    tell(upper=failure(lambda: RTDEControlInterface(host, 500.0, upper)))
+    report(upper=failure(lambda: RTDEControlInterface(host, 500.0, upper)))
     ask(do="claim-registers", range="lower", on=False)
-    tell(free=failure(lambda: RTDEControlInterface(host)))
+    report(free=failure(lambda: RTDEControlInterface(host)))
 
 
 def die_in_async_move(host: str) -> None:
@@ -293,14 +293,14 @@ def die_in_async_move(host: str) -> None:
     goal[5] += 1.0
     c.moveJ(goal, 0.05, 2.0, True)
     wait_for(lambda: abs(r.getTargetQd()[5]) > 1e-3)
-    tell(goal=goal)
+    report(goal=goal)
     os.kill(os.getpid(), signal.SIGKILL)
 
 
 def die_in_blocking_move(host: str) -> None:
     """The same with a blocking one."""
     r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
-    tell(goal=Move(r, c, 0.5, 0.05).goal)
+    report(goal=Move(r, c, 0.5, 0.05).goal)
     os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -312,7 +312,7 @@ def die_under_watchdog(host: str) -> None:
     goal[5] += 1.0
     c.moveJ(goal, 0.02, 2.0, True)
     wait_for(lambda: abs(r.getTargetQd()[5]) > 1e-3)
-    tell(died=True)
+    report(died=True)
     os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -324,22 +324,22 @@ def generation(host: str) -> None:
     d = DashboardClient(host)
     d.connect()
     r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
-    tell(version=d.polyscopeVersion(), model=d.getRobotModel(), serial=failure(d.getSerialNumber))
-    tell(registers=_running(c))
+    report(version=d.polyscopeVersion(), model=d.getRobotModel(), serial=failure(d.getSerialNumber))
+    report(registers=_running(c))
     q = r.getActualQ()
-    tell(limits=[c.isJointsWithinSafetyLimits(q), c.isJointsWithinSafetyLimits([7.0, *q[1:]])], tcp=c.getTCPOffset())
+    report(limits=[c.isJointsWithinSafetyLimits(q), c.isJointsWithinSafetyLimits([7.0, *q[1:]])], tcp=c.getTCPOffset())
     before = c.getAsyncOperationProgressEx().operationId()
-    tell(started=c.moveJ([*q[:5], q[5] + 1.0], 0.02, 2.0, True))
-    tell(operation=wait_for(lambda: c.getAsyncOperationProgressEx().operationId() == before + 1))
-    tell(moving=wait_for(lambda: abs(r.getTargetQd()[5]) > 0.01))
+    report(started=c.moveJ([*q[:5], q[5] + 1.0], 0.02, 2.0, True))
+    report(operation=wait_for(lambda: c.getAsyncOperationProgressEx().operationId() == before + 1))
+    report(moving=wait_for(lambda: abs(r.getTargetQd()[5]) > 0.01))
     c.stopJ(4.0)
-    tell(stopped=wait_for(lambda: not any(r.getTargetQd())))
-    tell(ended=wait_for(lambda: not _running(c)), short=r.getTargetQ()[5] < q[5] + 0.9)
-    tell(watchdog=c.setWatchdog(5.0))
-    tell(bites=wait_for(lambda: not c.isProgramRunning()))
-    tell(uploaded=c.reuploadScript() and wait_for(c.isProgramRunning))
+    report(stopped=wait_for(lambda: not any(r.getTargetQd())))
+    report(ended=wait_for(lambda: not _running(c)), short=r.getTargetQ()[5] < q[5] + 0.9)
+    report(watchdog=c.setWatchdog(5.0))
+    report(bites=wait_for(lambda: not c.isProgramRunning()))
+    report(uploaded=c.reuploadScript() and wait_for(c.isProgramRunning))
     c.stopScript()
-    tell(script_stopped=not c.isProgramRunning())
+    report(script_stopped=not c.isProgramRunning())
 
 
 def _running(control: Any) -> bool:
@@ -350,12 +350,12 @@ def variables(host: str) -> None:
     """A variable that only the controller knows shifts the following ones; one it does not know is named."""
     r = RTDEReceiveInterface(host, 125.0, ["timestamp", "tcp_offset", "actual_q"])
     whole = RTDEReceiveInterface(host)
-    tell(shifted=r.getActualQ() != whole.getActualQ())
+    report(shifted=r.getActualQ() != whole.getActualQ())
 
 
 def variables_refused(host: str) -> None:
     """An unknown variable is named in the error."""
-    tell(error=failure(lambda: RTDEReceiveInterface(host, 125.0, ["timestamp", "tcp_offset"])))
+    report(error=failure(lambda: RTDEReceiveInterface(host, 125.0, ["timestamp", "tcp_offset"])))
 
 
 def local_control(host: str) -> None:
@@ -363,12 +363,12 @@ def local_control(host: str) -> None:
     d = DashboardClient(host)
     d.connect()
     ask(do="remote-control", on=False)
-    tell(remote=d.isInRemoteControl(), stop=failure(d.stop), constructor=failure(lambda: RTDEControlInterface(host)))
+    report(remote=d.isInRemoteControl(), stop=failure(d.stop), constructor=failure(lambda: RTDEControlInterface(host)))
     ask(do="remote-control", on=True)
-    tell(remote_again=d.isInRemoteControl(), still=failure(d.stop))
+    report(remote_again=d.isInRemoteControl(), still=failure(d.stop))
     d.disconnect()
     d.connect()
-    tell(reconnected=failure(d.stop))
+    report(reconnected=failure(d.stop))
 
 
 def slider(host: str) -> None:
@@ -378,11 +378,11 @@ def slider(host: str) -> None:
     goal = r.getTargetQ()
     goal[5] += 1.0
     c.moveJ(goal, 0.04, 4.0, True)
-    tell(quarter=wait_for(lambda: abs(r.getTargetQd()[5] - 0.01) < 1e-6), fraction=r.getTargetSpeedFraction())
+    report(quarter=wait_for(lambda: abs(r.getTargetQd()[5] - 0.01) < 1e-6), fraction=r.getTargetSpeedFraction())
     ask(do="speed-scaling", fraction=0.5)
-    tell(eighth=wait_for(lambda: abs(r.getTargetQd()[5] - 0.005) < 1e-6), scaling=r.getSpeedScaling())
+    report(eighth=wait_for(lambda: abs(r.getTargetQd()[5] - 0.005) < 1e-6), scaling=r.getSpeedScaling())
     ask(do="slider", fraction=0.0)
-    tell(stands=wait_for(lambda: not any(r.getTargetQd())), running=_running(c))
+    report(stands=wait_for(lambda: not any(r.getTargetQd())), running=_running(c))
     c.stopScript()
 
 

@@ -1,8 +1,8 @@
-"""Proof that straight joint moves are clear, over all of their length and not at samples of it.
+"""Proof that straight joint moves are clear along their whole length, not only at samples.
 
-While every joint turns at constant proportion, the distance of two bodies changes by no more than the sum over the
-joints between them of |turn| times the farthest lever. An interval whose middle is farther from contact than half its
-length times that is clear; others are halved. Only the pairs still in question are looked at again.
+In a straight joint move, the distance of two bodies changes by at most the sum of |turn| times the longest lever over
+the joints between them. An interval is clear if its midpoint is farther from contact than half of that change. Other
+intervals are halved. Only pairs that are still undecided are examined again.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from ftdrive.planning.geometry.shapes import Bodies, height_above, separation, s
 FIRST_STEP_RAD = np.radians(15)
 LAST_STEP_RAD = np.radians(0.4)
 TIGHTNESS = 0.1
-"""The stated clearance is at most this share, or 2 mm, below that of the move's closest point."""
+"""The reported clearance is at most this fraction, or 2 mm, below the true minimum of the move."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,14 +32,14 @@ class Margins:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Certificate:
-    """What is proven of m moves."""
+    """The result of the proof for m moves."""
 
     clear: NDArray[np.bool_]
     """(m,) The whole move keeps the margins."""
     self_clearance_m: Array
-    """(m,) Lower bound of the distance between parts of arm and tool; an upper one of a move not clear."""
+    """(m,) Lower bound of the distance between parts of arm and tool; an upper bound if the move is not clear."""
     scene_clearance_m: Array
-    """(m,) The same to planes and boxes; infinite without any."""
+    """(m,) The same to planes and boxes; infinite if there are none."""
     limited_by: tuple[str, ...]
     """(m,) The pair that comes closest to its margin."""
 
@@ -50,7 +50,7 @@ class Certificate:
 
 
 class Certifier:
-    """Judges moves of one arm with its tool in one scene."""
+    """Proves moves of one arm with its tool in one scene."""
 
     def __init__(self, arm: ArmModel, scene: Scene, margins: Margins | None = None) -> None:
         self.arm, self.scene, self.margins = arm, scene, margins or Margins()
@@ -81,7 +81,7 @@ class Certifier:
         return distance[:, :n].min(axis=1), distance[:, n:].min(axis=1, initial=np.inf)
 
     def free(self, q_rad: ArrayLike) -> NDArray[np.bool_]:
-        """Say (n,) whether the margins are kept at joint vectors (n, 6)."""
+        """Return (n,) whether the margins are kept at joint vectors (n, 6)."""
         q = np.asarray(q_rad, dtype=np.float64).reshape(-1, 6)
         row, pair = (index.ravel() for index in np.indices((len(q), len(self._margin_m))))
         needed = self._margin_m[pair]
@@ -89,17 +89,17 @@ class Certifier:
         return ~np.isin(np.arange(len(q)), touching)
 
     def clear_around(self, q_rad: Array) -> bool:
-        """Say whether all moves of a closed tour through joint vectors (n, 6) are proven clear."""
+        """Return whether all moves of a closed tour through joint vectors (n, 6) are proven clear."""
         return bool(self.certify(q_rad, np.roll(q_rad, -1, axis=0), tight=False).clear.all())
 
     def certify(self, start_rad: ArrayLike, end_rad: ArrayLike, *, tight: bool = True) -> Certificate:
-        """Judge straight joint moves.
+        """Certify straight joint moves.
 
         Parameters
         ----------
         start_rad, end_rad : array_like, shape (m, 6)
         tight : bool
-            Bring the stated clearances close to the truth; else stop as soon as the margins are proven.
+            If true, refine the reported clearances; else stop as soon as the margins are proven.
         """
         start = np.asarray(start_rad, dtype=np.float64).reshape(-1, 6)
         turn = np.asarray(end_rad, dtype=np.float64).reshape(-1, 6) - start

@@ -1,4 +1,4 @@
-"""What stands around the arm, and how its base is mounted."""
+"""The surroundings of the arm, and the mounting of its base."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -37,7 +37,7 @@ class Box:
 
 
 BASE_PLANE = Plane((0.0, 0.0, 1.0), 0.0)
-"""What the base is bolted to."""
+"""The surface that the base is bolted to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Scene:
 
 
 def down_of(mounting: str) -> Array:
-    """Direction of gravity in base (3,), as mounted."""
+    """Return the direction of gravity in base (3,) for a mounting."""
     return Scene(lean_rad=lean_of(mounting)).down_base
 
 
@@ -72,5 +72,5 @@ def lean_of(mounting: str) -> float:
         return float(np.radians(float(mounting)))
     except ValueError:
         raise ConfigError(
-            f"mounting is '{mounting}': give {', '.join(MOUNTINGS)} or degrees the base leans to -x"
+            f"mounting is '{mounting}': give {', '.join(MOUNTINGS)} or the lean of the base towards -x in degrees"
         ) from None

@@ -100,7 +100,7 @@ def separation_from_box(bodies: Bodies, low_m: Array, high_m: Array) -> Array:
         reach = _dot(u, centre - bodies.centre_m) - np.abs(u) @ half - extent(bodies, u)
         best = np.maximum(best, np.where(length > TINY_M, reach, -np.inf))
         point = _nearest(bodies, on_box)
-    return np.asarray(np.maximum(best, -1.0))  # inside each other: no depth is told
+    return np.asarray(np.maximum(best, -1.0))  # the bodies intersect; the depth is not computed
 
 
 def _by_projections(a: Bodies, b: Bodies, on_b: Array) -> Array:

@@ -1,4 +1,4 @@
-"""A tour through poses chosen for what they tell, from those the wrist reaches: in a cone, or anywhere.
+"""A tour of the most informative poses that the wrist reaches, within a cone or anywhere.
 
 The poses follow the design of `calib.poses.selection`, which keeps the second solution away and the gravity directions
 out of one plane.
@@ -22,15 +22,15 @@ from ftdrive.planning.search.tours import clear_tour, connected
 
 DIRECTIONS, SPINS = 150, 8
 DIRECTIONS_OF_A_LUMP, SPINS_OF_A_LUMP = 60, 4
-"""Where joint 6 changes what can collide: every spin is a shape of its own then."""
+"""If joint 6 changes what can collide: each spin is a shape of its own then."""
 MOST_PARTS = 2
-"""Parts of free space, which do not hang together, that are tried."""
+"""Number of disconnected parts of free space that are tried."""
 NEARLY = 1.05
-"""A prediction this much above that of the best poses of the cone is not worth another posture."""
+"""No other posture is tried if the predicted error is within this factor of the best poses of the cone."""
 OTHER_POSTURES = 2
 POSTURE_STEP_DEG = 20
 LOOKS = 24
-"""Directions of the tool by which postures are compared."""
+"""Number of tool directions that compare postures."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,9 +44,9 @@ class Chosen:
     force_rms_N: float
     """Predicted error of compensation."""
     ideal_force_rms_N: float
-    """The same of the poses that would be chosen if the arm reached every one."""
+    """Predicted error of the best poses without limits of reach."""
     elsewhere: bool
-    """Joints 1 to 3 are not where the arm stands."""
+    """Joints 1 to 3 differ from the present posture."""
 
 
 def chosen_tour(
@@ -63,7 +63,7 @@ def chosen_tour(
     ----------
     certifier : Certifier
     q_rad : array_like, shape (6,)
-        Where the arm stands; another posture is taken where it brings much.
+        Present joint angles; another posture of joints 1 to 3 is used if it lowers the predicted error.
     poses : int
         4 or more.
     half_angle_rad : float
@@ -74,18 +74,18 @@ def chosen_tour(
     Returns
     -------
     Chosen or None
-        None where so many poses, different enough to estimate everything, are nowhere in reach.
+        None if too few poses are reachable, or if they are not informative enough to estimate everything.
     """
-    stands = np.asarray(q_rad, dtype=np.float64)
+    q_now = np.asarray(q_rad, dtype=np.float64)
     lumps = certifier.arm.travel_m[:, 5].any()
     spins, directions = (SPINS_OF_A_LUMP, DIRECTIONS_OF_A_LUMP) if lumps else (SPINS, DIRECTIONS)
     candidates = cone_candidates(half_angle_rad, spins, directions)
     candidates = _from_down(certifier.scene.down_base) @ candidates
     ideal = predicted_sigma(candidates[choose(candidates, poses, guess)], guess).force_rms_N
-    best = _at(certifier, stands, candidates, spins, poses, speeds, guess, ideal)
+    best = _at(certifier, q_now, candidates, spins, poses, speeds, guess, ideal)
     if best is None or best.force_rms_N > NEARLY * ideal:
-        for posture in _others(certifier, stands, candidates):
-            found = _at(certifier, np.array([*posture, *stands[3:]]), candidates, spins, poses, speeds, guess, ideal)
+        for posture in _others(certifier, q_now, candidates):
+            found = _at(certifier, np.array([*posture, *q_now[3:]]), candidates, spins, poses, speeds, guess, ideal)
             if found is not None and (best is None or found.force_rms_N * NEARLY < best.force_rms_N):
                 best = Chosen(found.numbers, found.q_rad, found.force_rms_N, ideal, elsewhere=True)
     return best
@@ -93,7 +93,7 @@ def chosen_tour(
 
 def _at(
     certifier: Certifier,
-    stands: Array,
+    q_now: Array,
     candidates: Array,
     spins: int,
     poses: int,
@@ -101,8 +101,8 @@ def _at(
     guess: Guess,
     ideal: float,
 ) -> Chosen | None:
-    """Choose from what is reached in this posture and hangs together."""
-    q, group = wrist_nodes(certifier, stands, candidates)
+    """Choose from the poses that are reachable at this posture and connected by clear moves."""
+    q, group = wrist_nodes(certifier, q_now, candidates)
     if not len(q):
         return None
     part = connected(certifier, q, group % spins)
@@ -119,14 +119,14 @@ def _at(
             continue
         nodes = nodes[order]
         rms = predicted_sigma(candidates[group[nodes]], guess).force_rms_N
-        if np.isfinite(rms):  # else there is something that these poses cannot tell
+        if np.isfinite(rms):  # else these poses leave a parameter unobservable
             return Chosen(tuple((101 + place[group[nodes]]).tolist()), q[nodes], rms, ideal, elsewhere=False)
     return None
 
 
-def _others(certifier: Certifier, stands: Array, candidates: Array) -> Array:
-    """Postures (k, 3) of joints 1 to 3 that bring the tool into most directions."""
-    postures = grid(certifier, stands, POSTURE_STEP_DEG)
+def _others(certifier: Certifier, q_now: Array, candidates: Array) -> Array:
+    """Postures (k, 3) of joints 1 to 3 that reach the most tool directions."""
+    postures = grid(certifier, q_now, POSTURE_STEP_DEG)
     looks = candidates[np.linspace(0, len(candidates) - 1, LOOKS).astype(int)]
     q = np.array([wrist_inverse(posture, looks) for posture in postures])  # (m, LOOKS, 2, 6)
     free = certifier.free(q.reshape(-1, 6)).reshape(q.shape[:3]).any(axis=2)

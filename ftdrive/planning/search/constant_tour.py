@@ -46,7 +46,7 @@ DIFFERENT_SHAPES = tuple(np.unique([row[1:3] for row in _TOUR_DEG], axis=0, retu
 
 
 def constant_tour(q_rad: ArrayLike) -> Array:
-    """Joint vectors (24, 6) of the tour around the posture in which the arm stands.
+    """Joint vectors (24, 6) of the tour at the present posture of joints 1 to 3.
 
     Joints 1 to 3 keep their angles. The flange orientation at a pose is `Rz(q1 - 45 deg) @ R_i.T` with the paper's
     matrix R_i, so at other base pans than 45 degrees the whole set is turned about the base's z axis.
@@ -54,7 +54,7 @@ def constant_tour(q_rad: ArrayLike) -> Array:
     Parameters
     ----------
     q_rad : array_like, shape (6,)
-        Where the arm stands. Joint 4 stays as close to it as whole turns allow.
+        Present joint angles. Joint 4 stays as close to it as whole turns allow.
 
     Returns
     -------

@@ -19,7 +19,7 @@ def box_tour(
     ----------
     certifier : Certifier
     q_rad : array_like, shape (6,)
-        Where the arm stands.
+        Present joint angles.
     R_base_flange : array, shape (m, 3, 3)
         Orientations to visit.
     centre_m : array, shape (3,)
@@ -33,12 +33,12 @@ def box_tour(
         Indices of the orientations in the order of travel.
     q : array, shape (m, 6)
     """
-    stands = np.asarray(q_rad, dtype=np.float64)
-    q, group = box_nodes(certifier, stands, R_base_flange, centre_m, half_size_m)
+    q_now = np.asarray(q_rad, dtype=np.float64)
+    q, group = box_nodes(certifier, q_now, R_base_flange, centre_m, half_size_m)
     if len(np.unique(group)) < len(R_base_flange):
         return None
     # Preferred: what moves base, shoulder and elbow least.
-    away = np.abs(q - stands)
+    away = np.abs(q - q_now)
     calm = np.argsort(away[:, :3].max(axis=1) + 0.01 * away.sum(axis=1), kind="stable")
     order = clear_tour(certifier, q[calm], group[calm], speeds)
     return None if order is None else (group[calm][order], q[calm][order])

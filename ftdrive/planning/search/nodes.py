@@ -28,7 +28,7 @@ def wrist_nodes(certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array) ->
     Parameters
     ----------
     q_rad : array_like, shape (6,)
-        Where the arm stands; the wrist stays in its windows about it.
+        Present joint angles; the wrist stays in its windows around them.
     R_base_flange : array, shape (m, 3, 3)
 
     Returns
@@ -37,10 +37,10 @@ def wrist_nodes(certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array) ->
     group : int array, shape (n,)
         Index of the orientation.
     """
-    stands = np.asarray(q_rad, dtype=np.float64)
-    solutions = wrist_inverse(stands[:3], R_base_flange)  # (m, 2, 6)
+    q_now = np.asarray(q_rad, dtype=np.float64)
+    solutions = wrist_inverse(q_now[:3], R_base_flange)  # (m, 2, 6)
     group = np.repeat(np.arange(len(solutions)), 2)
-    return _free(certifier, *_within_windows(solutions.reshape(-1, 6), group, stands, first=3))
+    return _free(certifier, *_within_windows(solutions.reshape(-1, 6), group, q_now, first=3))
 
 
 def box_nodes(
@@ -51,7 +51,7 @@ def box_nodes(
     Parameters
     ----------
     q_rad : array_like, shape (6,)
-        Where the arm stands; the joints stay in their windows about it.
+        Present joint angles; the joints stay in their windows around them.
     R_base_flange : array, shape (m, 3, 3)
     centre_m : array, shape (3,)
         Of the box, for the centre of the flange, in base.
@@ -70,8 +70,8 @@ def box_nodes(
     group = np.repeat(group, q.shape[1])
     q = q.reshape(-1, 6)
     reached = ~np.isnan(q[:, 0]) & (np.abs(q[:, 2]) <= ELBOW_RAD)
-    stands = np.asarray(q_rad, dtype=np.float64)
-    return _free(certifier, *_within_windows(q[reached], group[reached], stands, first=0))
+    q_now = np.asarray(q_rad, dtype=np.float64)
+    return _free(certifier, *_within_windows(q[reached], group[reached], q_now, first=0))
 
 
 def distinct(certifier: Certifier, q_rad: Array) -> tuple[Array, Nodes]:
@@ -82,10 +82,10 @@ def distinct(certifier: Certifier, q_rad: Array) -> tuple[Array, Nodes]:
     return np.where(moves, q_rad, 0.0)[first], back.ravel()
 
 
-def _within_windows(q_rad: Array, group: Nodes, stands: Array, first: int) -> tuple[Array, Nodes]:
+def _within_windows(q_rad: Array, group: Nodes, q_now: Array, first: int) -> tuple[Array, Nodes]:
     """Add whole turns to the joints from index `first` on, as far as windows and limits let them."""
     # Far from zero a joint has no room on one side: the window about zero serves there.
-    middle = np.where(np.abs(stands) > np.pi, 0.0, stands)
+    middle = np.where(np.abs(q_now) > np.pi, 0.0, q_now)
     for joint in range(first, 6):
         turned = q_rad[:, None] + 2 * np.pi * np.array([-1, 0, 1])[:, None] * np.eye(6)[joint]
         angle = turned[:, :, joint]

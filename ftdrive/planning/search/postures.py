@@ -1,4 +1,4 @@
-"""Other postures of joints 1 to 3, the nearest to where the arm stands first."""
+"""Other postures of joints 1 to 3, nearest to the present one first."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -15,11 +15,11 @@ _SHOULDER_DEG, _ELBOW_DEG = (-180, 0), (-160, 160)
 _BATCH = 40
 _LEVEL = 1e-9
 MOST_POSTURES = 200
-"""Postures with room for the poses of the constant tour that are offered, so that a hopeless cell is told in time."""
+"""At most so many postures are tried, so that a cell without a tour is reported in time."""
 
 
 def grid(certifier: Certifier, q_rad: Array, step_deg: int = _GRID_DEG) -> Array:
-    """Postures (m, 3) of joints 1 to 3 that are worth a look, the nearest first."""
+    """Candidate postures (m, 3) of joints 1 to 3, the nearest first."""
     level = not certifier.scene.boxes and all(np.hypot(*plane.normal[:2]) < _LEVEL for plane in certifier.scene.planes)
     pans = q_rad[0] + np.radians(_PANS_DEG[:1] if level else _PANS_DEG)  # nothing distinguishes one pan from another
     shoulder, elbow = (np.radians(np.arange(low, high + 1, step_deg)) for low, high in (_SHOULDER_DEG, _ELBOW_DEG))
@@ -30,7 +30,7 @@ def grid(certifier: Certifier, q_rad: Array, step_deg: int = _GRID_DEG) -> Array
 
 
 def with_room(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
-    """Constant tours (24, 6) elsewhere whose poses are free; their moves may not be clear."""
+    """Constant tours (24, 6) at other postures whose poses are free; their moves may not be clear."""
     postures = grid(certifier, q_rad)
     offered = 0
     for batch in np.array_split(postures, max(1, len(postures) // _BATCH)):

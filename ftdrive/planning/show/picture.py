@@ -29,7 +29,7 @@ _TURN = np.linspace(0, 2 * np.pi, 100)
 
 
 def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) -> None:
-    """Write a PNG with the arm at every pose, its tool and what stands around, seen from the front, side and above.
+    """Write a PNG with the arm at every pose, its tool and its surroundings, seen from the front, side and above.
 
     Needs the extra `viz`.
 
@@ -41,7 +41,7 @@ def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) 
     path : Path
         A new file.
     way_rad : array_like, shape (k + 1, 6), optional
-        From where the arm stands to the first pose; drawn in green.
+        From the present posture to the first pose; drawn in green.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:
         lines[0] += ", the WHOLE ARM moves"
     lines.append("grey: arm, orange: tool, at every pose; black: base; red: planes and boxes")
     if on_its_way:
-        lines.append("green: where the arm stands, and its way to the first pose")
+        lines.append("green: the present posture, and the approach to the first pose")
     if slanting := sum(not _drawn(plane) for plane in certifier.scene.planes):
         lines.append(f"not drawn: slanting planes ({slanting})")
     return "\n".join(lines)

@@ -19,7 +19,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.show.words import room_in_words
 
 HOST = "127.0.0.1"
-"""Nobody else on the network is shown the cell."""
+"""Only this computer can open the view."""
 _FRAME_RAD = np.radians(3)
 _ARM, _TOOL, _TIP, _BALL, _OBSTACLE = (150, 155, 165), (235, 130, 40), (200, 40, 40), (90, 140, 230), (90, 160, 110)
 _AROUND, _ARC = 24, 6
@@ -28,7 +28,7 @@ _AROUND, _ARC = 24, 6
 
 @contextmanager
 def shown(plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Array = ()) -> Iterator[str]:
-    """Serve the scene to browsers on this computer while the block runs; gives its address. Needs the extra `viz`.
+    """Serve the scene to browsers on this computer while the block runs; yields its address. Needs the extra `viz`.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def shown(plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Array = (
     certifier : Certifier
         For the same arm, tool and scene.
     way_rad : array, shape (k + 1, 6), optional
-        From where the arm stands to the first pose; shown ahead of the tour.
+        From the present posture to the first pose; shown before the tour.
     """
     try:
         from viser import ViserServer
@@ -46,7 +46,7 @@ def shown(plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Array = (
         server = ViserServer(host=HOST, label=f"ftdrive plan, {certifier.arm.name}", verbose=False)
     try:
         _fill(server, plan, certifier, way_rad)
-        yield f"http://{HOST}:{server.get_port()}"  # another port than usual when that is taken
+        yield f"http://{HOST}:{server.get_port()}"  # another port if the default one is in use
     finally:
         with redirect_stdout(StringIO()):
             server.stop()
@@ -92,7 +92,7 @@ def _fill(server: Any, plan: Plan, certifier: Certifier, way_rad: Sequence[Array
 def path(plan: Plan, way_rad: Sequence[Array] | Array = ()) -> tuple[Array, Any]:
     """Joint vectors (m, 6) along all moves, and the move (m,) that each belongs to.
 
-    The way to the first pose is move -1; then comes the whole tour, back to the first pose.
+    The approach is move -1; the closed tour follows.
     """
     q = np.array([step.q_rad for step in plan.steps])
     legs = [(-1, start, end) for start, end in pairwise(way_rad)]
@@ -106,9 +106,9 @@ def path(plan: Plan, way_rad: Sequence[Array] | Array = ()) -> tuple[Array, Any]
 
 
 def describe(plan: Plan, move: int) -> str:
-    """Say in words what a move is."""
+    """Return a move as text."""
     if move < 0:
-        return "From where the arm stands to the first pose.\n\nIt is asked for by itself."
+        return "From the present posture to the first pose.\n\nIt is confirmed separately."
     step, following = plan.steps[move], plan.steps[(move + 1) % len(plan.steps)]
     turn_deg, speed_deg_s = np.degrees([step.turn_rad, step.speed_rad_s])
     return (

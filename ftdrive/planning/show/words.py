@@ -1,4 +1,4 @@
-"""A plan in words: what a person reads before anything moves."""
+"""A plan as text, which the operator reads before anything moves."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,9 +11,9 @@ JOINTS = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
 
 
 def plan_in_words(plan: Plan) -> str:
-    """Say why this plan, its poses and moves, joint ranges, clearances, time, room, and what it will be worth.
+    """Return the reason for the plan, its moves, joint ranges, clearances, time, space and predicted accuracy.
 
-    The table is 72 columns wide at most; sentences are whole lines.
+    The table is at most 72 columns wide; each sentence is one line.
     """
     still = ", ".join(f"{angle:.0f}" for angle in np.degrees(plan.steps[0].q_rad[:3]))
     rest = [f"Base, shoulder and elbow stay at {still} degrees."] if plan.arm_rests else []
@@ -21,29 +21,29 @@ def plan_in_words(plan: Plan) -> str:
 
 
 def room_in_words(plan: Plan) -> str:
-    """Say what must be free."""
+    """Return which space must be clear."""
     ball = f"ball of {plan.ball_m:.2f} m around {point_in_words(plan)}"
     if plan.arm_rests:
-        return f"All that moves stays in a {ball}, where the axes of wrist 1 and 2 cross: keep it free, cables slack."
-    return f"Wrist and tool stay in a {ball}, and the whole arm moves: keep the room of both free, cables slack."
+        return f"All moving parts stay in a {ball}, where the axes of wrist 1 and 2 cross: keep it clear, cables slack."
+    return f"Wrist and tool stay in a {ball}, and the whole arm moves: keep the space of both clear, cables slack."
 
 
 def point_in_words(plan: Plan) -> str:
-    """Say where the centre of the ball is."""
+    """Return the centre of the ball as text."""
     x, y, z = (f"{value:.2f}" for value in plan.ball_centre_m)
     return f"x {x}, y {y}, z {z} m in base"
 
 
 def way_in_words(way_rad: ArrayLike, clearance_m: float) -> str:
-    """Say how many moves an approach has, which joints turn over which range, and whether all of the arm needs room."""
+    """Return the number of moves of an approach, the range of each joint, and whether the whole arm moves."""
     count = len(np.asarray(way_rad)) - 1
     words = f"{'1 move' if count == 1 else f'{count} moves'} ({turns_in_words(way_rad)}), "
     words += f"proven clear by {1e3 * clearance_m:.0f} mm"
-    return words + "; the whole arm moves: keep its room free" if arm_moves(way_rad) else words
+    return words + "; the whole arm moves: keep its space clear" if arm_moves(way_rad) else words
 
 
 def turns_in_words(way_rad: ArrayLike) -> str:
-    """Name the joints that move along a way, each with the range it turns over."""
+    """Return the joints that move along a path, each with its range."""
     ranges_deg = np.degrees(np.ptp(np.asarray(way_rad), axis=0))
     turns = [
         f"{name} {turn:.0f}°" for name, turn in zip(JOINTS, ranges_deg, strict=True) if turn >= np.degrees(STILL_RAD)
@@ -60,7 +60,7 @@ def _table(plan: Plan) -> list[str]:
         return "".join(f"{row[j]:{width}.0f}" for j, width in zip(shown, widths, strict=True))
 
     names = "".join(f"{JOINTS[j]:>{width}}" for j, width in zip(shown, widths, strict=True))
-    lines = ["Poses in degrees, and the move on to the next:", f"{'':4}{'R':>4}{names} turn  °/s    s clear mm"]
+    lines = ["Poses in degrees, and the move to the next pose:", f"{'':4}{'R':>4}{names} turn  °/s    s clear mm"]
     for i, (step, q) in enumerate(zip(plan.steps, q_deg, strict=True), start=1):
         turn, speed = np.degrees([step.turn_rad, step.speed_rad_s])
         move = f"{turn:5.0f}{speed:5.0f}{step.duration_s:5.1f}{1e3 * step.clearance_m:9.0f}"
@@ -88,5 +88,5 @@ def _summary(plan: Plan) -> list[str]:
 
 
 def _largest(sigma: object) -> float:
-    """Largest of some; NaN where the poses do not tell, which is null in the file."""
+    """Largest value; NaN if the poses do not determine one, which is null in the file."""
     return float(np.max(np.array(sigma, dtype=np.float64)))

@@ -109,7 +109,7 @@ def test_compensate_leaves_the_contact() -> None:
 @pytest.mark.parametrize(
     ("wrench", "rotation"), [((6,), (10, 3, 3)), ((10, 6), (3, 3)), ((10, 5), (10, 3, 3)), ((), ())]
 )
-def test_compensate_refuses_shapes_that_do_not_belong_together(
+def test_compensate_rejects_shapes_that_do_not_belong_together(
     wrench: tuple[int, ...], rotation: tuple[int, ...]
 ) -> None:
     with pytest.raises(ValueError, match="expected"):
@@ -136,7 +136,7 @@ def without(name: str) -> str:
     [
         ("", "the file is empty"),
         ("nonsense", "this is not valid JSON"),
-        ("3", "holds a JSON int"),
+        ("3", "a JSON int"),
         ("{}", "the field 'format' is missing"),
         (json.dumps(DATA.to_dict()), "the format is 'ftdrive.dataset/1'"),
         ('{"format": "ftdrive.calibration/2"}', "version '2' of ftdrive.calibration"),

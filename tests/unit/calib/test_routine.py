@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib.errors import TooFewSamples
+from calib.model import Array
 from calib.routine import PoseRecord, Sampling, TourPose, dataset_from, drift_check, take_pose
-
-Array = NDArray[np.float64]
 
 
 @dataclass

@@ -129,7 +129,7 @@ def test_mistakes_are_named(url: str, message: str) -> None:
 ACME = """
 import time
 import numpy as np
-from drivers.interfaces import ArmStatus, DeviceInfo, FtSamples
+from drivers.interfaces import ArmStatus, DeviceInfo, Finding, FtSamples
 from drivers.streaming import StreamingSensor
 from drivers.ur.arm import UrArm
 
@@ -165,6 +165,9 @@ class Arm(UrArm):
 
     def in_remote_control(self):
         return None
+
+    def diagnose(self):
+        return [Finding("brakes", False, "a brake is worn", "call Acme")]
 
     def status(self):
         now_ns = time.monotonic_ns()
@@ -232,7 +235,8 @@ def test_doctor_asks_the_arm_of_another_package_only_what_any_arm_knows(
     robot = {name: check for name, check in checks.items() if name.startswith("robot.")}
     assert robot["robot.reachable"]["found"] == "127.0.0.1 answers"
     assert robot["robot.identity"]["found"] == "Acme arm, serial 7, firmware 2.0"
-    assert "only a UR has" in robot["robot.programs"]["found"]
+    brakes = robot.pop("robot.brakes")
+    assert (brakes["state"], brakes["found"], brakes["fix"]) == ("failed", "a brake is worn", "call Acme")
     assert {check["state"] for check in robot.values()} == {"ok", "skipped"}
     assert checks["clock.pace"]["state"] == "ok"
 

@@ -144,7 +144,7 @@ def test_a_thread_of_the_station_is_waited_for_until_it_follows(real: RealTime, 
         assert clock.now_ns() == begun_ns + 3 * LEAD_NS, "the outer block goes on"
         assert clock.now_ns() == begun_ns + 3 * LEAD_NS
     real.pass_s(1.0)
-    assert clock.now_ns() > begun_ns + S, "nobody is left to be waited for"
+    assert clock.now_ns() > begun_ns + S, "no follower is left"
 
 
 def test_who_sleeps_until_a_time_is_waited_for_from_then_on(real: RealTime, clock: CellClock) -> None:

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mocks.arrays import Array
 from mocks.kinematics import (
     MODELS,
-    Array,
     closed_form,
     forward,
     inverse,

@@ -15,10 +15,10 @@ from mocks.sensors.bota import BANNER, BotaBox
 from mocks.sensors.netft import RECORD, Command, NetFtBox
 from mocks.sensors.robotiq import FRAME_GAP_S, RobotiqBox
 from mocks.sensors.robotous import RobotousCanNode, RobotousSerialBox
+from mocks.wires.device import Pacer
 from mocks.wires.faults import Faults
 from mocks.wires.pty import PtyDevice
 from mocks.wires.slcan import CanFrame
-from mocks.wires.stream import Pacer
 from tests.unit.mocks.real_time import RealTime
 
 STEP_S = 0.001
@@ -43,10 +43,9 @@ class Bench:
         self.begun_s = self.clock.now_s()
         if isinstance(self.device, PtyDevice):
             self.device._send = self._send  # type: ignore[method-assign]
-            self.device._power_up()
         else:
             self.device._socket = self
-            self.device._boot()
+        self.device._power_up()
 
     def run(self, duration_s: float, step_s: float = STEP_S) -> None:
         with self.clock.keeping_up():

@@ -1,4 +1,4 @@
-"""What poses can tell: exact ranks, true words, and advice that helps."""
+"""Observability of poses: exact ranks, correct reasons, and advice that helps."""
 
 import re
 
@@ -75,30 +75,30 @@ DEGENERATE = {
     "last joint at one tilt": (turned("z", tilt_deg=150), 13, "only the last joint was turned"),
     "about flange x": (turned("x"), 13, "turned about the flange's x axis only"),
     "about an oblique axis": (OBLIQUE, 13, r"turned about the axis \(.*\) of the flange only"),
-    "half turns": (HALF_TURNS, 13, "gravity pulls along one line of the tool only"),
+    "half turns": (HALF_TURNS, 13, "gravity acts along one line of the tool only"),
 }
 
 
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_degenerate_sets_have_their_rank_their_name_and_a_cure(name: str) -> None:
+def test_degenerate_sets_have_their_rank_a_reason_and_advice_that_helps(name: str) -> None:
     R, rank, words = DEGENERATE[name]
     found = assess(R)
     assert found.rank == rank
     assert found.condition == float("inf")
     assert not found.sound
-    assert re.search(words, found.gauges[0])
+    assert re.search(words, found.ambiguities[0])
     assert len(found.advice) == len(found.advised_R_base_flange) <= 3
-    cured = assess(np.concatenate([R, found.advised_R_base_flange]))
-    assert cured.sound
-    assert cured.gauges == cured.advice == ()
+    completed = assess(np.concatenate([R, found.advised_R_base_flange]))
+    assert completed.sound
+    assert completed.ambiguities == completed.advice == ()
 
 
 @pytest.mark.parametrize("tool", [NOMINAL, WALL], ids=["upright", "wall"])
-def test_what_is_said_to_be_mixed_is_mixed(tool: Parameters, snapshot: SnapshotAssertion) -> None:
+def test_named_ambiguities_exist(tool: Parameters, snapshot: SnapshotAssertion) -> None:
     """The changes named for a one-axis sweep leave every reading alone, whatever hangs on the sensor."""
     found = assess(OBLIQUE, tool, advise=False)
     assert found.rank == 13
-    assert found.gauges[1:] == snapshot
+    assert found.ambiguities[1:] == snapshot
     axis_flange = np.array([0.5, 0.3, 0.2]) / np.linalg.norm([0.5, 0.3, 0.2])
     axis_base, turn = OBLIQUE[0] @ axis_flange, 0.3
     around = Rotation.from_rotvec(turn * axis_base).as_matrix(), Rotation.from_rotvec(turn * axis_flange).as_matrix()
@@ -113,7 +113,7 @@ def test_what_is_said_to_be_mixed_is_mixed(tool: Parameters, snapshot: SnapshotA
 
 
 def test_turning_about_the_vertical_mixes_bias_with_everything(snapshot: SnapshotAssertion) -> None:
-    assert assess(about_the_vertical(), advise=False).gauges[1:] == snapshot
+    assert assess(about_the_vertical(), advise=False).ambiguities[1:] == snapshot
     # Gravity of a robot on a wall is across that axis: the same motion is an ordinary sweep about one axis.
     assert assess(about_the_vertical(), WALL, advise=False).rank == 13
 
@@ -124,11 +124,11 @@ def test_one_tilt_has_full_rank_and_an_exact_second_solution(tilt_deg: float) ->
     found = assess(R)
     assert found.rank == 15
     assert found.second_gap < 1e-12
-    assert f"one angle to gravity, {tilt_deg}° from the vertical" in found.gauges[0]
+    assert f"one angle to gravity, {tilt_deg}° from the vertical" in found.ambiguities[0]
     assert "tilt the tool" in found.sentence()
     assert len(found.advice) == 1
-    cured = assess(np.concatenate([R, found.advised_R_base_flange]))
-    assert cured.sound
+    completed = assess(np.concatenate([R, found.advised_R_base_flange]))
+    assert completed.sound
     # The second solution itself.
     over = Rotation.from_euler("z", 180, degrees=True).as_matrix()
     height_N = float((NOMINAL.gravity_force_base_N @ R)[0, 2])
@@ -143,8 +143,8 @@ def test_a_tool_that_never_turns_about_its_own_axis_is_caught_although_it_tilts(
     R = Rotation.from_euler("ZY", rng.uniform(-3, 3, (12, 2))).as_matrix()
     found = assess(R)
     assert (found.rank, found.second_gap < 1e-12) == (15, True)
-    assert "flange's y axis" in found.gauges[0]
-    assert "90°" in found.gauges[0]
+    assert "flange's y axis" in found.ambiguities[0]
+    assert "90°" in found.ambiguities[0]
     assert "turn the last joint" in found.advice[0]
     assert assess(np.concatenate([R, found.advised_R_base_flange])).sound
 
@@ -152,7 +152,7 @@ def test_a_tool_that_never_turns_about_its_own_axis_is_caught_although_it_tilts(
 def test_little_tilt_is_called_so() -> None:
     found = assess(within(15, 12))
     assert found.rank == 15
-    assert "gravity stays within 1" in found.gauges[0]
+    assert "gravity stays within 1" in found.ambiguities[0]
     assert assess(np.concatenate([within(15, 12), found.advised_R_base_flange])).sound
 
 
@@ -162,7 +162,7 @@ def test_inexact_poses_do_not_hide_a_degenerate_set() -> None:
     found = assess(real)
     assert found.rank == 15
     assert found.condition > 1e6
-    assert "the last joint" in found.gauges[0]
+    assert "the last joint" in found.ambiguities[0]
     assert assess(np.concatenate([real, found.advised_R_base_flange])).sound
 
 
@@ -171,7 +171,7 @@ def test_inexact_poses_do_not_hide_a_degenerate_set() -> None:
 def test_sound_sets_get_no_advice(R: Array, tool: Parameters) -> None:
     found = assess(R, tool)
     assert found.sound
-    assert found.gauges == found.advice == ()
+    assert found.ambiguities == found.advice == ()
     require_observable(R, tool)
     require_observable(R[:4] if R is ANY else R, tool)  # any four are enough, if the tool is not too light
 
@@ -203,7 +203,7 @@ def test_three_orientations_are_never_enough_although_their_rank_is_full() -> No
     [ANY[:3], np.tile(ANY[:1], (9, 1, 1)), turned("z", tilt_deg=150), leaning(40), about_the_vertical()],
     ids=["few", "one orientation", "last joint", "one tilt", "about the vertical"],
 )
-def test_refusals_are_one_sentence_with_the_cure(R: Array, snapshot: SnapshotAssertion) -> None:
+def test_rejections_are_one_sentence_with_advice(R: Array, snapshot: SnapshotAssertion) -> None:
     with pytest.raises(NotObservable) as refusal:
         require_observable(R, NOMINAL)
     reason, _, _ = str(refusal.value).partition("from the last one")  # which of equal turns is proposed may vary

@@ -52,7 +52,7 @@ def test_it_falls_with_white_noise_and_grows_with_a_random_walk_and_a_ramp() -> 
 
 
 @pytest.mark.parametrize("lengths", [[0], [101], [10, -1]])
-def test_lengths_that_do_not_fit_are_refused(lengths: list[int]) -> None:
+def test_lengths_that_do_not_fit_are_rejected(lengths: list[int]) -> None:
     with pytest.raises(BadDataset, match="choose 1 to 100"):
         allan_deviation(white(1), lengths)
 
@@ -73,7 +73,7 @@ def test_the_time_stays_within_one_and_ten_seconds() -> None:
     hard = chosen(white(60), force_N=1e-4)
     assert 5 < hard.seconds <= 10
     assert not hard.reached
-    assert "0.0001 N wanted: that would take" in hard.words
+    assert "0.0001 N: that needs" in hard.words
     assert "more poses" in hard.words
 
 
@@ -103,7 +103,7 @@ def test_drift_ends_the_averaging_at_the_minimum_of_the_curve() -> None:
     result = chosen(wrench, force_N=1e-4)
     assert 1.5 < result.seconds < 6
     assert result.sigma[2] < 1.06 * result.floor[2]
-    assert "fz does not come to the 0.0001 N" in result.words
+    assert "fz does not reach the target of 0.0001 N" in result.words
     assert "it drifts" in result.words
 
 
@@ -116,15 +116,15 @@ def test_a_frozen_channel_does_not_matter_and_a_coarse_one_is_not_believed() -> 
     assert not result.reached
     assert result.seconds < 2  # waiting does not help
     assert result.sigma[1] == pytest.approx(3 / np.sqrt(12), rel=0.05)
-    assert "fy does not come to the 0.1 N" in result.words
+    assert "fy does not reach the target of 0.1 N" in result.words
     assert "too coarse" in result.words
 
 
-def test_a_short_record_says_what_it_cannot_judge() -> None:
+def test_a_short_record_reports_its_limit() -> None:
     result = chosen(white(6), force_N=0.5 * SIGMA[0] / np.sqrt(RATE_HZ))
     assert result.seconds <= 2.0
     assert "record of 6 s" in result.words
-    with pytest.raises(BadDataset, match="record 3 s at least"):
+    with pytest.raises(BadDataset, match="record at least 3 s"):
         chosen(white(2.9))
     assert chosen(white(3)).seconds == 1.0
 
@@ -137,7 +137,7 @@ def test_any_rate_will_do(rate_Hz: float) -> None:
     assert 2 < result.seconds < 4.5
 
 
-def test_nonsense_is_refused() -> None:
+def test_invalid_targets_are_rejected() -> None:
     for force_N, torque_Nm in ((0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (1.0, -1.0)):
         with pytest.raises(ValueError, match=f"{force_N} N and {torque_Nm} N·m"):
             chosen(white(10), force_N, torque_Nm)

@@ -200,7 +200,7 @@ def csv(tmp_path: Path, *lines: str) -> Path:
     return path
 
 
-def test_csv_matrix_is_row_major_and_orientation_says_what_it_maps(tmp_path: Path) -> None:
+def test_csv_matrix_is_row_major_and_orientation_defines_the_mapping(tmp_path: Path) -> None:
     quarter = "0,-1,0,1,0,0,0,0,1"  # x goes to y
     path = csv(tmp_path, MATRIX_HEADER, f"{quarter},1,2,3,4,5,6")
     np.testing.assert_array_equal(read_csv(path).R_base_flange[0] @ [1, 0, 0], [0, 1, 0])

@@ -1,4 +1,4 @@
-"""The covariance of a dwell's mean tells the truth, and quiet dwells pass as quiet."""
+"""The covariance of the mean of a dwell is correct, and quiet dwells pass the test."""
 
 import time
 
@@ -28,7 +28,7 @@ MIXED = [0, 0.5, 0.9, 0, 0.9, 0.5]
         (1500, [-0.5] * 6),
     ],
 )
-def test_the_mean_lies_where_its_covariance_says(N: int, rho: list[float]) -> None:
+def test_the_mean_lies_where_its_covariance_states(N: int, rho: list[float]) -> None:
     rng = np.random.default_rng(N)
     lag = np.arange(1, N)
     variance = np.array([1 + 2 * np.sum((1 - lag / N) * r**lag) for r in rho]) / N
@@ -43,7 +43,7 @@ def test_the_mean_lies_where_its_covariance_says(N: int, rho: list[float]) -> No
     assert (0.88 if hard else 0.92) < coverage < 0.98
 
 
-def test_the_worst_channel_says_what_a_dwell_is_worth() -> None:
+def test_the_worst_channel_limits_the_effective_samples() -> None:
     rng = np.random.default_rng(0)
     assert 200 < mean_and_covariance(rng.normal(size=(400, 6))).n_effective < 450
     worth = mean_and_covariance(noise(rng, 20_000, np.array(MIXED))).n_effective
@@ -196,7 +196,7 @@ def test_a_window_must_fit_the_record(window: int) -> None:
         (np.where(np.arange(300).reshape(50, 6) == 8, np.nan, 0.0), r"sample 2: wrench\[2\] is nan"),
     ],
 )
-def test_bad_dwells_are_refused(samples: Array, words: str) -> None:
+def test_bad_dwells_are_rejected(samples: Array, words: str) -> None:
     for function in (mean_and_covariance, is_stationary):
         with pytest.raises(BadDataset, match=words):
             function(samples)

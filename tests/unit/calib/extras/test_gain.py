@@ -113,23 +113,23 @@ def test_what_the_force_gain_is_worth() -> None:
     assert np.mean(distance) == pytest.approx(14, rel=0.2)
 
 
-def test_without_the_weight_the_scale_is_free_and_said_so() -> None:
+def test_without_the_weight_the_scale_is_undetermined() -> None:
     it = world(0)
     forces = it.wrench[:, :3]
-    with pytest.raises(NotObservable, match="scale is free"):
+    with pytest.raises(NotObservable, match="scale is undetermined"):
         estimate_force_gain(it.parameters, it.R_base_flange, forces, covariances(24)[:, :3, :3], None)
     with pytest.raises(BadDataset, match="a known weight is -1 N"):
         estimate_force_gain(it.parameters, it.R_base_flange, forces, covariances(24)[:, :3, :3], -1)
 
 
-def test_poses_that_leave_the_force_gain_free_are_refused() -> None:
+def test_poses_that_leave_the_force_gain_free_are_rejected() -> None:
     it = world(0, 4)
     with pytest.raises(NotObservable, match="12 equations for 14 numbers"):
         estimate_force_gain(it.parameters, it.R_base_flange, it.wrench[:, :3], covariances(4)[:, :3, :3], WEIGHT_N)
     about_one_axis = Rotation.from_rotvec(np.linspace(0, 3, 12)[:, None] * [1, 0, 0]).as_matrix()
     upright = Parameters(np.eye(3), np.array([0, 0, -WEIGHT_N]), np.zeros(3), np.zeros(3), np.zeros(3))
     for p, R in ((it.parameters, about_one_axis), (upright, about_one_axis), (upright, np.tile(np.eye(3), (12, 1, 1)))):
-        with pytest.raises(NotObservable, match=r"of 14 numbers free.*: tilt"):
+        with pytest.raises(NotObservable, match=r"of 14 parameters.*: tilt"):
             estimate_force_gain(p, R, predict(p, R)[:, :3], covariances(12)[:, :3, :3], WEIGHT_N)
 
 
@@ -201,7 +201,7 @@ def test_rank_of_the_wrench_gain(payloads: tuple[Payload, ...], free: int) -> No
     s = np.linalg.svd(J / np.linalg.norm(J, axis=0), compute_uv=False)
     assert int((s > 1e-7 * s[0]).sum()) == 44 - free
     if free:
-        with pytest.raises(NotObservable, match=f"leave {free} of 44 numbers free: use three"):
+        with pytest.raises(NotObservable, match=f"do not determine {free} of 44 parameters: use three"):
             estimate_wrench_gain(p, R, y, covariances(n), index.tolist(), payloads)
 
 
@@ -226,20 +226,20 @@ def test_unknown_centres_of_mass_leave_four_numbers_free() -> None:
     assert J.shape[1] == 53
     assert int((s > 1e-7 * s[0]).sum()) == 49
     unknown = (*PAYLOADS[:2], Payload(15.0, None))
-    with pytest.raises(NotObservable, match="payload 2 is not known"):
+    with pytest.raises(NotObservable, match="payload 2 is unknown"):
         estimate_wrench_gain(p, R, y, covariances(45), index.tolist(), unknown)
 
 
 def test_payloads_that_are_listed_but_never_hung_do_not_count() -> None:
     _, p, R, y, index = wrench_world(PAYLOADS, 0.0, 0)
-    with pytest.raises(NotObservable, match="2 known payloads leave 6 of 44"):
+    with pytest.raises(NotObservable, match="2 known payloads do not determine 6 of 44"):
         estimate_wrench_gain(p, R[:30], y[:30], covariances(30), index[:30].tolist(), PAYLOADS)
     with pytest.raises(BadDataset, match=r"one of 0\.\.1"):
         estimate_wrench_gain(p, R, y, covariances(45), index.tolist(), PAYLOADS[:2])
 
 
-def test_too_few_poses_of_a_payload_are_refused() -> None:
+def test_too_few_poses_of_a_payload_are_rejected() -> None:
     _, p, R, y, index = wrench_world(PAYLOADS, 0.0, 0)
     few = [0, 1, 15, 16, 30, 31]
-    with pytest.raises(NotObservable, match=r"of 44 numbers free.*: tilt"):
+    with pytest.raises(NotObservable, match=r"of 44 parameters.*: tilt"):
         estimate_wrench_gain(p, R[few], y[few], covariances(6), index[few].tolist(), PAYLOADS)

@@ -70,23 +70,23 @@ def test_three_poses_give_payload_and_biases_exactly() -> None:
     assert update.dof == 8
 
 
-def test_one_pose_or_parallel_gravity_is_refused_in_words() -> None:
+def test_one_pose_or_parallel_gravity_is_rejected() -> None:
     new, old = loaded(truth()), exact(truth())
-    with pytest.raises(NotObservable, match=r"leaves 1 of 4 .* add 1"):
+    with pytest.raises(NotObservable, match="at least 2 are needed: add 1 or more"):
         update_payload(old, tilted(0), predict(new, tilted(0)), noise_of(1))
     for R in (tilted(0, 0.5), tilted(0, 180), tilted(10, 10, 10)):  # the same, upside down, and repeated
-        with pytest.raises(NotObservable, match="the same line"):
+        with pytest.raises(NotObservable, match="nearly one line"):
             update_payload(old, R, predict(new, R), noise_of(len(R)))
-    for n, free in ((1, "4 of 10"), (2, "1 of 10")):
+    for n in (1, 2):
         R = tilted(0, 60)[:n]
-        with pytest.raises(NotObservable, match=free):
+        with pytest.raises(NotObservable, match="at least 3 are needed"):
             update_payload(old, R, predict(new, R), noise_of(n), retare=True)
     R = tilted(0, 60, 60.1)
     with pytest.raises(NotObservable, match="fewer than three"):
         update_payload(old, R, predict(new, R), noise_of(3), retare=True)
 
 
-def test_no_payload_and_a_reversed_sign_are_refused() -> None:
+def test_no_payload_and_a_reversed_sign_are_rejected() -> None:
     R, old = tilted(0, 60), truth()
     bare = Parameters(old.R_flange_sensor, np.zeros(3), old.force_bias_N, np.zeros(3), old.torque_bias_Nm)
     with pytest.raises(NotObservable, match="is not 5 times its uncertainty"):
@@ -185,22 +185,22 @@ def test_a_tare_makes_the_tared_pose_more_certain_than_others() -> None:
 
 
 @pytest.mark.parametrize("push", [[0, 0, 8, 0, 0, 0], [5, 5, 0, 0, 0, 0], [0, 0, 0, 0, 0.2, 0]])
-def test_a_tare_under_load_is_refused(push: list[float]) -> None:
+def test_a_tare_under_load_is_rejected(push: list[float]) -> None:
     R = tilted(30)
     reading = dwell(truth(), R[0], np.random.default_rng(7)) + push
-    with pytest.raises(BadDataset, match="more than a tare explains"):
+    with pytest.raises(BadDataset, match="more than drift explains"):
         tare(exact(truth()), R, [reading])
 
 
-def test_a_tare_while_the_reading_moves_is_refused() -> None:
+def test_a_tare_while_the_reading_moves_is_rejected() -> None:
     R = tilted(30, 60)
     still, moving = (dwell(truth(), R[i], np.random.default_rng(8 + i)) for i in range(2))
     moving[:, 0] += np.linspace(0, 0.2, len(moving))
-    with pytest.raises(BadDataset, match="pose 2: the reading moves"):
+    with pytest.raises(BadDataset, match="pose 2: the reading changes"):
         tare(exact(truth()), R, [still, moving])
 
 
-def test_a_tare_with_another_payload_is_refused_though_every_pose_could_be_drift() -> None:
+def test_a_tare_with_another_payload_is_rejected_though_every_pose_could_be_drift() -> None:
     heavier = truth().moved(np.concatenate([np.zeros(3), 0.05 * truth().gravity_force_base_N, np.zeros(9)]))
     R = tilted(0, 90)
     with pytest.raises(BadDataset, match="do not agree"):
@@ -215,7 +215,7 @@ def test_good_tares_pass() -> None:
         tare(calibration(truth(), seed=seed), R[:1], [dwell(now, R[0], rng, 400)])
 
 
-def test_shapes_that_do_not_fit_are_refused() -> None:
+def test_shapes_that_do_not_fit_are_rejected() -> None:
     R = tilted(0, 60)
     with pytest.raises(BadDataset, match=r"wrench_cov has shape \(6, 6\), expected \(2, 6, 6\)"):
         update_payload(exact(truth()), R, predict(truth(), R), NOISE)

@@ -144,7 +144,7 @@ def test_published_table_of_chosen_sets_in_cones(degrees: int, figures: list[flo
     assert_allclose(row(candidates[choose(candidates, 24, FORCES_ONLY, least_gap=0.02)]), figures, rtol=0.08)
 
 
-def test_what_poses_do_not_tell_is_infinite() -> None:
+def test_undetermined_parameters_have_infinite_sigma() -> None:
     none, one = predicted_sigma(np.zeros((0, 3, 3)), GUESS), predicted_sigma(ALL[:1], GUESS)
     assert np.isinf([norm(none.sigma["mass_kg"]), norm(one.sigma["mass_kg"]), one.force_rms_N]).all()
     assert np.isinf([one.cond9, one.cond_u1, none.cond9, none.cond_u1]).all()
@@ -166,7 +166,7 @@ def test_linear_drift_costs_little_in_a_good_order_and_nothing_without_time() ->
     assert max(ratio) > 1.005
     unmoved = predicted_sigma(tour, guess, t_s=np.full(24, 7.0))
     assert_allclose(unmoved.sigma["weight_N"], still.sigma["weight_N"], rtol=1e-12)
-    # One half of the orientations first and the other later: drift cannot be told from what differs between them.
+    # One half of the orientations first and the other later: drift cannot be separated from their difference.
     sorted_ = ALL[np.lexsort((ALL[:, 2, 1], ALL[:, 2, 0]))]
     bad = predicted_sigma(sorted_, guess, t_s=np.arange(24))
     assert norm(bad.sigma["R_flange_sensor"]) > 1.2 * norm(still.sigma["R_flange_sensor"])
@@ -189,7 +189,7 @@ def test_wandering_bias_is_generalised_least_squares() -> None:
 
 
 @pytest.mark.parametrize("name", ["mass_kg", "sigma_force_N", "sigma_torque_Nm", "g_m_s2"])
-def test_a_guess_of_nothing_is_refused(name: str) -> None:
+def test_a_guess_of_nothing_is_rejected(name: str) -> None:
     with pytest.raises(ValueError, match=f"{name} is 0"):
         replace(GUESS, **{name: 0.0})
     with pytest.raises(ValueError, match="walk_force_N is -1"):
@@ -301,7 +301,7 @@ def test_random_sets_have_the_published_efficiency() -> None:
         assert_allclose(np.median(A), median, atol=0.03)
 
 
-def test_a_set_that_is_not_stored_is_refused() -> None:
+def test_a_set_that_is_not_stored_is_rejected() -> None:
     with pytest.raises(ValueError, match="no stored set of 7"):
         optimised(7)
 
@@ -365,7 +365,7 @@ def test_a_rim_gets_centre_poses() -> None:
         assert 1 <= np.count_nonzero(chosen >= len(rim)) <= 4
 
 
-def test_impossible_choices_are_refused() -> None:
+def test_impossible_choices_are_rejected() -> None:
     for n in (3, 25):
         with pytest.raises(ValueError, match=f"cannot choose {n} poses of 24"):
             choose(ALL, n, GUESS)

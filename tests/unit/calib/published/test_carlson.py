@@ -6,15 +6,13 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib.errors import BadDataset, NotObservable
-from calib.model import nearest_rotation
+from calib.model import Array, nearest_rotation
 from calib.published.carlson import ForceFit, eigen, iterative, nullspace, nullspace_all_pairs, polynomial
 from calib.published.carlson_known import cayley, cayley_rotation, relaxation, similarity
 
-Array = NDArray[np.float64]
 Method = Callable[[Array, Array, Array, bool], ForceFit]
 
 UNKNOWN: dict[str, Method] = {
@@ -127,7 +125,7 @@ def test_exact_without_noise(name: str, bias: bool, poses: str, mount: str) -> N
 
 @pytest.mark.parametrize("bias", [False, True])
 @pytest.mark.parametrize("name", METHODS)
-def test_exact_with_the_fewest_poses_and_one_less_is_refused(name: str, bias: bool) -> None:
+def test_exact_with_the_fewest_poses_and_one_less_is_rejected(name: str, bias: bool) -> None:
     rng = np.random.default_rng(1)
     n = MIN_POSES[name] + bias
     for _ in range(5):
@@ -269,7 +267,7 @@ def test_algorithm_1_reaches_the_truth_with_few_poses_from_its_own_start() -> No
     assert stuck  # why the start matters
 
 
-def test_algorithm_1_says_when_it_was_stopped() -> None:
+def test_algorithm_1_reports_when_it_was_stopped() -> None:
     rng = np.random.default_rng(11)
     truth, R = random_truth(rng), ball(rng, 24, 20)
     force_N = truth.force_N(R, 0.02)
@@ -305,7 +303,7 @@ def test_polynomial_is_the_certified_least_squares_solution(bias: bool) -> None:
 
 
 @pytest.mark.parametrize("sigma_N", [0, 0.05])
-def test_polynomial_refuses_one_tilt_only_because_gravity_may_be_up_or_down(sigma_N: float) -> None:
+def test_polynomial_rejects_one_tilt_only_because_gravity_may_be_up_or_down(sigma_N: float) -> None:
     R = rim(np.random.default_rng(13), 12, 40)
     truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), np.ones(3))
     with pytest.raises(NotObservable, match="two sensor orientations 180 deg apart"):
@@ -367,7 +365,7 @@ def test_total_least_squares_is_what_the_cayley_transform_needs() -> None:
 @pytest.mark.parametrize("sigma_N", [0, 0.1])
 @pytest.mark.parametrize("bias", [False, True])
 @pytest.mark.parametrize("name", DIRECTION | WEIGHT)
-def test_known_gravity_refuses_forces_that_point_up(name: str, bias: bool, sigma_N: float) -> None:
+def test_known_gravity_rejects_forces_that_point_up(name: str, bias: bool, sigma_N: float) -> None:
     rng = np.random.default_rng(17)
     for R in (random_poses(rng, 12), ball(rng, 12, 60)):
         truth = random_truth(rng)
@@ -399,7 +397,7 @@ DEGENERATE = {
 @pytest.mark.parametrize("poses", DEGENERATE)
 @pytest.mark.parametrize("bias", [False, True])
 @pytest.mark.parametrize("name", UNKNOWN)
-def test_refuses_poses_that_leave_gravity_open(name: str, bias: bool, poses: str, sigma_N: float) -> None:
+def test_rejects_poses_that_leave_gravity_open(name: str, bias: bool, poses: str, sigma_N: float) -> None:
     truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), bias * np.array([1.0, 2, -30]))
     method = METHODS[name]
     if name == "iterative":  # it never rests here, with noise
@@ -427,7 +425,7 @@ def test_known_gravity_is_content_with_one_axis(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["eigen", "nullspace", "all pairs", "iterative", "relaxation"])
-def test_relaxed_methods_refuse_one_tilt_only_with_bias(name: str) -> None:
+def test_relaxed_methods_reject_one_tilt_only_with_bias(name: str) -> None:
     R = rim(np.random.default_rng(18), 12, 40)
     truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), np.zeros(3))
     with pytest.raises(NotObservable, match="only 2"):
@@ -437,7 +435,7 @@ def test_relaxed_methods_refuse_one_tilt_only_with_bias(name: str) -> None:
 
 @pytest.mark.parametrize("bias", [False, True])
 @pytest.mark.parametrize("name", METHODS)
-def test_refuses_a_sensor_that_carries_nothing(name: str, bias: bool) -> None:
+def test_rejects_a_sensor_that_carries_nothing(name: str, bias: bool) -> None:
     with pytest.raises(NotObservable, match="no weight"):
         METHODS[name](SROM24, np.full((24, 3), 7.0 * bias), np.array([0, 0, -1.0]), bias)
 

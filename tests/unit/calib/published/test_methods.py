@@ -27,7 +27,7 @@ def test_every_published_method_is_exact_without_noise(method: str) -> None:
     np.testing.assert_allclose(TRUTH.difference(estimate(predict(TRUTH, R_base_flange))), 0, atol=1e-9)
 
 
-def test_methods_that_know_gravity_are_wrong_on_a_tilted_base_unless_told() -> None:
+def test_methods_that_know_gravity_are_wrong_on_a_tilted_base_unless_configured() -> None:
     direction = np.array([0.1, 0.0, -1.0]) / np.sqrt(1.01)
     tilted = Parameters(
         TRUTH.R_flange_sensor, 12.0 * direction, TRUTH.force_bias_N, TRUTH.p_sensor_com_m, TRUTH.torque_bias_Nm

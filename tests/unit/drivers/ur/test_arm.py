@@ -172,6 +172,22 @@ def test_reading_starts_nothing(make_arm: MakeArm, controller: Controller) -> No
     assert controller.did == []
 
 
+@pytest.mark.parametrize("taken", [False, True])
+@pytest.mark.parametrize("minor", [15, 3])
+def test_what_control_needs_is_diagnosed_without_control(
+    taken: bool, minor: int, make_arm: MakeArm, controller: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(controller, "version", (5, minor, 0, 1), raising=False)
+    controller.registers_taken = taken
+    arm = make_arm()
+    arm.open()
+    found = {finding.name: finding for finding in arm.diagnose()}
+    passed = {name: finding.passed for name, finding in found.items()}
+    assert passed == {"version": minor == 15, "registers": not taken, "programs": True}
+    assert ("5.4" in found["version"].fix) == (minor == 3)
+    assert ("EtherNet/IP" in found["registers"].fix) == taken
+
+
 @pytest.mark.parametrize(("timing", "release_s"), [(STRICT, 1.0), (UrTiming.emulated(), 5.0)], ids=["real", "emulated"])
 @pytest.mark.parametrize("what", ["registers_taken", "program"])
 def test_another_client_is_waited_for_and_not_ended(

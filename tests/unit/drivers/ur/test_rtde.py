@@ -232,3 +232,24 @@ def test_nobody_there() -> None:
     with pytest.raises(Unreachable, match="cannot be reached") as error:
         rtde.Subscription("127.83.7.2", OUTPUTS, 125.0, timeout_s=0.5)
     assert "switched on" in error.value.cure
+
+
+@pytest.mark.parametrize(
+    ("error", "fix"),
+    [
+        (TimeoutError("timed out"), "ping ur5"),
+        (OSError(113, "No route to host"), "ping ur5"),
+        (ConnectionRefusedError(111, "Connection refused"), "enable RTDE"),
+        (socket.gaierror(-2, "Name or service not known"), "IPv4 address"),
+    ],
+)
+def test_each_reason_for_no_connection_has_its_own_fix(
+    error: OSError, fix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(rtde, "_Connection", refuse)
+    with pytest.raises(Unreachable) as raised:
+        rtde.Subscription("ur5", OUTPUTS, 125.0, timeout_s=0.5)
+    assert fix in raised.value.cure

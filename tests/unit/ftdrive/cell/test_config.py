@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from ftdrive.cell.config import _KEYS, _RANGES, _WRONG, CellConfig, load, settings, user_file, variable
+from ftdrive import cell
+from ftdrive.cell.config import _KEYS, RULES, CellConfig, as_toml, load, settings, user_file, variable
+from ftdrive.cell.rules import Rule
 from ftdrive.errors import ConfigError
 
 HEAD = 'format = "ftdrive.config/1"\n'
@@ -13,7 +15,7 @@ GOOD = HEAD + '[robot]\nhost = "10.0.0.2"\n[sensor]\nurl = "ati-can://can0"\n'
 
 
 @pytest.fixture(autouse=True)
-def _nobody_else_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _no_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "user"))
@@ -27,11 +29,16 @@ def write_user_file(text: str) -> None:
 def test_defaults_fill_what_is_not_said(tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
     path.write_text(GOOD + "[sampling]\naverage_s = 1\n")
-    cell = load(path)
-    assert (cell.robot.host, cell.sensor.sign, cell.sampling.average_s, cell.site.g_m_s2) == ("10.0.0.2", 1, 1, 9.80665)
-    assert (cell.robot.speed_deg_s, cell.robot.acceleration_deg_s2, cell.robot.tip_speed_mm_s) == (60, 80, 250)
-    assert cell.sensor.height_mm is None
-    assert cell.workcell.measured is False
+    found = load(path)
+    assert (found.robot.host, found.sensor.sign, found.sampling.average_s, found.site.g_m_s2) == (
+        "10.0.0.2",
+        1,
+        1,
+        9.80665,
+    )
+    assert (found.robot.speed_deg_s, found.robot.acceleration_deg_s2, found.robot.tip_speed_mm_s) == (60, 80, 250)
+    assert found.sensor.height_mm is None
+    assert found.workcell.measured is False
 
 
 def test_every_section_reaches_the_cell(tmp_path: Path) -> None:
@@ -43,17 +50,17 @@ def test_every_section_reaches_the_cell(tmp_path: Path) -> None:
         + '[workcell]\nmounting = "30"\nplanes_mm = [[-1, 0, 0, -800]]\nboxes_mm = [[10, 20, 30, 40, 50, 60]]\n'
         + "measured = true\n"
     )
-    cell = load(path)
-    assert (cell.sensor.height_mm, cell.sensor.mass_kg, cell.tool.name, cell.tool.mass_kg) == (
+    found = load(path)
+    assert (found.sensor.height_mm, found.sensor.mass_kg, found.tool.name, found.tool.mass_kg) == (
         33,
         0.255,
         "gripper",
         1.2,
     )
-    assert cell.tool.cylinders_mm == ((0.0, 33.0, 80.0), (33.0, 200.0, 100.0, 0.0, -5.5))
-    assert cell.workcell.planes_mm == ((-1.0, 0.0, 0.0, -800.0),)
-    assert cell.workcell.boxes_mm == ((10.0, 20.0, 30.0, 40.0, 50.0, 60.0),)
-    assert (cell.workcell.mounting, cell.workcell.measured) == ("30", True)
+    assert found.tool.cylinders_mm == ((0.0, 33.0, 80.0), (33.0, 200.0, 100.0, 0.0, -5.5))
+    assert found.workcell.planes_mm == ((-1.0, 0.0, 0.0, -800.0),)
+    assert found.workcell.boxes_mm == ((10.0, 20.0, 30.0, 40.0, 50.0, 60.0),)
+    assert (found.workcell.mounting, found.workcell.measured) == ("30", True)
 
 
 SOURCES = ("option", "variable", "project", "user")
@@ -86,8 +93,8 @@ def test_a_named_file_replaces_the_projects_but_not_the_users(tmp_path: Path) ->
     Path("ftdrive.toml").write_text(HEAD + "[sampling]\naverage_s = 9\n")
     path = tmp_path / "cell.toml"
     path.write_text(GOOD)
-    cell = load(path)
-    assert (cell.site.g_m_s2, cell.sampling.average_s) == (9.81, 2.0)
+    found = load(path)
+    assert (found.site.g_m_s2, found.sampling.average_s) == (9.81, 2.0)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +132,7 @@ def test_variables_are_read_as_the_key_needs(
         ("FTDRIVE_TOOL_CYLINDERS_MM", "[[0, 200]]", ["cylinder"]),
         ("FTDRIVE_SENSOR_SIGN", "1.0", ["whole number"]),
         ("FTDRIVE_ROBOT_HOST", "", ["FTDRIVE_ROBOT_HOST", "empty", "unset"]),
-        ("FTDRIVE_ROBOT_HOTS", "10.0.0.2", ["FTDRIVE_ROBOT_HOTS", "the keys are host"]),
+        ("FTDRIVE_ROBOT_HOTS", "10.0.0.2", ["FTDRIVE_ROBOT_HOTS", "did you mean host", "the keys are host"]),
     ],
 )
 def test_a_variable_that_cannot_be_used_is_named(
@@ -220,7 +227,7 @@ def test_errors_name_file_and_key(text: str, word: str, tmp_path: Path) -> None:
     assert str(path) in str(error.value) or "is not set" in str(error.value)
 
 
-def test_a_file_of_another_kind_is_told_what_its_first_line_must_be(tmp_path: Path) -> None:
+def test_an_error_names_the_first_line_that_is_missing(tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
     path.write_text("[robot]\n")
     with pytest.raises(ConfigError, match=r'format = "ftdrive\.config/1"'):
@@ -233,11 +240,33 @@ def test_a_mark_of_the_byte_order_is_no_text(tmp_path: Path) -> None:
     assert load(path).robot.host == "10.0.0.2"
 
 
-def test_every_number_has_a_range_and_every_range_a_key() -> None:
-    values = settings()
-    numbers = {key for key in values if _KEYS[key].type in {int, float, float | None}}
-    assert numbers - {"sensor.sign"} == set(_RANGES)
-    assert set(_WRONG) <= set(values)
+def test_every_key_has_a_rule_and_every_number_a_range() -> None:
+    assert RULES.keys() == settings().keys()
+    assert all(rule.help for rule in RULES.values())
+    numbers = {key for key, item in _KEYS.items() if item.type in {int, float, float | None}}
+    assert {key for key, rule in RULES.items() if rule.between} == numbers - {"sensor.sign"}
+    assert all(rule.unit for key, rule in RULES.items() if rule.between and key != "sampling.attempts")
+
+
+def test_the_readme_describes_every_key() -> None:
+    def row(key: str, rule: Rule) -> str:
+        default = settings()[key]
+        shown = "" if default.value is None else f"`{as_toml(default.value)}`"
+        return f"| `[{key.replace('.', '] ')}` | {shown} | {rule.range} | {rule.help} |"
+
+    readme = Path(cell.__file__).with_name("README.md").read_text(encoding="utf-8")
+    rows = [line for line in readme.splitlines() if line.startswith("| `[")]
+    assert rows == [row(key, rule) for key, rule in RULES.items()]
+
+
+@pytest.mark.parametrize(
+    ("text", "meant"),
+    [("[robot]\nhots = 1", "host"), ("[robots]\nhost = 1", "robot"), ("[sensor]\nhight_mm = 1", "height_mm")],
+)
+def test_what_was_meant_is_suggested(text: str, meant: str) -> None:
+    Path("ftdrive.toml").write_text(f"{HEAD}{text}\n")
+    with pytest.raises(ConfigError, match=rf"did you mean {meant}\? the (keys|sections) are "):
+        load()
 
 
 def test_a_plan_needs_no_addresses() -> None:

@@ -1,4 +1,4 @@
-"""What doctor finds in states of a computer that can be made up, and what it says mends them."""
+"""The findings of doctor in made-up states of a computer, and their fixes."""
 
 import os
 import shlex
@@ -11,7 +11,8 @@ import pytest
 
 from ftdrive.cell import config
 from ftdrive.checks import computer as checks
-from ftdrive.checks.computer import Check, SensorAddress
+from ftdrive.checks.check import Check, merged, verdict
+from ftdrive.checks.computer import SensorAddress
 from ftdrive.errors import ConfigError
 
 
@@ -240,8 +241,19 @@ def test_a_disk_with_little_room(free: float, state: str, tmp_path: Path, monkey
 
 def test_the_verdict_is_the_worst_state() -> None:
     def of(*states: Any) -> str:
-        return checks.verdict([Check("x.y", state, "") for state in states])
+        return verdict([Check("x.y", state, "") for state in states])
 
     assert of("ok", "skipped") == "ok"
     assert of("ok", "warning") == "warning"
     assert of("failed", "warning") == "failed"
+
+
+def test_merged_checks_say_what_the_worst_found() -> None:
+    fine, slow, dead = (
+        Check("a", "ok", "1 Hz"),
+        Check("b", "warning", "slow", "wait"),
+        Check("c", "failed", "dead", "go"),
+    )
+    assert merged("x", [fine, fine]) == Check("x", "ok", "1 Hz, 1 Hz")
+    assert merged("x", [fine, slow, slow]) == Check("x", "warning", "slow, slow", "wait; wait")
+    assert merged("x", [dead, slow, fine]) == Check("x", "failed", "dead", "go")

@@ -1,4 +1,4 @@
-"""Which place means which question, and what is said of a place that cannot be asked."""
+"""Which protocol is used at which place, and the errors of places that cannot be probed."""
 
 from functools import partial
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from drivers.clock import REAL
 from drivers.errors import ConnectError
 from drivers.probe.serial_line import Answer
 from ftdrive.checks import computer, discovery
@@ -31,7 +32,7 @@ def can0(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """What the probes were told."""
+    """The calls of the probes."""
     calls: list[Any] = []
 
     def probe_can(channel: str, **options: Any) -> list[Answer]:
@@ -39,7 +40,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         return [FOUND, REFUSED]
 
     monkeypatch.setattr(discovery, "probe_can", probe_can)
-    monkeypatch.setattr(discovery, "probe", calls.append)
+    monkeypatch.setattr(discovery, "probe", lambda port, clock: calls.append((port, clock)))
     return calls
 
 
@@ -48,7 +49,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 def test_an_interface_of_the_kernel_is_asked_at_its_own_bit_rate(place: str, base: int, asked: list[Any]) -> None:
     assert is_place(place)
     assert sensor_at(place) == FOUND.url
-    assert asked == [("can0", {"interface": "socketcan", "bitrate": 500_000, "base": base})]
+    assert asked == [("can0", {"interface": "socketcan", "bitrate": 500_000, "base": base, "clock": REAL})]
     assert places()[0] == "can0"
 
 
@@ -65,7 +66,7 @@ def test_an_adapter_on_a_serial_port(
     place = f"slcan://{tty}{serial_speed}?{query}"
     assert is_place(place)
     assert ask(place) == [FOUND, REFUSED]
-    assert asked == [(tty + serial_speed, {"interface": "slcan", "bitrate": bitrate, "base": base})]
+    assert asked == [(tty + serial_speed, {"interface": "slcan", "bitrate": bitrate, "base": base, "clock": REAL})]
 
 
 def test_an_adapter_whose_name_is_written_like_in_any_address(asked: list[Any], tmp_path: Path) -> None:
@@ -77,8 +78,8 @@ def test_an_adapter_whose_name_is_written_like_in_any_address(asked: list[Any], 
 
 def test_a_port_without_more_is_a_serial_sensor(asked: list[Any], tmp_path: Path) -> None:
     assert ask("/dev/null") == []
-    assert asked == ["/dev/null"]
-    with pytest.raises(ConnectError, match=f"there is no {tmp_path}/ttyUSB0; plug it in"):
+    assert asked == [("/dev/null", REAL)]
+    with pytest.raises(ConnectError, match=f"{tmp_path}/ttyUSB0 does not exist; plug it in"):
         ask(f"{tmp_path}/ttyUSB0")
     assert not is_place("ati-serial:///dev/ttyUSB0")
 
@@ -86,9 +87,9 @@ def test_a_port_without_more_is_a_serial_sensor(asked: list[Any], tmp_path: Path
 @pytest.mark.parametrize(
     ("place", "words"),
     [
-        ("slcan:///dev/null", "at which bit rate.*slcan:///dev/ttyACM0.bitrate=250000"),
-        ("slcan://", "is no place to ask"),
-        ("ati-can://can0", "is no place to ask"),
+        ("slcan:///dev/null", "no bit rate.*slcan:///dev/ttyACM0.bitrate=250000"),
+        ("slcan://", "cannot be probed"),
+        ("ati-can://can0", "cannot be probed"),
         ("slcan:///dev/null?bitrate=fast", "must be a whole number"),
         ("can0?rate=1000", "option rate; known: base, bitrate"),
         ("can0?base=0x80", "allowed are 0 to 127"),
@@ -104,13 +105,15 @@ def test_a_place_that_is_not_written_well(place: str, words: str, asked: list[An
     ("place", "port"), [("ttyUSB0", "/dev/ttyUSB0"), ("socketcan:///dev/null", "/dev/null")], ids=["name", "path"]
 )
 def test_a_serial_port_is_no_can_interface(place: str, port: str, asked: list[Any]) -> None:
-    with pytest.raises(ConnectError, match=rf"is no CAN interface; .* {port}, .* slcan://{port}\?bitrate=250000$"):
+    with pytest.raises(ConnectError, match=rf"is not a CAN interface; .* {port}, .* slcan://{port}\?bitrate=250000$"):
         ask(place)
     assert asked == []
 
 
 def test_an_interface_that_cannot_be_asked(can0: Path, asked: list[Any]) -> None:
-    with pytest.raises(ConnectError, match=r"no interface can1; .*sudo ip link set can1 up type can bitrate 250000$"):
+    with pytest.raises(
+        ConnectError, match=r"no CAN interface can1; .*sudo ip link set can1 up type can bitrate 250000$"
+    ):
         ask("can1")
     with pytest.raises(ConnectError, match=r"can0 is at 500000 bit/s, .*sudo ip link set can0 down"):
         ask("socketcan://can0?bitrate=250000")
@@ -124,7 +127,7 @@ def test_an_interface_that_cannot_be_asked(can0: Path, asked: list[Any]) -> None
 @pytest.mark.parametrize(
     ("answers", "words"),
     [
-        ([], "answers on can0: is it powered"),
+        ([], "answers on can0: check its power"),
         ([REFUSED], "a Robotous was not asked"),
         ([FOUND, Answer("robotous-can://can0", "R")], "choose one, ati-can.* or robotous"),
     ],

@@ -102,7 +102,7 @@ def test_a_tool_on_the_command_line_keeps_name_and_mass(cells: list[Any]) -> Non
     assert (tool.name, tool.mass_kg) == ("gripper", 1.3)
     assert tool.cylinders_mm == ((0, 60, 90), (60, 200, 60, 0, 5))
     assert "give 3 or 5 numbers" in str(call("--tool", "0:60"))
-    assert "no cylinder" in str(call("--tool", "60:20:90"))
+    assert "not a cylinder" in str(call("--tool", "60:20:90"))
 
 
 Begin = Callable[..., str]

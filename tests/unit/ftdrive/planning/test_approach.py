@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from drivers.ur.kinematics import Array
-from ftdrive.cell.config import CellConfig, RobotConfig, Rows, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.cell.rules import Rows
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.approach import Approach, arm_moves, plan_approach
 from ftdrive.planning.cell_plan import certifier_for

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from syrupy.assertion import SnapshotAssertion
 
-from ftdrive.cell.config import CellConfig, RobotConfig, Rows, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.cell.rules import Rows
 from ftdrive.errors import ConfigError
 from ftdrive.planning.cell_plan import box_from_mm, certifier_for, plane_from_mm, require_possible
 from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder

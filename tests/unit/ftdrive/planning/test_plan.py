@@ -96,7 +96,7 @@ def test_another_posture_is_proposed_where_the_arm_stands_badly() -> None:
     plan = planned(certifier, q)
     assert plan.kind == "posture"
     assert plan.certified
-    assert "way there" in " ".join(plan.why)
+    assert "approach to them" in " ".join(plan.why)
     plan.require(certifier)
 
 

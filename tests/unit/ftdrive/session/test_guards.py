@@ -26,7 +26,7 @@ from ftdrive.session.guards import (
     SettingsGuard,
     StallGuard,
     Tripped,
-    out_of_sight,
+    arm_lost,
 )
 
 Array = NDArray[np.float64]
@@ -142,18 +142,18 @@ def test_every_stop_and_change_of_the_controller_is_seen_at_once(different: dict
     assert looks.trip(status=replace(STATUS, **different)).hazard == hazard
 
 
-def test_a_protective_stop_is_told_with_the_payload_that_may_have_caused_it() -> None:
+def test_a_protective_stop_is_reported_with_the_payload_that_may_have_caused_it() -> None:
     stopped = replace(STATUS, fault=DeviceFault("protective stop", "…"), safety_mode="protective stop")
     assert "1.50 kg" in str(Looks(SafetyGuard()).trip(status=stopped))
-    untold = str(Looks(SafetyGuard()).trip(status=replace(stopped, payload_kg=None)))
-    assert untold.endswith("payload or centre of mass")
+    without = str(Looks(SafetyGuard()).trip(status=replace(stopped, payload_kg=None)))
+    assert without.endswith("payload or centre of mass")
     braked = replace(STATUS, fault=DeviceFault("emergency stop", "…"), safety_mode="robot emergency stop")
     assert "payload" not in str(Looks(SafetyGuard()).trip(status=braked))
 
 
 def test_an_arm_out_of_sight_may_be_ending_its_move() -> None:
     lost = DeviceTimeout("the clock stands still", "check the robot")
-    under_way, standing = out_of_sight(lost, moving=True), out_of_sight(lost, moving=False)
+    under_way, standing = arm_lost(lost, moving=True), arm_lost(lost, moving=False)
     assert (under_way.hazard, standing.hazard) == (16, 16)
     assert isinstance(under_way.error, DeviceTimeout)
     assert "may not have heard" in str(under_way)

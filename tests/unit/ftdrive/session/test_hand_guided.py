@@ -16,7 +16,7 @@ from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
 from drivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
 from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
-from ftdrive.session.hand_guided import collect_manually
+from ftdrive.session.hand_guided import Recorder, collect_manually
 from ftdrive.session.operator import Key, Question
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import STATUS
@@ -238,11 +238,9 @@ class Outcome:
                 self.cell,
                 sampling,
                 self.person,
-                self.fit.add,
-                self._commit,
+                Recorder(self.fit.add, self._commit, earlier),
                 down_base=FLOOR,
                 listen=listen,
-                earlier=earlier,
                 clock=self.cell.clock,
             )
 
@@ -358,7 +356,7 @@ TILTED = [Rotation.from_euler("xyz", angles, degrees=True) for angles in ((45, 0
 def test_without_keys_it_ends_by_itself_when_the_poses_are_enough() -> None:
     outcome = Outcome(dwells(*AROUND, *TILTED), has_keys=False)
     assert outcome.stops == [1, 2, 3, 4, 5, 6]
-    assert "ends by itself" in outcome.person.words()
+    assert "once the coverage is green" in outcome.person.words()
     assert "6 poses are kept." in outcome.person.words()
     assert "press" not in outcome.person.words()
 
@@ -449,7 +447,7 @@ def test_a_sensor_that_does_not_come_back_ends_it(away_s: float) -> None:
 def test_an_arm_that_is_silent_for_a_second_is_waited_for(since_s: float, listen: bool) -> None:
     outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), silent_s=(since_s, since_s + 1.0), listen=listen)
     assert [r.before.R_base_flange[2, 2].round(3) for r in outcome.kept] == [1.0, -1.0, 0.0]
-    words = "Nothing is measured until the arm is heard again: its clock has stood still."
+    words = "Nothing is measured until the arm answers again: its clock has stood still."
     assert outcome.person.words().count(words) == 1
 
 
@@ -603,6 +601,12 @@ def test_a_disk_that_is_full_ends_it() -> None:
 
     with pytest.raises(OSError, match="No space"):
         collect_manually(
-            cell, cell, Sampling(average_s=AVERAGE_S), person, Fit().add, commit, down_base=FLOOR, listen=False
+            cell,
+            cell,
+            Sampling(average_s=AVERAGE_S),
+            person,
+            Recorder(Fit().add, commit),
+            down_base=FLOOR,
+            listen=False,
         )
     assert not any(isinstance(event, PoseTaken) for event in person.told)

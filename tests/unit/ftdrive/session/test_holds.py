@@ -55,14 +55,14 @@ def holds(lab: Lab) -> list[str]:
 @pytest.mark.parametrize("answer", ["resume", "skip"])
 def test_a_way_that_is_not_confirmed_leads_back_to_the_hold(answer: str, lab: Lab) -> None:
     pause_on_the_way(lab, 4)
-    lab.operator.answers["Type resume"] = ["resume", answer]
+    lab.operator.answers["resume:"] = ["resume", answer]
     lab.operator.answers["the way to pose 4"] = ["no"]
     moves: list[int] = []
-    when_asked(lab, "Type resume", lambda: moves.append(len(lab.arm.moves)))
+    when_asked(lab, "resume:", lambda: moves.append(len(lab.arm.moves)))
     assert lab.calibrate() is not None
     assert moves == [4, 4]
     first, second = holds(lab)
-    assert first == "paused by a person"
+    assert first == "paused by the operator"
     assert second.startswith("not confirmed: The arm goes")
     assert lab.operator.of(GuardTripped) == []
     assert lab.stops() == [1, 2, 3, *([4] if answer == "resume" else []), 5, 6, 7]
@@ -70,7 +70,7 @@ def test_a_way_that_is_not_confirmed_leads_back_to_the_hold(answer: str, lab: La
 
 def test_who_does_not_confirm_a_way_can_end_it_there_and_keeps_the_poses(lab: Lab) -> None:
     pause_on_the_way(lab, 4)
-    lab.operator.answers["Type resume"] = ["resume", "quit"]
+    lab.operator.answers["resume:"] = ["resume", "quit"]
     lab.operator.answers["the way to pose 4"] = ["no"]
     with pytest.raises(Declined, match="not confirmed: The arm goes"):
         lab.calibrate()
@@ -81,7 +81,7 @@ def test_who_does_not_confirm_a_way_can_end_it_there_and_keeps_the_poses(lab: La
 
 def test_the_way_back_that_is_not_confirmed_is_not_gone_but_offered_again(lab: Lab) -> None:
     lab.push_on_the_way(4)
-    lab.operator.answers["Type resume"] = ["back", "resume"]
+    lab.operator.answers["resume:"] = ["back", "resume"]
     lab.operator.answers["the way back to pose 3"] = ["no"]
     assert lab.calibrate() is not None
     assert len(holds(lab)) == 2
@@ -91,7 +91,7 @@ def test_the_way_back_that_is_not_confirmed_is_not_gone_but_offered_again(lab: L
 
 def test_a_tour_that_may_not_begin_yet_is_held_at_its_first_pose(lab: Lab) -> None:
     lab.operator.answers["Begin?"] = ["no"]
-    lab.operator.answers["Type resume"] = ["resume"]
+    lab.operator.answers["resume:"] = ["resume"]
     assert lab.calibrate() is not None
     assert [words.startswith("not confirmed: The arm stands") for words in holds(lab)] == [True]
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
@@ -116,8 +116,8 @@ def test_an_emergency_stop_that_is_pressed_in_a_hold_brings_the_questions_again(
         pause_on_the_way(lab, 4)
     else:
         lab.push_on_the_way(4)
-    lab.operator.answers["Type resume"] = ["resume"]
-    when_asked(lab, "Type resume", once(lambda: press_and_release(lab, mode)))
+    lab.operator.answers["resume:"] = ["resume"]
+    when_asked(lab, "resume:", once(lambda: press_and_release(lab, mode)))
     assert lab.calibrate() is not None
     counts = mode != "protective stop"
     assert questions(lab) == 1 + counts
@@ -129,9 +129,9 @@ def test_an_emergency_stop_that_is_pressed_in_a_hold_brings_the_questions_again(
 
 def test_the_questions_come_until_they_are_all_answered_with_yes(lab: Lab) -> None:
     pause_on_the_way(lab, 4)
-    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    lab.operator.answers["resume:"] = ["resume", "resume"]
     lab.operator.answers["Is the emergency stop in reach"] = ["yes", "no"]
-    when_asked(lab, "Type resume", once(lambda: press_and_release(lab)))
+    when_asked(lab, "resume:", once(lambda: press_and_release(lab)))
     assert lab.calibrate() is not None
     assert questions(lab) == 3
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [11]
@@ -140,9 +140,9 @@ def test_the_questions_come_until_they_are_all_answered_with_yes(lab: Lab) -> No
 
 def test_an_emergency_stop_that_is_still_pressed_is_refused_and_asked_about_once_released(lab: Lab) -> None:
     pause_on_the_way(lab, 4)
-    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    lab.operator.answers["resume:"] = ["resume", "resume"]
     pressed_then_not = iter([{"fault": DeviceFault("a stop"), "safety_mode": "robot emergency stop"}, {}])
-    when_asked(lab, "Type resume", lambda: lab.arm.set_status(**next(pressed_then_not)))
+    when_asked(lab, "resume:", lambda: lab.arm.set_status(**next(pressed_then_not)))
     assert lab.calibrate() is not None
     (refused,) = [event.words for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
     assert "safety: a stop" in refused
@@ -153,8 +153,8 @@ def test_an_emergency_stop_that_is_still_pressed_is_refused_and_asked_about_once
 @pytest.mark.parametrize("words", ["Is the tool free", "the way to pose 4"])
 def test_an_emergency_stop_that_is_pressed_at_a_question_counts_too(words: str, lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode="safeguard stop")
-    lab.operator.answers["Type resume"] = ["resume", "resume"]
-    when_asked(lab, "Type resume", lab.arm.set_status)
+    lab.operator.answers["resume:"] = ["resume", "resume"]
+    when_asked(lab, "resume:", lab.arm.set_status)
     moves: list[int] = []
 
     def press() -> None:
@@ -171,10 +171,10 @@ def test_an_emergency_stop_that_is_pressed_at_a_question_counts_too(words: str, 
 
 
 def test_an_emergency_stop_between_two_steps_holds_the_arm_where_it_stands(lab: Lab) -> None:
-    lab.operator.answers["Type resume"] = ["resume"]
+    lab.operator.answers["resume:"] = ["resume"]
     when_asked(lab, "Pose 4 of 7", once(lambda: press_and_release(lab)))
     moves: list[int] = []
-    when_asked(lab, "Type resume", lambda: moves.append(len(lab.arm.moves)))
+    when_asked(lab, "resume:", lambda: moves.append(len(lab.arm.moves)))
     assert lab.calibrate(mode="step") is not None
     assert moves == [3]
     assert holds(lab) == ["the arm stopped: a stop"]
@@ -185,7 +185,7 @@ def test_an_emergency_stop_between_two_steps_holds_the_arm_where_it_stands(lab: 
 
 def test_who_resumes_an_arm_that_nobody_could_see_is_asked_again(lab: Lab) -> None:
     pause_on_the_way(lab, 4)
-    lab.operator.answers["Type resume"] = ["resume"]
+    lab.operator.answers["resume:"] = ["resume"]
 
     def out_of_sight() -> None:
         def unseen() -> None:
@@ -195,7 +195,7 @@ def test_who_resumes_an_arm_that_nobody_could_see_is_asked_again(lab: Lab) -> No
         lab.clock.sleep(1.1)
         lab.arm.at_look = lambda: None
 
-    when_asked(lab, "Type resume", once(out_of_sight))
+    when_asked(lab, "resume:", once(out_of_sight))
     assert lab.calibrate() is not None
     assert questions(lab) == 2
     assert [event for event in lab.operator.of(Noted) if "out of sight" in event.words]
@@ -204,10 +204,10 @@ def test_who_resumes_an_arm_that_nobody_could_see_is_asked_again(lab: Lab) -> No
 
 @pytest.mark.parametrize("words", QUESTIONS)
 def test_an_emergency_stop_at_the_first_questions_brings_them_again(words: str, lab: Lab) -> None:
-    lab.operator.answers["Type resume"] = ["resume"]
+    lab.operator.answers["resume:"] = ["resume"]
     when_asked(lab, words, once(lambda: press_and_release(lab)))
     held_at: list[int] = []
-    when_asked(lab, "Type resume", lambda: held_at.append(len(lab.arm.moves)))
+    when_asked(lab, "resume:", lambda: held_at.append(len(lab.arm.moves)))
     assert lab.calibrate() is not None
     assert held_at == [0]
     assert questions(lab) == 2

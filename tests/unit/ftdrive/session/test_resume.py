@@ -36,21 +36,21 @@ from tests.unit.ftdrive.fake_cell import Lab
 
 def test_pause_holds_the_arm_on_its_way_and_goes_on_or_ends(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
-    lab.operator.answers["Type resume to go on"] = ["resume"]
+    lab.operator.answers["resume: go on"] = ["resume"]
     lab.calibrate()
     assert lab.operator.states().count(State.HOLD) == 1
     assert lab.operator.of(GuardTripped) == []
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     lab.arm.moves.clear()
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
-    lab.operator.answers["Type resume to go on"] = ["quit"]
-    with pytest.raises(Declined, match="paused by a person"):
+    lab.operator.answers["resume: go on"] = ["quit"]
+    with pytest.raises(Declined, match="paused by the operator"):
         lab.calibrate()
 
 
 def test_stop_ends_the_session_without_a_question_and_says_how_to_go_on(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
-    with pytest.raises(Declined, match="stopped by a person"):
+    with pytest.raises(Declined, match="stopped by the operator"):
         lab.calibrate()
     assert lab.arm.halted.is_set()
     assert State.HOLD not in lab.operator.states()
@@ -97,7 +97,7 @@ def test_keep_has_nothing_to_do_in_a_tour_and_says_so(lab: Lab) -> None:
     lab.press((Key.KEEP, PoseTaken, 3))
     lab.calibrate()
     assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
-    assert lab.said().count("r takes it again") == 1
+    assert lab.said().count("r to take it again") == 1
 
 
 def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> None:
@@ -223,13 +223,13 @@ def test_a_hold_tells_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> 
     lab.arm.at_move[4] = lambda: lab.arm.set_status(
         fault=DeviceFault("protective stop", "…"), safety_mode="protective stop"
     )
-    lab.operator.answers["Type resume when it is mended"] = ["quit"]
+    lab.operator.answers["after fixing the cause"] = ["quit"]
     with pytest.raises(DeviceFault):
         lab.calibrate()
     (hold,) = [event for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
     assert str(lab.folder) not in hold.words + lab.operator.asked[-1].text
     assert "protective stop" in hold.words
-    assert "3 poses are kept" in lab.operator.asked[-1].text
+    assert "3 poses are saved" in lab.operator.asked[-1].text
 
 
 def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None:
@@ -266,7 +266,7 @@ def test_a_run_goes_on_in_its_own_mode_or_in_steps(begun: str, asked: str, in_st
 
 def test_a_resumed_run_is_open_with_its_poses_before_anything_is_checked(lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
-    lab.operator.answers["Type resume"] = ["quit"]
+    lab.operator.answers["resume:"] = ["quit"]
     with pytest.raises(Declined):
         lab.calibrate()
     run = lab.run()
@@ -281,7 +281,7 @@ def test_a_resumed_run_is_open_with_its_poses_before_anything_is_checked(lab: La
 
 def test_a_run_is_not_gone_on_with_another_tool(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
-    lab.operator.answers["Type resume"] = ["quit"]
+    lab.operator.answers["resume:"] = ["quit"]
     with pytest.raises(Declined):
         lab.calibrate()
     lab.arm.moves.clear()

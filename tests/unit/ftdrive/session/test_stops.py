@@ -94,7 +94,7 @@ FAULTS: dict[str, tuple[int, Callable[[Lab], None], Callable[[Lab], None], type[
         lambda lab: setattr(lab.arm, "gone", None),
         DeviceTimeout,
     ),
-    "somebody else's program": (
+    "another client's program": (
         21,
         lambda lab: lab.arm.set_status(program="stopped"),
         lambda lab: lab.arm.set_status(),
@@ -115,7 +115,7 @@ def test_a_fault_on_the_way_stops_the_arm_and_resume_goes_on(fault: str, lab: La
             mend(lab)
 
     lab.operator.on_event = on_event
-    lab.operator.answers["Type resume"] = ["resume"]
+    lab.operator.answers["resume:"] = ["resume"]
     outcome = lab.calibrate()
     assert outcome is not None
     (trip,) = lab.operator.of(GuardTripped)
@@ -166,17 +166,17 @@ def test_a_push_once_the_tool_is_known(lab: Lab) -> None:
         lab.sensor.push = np.array([0, 0, 0, 0, 2.0, 0])
 
     lab.arm.at_move[7] = push
-    lab.operator.answers["Type resume"] = ["quit"]
+    lab.operator.answers["resume:"] = ["quit"]
     with pytest.raises(DeviceFault, match="unexpected contact"):
         lab.calibrate()
     assert lab.operator.of(GuardTripped)[0].hazard == 14
 
 
-def test_resume_before_the_cause_is_mended_is_not_believed(lab: Lab) -> None:
+def test_resume_before_the_cause_is_fixed_is_refused(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: lab.arm.set_status(
         fault=DeviceFault("protective stop", "…"), safety_mode="protective stop"
     )
-    lab.operator.answers["Type resume"] = ["resume", "resume", "quit"]
+    lab.operator.answers["resume:"] = ["resume", "resume", "quit"]
     with pytest.raises(DeviceFault, match="protective stop"):
         lab.calibrate()
     assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet")]) == 2
@@ -191,7 +191,7 @@ def goals(lab: Lab) -> list[int]:
 
 def test_after_a_contact_the_arm_goes_back_or_round_it_where_a_person_says_so(lab: Lab) -> None:
     lab.push_on_the_way(4, 5, 7)  # to pose 4, back to pose 3, to pose 4 again
-    lab.operator.answers["Type resume"] = ["back", "back", "resume", "skip"]
+    lab.operator.answers["resume:"] = ["back", "back", "resume", "skip"]
     lab.calibrate()
     anywhere = ("resume", "skip", "back", "quit")
     assert lab.holds() == [anywhere, anywhere, ("resume", "skip", "quit"), anywhere]
@@ -218,7 +218,7 @@ def test_the_way_back_is_confirmed_by_a_person_though_the_plan_is_known(lab: Lab
         lab.operator.asked.clear()
         lab.arm.moves.clear()
         lab.push_on_the_way(3)
-        lab.operator.answers["Type resume"] = [answer, "quit"]
+        lab.operator.answers["resume:"] = [answer, "quit"]
         lab.operator.answers["the way back"] = ["no"]
         with suppress(Declined):
             lab.calibrate()
@@ -229,7 +229,7 @@ def test_the_way_back_is_confirmed_by_a_person_though_the_plan_is_known(lab: Lab
 
 def test_back_is_offered_only_on_the_way_from_a_pose_that_was_not_skipped(lab: Lab) -> None:
     lab.press((Key.PAUSE, StateChanged, 1), (Key.PAUSE, PoseTaken, 2))  # on the first approach; where the arm stands
-    lab.operator.answers["Type resume"] = ["resume"] * 3
+    lab.operator.answers["resume:"] = ["resume"] * 3
 
     def skip_then_pause() -> None:
         if len(lab.arm.moves) == 5 and not done:
@@ -245,13 +245,13 @@ def test_back_is_offered_only_on_the_way_from_a_pose_that_was_not_skipped(lab: L
 
 def test_a_pause_with_nobody_to_end_it_is_no_fault(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
-    with pytest.raises(Declined, match="paused by a person"):
+    with pytest.raises(Declined, match="paused by the operator"):
         lab.calibrate()
 
 
 def test_resume_with_something_still_pushing_is_not_believed_though_nobody_knows_the_tool(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: setattr(lab.sensor, "push", np.array([150.0, 0, 0, 0, 0, 0]))
-    lab.operator.answers["Type resume"] = ["resume", "quit"]
+    lab.operator.answers["resume:"] = ["resume", "quit"]
     with pytest.raises(DeviceFault, match="unexpected contact"):
         lab.calibrate()
     (refused,) = [event for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
@@ -270,7 +270,7 @@ def test_a_sensor_that_was_switched_off_may_have_another_zero(lab: Lab) -> None:
 
     lab.arm.at_move[2] = fail
     lab.operator.on_event = on_event
-    lab.operator.answers["Type resume"] = ["resume"]
+    lab.operator.answers["resume:"] = ["resume"]
     lab.calibrate()
     assert not [event for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
 
@@ -286,7 +286,7 @@ def test_a_sensor_that_comes_back_while_the_arm_stands_needs_nobody(lab: Lab) ->
     assert lab.calibrate() is not None
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     assert State.HOLD not in lab.operator.states()
-    assert any("begins anew" in event.words for event in lab.operator.of(Noted))
+    assert any("restarts" in event.words for event in lab.operator.of(Noted))
 
 
 def test_a_sensor_that_fails_twice_at_a_pose_needs_a_person(lab: Lab) -> None:
@@ -303,7 +303,7 @@ def test_a_sensor_that_fails_twice_at_a_pose_needs_a_person(lab: Lab) -> None:
     with pytest.raises(StreamBroken, match="a cable came off"):
         lab.calibrate()
     assert samplings == [3, 3]
-    assert len([event for event in lab.operator.of(Noted) if "begins anew" in event.words]) == 1
+    assert len([event for event in lab.operator.of(Noted) if "restarts" in event.words]) == 1
     assert lab.stops() == [1, 2]
 
 
@@ -317,7 +317,7 @@ def test_a_full_disk_holds_before_the_arm_moves_on(lab: Lab, monkeypatch: pytest
         commit(run, record)
 
     monkeypatch.setattr(Run, "commit", full)
-    lab.operator.answers["Type resume"] = ["resume"]
+    lab.operator.answers["resume:"] = ["resume"]
     lab.calibrate()
     assert lab.operator.of(GuardTripped)[0].hazard == 26
     assert failed == [3]
@@ -345,7 +345,7 @@ def test_an_arm_that_was_moved_while_a_way_waits_for_its_word_does_not_begin_it(
         lab.arm.q = lab.arm.q + np.radians([25.0, 0, 0, 0, 0, 0])
 
     lab.push_on_the_way(4)
-    lab.operator.answers["Type resume"] = answers
+    lab.operator.answers["resume:"] = answers
     lab.operator.at_question.append((f"The arm goes the {way}", move))
     with pytest.raises(DeviceFault, match=r"joint 1 is 25\.0° from"):
         lab.calibrate()
@@ -382,8 +382,8 @@ def test_the_controller_is_asked_for_the_way_on_itself(lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.PAUSE)
     lab.operator.on_event = on_event
     moves: list[int] = []
-    lab.operator.at_question.append(("Type resume", lambda: moves.append(len(lab.arm.moves))))
-    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    lab.operator.at_question.append(("resume:", lambda: moves.append(len(lab.arm.moves))))
+    lab.operator.answers["resume:"] = ["resume", "resume"]
     assert lab.calibrate() is not None
     assert moves == [4, 4]
     words = [event.words for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
@@ -420,7 +420,7 @@ QUESTIONS = ("Is the tool free", "Is the ball of", "Is the emergency stop in rea
 
 
 def hold_and_resume(lab: Lab, fault: Callable[[], None], mend: Callable[[], None]) -> None:
-    """Let something stop the arm in its fourth move, and be mended when a person is asked."""
+    """Let something stop the arm in its fourth move, and be gone when the operator is asked."""
 
     def on_event(event: Event) -> None:
         if isinstance(event, StateChanged) and event.state is State.HOLD:
@@ -431,7 +431,7 @@ def hold_and_resume(lab: Lab, fault: Callable[[], None], mend: Callable[[], None
 
     lab.arm.at_move[4] = fault
     lab.operator.on_event = on_event
-    lab.operator.answers.setdefault("Type resume", ["resume"])
+    lab.operator.answers.setdefault("resume:", ["resume"])
     lab.calibrate()
 
 
@@ -460,7 +460,7 @@ def test_the_controller_is_asked_for_every_pose_once_more_but_not_for_the_ways_b
 
     lab.operator.on_event = on_event
     lab.arm.at_move[4] = lambda: lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode="protective stop")
-    lab.operator.answers["Type resume"] = ["resume"]
+    lab.operator.answers["resume:"] = ["resume"]
     lab.calibrate()
     first, again = asked
     assert first > 50
@@ -477,7 +477,7 @@ def test_what_became_wrong_while_the_arm_stood_is_found_before_it_goes_on(lab: L
             lab.arm.remote = True
         held(event)
 
-    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    lab.operator.answers["resume:"] = ["resume", "resume"]
     lab.arm.at_move[4] = lambda: setattr(lab.sensor, "push", np.array([150.0, 0, 0, 0, 0, 0]))
 
     def held(event: Event) -> None:
@@ -493,7 +493,7 @@ def test_what_became_wrong_while_the_arm_stood_is_found_before_it_goes_on(lab: L
 
 def test_a_question_that_is_not_answered_with_yes_leads_back_to_the_hold(lab: Lab) -> None:
     lab.operator.answers["Is the emergency stop in reach"] = ["yes", "no", "yes"]
-    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    lab.operator.answers["resume:"] = ["resume", "resume"]
     hold_and_resume(
         lab,
         lambda: lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode="robot emergency stop"),
@@ -522,7 +522,7 @@ def test_reduced_mode_that_comes_a_second_time_is_confirmed_again(lab: Lab) -> N
         5: lab.arm.set_status,
         7: lambda: lab.arm.set_status(safety_mode="reduced"),
     }
-    lab.operator.answers["Type resume"] = ["resume"] * 3
+    lab.operator.answers["resume:"] = ["resume"] * 3
     asked: list[int] = []
     lab.operator.at_question.append(("in reduced mode", lambda: asked.append(len(lab.arm.moves))))
     assert lab.calibrate() is not None

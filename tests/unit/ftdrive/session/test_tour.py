@@ -23,7 +23,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
 from ftdrive.planning.show import view
 from ftdrive.session import preflight
-from ftdrive.session.completed import has_completed, remember_completed
+from ftdrive.session.completed_plans import has_completed, remember_completed
 from ftdrive.session.events import (
     Asked,
     Checked,
@@ -215,7 +215,7 @@ def test_a_pose_that_is_skipped_where_the_arm_stands_counts_against_the_plan(lab
 @pytest.mark.parametrize(("key", "answer"), [(Key.PAUSE, "resume"), (Key.PAUSE, "back"), (Key.STOP, "")])
 def test_a_move_that_was_broken_off_counts_against_the_plan(key: Key, answer: str, lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(key)
-    lab.operator.answers["poses are kept"] = [answer, "resume"]
+    lab.operator.answers["poses are saved"] = [answer, "resume"]
     if key is Key.STOP:
         with pytest.raises(Declined):
             lab.calibrate()
@@ -224,7 +224,7 @@ def test_a_move_that_was_broken_off_counts_against_the_plan(key: Key, answer: st
         lab.calibrate()
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     assert not has_run(lab)
-    assert "not driven so: from pose" in lab.said()
+    assert "moves replaced: from pose" in lab.said()
 
 
 def test_poses_taken_again_and_a_pause_while_one_is_measured_do_not_count_against_the_plan(lab: Lab) -> None:
@@ -236,7 +236,7 @@ def test_poses_taken_again_and_a_pause_while_one_is_measured_do_not_count_agains
     paused: list[bool] = []
     lab.sensor.collecting = pause
     lab.press((Key.REDO, PoseTaken, 1), (Key.REDO, StateChanged, 4))
-    lab.operator.answers["poses are kept"] = ["resume"]
+    lab.operator.answers["poses are saved"] = ["resume"]
     lab.calibrate()
     assert lab.taken() == [1, 1, 2, 3, 3, 4, 5, 6, 7]
     assert len(lab.holds()) == 1
@@ -252,7 +252,7 @@ def test_an_arm_that_tells_no_serial_number_runs_slowly_each_time_and_the_reason
         lab.calibrate(fast=True, yes=True)
         assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
         assert len([question for question in lab.operator.asked if "Type MOVE" in question.text]) == 1
-        assert lab.said().count("tells no serial number") == 2
+        assert lab.said().count("reports no serial number") == 2
         assert "every run of a plan" in lab.said()
     remember_completed(NOT_REPORTED, "p")  # as an earlier version did
     assert not has_completed(NOT_REPORTED, "p")

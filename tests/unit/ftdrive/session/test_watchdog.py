@@ -154,7 +154,7 @@ def test_a_stop_is_reported_when_it_is_done_or_after_a_fifth_of_a_second(takes_s
     assert told_s - begin_s == pytest.approx(told_after_s, abs=0.011)  # one look
 
 
-def test_a_stop_that_cannot_be_told_ends_no_guard_and_is_told_in_the_hold(lab: Lab) -> None:
+def test_a_stop_that_cannot_be_reported_ends_no_guard_and_is_shown_in_the_hold(lab: Lab) -> None:
     failed: list[bool] = []
 
     def on_event(event: Event) -> None:
@@ -167,12 +167,12 @@ def test_a_stop_that_cannot_be_told_ends_no_guard_and_is_told_in_the_hold(lab: L
 
     lab.push_on_the_way(3, 6)
     lab.operator.on_event = on_event
-    lab.operator.answers["Type resume"] = ["resume", "resume"]
+    lab.operator.answers["resume:"] = ["resume", "resume"]
     assert lab.calibrate() is not None
     assert failed == [True]
     diary = (lab.run().folder / "events.ndjson").read_text()
     assert diary.count('"guard-tripped"') == 2  # one for each of the two pushes
-    (note,) = [event.words for event in lab.operator.of(Noted) if "not told at once" in event.words]
+    (note,) = [event.words for event in lab.operator.of(Noted) if "reported late" in event.words]
     assert "the terminal takes no more" in note
     assert "unexpected contact" in note
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
@@ -243,7 +243,7 @@ def end(lab: Lab) -> None:
 
 def test_guards_that_ended_on_the_way_are_missed_at_once(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: end(lab)
-    lab.operator.answers["Type resume"] = ["resume", "quit"]
+    lab.operator.answers["resume:"] = ["resume", "quit"]
     with pytest.raises(DeviceFault, match="thread has ended"):
         lab.calibrate()
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [18]

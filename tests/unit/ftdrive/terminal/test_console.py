@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 from rich.console import Console
 from syrupy.assertion import SnapshotAssertion
 
-from ftdrive.checks.computer import Check
+from ftdrive.checks.check import Check
 from ftdrive.cli import cli, in_a_sentence
 from ftdrive.commands.doctor import _print
 from ftdrive.commands.live import _screen

@@ -61,13 +61,13 @@ def test_documented_packets(frame: str) -> None:
     assert packet(data[1:-2]) == data
 
 
-def test_documented_sample(sensor: RobotousSensor) -> None:
+def test_documented_sample(sensor: RobotousSensor[bytes]) -> None:
     assert sample_field(0x0B, [500, -250, 1000, 2000, -1000, 100], 0) == bytes.fromhex(SAMPLE)
     assert sensor.samples(2) == [bytes.fromhex(SAMPLE)] * 2
     assert sensor.execute(command("0A")) == [b"\x0a" + bytes.fromhex(SAMPLE)[1:]]
 
 
-def test_divisors_of_the_large_models(sensor: RobotousSensor) -> None:
+def test_divisors_of_the_large_models(sensor: RobotousSensor[bytes]) -> None:
     sensor.model = Model("RFT80-6A01", 50, 1000, (500,) * 3 + (20,) * 3)
     assert sensor.samples(1)[0].hex().upper() == "0B01F4FF0603E803E8FE0C003200" + "0000"
 
@@ -120,17 +120,17 @@ def test_damaged_packets_are_skipped_and_the_next_one_found() -> None:
         ("04 10 11 12", bytes.fromhex("04 00 01") + bytes(13)),
     ],
 )
-def test_commands(sensor: RobotousSensor, request_: str, response: bytes) -> None:
+def test_commands(sensor: RobotousSensor[bytes], request_: str, response: bytes) -> None:
     assert sensor.execute(command(request_)) == [response]
 
 
 @pytest.mark.parametrize("request_", ["00", "0B", "0C", "0D", "0E", "11 01", "11 00", "11 02", "13", "55", "FF"])
-def test_commands_without_reply(sensor: RobotousSensor, request_: str) -> None:
+def test_commands_without_reply(sensor: RobotousSensor[bytes], request_: str) -> None:
     assert sensor.execute(command(request_)) == []
 
 
 @pytest.mark.parametrize(("code", "rate_hz"), list(enumerate([200, 10, 20, 50, 100, 200, 333, 500, 1000])))
-def test_rates(code: int, rate_hz: int, sensor: RobotousSensor) -> None:
+def test_rates(code: int, rate_hz: int, sensor: RobotousSensor[bytes]) -> None:
     sensor.execute(command(f"0F {code:02X}"))
     assert sensor.execute(command("10"))[0][1] == code
     if rate_hz < 1000:
@@ -142,7 +142,7 @@ def test_rates(code: int, rate_hz: int, sensor: RobotousSensor) -> None:
     assert sensor.rate_hz == rate_hz
 
 
-def test_settings_read_back_and_those_of_the_line_wait_for_a_reboot(sensor: RobotousSensor) -> None:
+def test_settings_read_back_and_those_of_the_line_wait_for_a_reboot(sensor: RobotousSensor[bytes]) -> None:
     sensor.execute(command("06 01"))
     sensor.execute(command("08 01 05"))
     assert sensor.execute(command("07"))[0][:3] == bytes.fromhex("07 00 01")
@@ -174,7 +174,7 @@ def test_while_streaming_only_stop_and_bias_are_taken(sensor: RobotousSerialBox)
     assert not sensor.streaming
 
 
-def test_bias_is_taken_lifted_and_lost(sensor: RobotousSensor, readings: Readings) -> None:
+def test_bias_is_taken_lifted_and_lost(sensor: RobotousSensor[bytes], readings: Readings) -> None:
     sensor.execute(command("11 01"))
     readings.wrench = 2 * WRENCH
     assert sensor.samples(1) == [bytes.fromhex(SAMPLE)]
@@ -187,7 +187,7 @@ def test_bias_is_taken_lifted_and_lost(sensor: RobotousSensor, readings: Reading
 
 
 @pytest.mark.parametrize("axis", range(6))
-def test_overload_bits_and_counts(sensor: RobotousSensor, readings: Readings, axis: int) -> None:
+def test_overload_bits_and_counts(sensor: RobotousSensor[bytes], readings: Readings, axis: int) -> None:
     for wrench in (WRENCH, WRENCH + 210 * np.eye(6)[axis], WRENCH - 400 * np.eye(6)[axis], WRENCH):
         readings.wrench = wrench
         loaded = wrench is not WRENCH
@@ -195,7 +195,7 @@ def test_overload_bits_and_counts(sensor: RobotousSensor, readings: Readings, ax
     assert list(sensor.execute(command("12"))[0][1:7]) == [int(i == axis) for i in range(6)]
 
 
-def test_saturated_axis_and_overload_knob(sensor: RobotousSensor) -> None:
+def test_saturated_axis_and_overload_knob(sensor: RobotousSensor[bytes]) -> None:
     sensor.saturated_axis = 2
     sensor.overload = 0x01
     field = sensor.samples(1)[0]
@@ -203,12 +203,12 @@ def test_saturated_axis_and_overload_knob(sensor: RobotousSensor) -> None:
     assert field[13] == 0x09
 
 
-def test_readings_are_clipped_not_wrapped(sensor: RobotousSensor, readings: Readings) -> None:
+def test_readings_are_clipped_not_wrapped(sensor: RobotousSensor[bytes], readings: Readings) -> None:
     readings.wrench = np.array([1000, -1000, 0, 0, 0, 0.0])
     assert sensor.samples(1)[0][1:5] == b"\x7f\xff\x80\x00"
 
 
-def test_one_reading_per_sample(sensor: RobotousSensor, readings: Readings) -> None:
+def test_one_reading_per_sample(sensor: RobotousSensor[bytes], readings: Readings) -> None:
     sensor.samples(7)
     sensor.execute(command("0A"))
     assert readings.made == 8

@@ -240,7 +240,7 @@ def test_a_hand_moves_the_arm_without_a_program_at_its_own_speed() -> None:
     assert robot.runtime == Runtime.STOPPED
     assert robot.arm.actual_qd[5] == pytest.approx(0.4, rel=1e-6)
     assert robot.arm.q[5] == pytest.approx(robot.arm.actual_q[5], abs=0.4 * 0.006)
-    robot.hand_move(HOME, 0.4)  # the person changes her mind: the arm turns round without a jump
+    robot.hand_move(HOME, 0.4)  # the operator turns back: the arm follows without a jump
     q_rad = [robot.arm.q[5]]
     for _ in range(2000):
         robot.tick()
@@ -250,7 +250,7 @@ def test_a_hand_moves_the_arm_without_a_program_at_its_own_speed() -> None:
     assert robot.arm.at_rest
 
 
-def test_nobody_moves_an_arm_by_hand_that_a_program_or_its_brakes_hold() -> None:
+def test_an_arm_held_by_a_program_or_its_brakes_cannot_be_moved_by_hand() -> None:
     with pytest.raises(ValueError, match="a program plays"):
         moving_robot().hand_move(GOAL, 0.4)
     robot = new_robot()

@@ -1,5 +1,6 @@
 """The controller's cycles and samples follow the cell's clock, whatever the computer does."""
 
+import os
 import selectors
 import socket
 import struct
@@ -188,7 +189,31 @@ def test_a_client_that_never_reads_is_disconnected_in_the_end(controller: Contro
         assert controller.clock.now_s() - begun_s >= BACKLOG_LIMIT_S
 
 
-def test_the_diary_is_in_the_time_of_the_cell(controller: Controller) -> None:
+def test_the_event_log_is_in_the_time_of_the_cell(controller: Controller) -> None:
     controller.real.pass_s(5.0)
     controller.robot.note("operator", "slider")
     assert controller.robot.events[-1].t_host_ns == controller.clock.now_ns()
+
+
+def test_while_the_clock_is_held_a_client_that_commands_gets_the_last_sample_again(controller: Controller) -> None:
+    """ur_rtde stops the program and uploads it again after 2.5 s of real time without a sample."""
+
+    def serve(real_s: float) -> None:
+        end_ns = controller.real.ns + round(real_s * 1e9)
+        controller.server.run(lambda: controller.real.ns >= end_ns)
+
+    controller.clock._page[4], controller.clock._page[5] = os.getpid(), controller.clock.now_ns()  # a starved follower
+    address = (controller.server.host, 30004)
+    with socket.create_connection(address, 10.0) as commands, socket.create_connection(address, 10.0) as reads:
+        serve(0.05)
+        for client in (commands, reads):
+            client.sendall(struct.pack(">HBd", 3 + 8 + 9, ord("O"), 125.0) + b"timestamp" + b"\x00\x03S")
+        commands.sendall(struct.pack(">HB", 3 + 20, ord("I")) + b"input_int_register_0")
+        serve(0.05)
+        held_cycle = controller.robot.cycle
+        serve(4.0)
+        samples, others = (
+            client.recv(65536).split(struct.pack(">HBB", 3 + 1 + 8, ord("U"), 1))[1:] for client in (commands, reads)
+        )
+    assert controller.robot.cycle == held_cycle
+    assert (len(samples), len(set(samples)), others) == (8, 1, [])

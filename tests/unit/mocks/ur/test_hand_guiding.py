@@ -1,6 +1,4 @@
-"""The emulated person who guides the arm, and their program on the pendant: where the wrist goes, how fast, how long it
-rests, and what both put up with.
-"""
+"""The emulated operator who guides the arm, and the program on the pendant: poses, speed, rests and interruptions."""
 
 import math
 from itertools import pairwise
@@ -8,7 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mocks.kinematics import MODELS, Array, Vector6, forward, vector6
+from mocks.arrays import Array
+from mocks.kinematics import MODELS, Vector6, forward, vector6
 from mocks.ur.hand import IN_A_PROGRAM, SPEED_RAD_S, guided_by_hand, orientations, pendant_program
 from mocks.ur.modes import Runtime
 from mocks.ur.robot import Robot, RobotSettings

@@ -53,14 +53,15 @@ def test_a_stream_keeps_a_frame_back_until_the_next_one() -> None:
 
 
 @pytest.mark.parametrize(("faults", "low", "high"), [(Faults(drop=0.1), 850, 950), (Faults(duplicate=0.1), 1050, 1150)])
-def test_chances_are_as_told_and_seeded(faults: Faults, low: int, high: int) -> None:
+def test_chances_are_as_configured_and_seeded(faults: Faults, low: int, high: int) -> None:
     assert low < len(sent(faults, NUMBERED)) < high
     assert sent(faults, NUMBERED, seed=5) == sent(faults, NUMBERED, seed=5) != sent(faults, NUMBERED, seed=6)
 
 
 def test_foreign_frames_precede_and_can_frames_stay_whole() -> None:
     alien, own = CanFrame(0x7FF), CanFrame(1, b"12345678")
-    wire = FaultyWire(Faults(foreign=1, corrupt=1, byte_slip=1), CLOCK, foreign=lambda _rng: alien)
+    wire: FaultyWire[CanFrame] = FaultyWire(Faults(foreign=1, corrupt=1, byte_slip=1), CLOCK)
+    wire.foreign = lambda _rng: alien
     wire.put([own, own])
     assert wire.due(LATER_S) == [alien, own, alien, own]
 

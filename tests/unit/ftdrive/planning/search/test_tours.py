@@ -117,9 +117,9 @@ def test_cone_that_cannot_be_is_refused(half_angle_rad: float, words: str) -> No
         plan_cone(certifier, half_angle_rad=half_angle_rad, speeds=Speeds(), guess=guess_of(certifier))
 
 
-def test_poses_that_cannot_tell_everything_are_no_plan() -> None:
+def test_poses_that_leave_a_parameter_unobservable_are_refused() -> None:
     certifier = certifier_of()
-    with pytest.raises(PlanRefused, match="not different enough"):
+    with pytest.raises(PlanRefused, match="informative enough"):
         plan_cone(certifier, poses=6, half_angle_rad=1e-6, speeds=Speeds(), guess=guess_of(certifier))
 
 

@@ -49,7 +49,7 @@ def test_the_slider_begins_where_the_arm_stands(plan: Plan) -> None:
     np.testing.assert_allclose(q[0], way[0])
     np.testing.assert_allclose(q[move >= 0], alone)
     assert np.abs(np.diff(q, axis=0)).max() <= np.radians(3) + 1e-9
-    assert "From where the arm stands" in describe(plan, int(move[0]))
+    assert "From the present posture" in describe(plan, int(move[0]))
 
 
 @given(st.floats(0, 1), st.floats(0, 0.5), st.floats(0, 0.2))

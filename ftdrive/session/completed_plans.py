@@ -1,4 +1,4 @@
-"""Which plans have run to their end on which arm: only those may run at full speed, or without a typed word."""
+"""Register of plans that were driven to their end, by arm: only those may run fast, or without a typed word."""
 
 import json
 import os
@@ -11,16 +11,16 @@ FORMAT = "ftdrive.completed/1"
 
 
 def state_file() -> Path:
-    """Where a user's completed plans are remembered; it need not exist."""
+    """Return the user's register of completed plans; it need not exist."""
     home = os.environ.get("XDG_STATE_HOME", "")
     folder = Path(home) if Path(home).is_absolute() else Path("~/.local/state").expanduser()
     return folder / "ftdrive" / "completed.ndjson"
 
 
 def has_completed(arm_serial: str, plan_sha256: str) -> bool:
-    """Tell whether this plan has run to its end on this arm before. A line that cannot be read counts for nothing.
+    """Whether this arm has driven this plan to its end before; unreadable lines are ignored.
 
-    Never on an arm that tells no serial number: nobody knows whether it is the same one.
+    False for an arm that reports no serial number, because it may be another one.
     """
     path = state_file()
     if arm_serial == NOT_REPORTED or not path.is_file():
@@ -33,7 +33,7 @@ def has_completed(arm_serial: str, plan_sha256: str) -> bool:
 
 
 def remember_completed(arm_serial: str, plan_sha256: str) -> None:
-    """Note that it has: slowly, all of its own moves in one session, and every pose of it was taken."""
+    """Record that one session drove every move of the plan, slowly, and took every pose."""
     path = state_file()
     path.parent.mkdir(parents=True, exist_ok=True)
     line = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256, "utc": datetime.now(UTC).isoformat()}
