@@ -14,24 +14,23 @@ from ftdrive import __version__, _siblings
 
 # A command, its module, its line in the help. The module is imported only when the command is called: help is fast.
 _COMMANDS = {
-    "demo": ("ftdrive.commands.demo", "Calibrate an emulated cell: nothing to connect, half a minute."),
-    "init": ("ftdrive.commands.init", "Describe a cell: asks, looks, writes ftdrive.toml. Moves nothing."),
-    "config": ("ftdrive.commands.config", "Show the configuration, and where it comes from."),
-    "plan": ("ftdrive.commands.plan", "Plan a tour that is proven clear; needs no robot."),
-    "calibrate": ("ftdrive.commands.calibrate", "Take an arm through the tour, average its sensor, solve."),
-    "doctor": ("ftdrive.commands.doctor", "Is everything connected, quiet and permitted? Moves nothing."),
+    "demo": ("ftdrive.commands.demo", "Calibrate an emulated cell: no hardware, 25 s."),
+    "init": ("ftdrive.commands.init", "Ask about the cell, probe it, write ftdrive.toml. Moves nothing."),
+    "config": ("ftdrive.commands.config", "Show the configuration and the source of each value."),
+    "plan": ("ftdrive.commands.plan", "Plan a tour proven clear of collisions. Needs no robot."),
+    "calibrate": ("ftdrive.commands.calibrate", "Drive the tour, average the sensor at each pose, solve."),
+    "doctor": ("ftdrive.commands.doctor", "Check robot, sensor and computer. Moves nothing."),
     "devices": ("ftdrive.commands.devices", "List serial ports and CAN interfaces."),
     "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
     "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
     "replay": ("ftdrive.commands.replay", "Repeat a recorded run through the same routine and solver."),
-    "export": ("ftdrive.commands.export", "Write a plan as a program for the pendant, or as a table."),
+    "export": ("ftdrive.commands.export", "Write a plan as a program for the pendant or as a table."),
     "transcript": ("ftdrive.commands.transcript", "Record or play the bytes on a sensor's wire."),
 }
 
 _EPILOG = """\
 Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,
-5 device fault, 6 file unreadable or not what it should be, 7 not acceptable (not observable, rejected),
-130 interrupted (data kept)."""
+5 device fault, 6 file cannot be read or written, 7 check or acceptance failed, 130 interrupted (data kept)."""
 
 
 class _LazyGroup(click.Group):
@@ -50,8 +49,8 @@ class _LazyGroup(click.Group):
 
 
 @click.group(cls=_LazyGroup, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
-@click.option("-v", "--verbose", count=True, help="Say more on stderr; twice for everything.")
-@click.option("-q", "--quiet", is_flag=True, help="Only errors on stderr; before a question, what it is about.")
+@click.option("-v", "--verbose", count=True, help="Print details on stderr; -vv also prints debug messages.")
+@click.option("-q", "--quiet", is_flag=True, help="Print only errors and, before a question, the text it refers to.")
 @click.version_option(__version__, prog_name="ftdrive")
 def cli(verbose: int, quiet: bool) -> None:
     """Calibrate a wrist force/torque sensor on a Universal Robots arm, and see the true contact force.
@@ -59,16 +58,16 @@ def cli(verbose: int, quiet: bool) -> None:
     New here? `ftdrive demo` needs no hardware.
     """
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logger = logging.StreamHandler() if quiet else _Talk()
+    logger = logging.StreamHandler() if quiet else _TalkHandler()
     logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[logger])
-    if quiet:
+    if quiet or verbose:
         from ftdrive.terminal.console import talk
 
-        talk.quiet = True
+        talk.quiet, talk.verbose = quiet, bool(verbose)
 
 
-class _Talk(logging.Handler):
-    """To where people are told things, above a live screen if there is one."""
+class _TalkHandler(logging.Handler):
+    """Prints log records on stderr, above a live screen if there is one."""
 
     def emit(self, record: logging.LogRecord) -> None:
         from ftdrive.terminal.console import talk
@@ -77,7 +76,7 @@ class _Talk(logging.Handler):
 
 
 def exit_code(error: BaseException) -> int | None:
-    """Exit code of an error that a user can mend; None for a defect of ours."""
+    """Return the exit code of an error that a user can fix; None for a defect of ftdrive."""
     from calib.errors import BadCalibration, BadDataset, CalibError, TooFewSamples
     from drivers.errors import ConnectError, DeviceFault, DriverError
     from drivers.transcript.recorder import BadTranscript
@@ -101,7 +100,7 @@ def exit_code(error: BaseException) -> int | None:
 
 
 def in_a_sentence(error: BaseException) -> str:
-    """Say an error; one of the system with its file and what to look at, where it would be a number and two words."""
+    """Return the message of an error; for an error of the system also its file and what to check."""
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}: check this path, and who may read and write there"
     if isinstance(error, OSError) and error.errno == ENOSPC:
@@ -127,8 +126,8 @@ def run(arguments: Sequence[str]) -> int:
     except click.ClickException as error:
         from ftdrive.terminal.console import in_whole_words
 
-        error.show(told := StringIO())
-        click.echo(in_whole_words(told.getvalue(), sys.stderr), err=True, nl=False)
+        error.show(message := StringIO())
+        click.echo(in_whole_words(message.getvalue(), sys.stderr), err=True, nl=False)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         click.echo("interrupted", err=True)

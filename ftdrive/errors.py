@@ -1,4 +1,4 @@
-"""What can go wrong in the application itself."""
+"""Errors of the application itself."""
 
 
 class ConfigError(Exception):
@@ -6,16 +6,16 @@ class ConfigError(Exception):
 
 
 class NotAccepted(Exception):
-    """The result is not good enough to be kept, or differs from what it must equal."""
+    """A check failed, or a result is rejected or differs from the one it must equal."""
 
 
 class BadPlan(Exception):
-    """A file is no plan."""
+    """A file does not contain a valid plan."""
 
 
 class PlanRefused(NotAccepted):
-    """No motion is proven clear, or a plan was made for something else than what is there now."""
+    """No motion is proven clear, or a plan was made for another cell."""
 
 
 class Declined(Exception):
-    """A person said no to what was asked, or nobody was there to answer."""
+    """The operator answered no, or the input ended before an answer."""

@@ -1,8 +1,7 @@
-"""`ftdrive calibrate`: the job on a real cell."""
+"""`ftdrive calibrate`: a guided calibration."""
 
-from collections.abc import Collection
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,37 +29,35 @@ _EXCLUDE_ONE_ANOTHER = (
     "--tool",
     multiple=True,
     metavar="FROM:TO:DIAMETER[:X:Y]",
-    help="A cylinder of what is mounted, sensor included, in mm from the flange face; not those of [tool]. Repeatable.",
+    help="A cylinder of tool and sensor, mm from the flange face; replaces those of [tool]. Repeatable.",
 )
-@click.option("--simulate", is_flag=True, help="An emulated cell; --sensor emulated://NAME chooses its sensor.")
+@click.option("--simulate", is_flag=True, help="Use an emulated cell; --sensor emulated://NAME chooses its sensor.")
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses.")
 @click.option("--step", is_flag=True, help="Wait for Enter before each move.")
 @click.option(
-    "--fast", is_flag=True, help="At the plan's speed, once it has run to its end slowly: 60 °/s, 250 mm/s at most."
+    "--fast", is_flag=True, help="Full speed of the plan (60 °/s, 250 mm/s at most), after one complete slow run."
 )
-@click.option("--manual", is_flag=True, help="No motion at all: you move the arm, ftdrive tells where to.")
-@click.option("--listen", is_flag=True, help="No motion at all: a program on the pendant moves the arm.")
-@click.option("--dry-run", is_flag=True, help="Plan, show, check all that can be seen without control; nothing moves.")
+@click.option("--manual", is_flag=True, help="No motion commands: you move the arm, ftdrive shows where to.")
+@click.option("--listen", is_flag=True, help="No motion commands: a program on the pendant moves the arm.")
+@click.option("--dry-run", is_flag=True, help="Plan and check without control of the arm; nothing moves.")
 @click.option("--output", type=NewFile(), help="Save the plan as a new JSON file.")
 @click.option("--png", type=NewFile(), help="Save stick figures (needs ftdrive[viz]).")
-@click.option("--view", is_flag=True, help="Show the plan in the browser first, until you answer (needs ftdrive[viz]).")
-@click.option("--plan", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="A plan made before.")
+@click.option("--view", is_flag=True, help="Show the plan in the browser before the questions (needs ftdrive[viz]).")
+@click.option("--plan", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Use this plan.")
 @click.option(
     "--resume",
     type=click.Path(exists=True, file_okay=False, path_type=Path),
-    help="Go on with a run that was ended: in its way, with its options, and the files of settings as they are now.",
+    help="Continue an interrupted run in its mode, with its options and the present configuration files.",
 )
-@click.option("--redo", type=int, multiple=True, metavar="N", help="With --resume: take pose N again. Repeatable.")
+@click.option("--redo", type=int, multiple=True, metavar="N", help="With --resume: repeat pose N. Repeatable.")
 @click.option(
     "--yes",
     is_flag=True,
-    help="Answer what may be answered without a person; never a first run, nor a way of the whole arm.",
+    help="Answer the safety questions automatically; never a first run, nor a move of the whole arm.",
 )
 @runs()
-@click.option(
-    "--json", "as_json", is_flag=True, help="One JSON object a line on stdout: events, questions, the result."
-)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line: events, questions, the result.")
 def calibrate(
     config: Path | None,
     robot: str | None,
@@ -84,10 +81,11 @@ def calibrate(
     runs: Path,
     as_json: bool,
 ) -> None:
-    """Take the arm through 24 orientations, average the sensor at each, and solve.
+    """Move the arm through 24 orientations, average the sensor at each, and solve.
 
-    Every move is proven clear and shown before it happens; a first motion needs a typed word and is slow. Where the arm
-    has room only the three wrist joints move. Ctrl-C stops the arm; what was taken is kept and --resume goes on.
+    Every move is proven clear and shown before it happens. The first run of a plan is slow and starts after a typed
+    word. If there is room, only the three wrist joints move. Ctrl-C stops the arm; the poses are kept, and --resume
+    continues.
     """
     from ftdrive.cell.emulated import MOVED_BY, Station, sensor_name
     from ftdrive.errors import Declined
@@ -98,28 +96,12 @@ def calibrate(
     from ftdrive.terminal.report import print_result
     from ftdrive.terminal.screen import open_operator
 
-    given = {
-        "--step": step,
-        "--manual": manual,
-        "--listen": listen,
-        "--quick": quick,
-        "--minimal": minimal,
-        "--output": output,
-        "--png": png,
-        "--view": view,
-        "--plan": plan,
-        "--resume": resume,
-        "--simulate": simulate,
-        "--config": config,
-        "--robot": robot,
-        "--tool": tool,
-    }
-    _refuse_contradictions([option for option, value in given.items() if value])
+    _refuse_contradictions(click.get_current_context())
     mode: Mode = "step" if step else "manual" if manual else "listen" if listen else "auto"
     with ExitStack() as stack:
         description: dict[str, Any] = {}
         made_by = {} if resume is None else Run(resume).header_to_resume().get("station") or {}
-        simulate = simulate or bool(made_by and not (config or robot or tool))  # a run goes on where it was begun
+        simulate = simulate or bool(made_by and not (config or robot or tool))  # a resumed run keeps its cell
         if simulate:
             name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
             station = stack.enter_context(Station(name, made_by.get("options", ())))
@@ -127,7 +109,7 @@ def calibrate(
             description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
         else:
             said = Said(str(config.absolute()) if config else None, robot, sensor, tool)
-            description = {"said": said.to_dict()}
+            description = {"said": asdict(said)}
             cell = said.cell() if resume is None else _cell_to_resume(resume, said)
         options = Options(
             runs,
@@ -156,7 +138,7 @@ def calibrate(
             talk.print(str(error))
             raise click.Abort from error
     if outcome is None:
-        talk.print("A dry run: nothing has moved.")
+        talk.print("Dry run: nothing has moved.")
         return
     if as_json:
         write_json(_as_json(outcome))
@@ -166,9 +148,10 @@ def calibrate(
     stop_unless_accepted(outcome.result, to_be_saved=True)
 
 
-def _refuse_contradictions(given: Collection[str]) -> None:
+def _refuse_contradictions(context: click.Context) -> None:
     from ftdrive.errors import ConfigError
 
+    given = [f"--{name.replace('_', '-')}" for name, value in context.params.items() if value]
     for group in _EXCLUDE_ONE_ANOTHER:
         both = [option for option in group if option in given]
         if len(both) > 1:
@@ -177,19 +160,15 @@ def _refuse_contradictions(given: Collection[str]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """Options that have a say in the cell. A run keeps them, so that it is resumed with the same."""
+    """Options that describe the cell. A run keeps them, so that it is resumed with the same values."""
 
     config: str | None = None
     robot: str | None = None
     sensor: str | None = None
     tool: tuple[str, ...] = ()
 
-    def to_dict(self) -> dict[str, Any]:
-        """Give what run.json keeps."""
-        return {"config": self.config, "robot": self.robot, "sensor": self.sensor, "tool": list(self.tool)}
-
     def settings(self) -> dict[str, Any]:
-        """Give these options, environment and files, in this order of precedence; see `cell.config.settings`."""
+        """Return options, environment and files, in this order of precedence; see `cell.config.settings`."""
         from ftdrive.cell.config import settings
 
         flags = {
@@ -200,24 +179,24 @@ class Said:
         return settings(None if self.config is None else Path(self.config), flags)
 
     def cell(self) -> "CellConfig":
-        """Put the cell together."""
+        """Return the cell."""
         from ftdrive.cell.config import cell_of
 
         return cell_of(self.settings())
 
 
 def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
-    """Cell of a run that goes on: with the options it was begun with, where they are not given anew.
+    """Return the cell of a resumed run: options given now replace those of the run.
 
-    Tool and surroundings are those that files and environment describe now: when they are not those of the plan, it is
-    refused. Where nothing describes them any more, the run's own record counts.
+    Files and environment describe tool and surroundings as they are now; the session refuses to continue if they differ
+    from those of the plan. If no file describes them any more, the run's own record is used.
     """
     from ftdrive.cell.config import Setting, cell_of, recorded_cell
     from ftdrive.runs.run import Run
     from ftdrive.terminal.console import talk
 
     header = Run(folder).header()
-    begun: dict[str, Any] = {**Said().to_dict(), **header.get("said", {})}
+    begun: dict[str, Any] = {**asdict(Said()), **header.get("said", {})}
     if begun["config"] is not None and not Path(begun["config"]).is_file():
         begun["config"] = None
     said = Said(
@@ -227,15 +206,15 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
         said.tool or tuple(begun["tool"]),
     )
     found, before = said.settings(), recorded_cell(header["config"])
-    nobody = {"default", "not set", "--tool"}
-    origins = {one.origin for key, one in found.items() if key.startswith(("tool.", "workcell."))} - nobody
+    undescribed = {"default", "not set", "--tool"}
+    origins = {one.origin for key, one in found.items() if key.startswith(("tool.", "workcell."))} - undescribed
     if origins:
-        talk.print(f"Tool and surroundings as they are described now: {', '.join(sorted(origins))}.")
+        talk.print(f"Tool and surroundings are read from {', '.join(sorted(origins))}.")
         for key, value in (("robot.host", before.robot.host), ("sensor.url", before.sensor.url)):
             if found[key].value is None:
                 found[key] = Setting(value, str(folder))
         return cell_of(found)
-    talk.print("Settings as the run was begun: no file here describes tool and surroundings.")
+    talk.print("No file describes tool and surroundings: the settings of the run are used.")
     cylinders_mm = found["tool.cylinders_mm"].value or before.tool.cylinders_mm
     return replace(
         before,
@@ -246,7 +225,7 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
 
 
 def _as_json(outcome: "Outcome") -> dict[str, Any]:
-    """Give the run, the result, and what the report says beside: pose 1 seen again, and what probably happened."""
+    """Return the run, the result, the drift check of pose 1, and the hints of the report."""
     from ftdrive.runs.pose_hints import hints
 
     drift = outcome.drift

@@ -18,11 +18,11 @@ JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on 
 
 
 MODEL = click.option(
-    "--model", help="Of the arm, where the controller does not tell it (CB3 before 3.12, e-Series before 5.6)."
+    "--model", help="Model of the arm, for controllers that do not report it (CB3 before 3.12, e-Series before 5.6)."
 )
 
 
-def runs(words: str = "Folder in which the run's own folder is made.") -> Callable[[F], F]:
+def runs(words: str = "Parent folder of the new run folder.") -> Callable[[F], F]:
     """Make the option --runs."""
     kind = click.Path(file_okay=False, path_type=Path)
     return click.option("--runs", type=kind, default=Path("runs"), show_default=True, help=words)
@@ -31,19 +31,19 @@ def runs(words: str = "Folder in which the run's own folder is made.") -> Callab
 CONFIG = click.option(
     "--config",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="The cell, in TOML, in place of ftdrive.toml here.",
+    help="TOML file that describes the cell, instead of ./ftdrive.toml.",
 )
 
 
 def CELL(command: F) -> F:
-    """Add the options --config, --robot and --sensor, which say what `read_cell` reads."""
-    sensor_help = "Such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0."
+    """Add the options --config, --robot and --sensor, which `read_cell` takes."""
+    sensor_help = "Address, such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0."
     command = click.option("--sensor", metavar="URL", help=sensor_help)(command)
     return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller.")(command))
 
 
 class Number(click.FloatRange):
-    """A number of a range. `click` takes nan for one of any range."""
+    """A finite number within a range; `click` alone accepts nan."""
 
     name = "number"
 
@@ -58,7 +58,7 @@ class Number(click.FloatRange):
 
 
 class NewFile(click.Path):
-    """A file that a command makes: refused before any work where one is there already, or where its folder is not."""
+    """A file that a command creates. It is rejected before any work if it exists or its folder does not."""
 
     def __init__(self) -> None:
         super().__init__(dir_okay=False, path_type=Path)
@@ -76,31 +76,31 @@ class NewFile(click.Path):
         return path
 
 
-def simulate(words: str = "An emulated cell; --sensor emulated://NAME chooses its sensor.") -> Callable[[F], F]:
-    """Make the option --simulate, which every command has."""
+def simulate(words: str = "Use an emulated cell; --sensor emulated://NAME chooses its sensor.") -> Callable[[F], F]:
+    """Make the option --simulate, which every command accepts."""
     return click.option("--simulate", is_flag=True, help=words)
 
 
-EMULATED_SENSOR = click.option("--sensor", metavar="emulated://NAME", help="With --simulate: the sensor it has.")
+EMULATED_SENSOR = click.option("--sensor", metavar="emulated://NAME", help="With --simulate: the emulated sensor.")
 
 
 def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated: Mapping[str, object] = {}) -> None:
-    """Raise `ConfigError` for an option, by name, that would be ignored.
+    """Raise `ConfigError` for an option that would be ignored.
 
     Parameters
     ----------
     real, emulated : mapping
-        What goes only without, and only with --simulate; None, False and nothing at all were not given.
+        Values by option that require a real cell, and that require --simulate. None, False and empty mean not given.
     """
     from ftdrive.errors import ConfigError
 
-    if said := [option for option, value in (real if simulate else emulated).items() if value]:
-        cure = "leave one of the two out" if simulate else "add --simulate, or leave it out"
-        raise ConfigError(f"{said[0]} {'does not go with' if simulate else 'goes only with'} --simulate: {cure}")
+    if given := [option for option, value in (real if simulate else emulated).items() if value]:
+        fix = "leave one of the two out" if simulate else "add --simulate, or leave it out"
+        raise ConfigError(f"{given[0]} {'does not go with' if simulate else 'goes only with'} --simulate: {fix}")
 
 
 def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> list[float]:
-    """Read the numbers in the value of an option; raises `ConfigError` unless there are as many as asked for."""
+    """Read the numbers in the value of an option; raises `ConfigError` unless their count is one of `counts`."""
     from math import isfinite
 
     from ftdrive.errors import ConfigError
@@ -116,7 +116,7 @@ def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> li
 
 
 def rows(option: str, texts: Sequence[str], counts: Sequence[int]) -> list[list[float]] | None:
-    """Read an option that may be repeated, numbers separated by colons; None where it was not given."""
+    """Read a repeatable option, numbers separated by colons; None if it was not given."""
     return [numbers(option, text, ":", counts) for text in texts] or None
 
 
@@ -126,7 +126,7 @@ def write_json(value: Mapping[str, Any]) -> None:
 
 
 def read_cell(config: Path | None, robot: str | None, sensor: str | None, *, model: str | None = None) -> "CellConfig":
-    """Take the cell from options, environment and files, in this order of precedence."""
+    """Read the cell from options, environment and files, in this order of precedence."""
     from ftdrive.cell.config import load
 
     flags = {"robot.host": ("--robot", robot), "robot.model": ("--model", model), "sensor.url": ("--sensor", sensor)}
@@ -134,7 +134,7 @@ def read_cell(config: Path | None, robot: str | None, sensor: str | None, *, mod
 
 
 def stop_unless_accepted(result: "CalibrationResult", *, to_be_saved: bool = False) -> None:
-    """Raise `NotAccepted` for a rejected result, which says so where somebody waits for its file."""
+    """Raise `NotAccepted` for a rejected result; its message mentions the missing file if one was requested."""
     from ftdrive.errors import NotAccepted
 
     if result.verdict == "rejected":

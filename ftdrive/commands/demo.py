@@ -1,9 +1,8 @@
-"""`ftdrive demo`: the whole job on an emulated cell, truth beside estimate."""
+"""`ftdrive demo`: a calibration of an emulated cell, with the truth beside each estimate."""
 
 import os
 from pathlib import Path
 from shlex import quote
-from typing import Any
 
 import click
 import numpy as np
@@ -12,26 +11,24 @@ from ftdrive.cell.emulated import SENSORS, Station
 from ftdrive.cell.emulated_run import rehearse
 from ftdrive.commands.common import JSON, runs, stop_unless_accepted, write_json
 from ftdrive.terminal.console import talk
-from ftdrive.terminal.report import errors_in_sigma, print_result
+from ftdrive.terminal.report import compensation_error, errors_in_sigma, print_result
 
 
 @click.command()
-@click.option("--sensor", type=click.Choice(list(SENSORS)), default="can", show_default=True, help="Which one.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Draws the truth and the noise.")
-@click.option("--simulate", is_flag=True, expose_value=False, help="As every command has it; a demo always is.")
+@click.option("--sensor", type=click.Choice(list(SENSORS)), default="can", show_default=True, help="Emulated sensor.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the random truth and noise.")
+@click.option("--simulate", is_flag=True, expose_value=False, help="Always on; every command accepts it.")
 @runs()
 @JSON
 def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
-    """Calibrate an emulated cell: nothing is connected, nothing real moves.
+    """Calibrate an emulated cell: no real device is connected or moved. Takes about 25 s.
 
-    A UR5e and a sensor are emulated in a process of their own, down to the bytes on their wires; the arm lives 20 times
-    faster. Everything on this side is what a real cell gets.
+    A UR5e and a sensor are emulated in another process, down to the bytes on their wires. The arm moves 20 times faster
+    than a real one. The drivers, the session and the solver are those of a real cell.
     """
     with Station(sensor, ["--seed", str(seed)]) as station:
         truth = station.truth
-        talk.print(
-            f"An emulated UR5e, {SENSORS[sensor]}, tool of {truth['mass_kg']:.3f} kg. Nothing real is connected."
-        )
+        talk.print(f"Emulated UR5e, {SENSORS[sensor]}, tool of {truth['mass_kg']:.3f} kg. No real device is used.")
         outcome = rehearse(station, runs, "demo")
     if as_json:
         write_json(
@@ -47,31 +44,12 @@ def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
             }
         )
     else:
-        print_result(outcome.result, truth=truth, drift=outcome.drift, records=outcome.run.records())
+        print_result(outcome.result, truth=truth, drift=outcome.drift, records=outcome.run.records(), hinted=False)
         uv = "uv run " if "UV_RUN_RECURSION_DEPTH" in os.environ else ""  # which uv run sets
+        talk.print("Next", style="bold cyan")
         talk.print(
-            "\n Try next:"
-            f"\n   {uv}ftdrive live --calibration {quote(str(outcome.run.calibration_path))} --simulate"
-            f"\n   {uv}ftdrive replay {quote(str(outcome.run.folder))}"
-            f"\n   {uv}{outcome.run.solve_command} --method lrom"
-            f"\n Saved {outcome.run.calibration_path}"
+            f"   {uv}ftdrive live --calibration {quote(str(outcome.run.folder))} --simulate"
+            f"\n   {uv}{outcome.run.solve_command} --method all"
+            f"\n   {uv}ftdrive init   (describe your own cell)"
         )
     stop_unless_accepted(outcome.result, to_be_saved=True)
-
-
-def compensation_error(result: Any, truth: Any) -> dict[str, float]:
-    """Rms of what is left of a free tool's wrench after compensation, over 1000 random orientations.
-
-    The wrench is computed here from the truth, not with the solver's model.
-    """
-    from scipy.spatial.transform import Rotation
-
-    R_base_flange = Rotation.random(1000, rng=0).as_matrix()
-    weight = np.einsum(
-        "ji,nkj,k->ni", np.asarray(truth["R_flange_sensor"]), R_base_flange, np.asarray(truth["gravity_force_base_N"])
-    )
-    force = weight + truth["force_bias_N"]
-    torque = np.cross(truth["p_sensor_com_m"], weight) + truth["torque_bias_Nm"]
-    left = result.compensate(np.hstack([force, torque]), R_base_flange)
-    rms = [float(np.sqrt(np.mean(np.sum(part**2, axis=1)))) for part in (left[:, :3], left[:, 3:])]
-    return {"force_rms_N": rms[0], "torque_rms_Nm": rms[1]}

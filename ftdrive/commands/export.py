@@ -1,4 +1,4 @@
-"""`ftdrive export`: what ftdrive knows, in the languages of others."""
+"""`ftdrive export`: plans as files of other programs."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @click.group()
 def export() -> None:
-    """Write a plan in the language of another program. Files are never overwritten."""
+    """Write a plan for another program. Files are never overwritten."""
 
 
 @export.command()
@@ -25,24 +25,24 @@ def export() -> None:
     "target",
     required=True,
     type=click.Choice(["urscript", "csv"]),
-    help="A program for the pendant, or a table of joint targets.",
+    help="A program for the pendant or a table of joint targets.",
 )
-@click.option("-o", "--output", type=NewFile(), help="A new file; without it, stdout.")
+@click.option("-o", "--output", type=NewFile(), help="A new file instead of stdout.")
 @click.option(
     "--dwell",
     "dwell_s",
     type=Number(0, 600),
     default=4.0,
     show_default=True,
-    help="Rest at each pose, seconds (urscript).",
+    help="Rest at each pose, s (urscript).",
 )
-@simulate("Export the plan of an emulated cell, in the posture that `ftdrive plan` takes.")
+@simulate("Export the plan of an emulated cell in the default posture of `ftdrive plan`.")
 @JSON
 def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, simulate: bool, as_json: bool) -> None:
-    """Write a plan of `ftdrive plan --output` as a URScript program, or as a table.
+    """Write a plan of `ftdrive plan --output` as a URScript program or as a table.
 
-    The program asks before it moves, and stops unless the arm is near its first pose: the way there is not planned. It
-    has no guards of ours; `ftdrive calibrate` has.
+    The program asks before it moves, and stops unless the arm is near the first pose, because the approach is not
+    planned. Unlike `ftdrive calibrate`, it has no guards.
     """
     from calib.files import write_new
     from ftdrive.errors import ConfigError
@@ -62,8 +62,8 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
         write_new(output, text)
         talk.print(f" Wrote {output}")
     if as_json:
-        told = {"format": target, "plan": made.to_dict()["sha256"], "file": None if output is None else str(output)}
-        write_json({"schema_version": 1, **told, "text": text})
+        about = {"format": target, "plan": made.to_dict()["sha256"], "file": None if output is None else str(output)}
+        write_json({"schema_version": 1, **about, "text": text})
     elif output is None:
         click.echo(text, nl=False)
 

@@ -40,7 +40,7 @@ _NAMES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
-    """The mean of a tenth of a second."""
+    """The mean of `_PERIOD_S`."""
 
     mean: PoseMean
     R_base_flange: Array
@@ -52,16 +52,21 @@ class Look:
 @click.option(
     "--calibration",
     "path",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="FILE; with --simulate one is made first where none is given.",
+    metavar="PATH",
+    type=click.Path(exists=True, path_type=Path),
+    help="A calibration.json or its run folder. With --simulate the default is a new one.",
 )
 @CELL
-@simulate("An emulated cell: that which the calibration is of, or that of --sensor emulated://NAME.")
-@click.option("--replay", type=click.Path(exists=True, file_okay=False, path_type=Path), help="A recorded run.")
+@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
 @click.option(
-    "--axes", type=click.Choice(["sensor", "flange", "base"]), default="sensor", show_default=True, help="Shown along."
+    "--replay",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Show the samples of a recorded run.",
 )
-@click.option("--once", is_flag=True, help="One look, then end.")
+@click.option(
+    "--axes", type=click.Choice(["sensor", "flange", "base"]), default="sensor", show_default=True, help="Axes to show."
+)
+@click.option("--once", is_flag=True, help="Print one reading, then end.")
 @JSON
 def live(
     path: Path | None,
@@ -76,16 +81,16 @@ def live(
 ) -> None:
     """Show the raw and the compensated wrench, refreshed ten times a second.
 
-    The compensated wrench is what touches the tool: bias and weight of the tool are taken away. Both are shown about
-    the sensor's origin, along the axes asked for. The arm is only read, never moved. With --json, one object a line.
+    The compensated wrench is the contact wrench: measured minus bias and gravity. Both are about the sensor origin,
+    along the chosen axes. The arm is only read, never moved. With --json, one object per line.
     """
     check_simulate(simulate, real={"--config": config, "--robot": robot, "--replay": replay})
-    calibration = None if path is None else CalibrationResult.load(path)
+    calibration = None if path is None else _load(path)
     with ExitStack() as stack:
         if simulate:
             calibration, cell = _emulated(calibration, sensor, stack)
         if calibration is None:
-            raise ConfigError("whose weight is to be taken away? Give --calibration FILE, or --simulate")
+            raise ConfigError("no calibration: give --calibration PATH, or --simulate")
         if replay is not None:
             looks = _recorded_looks(Run(replay))
         else:
@@ -103,7 +108,7 @@ def live(
                 if once:
                     break
         else:
-            made = "made for this" if path is None else str(path)
+            made = "temporary calibration" if path is None else str(path)
             stack.enter_context(Keyboard(0) if Keyboard.usable(0) else nullcontext())  # Enter would break the screen
             with Live(console=talk, refresh_per_second=10) as screen:
                 shown = Group()
@@ -113,10 +118,14 @@ def live(
                 screen.update(Group(shown, "The recording has ended."))
 
 
+def _load(path: Path) -> CalibrationResult:
+    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path)
+
+
 def _emulated(
     calibration: CalibrationResult | None, sensor: str | None, stack: ExitStack
 ) -> tuple[CalibrationResult, CellConfig]:
-    """Start the cell that a calibration is of, or make a short calibration of one."""
+    """Start the cell of a calibration, or calibrate a new one with six poses."""
     if calibration is not None:
         made_by = calibration.provenance.get("station") or {}
         name = sensor_name(sensor) if sensor else made_by.get("sensor", "can")
@@ -138,7 +147,7 @@ def _live_looks(cell: CellConfig, calibration: CalibrationResult) -> Iterator[It
             recent = np.empty((0, 6))
             while True:
                 wrench = sensor.collect(_PERIOD_S).wrench
-                # A slow sensor says too little in one period to tell its noise.
+                # One period of a slow sensor has too few samples to estimate its noise.
                 recent = np.concatenate([recent, wrench])[-max(len(wrench), LEAST_SAMPLES) :]
                 R_base_flange = arm.state().R_base_flange
                 health = sensor.health()
@@ -158,7 +167,7 @@ def _recorded_looks(run: Run) -> Iterator[Look]:
         for start in range(0, n - size + 1, size):
             mean = mean_and_covariance(samples.wrench[start : start + size])
             yield Look(mean, record.before.R_base_flange, rate_Hz, lost)
-            time.sleep(size / rate_Hz)  # for whoever watches: as fast as it was recorded
+            time.sleep(size / rate_Hz)  # at the speed of the recording
 
 
 def _refuse_other_devices(calibration: CalibrationResult, found: dict[str, DeviceInfo]) -> None:
@@ -170,7 +179,7 @@ def _refuse_other_devices(calibration: CalibrationResult, found: dict[str, Devic
 
 
 def _beyond_noise(calibration: CalibrationResult) -> Array:
-    """Variance (6,) that noise does not explain, as the report says it: it may be along any axis."""
+    """Return the variance (6,) beyond the predicted one, as in the report, spread over all axes."""
     total = likely_error(calibration) ** 2 - np.square(calibration.predicted_error())
     return np.repeat(total / 3, 3)
 
@@ -223,7 +232,7 @@ def _screen(reading: dict[str, Any], made: str) -> Group:
     return Group(
         Text.assemble(
             (f"{reading['axes']} axes, about the {reading['about']}", "bold"),
-            "   contact: raw less bias and weight of tool",
+            "   contact: raw minus bias and gravity",
         ),
         f"{made}, {reading['verdict']}   mean of {_PERIOD_S} s   {reading['rate_Hz']:.0f} Hz, lost {reading['lost']}",
         table,

@@ -1,4 +1,4 @@
-"""`ftdrive plan`: where an arm would go and how clear it stays, without an arm."""
+"""`ftdrive plan`: a tour proven clear, without an arm."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,54 +17,54 @@ USUAL_POSTURE_DEG = (45, -100, 60)
 
 @click.command()
 @CONFIG
-@click.option("--model", help="Of the arm: ur3e, ur5e, ur7e, ur10e, ur12e, ur16e, ur20 or ur30.")
+@click.option("--model", help="Model of the arm: ur3e, ur5e, ur7e, ur10e, ur12e, ur16e, ur20 or ur30.")
 @click.option(
     "--tool",
     "tool",
     multiple=True,
     metavar="FROM:TO:DIAMETER[:X:Y]",
-    help="A cylinder of what is mounted, in mm from the flange face; X:Y puts its axis aside. Repeatable.",
+    help="A cylinder of tool and sensor, mm from the flange face; X:Y is the offset of its axis. Repeatable.",
 )
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses.")
 @click.option(
-    "--cone", "cone_deg", type=float, metavar="DEG", help="Chosen poses with the tool so near to straight down."
+    "--cone", "cone_deg", type=float, metavar="DEG", help="Only poses with the tool within DEG of straight down."
 )
 @click.option(
-    "--free-box", "box_mm", type=float, metavar="MM", help="The flange may go so far to each side: the whole arm moves."
+    "--free-box", "box_mm", type=float, metavar="MM", help="The flange may move MM to each side; the whole arm moves."
 )
 @click.option(
     "--posture",
     default=",".join(map(str, USUAL_POSTURE_DEG)),
     show_default=True,
     metavar="Q1,Q2,Q3",
-    help="Of the first three joints, degrees.",
+    help="First three joints, degrees.",
 )
-@click.option("--mounting", help="floor, wall, ceiling, or degrees the base leans towards its -x: 90 is wall.")
+@click.option("--mounting", help="floor, wall, ceiling, or degrees that the base leans towards its -x (wall: 90).")
 @click.option(
     "--plane",
     "planes",
     multiple=True,
     metavar="NX:NY:NZ:MM",
-    help="A wall: the arm stays where normal times place, base axes, is MM or more. The mounting surface is known.",
+    help="A wall: the arm stays where N·p >= MM, base axes. The mounting surface is always included.",
 )
 @click.option("--box", "boxes", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block, two corners in mm, base axes.")
 @click.option(
     "--tip-speed-limit",
     metavar="MM/S|none",
-    help="Of the tool's farthest points.  [default: [robot] tip_speed_mm_s, else 250]",
+    help="Speed of the tool's farthest points.  [default: [robot] tip_speed_mm_s, else 250]",
 )
 @click.option(
     "--mass",
     "mass_kg",
     metavar="KG",
     type=float,
-    help="Of the tool, for the prediction.  [default: [tool] mass_kg, else 1]",
+    help="Mass of the tool, for the prediction.  [default: [tool] mass_kg, else 1]",
 )
 @click.option("--output", type=NewFile(), help="Save the plan as a new JSON file.")
 @click.option("--png", type=NewFile(), help="Save stick figures (needs ftdrive[viz]).")
-@click.option("--view", is_flag=True, help="Show it in the browser, in three dimensions (needs ftdrive[viz]).")
-@simulate("For arm and tool of an emulated cell, in place of those of the configuration.")
+@click.option("--view", is_flag=True, help="Show the plan in the browser, in three dimensions (needs ftdrive[viz]).")
+@simulate("Use arm and tool of an emulated cell instead of the configuration.")
 @JSON
 def plan(
     config: Path | None,
@@ -86,10 +86,10 @@ def plan(
     simulate: bool,
     as_json: bool,
 ) -> None:
-    """Plan a tour that is proven clear of the arm itself, of the tool and of planes and boxes. Needs no robot.
+    """Plan a tour proven clear of the arm itself, the tool, planes and boxes. Needs no robot.
 
-    Arm, tool and surroundings come from the configuration where there is one; what is given here takes its place. Real
-    cables, fixtures and people are not in the model: look at the ball before anything moves.
+    Arm, tool and surroundings come from the configuration; options replace its values. Cables, fixtures and people are
+    not in the model: look at the ball that must be free before anything moves.
     """
     import numpy as np
 
@@ -125,10 +125,10 @@ def plan(
     cell = cell_of(found, devices=False)
     described = {found[key].origin for key in ("tool.cylinders_mm", "workcell.planes_mm", "workcell.boxes_mm")}
     described -= {"default", "--tool", "--plane", "--box"}
-    if not described:  # said here and now, or nothing but the arm and its mounting is there
+    if not described:  # described by options, or nothing but arm and mounting
         cell = replace(cell, workcell=replace(cell.workcell, measured=True))
     if not cell.workcell.measured:
-        talk.print(f"Placeholders are in {', '.join(sorted(described))} (measured = false): a plan for the eye only.")
+        talk.print(f"Placeholders in {', '.join(sorted(described))} (measured = false): this plan is for the eye only.")
     certifier = certifier_for(cell, cell.robot.model)
     q_rad = np.array([*np.radians(numbers("--posture", posture, ",", (3,))), *USUAL_POSTURE_RAD[3:]])
     made = plan_for(

@@ -1,4 +1,4 @@
-"""`ftdrive replay`: a recorded run once more, through the same routine and solver, without any driver."""
+"""`ftdrive replay`: a recorded run, repeated by the same routine and solver without a driver."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,17 +20,17 @@ from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.runs.replay_source import RecordedRun
 from ftdrive.runs.run import Run
 from ftdrive.session import solve_records
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import hanging, talk
 from ftdrive.terminal.report import print_result
 
 
 @click.command()
 @click.argument("folder", metavar="RUN", required=False, type=click.Path(exists=True, file_okay=False, path_type=Path))
-@simulate("Record a short run of an emulated cell first, and repeat that.")
+@simulate("Record a short run of an emulated cell, then repeat it.")
 @EMULATED_SENSOR
 @JSON
 def replay(folder: Path | None, simulate: bool, sensor: str | None, as_json: bool) -> None:
-    """Repeat the recorded RUN and compare the result with the one it saved: they must agree to the last digit."""
+    """Repeat the recorded RUN and compare the result with the saved one: they must be equal to the last digit."""
     check_simulate(simulate, real={"RUN": folder}, emulated={"--sensor": sensor})
     if simulate:
         with rehearsed_run(sensor) as recorded:
@@ -38,7 +38,7 @@ def replay(folder: Path | None, simulate: bool, sensor: str | None, as_json: boo
     elif folder is not None:
         _repeat(Run(folder), as_json)
     else:
-        raise ConfigError("which run? Give its folder, or --simulate")
+        raise ConfigError("no run: give its folder, or --simulate")
 
 
 def _repeat(run: Run, as_json: bool) -> None:
@@ -49,7 +49,8 @@ def _repeat(run: Run, as_json: bool) -> None:
         recorded.go_on_to(kept.pose.q_rad)
         again = take_pose(recorded, recorded, kept.stop, kept.pose, sampling)
         records.append(replace(again, clock_offset_ns=kept.clock_offset_ns))
-        talk.print(f"{kept.stop:2d}  R{kept.pose.number:02d}  {len(kept.samples.t_host_ns)} samples")
+        if talk.verbose:
+            talk.print(f"{kept.stop:2d}  R{kept.pose.number:02d}  {len(kept.samples.t_host_ns)} samples")
     outcome = solve_records(run, records)
     if as_json:
         write_json(outcome.result.to_dict())
@@ -58,7 +59,7 @@ def _repeat(run: Run, as_json: bool) -> None:
     stop_unless_accepted(outcome.result)
     if run.calibration_path.exists():
         _compare(outcome.result, CalibrationResult.load(run.calibration_path))
-        talk.print(f" Equal to {run.calibration_path}, to the last digit")
+        talk.print(hanging(" ✔ ", f"equal to the last digit: {run.calibration_path}"))
 
 
 def _compare(again: CalibrationResult, saved: CalibrationResult) -> None:

@@ -1,4 +1,4 @@
-"""`ftdrive solve`: from data on disk to a calibration, without any device."""
+"""`ftdrive solve`: a calibration from data on disk, without a device."""
 
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -58,27 +58,27 @@ _NAMES = "\b\nMETHOD is one of\n" + fill(
     type=click.Choice(_METHODS),
     default="ml",
     show_default=True,
-    help="Below; all: side by side.",
+    help="One of those below; all prints them side by side.",
 )
 @click.option(
     "--orientation",
     type=click.Choice(["R_base_flange", "R_flange_base"]),
     default="R_base_flange",
     show_default=True,
-    help="What the rotation of a CSV maps: flange to base coordinates, or the other way (as in the papers).",
+    help="Rotation in a CSV: flange to base coordinates, or the inverse (as in the papers).",
 )
 @click.option(
     "--drift",
     type=click.Choice(["auto", "none", "linear", "random-walk"]),
     default="auto",
     show_default=True,
-    help="How the bias may move during the poses; the order of rows stands in for missing times.",
+    help="Model of the bias drift; rows without times count as equally spaced.",
 )
-@click.option("--mass-kg", metavar="KG", type=Number(0, min_open=True), help="Known mass of what hangs on the sensor.")
-@click.option("--level-deg", metavar="DEG", type=Number(0, 180), help="The base is level within so much (one sigma).")
+@click.option("--mass-kg", metavar="KG", type=Number(0, min_open=True), help="Known mass below the sensor.")
+@click.option("--level-deg", metavar="DEG", type=Number(0, 180), help="The base is level within DEG (one sigma).")
 @click.option("--mounting-deg", metavar="RX,RY,RZ", help="Known rotation vector of the sensor in the flange.")
-@click.option("--output", "-o", type=NewFile(), help="Save the calibration here.")
-@click.option("--force", is_flag=True, help="Save even a rejected result; it stays marked as rejected.")
+@click.option("--output", "-o", type=NewFile(), help="Save the calibration as a new file.")
+@click.option("--force", is_flag=True, help="Save a rejected result too; it stays marked as rejected.")
 @simulate("Solve a short run of an emulated cell.")
 @EMULATED_SENSOR
 @JSON
@@ -103,7 +103,7 @@ def solve(
     """
     check_simulate(simulate, real={"DATASET": sources}, emulated={"--sensor": sensor})
     if not (sources or simulate):
-        raise ConfigError("which data? Give a run folder, a dataset.json or a CSV file, or --simulate")
+        raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
     if output is not None and (len(sources) > 1 or method == "all"):
         raise ConfigError("--output takes one result: give one dataset and one method")
     options = {"drift": drift, "known": _known(mass_kg, level_deg, mounting_deg)}
@@ -125,17 +125,17 @@ def _solve_each(
         try:
             dataset, circumstances, provenance = _read(source, orientation)
             known = options["known"]
-            if known is not None and known.gravity_direction_base is not None:  # level as the arm is mounted there
+            if known is not None and known.gravity_direction_base is not None:  # level with respect to the mounting
                 known = replace(known, gravity_direction_base=-circumstances["up_in_base"])
             here = {**options, **circumstances, "known": known}
             if method == "all":
                 _show_all(source, dataset, here, as_json)
                 continue
             result = _solve(dataset, method, {**here, "provenance": provenance})
-            records = Run(source).records() if source.is_dir() else []  # a run tells more than its dataset
+            records = Run(source).records() if source.is_dir() else []  # for hints and drift
             if as_json:
-                told = list(hints(result, records)) if records else []
-                write_json({"source": str(source), "hints": told, **result.to_dict()})
+                found = list(hints(result, records)) if records else []
+                write_json({"source": str(source), "hints": found, **result.to_dict()})
             else:
                 print_result(result, drift=drift_check(records), records=records)
             if not force:

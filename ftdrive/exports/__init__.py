@@ -1,1 +1,1 @@
-"""What ftdrive knows, in the languages of others: one module a target, from an object of ours to the text of a file."""
+"""Exports to other programs: one module per target, each from an object of ftdrive to the text of a file."""

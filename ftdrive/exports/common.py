@@ -1,4 +1,4 @@
-"""What the exports of a plan share."""
+"""Checks and text conversion shared by the exports of a plan."""
 
 from math import pi, radians
 
@@ -10,10 +10,10 @@ _SPELLED = {"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "
 
 
 def require_usable(plan: Plan) -> None:
-    """Raise `PlanRefused` for placeholders, a move that is not proven clear, and numbers that no arm can follow."""
+    """Raise `PlanRefused` for placeholders, moves that are not proven clear, and values that no arm can follow."""
     if not plan.measured:
         raise PlanRefused(
-            "nobody has said that tool, planes and boxes of this plan were measured, they may be placeholders: "
+            "tool, planes and boxes of this plan are not marked as measured: "
             "measure them, set measured = true in [workcell], and make a new plan"
         )
     if not plan.certified:
@@ -29,7 +29,7 @@ def require_usable(plan: Plan) -> None:
 
 
 def plain(text: str) -> str:
-    """Reduce a text to what cannot end a string, a comment or a line where there are no escapes, as in URScript."""
+    """Reduce a text to printable ASCII without quotes and backslashes, because URScript strings have no escapes."""
     for sign, words in _SPELLED.items():
         text = text.replace(sign, words)
     return "".join(c if " " <= c <= "~" and c not in "\"'\\" else "?" for c in text)

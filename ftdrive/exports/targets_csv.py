@@ -8,7 +8,7 @@ COLUMNS = "pose,orientation,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,speed_rad_
 
 
 def table(plan: Plan) -> str:
-    """Write one line a pose; speed, acceleration and clearance are of the move to the next one, the last to the first.
+    """Write one line per pose, with speed, acceleration and clearance of the move to the next (last: first).
 
     The first line is a comment with the format, the plan's hash and the model.
     """

@@ -1,4 +1,4 @@
-"""A plan as a program in URScript, for those who run the tour from the pendant.
+"""A plan as a URScript program, to run the tour from the pendant.
 
 Ref: Universal Robots, "The URScript Programming Language", SW 5: movej, get_actual_joint_positions, popup, textmsg.
 Checked on hardware: no.
@@ -28,7 +28,7 @@ def program(plan: Plan, *, dwell_s: float) -> str:
     Raises
     ------
     PlanRefused
-        A move is not proven clear, or a number in the plan is not one that an arm can follow.
+        A move is not proven clear, or no arm can follow a value in the plan.
     """
     require_usable(plan)
     return "".join(
@@ -100,7 +100,7 @@ def _warnings(model: str) -> Iterator[str]:
     yield f"Run it on a {model} with exactly this tool and mounting; in another cell the moves are not proven clear."
     yield "The tool turns every way, upside down too: nothing loose, no fluid, nothing in the gripper."
     yield (
-        f"The way to the first pose is not in the plan: the program stops unless each joint is within "
+        f"The approach to the first pose is not in the plan: the program stops unless each joint is within "
         f"{degrees(NEAR_RAD):.0f} degrees of it."
     )
     yield "The first time: speed slider at 30 percent, hand on the emergency stop."
@@ -119,7 +119,7 @@ def _joints(q_rad: tuple[float, ...]) -> str:
 
 
 def _scene(scene: dict[str, Any]) -> Iterator[str]:
-    """Say what stands around the arm; planes and boxes as `--plane` and `--box` take them."""
+    """Describe the surroundings; planes and boxes in the form of `--plane` and `--box`."""
     lean_rad = float(scene["lean_rad"])
     names = [name for name, angle in MOUNTINGS.items() if abs(lean_rad - angle) < 1e-9]
     yield f"mounted: {names[0] if names else f'base leans {degrees(lean_rad):.1f} deg towards its -x'}"
@@ -130,7 +130,7 @@ def _scene(scene: dict[str, Any]) -> Iterator[str]:
     for box in scene["boxes"]:
         yield f"box {':'.join(f'{1e3 * float(value):.1f}' for value in (*box['low_m'], *box['high_m']))}"
     if len(scene["planes"]) <= 1 and not scene["boxes"]:
-        yield "nothing else: free space around the arm. A table, wall or fixture that is there is NOT in the plan"
+        yield "nothing else: free space around the arm. Any table, wall or fixture is NOT in the plan"
 
 
 def _cylinder(part: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Where people are told things: stderr, for stdout is for data."""
+"""Output for people goes to stderr, because stdout is for data."""
 
 import os
 import sys
@@ -8,8 +8,15 @@ from typing import TextIO
 from rich.console import Console
 from rich.text import Text
 
-talk = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
-"""A terminal gets whole words, a file whole lines. Brackets and colons stand as they are: paths have them too."""
+
+class Talk(Console):
+    """A console that knows whether details are wanted (`-v`); `quiet` is the console's own."""
+
+    verbose = False
+
+
+talk = Talk(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
+"""Folds between words in a terminal, never in a file. Prints brackets and colons as they are: paths contain them."""
 
 _NARROWEST = 20
 """Columns behind a head: with fewer, lines begin at the left."""

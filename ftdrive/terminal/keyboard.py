@@ -1,4 +1,4 @@
-"""Single keys from a terminal, without Enter, while Ctrl-C works as ever."""
+"""Single keys from a terminal, without Enter. Ctrl-C still interrupts."""
 
 import atexit
 import os
@@ -20,13 +20,13 @@ _ESCAPE = re.compile(rb"\x1b(\[[0-?]*[ -/]*[@-~]|O.|.)?")
 """Arrows and function keys arrive as escape, then letters that would be read as keys."""
 _KEYS = {key.value: key for key in Key}
 _WORD_S = 0.3
-"""A letter that follows another so soon belongs to a word, such as an answer that was typed too late."""
+"""A letter within this time of another belongs to a word, such as an answer typed too late."""
 _ALWAYS = {Key.PAUSE, Key.STOP}
-"""Heard in a word too: better stopped once too often."""
+"""Read within a word too: an unnecessary stop does no harm."""
 
 
 class Keyboard:
-    """Keys of the live screen, read by a thread; the terminal is as before on every way out of the context.
+    """Keys of the live screen, read by a thread. The terminal settings are restored on every exit from the context.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class Keyboard:
 
     @staticmethod
     def usable(fd: int) -> bool:
-        """Tell whether this is a terminal whose keys are ours: not a pipe, and not that of a job in the background."""
+        """Whether this is a terminal in the foreground, whose keys can be read: not a pipe, not a background job."""
         try:
             return os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp()
         except OSError:
@@ -69,7 +69,7 @@ class Keyboard:
 
     @contextmanager
     def suspended(self) -> Iterator[None]:
-        """Give the terminal back for a typed answer; keys pressed before are thrown away, they were no answer."""
+        """Restore the terminal for a typed answer and discard the keys pressed before."""
         self._stop()
         try:
             yield
@@ -123,6 +123,6 @@ class Keyboard:
                         self._keys.append(key)
                 word += letters
         except OSError:
-            return  # the terminal is gone: SIGHUP says so to everybody
+            return  # the terminal is gone: SIGHUP ends the program
         finally:
             os.close(wake)

@@ -1,4 +1,4 @@
-"""Results and plans as text for a person."""
+"""Results as text."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,6 +23,10 @@ _STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
 _ROUNDED = 1e-9
 """A standard deviation below this share of the largest one is one of rounding: its value was taken as known."""
 _NO_LIMIT = 10_000
+_RANDOM = Rotation.random(1000, rng=0).as_matrix()
+"""Orientations over which the error of a calibration is averaged if the truth is known."""
+_DERIVED = {"gravity_force_base_N"}
+"""Rows that follow from mass and tilt: printed only with -v."""
 
 
 def print_result(
@@ -31,31 +35,57 @@ def print_result(
     truth: Mapping[str, Any] | None = None,
     drift: DriftCheck | None = None,
     records: Sequence[PoseRecord] = (),
+    hinted: bool = True,
     saved: Path | None = None,
 ) -> None:
-    """Show verdict, estimates with one sigma, how well poses fit, what probably happened, and where the file is.
+    """Print estimates with one sigma, the verdict with the compensation error, hints, and the path of the file.
+
+    Residuals and drift follow if the verdict is not good, if the drift is significant, or with `-v`.
 
     Parameters
     ----------
     result : CalibrationResult
     truth : mapping, optional
-        By the names of the result: truth and error are shown beside the estimates.
+        Same keys as the result: truth and error are printed beside the estimates.
     drift : DriftCheck, optional
     records : sequence of PoseRecord
-        Of the result's dataset: poses are named by their orientation, and those that fit badly are explained.
+        Of the result's dataset: poses are named by their orientation, and bad fits are explained.
+    hinted : bool
+        Print what a user should check in the cell.
     saved : Path, optional
-        The calibration file, told in the last line.
+        The calibration file, printed in the last line.
     """
-    data = result.to_dict()
-    talk.print()
+    talk.print(Text.assemble(("Result", "bold cyan"), f"  {result.n_poses} poses, method {result.method}"))
+    talk.print(_table(result, truth))
     talk.print(
         hanging(
             Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  "),
-            f"{result.n_poses} poses, method {result.method}; compensation error {error_in_words(result)}",
+            f"compensation error {error_in_words(result)}",
         )
     )
+    if truth is not None:
+        raw, left = free_tool_wrench(truth, _RANDOM), compensation_error(result, truth)
+        talk.print(
+            hanging(
+                " truth: ",
+                f"a free tool reads {left['force_rms_N']:.4f} N, {left['torque_rms_Nm']:.5f} N·m rms; "
+                f"before {_rms(raw[:, :3]):.1f} N, {_rms(raw[:, 3:]):.2f} N·m",
+            )
+        )
     for reason in result.reasons:
         talk.print(hanging("   ", reason))
+    if talk.verbose or result.verdict != "good":
+        _print_fit(result, names_of(records))
+    _print_drift(result, drift)
+    if records and (hinted or talk.verbose):
+        for hint in hints(result, records):
+            talk.print(hanging(" ? ", hint), style="yellow")
+    if saved is not None:
+        talk.print(f" Saved {saved}")
+
+
+def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
+    data = result.to_dict()
     errors = {} if truth is None else errors_in_sigma(result, truth)
     fixed_below = _ROUNDED * float(np.sqrt(np.diag(result.covariance).max()))
     table = Table(box=None, padding=(0, 1))
@@ -63,6 +93,8 @@ def print_result(
         if truth is not None or title not in {"truth", "error / sigma"}:
             table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may be folded
     for label, scale, unit, key in _ROWS:
+        if key in _DERIVED and not talk.verbose:
+            continue
         estimates, sigmas = (_values(source[key], key) * scale for source in (data, data["sigma"]))
         truths = None if truth is None else _values(truth[key], key) * scale
         fixed = sigmas <= fixed_below * scale
@@ -71,13 +103,20 @@ def print_result(
         digits = 4 if fixed.all() else int(np.clip(1 - np.floor(np.log10(max(least, 1e-9))), 0, 7))
         for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
             spread = "fixed" if fixed[i] else f"{sigmas[i]:.{digits}f}"
-            cells = [f"{label} {axis}".strip() + f", {unit}", f"{estimates[i]:.{digits}f}", spread]
-            if truths is not None:
-                cells.insert(1, f"{truths[i]:.{digits}f}")
-                cells.append(f"{errors[key][i]:+.1f}")
-            table.add_row(*cells)
-    talk.print(table)
-    residual = data["residual"]
+            known = [] if truths is None else [f"{truths[i]:.{digits}f}"]
+            error = [Text(f"{errors[key][i]:+.1f}", _error_style(errors[key][i]))] if known else []
+            name = f"{label} {axis}".strip() + f", {unit}"
+            table.add_row(name, *known, f"{estimates[i]:.{digits}f}", spread, *error)
+    return table
+
+
+def _error_style(error_sigma: float) -> str:
+    """Colour of an error: one in 20 is above 2 sigma, one in 16,000 above 4."""
+    return "green" if abs(error_sigma) < 2 else "yellow" if abs(error_sigma) < 4 else "bold red"
+
+
+def _print_fit(result: CalibrationResult, names: Sequence[str]) -> None:
+    residual = result.to_dict()["residual"]
     talk.print(
         hanging(
             " residuals: ",
@@ -85,11 +124,15 @@ def print_result(
             f"torque {residual['torque_rms_Nm']:.5f} N·m rms, {residual['torque_max_Nm']:.5f} max",
         )
     )
-    if (poses := poses_in_words(result, names_of(records))) is not None:
+    if (poses := poses_in_words(result, names)) is not None:
         talk.print(hanging(" worst: ", poses))
+
+
+def _print_drift(result: CalibrationResult, drift: DriftCheck | None) -> None:
     if drift is not None:
         words, bad = drift_in_words(drift)
-        talk.print(hanging(" drift: ", words), style="yellow" if bad else None)
+        if bad or talk.verbose or result.verdict != "good":
+            talk.print(hanging(" drift: ", words), style="yellow" if bad else None)
     if result.drift is not None:
         change, sigma = result.drift.change, result.drift.sigma
         words = (
@@ -97,18 +140,13 @@ def print_result(
             f"{np.linalg.norm(change[3:]):.4f} ± {np.max(sigma[3:]):.4f} N·m from the first pose to the last"
         )
         talk.print(hanging(" drift in the fit: ", words))
-    if records:
-        for hint in hints(result, records):
-            talk.print(hanging(" ? ", hint), style="yellow")
-    if saved is not None:
-        talk.print(f" Saved {saved}")
 
 
 def error_in_words(result: CalibrationResult) -> str:
-    """Say how well a free tool will be compensated, N and N·m, and from what that is known."""
+    """Describe the compensation error of a free tool, N and N·m, and its source."""
     words = "{:.4f} N, {:.5f} N·m".format(*result.predicted_error())
     if _noise_explains(result):
-        return f"{words} rms over all orientations (predicted)"
+        return f"{words} rms (predicted)"
     seen = "{:.4f} N, {:.5f} N·m".format(*likely_error(result))
     why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
     return f"{seen} rms (cross-validated, as {why}; predicted: {words})"
@@ -128,12 +166,12 @@ def likely_error(result: CalibrationResult) -> Array:
 
 
 def _noise_explains(result: CalibrationResult) -> bool:
-    """Tell whether nothing speaks against the noise model: files of the first version hold nothing that could."""
+    """Whether the residuals agree with the noise model; True for files of the first version, which do not say."""
     return not result.quality or (result.p_value is not None and result.p_value >= SURE)
 
 
 def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:
-    """Say which pose fits worst and how well each is predicted by the others; None for results that do not know.
+    """Describe the worst pose and the cross-validation; None for results without these figures.
 
     Parameters
     ----------
@@ -191,8 +229,28 @@ def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict
     return errors
 
 
+def free_tool_wrench(truth: Mapping[str, Any], R_base_flange: Array) -> Array:
+    """Return what the sensor of a free tool reads, (n, 6): computed from the truth, not with the solver's model."""
+    weight = np.einsum(
+        "ji,nkj,k->ni", np.asarray(truth["R_flange_sensor"]), R_base_flange, np.asarray(truth["gravity_force_base_N"])
+    )
+    force = weight + truth["force_bias_N"]
+    torque = np.cross(truth["p_sensor_com_m"], weight) + truth["torque_bias_Nm"]
+    return np.hstack([force, torque])
+
+
+def compensation_error(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, float]:
+    """Rms of the wrench that remains of a free tool after compensation, over `_RANDOM` orientations."""
+    left = result.compensate(free_tool_wrench(truth, _RANDOM), _RANDOM)
+    return {"force_rms_N": _rms(left[:, :3]), "torque_rms_Nm": _rms(left[:, 3:])}
+
+
+def _rms(vectors: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
 def print_comparison(compared: Sequence[Compared]) -> None:
-    """Show all methods side by side, no number cut: a narrow terminal gets no vectors, a pipe lines of any length."""
+    """Print all methods side by side without cutting a number: a narrow terminal gets no vectors, a pipe long lines."""
     table = _comparison(compared, vectors=True)
     if talk.is_terminal and table.width is not None and table.width > talk.width:
         table = _comparison(compared, vectors=False)
@@ -228,13 +286,13 @@ def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:
 
 
 def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
-    """Say how the first pose reads at the end; true where that is more than noise."""
+    """Describe the change of the first pose at the end; True if it exceeds the noise."""
     worst = float(np.max(np.abs(drift.change) / drift.sigma))
     force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
     apart_s = abs(drift.elapsed_s)
     again = f"first pose again after {apart_s:.0f} s"
     if drift.elapsed_s < 0:  # --redo 1
-        again = f"first pose, taken anew {apart_s:.0f} s after the return to it"
+        again = f"first pose, repeated {apart_s:.0f} s after the return to it"
     words = f"{again}, {force_N:.3f} N, {torque_Nm:.4f} N·m away: "
     if worst < 4:
         return words + "none seen", False

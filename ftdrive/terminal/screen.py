@@ -1,4 +1,4 @@
-"""The live screen of a session: where it stands, what it knows by now, what it lacks, and the keys."""
+"""The live screen of a session: state, progress, estimates, coverage, keys."""
 
 import os
 import sys
@@ -25,12 +25,10 @@ from calib.routine import DriftCheck
 from ftdrive.errors import Declined
 from ftdrive.session.events import (
     Asked,
-    Checked,
     Estimated,
     Event,
     GuardTripped,
     Noted,
-    Planned,
     PoseTaken,
     RunOpened,
     State,
@@ -40,24 +38,16 @@ from ftdrive.session.live_fit import GREEN
 from ftdrive.session.operator import Key, Operator, Question
 from ftdrive.terminal.console import hanging, talk
 from ftdrive.terminal.keyboard import Keyboard
-from ftdrive.terminal.operators import (
-    JsonOperator,
-    PlainOperator,
-    head_and_words,
-    in_words,
-    match,
-    prompt,
-    read_line,
-    rms_sigma,
-)
+from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, prompt, read_line
 from ftdrive.terminal.report import drift_in_words
+from ftdrive.terminal.session_text import Line, SessionText, in_words, rms_sigma
 
 Array = NDArray[np.float64]
 
 REFRESH_HZ = 4
 KEYS = {Key.KEEP: "finish", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "stop"}
 
-# Label and unit, factor from SI to it, name; and what goes first where there is no room, see `frame`.
+# Label and unit, factor from SI, name, and rank in `frame`: higher ranks are omitted first.
 _ROWS = (
     ("mass kg", 1.0, "mass_kg", 1),
     ("centre mm", 1e3, "p_sensor_com_m", 2),
@@ -72,20 +62,22 @@ _FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _CUBE_WIDTH = 25
 _NUMBER_WIDTH = 9
 _TABLE_WIDTH = 53
+_NARROWEST_BAR = 8
 _ROUNDED = 1e-9
-"""A standard deviation below this, N or N·m, is one of rounding: what it belongs to is no part of the fit."""
+"""A standard deviation below this, N or N·m, comes from rounding: its value was not fitted."""
 _ASCII = str.maketrans(
-    dict(zip("┌┐└┘├┤┬┴┼─│", "+++++++++-|", strict=True)) | {"±": "+-", "°": " deg", "·": ".", "…": "~"}
+    dict(zip("┌┐└┘├┤┬┴┼─│━", "+++++++++-|=", strict=True))
+    | {"±": "+-", "°": " deg", "·": ".", "…": "~", "✔": "ok", "✘": "FAIL"}
 )
 
 
 @dataclass
 class View:
-    """What the screen knows."""
+    """The state that the screen draws."""
 
     now: StateChanged | None = None
     since_s: float = 0.0
-    """When the state began, of the clock that `frame` is given."""
+    """Start of the state, in the clock of `frame`."""
     folder: str = ""
     resume: str = ""
     taken: dict[int, tuple[PoseTaken, float]] = field(default_factory=dict)
@@ -96,12 +88,12 @@ class View:
     note: str = ""
     waiting: tuple[Key, ...] = ()
     ascii_only: bool = False
-    """Whether the terminal knows nothing else."""
+    """The terminal's encoding is ASCII."""
     keys: Literal["live", "asking", "over"] = "live"
-    """Whether keys do anything now."""
+    """Whether keys are read now."""
 
     def update(self, event: Event, now_s: float) -> None:
-        """Take an event in."""
+        """Update the state from an event."""
         match event:
             case RunOpened():
                 self.folder, self.resume = event.folder, event.resume
@@ -115,7 +107,7 @@ class View:
                 self.note = in_words(event)
 
     def shown(self, text: str) -> str:
-        """Replace what the terminal's encoding lacks; before anything is measured or cut, for it gets longer."""
+        """Replace what the terminal's encoding lacks, which lengthens the text: call it before measuring or cutting."""
         return text.translate(_ASCII) if self.ascii_only else text
 
     def _take(self, event: PoseTaken, now_s: float) -> None:
@@ -130,7 +122,7 @@ class View:
 def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Group:
     """Draw the screen: never wider than `width`, never higher than `height` less one line for the cursor.
 
-    Blocks of lines go by their number where there is not enough room, the highest first; those of 0 stay.
+    If there is not enough room, blocks are omitted, the highest rank first. Blocks of rank 0 stay.
     """
     wide = width >= _TABLE_WIDTH + 1 + _CUBE_WIDTH
     blocks: list[tuple[int, list[Text]]] = [(0, [_title(view, now_s, width), *_state(view, now_s, width)])]
@@ -160,15 +152,22 @@ def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Gro
 
 def _title(view: View, now_s: float, width: int) -> Text:
     times_s = sorted(at_s for _, at_s in view.taken.values())
-    kept = max(len(view.taken), view.estimated.poses if view.estimated else 0)  # those of a resumed run were not told
+    kept = max(len(view.taken), view.estimated.poses if view.estimated else 0)  # more if resumed
     right = f"{kept} kept"
     left = view.last.stops - kept if view.last else 0
     if len(times_s) > 2 and left > 0:
-        usual_s = median(b - a for a, b in pairwise(times_s))  # a stop with questions is not usual
-        rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)  # nothing goes on in a hold
+        usual_s = median(b - a for a, b in pairwise(times_s))  # a stop with questions takes longer than usual
+        rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)  # a hold does not shorten the rest
         right += f", about {_minutes(rest_s)} left"
     name = "ftdrive calibrate"
-    return Text.assemble((name, "bold"), " " * max(width - len(name) - len(right), 2), right)
+    room = width - len(name) - len(right)
+    if view.last is None or room < _NARROWEST_BAR + 4:
+        return Text.assemble((name, "bold"), " " * max(room, 2), right)
+    done = min(kept / view.last.stops, 1.0)
+    filled = round((room - 4) * done)
+    return Text.assemble(
+        (name, "bold"), "  ", ("━" * filled, "green"), ("━" * (room - 4 - filled), "bright_black"), "  ", right
+    )
 
 
 def _state(view: View, now_s: float, width: int) -> list[Text]:
@@ -176,7 +175,7 @@ def _state(view: View, now_s: float, width: int) -> list[Text]:
     if now is None:
         return [Text("starting")]
     if view.keys == "asking" and now.state in {State.MOVE, State.SETTLE, State.SAMPLE}:
-        return [Text("WAITS for an answer", "bold cyan")]  # what was done before is over
+        return [Text("WAITS for an answer", "bold cyan")]  # the motion before the question is over
     line = Text()
     if now.stop is not None:
         line.append(f"pose {now.stop}/{now.stops}" if now.stops is not None else f"pose {now.stop}", "bold")
@@ -214,7 +213,7 @@ def _last(view: View) -> list[Text]:
 
 
 def _estimates(view: View, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
-    """Estimates at the left; the cube beside them, or its counts in a line below."""
+    """Return the estimates, with the cube beside them or its counts in a line below."""
     fit = view.estimated
     rows = [Text(f"{'estimate':<13}{'':27}{'± 1 sigma':>12}", "dim")]
     rows += [_estimate(fit, label, factor, name) for label, factor, name, _ in _ROWS]
@@ -248,7 +247,7 @@ def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Te
 
 
 def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
-    """Unfold the cube of the flange axes: how many poses had gravity along each."""
+    """Draw the unfolded cube of the flange axes, with the number of poses that had gravity along each."""
     face = None
     if newest is not None:
         axis = int(np.abs(newest).argmax())
@@ -307,7 +306,7 @@ def _keys(view: View) -> list[Text]:
     end = "Ctrl-C ends, poses are kept" if view.folder else "Ctrl-C ends"
     if view.keys != "live":
         return [Text(f"Enter sends the answer; {end}", "dim")] if view.keys == "asking" else []
-    useful: set[Key] = set()  # before and after the poses nobody listens
+    useful: set[Key] = set()  # before and after the poses no key is read
     if view.now is not None and view.now.stop is not None:
         useful = set(KEYS) if view.now.stops is None else set(KEYS) - {Key.KEEP}  # by hand there is no last one
     line = Text()
@@ -339,7 +338,7 @@ def _folded(view: View, text: str, width: int, style: str = "") -> list[Text]:
 
 
 def _end_of(text: str, width: int) -> str:
-    """Shorten a path at its beginning: the end tells runs apart."""
+    """Shorten a path at its beginning: its end distinguishes runs."""
     return text if len(text) <= width else "…" + text[len(text) - width + 1 :]
 
 
@@ -348,14 +347,16 @@ def _minutes(seconds: float) -> str:
 
 
 class Screen:
-    """An operator at a terminal: the frame below, what happened above it, questions in between.
+    """An operator at a terminal: messages scroll above a frame, questions are asked below it.
 
     Parameters
     ----------
     console : rich Console
-        Where it is drawn; a terminal.
+        A terminal.
     keyboard : Keyboard, optional
-        None: no keys; questions are answered by lines all the same.
+        Without it there are no keys; questions are still answered by lines.
+    verbose : bool
+        Print every check, the table of the plan and each pose above the frame.
     """
 
     def __init__(
@@ -364,11 +365,13 @@ class Screen:
         keyboard: Keyboard | None = None,
         *,
         stdin: TextIO | None = None,
+        verbose: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._console, self._keyboard, self._stdin = console, keyboard, stdin or sys.stdin
         self._clock = clock
         self._view = View()
+        self._text = SessionText(verbose=verbose, poses=False)
         self._lock = RLock()
         self._live = self._new_live()
         self._stack = ExitStack()
@@ -386,42 +389,49 @@ class Screen:
     ) -> None:
         self._view.keys = "over"
         with self._stack:
+            self._print(self._text.pending())
+            self._live.transient = kind is None  # after an error the frame stays: it has the command to resume
             self._live.stop()
+        if kind is None and self._view.folder:
+            self._print([Line(" ✔ ", f"{len(self._view.taken)} averages kept in {self._view.folder}", "green")])
 
     def show(self, event: Event) -> None:
         """Show an event."""
         with self._lock:
             self._view.update(event, self._clock())
-        head, words = head_and_words(event)
-        if words and _history(event, self._view):
-            style = "bold red" if isinstance(event, GuardTripped) else ""
-            self._console.print(hanging(head, self._plain(words), self._console), style=style)
+        self._print(self._text.lines(event) if _history(event, self._view) else self._text.pending())
 
     def ask(self, question: Question) -> str:
-        """Ask below the frame, which stands still meanwhile."""
+        """Ask below the frame, which is not redrawn until the answer is there."""
+        self._print(self._text.pending())
         self._view.keys = "asking"
         self._live.stop()
         with self._keyboard.suspended() if self._keyboard is not None else nullcontext():
             answer = self._answer(question)
         self._view.keys = "live"
-        self._live = self._new_live()  # the old one would erase as many lines as it had drawn
+        self._live = self._new_live()  # the old one would erase the lines of its last frame
         self._live.start(refresh=True)
         return answer
 
     @property
     def has_keys(self) -> bool:
-        """Whether the terminal's keys are ours."""
+        """Whether keys are read."""
         return self._keyboard is not None
 
     def pressed(self) -> Key | None:
-        """Take the oldest key that was pressed and not yet taken."""
+        """Return the oldest unread key, or None."""
         return None if self._keyboard is None else self._keyboard.pressed()
+
+    def _print(self, lines: Sequence[Line]) -> None:
+        for line in lines:
+            head = self._plain(line.head)
+            self._console.print(hanging(head, self._plain(line.words), self._console), style=line.style)
 
     def _new_live(self) -> Live:
         return Live(console=self._console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
 
     def _answer(self, question: Question) -> str:
-        """Ask until there is an answer, then take questions and frame away: the next one is drawn in their place."""
+        """Ask until there is an answer, then erase question and frame: the next frame is drawn in their place."""
         used = len(self._frame().renderables)
         while True:
             width = self._console.width
@@ -432,7 +442,7 @@ class Screen:
             try:
                 typed = read_line(self._stdin, question)
             except (KeyboardInterrupt, Declined):
-                self._console.file.write("\n")  # what is told next begins a line
+                self._console.file.write("\n")  # the next message begins on a new line
                 raise
             used += len(lines) + (last.cell_len + 1 + cell_len(typed.rstrip("\n"))) // width + 1
             if (answer := match(question, typed)) is not None:
@@ -457,27 +467,34 @@ class Screen:
 
 
 def _history(event: Event, view: View) -> bool:
-    """Tell whether an event is worth a line above the frame."""
-    if isinstance(event, StateChanged):
-        return event.state is State.HOLD and event.words not in view.note  # which stands there already
-    if isinstance(event, Asked):
-        return event.answer != ""
-    return isinstance(event, Checked | Noted | Planned | PoseTaken | GuardTripped)
+    """Whether an event is printed above the frame, where the frame does not show it already."""
+    match event:
+        case StateChanged():
+            return event.state is State.HOLD and event.words not in view.note
+        case Asked():
+            return event.answer != ""
+        case Estimated():
+            return False
+        case _:
+            return True
 
 
 @contextmanager
 def open_operator(*, as_json: bool = False) -> Iterator[Operator]:
-    """Give the operator that fits: JSON where asked for, a live screen at a terminal, else plain lines.
+    """Choose the operator: JSON if requested, a live screen in a terminal, otherwise plain lines.
 
-    The screen goes to stderr, like everything said to a person; a dumb terminal gets plain lines, and so does who wants
-    it quiet.
+    The screen is drawn on stderr. A dumb terminal and `-q` get plain lines.
     """
     if as_json:
         yield JsonOperator()
         return
     if talk.quiet or not talk.is_terminal or talk.is_dumb_terminal or not os.isatty(0):
-        yield PlainOperator(quiet=talk.quiet)
+        operator = PlainOperator(quiet=talk.quiet, verbose=talk.verbose)
+        try:
+            yield operator
+        finally:
+            operator.finish()
         return
     keyboard = Keyboard(0) if Keyboard.usable(0) else None
-    with Screen(talk, keyboard) as screen:
+    with Screen(talk, keyboard, verbose=talk.verbose) as screen:
         yield screen

@@ -1,5 +1,6 @@
 """The demo recovers the truth within its own sigmas, and its run can be replayed, solved again and shown live."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,22 @@ def test_the_run_of_a_demo_is_solved_by_another_method(demo: dict[str, Any], ftd
 @pytest.mark.parametrize("source", ["--simulate", "--replay"])
 def test_the_calibration_of_a_demo_compensates_live(source: str, demo: dict[str, Any], ftdrive: CommandLine) -> None:
     run = Path(demo["run"])
-    wrenches = [source] if source == "--simulate" else [source, run]
-    look = ftdrive.json("live", "--calibration", run / "calibration.json", *wrenches, "--once", "--axes", "base")
+    wrenches, path = ([source], run) if source == "--simulate" else ([source, run], run / "calibration.json")
+    look = ftdrive.json("live", "--calibration", path, *wrenches, "--once", "--axes", "base")
     assert look["about"] == "sensor origin"
     for key, limit in (("force_N", 0.05), ("torque_Nm", 0.005)):
         assert np.abs(look["compensated"][key]).max() < limit
         assert np.abs(np.divide(look["compensated"][key], look["sigma"][key])).max() < 5
     assert np.linalg.norm(look["raw"]["force_N"]) > 1
+
+
+def test_the_python_of_the_readme_runs(
+    demo: dict[str, Any], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(Path(demo["run"]).parents[1])
+    exec(program, {})
+    verdict, left = capsys.readouterr().out.splitlines()
+    assert verdict.startswith("good: ")
+    assert float(left.split()[-2]) < 0.05

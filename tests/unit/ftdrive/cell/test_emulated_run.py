@@ -64,5 +64,5 @@ def test_the_demo_names_its_next_commands_as_they_can_be_typed(
     with capsys.disabled():
         told = CliRunner().invoke(demo.demo, catch_exceptions=False).stderr
     lines = [line for line in told.splitlines() if "runs/a" in line and "Saved" not in line]
-    assert len(lines) == 3
+    assert len(lines) == 2
     assert all(line.startswith(command) for line in lines)

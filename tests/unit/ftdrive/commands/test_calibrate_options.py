@@ -149,7 +149,7 @@ def test_a_resumed_run_reads_the_file_it_was_begun_with(change: str, begin: Begi
     assert cell.robot.host == "10.0.0.9"
     assert cell.workcell.measured
     assert cell.tool.cylinders_mm == ((0, 200 if change.endswith("gone") else 260, 100),)
-    assert ("as the run was begun" if change.endswith("gone") else "cell.toml") in outcome.stderr
+    assert ("settings of the run" if change.endswith("gone") else "cell.toml") in outcome.stderr
 
 
 def test_a_resumed_run_keeps_the_tool_it_was_given(begin: Begin, cells: list[Any]) -> None:

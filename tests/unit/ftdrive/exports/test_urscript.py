@@ -186,24 +186,24 @@ def test_a_program_that_moves_the_whole_arm_says_so(plan: Plan) -> None:
 def test_header_and_question_tell_how_fast_it_is(plan: Plan, tip_m_s: float | None, words: str) -> None:
     speeds = {**plan.description["speeds"], "tip_m_s": tip_m_s}
     lines = urscript.program(replace(plan, description={**plan.description, "speeds": speeds}), dwell_s=1.0)
-    told = [line for line in lines.splitlines() if f"joints up to 60 deg/s, the tips of the tool {words}" in line]
-    assert [line.split("(")[0].split(":")[0].strip() for line in told] == ["# Speed", "popup"]
+    printed = [line for line in lines.splitlines() if f"joints up to 60 deg/s, the tips of the tool {words}" in line]
+    assert [line.split("(")[0].split(":")[0].strip() for line in printed] == ["# Speed", "popup"]
 
 
 def test_a_plan_told_as_json_is_a_plan(tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
-    told = CliRunner().invoke(cli, ["plan", "--model", "ur5e", "--tool", "0:200:100", "--minimal", "--json"])
-    path.write_text(told.stdout)
+    printed = CliRunner().invoke(cli, ["plan", "--model", "ur5e", "--tool", "0:200:100", "--minimal", "--json"])
+    path.write_text(printed.stdout)
     assert export(path, "--format", "csv").exit_code == 0
-    path.write_text(told.stdout.replace('"limited_by"', '"limited-by"'))
+    path.write_text(printed.stdout.replace('"limited_by"', '"limited-by"'))
     assert "changed" in str(export(path, "--format", "csv").exception)
 
 
-@pytest.mark.parametrize("told", [{}, {"measured": False}])
-def test_placeholders_do_not_reach_the_pendant(told: dict[str, bool], plan: Plan, tmp_path: Path) -> None:
+@pytest.mark.parametrize("missing", [{}, {"measured": False}])
+def test_placeholders_do_not_reach_the_pendant(missing: dict[str, bool], plan: Plan, tmp_path: Path) -> None:
     described = {key: value for key, value in plan.description.items() if key != "measured"}
     path = tmp_path / "plan.json"
-    replace(plan, description=described | told).save(path)
+    replace(plan, description=described | missing).save(path)
     for target in ("urscript", "csv"):
         refused = export(path, "--format", target)
         assert isinstance(refused.exception, PlanRefused)

@@ -35,7 +35,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Key
-from ftdrive.terminal.operators import in_words
+from ftdrive.terminal.session_text import in_words
 from tests.unit.ftdrive.fake_cell import MODEL, Lab
 
 Array = NDArray[np.float64]

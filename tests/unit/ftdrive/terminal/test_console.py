@@ -1,4 +1,4 @@
-"""What is told to a person: texts stand as they are, -q leaves them out, errors of the system become sentences."""
+"""Output for people: texts are printed unchanged, -q omits them, errors of the system become sentences."""
 
 import io
 import logging
@@ -77,10 +77,10 @@ def test_findings_of_doctor_and_their_cures_are_indented(
 ) -> None:
     monkeypatch.setenv("TERM", "dumb")  # 80 columns, no colour
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    _print([Check("robot.payload", "failed", "found [1] " * 20, "mend it " * 20)])
+    _print([Check("robot.payload", "failed", "found [1] " * 20, "fix it " * 20)])
     first, *others = (line.rstrip() for line in capsys.readouterr().out.splitlines())
     assert first.startswith(" robot       ✘ found [1]")
-    cure = next(k for k, line in enumerate(others) if line.startswith(" " * 15 + "fix: mend"))
+    cure = next(k for k, line in enumerate(others) if line.startswith(" " * 15 + "fix: fix"))
     assert cure > 0
     assert all(re.match(r" {15}\S", line) for line in others[:cure])
     assert all(re.match(r" {20}\S", line) for line in others[cure + 1 :])
@@ -101,11 +101,11 @@ def test_quiet_asks_with_all_that_a_question_is_about(monkeypatch: pytest.Monkey
     assert stderr.getvalue() == ""
     assert operator.ask(Question("Go?")) == "yes"
     operator.show(Noted(words="it went"))
-    assert stderr.getvalue().splitlines() == ["the arm goes there", "Go? [yes/no] yes"]
+    assert stderr.getvalue().splitlines() == ["   the arm goes there", "Go? [yes/no] yes"]
     monkeypatch.setattr(talk, "quiet", True)
     with open_operator() as chosen:
         assert isinstance(chosen, PlainOperator)
-        chosen.show(Noted(words="not told"))
+        chosen.show(Noted(words="not printed"))
 
 
 def test_errors_of_the_system_name_the_file_and_what_to_look_at(tmp_path: Path, snapshot: SnapshotAssertion) -> None:

@@ -142,14 +142,14 @@ def plain_operator(typed: str) -> Operator:
 
 
 @pytest.mark.parametrize("operator", [json_operator, plain_operator])
-def test_nobody_to_answer_is_no_consent(operator: Callable[..., Operator]) -> None:
-    with pytest.raises(Declined, match="nobody answered 'Type MOVE"):
+def test_the_end_of_the_input_is_no_consent(operator: Callable[..., Operator]) -> None:
+    with pytest.raises(Declined, match="no answer to 'Type MOVE"):
         operator("").ask(MOVE)
     with pytest.raises(Declined):
         operator("maybe\n").ask(FREE)
 
 
-def test_plain_lines_tell_what_is_worth_a_line(snapshot: SnapshotAssertion) -> None:
+def test_plain_lines_hold_what_a_log_needs(snapshot: SnapshotAssertion) -> None:
     stderr = io.StringIO()
     operator: Operator = PlainOperator(stdin=io.StringIO("what\nMOVE\n"), stderr=stderr)
     events: list[Event] = [
@@ -173,23 +173,24 @@ def test_plain_lines_tell_what_is_worth_a_line(snapshot: SnapshotAssertion) -> N
 
 
 @pytest.mark.parametrize("quiet", [True, False])
-def test_what_is_told_goes_on_behind_its_mark(quiet: bool) -> None:
+def test_a_folded_line_continues_behind_its_mark(quiet: bool) -> None:
     person, program = pty.openpty()
     termios.tcsetwinsize(program, (24, 40))
     with os.fdopen(program, "w", encoding="utf-8") as file:
-        operator = PlainOperator(stdin=io.StringIO("yes\n"), stderr=file, quiet=quiet)
+        operator = PlainOperator(stdin=io.StringIO("yes\n"), stderr=file, quiet=quiet, verbose=True)
         operator.show(Checked(name="load", passed=True, words="not compared: the tool's mass is not known"))
         operator.show(Noted(words="the first run of a plan is slow, whatever was asked", warning=True))
         operator.ask(Question("Go?"))
-        told = ""
-        while not told.endswith("] yes\r\n"):
-            told += os.read(person, 4096).decode()
+        printed = ""
+        while not printed.endswith("] yes\r\n"):
+            printed += os.read(person, 4096).decode()
     os.close(person)
-    assert told.splitlines() == [
-        "ok   load: not compared: the tool's mass",
-        "     is not known",
-        "! the first run of a plan is slow,",
-        "  whatever was asked",
+    assert printed.splitlines() == [
+        "Checks",
+        " ✔ load: not compared: the tool's mass",
+        "   is not known",
+        " ! the first run of a plan is slow,",
+        "   whatever was asked",
         "Go? [yes/no] yes",
     ]
 
@@ -197,7 +198,7 @@ def test_what_is_told_goes_on_behind_its_mark(quiet: bool) -> None:
 def test_a_terminal_gets_whole_words_and_a_file_whole_lines() -> None:
     person, program = pty.openpty()
     termios.tcsetwinsize(program, (24, 40))
-    path = "/home/somebody/" + "deep/" * 8 + "run"
+    path = "/home/operator/" + "deep/" * 8 + "run"
     text = f"error: the sensor must be measured, set it in the file {path} then start again: "
     with os.fdopen(program, "w", encoding="utf-8") as file:
         folded = in_whole_words(text, file)
@@ -214,19 +215,19 @@ def test_a_terminal_gets_whole_words_and_a_file_whole_lines() -> None:
 
 def test_what_was_typed_before_a_question_is_no_answer_to_it() -> None:
     person, program = pty.openpty()
-    told, answers = list[bytes](), list[str]()
+    printed, answers = list[bytes](), list[str]()
 
     def read_until(words: bytes, times: int = 1) -> None:
-        while b"".join(told).count(words) < times:
-            assert select.select([person], [], [], 10.0)[0], "nothing more is told"
-            told.append(os.read(person, 4096))
+        while b"".join(printed).count(words) < times:
+            assert select.select([person], [], [], 10.0)[0], "nothing more is printed"
+            printed.append(os.read(person, 4096))
 
     with os.fdopen(program, "r+b", buffering=0) as device:
         stdin = io.TextIOWrapper(io.BufferedReader(device), encoding="utf-8")
         stderr = io.TextIOWrapper(io.FileIO(program, "w", closefd=False), write_through=True)
         operator = PlainOperator(stdin=stdin, stderr=stderr)
         for question, answer in ((STEP, "stop"), (FREE, "no"), (STEP, "")):
-            told.clear()
+            printed.clear()
             os.write(person, b"\n\nyes\n")
             read_until(b"\n", 3)  # the terminal's echo: it has them all
             asking = threading.Thread(target=lambda asked: answers.append(operator.ask(asked)), args=(question,))
@@ -236,3 +237,20 @@ def test_what_was_typed_before_a_question_is_no_answer_to_it() -> None:
             asking.join(10.0)
             assert answers.pop() == answer
     os.close(person)
+
+
+def test_checks_that_pass_share_a_line_and_details_need_verbose() -> None:
+    checks = [Checked(name=name, passed=name != "load", words=f"about {name}") for name in ("robot", "load", "disk")]
+
+    def printed(verbose: bool) -> list[str]:
+        operator = PlainOperator(stdin=io.StringIO(), stderr=(stderr := io.StringIO()), verbose=verbose)
+        for check in checks:
+            operator.show(check)
+        operator.show(estimated(hint=""))
+        operator.finish()
+        return stderr.getvalue().splitlines()
+
+    assert printed(verbose=False) == ["Checks", " ✔ robot", " ✘ load: about load", " ✔ disk"]
+    brief_of_each = [f" {mark} {name}: about {name}" for mark, name in (("✔", "robot"), ("✘", "load"), ("✔", "disk"))]
+    assert printed(verbose=True)[:4] == ["Checks", *brief_of_each]
+    assert "coverage amber" in printed(verbose=True)[4]

@@ -65,7 +65,7 @@ def test_the_headline_of_a_good_calibration_is_what_its_noise_predicts() -> None
     result = solve(tilted())
     assert result.verdict == "good"
     force_N, torque_Nm = result.predicted_error()
-    assert error_in_words(result) == f"{force_N:.4f} N, {torque_Nm:.5f} N·m rms over all orientations (predicted)"
+    assert error_in_words(result) == f"{force_N:.4f} N, {torque_Nm:.5f} N·m rms (predicted)"
 
 
 def test_a_method_with_wrong_known_values_is_named_as_the_cause() -> None:
@@ -107,6 +107,17 @@ def test_too_few_poses_to_do_without_what_is_known_blame_nothing() -> None:
     assert not any("given as known" in reason for reason in solve(few, known=known).reasons)
 
 
+def test_beside_the_truth_the_report_says_what_a_free_tool_reads(capsys: pytest.CaptureFixture[str]) -> None:
+    result = solve(tilted())
+    print_result(result, truth=result.to_dict())
+    printed = capsys.readouterr().err
+    (words,) = re.findall(r"a free tool reads (0\.0000) N, 0\.00000 N·m rms; before (.*) N, 0\.\d\d N·m", printed)
+    weight_and_bias_N = np.hypot(np.linalg.norm(TILTED.gravity_force_base_N), np.linalg.norm(TILTED.force_bias_N))
+    assert float(words[1]) == pytest.approx(weight_and_bias_N, rel=0.02)
+    assert printed.count(" +0.0\n") + printed.count(" +0.0 \n") == 15
+    assert "residuals" not in printed, "details are for -v and for findings"
+
+
 def terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
     state: Any = {"_force_terminal": True, "_width": width, "_height": 25, "_color_system": None, "soft_wrap": False}
     for name, value in state.items():
@@ -123,12 +134,11 @@ def test_lines_of_the_report_go_on_under_their_text(
     lines = [line.rstrip() for line in capsys.readouterr().err.splitlines()]
     assert max(map(len, lines)) <= width
     start = next(i for i, line in enumerate(lines) if line.startswith(" REJECTED"))
-    end = next(i for i, line in enumerate(lines) if "estimate" in line)
+    end = next(i for i, line in enumerate(lines) if line.startswith(" residuals:"))
     assert lines[start + 1].startswith(" " * len(" REJECTED  "))
     assert all(line.startswith("   ") for line in lines[start + 1 : end])
-    residuals = next(i for i, line in enumerate(lines) if line.startswith(" residuals:"))
     assert "…" not in "".join(lines)
-    below = [re.match(r" (residuals:|worst:| {7,}) ?\S", line) for line in lines[residuals:]]
+    below = [re.match(r" (residuals:|worst:| {7,}) ?\S", line) for line in lines[end:]]
     assert len(below) > 2
     assert all(below)
 
@@ -141,7 +151,7 @@ def test_lines_of_the_report_go_on_under_their_text(
         ("--mass-kg", "0", "0.0 is not in the range x>0"),
     ],
 )
-def test_a_known_value_that_cannot_be_is_told_as_it_was_given(
+def test_an_impossible_known_value_is_reported_as_it_was_given(
     option: str, value: str, words: str, tmp_path: Path
 ) -> None:
     tilted().save(tmp_path / "data.json")
@@ -157,16 +167,16 @@ def test_solve_says_of_a_run_what_calibrate_says(as_json: bool, lab: Lab, capsys
     outcome = lab.calibrate()
     assert outcome is not None
     records = outcome.run.records()
-    told = hints(outcome.result, records)
-    assert any("the base leans" in one for one in told)
-    assert any("2.50 kg" in one for one in told)
+    expected = hints(outcome.result, records)
+    assert any("the base leans" in one for one in expected)
+    assert any("2.50 kg" in one for one in expected)
     capsys.readouterr()
     print_result(outcome.result, drift=outcome.drift, records=records)
     by_calibrate = capsys.readouterr().err
     solve_command.main([str(outcome.run.folder), *["--json"][:as_json]], standalone_mode=False)
     by_solve = capsys.readouterr()
     if as_json:
-        assert json.loads(by_solve.out)["hints"] == list(told)
+        assert json.loads(by_solve.out)["hints"] == list(expected)
     else:
         assert by_solve.err == by_calibrate
 
@@ -195,8 +205,13 @@ def test_a_method_that_lacks_the_mass_says_how_to_give_it() -> None:
     ],
 )
 def test_what_was_taken_as_known_is_called_fixed(
-    method: Method, known: Known | None, fixed: set[str], capsys: pytest.CaptureFixture[str]
+    method: Method,
+    known: Known | None,
+    fixed: set[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(talk, "verbose", True)  # with the rows that follow from others
     print_result(solve(tilted(), method, known=known))
     lines = capsys.readouterr().err.splitlines()
     assert {line[: line.index("  ")].strip() for line in lines if line.rstrip().endswith(" fixed")} == fixed

@@ -10,7 +10,7 @@ import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -185,7 +185,7 @@ def test_a_pose_out_of_line_says_which_key_helps() -> None:
     assert "3 tries, NOT STEADY" in text
 
 
-def test_the_first_pose_seen_again_tells_the_drift() -> None:
+def test_the_first_pose_seen_again_shows_the_drift() -> None:
     quiet = view(pose(1, 19), pose(2, 5), pose(3, 19, mean=np.full(6, 1e-4)))
     assert any("drift  first pose again after 2 s" in line and "none seen" in line for line in drawn(quiet))
     drifted = view(pose(1, 19), pose(2, 5), pose(3, 19, mean=np.array([0.5, 0, 0, 0, 0, 0])))
@@ -194,17 +194,17 @@ def test_the_first_pose_seen_again_tells_the_drift() -> None:
     assert any("drift  0.520 ± 0.020 N" in line for line in drawn(view(*MIDDLE, fitted)))
 
 
-def test_a_drift_of_the_force_alone_is_told_for_sure_and_without_torque() -> None:
-    def told(force: str, event: Estimated) -> list[str]:
+def test_a_drift_of_the_force_alone_is_shown_without_torque() -> None:
+    def certainty(force: str, event: Estimated) -> list[str]:
         lines = [line for line in drawn(view(*MIDDLE, event)) if line.startswith(f"drift  {force} ")]
         assert not any("N·m" in line for line in lines)
         return ["perhaps" if line.endswith("perhaps") else "sure" for line in lines]
 
     change, sigma = np.array([0.3, 0, 0.01, 3e-20, 0, 0]), np.array([6e-4, 6e-4, 6e-4, 2e-21, 0, 3e-12])
     fitted = estimated(values=VALUES | {"drift": change}, sigma=SIGMA | {"drift": sigma})
-    assert told("0.300 ± 0.001 N", fitted) == ["sure"]
+    assert certainty("0.300 ± 0.001 N", fitted) == ["sure"]
     doubtful = estimated(values=VALUES | {"drift": change / 200}, sigma=SIGMA | {"drift": sigma})
-    assert told("0.002 ± 0.001 N", doubtful) == ["perhaps"]
+    assert certainty("0.002 ± 0.001 N", doubtful) == ["perhaps"]
 
 
 def test_a_reason_stands_once_on_the_screen() -> None:
@@ -243,7 +243,7 @@ def test_a_warning_stays_until_the_next_pose() -> None:
 
 
 def test_a_long_path_keeps_the_end_that_tells_runs_apart() -> None:
-    long = "/home/somebody/" + "deep/" * 20 + "2026-11-20T211503Z-gripper_a"
+    long = "/home/operator/" + "deep/" * 20 + "2026-11-20T211503Z-gripper_a"
     lines = drawn(view(RunOpened(folder=long, resume=f"ftdrive calibrate --resume {long}")))
     assert [line for line in lines if line.endswith("2026-11-20T211503Z-gripper_a") and len(line) == 80] == lines[-2:]
 
@@ -373,7 +373,7 @@ def screen(person: int, program: int) -> Iterator[tuple[Screen, Shown]]:
         open(program, encoding="utf-8", closefd=False) as stdin,
     ):
         console = Console(file=file, force_terminal=True, width=80, height=24, color_system=None)
-        with Screen(console, Keyboard(program), stdin=stdin) as found:
+        with Screen(console, Keyboard(program), stdin=stdin, verbose=True) as found:
             yield found, Shown(person)
 
 
@@ -455,14 +455,14 @@ def test_enter_in_step_mode_leaves_no_line_behind() -> None:
 def test_a_long_finding_goes_on_under_its_text() -> None:
     console = Console(file=(file := io.StringIO()), width=40, force_terminal=True, color_system=None)
     words = "the controller carries 0.50 kg; nothing in [tool] to compare it with"
-    with Screen(console, stdin=io.StringIO()) as operator:
+    with Screen(console, stdin=io.StringIO(), verbose=True) as operator:
         operator.show(Checked(name="payload", passed=True, words=words))
-    told = file.getvalue()
-    begins = told.index("ok   payload:")
-    lines = [line.rstrip() for line in told[begins : told.index("with", begins) + 4].splitlines()]
-    assert lines[0] == "ok   payload: the controller carries"
-    assert all(line.startswith(" " * 5) and len(line) <= 40 for line in lines[1:])
-    assert " ".join(" ".join(lines).split()) == f"ok payload: {words}"
+    printed = file.getvalue()
+    begins = printed.index(" ✔ payload:")
+    lines = [line.rstrip() for line in printed[begins : printed.index("with", begins) + 4].splitlines()]
+    assert lines[0] == " ✔ payload: the controller carries 0.50"
+    assert all(line.startswith(" " * 3) and len(line) <= 40 for line in lines[1:])
+    assert " ".join(" ".join(lines).split()) == f"✔ payload: {words}"
 
 
 def test_without_a_terminal_there_are_plain_lines_and_json_where_asked_for() -> None:
@@ -531,3 +531,18 @@ def test_ctrl_c_and_sigterm_end_the_program_and_restore_the_terminal(
         finally:
             child.kill()
             child.wait()
+
+
+@pytest.mark.parametrize("error", [None, KeyboardInterrupt])
+def test_the_frame_is_erased_after_success_and_stays_after_an_error(error: type[BaseException] | None) -> None:
+    console = Console(file=(file := io.StringIO()), width=80, height=24, force_terminal=True, color_system=None)
+    with suppress(KeyboardInterrupt), Screen(console, stdin=io.StringIO()) as operator:
+        for event in MIDDLE:
+            operator.show(event)
+        if error is not None:
+            raise error
+    *_, last = file.getvalue().split("resume  ")  # the frame's last line
+    assert ("\x1b[1A\x1b[2K" in last) == (error is None)  # up, and clear the line
+    assert ("✔ 6 averages kept in runs/2026" in last) == (error is None)
+    assert "SETTLE" in file.getvalue()
+    assert "settled 0.9 s, 2000 samples in" not in file.getvalue(), "the frame shows the poses"

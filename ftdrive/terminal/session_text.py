@@ -1,0 +1,181 @@
+"""The lines that a session prints, for every operator that shows text."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.show.words import plan_in_words, point_in_words
+from ftdrive.session.events import (
+    Asked,
+    Checked,
+    Estimated,
+    Event,
+    GuardTripped,
+    Noted,
+    Planned,
+    PoseTaken,
+    RunOpened,
+    State,
+    StateChanged,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line of text."""
+
+    head: str
+    """A mark or indent; a folded line continues below the first word after it."""
+    words: str
+    style: str = ""
+    """Of rich, for a terminal with colour."""
+
+
+class SessionText:
+    """Turns events into lines, in sections with headings.
+
+    Parameters
+    ----------
+    verbose : bool
+        Print a line for each check, the table of the plan, and the estimate after each pose. Otherwise passed checks
+        share one line, and the plan has three.
+    poses : bool
+        Print a line for each pose. A live screen shows them already.
+    """
+
+    def __init__(self, *, verbose: bool = False, poses: bool = True) -> None:
+        self._verbose, self._poses = verbose, verbose or poses
+        self._sections = list[str]()
+        self._passed = list[str]()
+
+    def lines(self, event: Event) -> list[Line]:
+        """Return the lines to print for an event, those that waited for it first."""
+        if isinstance(event, Checked) and event.passed and not self._verbose:
+            heading = [] if self._passed else self._heading("Checks")
+            self._passed.append(event.name)
+            return heading
+        body, waiting = self._body(event), self.pending()
+        if not body and not isinstance(event, RunOpened):
+            return waiting
+        return waiting + self._heading_before(event) + body
+
+    def pending(self) -> list[Line]:
+        """Return the line of the checks that have passed so far."""
+        passed, self._passed = self._passed, []
+        return [Line(" ✔ ", ", ".join(passed), "green")] if passed else []
+
+    def _heading_before(self, event: Event) -> list[Line]:
+        match event:
+            case Planned():
+                return self._heading("Plan")
+            case Checked():
+                return self._heading("Checks")
+            case RunOpened() | PoseTaken() | StateChanged(state=State.APPROACH | State.MOVE):
+                return self._heading("Tour")
+            case _:
+                return []
+
+    def _heading(self, name: str) -> list[Line]:
+        """Print each heading once: checks after a stop belong to the tour."""
+        if name in self._sections:
+            return []
+        self._sections.append(name)
+        return [Line("", name, "bold cyan")]
+
+    def _body(self, event: Event) -> list[Line]:
+        match event:
+            case Planned() if not self._verbose:
+                return [Line("   ", words) for words in (*plan_in_brief(event.plan), event.way_words)]
+            case RunOpened() | PoseTaken() if not self._poses:
+                return []
+            case Estimated(hint="") if not self._verbose:
+                return []
+            case StateChanged(state=State.PREFLIGHT | State.CLOSE, words="") if not self._verbose:
+                return []
+        head, words = head_and_words(event)
+        if not words:
+            return []
+        style = ""
+        if isinstance(event, GuardTripped) or (isinstance(event, Checked) and not event.passed):
+            style = "bold red"
+        elif isinstance(event, Noted) and event.warning:
+            style = "yellow"
+        elif isinstance(event, StateChanged) and event.state is State.HOLD:
+            style = "bold yellow"
+        return [Line(f" {head}" if head.strip() else "   ", words, style)]
+
+
+def plan_in_brief(plan: Plan) -> tuple[str, str]:
+    """Describe a plan in two lines: its moves and clearance, and the room to keep free."""
+    nearest = min(plan.steps, key=lambda step: step.clearance_m)
+    count = len(plan.steps)
+    clear = f"{1e3 * nearest.clearance_m:.0f} mm"
+    proven = f"proven clear by {clear}" if plan.certified else f"NOT ALL PROVEN CLEAR (nearest: {clear})"
+    moving = "only the wrist moves" if plan.arm_rests else "the whole arm moves"
+    room = "" if plan.arm_rests else ", and the room of the whole arm"
+    return (
+        f"{count} poses, {count} moves {proven}; {moving}",
+        f"keep free: ball of {plan.ball_m:.2f} m around {point_in_words(plan)}{room}",
+    )
+
+
+def in_words(event: Event) -> str:
+    """Return all words of an event: a plan in many lines, others in one. Empty for events that only a screen shows."""
+    return "".join(head_and_words(event))
+
+
+def head_and_words(event: Event) -> tuple[str, str]:
+    """Return the mark an event begins with, under which its lines are not continued, and its words."""
+    match event:
+        case RunOpened():
+            return "", f"kept in {event.folder}; to continue after a stop: {event.resume}"
+        case StateChanged(state=State.HOLD):  # repeats the words of STOP
+            return "", f"{event.state.upper()}: {event.words}"
+        case StateChanged(state=State.PREFLIGHT | State.APPROACH | State.CLOSE):
+            return "", f"{event.state}{': ' if event.words else ''}{event.words}"
+        case Checked():
+            return "✔ " if event.passed else "✘ ", f"{event.name}: {event.words}"
+        case Planned():
+            return "", f"{plan_in_words(event.plan)}\n{event.way_words}"
+        case Noted():
+            return "! " if event.warning else "", event.words
+        case PoseTaken():
+            return "", pose_in_words(event)
+        case Estimated():
+            return "  ", estimate_in_words(event)
+        case GuardTripped():
+            return "", f"STOPPED by guard {event.hazard}: {event.words}"
+        case Asked():
+            colon = "" if event.question.endswith("?") else ":"
+            return "", f"{event.question}{colon} {event.answer}{' (--yes)' if event.by == '--yes' else ''}"
+        case _:
+            return "", ""
+
+
+def pose_in_words(event: PoseTaken) -> str:
+    """Describe how a pose was averaged."""
+    force_N, torque_Nm = rms_sigma(event)
+    words = (
+        f"{event.stop}/{event.stops} R{event.number:02d}: settled {event.settle_s:.1f} s, {event.samples} samples in "
+        f"{event.average_s:.1f} s, sigma {force_N:.2g} N {torque_Nm:.2g} N·m"
+    )
+    if event.attempts > 1:
+        words += f", {event.attempts} attempts"
+    return words if event.steady else words + ", NOT STEADY"
+
+
+def estimate_in_words(event: Estimated) -> str:
+    """Describe coverage and running fit."""
+    words = f"coverage {event.light}"
+    if "mass_kg" in event.values:
+        words += f", mass {event.values['mass_kg']:.4f} ± {event.sigma['mass_kg']:.4f} kg"
+    if event.residual_sigma is not None and event.residual_force_N is not None:
+        words += f", {event.residual_force_N:.3f} N from the fit before, {event.residual_sigma:.1f} sigma"
+    return f"{words}; helps most: {event.hint}" if event.hint else words
+
+
+def rms_sigma(event: PoseTaken) -> tuple[float, float]:
+    """Standard deviation of one axis of the mean: force, N, and torque, N·m."""
+    variance = np.square(event.sigma)
+    return float(np.sqrt(variance[:3].mean())), float(np.sqrt(variance[3:].mean()))
