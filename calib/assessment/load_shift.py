@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.likelihood.descent import column_scale
+from calib.likelihood.gain_and_cross_talk import response_columns
 from calib.likelihood.session_noise import summed_products
 from calib.model import Array, Parameters, jacobian
 
@@ -87,7 +88,9 @@ def lasting_change(
         return None
     sigma = np.asarray(sigma, dtype=np.float64)
     y = residuals / sigma
-    J = jacobian(parameters, R_base_flange) / sigma[:, None]
+    # A fit may have taken a part of the change for gain and cross-talk: these are free too.
+    free = [jacobian(parameters, R_base_flange), response_columns(parameters, R_base_flange)]
+    J = np.concatenate(free, axis=2) / sigma[:, None]
     ramp = ((t_s - t_s.mean()) / (np.ptp(t_s) or 1.0))[:, None, None] * (np.eye(6) / sigma[:, None])
     others = [_misfit(J, y), _misfit(np.concatenate([J, ramp], axis=2), y)]
     used = np.ones(n, bool)
@@ -127,14 +130,15 @@ def _best_change(parameters: Parameters, J: Array, y: Array, positions: NDArray[
     rest = float((y**2).sum() - moment.sum(axis=0) @ inverse @ moment.sum(axis=0))
     # What the change sees when the parameters have made good what they can.
     seen = after - after @ inverse @ after
-    asked = moment_after - after @ (inverse @ moment.sum(axis=0))
+    asked = (moment_after - after @ (inverse @ moment.sum(axis=0)))[:, :15]
+    seen = seen[:, :15, :15]
     found = []
     for what, directions in _changes(parameters).items():
-        D = directions * scale[:, None]
+        D = directions * scale[:15, None]
         gain = np.linalg.pinv(D.T @ seen @ D, rcond=1e-10, hermitian=True)
         x = (gain @ (asked @ D)[..., None])[..., 0]
         size = directions.shape[1]
-        misfit = (rest - np.sum(x * (asked @ D), axis=1)) / max(6 * n - 15 - size, 1)
+        misfit = (rest - np.sum(x * (asked @ D), axis=1)) / max(6 * n - J.shape[2] - size, 1)
         misfit = np.maximum(misfit, 1e-12 * rest / n)
         criterion = 6 * n * np.log(misfit) + size * np.log(6 * n)
         k = int(np.argmin(criterion))
