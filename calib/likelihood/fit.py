@@ -142,11 +142,7 @@ class Fit:
     def residuals(self) -> Array:
         """(n, 6) measured minus predicted, gain and cross-talk included, drift not."""
         added = 0.0 if self.response is None else self.response.wrench(self.parameters, self.R_base_flange)
-        return np.asarray(self._plain_residuals - added)
-
-    @cached_property
-    def _plain_residuals(self) -> Array:
-        return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange))
+        return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange) - added)
 
     @cached_property
     def jacobian(self) -> Array:
@@ -154,11 +150,30 @@ class Fit:
         return jacobian(self.parameters, self.R_base_flange)
 
     @cached_property
-    def _weighted(self) -> tuple[Array, Array]:
-        """Inverse noise times Jacobian (n, 6, 15) and times residuals (n, 6), poses by time."""
-        J, r = self.jacobian[self.order], self._plain_residuals[self.order]
-        WX = self.noise.solve(np.concatenate([J, r[..., None]], axis=2))
-        return WX[..., :15], WX[..., 15]
+    def _pass(self) -> tuple[Array, Array, Array]:
+        """One pass over the poses: left-out residuals, their covariance, and the normal equations (27, 27).
+
+        These are of the 15 parameters, the residual and the 11 numbers of gain and cross-talk.
+        """
+        e, S, G = np.empty((len(self.order), 6)), np.empty((len(self.order), 6, 6)), np.zeros((27, 27))
+        for part, noise in self.noise.parts():
+            rows = self.order[part]
+            R = self.R_base_flange[rows]
+            r = self.wrench[rows] - predict(self.parameters, R)
+            X = np.concatenate(
+                [jacobian(self.parameters, R), r[..., None], response_columns(self.parameters, R)], axis=2
+            )
+            WX = noise.solve(X)
+            G += summed_products(X, WX)
+            # With a prior the best parameters leave some of J' W r.
+            e[rows], S[rows] = left_out(noise, WX[..., :15], WX[..., 15], self.covariance)
+        return e, S, G
+
+    def _response_equations(self, which: NDArray[np.intp]) -> tuple[Array, Array, Array]:
+        """Give J' W T (15, k), T' W r (k,) and T' P T (k, k), T the columns of these numbers of gain and cross-talk."""
+        G, own = self._pass[2], 16 + which
+        JWT = G[:15, own]
+        return JWT, G[own, 15], G[np.ix_(own, own)] - JWT.T @ self.covariance @ JWT
 
     @cached_property
     def response(self) -> Response | None:
@@ -166,18 +181,15 @@ class Fit:
         which, variance = self.effects
         if not which.size:
             return None
-        T = response_columns(self.parameters, self.R_base_flange[self.order])[..., which]
-        WJ, u = self._weighted
-        JWT = summed_products(WJ, T)
+        JWT, Tu, TPT = self._response_equations(which)
         C, total = self.covariance, np.zeros((15 + SIZE, 15 + SIZE))
         own = 15 + which
         total[:15, :15] = C
         total[:15, own] = -C @ JWT * variance
         total[own, :15] = total[:15, own].T
-        TPT = summed_products(T, self.noise.solve(T)) - JWT.T @ C @ JWT
         total[np.ix_(own, own)] = np.diag(variance) - variance[:, None] * TPT * variance
         coefficients = np.zeros(SIZE)
-        coefficients[which] = variance * np.tensordot(u, T, 2)
+        coefficients[which] = variance * Tu
         return Response(coefficients, total)
 
     @cached_property
@@ -185,30 +197,19 @@ class Fit:
         """Standard deviation of the entries of the gain: as found, else what the data leave room for, by moments."""
         if "gain" in self.components or len(self.weights) < FEW_POSES_FOR_RESPONSE:
             return self.components.get("gain", 0.0)
-        T = response_columns(self.parameters, self.R_base_flange[self.order])[..., :5]
-        WJ, u = self._weighted
-        JWT, Tu = summed_products(WJ, T), np.tensordot(u, T, 2)
-        M = summed_products(T, self.noise.solve(T)) - JWT.T @ self.covariance @ JWT
+        _, Tu, M = self._response_equations(np.arange(5))
         excess = float(Tu @ np.linalg.lstsq(M, Tu, rcond=1e-9)[0]) - len(M)
         return float(np.sqrt(max(excess, 0.0) / np.trace(M)))
 
     @property
     def left_out_residuals(self) -> Array:
         """(n, 6) measured minus what all other poses predict for this one, drift and correlation included."""
-        return self._left_out[0]
+        return self._pass[0]
 
     @property
     def left_out_cov(self) -> Array:
         """(n, 6, 6) covariance of these: noise of the pose and uncertainty of its prediction."""
-        return self._left_out[1]
-
-    @cached_property
-    def _left_out(self) -> tuple[Array, Array]:
-        # With a prior the best parameters leave some of J' W r.
-        e, S = left_out(self.noise, *self._weighted, self.covariance)
-        unsorted = np.empty_like(self.order)
-        unsorted[self.order] = np.arange(len(self.order))
-        return e[unsorted], S[unsorted]
+        return self._pass[1]
 
     @cached_property
     def standardized_residuals(self) -> Array:
