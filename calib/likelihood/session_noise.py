@@ -3,7 +3,8 @@
     V = blockdiag(D_i) + S (K (x) I6) S + slopes + effects,    S = diag(walk)
 
 K is the covariance of a random walk less its mean over the poses, so that "the bias" is the mean bias: the
-pseudo-inverse of the path's stiffness matrix. That one is tridiagonal, so with Woodbury's identity all is O(n).
+pseudo-inverse of the path's stiffness matrix. This matrix is tridiagonal.
+Woodbury's identity makes every operation O(n).
 """
 
 from collections.abc import Iterator
