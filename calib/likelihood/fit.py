@@ -231,7 +231,7 @@ def fit(
     t_s : array, shape (n,), optional
         When each pose was taken; without it, or with NaN in it, their order counts.
     drift : {"auto", "none", "linear", "random-walk"}
-        How the bias may move: as the restricted likelihood decides, not at all, or surely so.
+        How the bias may move: "auto": the restricted likelihood decides. The others: not at all, or always.
     known : Known, optional
     g_m_s2 : float
         Only to turn a known mass into a weight.

@@ -6,11 +6,14 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from calib import Parameters
+from calib.assessment.cross_validation import leave_one_out
 from calib.data.pooling import pooled_covariance
 from calib.known import Constraints, Known
 from calib.likelihood.descent import Descent
 from calib.likelihood.fit import Drift, Fit, fit
+from calib.likelihood.session_noise import inverse_blocks
 from calib.likelihood.sufficient_statistics import (
+    CHUNK,
     Statistics,
     coefficients,
     coefficients_derivative,
@@ -433,3 +436,29 @@ def test_covariances_of_unknown_origin_are_taken_as_they_are() -> None:
     mixed = pooled_covariance(S, np.array([0, 10, 10, 10**9, 0]))
     np.testing.assert_array_equal(mixed[[0, 4]], S[[0, 4]])
     np.testing.assert_allclose(mixed[3], S[3], rtol=1e-4)
+
+
+def test_many_poses_are_predicted_in_parts_as_they_would_be_at_once() -> None:
+    rng = np.random.default_rng(8)
+    n = CHUNK + 50
+    p, R = truth(rng), haar(rng, n)
+    best = fit(R, predict(p, R) + noise(rng, n), WHITE, drift="none")
+    assert len(list(best.noise.parts())) == 2
+    residuals, cov = leave_one_out(best.residuals, jacobian(best.parameters, R), np.broadcast_to(WHITE, (n, 6, 6)))
+    np.testing.assert_allclose(best.left_out_residuals, residuals, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(best.left_out_cov, cov, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6, 7])
+def test_the_blocks_of_the_inverse_are_those_of_the_dense_one(n: int) -> None:
+    rng = np.random.default_rng(n)
+    diagonal, above = rng.normal(size=(n, 3, 3)), rng.normal(size=(n - 1, 3, 3))
+    diagonal = diagonal @ np.swapaxes(diagonal, 1, 2) + 12 * np.eye(3)
+    dense = np.zeros((n, 3, n, 3))
+    dense[range(n), :, range(n)] = diagonal
+    dense[range(n - 1), :, range(1, n)] = above
+    dense[range(1, n), :, range(n - 1)] = np.swapaxes(above, 1, 2)
+    inverse = np.linalg.inv(dense.reshape(3 * n, 3 * n)).reshape(n, 3, n, 3)
+    own, beside = inverse_blocks(diagonal, above)
+    np.testing.assert_allclose(own, inverse[range(n), :, range(n)], atol=1e-12)
+    np.testing.assert_allclose(beside, inverse[range(n - 1), :, range(1, n)], atol=1e-12)
