@@ -1,4 +1,4 @@
-"""What was mixed up where a fit is bad: orientations, pairs, axes, units. Named only if undoing it helps."""
+"""Mistakes in the data of a bad fit: orientations, pairs, axes, units. Named only if undoing one helps."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from calib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
 ROUNDING = 1e-9
 """Of readings, relative to the largest: what is left at least."""
 COLLAPSE = 0.4
-"""An explanation is one if the residual drops to this share."""
+"""Accept a hypothesis if it reduces the residual to this share."""
 NO_WORSE = 1.2
 """The other residual may grow by this factor."""
 PLAUSIBLE_TILT_DEG = 60.0
 IMPLAUSIBLE = 1.0
-"""What a weight that does not pull downwards counts, in the logarithm of the residuals."""
+"""Penalty of a weight that does not pull downwards, in the logarithm of the residuals."""
 TIED = 1.3
 """Residuals that differ by less than this factor are equal: the simpler explanation is taken."""
 IN_BASE_RAD = np.deg2rad(10.0)
@@ -64,13 +64,13 @@ class _Rough:
         return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
     def score(self, up_in_base: Array) -> float:
-        """Give the logarithm of the residuals; lower is better."""
+        """Logarithm of the residuals plus the penalty; lower is better."""
         implausible = self.tilt_deg(up_in_base) > PLAUSIBLE_TILT_DEG
         return float(np.log(self.force_rms_N * self.torque_rms_Nm)) + IMPLAUSIBLE * implausible
 
 
 def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[str]:
-    """Find out what explains a bad fit: how orientations are given, which wrench belongs to which pose, or the axes.
+    """Find the mistake that explains a bad fit: form of orientations, pairing of wrenches and poses, or axes.
 
     Reversing all three axes of torque or of force only moves the centre of mass to the other side of the sensor.
 
@@ -98,7 +98,7 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
     if found:
         _, (what, advice), best = min(found, key=lambda each: each[0])
         return [
-            f"{what}, with that undone the force residual drops from {as_read.force_rms_N:.2g} to "
+            f"{what}. Corrected, the force residual drops from {as_read.force_rms_N:.2g} to "
             f"{best.force_rms_N:.2g} N: {advice}"
         ]
     return _axes(as_read, wrench[:, 3:], up)
@@ -118,7 +118,7 @@ def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[s
 
 
 def _readings(R: Array, wrench: Array) -> Iterator[tuple[tuple[str, str], Array, Array]]:
-    """What was meant, if one thing was mixed up."""
+    """Each mistake in words, with the data as they are without it."""
     yield ("the orientations look inverted", "state that they map base to flange"), np.swapaxes(R, 1, 2), wrench
     quaternions = Rotation.from_matrix(R).as_quat()
     for shift, given, read in ((-1, "w, x, y, z", "x, y, z, w"), (1, "x, y, z, w", "w, x, y, z")):
@@ -156,13 +156,9 @@ def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[str]:
     ]
 
 
-def _signs_only(Q: Array) -> bool:
-    return bool(np.abs(np.diag(Q)).min() > 0.5)
-
-
 def _order(Q: Array) -> str:
-    """Say which channels the axes come from."""
-    if _signs_only(Q):
+    """Name the channels from which the axes come."""
+    if np.abs(np.diag(Q)).min() > 0.5:
         return " and ".join("xyz"[k] for k in range(3) if Q[k, k] < 0) + " reversed"
     channels = ", ".join(("-" if row[k] < 0 else "") + "xyz"[k] for row in Q for k in [int(np.abs(row).argmax())])
     return f"x, y, z taken from ({channels})"
@@ -190,7 +186,7 @@ def broken_channels(wrench: Array, R_base_flange: Array) -> list[str]:
     spread = np.ptp(wrench, axis=0)
     group = np.repeat([spread[:3].max(), spread[3:].max()], 3)
     stuck = [name for name, own, all_ in zip(names, spread, group, strict=True) if own == 0 < all_]
-    found = [f"{', '.join(stuck)} reads the same in all poses: the channel is stuck, check it"] if stuck else []
+    found = [f"{', '.join(stuck)} reads the same in all poses: the channel is stuck. Check it"] if stuck else []
     if len(np.unique(wrench[:, np.argmax(spread)])) == len(wrench):
         return found
     _, first, count = np.unique(wrench, axis=0, return_index=True, return_counts=True)

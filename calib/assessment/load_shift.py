@@ -1,4 +1,4 @@
-"""Something that changed for good between two poses: a load that shifted, a sensor that was tared."""
+"""A lasting change between two poses: a load that shifted, or a sensor that was tared."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.likelihood.descent import column_scale
+from calib.likelihood.gain_and_cross_talk import response_columns
 from calib.likelihood.session_noise import summed_products
 from calib.model import Array, Parameters, jacobian
 
@@ -39,18 +40,18 @@ class Change:
         return self.what in {"centre of mass", "load"}
 
     def in_words(self, since: str) -> str:
-        """Say what changed from a pose on, and what to do."""
+        """State what changed from a pose on, and what to do."""
         step, size = self.step, float(np.linalg.norm(self.step))
         tared = "was the sensor tared, or does a cable pull? Check it"
         what = {
-            "centre of mass": f"the centre of mass is {1e3 * size:.2g} mm elsewhere: did the load shift? Fix it",
+            "centre of mass": f"the centre of mass is {1e3 * size:.2g} mm off: did the load shift? Fix it",
             "load": f"the load weighs {abs(step[0]):.2g} N {'less' if step[0] < 0 else 'more'}: was something lost or "
             "picked up? Check the tool",
-            "force": f"the force reads {size:.2g} N otherwise: {tared}",
-            "torque": f"the torque reads {size:.2g} N·m otherwise: {tared}",
+            "force": f"the force reads {size:.2g} N differently: {tared}",
+            "torque": f"the torque reads {size:.2g} N·m differently: {tared}",
             "force and torque": f"force and torque read {np.linalg.norm(step[:3]):.2g} N and "
-            f"{np.linalg.norm(step[3:]):.2g} N·m otherwise: {tared}",
-            "mounting": f"the sensor sits {np.degrees(size):.2g}° otherwise: is a screw loose? Fasten it",
+            f"{np.linalg.norm(step[3:]):.2g} N·m differently: {tared}",
+            "mounting": f"the sensor is turned by {np.degrees(size):.2g}°: is a screw loose? Fasten it",
         }[self.what]
         return f"from {since} on {what} and calibrate again"
 
@@ -63,7 +64,7 @@ def lasting_change(
     t_s: Array,
     suspect: Sequence[int] = (),
 ) -> Change | None:
-    """Find what changed for good between two poses, if that explains the residuals far better than anything else.
+    """Find a lasting change between two poses that explains the residuals far better than anything else.
 
     Linear least squares of the residuals with the parameters free, and some of them different from a pose on. It must
     beat no change, a steady drift, and single poses that are off, unless those are all at one end of the tour.
@@ -87,7 +88,9 @@ def lasting_change(
         return None
     sigma = np.asarray(sigma, dtype=np.float64)
     y = residuals / sigma
-    J = jacobian(parameters, R_base_flange) / sigma[:, None]
+    # A fit may have taken a part of the change for gain and cross-talk: these are free too.
+    free = [jacobian(parameters, R_base_flange), response_columns(parameters, R_base_flange)]
+    J = np.concatenate(free, axis=2) / sigma[:, None]
     ramp = ((t_s - t_s.mean()) / (np.ptp(t_s) or 1.0))[:, None, None] * (np.eye(6) / sigma[:, None])
     others = [_misfit(J, y), _misfit(np.concatenate([J, ramp], axis=2), y)]
     used = np.ones(n, bool)
@@ -125,17 +128,17 @@ def _best_change(parameters: Parameters, J: Array, y: Array, positions: NDArray[
     after, moment_after = (np.cumsum(x[:0:-1], axis=0)[::-1] for x in (information, moment))
     inverse = np.linalg.pinv(information.sum(axis=0), rcond=1e-12, hermitian=True)
     rest = float((y**2).sum() - moment.sum(axis=0) @ inverse @ moment.sum(axis=0))
-    # What the change sees when the parameters have made good what they can.
-    seen = after - after @ inverse @ after
-    asked = moment_after - after @ (inverse @ moment.sum(axis=0))
+    # What a change can still explain beside the parameters.
+    seen = (after - after @ inverse @ after)[:, :15, :15]
+    asked = (moment_after - after @ (inverse @ moment.sum(axis=0)))[:, :15]
     found = []
     for what, directions in _changes(parameters).items():
-        D = directions * scale[:, None]
+        D = directions * scale[:15, None]
         gain = np.linalg.pinv(D.T @ seen @ D, rcond=1e-10, hermitian=True)
         x = (gain @ (asked @ D)[..., None])[..., 0]
         size = directions.shape[1]
-        misfit = (rest - np.sum(x * (asked @ D), axis=1)) / max(6 * n - 15 - size, 1)
-        misfit = np.maximum(misfit, 1e-12 * rest / n)
+        misfit = (rest - np.sum(x * (asked @ D), axis=1)) / max(6 * n - J.shape[2] - size, 1)
+        misfit = np.maximum(misfit, 1e-12 * float((y**2).sum()) / n)
         criterion = 6 * n * np.log(misfit) + size * np.log(6 * n)
         k = int(np.argmin(criterion))
         found.append(Change(what, int(positions[k]), x[k], float(misfit[k]), float(criterion[k])))

@@ -91,7 +91,7 @@ class Descent:
 
     @staticmethod
     def same(p: Parameters, q: Parameters) -> bool:
-        """Tell whether two points belong to one minimum."""
+        """Whether two points belong to one minimum."""
         return bool(angle_between(p.R_flange_sensor, q.R_flange_sensor) <= SAME_ROTATION_RAD)
 
     def normal_equations(self, equations: Equations, p: Parameters) -> tuple[Array, Array, float]:

@@ -1,7 +1,7 @@
 """Maximum likelihood: joint weighted least squares of forces and torques, under the noise the data show.
 
-There is one objective: the restricted likelihood at the best parameters, less what each component of the noise and each
-rejected pose must bring. From all minima of the force equations down to the minima of the joint cost; then parameters,
+The objective is the restricted likelihood at the best parameters, less what each component of the noise and each
+rejected pose must bring. The descent starts from all minima of the force cost. Then the fit improves parameters,
 variances, components and rejected poses in turn, until nothing changes.
 """
 
@@ -53,12 +53,12 @@ Drift = Literal["auto", "none", "linear", "random-walk"]
 
 RANK_TOLERANCE = 1e-9
 LEVER_M = 0.025  # usual ratio of torque noise to force noise
-FEW_POSES = 6  # fewer cannot tell force noise from torque noise: the usual ratio is taken
-FEW_POSES_FOR_RESPONSE = 7  # fewer cannot tell gain and cross-talk from noise
-FEW_POSES_WITHOUT_NOISE = 12  # fewer cannot tell drift from noise that nobody measured
-POSES_FOR_EACH_AXIS = 50  # fewer cannot tell the drift of one axis from that of another of its group
+FEW_POSES = 6  # fewer cannot separate force noise from torque noise: the usual ratio is taken
+FEW_POSES_FOR_RESPONSE = 7  # fewer cannot separate gain and cross-talk from noise
+FEW_POSES_WITHOUT_NOISE = 12  # fewer cannot separate drift from unknown noise
+POSES_FOR_EACH_AXIS = 50  # fewer cannot separate the drifts of the axes of a group
 MANY_POSES = 20_000  # from here on single poses are looked at only when chi2 or `drift` asks for it
-FLOOR = 1e-3  # of the residuals: white noise that is surely there when nobody measured it
+FLOOR = 1e-3  # of the residuals: the least white noise where it was not measured
 SUSPICIOUS = 0.01  # p-value below which more than the measured noise is looked for
 LIGHT_TAIL = 0.6  # the median of squared distances relative to their mean, in units of what Gaussian noise has
 ROUNDS = 12  # of the outer loop; it ends after two or three
@@ -94,12 +94,12 @@ class Fit:
     """Under the noise model: measured or estimated white noise plus `components`. About dof by construction."""
     dof: int
     measured_chi2: float
-    """The same poses, best fit without drift, weighted by the measured noise alone; NaN when nobody measured it."""
+    """The same poses, best fit without drift, weighted by the measured noise alone; NaN without it."""
     weights: Array
-    """(n,) 1 = used, 0 = rejected because it fits none of what the others tell."""
+    """(n,) 1 = used, 0 = rejected because it does not fit the others."""
     components: Mapping[str, float]
-    """Standard deviations of what was found, by name and unit: beyond the measured noise, or all of the noise when
-    nobody measured it. A `walk` is per mean interval between poses, a `slope` per session."""
+    """Standard deviations of what was found, by name and unit: beyond the measured noise, or all of the noise
+    where it was not measured. A `walk` is per mean interval between poses, a `slope` per session."""
     drift: DriftEstimate | None
     noise: Noise
     """Covariance of all wrenches under the noise model, poses in the order of `order`."""
@@ -142,23 +142,33 @@ class Fit:
     def residuals(self) -> Array:
         """(n, 6) measured minus predicted, gain and cross-talk included, drift not."""
         added = 0.0 if self.response is None else self.response.wrench(self.parameters, self.R_base_flange)
-        return np.asarray(self._plain_residuals - added)
+        return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange) - added)
 
     @cached_property
-    def _plain_residuals(self) -> Array:
-        return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange))
+    def _pass(self) -> tuple[Array, Array, Array]:
+        """One pass over the poses: left-out residuals, their covariance, and the normal equations (27, 27).
 
-    @cached_property
-    def jacobian(self) -> Array:
-        """(n, 6, 15) derivative of the prediction."""
-        return jacobian(self.parameters, self.R_base_flange)
+        These are of the 15 parameters, the residual and the 11 numbers of gain and cross-talk.
+        """
+        e, S, G = np.empty((len(self.order), 6)), np.empty((len(self.order), 6, 6)), np.zeros((27, 27))
+        for part, noise in self.noise.parts():
+            rows = self.order[part]
+            R = self.R_base_flange[rows]
+            r = self.wrench[rows] - predict(self.parameters, R)
+            X = np.concatenate(
+                [jacobian(self.parameters, R), r[..., None], response_columns(self.parameters, R)], axis=2
+            )
+            WX = noise.solve(X)
+            G += summed_products(X, WX)
+            # With a prior the best parameters leave some of J' W r.
+            e[rows], S[rows] = left_out(noise, WX[..., :15], WX[..., 15], self.covariance)
+        return e, S, G
 
-    @cached_property
-    def _weighted(self) -> tuple[Array, Array]:
-        """Inverse noise times Jacobian (n, 6, 15) and times residuals (n, 6), poses by time."""
-        J, r = self.jacobian[self.order], self._plain_residuals[self.order]
-        WX = self.noise.solve(np.concatenate([J, r[..., None]], axis=2))
-        return WX[..., :15], WX[..., 15]
+    def _response_equations(self, which: NDArray[np.intp]) -> tuple[Array, Array, Array]:
+        """Give J' W T (15, k), T' W r (k,) and T' P T (k, k), T the columns of these numbers of gain and cross-talk."""
+        G, own = self._pass[2], 16 + which
+        JWT = G[:15, own]
+        return JWT, G[own, 15], G[np.ix_(own, own)] - JWT.T @ self.covariance @ JWT
 
     @cached_property
     def response(self) -> Response | None:
@@ -166,18 +176,15 @@ class Fit:
         which, variance = self.effects
         if not which.size:
             return None
-        T = response_columns(self.parameters, self.R_base_flange[self.order])[..., which]
-        WJ, u = self._weighted
-        JWT = summed_products(WJ, T)
+        JWT, Tu, TPT = self._response_equations(which)
         C, total = self.covariance, np.zeros((15 + SIZE, 15 + SIZE))
         own = 15 + which
         total[:15, :15] = C
         total[:15, own] = -C @ JWT * variance
         total[own, :15] = total[:15, own].T
-        TPT = summed_products(T, self.noise.solve(T)) - JWT.T @ C @ JWT
         total[np.ix_(own, own)] = np.diag(variance) - variance[:, None] * TPT * variance
         coefficients = np.zeros(SIZE)
-        coefficients[which] = variance * np.tensordot(u, T, 2)
+        coefficients[which] = variance * Tu
         return Response(coefficients, total)
 
     @cached_property
@@ -185,41 +192,19 @@ class Fit:
         """Standard deviation of the entries of the gain: as found, else what the data leave room for, by moments."""
         if "gain" in self.components or len(self.weights) < FEW_POSES_FOR_RESPONSE:
             return self.components.get("gain", 0.0)
-        T = response_columns(self.parameters, self.R_base_flange[self.order])[..., :5]
-        WJ, u = self._weighted
-        JWT, Tu = summed_products(WJ, T), np.tensordot(u, T, 2)
-        M = summed_products(T, self.noise.solve(T)) - JWT.T @ self.covariance @ JWT
+        _, Tu, M = self._response_equations(np.arange(5))
         excess = float(Tu @ np.linalg.lstsq(M, Tu, rcond=1e-9)[0]) - len(M)
         return float(np.sqrt(max(excess, 0.0) / np.trace(M)))
 
     @property
     def left_out_residuals(self) -> Array:
         """(n, 6) measured minus what all other poses predict for this one, drift and correlation included."""
-        return self._left_out[0]
+        return self._pass[0]
 
     @property
     def left_out_cov(self) -> Array:
         """(n, 6, 6) covariance of these: noise of the pose and uncertainty of its prediction."""
-        return self._left_out[1]
-
-    @cached_property
-    def _left_out(self) -> tuple[Array, Array]:
-        # With a prior the best parameters leave some of J' W r.
-        e, S = left_out(self.noise, *self._weighted, self.covariance)
-        unsorted = np.empty_like(self.order)
-        unsorted[self.order] = np.arange(len(self.order))
-        return e[unsorted], S[unsorted]
-
-    @cached_property
-    def standardized_residuals(self) -> Array:
-        """(n, 6) `left_out_residuals` whitened by `left_out_cov`: independent within a pose, standard deviation 1."""
-        L = np.linalg.cholesky(self.left_out_cov)
-        return np.asarray(np.linalg.solve(L, self.left_out_residuals[..., None])[..., 0])
-
-    @cached_property
-    def left_out_distances(self) -> Array:
-        """(n,) squared length of `standardized_residuals`: chi-square with 6 degrees of freedom for a good pose."""
-        return np.asarray((self.standardized_residuals**2).sum(axis=1))
+        return self._pass[1]
 
 
 def fit(
@@ -232,7 +217,7 @@ def fit(
     known: Known | None = None,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
 ) -> Fit:
-    """Fit all 15 parameters and, as far as the data ask for it, the noise.
+    """Fit all 15 parameters and, where the likelihood rises enough, components of the noise.
 
     Parameters
     ----------
@@ -246,7 +231,7 @@ def fit(
     t_s : array, shape (n,), optional
         When each pose was taken; without it, or with NaN in it, their order counts.
     drift : {"auto", "none", "linear", "random-walk"}
-        How the bias may move: as the restricted likelihood decides, not at all, or surely so.
+        How the bias may move: "auto": the restricted likelihood decides. The others: not at all, or always.
     known : Known, optional
     g_m_s2 : float
         Only to turn a known mass into a weight.
@@ -356,7 +341,7 @@ class _Problem:
     # Explanations
 
     def _is_quiet(self, best: Minimum) -> bool:
-        """Tell whether the measured noise explains everything, so that nothing more would be found."""
+        """Whether the measured noise explains everything, so that nothing more would be found."""
         always, candidates = self._always(), self._candidates()
         if not self.measured or always or self.drift == "linear":
             return False
@@ -388,7 +373,7 @@ class _Problem:
         return found
 
     def _stand_out(self, distances: Array) -> bool:
-        """Tell whether poses stand out, or so many of them that none does."""
+        """Whether poses stand out, or so many of them that none does."""
         if self.n < FEWEST_TO_REJECT_FROM:
             return False
         tail = float(np.median(distances)) / MEDIAN_DISTANCE / (float(distances.mean()) / 6)
@@ -542,7 +527,7 @@ class _Problem:
         )
 
     def _deviation(self, c: Component, variance: float) -> float:
-        """Standard deviation that the fit used: white noise that nobody measured includes its least."""
+        """Standard deviation that the fit used: estimated white noise includes its lower bound."""
         least = 0.0 if self.measured or c.kind != "white" else self.cov[0][np.argmax(c.share), np.argmax(c.share)]
         return float(np.sqrt(variance + least))
 

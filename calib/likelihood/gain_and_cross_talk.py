@@ -3,8 +3,8 @@
     force_N = (1 + force_gain) u + force_bias_N        torque_Nm = p x u + cross_talk_m u + torque_bias_Nm
 
 with u the weight in the sensor frame. Both matrices are symmetric, and the gain has no trace: together with mounting,
-weight and centre of mass they describe every linear response to one payload. A gain common to all axes cannot be told
-from the weight.
+weight and centre of mass they describe every linear response to one payload. A gain common to all axes cannot be
+separated from the weight.
 """
 
 from dataclasses import dataclass

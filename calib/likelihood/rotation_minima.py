@@ -33,8 +33,8 @@ class Minimum:
     """`r.T @ Q @ r`."""
 
 
-def force_gram(R_base_flange: Array, force_N: Array, weights: Array) -> Array:
-    """Sum up all that force-only estimation needs to know of the data.
+def force_cost(R_base_flange: Array, force_N: Array, weights: Array, *, with_bias: bool = True) -> Array:
+    """Eliminate gravity and bias from weighted least squares.
 
     Parameters
     ----------
@@ -46,27 +46,6 @@ def force_gram(R_base_flange: Array, force_N: Array, weights: Array) -> Array:
         1 / variance of each pose's force, or its information matrix (inverse covariance). Of a matrix only the mean of
         its diagonal is used: turning the residual into the flange frame, which makes the cost quadratic, keeps a
         multiple of the identity and no other metric. Then the cost is an approximation, good for starting points.
-
-    Returns
-    -------
-    (13, 13)
-        `sum(w * row.T @ row)` with row = (force, R_base_flange row by row, 1). Sums of disjoint data add up.
-
-    Raises
-    ------
-    BadDataset
-        If shapes disagree, a value is not finite, or the weights are negative or all zero.
-    """
-    return _gram(*_checked(R_base_flange, force_N, weights), np.zeros(13))
-
-
-def force_cost(R_base_flange: Array, force_N: Array, weights: Array, *, with_bias: bool = True) -> Array:
-    """Eliminate gravity and bias from weighted least squares.
-
-    Parameters
-    ----------
-    R_base_flange, force_N, weights
-        As in `force_gram`.
     with_bias : bool
         Whether the sensor has an unknown force bias.
 
@@ -80,7 +59,7 @@ def force_cost(R_base_flange: Array, force_N: Array, weights: Array, *, with_bia
     Raises
     ------
     BadDataset
-        As in `force_gram`.
+        If shapes disagree, a value is not finite, or the weights are negative or all zero.
 
     Notes
     -----
@@ -92,8 +71,9 @@ def force_cost(R_base_flange: Array, force_N: Array, weights: Array, *, with_bia
 
 
 def force_cost_from_gram(gram: Array, *, with_bias: bool = True) -> Array:
-    """Do the same as `force_cost` from the sums of `force_gram`.
+    """Do the same as `force_cost` from sums over the poses.
 
+    The sums (13, 13) are of `w * row.T @ row` with row = (force, R_base_flange row by row, 1).
     A bias of k times the weight costs `2 * log10(k)` of the 16 digits; `force_cost` sees the data and loses none.
     """
     force_square, gravity_square, gravity_force = _blocks(gram, with_bias=with_bias)
@@ -123,21 +103,15 @@ def given_rotation(
     Raises
     ------
     BadDataset
-        As in `force_gram`.
+        As in `force_cost`.
     """
     gram, offset = _centred_gram(R_base_flange, force_N, weights, with_bias=with_bias)
-    gravity_N, bias_N = given_rotation_from_gram(gram, R_sensor_flange, with_bias=with_bias)
-    return gravity_N, bias_N + offset[:3] - R_sensor_flange @ offset[3:12].reshape(3, 3).T @ gravity_N
-
-
-def given_rotation_from_gram(gram: Array, R_sensor_flange: Array, *, with_bias: bool = True) -> tuple[Array, Array]:
-    """Do the same as `given_rotation` from the sums of `force_gram`."""
     _, gravity_square, gravity_force = _blocks(gram, with_bias=with_bias)
     gravity_N = _inverse(gravity_square, gram[12, 12]) @ gravity_force @ R_sensor_flange.ravel()
     if not with_bias:
         return gravity_N, np.zeros(3)
-    mean = gram[12] / gram[12, 12]
-    return gravity_N, mean[:3] - R_sensor_flange @ mean[3:12].reshape(3, 3).T @ gravity_N
+    mean = gram[12, :12] / gram[12, 12] + offset[:12]
+    return gravity_N, mean[:3] - R_sensor_flange @ mean[3:].reshape(3, 3).T @ gravity_N
 
 
 def minima(Q: Array) -> list[Minimum]:
@@ -238,7 +212,7 @@ def _checked(R_base_flange: ArrayLike, force_N: ArrayLike, weights: ArrayLike) -
 
 
 def _gram(R_base_flange: Array, force_N: Array, weights: Array, offset: Array) -> Array:
-    """`force_gram` of rows less an offset, in chunks."""
+    """Weighted sum of `row.T @ row` for rows less an offset, in chunks."""
     gram = np.zeros((13, 13))
     for first in range(0, len(weights), _CHUNK):
         part = slice(first, first + _CHUNK)

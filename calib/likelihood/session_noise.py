@@ -3,15 +3,18 @@
     V = blockdiag(D_i) + S (K (x) I6) S + slopes + effects,    S = diag(walk)
 
 K is the covariance of a random walk less its mean over the poses, so that "the bias" is the mean bias: the
-pseudo-inverse of the path's stiffness matrix. That one is tridiagonal, so with Woodbury's identity all is O(n).
+pseudo-inverse of the path's stiffness matrix. This matrix is tridiagonal.
+Woodbury's identity makes every operation O(n).
 """
 
+from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from calib.likelihood.sufficient_statistics import CHUNK
 from calib.model import Array
 
 SHORTEST_STEP = 1e-3  # in mean intervals: two poses at the same time have nearly the same bias
@@ -48,14 +51,8 @@ class Noise:
     ) -> None:
         self.D = D
         self.n = len(D)
-        common = D.strides[0] == 0
-        self.W = np.broadcast_to(np.linalg.inv(D[:1]), D.shape) if common else np.linalg.inv(D)
         self.kept = np.ones(self.n, bool) if kept is None else kept
-        logdet = np.broadcast_to(np.linalg.slogdet(D[:1] if common else D)[1], self.n)
-        if not self.kept.all():
-            self.W = self.W * np.where(self.kept, 1.0, FAINT)[:, None, None]
-            logdet = logdet[self.kept]
-        self._logdet = float(logdet.sum())
+        self._logdet = 0.0
         self._low_rank: list[tuple[Array, Array]] = []
         self._walking = np.zeros(0, np.intp)
         if time is not None and walk is not None and walk.any():
@@ -67,6 +64,24 @@ class Noise:
             self._add_effects(centred(time)[:, None, None] * np.eye(6)[:, sloping], slope[sloping] ** 2)
         if effects is not None:
             self._add_effects(*effects)
+
+    @cached_property
+    def W(self) -> Array:
+        """(n, 6, 6) inverse noise of each pose by itself."""
+        if self.D.strides[0] == 0:
+            W = np.broadcast_to(np.linalg.inv(self.D[:1]), self.D.shape)
+        else:
+            W = np.linalg.inv(self.D)
+        return np.asarray(W if self.kept.all() else W * np.where(self.kept, 1.0, FAINT)[:, None, None])
+
+    def parts(self) -> Iterator[tuple[slice, "Noise"]]:
+        """Split into poses that are independent of those of other parts, few enough for the caches."""
+        if self._low_rank or self.n <= CHUNK:
+            yield slice(None), self
+            return
+        for first in range(0, self.n, CHUNK):
+            part = slice(first, first + CHUNK)
+            yield part, Noise(self.D[part], kept=self.kept[part])
 
     def _add_walk(self, dt: Array) -> None:
         """Factorise M = K^+ + S W S, unknowns ordered by pose, then channel; then keep the mean of the walk at zero."""
@@ -112,10 +127,12 @@ class Noise:
             Y += Q @ (core @ summed_products(Q, X))
         return Y
 
-    @property
+    @cached_property
     def logdet(self) -> float:
         """Logarithm of the determinant of V; with slopes of infinite variance what depends on the rest of it."""
-        return self._logdet
+        common = self.D.strides[0] == 0
+        each = np.broadcast_to(np.linalg.slogdet(self.D[:1] if common else self.D)[1], self.n)
+        return self._logdet + float(each[self.kept].sum())
 
     @cached_property
     def blocks(self) -> Array:
@@ -123,22 +140,39 @@ class Noise:
         W = self.W
         if self._walking.size:
             WS = self.W[:, :, self._walking] * self._s
-            W = W - WS @ self._selected_inverse() @ np.swapaxes(WS, 1, 2)
+            above = -self._stiffness[:, None, None] * np.eye(self._walking.size)
+            W = W - WS @ inverse_blocks(self._blocks, above)[0] @ _transposed(WS)
         for Q, core in self._low_rank:
-            W = W + Q @ core @ np.swapaxes(Q, 1, 2)
+            W = W + Q @ core @ _transposed(Q)
         return np.asarray(W, dtype=np.float64)
 
-    def _selected_inverse(self) -> Array:
-        """Diagonal blocks of M^-1, by elimination forward and substitution back (Takahashi 1973)."""
-        pivots = np.empty_like(self._blocks)
-        pivots[0] = np.linalg.inv(self._blocks[0])
-        squared = self._stiffness**2
-        for i in range(1, self.n):
-            pivots[i] = np.linalg.inv(self._blocks[i] - squared[i - 1] * pivots[i - 1])
-        inverse = pivots.copy()
-        for i in range(self.n - 2, -1, -1):
-            inverse[i] += squared[i] * (pivots[i] @ inverse[i + 1] @ pivots[i])
-        return inverse
+
+def inverse_blocks(diagonal: Array, above: Array) -> tuple[Array, Array]:
+    """Invert a symmetric block-tridiagonal matrix as far as its own blocks: diagonal (n, k, k), above it (n-1, k, k).
+
+    Every second block is eliminated at once, and the rest is inverted in the same way (cyclic reduction).
+    """
+    if len(diagonal) == 1:
+        return np.asarray(np.linalg.inv(diagonal)), above
+    inverse, beside = np.empty_like(diagonal), np.empty_like(above)
+    before, after, own = above[::2], above[1::2], np.linalg.inv(diagonal[1::2])
+    k = len(after)  # the last of the eliminated blocks may have none after it
+    left, right = own @ _transposed(before), own[:k] @ after
+    rest = diagonal[::2].copy()
+    rest[: len(own)] -= before @ left
+    rest[1:] -= _transposed(after) @ right
+    kept, between = inverse_blocks(rest, -before[:k] @ right)
+    beside[::2] = -kept[: len(own)] @ _transposed(left)
+    beside[::2][:k] -= between @ _transposed(right)
+    beside[1::2] = -left[:k] @ between - right @ kept[1:]
+    inverse[::2] = kept
+    inverse[1::2] = own - _transposed(beside[::2]) @ _transposed(left)
+    inverse[1::2][:k] -= beside[1::2] @ _transposed(right)
+    return inverse, beside
+
+
+def _transposed(X: Array) -> Array:
+    return np.swapaxes(X, -1, -2)
 
 
 def summed_products(X: Array, Y: Array) -> Array:

@@ -17,6 +17,8 @@ from calib.model import Array, Parameters, skew
 
 CHUNK = 4096
 """Rows per matrix product, so that a chunk stays in the cache."""
+FEW = 256
+"""The same for rows of 100 products."""
 
 _CROSS = skew(np.eye(3))
 _CONSTANT = np.zeros((15, 6, 10))
@@ -79,10 +81,10 @@ class Statistics:
         """
         n = len(phi)
         e = wrench - phi @ reference.T
-        We = (weights @ e[..., None])[..., 0]
+        We = np.einsum("nij,nj->ni", weights, e)
         A = np.zeros((36, 100))
-        for first in range(0, n, CHUNK):
-            part = slice(first, first + CHUNK)
+        for first in range(0, n, FEW):
+            part = slice(first, first + FEW)
             outer = (phi[part, :, None] * phi[part, None, :]).reshape(-1, 100)
             A += weights[part].reshape(-1, 36).T @ outer
         return cls(reference, _sixty(A), (We.T @ phi).ravel(), float(np.vdot(We, e)))

@@ -18,11 +18,11 @@ GAIN = 2.0
 """A component stays when it raises the restricted log-likelihood by more than this: 2 % come in by chance."""
 GAIN_OF_RESPONSE = 3.0
 """The same for gain and cross-talk of the sensor, whose 5 and 6 numbers come in by chance in 0.4 %."""
-SURE = 20.0  # a gain or loss that no other component makes good
+SURE = 20.0  # a gain or loss that no other component can regain
 WORTH_A_TRY = 1.0  # gain predicted from slope and curvature at zero
 NEGLIGIBLE = 1e-4  # of the white noise: where slope and curvature "at zero" are taken
 LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2}
-"""Variances that no arm or sensor in working order exceeds: what asks for more is something else."""
+"""Variances that no arm or sensor in working order exceeds. A larger one has another cause."""
 _AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
 
 Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk"]
@@ -67,7 +67,7 @@ class Linearised:
     turn: Array
     """(n, 6, 3) derivative by the orientation of each pose."""
     D: Array
-    """(n, 6, 6) measured noise of each pose, or what is surely there when nobody measured it."""
+    """(n, 6, 6) measured noise of each pose, or a lower bound where the noise is unknown."""
     time: Array
     """(n,) ascending, in mean intervals."""
     kept: NDArray[np.bool_]
@@ -252,7 +252,7 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array)
             best, caution = trial, max(caution / 10, 1e-6)
         if (gained < 1e-3 and np.abs(step).max() < 0.05) or gained < 1e-6:
             break
-        # What sinks without changing the likelihood has left: it will be dropped.
+        # A variance that sinks without changing the likelihood will be dropped.
         if gained < 1e-2 and (slope < 0.05).all():
             break
     return best
@@ -265,7 +265,7 @@ def select(
     candidates: Sequence[Component],
     needed: int | None = None,
 ) -> Point:
-    """Add the candidates that the data ask for, one by one, then drop those that others make needless.
+    """Add the candidates that raise the likelihood, one by one, then drop those that others make needless.
 
     Parameters
     ----------
@@ -286,9 +286,8 @@ def select(
         k = int(np.argmax(gains))
         if gains[k] < WORTH_A_TRY:
             break
-        # Walks that are as good as certain come in together: each channel has its own.
-        certain = gains > SURE if waiting[k].kind == "walk" else np.zeros(len(gains), bool)
-        together = [i for i, c in enumerate(waiting) if i == k or (c.kind == "walk" and certain[i])]
+        # What is as good as certain comes in together with others of its kind: each acts on its own channels.
+        together = [i for i, c in enumerate(waiting) if i == k or (c.kind == waiting[k].kind and gains[i] > SURE)]
         trial = maximise(
             problem, [*best.components, *(waiting[i] for i in together)], np.append(best.theta, start[together])
         )
@@ -317,12 +316,12 @@ def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
 
 
 def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
-    """Drop what is not worth its place, one at a time."""
+    """Drop components that raise the likelihood too little, one at a time."""
     k = needed
     while k < len(best.components):
         rest = [i for i in range(len(best.components)) if i != k]
         components, theta = [best.components[i] for i in rest], best.theta[rest]
-        without = point(problem, components, theta)  # the others can make good a part of what is lost
+        without = point(problem, components, theta)  # the others can regain a part of what is lost
         if best.loglik - without.loglik < SURE:
             without = maximise(problem, components, theta)
         if without.worth > best.worth:

@@ -1,4 +1,4 @@
-"""A load that shifts in mid-run: found, told, and refused where poses of both loads were used."""
+"""A load that shifts in mid-run: found, named, and refused where poses of both loads were used."""
 
 from dataclasses import replace
 
@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, CalibrationResult, solve
+from calib.assessment.load_shift import lasting_change
+from calib.likelihood.gain_and_cross_talk import SIZE, response_columns
 from calib.model import Parameters, predict
 from calib.published.yu import SPECIAL_R_flange_base
 
@@ -28,7 +30,7 @@ TARED = replace(TOOL, force_bias_N=TOOL.force_bias_N - 0.3)
 
 
 def session(after: Parameters, position: int, seed: int, rows: NDArray[np.int64] | None = None) -> CalibrationResult:
-    """24 poses, of which those from a place on are of another tool; `rows` tells where each stands in the dataset."""
+    """24 poses, the later ones of another tool; `rows`: the pose in each row of the dataset."""
     wrench = predict(TOOL, ORIENTATIONS)
     wrench[position:] = predict(after, ORIENTATIONS[position:])
     wrench += np.random.default_rng(seed).normal(0, SIGMA, wrench.shape)
@@ -77,3 +79,17 @@ def test_a_quiet_run_and_one_that_was_tared_are_not_refused(after: Parameters, s
     assert result.verdict != "rejected"
     sure = [0, 1, 2, 3, 4, 5, 9, 10, 11]  # the bias is that of no single moment
     assert np.abs(sigmas(result, TOOL)[sure]).max() < 4.5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gain_and_cross_talk_of_a_fit_hide_no_part_of_a_change(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    wrench = np.where(np.arange(24)[:, None] < 14, predict(TOOL, ORIENTATIONS), predict(LIGHTER, ORIENTATIONS))
+    residuals = wrench + rng.normal(0, SIGMA, wrench.shape) - predict(TOOL, ORIENTATIONS)
+    residuals -= response_columns(TOOL, ORIENTATIONS) @ rng.normal(0, 0.01, SIZE)
+    change = lasting_change(TOOL, ORIENTATIONS, residuals, SIGMA, np.arange(24.0))
+    assert change is not None
+    assert (change.what, change.position) == ("load", 14)
+    # Beside 15 free parameters the sigma of a step between two halves is about that of a mean of 4 poses.
+    lighter_N = np.linalg.norm(LIGHTER.gravity_force_base_N) - np.linalg.norm(TOOL.gravity_force_base_N)
+    assert change.step[0] == pytest.approx(lighter_N, abs=3 * SIGMA[0] / 2)

@@ -6,17 +6,21 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from calib import Parameters
+from calib.assessment.cross_validation import leave_one_out
 from calib.data.pooling import pooled_covariance
 from calib.known import Constraints, Known
 from calib.likelihood.descent import Descent
 from calib.likelihood.fit import Drift, Fit, fit
+from calib.likelihood.session_noise import inverse_blocks
 from calib.likelihood.sufficient_statistics import (
+    CHUNK,
     Statistics,
     coefficients,
     coefficients_derivative,
     features,
     wrench_gram,
 )
+from calib.likelihood.variance_components import squared_length
 from calib.model import Array, jacobian, predict
 
 WEIGHT_N = 20.0
@@ -178,7 +182,8 @@ def test_bumped_poses_are_rejected_and_no_others(n: int, bumped: int, measured: 
         error += squared(best, p)
         least += bound(p, R[bumped:], np.linalg.inv(WHITE))
         assert best.dof == 6 * int(best.weights.sum()) - 15
-        assert (best.left_out_distances[best.weights == 0] > 22).all()
+        distances = squared_length(best.left_out_residuals, best.left_out_cov)
+        assert (distances[best.weights == 0] > 22).all()
     assert missed <= 1
     assert false <= 2
     assert (error / least < 4).all()
@@ -269,7 +274,7 @@ def test_left_out_poses_are_predicted_as_by_a_new_fit(drift: Drift) -> None:
     rng = np.random.default_rng(6)
     _, R, wrench, _ = drifting(rng, 12, "walk")
     best = fit(R, wrench, np.diag((SIGMA / 10) ** 2), drift=drift)
-    J, e, order = best.jacobian.reshape(72, 15), best.residuals.ravel(), np.arange(72)
+    J, e, order = jacobian(best.parameters, R).reshape(72, 15), best.residuals.ravel(), np.arange(72)
     V: Array = np.zeros((72, 72))
     for i in range(12):
         V[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = best.noise.D[i]
@@ -431,3 +436,29 @@ def test_covariances_of_unknown_origin_are_taken_as_they_are() -> None:
     mixed = pooled_covariance(S, np.array([0, 10, 10, 10**9, 0]))
     np.testing.assert_array_equal(mixed[[0, 4]], S[[0, 4]])
     np.testing.assert_allclose(mixed[3], S[3], rtol=1e-4)
+
+
+def test_many_poses_are_predicted_in_parts_as_they_would_be_at_once() -> None:
+    rng = np.random.default_rng(8)
+    n = CHUNK + 50
+    p, R = truth(rng), haar(rng, n)
+    best = fit(R, predict(p, R) + noise(rng, n), WHITE, drift="none")
+    assert len(list(best.noise.parts())) == 2
+    residuals, cov = leave_one_out(best.residuals, jacobian(best.parameters, R), np.broadcast_to(WHITE, (n, 6, 6)))
+    np.testing.assert_allclose(best.left_out_residuals, residuals, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(best.left_out_cov, cov, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6, 7])
+def test_the_blocks_of_the_inverse_are_those_of_the_dense_one(n: int) -> None:
+    rng = np.random.default_rng(n)
+    diagonal, above = rng.normal(size=(n, 3, 3)), rng.normal(size=(n - 1, 3, 3))
+    diagonal = diagonal @ np.swapaxes(diagonal, 1, 2) + 12 * np.eye(3)
+    dense = np.zeros((n, 3, n, 3))
+    dense[range(n), :, range(n)] = diagonal
+    dense[range(n - 1), :, range(1, n)] = above
+    dense[range(1, n), :, range(n - 1)] = np.swapaxes(above, 1, 2)
+    inverse = np.linalg.inv(dense.reshape(3 * n, 3 * n)).reshape(n, 3, n, 3)
+    own, beside = inverse_blocks(diagonal, above)
+    np.testing.assert_allclose(own, inverse[range(n), :, range(n)], atol=1e-12)
+    np.testing.assert_allclose(beside, inverse[range(n - 1), :, range(1, n)], atol=1e-12)

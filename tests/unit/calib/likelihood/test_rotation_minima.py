@@ -95,13 +95,11 @@ def test_a_huge_bias_costs_no_digits() -> None:
 
 
 @pytest.mark.parametrize("with_bias", [True, False])
-def test_sums_of_parts_give_the_same_as_the_data(with_bias: bool) -> None:
-    R_base_flange, force, R = problem(1, 10_000)
+def test_sums_give_the_same_as_the_data(with_bias: bool) -> None:
+    R_base_flange, force, _ = problem(1, 10_000)
     weights = np.linspace(0, 2, 10_000)
-    gram = sum(
-        (rotation_minima.force_gram(R_base_flange[s], force[s], weights[s]) for s in (slice(0, 9), slice(9, None))),
-        np.zeros((13, 13)),
-    )
+    rows = np.column_stack([force, R_base_flange.reshape(-1, 9), np.ones(10_000)])
+    gram = (rows * weights[:, None]).T @ rows
     Q = rotation_minima.force_cost(R_base_flange, force, weights, with_bias=with_bias)
     assert rotation_minima.force_cost_from_gram(gram, with_bias=with_bias) == pytest.approx(
         Q, rel=1e-9, abs=1e-9 * np.trace(Q)
@@ -111,12 +109,6 @@ def test_sums_of_parts_give_the_same_as_the_data(with_bias: bool) -> None:
     assert rotation_minima.force_cost(R_base_flange, force, weights * kept, with_bias=with_bias) == pytest.approx(
         only, rel=1e-9
     )
-    for ours, same in zip(
-        rotation_minima.given_rotation_from_gram(gram, R, with_bias=with_bias),
-        rotation_minima.given_rotation(R, R_base_flange, force, weights, with_bias=with_bias),
-        strict=True,
-    ):
-        assert ours == pytest.approx(same, abs=1e-9)
 
 
 def test_information_matrices_count_by_their_mean_diagonal() -> None:
@@ -137,7 +129,7 @@ def test_undetermined_gravity_is_the_shortest() -> None:
 
 
 @pytest.mark.parametrize(
-    ("poses", "force", "weights", "told"),
+    ("poses", "force", "weights", "message"),
     [
         (np.zeros((3, 3)), np.zeros((3, 3)), np.ones(3), "must be"),
         (CUBE[:5], np.zeros((4, 3)), np.ones(4), "must be"),
@@ -148,11 +140,9 @@ def test_undetermined_gravity_is_the_shortest() -> None:
         (CUBE[:2], np.zeros((2, 3)), np.array([1, np.nan]), "finite"),
     ],
 )
-def test_bad_data_are_refused(poses: Array, force: Array, weights: Array, told: str) -> None:
-    with pytest.raises(BadDataset, match=told):
+def test_bad_data_are_refused(poses: Array, force: Array, weights: Array, message: str) -> None:
+    with pytest.raises(BadDataset, match=message):
         rotation_minima.force_cost(poses, force, weights)
-    with pytest.raises(BadDataset, match=told):
-        rotation_minima.force_gram(poses, force, weights)
 
 
 # The minima
