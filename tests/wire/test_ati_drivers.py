@@ -79,7 +79,7 @@ def test_saturated_gauge_is_a_fault(start: Start, scheme: str) -> None:
 
 
 def test_critical_status_is_a_fault(start: Start, scheme: str) -> None:
-    with pytest.raises(DeviceFault, match=r"0x8010 \(bit 4: power supply too high, bit 15: any error\)"):
+    with pytest.raises(DeviceFault, match=r"0x8010 \(bit 4: .*, bit 15: "):
         start(scheme, status=0x8010).sensor().open()
 
 
@@ -122,7 +122,7 @@ def test_can_lost_frames_are_gaps_not_wrong_samples(start: Start) -> None:
 
 
 def test_can_wrong_slot_echo_is_refused(start: Start) -> None:
-    with pytest.raises(ConnectError, match="slot 0, the sensor answered 5"):
+    with pytest.raises(ConnectError, match=r"slot 0, .* 5"):
         start("ati-can", wrong_echo=5).sensor().open()
 
 
@@ -149,7 +149,7 @@ def test_can_old_firmware(start: Start, caplog: pytest.LogCaptureFixture) -> Non
     with start("ati-can", firmware=(3, 6, 1)).sensor("units=lbf,lbf-in&counts=4448222,112985") as sensor:
         np.testing.assert_allclose(sensor.collect(0.1).wrench.mean(axis=0), WRENCH, atol=0.05)
         assert sensor.identify().facts["counts_per_N"].source == "configured"
-    with pytest.raises(ConnectError, match="counts per lbf and 1000000 per N-m"):
+    with pytest.raises(ConnectError, match=r"per lbf .*1000000 per N-m"):
         start("ati-can").sensor("units=lbf,N-m").open()
 
 
@@ -187,7 +187,7 @@ def test_serial_refused_start(start: Start) -> None:
 
 
 def test_serial_empty_calibration(start: Start) -> None:
-    with pytest.raises(ConnectError, match=r"^ATI serial.*slot 9: it is empty"):
+    with pytest.raises(ConnectError, match=r"^ATI serial.*slot 9: .*empty"):
         start("ati-serial").sensor("calibration=9").open()
 
 

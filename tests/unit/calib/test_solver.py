@@ -280,7 +280,7 @@ def test_knowledge_makes_poor_poses_enough() -> None:
     )
     error = solve(data, known=known).parameters.difference(TRUTH)
     assert np.linalg.norm(error[:3]) < 0.05
-    with pytest.raises(NotObservable, match="the poses leave 1 of 12"):
+    with pytest.raises(NotObservable, match="1 of 12"):
         solve(data, known=Known(R_flange_sensor=TRUTH.R_flange_sensor))
     with pytest.raises(ValueError, match="lrom cannot use"):
         solve(data, "lrom", known=known)

@@ -203,7 +203,7 @@ def test_another_package_brings_a_sensor_and_an_arm(install: Install) -> None:
             "sign": Fact(-1, "configured"),
         }
         assert (sensor.collect(0.05).wrench == -3).all()
-    with pytest.raises(BadUrl, match="unknown option gian; known: gain, range, recover, serial"):
+    with pytest.raises(BadUrl, match=r"gian.* gain, range, recover, serial"):
         sensor_from_url("acme-usb:///dev/acme0?gian=3")
     with pytest.raises(BadUrl, match=r"known: ati-can, .*, acme-usb"):
         sensor_from_url("acme:///dev/acme0")
@@ -211,7 +211,7 @@ def test_another_package_brings_a_sensor_and_an_arm(install: Install) -> None:
     assert arm_class("acme") is not UrArm
     anything = SensorConfig("acme-usb:///dev/acme0")
     assert type(build_arm(CellConfig(RobotConfig("127.0.0.1", driver="acme"), anything))) is arm_class("acme")
-    with pytest.raises(ConfigError, match=r"\[robot\] driver: unknown arm 'acmee'; known: acme, ur|known: ur, acme"):
+    with pytest.raises(ConfigError, match=r"^\[robot\] driver: .*'acmee'; .*\bacme\b"):
         build_arm(CellConfig(RobotConfig("127.0.0.1", driver="acmee"), anything))
 
 
@@ -249,7 +249,7 @@ def test_a_driver_that_is_no_stream_of_ours_takes_no_options_of_ours(install: In
     install("plain_ft", "[ftdrive.sensors]\nplain = plain_ft:Sensor\n", PLAIN)
     assert type(sensor_from_url("plain://x")).__module__ == "plain_ft"
     for option in ("recover=1", "range=1,1", "serial=A"):
-        with pytest.raises(BadUrl, match="knows none of the options recover, serial and range"):
+        with pytest.raises(BadUrl, match="recover, serial and range"):
             sensor_from_url(f"plain://x?{option}")
 
 
@@ -268,7 +268,7 @@ def test_our_own_names_cannot_be_taken(install: Install) -> None:
 def test_two_packages_with_one_name_are_both_named(install: Install) -> None:
     install("first_ft", "[ftdrive.sensors]\nshared = first_ft:Sensor\n")
     install("other_ft", "[ftdrive.sensors]\nshared = other_ft:Sensor\n")
-    with pytest.raises(BadUrl, match="'shared' is offered by first_ft and other_ft"):
+    with pytest.raises(BadUrl, match=r"'shared' .*first_ft.* other_ft"):
         sensor_from_url("shared://x")
 
 
@@ -290,5 +290,5 @@ def test_a_package_that_cannot_be_imported_is_named(install: Install, source: st
 
 def test_a_class_that_is_no_driver_is_named(install: Install) -> None:
     install("odd_ft", "[ftdrive.sensors]\nodd = odd_ft:Sensor\n", "class Sensor:\n    pass\n")
-    with pytest.raises(BadUrl, match=r"odd://x: odd_ft:Sensor has no from_url, .*: reinstall odd_ft"):
+    with pytest.raises(BadUrl, match=r"^odd://x: odd_ft:Sensor .*from_url.*: reinstall"):
         sensor_from_url("odd://x")

@@ -118,7 +118,7 @@ def test_without_the_weight_the_scale_is_free_and_said_so() -> None:
     forces = it.wrench[:, :3]
     with pytest.raises(NotObservable, match="scale is free"):
         estimate_force_gain(it.parameters, it.R_base_flange, forces, covariances(24)[:, :3, :3], None)
-    with pytest.raises(BadDataset, match="a known weight is -1 N"):
+    with pytest.raises(BadDataset, match="-1 N"):
         estimate_force_gain(it.parameters, it.R_base_flange, forces, covariances(24)[:, :3, :3], -1)
 
 
@@ -232,7 +232,7 @@ def test_unknown_centres_of_mass_leave_four_numbers_free() -> None:
 
 def test_payloads_that_are_listed_but_never_hung_do_not_count() -> None:
     _, p, R, y, index = wrench_world(PAYLOADS, 0.0, 0)
-    with pytest.raises(NotObservable, match="2 known payloads leave 6 of 44"):
+    with pytest.raises(NotObservable, match=r"2 .*6 of 44"):
         estimate_wrench_gain(p, R[:30], y[:30], covariances(30), index[:30].tolist(), PAYLOADS)
     with pytest.raises(BadDataset, match=r"one of 0\.\.1"):
         estimate_wrench_gain(p, R, y, covariances(45), index.tolist(), PAYLOADS[:2])

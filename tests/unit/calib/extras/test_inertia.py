@@ -207,7 +207,7 @@ def test_without_change_of_specific_force_mass_and_bias_are_one() -> None:
         linear_acceleration_m_s2=(PARAMETERS.gravity_force_base_N / MASS_KG)
         @ (MOVING.R_base_flange @ PARAMETERS.R_flange_sensor)
     )
-    with pytest.raises(NotObservable, match=r"1 of 16 numbers free, mixing mass"):
+    with pytest.raises(NotObservable, match=r"1 of 16 .* mass"):
         estimate_inertia(PARAMETERS, *falling, reading(falling), g_m_s2=G)
 
 
@@ -229,7 +229,7 @@ def test_implausible_bodies_are_named() -> None:
 
 def test_data_that_do_not_fit_are_refused() -> None:
     wrench = reading(MOVING)
-    with pytest.raises(BadDataset, match=r"wrench has shape \(1999, 6\), expected \(2000, 6\)"):
+    with pytest.raises(BadDataset, match=r"wrench .*\(1999, 6\).*\(2000, 6\)"):
         estimate_inertia(PARAMETERS, *MOVING, wrench[1:], g_m_s2=G)
     with pytest.raises(BadDataset, match="each later than"):
         estimate_inertia(PARAMETERS, *MOVING._replace(t_s=TIMES[::-1]), wrench, g_m_s2=G)

@@ -72,7 +72,7 @@ def test_three_poses_give_payload_and_biases_exactly() -> None:
 
 def test_one_pose_or_parallel_gravity_is_refused_in_words() -> None:
     new, old = loaded(truth()), exact(truth())
-    with pytest.raises(NotObservable, match=r"leaves 1 of 4 .* add 1"):
+    with pytest.raises(NotObservable, match=r"1 of 4 .* add 1"):
         update_payload(old, tilted(0), predict(new, tilted(0)), noise_of(1))
     for R in (tilted(0, 0.5), tilted(0, 180), tilted(10, 10, 10)):  # the same, upside down, and repeated
         with pytest.raises(NotObservable, match="the same line"):
@@ -89,7 +89,7 @@ def test_one_pose_or_parallel_gravity_is_refused_in_words() -> None:
 def test_no_payload_and_a_reversed_sign_are_refused() -> None:
     R, old = tilted(0, 60), truth()
     bare = Parameters(old.R_flange_sensor, np.zeros(3), old.force_bias_N, np.zeros(3), old.torque_bias_Nm)
-    with pytest.raises(NotObservable, match="is not 5 times its uncertainty"):
+    with pytest.raises(NotObservable, match="uncertainty"):
         update_payload(exact(old), R, predict(bare, R), noise_of(2))
     with pytest.raises(NotObservable, match="check the sign"):
         update_payload(exact(old), R, 2 * predict(bare, R) - predict(old, R), noise_of(2))
@@ -217,7 +217,7 @@ def test_good_tares_pass() -> None:
 
 def test_shapes_that_do_not_fit_are_refused() -> None:
     R = tilted(0, 60)
-    with pytest.raises(BadDataset, match=r"wrench_cov has shape \(6, 6\), expected \(2, 6, 6\)"):
+    with pytest.raises(BadDataset, match=r"wrench_cov .*\(6, 6\).*\(2, 6, 6\)"):
         update_payload(exact(truth()), R, predict(truth(), R), NOISE)
     with pytest.raises(BadDataset, match="R_base_flange"):
         tare(exact(truth()), R, [dwell(truth(), R[0], np.random.default_rng(0))])
