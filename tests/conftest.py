@@ -1,5 +1,6 @@
 """What all levels of tests share."""
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -26,6 +27,12 @@ def pytest_configure(config: pytest.Config) -> None:
     """Keep the byte code of the processes that tests start, which would each compile numpy and scipy again."""
     if os.environ.pop("PYTHONDONTWRITEBYTECODE", None) and config.cache is not None:
         os.environ["PYTHONPYCACHEPREFIX"] = str(config.cache.mkdir("bytecode"))
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector the modules and some thousand tests, which stay to the end."""
+    gc.collect()
+    gc.freeze()
 
 
 settings.register_profile("ftdrive", deadline=None, derandomize=True, max_examples=60)

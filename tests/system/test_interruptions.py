@@ -29,7 +29,8 @@ def tour(station: Station, ftdrive: CommandLine) -> subprocess.Popen[str]:
     return process
 
 
-@pytest.mark.parametrize("by", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_stops_the_arm_and_keeps_the_poses(
     station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine, by: signal.Signals
 ) -> None:

@@ -79,7 +79,7 @@ def test_saturated_gauge_is_a_fault(start: Start, scheme: str) -> None:
 
 
 def test_critical_status_is_a_fault(start: Start, scheme: str) -> None:
-    with pytest.raises(DeviceFault, match=r"0x8010 \(bit 4: power supply too high, bit 15: any error\)"):
+    with pytest.raises(DeviceFault, match=r"0x8010 \(bit 4: .*, bit 15: "):
         start(scheme, status=0x8010).sensor().open()
 
 
@@ -149,7 +149,7 @@ def test_can_old_firmware(start: Start, caplog: pytest.LogCaptureFixture) -> Non
     with start("ati-can", firmware=(3, 6, 1)).sensor("units=lbf,lbf-in&counts=4448222,112985") as sensor:
         np.testing.assert_allclose(sensor.collect(0.1).wrench.mean(axis=0), WRENCH, atol=0.05)
         assert sensor.identify().facts["counts_per_N"].source == "configured"
-    with pytest.raises(ConnectError, match="counts per lbf and 1000000 per N-m"):
+    with pytest.raises(ConnectError, match=r"per lbf .*1000000 per N-m"):
         start("ati-can").sensor("units=lbf,N-m").open()
 
 

@@ -138,7 +138,7 @@ def test_wrong_shapes_are_rejected() -> None:
             compensator.batch(bad_wrench, bad_R)
     with pytest.raises(ValueError, match="use sample for one"):
         compensator.batch(wrench[0], R[0])
-    with pytest.raises(ValueError, match=r"out is float64 \(3, 6\), expected float64 \(4, 6\)"):
+    with pytest.raises(ValueError, match=r"out .*\(3, 6\).*\(4, 6\)"):
         compensator.batch(wrench, R, np.empty((3, 6)))
     with pytest.raises(ValueError, match="out is float32"):
         compensator.batch(wrench, R, np.empty((4, 6), np.float32))

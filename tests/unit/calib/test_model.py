@@ -89,7 +89,7 @@ def test_parameters_are_frozen_copies_of_the_right_shape() -> None:
     parameters = random_parameters(np.random.default_rng(0))
     with pytest.raises(ValueError, match="read-only"):
         parameters.force_bias_N[0] = 1
-    with pytest.raises(ValueError, match=r"force_bias_N has shape \(2,\), expected \(3,\)"):
+    with pytest.raises(ValueError, match=r"force_bias_N .*\(2,\).*\(3,\)"):
         Parameters(np.eye(3), np.zeros(3), np.zeros(2), np.zeros(3), np.zeros(3))
 
 

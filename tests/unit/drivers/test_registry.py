@@ -206,7 +206,7 @@ def test_another_package_brings_a_sensor_and_an_arm(install: Install) -> None:
             "sign": Fact(-1, "configured"),
         }
         assert (sensor.collect(0.05).wrench == -3).all()
-    with pytest.raises(BadUrl, match="unknown option gian; known: gain, range, recover, serial"):
+    with pytest.raises(BadUrl, match=r"gian.* gain, range, recover, serial"):
         sensor_from_url("acme-usb:///dev/acme0?gian=3")
     with pytest.raises(BadUrl, match=r"known: ati-can, .*, acme-usb"):
         sensor_from_url("acme:///dev/acme0")
@@ -214,7 +214,7 @@ def test_another_package_brings_a_sensor_and_an_arm(install: Install) -> None:
     assert arm_class("acme") is not UrArm
     anything = SensorConfig("acme-usb:///dev/acme0")
     assert type(build_arm(CellConfig(RobotConfig("127.0.0.1", driver="acme"), anything))) is arm_class("acme")
-    with pytest.raises(ConfigError, match=r"\[robot\] driver: unknown arm 'acmee'; known: acme, ur|known: ur, acme"):
+    with pytest.raises(ConfigError, match=r"^\[robot\] driver: .*'acmee'; .*\bacme\b"):
         build_arm(CellConfig(RobotConfig("127.0.0.1", driver="acmee"), anything))
 
 
@@ -272,7 +272,7 @@ def test_our_own_names_cannot_be_taken(install: Install) -> None:
 def test_two_packages_with_one_name_are_both_named(install: Install) -> None:
     install("first_ft", "[ftdrive.sensors]\nshared = first_ft:Sensor\n")
     install("other_ft", "[ftdrive.sensors]\nshared = other_ft:Sensor\n")
-    with pytest.raises(BadUrl, match="'shared' is offered by first_ft and other_ft"):
+    with pytest.raises(BadUrl, match=r"'shared' .*first_ft.* other_ft"):
         sensor_from_url("shared://x")
 
 

@@ -194,7 +194,7 @@ def test_three_orientations_are_never_enough_although_their_rank_is_full() -> No
     assert second_basin_gap(R) < AMBIGUOUS_GAP
     assert not found.sound
     assert assess(np.concatenate([R, found.advised_R_base_flange])).sound
-    with pytest.raises(NotObservable, match="6 poses have only 3 different"):
+    with pytest.raises(NotObservable, match="only 3 different"):
         require_orientations(R)
 
 
@@ -212,7 +212,7 @@ def test_rejections_are_one_sentence_with_advice(R: Array, snapshot: SnapshotAss
 
 def test_without_parameters_only_the_count_is_checked() -> None:
     require_orientations(leaning(40))
-    with pytest.raises(NotObservable, match=r"4 poses are too few.* 5 .* add 1"):
+    with pytest.raises(NotObservable, match=r"4 poses .* add 1"):
         require_orientations(ANY[:4], least=5)
 
 

@@ -147,7 +147,7 @@ def test_a_file_is_never_overwritten_and_never_half(tmp_path: Path) -> None:
         dataset(meta={}).save(path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
-    with pytest.raises(FileNotFoundError, match=r"the folder .* does not exist"):
+    with pytest.raises(FileNotFoundError, match="folder"):
         dataset().save(tmp_path / "no" / "d.json")
 
 

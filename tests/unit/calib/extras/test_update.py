@@ -89,7 +89,7 @@ def test_one_pose_or_parallel_gravity_is_rejected() -> None:
 def test_no_payload_and_a_reversed_sign_are_rejected() -> None:
     R, old = tilted(0, 60), truth()
     bare = Parameters(old.R_flange_sensor, np.zeros(3), old.force_bias_N, np.zeros(3), old.torque_bias_Nm)
-    with pytest.raises(NotObservable, match="is not 5 times its uncertainty"):
+    with pytest.raises(NotObservable, match="uncertainty"):
         update_payload(exact(old), R, predict(bare, R), noise_of(2))
     with pytest.raises(NotObservable, match="check the sign"):
         update_payload(exact(old), R, 2 * predict(bare, R) - predict(old, R), noise_of(2))
@@ -217,7 +217,7 @@ def test_good_tares_pass() -> None:
 
 def test_shapes_that_do_not_fit_are_rejected() -> None:
     R = tilted(0, 60)
-    with pytest.raises(BadDataset, match=r"wrench_cov has shape \(6, 6\), expected \(2, 6, 6\)"):
+    with pytest.raises(BadDataset, match=r"wrench_cov .*\(6, 6\).*\(2, 6, 6\)"):
         update_payload(exact(truth()), R, predict(truth(), R), NOISE)
     with pytest.raises(BadDataset, match="R_base_flange"):
         tare(exact(truth()), R, [dwell(truth(), R[0], np.random.default_rng(0))])

@@ -306,7 +306,7 @@ def test_polynomial_is_the_certified_least_squares_solution(bias: bool) -> None:
 def test_polynomial_rejects_one_tilt_only_because_gravity_may_be_up_or_down(sigma_N: float) -> None:
     R = rim(np.random.default_rng(13), 12, 40)
     truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), np.ones(3))
-    with pytest.raises(NotObservable, match="two sensor orientations 180 deg apart"):
+    with pytest.raises(NotObservable, match="180 deg"):
         polynomial(R, truth.force_N(R, sigma_N), bias=True)
     assert (
         error_deg(polynomial(R, truth.force_N(R, sigma_N), bias=False), truth) > 1
@@ -452,7 +452,7 @@ def test_names_the_row_that_is_not_finite(name: str) -> None:
 
 
 def test_names_the_shapes() -> None:
-    with pytest.raises(ValueError, match=r"got \(24, 3, 3\) and \(23, 3\)"):
+    with pytest.raises(ValueError, match=r"\(24, 3, 3\).*\(23, 3\)"):
         nullspace(SROM24, np.ones((23, 3)), bias=True)
 
 

@@ -104,7 +104,7 @@ def test_lrom_is_exact_from_five_poses_whatever_the_mounting(n: int) -> None:
 
 def test_lrom_rejects_four_poses_and_poses_with_several_solutions() -> None:
     R = Rotation.random(4, rng=np.random.default_rng(0)).as_matrix()
-    with pytest.raises(NotObservable, match="at least 5 poses, there are 4"):
+    with pytest.raises(NotObservable, match=r"5 poses.* 4"):
         lrom(R, predict(TRUTH, R))
     spin = Rotation.from_euler("x", np.arange(8)[:, None] * 40.0, degrees=True).as_matrix()
     with pytest.raises(NotObservable, match="several solutions"):

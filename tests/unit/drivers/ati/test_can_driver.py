@@ -136,7 +136,7 @@ def test_bus_that_echoes_does_not_fake_the_slot_echo(table: Table, talk: Talk) -
     ids=["counts", "units", "not finite", "singular"],
 )
 def test_calibration_that_is_none_names_device_slot_and_cure(talk: Talk, answers: dict[str, Answer]) -> None:
-    with pytest.raises(ConnectError, match=r"^ATI CAN sensor 0x20 on .*: calibration slot 0: ") as caught:
+    with pytest.raises(ConnectError, match=r"^ATI CAN sensor 0x20 .*slot 0: ") as caught:
         opened(talk(answers)).open()
     assert "slot=0 to 15" in caught.value.fix
 

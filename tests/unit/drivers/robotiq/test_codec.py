@@ -79,7 +79,7 @@ def test_foreign_and_damaged_replies(reply: bytes, says: str) -> None:
 
 
 def test_refusal() -> None:
-    with pytest.raises(codec.Refused, match="function 0x10 with Modbus exception 2"):
+    with pytest.raises(codec.Refused, match=r"0x10 .*exception 2"):
         codec.check_reply(START, with_crc(bytes.fromhex("09 90 02")))
 
 

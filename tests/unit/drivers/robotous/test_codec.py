@@ -101,7 +101,7 @@ def test_rates() -> None:
 
 def test_settings_are_confirmed_or_refused() -> None:
     codec.check_set(reply("0F 01"))
-    with pytest.raises(ProtocolError, match="2 \\(value out of range\\); leave rate out"):
+    with pytest.raises(ProtocolError, match=r"out of range.* rate"):
         codec.check_set(reply("0F 00 02"))
 
 

@@ -134,7 +134,7 @@ def test_without_ur_rtde_the_error_says_where_it_exists(monkeypatch: pytest.Monk
         raise ModuleNotFoundError(f"No module named {name!r}")
 
     monkeypatch.setattr(dashboard, "import_module", missing)
-    with pytest.raises(ConnectError, match=r"not installed for Python .*CPython 3\.11 or 3\.12"):
+    with pytest.raises(ConnectError, match=r"CPython 3\.11 or 3\.12"):
         dashboard.ask_dashboard(HOST, lambda _: None, timeout_s=1)
 
 

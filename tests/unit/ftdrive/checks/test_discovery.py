@@ -115,10 +115,10 @@ def test_an_interface_that_cannot_be_asked(can0: Path, asked: list[Any]) -> None
         ConnectError, match=r"no CAN interface can1; .*sudo ip link set can1 up type can bitrate 250000$"
     ):
         ask("can1")
-    with pytest.raises(ConnectError, match=r"can0 is at 500000 bit/s, .*sudo ip link set can0 down"):
+    with pytest.raises(ConnectError, match=r"500000 bit/s, .*link set can0 down"):
         ask("socketcan://can0?bitrate=250000")
     (can0 / "flags").write_text("0x40080\n")
-    with pytest.raises(ConnectError, match=r"^can0 is down; sudo ip link set can0 up type can bitrate 500000$"):
+    with pytest.raises(ConnectError, match=r"^can0 is down; .*link set can0 up .* 500000$"):
         ask("can0")
     assert asked == []
 

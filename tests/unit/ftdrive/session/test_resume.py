@@ -346,7 +346,7 @@ def test_an_arm_without_a_serial_number_is_the_same_where_its_model_is(lab: Lab)
 def test_a_run_is_not_gone_on_with_the_other_sign(lab: Lab) -> None:
     folder = broken_off(lab)
     lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, sign=-1))
-    with pytest.raises(PlanRefused, match=r"sign was 1 and is -1"):
+    with pytest.raises(PlanRefused, match=r"sign .*1 .*-1"):
         lab.calibrate(resume=folder)
     assert lab.arm.moves == []
     lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, sign=1))
