@@ -8,8 +8,8 @@ import click
 import numpy as np
 
 from ftdrive.cell.emulated import SENSORS, Station
-from ftdrive.cell.emulated_run import rehearse
 from ftdrive.commands.common import JSON, runs, stop_unless_accepted, write_json
+from ftdrive.commands.emulated_run import rehearse
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.report import compensation_error, errors_in_sigma, print_result
 

@@ -22,9 +22,9 @@ from drivers.interfaces import DeviceInfo
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station, sensor_name
-from ftdrive.cell.emulated_run import rehearse
 from ftdrive.checks.devices import belonging
 from ftdrive.commands.common import CELL, JSON, check_simulate, read_cell, simulate, stop_unless_accepted, write_json
+from ftdrive.commands.emulated_run import rehearse
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.terminal.console import talk

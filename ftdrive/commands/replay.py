@@ -7,7 +7,6 @@ import click
 
 from calib import CalibrationResult
 from calib.routine import PoseRecord, Sampling, take_pose
-from ftdrive.cell.emulated_run import rehearsed_run
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
     JSON,
@@ -16,6 +15,7 @@ from ftdrive.commands.common import (
     stop_unless_accepted,
     write_json,
 )
+from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.runs.replay_source import RecordedRun
 from ftdrive.runs.run import Run

@@ -19,7 +19,6 @@ from calib.likelihood.fit import Drift
 from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE
 from calib.result import Method
 from calib.routine import drift_check
-from ftdrive.cell.emulated_run import rehearsed_run
 from ftdrive.cli import exit_code
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
@@ -32,6 +31,7 @@ from ftdrive.commands.common import (
     stop_unless_accepted,
     write_json,
 )
+from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.runs.pose_hints import hints
 from ftdrive.runs.run import Run, versions

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from ftdrive.cell import emulated_run
-from ftdrive.commands import demo
+from ftdrive.commands import demo, emulated_run
 from ftdrive.runs.run import Run
 from ftdrive.session.events import Event, Noted, RunOpened
 
