@@ -112,7 +112,7 @@ def test_the_table_fits_into_80_columns(arguments: list[str]) -> None:
     ("arguments", "said"),
     [
         (["--tool", "0:200"], "3 or 5 numbers"),
-        (["--tool", "200:100:50"], "cylinder of the tool"),
+        (["--tool", "200:100:50"], "[200.0, 100.0, 50.0] is not"),
         (["--quick", "--minimal"], "not both"),
         (["--mounting", "sideways"], "mounting"),
         (["--plane", "0:0:0:1"], "no direction"),

@@ -178,7 +178,7 @@ def test_a_pose_of_a_run_that_redo_names_stays_when_it_is_skipped(lab: Lab) -> N
     assert outcome.result.n_poses == 6
 
 
-def test_a_first_pose_that_is_taken_anew_after_its_return_gives_the_drift_between_the_two(lab: Lab) -> None:
+def test_a_first_pose_that_is_repeated_after_its_return_gives_the_drift_between_the_two(lab: Lab) -> None:
     lab.calibrate()
     lab.sensor.push = np.array([0.5, 0, 0, 0, 0, 0])
     outcome = lab.calibrate(resume=lab.run().folder, redo=(1,))
@@ -194,7 +194,7 @@ def test_a_first_pose_that_is_taken_anew_after_its_return_gives_the_drift_betwee
     assert words.startswith(f"first pose, taken anew {-drift.elapsed_s:.0f} s after the return to it, 0.")
 
 
-@pytest.mark.parametrize(("elapsed_s", "when"), [(300.0, "again after 300 s"), (-300.0, "anew 300 s after")])
+@pytest.mark.parametrize(("elapsed_s", "when"), [(300.0, "again after 300 s"), (-300.0, "repeated 300 s after")])
 def test_the_rate_of_a_drift_is_the_same_whichever_was_first(elapsed_s: float, when: str) -> None:
     words, bad = drift_in_words(DriftCheck(np.array([0.5, 0, 0, 0, 0, 0]), np.full(6, 0.01), elapsed_s))
     assert bad
