@@ -622,7 +622,7 @@ def test_an_arm_that_is_not_ready(station: Station, mode: int, fix: str) -> None
 @pytest.mark.parametrize(
     ("what", "found", "fix"),
     [
-        ("rtde", "cannot be reached", "address, cable"),
+        ("rtde", "cannot be reached", "switched on"),
         ("dashboard", "dashboard server", "Settings, Security, Services"),
         ("script", "30003", "Settings, Security, Services"),
     ],

@@ -191,7 +191,7 @@ def test_a_first_pose_that_is_repeated_after_its_return_gives_the_drift_between_
     assert drift.change[0] == pytest.approx(-0.5, abs=0.05)  # per time it rises all the same
     words, bad = drift_in_words(drift)
     assert bad
-    assert words.startswith(f"first pose, taken anew {-drift.elapsed_s:.0f} s after the return to it, 0.")
+    assert words.startswith(f"first pose, repeated {-drift.elapsed_s:.0f} s after the return to it, 0.")
 
 
 @pytest.mark.parametrize(("elapsed_s", "when"), [(300.0, "again after 300 s"), (-300.0, "repeated 300 s after")])

@@ -164,5 +164,5 @@ def test_where_the_24_are_out_of_reach_the_most_telling_poses_are_taken_and_the_
     assert plan.certified
     assert sampled_clear(certifier, plan)
     words = " ".join(plan.why)
-    assert "in reach" in words
+    assert "out of reach" in words
     assert "times that of all 24" in words
