@@ -18,6 +18,8 @@ from dashboard_client import DashboardClient
 from rtde_control import RTDEControlInterface
 from rtde_receive import RTDEReceiveInterface
 
+FACTS = os.fdopen(os.dup(1), "w", encoding="utf-8")
+os.dup2(2, 1)  # what the C++ library prints must not come between the facts
 LIMIT_S = 30.0
 """Whatever must happen has happened by then."""
 HANGS_S = 1.5
@@ -35,15 +37,15 @@ BROKEN_PROGRAM: dict[str, dict[str, Any]] = {
 
 
 def ask(**request: Any) -> dict[str, Any]:
-    sys.stdout.write("@ask " + json.dumps(request) + "\n")
-    sys.stdout.flush()
+    FACTS.write("@ask " + json.dumps(request) + "\n")
+    FACTS.flush()
     answer: dict[str, Any] = json.loads(sys.stdin.readline())
     return answer
 
 
 def report(**facts: Any) -> None:
-    sys.stdout.write("@fact " + json.dumps(facts) + "\n")
-    sys.stdout.flush()
+    FACTS.write("@fact " + json.dumps(facts) + "\n")
+    FACTS.flush()
 
 
 def wait_for(condition: Callable[[], bool], timeout_s: float = LIMIT_S) -> bool:
