@@ -12,12 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.command_line import CommandLine, assert_demo_found_the_truth
+from tests.system.command_line import CommandLine
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 LOOPS = 2
-STALL_S = 2.0
 
 
 @contextmanager
@@ -45,27 +44,31 @@ def station_of(program: int) -> int:
     raise AssertionError("no station was started")
 
 
-def test_a_demo_beside_two_busy_loops_ends_good(ftdrive: CommandLine) -> None:
+def test_a_session_beside_two_busy_loops_ends_well(ftdrive: CommandLine) -> None:
     with busy_loops():
-        process = ftdrive.start("demo", "--json")
-        out, err = process.communicate()
+        process = ftdrive.start("calibrate", "--simulate", "--minimal", "--yes", "--json")
+        _, err = process.communicate()
     assert process.returncode == 0, err
-    assert_demo_found_the_truth(json.loads(out))
+    assert len(ftdrive.poses()) == 7
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for the station in /proc")
-def test_a_demo_whose_processes_are_stopped_for_two_seconds_in_mid_tour_ends_good(ftdrive: CommandLine) -> None:
-    process = ftdrive.start("demo", "--json")
+def test_a_session_whose_processes_are_stopped_for_seconds_in_mid_tour_ends_well(ftdrive: CommandLine) -> None:
+    process = ftdrive.start("calibrate", "--simulate", "--quick", "--yes", "--json")
     ftdrive.wait_for_poses(process, 1)
     program, station = process.pid, station_of(process.pid)
-    for poses, stopped in ((4, (program, station)), (9, (program,)), (14, (station,))):
+    for poses, stopped, stall_s in (
+        (2, (program, station), 2.0),
+        (4, (program,), 4.0),  # ur_rtde gives a link up after 2.5 s without a sample
+        (6, (station,), 2.0),
+    ):
         ftdrive.wait_for_poses(process, poses)
         for pid in stopped:
             os.kill(pid, signal.SIGSTOP)
-        time.sleep(STALL_S)
+        time.sleep(stall_s)
         for pid in reversed(stopped):
             os.kill(pid, signal.SIGCONT)
-        assert len(ftdrive.poses()) < 24, "the tour has ended before"
+        assert len(ftdrive.poses()) < 12, "the tour has ended before"
     out, err = process.communicate()
     assert process.returncode == 0, err
-    assert_demo_found_the_truth(json.loads(out))
+    assert json.loads(out.splitlines()[-1])["verdict"] == "good"
