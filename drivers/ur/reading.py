@@ -18,14 +18,7 @@ from typing import Final
 import numpy as np
 
 from drivers.clock import Clock, Follower
-from drivers.errors import (
-    ConnectError,
-    DeviceFault,
-    DeviceTimeout,
-    DriverError,
-    ModelUnknown,
-    StreamBroken,
-)
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ModelUnknown, StreamBroken
 from drivers.interfaces import NOT_REPORTED, ArmState, ArmStatus, DeviceInfo
 from drivers.ur.dashboard import Dashboard, ask_dashboard
 from drivers.ur.kinematics import MODELS, Pose, forward, model_named
