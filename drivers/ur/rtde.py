@@ -35,16 +35,11 @@ DATA: Final = ord("U")
 
 _HEADER: Final = struct.Struct(">HB")  # size of the whole package, type
 _FORMATS: Final = {
-    "BOOL": "?",
-    "UINT8": "B",
     "UINT32": "I",
-    "UINT64": "Q",
     "INT32": "i",
     "DOUBLE": "d",
     "VECTOR3D": "3d",
     "VECTOR6D": "6d",
-    "VECTOR6INT32": "6i",
-    "VECTOR6UINT32": "6I",
 }
 
 
