@@ -8,7 +8,7 @@ from calib.ports import Arm, Sensor
 from drivers.interfaces import ForceTorqueSensor, RobotArm
 from drivers.registry import arm_class, sensor_from_url
 from ftdrive.cell.config import CellConfig
-from ftdrive.cell.emulated import sensor_clock, sensor_url
+from ftdrive.cell.emulated import sensor_reached
 from ftdrive.errors import ConfigError
 
 
@@ -33,9 +33,9 @@ def build_arm(cell: CellConfig) -> RobotArm:
 
 def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
     """Build the sensor's driver, not yet open."""
-    url = cell.sensor.url
+    url, clock = sensor_reached(cell.sensor.url, cell.clock)
     try:
-        sensor = sensor_from_url(sensor_url(url), sign=cell.sensor.sign, clock=sensor_clock(url, cell.clock))
+        sensor = sensor_from_url(url, sign=cell.sensor.sign, clock=clock)
     except ValueError as error:
         raise ConfigError(str(error)) from error
     _fits: Sensor = sensor
