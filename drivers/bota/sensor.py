@@ -107,7 +107,6 @@ class BotaSensor(StreamingSensor):
         self._port.close()
 
     def _configure(self, sinc: int) -> None:
-        """Enter set-up, set calibrated binary frames and the filter, and run again."""
         self._command(codec.ENTER_SETUP)
         self._command(codec.BINARY_AND_CALIBRATED)
         self._command(codec.filter_command(sinc))

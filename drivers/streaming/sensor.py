@@ -302,7 +302,6 @@ class StreamingSensor(ForceTorqueSensor):
         self._start_watching()
 
     def _start_watching(self) -> None:
-        """Reset the checks of a running stream."""
         self._liveness = Liveness(self.name)
         self._device_clock = DeviceClock(self.name)
         self._rate.forget()
@@ -313,7 +312,6 @@ class StreamingSensor(ForceTorqueSensor):
         self._thread.start()
 
     def _run(self) -> None:
-        """Read until `close`, or until an error ends the stream."""
         while self._is_mine() and not self._has_ended:
             self._take_turn()
 
@@ -339,7 +337,6 @@ class StreamingSensor(ForceTorqueSensor):
             self._news.notify_all()
 
     def _pump(self) -> None:
-        """Read once and publish."""
         block = self._read_block()
         turn_s = self._turn()  # after the read: a stamp is the time of the read, not of the measurement
         if self._was_away(turn_s):

@@ -162,7 +162,6 @@ class Reader:
     # ------------------------------------------------------------------ following the stream
 
     def _wait(self, is_new: Callable[[], bool], limit_s: float) -> Sample:
-        """Return the newest sample as soon as it `is_new`."""
         patience = Patience(self._clock, limit_s)
         with self._changed:
             while True:

@@ -251,7 +251,6 @@ CONTROL_REGISTERS: Final = (
 
 
 def _fix_of(error: OSError, host: str) -> str:
-    """Return what to do when a controller cannot be reached."""
     if isinstance(error, ConnectionRefusedError):
         return (
             f"check that {host} is the robot controller, switched on and started; enable RTDE at the pendant under "

@@ -382,7 +382,6 @@ def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> 
 
 
 def _answers_s(arm: RobotArm, clock: Clock) -> list[float]:
-    """Read the state of the arm repeatedly; return how long each answer took."""
     took_s, end_s = list[float](), clock.now_s() + _LINK_S
     while (started_s := clock.now_s()) < end_s:
         arm.state()

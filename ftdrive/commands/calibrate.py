@@ -225,7 +225,6 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
 
 
 def _as_json(outcome: "Outcome") -> dict[str, Any]:
-    """Return the run, the result, the drift check of pose 1, and the hints of the report."""
     from ftdrive.runs.pose_hints import hints
 
     drift = outcome.drift

@@ -141,7 +141,6 @@ def _examine_robot(cell: CellConfig, stack: ExitStack) -> tuple[list[Check], Rob
 
 
 def _check_poses(arm: RobotArm, status: ArmStatus, clock: Clock) -> list[Check]:
-    """Check that the arm reports its flange, and how fast."""
     name = "robot.flange"
     if status.tcp_offset is None:
         found = "the controller does not report its TCP offset: only a calibration, which takes control, can read poses"

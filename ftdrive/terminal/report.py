@@ -251,7 +251,6 @@ def print_comparison(compared: Sequence[Compared]) -> None:
 
 
 def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:
-    """Make the table, as wide as it needs to be."""
     table = Table(box=None, padding=(0, 1))
     for title, shown in (
         *(("method", True), ("mass\nkg", True)),
