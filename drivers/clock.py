@@ -31,6 +31,10 @@ class Clock(ABC):
         """The longest that one read may block, in real time; the time of an emulated cell stands still meanwhile."""
         return 0.005 if self.emulated else 0.05
 
+    def patience_s(self, limit_s: float) -> float:
+        """Return a limit on another process in real time: a long one in an emulated cell, whose far side may starve."""
+        return 30.0 if self.emulated else limit_s
+
     @abstractmethod
     def now_ns(self) -> int:
         """Return the time in nanoseconds; samples are stamped with it as `t_host_ns`."""

@@ -1,16 +1,4 @@
-"""What can go wrong with a device.
-
-DriverError
-├── ConnectError      the device could not be opened, or is not what it should be
-│   ├── PortInUse     another program has its port
-│   ├── Unreachable   nothing answers at its address
-│   ├── ModelUnknown  an arm does not report its model, and none is configured
-│   └── NoDashboard   the dashboard server of an arm does not answer, or refuses
-├── StreamBroken      the connection was lost after it had worked
-├── DeviceTimeout     nothing arrived in time (also a TimeoutError)
-├── ProtocolError     bytes arrived that the document does not allow
-└── DeviceFault       the device itself reports a fault: sensor status, protective or emergency stop
-    └── Frozen        a sensor repeats one reading
+"""What can go wrong with a device; `DriverError` is the base of all.
 
 `found` is what happened, with the value. `fix` starts with a verb and is what to do next, where the driver knows it.
 The text of an error is "found; fix", without capital and full stop. A conversion to another class keeps the fix.
@@ -64,7 +52,7 @@ class StreamBroken(DriverError):
 
 
 class DeviceTimeout(DriverError, TimeoutError):
-    """Nothing arrived in time."""
+    """Nothing arrived in time; also a `TimeoutError`."""
 
 
 class ProtocolError(DriverError):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from math import isfinite
 from types import MappingProxyType
-from typing import Any, Protocol, cast
+from typing import Any, cast
 from urllib.parse import parse_qsl, quote, unquote, urlsplit
 
 from drivers.clock import REAL, Clock
@@ -154,10 +154,6 @@ def in_url(address: str) -> str:
     return quote(address, safe="/:@")
 
 
-class _FromUrl(Protocol):
-    def from_url(self, address: str, options: Options, *, sign: int = 1, **clock: Clock) -> ForceTorqueSensor: ...
-
-
 def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTorqueSensor:
     """Build the sensor that an address names, without opening it.
 
@@ -183,14 +179,14 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
         raise BadUrl(f"{url}: unknown sensor '{parts.scheme}'; known: {known}, as in {_EXAMPLES[0]}")
     if not parts.address or parts.fragment or not url.lower().startswith(f"{parts.scheme}://"):
         raise BadUrl(f"{url}: names no device; write it like {', '.join(_EXAMPLES)}")
-    driver = cast("_FromUrl", _load(entry))
+    driver = _load(entry)
     if not hasattr(driver, "from_url"):
         raise BadUrl(f"{url}: {entry.value} has no from_url, so it is no driver; reinstall {_package(entry)}")
     options = Options(url, parts.query)
     recover, configured = bool(options.integer("recover", 0, 0, 1)), options.configured()
     own_time = {} if clock is REAL else {"clock": clock}
     try:
-        sensor = driver.from_url(parts.address, options, sign=sign, **own_time)
+        sensor: ForceTorqueSensor = driver.from_url(parts.address, options, sign=sign, **own_time)
     except BadUrl:
         raise
     except ValueError as exc:

@@ -82,21 +82,16 @@ def exit_code(error: BaseException) -> int | None:
     from drivers.transcript.recorder import BadTranscript
     from ftdrive.errors import BadPlan, ConfigError, NotAccepted
 
-    codes: list[tuple[type[BaseException], int]] = [
-        (ConfigError, 2),
-        (ConnectError, 3),
-        (DeviceFault, 5),
-        (DriverError, 4),
-        (TooFewSamples, 4),
-        (BadDataset, 6),
-        (BadCalibration, 6),
-        (BadTranscript, 6),
-        (BadPlan, 6),
-        (CalibError, 7),
-        (NotAccepted, 7),
-        (OSError, 6),
+    codes: list[tuple[int, tuple[type[BaseException], ...]]] = [
+        (2, (ConfigError,)),
+        (3, (ConnectError,)),
+        (5, (DeviceFault,)),
+        (4, (DriverError, TooFewSamples)),
+        (6, (BadDataset, BadCalibration, BadTranscript, BadPlan)),
+        (7, (CalibError, NotAccepted)),
+        (6, (OSError,)),
     ]
-    return next((code for kind, code in codes if isinstance(error, kind)), None)
+    return next((code for code, kinds in codes if isinstance(error, kinds)), None)
 
 
 def in_a_sentence(error: BaseException) -> str:

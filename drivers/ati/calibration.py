@@ -113,16 +113,12 @@ class Calibration:
         return np.asarray(gauges @ self.wrench_per_count.T)
 
 
-def saturated_gauges(gauges: NDArray[np.int32]) -> list[int]:
-    """Return the gauges at the end of their range in any of n rows (n, 6): the wrench is then meaningless.
-
-    No status bit reports an overload or a broken cable.
-    """
-    return [int(g) for g in np.flatnonzero(((gauges == _LOWEST) | (gauges == _HIGHEST)).any(axis=0))]
-
-
 def refuse_saturated(name: str, gauges: NDArray[np.int32]) -> None:
-    """Raise `DeviceFault` when a gauge of the sensor is at the end of its range in any of n rows (n, 6)."""
-    if saturated := saturated_gauges(gauges):
+    """Raise `DeviceFault` when a gauge of the sensor is at the end of its range in any of n rows (n, 6).
+
+    The wrench is then meaningless. No status bit reports an overload or a broken cable.
+    """
+    saturated = np.flatnonzero(((gauges == _LOWEST) | (gauges == _HIGHEST)).any(axis=0))
+    if len(saturated):
         names = ", ".join(f"G{gauge}" for gauge in saturated)
         raise DeviceFault(f"{name}: gauge {names} is at the end of its range", "take the load off, check the cable")

@@ -234,16 +234,12 @@ class AtiCanSensor(StreamingSensor):
         """Exchange with retries, for the start-up sequence."""
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(DeviceTimeout, ProtocolError):
-                return self._exchange(op, bytes(args), _TRANSACTION_S)
+                self._request(op, bytes(args))
+                return self._answer(op, bytes(args), _TRANSACTION_S)
         raise DeviceTimeout(
             f"{self.name}: no reply to {op.name} after {_ATTEMPTS} attempts of {_TRANSACTION_S} s",
             "check bit rate, base identifier, supply and termination",
         )
-
-    def _exchange(self, op: Op, data: bytes, timeout_s: float) -> list[bytes]:
-        """Send one request and return the payloads of its reply; in one thread at a time. Raises as `_answer`."""
-        self._request(op, data)
-        return self._answer(op, data, timeout_s)
 
     def _request(self, op: Op, data: bytes) -> None:
         """Drop what belongs to earlier requests, and send one; `_answer` must follow."""

@@ -37,8 +37,6 @@ _SILENCE_S = 0.3
 _STARTS = 5
 """The request to start is a datagram, which can be lost."""
 _HTTP_S = 1.0
-_PATIENCE_S = 30.0
-"""Replaces `_HTTP_S` in an emulated cell, whose pages are served in real time."""
 _NEVER_S = 3600.0
 _WAIT_S, _BATCH_S = 0.05, 0.002
 """In real time, for the first sample and then for those after it."""
@@ -178,7 +176,7 @@ class NetFtSensor(StreamingSensor):
         name = f"{'OnRobot' if onrobot else 'ATI'} Ethernet sensor at {host}"
         # UDP reports no broken cable: a silence ends the stream, before the stream is stale
         super().__init__(name, sign=sign, clock=clock, limits=StreamLimits(stale_s=_SILENCE_S + 0.15))
-        self._http_s = _PATIENCE_S if clock.emulated else _HTTP_S
+        self._http_s = clock.patience_s(_HTTP_S)
         self._host = host
         self._onrobot = onrobot
         self._rdt_port = rdt_port
@@ -338,13 +336,10 @@ class NetFtSensor(StreamingSensor):
     def _judge(self, status: int) -> None:
         """Raise on a fault, log a latched monitor condition once."""
         if status not in {0, MONITOR_LATCHED}:
-            raise self._fault(status)
+            raise DeviceFault(f"{self.name}: status {describe_status(status, self._bits, 32)}", UNUSABLE)
         if status and not self._warned:
             log.warning("%s: status %s; measuring continues", self.name, describe_status(status, self._bits, 32))
             self._warned = True
-
-    def _fault(self, status: int) -> DeviceFault:
-        return DeviceFault(f"{self.name}: status {describe_status(status, self._bits, 32)}", UNUSABLE)
 
     def _read_page(self, path: str) -> bytes:
         """Read a page that pynetft does not: serial number of the calibration in use, rate, range."""

@@ -107,14 +107,10 @@ class BotaSensor(StreamingSensor):
         self._port.close()
 
     def _configure(self, sinc: int) -> None:
-        """Enter set-up, set calibrated binary frames and the filter, and run again."""
-        for command in (
-            codec.ENTER_SETUP,
-            codec.BINARY_AND_CALIBRATED,
-            codec.filter_command(sinc),
-            codec.ENTER_RUN,
-        ):
-            self._command(command)
+        self._command(codec.ENTER_SETUP)
+        self._command(codec.BINARY_AND_CALIBRATED)
+        self._command(codec.filter_command(sinc))
+        self._command(codec.ENTER_RUN)
 
     def _command(self, command: bytes) -> None:
         for _ in range(_ATTEMPTS):

@@ -165,7 +165,6 @@ def _url(scheme: str, channel: str, options: Sequence[str]) -> str:
 
 
 def _ask(bus: CanBus, clock: Clock, identifier: int, data: bytes, parts: Mapping[int, int]) -> bytes | None:
-    """Send a request and return its reply, or None."""
     bus.send(identifier, data)
     frames: list[Frame] = []
     for left_s in clock.looks(_REPLY_S):

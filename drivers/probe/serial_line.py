@@ -39,8 +39,8 @@ class _Known:
     baud: int
     even_parity: bool
     streams: Callable[[bytes], bool]
-    request: bytes | None
-    reply: Callable[[bytes], str]
+    request: bytes | None = None
+    reply: Callable[[bytes], str] | None = None
     """What the device reports about itself; raises `ProtocolError`."""
 
 
@@ -57,7 +57,7 @@ def probe(port: str, clock: Clock = REAL) -> Answer | None:
             if known.streams(_hear(port, known, None, _LISTEN_S, clock)):
                 return Answer(known.url.format(port=in_url(port)), "it streams")
         for known in _KNOWN:
-            if known.request is not None:
+            if known.request is not None and known.reply is not None:
                 try:
                     what = known.reply(_hear(port, known, known.request, _REPLY_S, clock))
                 except ProtocolError:
@@ -122,14 +122,10 @@ def _robotous_reply(data: bytes) -> str:
     raise ProtocolError("no reply of a Robotous sensor")
 
 
-def _nothing(_: bytes) -> str:
-    raise ProtocolError("this sensor is not asked")
-
-
 _robotous_streams = _frames(robotous.deframer)
 
 _KNOWN = (
-    _Known("bota://{port}", 460_800, False, _frames(bota.deframer), None, _nothing),
+    _Known("bota://{port}", 460_800, False, _frames(bota.deframer)),
     _Known("robotiq-ft300://{port}", 19_200, False, _frames(robotiq.deframer), _ROBOTIQ_REQUEST, _robotiq_reply),
     _Known("robotous-serial://{port}", 115_200, False, _robotous_streams, _ROBOTOUS_REQUEST, _robotous_reply),
     _Known(

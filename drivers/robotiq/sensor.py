@@ -93,7 +93,6 @@ class RobotiqFt300(StreamingSensor):
             self._port.close()
 
     def _stop_stream(self) -> None:
-        """Stop a stream and wait for silence."""
         self._port.write(codec.STOP)
         self._port.drain(_SILENCE_S, _STOP_S)
 

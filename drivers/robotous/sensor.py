@@ -7,7 +7,7 @@ A streaming sensor accepts only stop and bias, so a reply to any other command p
 never sends the bias command.
 """
 
-from typing import Protocol
+from abc import abstractmethod
 
 import numpy as np
 
@@ -22,42 +22,8 @@ _REPLY_S = 0.15
 _ATTEMPTS = 3
 
 
-class Link(Protocol):
-    """The wire that carries fields: a CAN bus or a UART."""
-
-    name: str
-    """Name of the device, for errors."""
-    fastest_Hz: int
-    """The highest output rate of the wire."""
-    clock: Clock
-    """Measures the sensor's limits."""
-
-    @property
-    def damaged(self) -> int:
-        """How many fields were damaged or incomplete."""
-
-    @property
-    def unpaired(self) -> bool:
-        """Whether frames arrive that cannot be paired into fields."""
-
-    def open(self) -> None:
-        """Open the wire."""
-
-    def send(self, field: bytes) -> None:
-        """Send a command field (8 bytes)."""
-
-    def stream(self, rate_Hz: int, /) -> None:
-        """Start the stream at this rate."""
-
-    def receive(self) -> list[Field]:
-        """Return the fields that arrive within about 0.05 s."""
-
-    def close(self) -> None:
-        """Close the wire. Idempotent."""
-
-
 class RobotousSensor(StreamingSensor):
-    """A Robotous RFT on a `Link`.
+    """A Robotous RFT; a subclass sends and receives its fields on one wire.
 
     `counts` are the six raw values, `t_device_s` is NaN, `status` holds the overload bits (5 for Fx down to 0 for Tz);
     any of them set is a `DeviceFault`. Samples carry no number. On a UART `seq` counts arrived frames, including
@@ -65,8 +31,10 @@ class RobotousSensor(StreamingSensor):
 
     Parameters
     ----------
-    link : Link
-        `drivers.robotous.can.CanLink` or `drivers.robotous.serial.SerialLink`.
+    name : str
+        The device as the user knows it.
+    fastest_Hz : int
+        The highest output rate of the wire.
     rate_Hz : int, optional
         10, 20, 50, 100, 200, 333, 500 or 1000, which a UART carries at 921600 baud only. Without it, the rate that is
         set in the sensor.
@@ -74,17 +42,37 @@ class RobotousSensor(StreamingSensor):
         -1 for a sensor mounted or wired to report the reaction.
     """
 
-    def __init__(self, link: Link, *, rate_Hz: int | None = None, sign: int = 1) -> None:
-        super().__init__(link.name, sign=sign, clock=link.clock)
+    def __init__(self, name: str, fastest_Hz: int, *, rate_Hz: int | None, sign: int, clock: Clock) -> None:
+        super().__init__(name, sign=sign, clock=clock)
         if rate_Hz is not None and rate_Hz not in codec.RATE_CODES:
             raise ValueError(f"rate is {rate_Hz} Hz; choose one of {', '.join(map(str, codec.RATE_CODES))}")
-        if rate_Hz is not None and rate_Hz > link.fastest_Hz:
-            raise ValueError(f"rate is {rate_Hz} Hz; choose at most {link.fastest_Hz} Hz, or a higher baud rate")
-        self._link = link
+        if rate_Hz is not None and rate_Hz > fastest_Hz:
+            raise ValueError(f"rate is {rate_Hz} Hz; choose at most {fastest_Hz} Hz, or a higher baud rate")
         self._rate_Hz = rate_Hz
 
+    @abstractmethod
+    def _open(self) -> None: ...
+
+    @abstractmethod
+    def _close(self) -> None: ...
+
+    @abstractmethod
+    def _send(self, field: bytes) -> None:
+        """Send a command field (8 bytes)."""
+
+    @abstractmethod
+    def _receive(self) -> list[Field]:
+        """Return the fields that arrive within about 0.05 s."""
+
+    @abstractmethod
+    def _damaged(self) -> int:
+        """Return how many fields were damaged or incomplete."""
+
+    def _start_stream(self, _rate_Hz: int) -> None:
+        self._send(codec.encode(Command.START))
+
     def _connect(self) -> DeviceInfo:
-        self._link.open()
+        self._open()
         model = codec.decode_text(self._ask(Command.MODEL))
         force, torque = codec.counts_per_unit(model)
         self._unit_per_count = 1 / np.array([force] * 3 + [torque] * 3)
@@ -94,8 +82,8 @@ class RobotousSensor(StreamingSensor):
         if self._rate_Hz is not None and rate_Hz != self._rate_Hz:
             codec.check_set(self._ask(Command.SET_RATE, codec.RATE_CODES[self._rate_Hz]))
             rate_Hz = self._rate_Hz
-        self._link.stream(rate_Hz)
-        self._damaged_before = self._link.damaged
+        self._start_stream(rate_Hz)
+        self._damaged_before = self._damaged()
         self._nominal_Hz = rate_Hz
         return DeviceInfo(
             model=f"Robotous {model}",
@@ -105,8 +93,8 @@ class RobotousSensor(StreamingSensor):
         )
 
     def _read_block(self) -> FtSamples:
-        received = self._link.receive()
-        self._lost = self._malformed = self._link.damaged - self._damaged_before
+        received = self._receive()
+        self._lost = self._malformed = self._damaged() - self._damaged_before
         fields = [field for field in received if field.data[0] == Command.START]  # a late reply is no sample
         if not fields:
             return NOTHING
@@ -127,22 +115,17 @@ class RobotousSensor(StreamingSensor):
 
     def _disconnect(self) -> None:
         try:
-            self._link.send(codec.encode(Command.STOP))
+            self._send(codec.encode(Command.STOP))
         finally:
-            self._link.close()
-
-    def _silence_fix(self) -> str:
-        if self._link.unpaired:
-            return "give this computer less to do, because frames arrive too late to be paired"
-        return super()._silence_fix()
+            self._close()
 
     def _ask(self, command: Command, *parameters: int) -> bytes:
         """Stop any stream, send a command and return the field that replies to it."""
         for _ in range(_ATTEMPTS):
-            self._link.send(codec.encode(Command.STOP))
-            self._link.send(codec.encode(command, *parameters))
+            self._send(codec.encode(Command.STOP))
+            self._send(codec.encode(command, *parameters))
             for _ in self._clock.looks(_REPLY_S):
-                for field in self._link.receive():
+                for field in self._receive():
                     if field.data[0] == command:
                         return field.data
         raise DeviceTimeout(

@@ -53,8 +53,6 @@ class StreamLimits:
     """In real time: how long `close` waits for the reader before it closes the port."""
 
 
-_PATIENCE_S = 30.0
-"""`join_s` in an emulated cell, whose reader may be starved."""
 _EVENTS = 1000
 
 
@@ -181,7 +179,7 @@ class StreamingSensor(ForceTorqueSensor):
             self._news.notify_all()
         if thread is None:
             return
-        thread.join(_PATIENCE_S if self._clock.emulated else self._limits.join_s)
+        thread.join(self._clock.patience_s(self._limits.join_s))
         if thread.is_alive():
             log.warning("%s: the reader thread hangs in a read; closing its port", self.name)
         self._let_go()
@@ -304,7 +302,6 @@ class StreamingSensor(ForceTorqueSensor):
         self._start_watching()
 
     def _start_watching(self) -> None:
-        """Reset the checks of a running stream."""
         self._liveness = Liveness(self.name)
         self._device_clock = DeviceClock(self.name)
         self._rate.forget()
@@ -315,7 +312,6 @@ class StreamingSensor(ForceTorqueSensor):
         self._thread.start()
 
     def _run(self) -> None:
-        """Read until `close`, or until an error ends the stream."""
         while self._is_mine() and not self._has_ended:
             self._take_turn()
 
@@ -341,15 +337,16 @@ class StreamingSensor(ForceTorqueSensor):
             self._news.notify_all()
 
     def _pump(self) -> None:
-        """Read once and publish."""
         block = self._read_block()
         turn_s = self._turn()  # after the read: a stamp is the time of the read, not of the measurement
         if self._was_away(turn_s):
             self._drop_backlog(turn_s, len(block))
         elif len(block):
             self._publish(block)
-        elif self.recover and min(self._age_s(), self._settled_s()) > self._limits.stale_s:
-            raise self._stale(self._age_s())
+        elif self.recover:
+            since_pause_s = (self._clock.now_ns() - self._fresh_from_ns) / 1e9
+            if min(self._age_s(), since_pause_s) > self._limits.stale_s:
+                raise self._stale(self._age_s())
 
     def _turn(self) -> float:
         """Return the time since the last call, including sleep of the computer."""
@@ -510,10 +507,6 @@ class StreamingSensor(ForceTorqueSensor):
 
     def _age_s(self) -> float:
         return self._clock.awake_s() - self._heard_s
-
-    def _settled_s(self) -> float:
-        """Return the time since the last pause."""
-        return (self._clock.now_ns() - self._fresh_from_ns) / 1e9
 
     def _stale(self, age_s: float) -> DeviceTimeout:
         found = f"{self.name}: no new sample for {age_s:.3f} s (allowed: {self._limits.stale_s:g} s)"

@@ -83,16 +83,12 @@ class Writer:
 
     def event(self, name: str, **content: Any) -> None:
         """Record an event."""
-        with self._lock:
-            self._flush_received()
-            self.has_port |= name == "open"
-            self._line({"t_ns": self.clock.now_ns(), "event": name, **content})
+        self.has_port |= name == "open"
+        self._entry(event=name, **content)
 
     def sent(self, data: bytes) -> None:
         """Record one write of the driver."""
-        with self._lock:
-            self._flush_received()
-            self._line({"t_ns": self.clock.now_ns(), "dir": "tx", "hex": data.hex()})
+        self._entry(dir="tx", hex=data.hex())
 
     def received(self, data: bytes) -> None:
         """Record what the driver has read; reads within 2 ms become one line."""
@@ -108,9 +104,7 @@ class Writer:
 
     def received_datagram(self, data: bytes) -> None:
         """Record one datagram to the driver as one line."""
-        with self._lock:
-            self._flush_received()
-            self._line({"t_ns": self.clock.now_ns(), "dir": "rx", "hex": data.hex()})
+        self._entry(dir="rx", hex=data.hex())
 
     def end(self, **content: Any) -> None:
         """Write the last line and rename the file."""
@@ -133,6 +127,11 @@ class Writer:
         if file is not None:
             file.close()
             self._partial.unlink()
+
+    def _entry(self, **content: Any) -> None:
+        with self._lock:
+            self._flush_received()
+            self._line({"t_ns": self.clock.now_ns(), **content})
 
     def _flush_received(self) -> None:
         if self._received:

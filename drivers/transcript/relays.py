@@ -19,9 +19,8 @@ import pynetft
 
 from drivers.transcript.ports import AT_ONCE, HTTP_S, LOOK_S, LOOPBACK, PageServer
 from drivers.transcript.recorder import Writer
+from drivers.transcript.taps import replaced
 
-_CLIENT_CLASS: Final = "Client"
-_CONNECTION_CLASS: Final = "HTTPConnection"
 _ROOM: Final = 4 << 20
 """Receive buffer of a relay in bytes; the system may grant less."""
 
@@ -29,7 +28,6 @@ _ROOM: Final = 4 << 20
 @contextlib.contextmanager
 def relayed(writer: Writer) -> Iterator[None]:
     """Redirect pynetft and HTTP clients in the `with` block to relays."""
-    plain, plain_connection = pynetft.Client, http.client.HTTPConnection
     with contextlib.ExitStack() as relays:
 
         @cache
@@ -57,13 +55,8 @@ def relayed(writer: Writer) -> Iterator[None]:
                 super().__init__(*arguments, **options)
                 self.host, self.port = LOOPBACK, pages_of(self.host, self.port)
 
-        setattr(pynetft, _CLIENT_CLASS, RelayedClient)
-        setattr(http.client, _CONNECTION_CLASS, RelayedConnection)
-        try:
+        with replaced(pynetft, "Client", RelayedClient), replaced(http.client, "HTTPConnection", RelayedConnection):
             yield
-        finally:
-            setattr(pynetft, _CLIENT_CLASS, plain)
-            setattr(http.client, _CONNECTION_CLASS, plain_connection)
 
 
 class _DatagramRelay:

@@ -4,7 +4,8 @@ import contextlib
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
-from typing import Any, Final, cast
+from types import ModuleType
+from typing import Any, cast
 
 import can
 import serial
@@ -12,8 +13,16 @@ import serial
 from drivers.transcript.recorder import Writer
 from drivers.wires.parity import marks_asked_for
 
-_PORT_CLASS: Final = "Serial"
-_BUS_CLASS: Final = "Bus"
+
+@contextlib.contextmanager
+def replaced(module: ModuleType, name: str, other: object) -> Iterator[None]:
+    """Put another object in the place of the one that a module has by this name, during the `with` block."""
+    plain = getattr(module, name)
+    setattr(module, name, other)
+    try:
+        yield
+    finally:
+        setattr(module, name, plain)
 
 
 @contextlib.contextmanager
@@ -39,7 +48,7 @@ def _ethernet(writer: Writer) -> AbstractContextManager[None]:
 
 @contextlib.contextmanager
 def _ports_and_buses(writer: Writer) -> Iterator[None]:
-    plain, plain_bus = serial.Serial, can.Bus
+    plain_bus = can.Bus
     opened: list[serial.Serial] = []
 
     class RecordedPort(serial.Serial):
@@ -96,13 +105,8 @@ def _ports_and_buses(writer: Writer) -> Iterator[None]:
         vars(bus).update(recv=recv, send=recorded_send)
         return bus
 
-    setattr(serial, _PORT_CLASS, RecordedPort)
-    setattr(can, _BUS_CLASS, recorded_bus)
-    try:
+    with replaced(serial, "Serial", RecordedPort), replaced(can, "Bus", recorded_bus):
         yield
-    finally:
-        setattr(serial, _PORT_CLASS, plain)
-        setattr(can, _BUS_CLASS, plain_bus)
 
 
 def _slcan_line(frame: can.Message) -> bytes:

@@ -26,7 +26,7 @@ from drivers.ur.kinematics import MODELS, model_named
 from drivers.ur.reading import FREQUENCY_HZ, Reader
 from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
 from drivers.ur.sample import PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Sample
-from drivers.ur.timing import STRICT, UrTiming
+from drivers.ur.timing import UrTiming
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class UrArm(RobotArm):
     clock
         Measures and waits; an emulated cell has its own.
     timing
-        Every time limit.
+        Every time limit; by default those of the cell that `clock` times.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class UrArm(RobotArm):
         speed_rad_s: float = radians(30),
         acceleration_rad_s2: float = radians(40),
         clock: Clock = REAL,
-        timing: UrTiming = STRICT,
+        timing: UrTiming | None = None,
     ) -> None:
         _check_speed(speed_rad_s, acceleration_rad_s2)
         if model is not None and model_named(model, 0) is None:
@@ -73,7 +73,7 @@ class UrArm(RobotArm):
         self._speed_rad_s = float(speed_rad_s)
         self._acceleration_rad_s2 = float(acceleration_rad_s2)
         self._clock = clock
-        self._timing = timing
+        self._timing = timing or UrTiming.of(clock)
         self._moves_at_rad_s = self._speed_rad_s
         self._reader: Reader | None = None
         self._control: ControlProcess | None = None

@@ -56,11 +56,6 @@ class ControlProcess:
             reader.start()
 
     @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
-
-    @property
     def alive(self) -> bool:
         """Whether it accepts calls."""
         return not (self._ended or self._killed)

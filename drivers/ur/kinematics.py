@@ -81,16 +81,10 @@ class Pose:
 
 def forward(geometry: Geometry, q_rad: Sequence[float] | Array) -> Pose:
     """Return the flange in base for the joint angles `q_rad` (6,), by the nominal lengths."""
-    lengths = (
-        (geometry.d1_m, 0.0),
-        (0.0, geometry.a2_m),
-        (0.0, geometry.a3_m),
-        (geometry.d4_m, 0.0),
-        (geometry.d5_m, 0.0),
-        (geometry.d6_m, 0.0),
-    )
+    d_m = (geometry.d1_m, 0.0, 0.0, geometry.d4_m, geometry.d5_m, geometry.d6_m)
+    a_m = (0.0, geometry.a2_m, geometry.a3_m, 0.0, 0.0, 0.0)
     flange = Pose(np.eye(3), np.zeros(3))
-    for q, alpha, (d, a) in zip(q_rad, _ALPHA_RAD, lengths, strict=True):
+    for q, alpha, d, a in zip(q_rad, _ALPHA_RAD, d_m, a_m, strict=True):
         link = np.array(
             [
                 [cos(q), -sin(q) * cos(alpha), sin(q) * sin(alpha)],

@@ -18,14 +18,7 @@ from typing import Final
 import numpy as np
 
 from drivers.clock import Clock, Follower
-from drivers.errors import (
-    ConnectError,
-    DeviceFault,
-    DeviceTimeout,
-    DriverError,
-    ModelUnknown,
-    StreamBroken,
-)
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ModelUnknown, StreamBroken
 from drivers.interfaces import NOT_REPORTED, ArmState, ArmStatus, DeviceInfo
 from drivers.ur.dashboard import Dashboard, ask_dashboard
 from drivers.ur.kinematics import MODELS, Pose, forward, model_named
@@ -169,7 +162,6 @@ class Reader:
     # ------------------------------------------------------------------ following the stream
 
     def _wait(self, is_new: Callable[[], bool], limit_s: float) -> Sample:
-        """Return the newest sample as soon as it `is_new`."""
         patience = Patience(self._clock, limit_s)
         with self._changed:
             while True:

@@ -35,16 +35,11 @@ DATA: Final = ord("U")
 
 _HEADER: Final = struct.Struct(">HB")  # size of the whole package, type
 _FORMATS: Final = {
-    "BOOL": "?",
-    "UINT8": "B",
     "UINT32": "I",
-    "UINT64": "Q",
     "INT32": "i",
     "DOUBLE": "d",
     "VECTOR3D": "3d",
     "VECTOR6D": "6d",
-    "VECTOR6INT32": "6i",
-    "VECTOR6UINT32": "6I",
 }
 
 
@@ -256,7 +251,6 @@ CONTROL_REGISTERS: Final = (
 
 
 def _fix_of(error: OSError, host: str) -> str:
-    """Return what to do when a controller cannot be reached."""
     if isinstance(error, ConnectionRefusedError):
         return (
             f"check that {host} is the robot controller, switched on and started; enable RTDE at the pendant under "

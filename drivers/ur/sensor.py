@@ -20,7 +20,7 @@ from drivers.errors import ConnectError, ProtocolError, StreamBroken
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
 from drivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from drivers.ur.rtde import Subscription
-from drivers.ur.timing import STRICT, UrTiming
+from drivers.ur.timing import UrTiming
 
 if TYPE_CHECKING:
     from drivers.registry import Options
@@ -70,7 +70,7 @@ class UrWristSensor(StreamingSensor):
 
     def _connect(self) -> DeviceInfo:
         outputs = {"timestamp": "DOUBLE", "ft_raw_wrench": "VECTOR6D"}
-        connect_s = (UrTiming.emulated() if self._clock.emulated else STRICT).connect_s
+        connect_s = UrTiming.of(self._clock).connect_s
         self._stream = Subscription(self._host, outputs, _RATE_Hz, timeout_s=connect_s, clock=self._clock)
         version = ".".join(map(str, self._stream.version))
         if self._stream.missing:

@@ -16,8 +16,6 @@ from drivers.wires.serial_port import LINK_ERRORS, refusal
 
 BUS_ERRORS = (can.CanError, ValueError, *LINK_ERRORS)
 _SEND_S, _LOOK_S = 0.1, 0.05
-_PATIENCE_S = 30.0
-"""Replaces `_SEND_S` in an emulated cell, whose far side may be starved."""
 _DISCARD_S = 0.1
 
 
@@ -124,7 +122,7 @@ class CanBus:
         """Send one data frame; it is lost when a busy adapter does not accept it in time. Raises `StreamBroken`."""
         if self._bus is None:
             raise StreamBroken(f"{self._owner}: the bus is closed", "open it first")
-        timeout_s = _PATIENCE_S if self._clock.emulated else _SEND_S
+        timeout_s = self._clock.patience_s(_SEND_S)
         try:
             self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=timeout_s)
         except BUS_ERRORS as exc:

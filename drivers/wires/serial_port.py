@@ -17,8 +17,6 @@ LINK_ERRORS = (OSError, termios.error)
 """Raised by a vanished serial port; `termios.error` is not an `OSError`."""
 
 _WRITE_S = 0.2
-_PATIENCE_S = 30.0
-"""Replaces `_WRITE_S` in an emulated cell, whose far side may be starved."""
 _DRAIN_BYTES = 416
 """5 ms of the fastest sensor."""
 
@@ -81,7 +79,7 @@ class SerialPort:
                 self._baud,
                 parity=serial.PARITY_EVEN if self._even_parity and not emulated else serial.PARITY_NONE,
                 timeout=self._read_s,
-                write_timeout=_PATIENCE_S if self._clock.emulated else _WRITE_S,
+                write_timeout=self._clock.patience_s(_WRITE_S),
                 exclusive=True,
             )
             self._marks = Unmarker() if self._even_parity and ask_for_marks(self._port) else None

@@ -7,9 +7,8 @@ from typing import cast
 from calib.ports import Arm, Sensor
 from drivers.interfaces import ForceTorqueSensor, RobotArm
 from drivers.registry import arm_class, sensor_from_url
-from drivers.ur.timing import STRICT, UrTiming
 from ftdrive.cell.config import CellConfig
-from ftdrive.cell.emulated import sensor_clock, sensor_url
+from ftdrive.cell.emulated import sensor_reached
 from ftdrive.errors import ConfigError
 
 
@@ -19,8 +18,8 @@ def build_arm(cell: CellConfig) -> RobotArm:
         build = cast("Callable[..., RobotArm]", arm_class(cell.robot.driver))
     except ValueError as error:
         raise ConfigError(f"[robot] driver: {error}") from error
-    # Only an emulated arm takes clock and timing: an arm of another package may not know them.
-    emulated = {"clock": cell.clock, "timing": ur_timing(cell)} if cell.clock.emulated else {}
+    # Only an emulated arm takes a clock: an arm of another package may not know it.
+    emulated = {"clock": cell.clock} if cell.clock.emulated else {}
     arm = build(
         cell.robot.host,
         model=cell.robot.model,
@@ -32,16 +31,11 @@ def build_arm(cell: CellConfig) -> RobotArm:
     return arm
 
 
-def ur_timing(cell: CellConfig) -> UrTiming:
-    """Limits of time of a UR arm: strict, or patient with the processes of an emulated cell."""
-    return UrTiming.emulated() if cell.clock.emulated else STRICT
-
-
 def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
     """Build the sensor's driver, not yet open."""
-    url = cell.sensor.url
+    url, clock = sensor_reached(cell.sensor.url, cell.clock)
     try:
-        sensor = sensor_from_url(sensor_url(url), sign=cell.sensor.sign, clock=sensor_clock(url, cell.clock))
+        sensor = sensor_from_url(url, sign=cell.sensor.sign, clock=clock)
     except ValueError as error:
         raise ConfigError(str(error)) from error
     _fits: Sensor = sensor

@@ -125,22 +125,16 @@ class Station:
         )
 
 
-def sensor_url(url: str) -> str:
-    """Return the address for a driver: for emulated://NAME that of a sensor, which is started once.
+def sensor_reached(url: str, clock: Clock = REAL) -> tuple[str, Clock]:
+    """Return address and clock for a driver: for emulated://NAME those of a sensor, which is started once.
 
-    Its orientation is constant; emulated:// alone is an ATI sensor on CAN. Any other address is returned unchanged.
-
-    Raises
-    ------
-    ConfigError
-        Unknown name.
+    Its orientation is constant; emulated:// alone is an ATI sensor on CAN. Any other address keeps the given clock.
+    Raises `ConfigError` for an unknown name.
     """
-    return _emulated_alone(sensor_name(url)).sensor.url if url.startswith(EMULATED) else url
-
-
-def sensor_clock(url: str, clock: Clock = REAL) -> Clock:
-    """Return the clock of a sensor: for emulated://NAME its own, for any other address that of its cell."""
-    return _emulated_alone(sensor_name(url)).clock if url.startswith(EMULATED) else clock
+    if not url.startswith(EMULATED):
+        return url, clock
+    cell = _emulated_alone(sensor_name(url))
+    return cell.sensor.url, cell.clock
 
 
 def sensor_name(url: str | None) -> str:

@@ -3,12 +3,10 @@
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib import CalibrationResult
+from drivers.interfaces import Array
 from ftdrive.planning.geometry.scene import down_of
-
-Array = NDArray[np.float64]
 
 PAYLOAD_KG, PAYLOAD_SHARE = 0.5, 0.3
 """A payload may differ by the larger of this mass and this share of the expected one."""

@@ -24,14 +24,12 @@ from drivers.errors import (
     ProtocolError,
     StreamBroken,
 )
-from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, Finding, FtSamples, Health, RobotArm
+from drivers.interfaces import NOT_REPORTED, ArmStatus, Array, DeviceInfo, Fact, Finding, FtSamples, Health, RobotArm
 from drivers.ur.kinematics import MODELS
 from ftdrive.cell.config import CellConfig, RobotConfig, ToolConfig
 from ftdrive.checks.check import Check, State
 from ftdrive.checks.computer import SensorAddress, latency_command
 from ftdrive.checks.controller_settings import PAYLOAD_KG, PAYLOAD_SHARE
-
-Array = NDArray[np.float64]
 
 _PUSH_N = 2.0
 _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs on this computer"
@@ -384,7 +382,6 @@ def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> 
 
 
 def _answers_s(arm: RobotArm, clock: Clock) -> list[float]:
-    """Read the state of the arm repeatedly; return how long each answer took."""
     took_s, end_s = list[float](), clock.now_s() + _LINK_S
     while (started_s := clock.now_s()) < end_s:
         arm.state()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import CELL, NewFile, rows, runs, stop_unless_accepted, write_json
+from ftdrive.commands.common import CELL, FILE, FOLDER, NewFile, rows, runs, simulate, stop_unless_accepted, write_json
 
 if TYPE_CHECKING:
     from ftdrive.cell.config import CellConfig
@@ -31,7 +31,7 @@ _EXCLUDE_ONE_ANOTHER = (
     metavar="FROM:TO:DIAMETER[:X:Y]",
     help="A cylinder of tool and sensor, mm from the flange face; replaces those of [tool]. Repeatable.",
 )
-@click.option("--simulate", is_flag=True, help="Use an emulated cell; --sensor emulated://NAME chooses its sensor.")
+@simulate()
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses.")
 @click.option("--step", is_flag=True, help="Wait for Enter before each move.")
@@ -44,10 +44,10 @@ _EXCLUDE_ONE_ANOTHER = (
 @click.option("--output", type=NewFile(), help="Save the plan as a new JSON file.")
 @click.option("--png", type=NewFile(), help="Save stick figures (needs ftdrive[viz]).")
 @click.option("--view", is_flag=True, help="Show the plan in the browser before the questions (needs ftdrive[viz]).")
-@click.option("--plan", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="Use this plan.")
+@click.option("--plan", type=FILE, help="Use this plan.")
 @click.option(
     "--resume",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    type=FOLDER,
     help="Continue an interrupted run in its mode, with its options and the present configuration files.",
 )
 @click.option("--redo", type=int, multiple=True, metavar="N", help="With --resume: repeat pose N. Repeatable.")
@@ -225,7 +225,6 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
 
 
 def _as_json(outcome: "Outcome") -> dict[str, Any]:
-    """Return the run, the result, the drift check of pose 1, and the hints of the report."""
     from ftdrive.runs.pose_hints import hints
 
     drift = outcome.drift

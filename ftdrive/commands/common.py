@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
-
-
 MODEL = click.option(
     "--model", help="Model of the arm, for controllers that do not report it (CB3 before 3.12, e-Series before 5.6)."
 )
@@ -24,15 +24,11 @@ MODEL = click.option(
 
 def runs(words: str = "Parent folder of the new run folder.") -> Callable[[F], F]:
     """Make the option --runs."""
-    kind = click.Path(file_okay=False, path_type=Path)
-    return click.option("--runs", type=kind, default=Path("runs"), show_default=True, help=words)
+    folder = click.Path(file_okay=False, path_type=Path)
+    return click.option("--runs", type=folder, default=Path("runs"), show_default=True, help=words)
 
 
-CONFIG = click.option(
-    "--config",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="TOML file that describes the cell, instead of ./ftdrive.toml.",
-)
+CONFIG = click.option("--config", type=FILE, help="TOML file that describes the cell, instead of ./ftdrive.toml.")
 
 
 def CELL(command: F) -> F:

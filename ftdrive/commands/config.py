@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from ftdrive.commands.common import EMULATED_SENSOR, JSON, check_simulate, simulate, write_json
+from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, check_simulate, simulate, write_json
 
 
 @click.group()
@@ -14,12 +14,7 @@ def config() -> None:
 
 
 @config.command()
-@click.option(
-    "--config",
-    "path",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="In place of ./ftdrive.toml.",
-)
+@click.option("--config", "path", type=FILE, help="In place of ./ftdrive.toml.")
 @click.option("--origin", is_flag=True, help="Print the origin of each value instead of its meaning.")
 @simulate("Show that of an emulated cell. Its addresses are valid until this command ends.")
 @EMULATED_SENSOR

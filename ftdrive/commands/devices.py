@@ -14,7 +14,6 @@ from drivers.clock import Clock
 from drivers.errors import DriverError
 from ftdrive.cell.config import clock_in_force
 from ftdrive.cell.emulated import Station
-from ftdrive.checks.check import Check
 from ftdrive.checks.computer import can_details, can_interfaces, check_serial_port, name_by_id
 from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
@@ -43,7 +42,14 @@ def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
     """
     check_simulate(simulate, real={"--probe": places})
     failures: list[Exception] = []
-    found = _emulated(failures) if simulate else {"serial": _serial_ports(), "can": _can_interfaces()}
+    found = (
+        _emulated(failures)
+        if simulate
+        else {
+            "serial": [_serial_port(port) for port in sorted(list_ports.comports())],
+            "can": [{"interface": name, **can_details(name)} for name in can_interfaces()],
+        }
+    )
     if places:
         clock = clock_in_force()
         found["answers"] = [answer for place in places for answer in _answers(place, clock, failures)]
@@ -55,29 +61,17 @@ def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
         raise failures[0]
 
 
-def _serial_ports() -> list[dict[str, Any]]:
-    return [_serial_port(port) for port in sorted(list_ports.comports())]
-
-
 def _serial_port(port: ListPortInfo) -> dict[str, Any]:
     name = name_by_id(Path(port.device))
+    checks = check_serial_port(name or Path(port.device))
     return {
         "port": port.device,
         "by_id": None if name is None else str(name),
         "description": None if port.description == "n/a" else port.description,
         "usb": None if port.vid is None else f"{port.vid:04x}:{port.pid:04x}",
         "serial_number": port.serial_number,
-        "findings": _findings(check_serial_port(name or Path(port.device))),
+        "findings": [{"found": one.found, "fix": one.fix} for one in checks if one.state in {"warning", "failed"}],
     }
-
-
-def _findings(checks: list[Check]) -> list[dict[str, Any]]:
-    wrong = [check for check in checks if check.state in {"warning", "failed"}]
-    return [{"found": check.found, "fix": check.fix} for check in wrong]
-
-
-def _can_interfaces() -> list[dict[str, Any]]:
-    return [{"interface": name, **can_details(name)} for name in can_interfaces()]
 
 
 def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[str, Any]]:

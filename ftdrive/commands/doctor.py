@@ -10,26 +10,35 @@ from typing import Any
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.text import Text
 
 from calib import CalibrationResult
 from drivers.clock import Clock
 from drivers.errors import DriverError
-from drivers.interfaces import ArmStatus, ForceTorqueSensor, RobotArm
+from drivers.interfaces import ArmStatus, Array, ForceTorqueSensor, RobotArm
 from ftdrive.cell.config import USUAL_KG, CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
-from ftdrive.cell.emulated import Station, sensor_name, sensor_url
+from ftdrive.cell.emulated import Station, sensor_name, sensor_reached
 from ftdrive.checks import computer, devices
 from ftdrive.checks.check import Check, verdict
 from ftdrive.checks.computer import SensorAddress
-from ftdrive.commands.common import CELL, JSON, MODEL, Number, check_simulate, read_cell, runs, simulate, write_json
+from ftdrive.commands.common import (
+    CELL,
+    FILE,
+    JSON,
+    MODEL,
+    Number,
+    check_simulate,
+    read_cell,
+    runs,
+    simulate,
+    write_json,
+)
 from ftdrive.errors import NotAccepted
 from ftdrive.session.guards import Limits
 from ftdrive.terminal.console import hanging, talk
 
-Array = NDArray[np.float64]
 Blame = Callable[[str, DriverError], Check]
 """From the name of a check and the error of a sensor's driver."""
 
@@ -45,16 +54,9 @@ _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "
 @CELL
 @MODEL
 @simulate()
+@click.option("--calibration", "path", type=FILE, help="Is it of these devices?")
 @click.option(
-    "--calibration",
-    "path",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="Is it of these devices?",
-)
-@click.option(
-    "--mass-kg",
-    type=Number(0, min_open=True),
-    help="Expected, of the tool.  [default: [tool] mass_kg, else 1]",
+    "--mass-kg", type=Number(0, min_open=True), help="Expected, of the tool.  [default: [tool] mass_kg, else 1]"
 )
 @click.option("--push", is_flag=True, help="Find the sign of the sensor: you push the tool along +X of the base.")
 @runs("Folder of the runs, whose disk is checked.")
@@ -82,15 +84,14 @@ def doctor(
     with ExitStack() as stack:
         station = stack.enter_context(Station(sensor_name(sensor), ["--time-scale", "1"])) if simulate else None
         cell = read_cell(config, robot, sensor, model=model) if station is None else station.cell
-        address = SensorAddress.of(sensor_url(cell.sensor.url))
+        address = SensorAddress.of(sensor_reached(cell.sensor.url)[0])
         device = build_sensor(cell)
 
         found, arm = _examine_robot(cell, stack)
         permissions = computer.check_permissions(address)
         blame = partial(devices.check_sensor_error, address=address, permissions=permissions)
-        of_sensor, alive = _examine_sensor(
-            device, address, cell, mass_kg or cell.tool.mass_kg or USUAL_KG, blame, stack
-        )
+        mass_kg = mass_kg or cell.tool.mass_kg or USUAL_KG
+        of_sensor, alive = _examine_sensor(device, address, cell, mass_kg, blame, stack)
         model = cell.robot.model if arm is None else arm.identify().model
         found += [*of_sensor, computer.check_workcell(cell, model), computer.check_disk(runs), *permissions]
         if calibration is not None:
@@ -108,11 +109,7 @@ def doctor(
             found.append(check)
     failed = [check.name for check in found if check.state == "failed"]
     if as_json:
-        answer = {
-            "schema_version": 1,
-            "checks": [asdict(check) for check in found],
-            "verdict": verdict(found),
-        }
+        answer = {"schema_version": 1, "checks": [asdict(check) for check in found], "verdict": verdict(found)}
         write_json({**answer, "push": pushed} if push else answer)
     else:
         _print(found)
@@ -144,7 +141,6 @@ def _examine_robot(cell: CellConfig, stack: ExitStack) -> tuple[list[Check], Rob
 
 
 def _check_poses(arm: RobotArm, status: ArmStatus, clock: Clock) -> list[Check]:
-    """Check that the arm reports its flange, and how fast."""
     name = "robot.flange"
     if status.tcp_offset is None:
         found = "the controller does not report its TCP offset: only a calibration, which takes control, can read poses"
@@ -245,7 +241,5 @@ def _print(found: list[Check]) -> None:
         if check.fix is not None and check.state in {"warning", "failed"}:
             data.print(hanging(f"{'':15}fix: ", check.fix, data))
         subject = first
-    worst = verdict(found)
-    talk.print(
-        {"ok": " All checks passed.", "warning": " Usable; see the lines with !", "failed": " Not ready."}[worst]
-    )
+    words = {"ok": " All checks passed.", "warning": " Usable; see the lines with !", "failed": " Not ready."}
+    talk.print(words[verdict(found)])

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import JSON, NewFile, Number, check_simulate, simulate, write_json
+from ftdrive.commands.common import FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
 
 if TYPE_CHECKING:
     from ftdrive.planning.plan import Plan
@@ -17,9 +17,7 @@ def export() -> None:
 
 
 @export.command()
-@click.argument(
-    "path", metavar="PLAN.json", required=False, type=click.Path(exists=True, dir_okay=False, path_type=Path)
-)
+@click.argument("path", metavar="PLAN.json", required=False, type=FILE)
 @click.option(
     "--format",
     "target",
@@ -29,12 +27,7 @@ def export() -> None:
 )
 @click.option("-o", "--output", type=NewFile(), help="A new file instead of stdout.")
 @click.option(
-    "--dwell",
-    "dwell_s",
-    type=Number(0, 600),
-    default=4.0,
-    show_default=True,
-    help="Rest at each pose, s (urscript).",
+    "--dwell", "dwell_s", type=Number(0, 600), default=4.0, show_default=True, help="Rest at each pose, s (urscript)."
 )
 @simulate("Export the plan of an emulated cell in the default posture of `ftdrive plan`.")
 @JSON

@@ -158,12 +158,7 @@ class Questions:
     """Asks for each key that is not given as an option; with `yes` it takes the defaults, by key."""
 
     def __init__(self, yes: bool, defaults: Mapping[str, Any]) -> None:
-        self._yes, self.defaults = yes, defaults
-
-    @property
-    def interactive(self) -> bool:
-        """Whether a question may be asked again in other words."""
-        return not self._yes
+        self.interactive, self.defaults = not yes, defaults
 
     def ask(self, words: str, key: str, given: str | None, usual: str | None, read: Callable[[str], T]) -> T:
         """Return the option or the answer; `usual` is the answer of Enter and --yes, None where there is none."""
@@ -172,7 +167,7 @@ class Questions:
         from ftdrive.terminal.console import in_whole_words
 
         option = RULES[key].option
-        if given is None and self._yes:
+        if given is None and not self.interactive:
             if usual is None:
                 raise ConfigError(f"{option} is missing and has no default: {words[0].lower()}{words[1:]}")
             given = usual
@@ -237,7 +232,7 @@ class Questions:
             found += map(read, given)
             whole(tuple(found))
             return tuple(found)
-        if self._yes and not needed:
+        if not (self.interactive or needed):
             return ()
         while True:
             if found:

@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Group
 from rich.live import Live
 from rich.table import Table
@@ -18,12 +17,21 @@ from rich.text import Text
 
 from calib import CalibrationResult
 from calib.data.dwell_mean import LEAST_SAMPLES, PoseMean, mean_and_covariance
-from drivers.interfaces import DeviceInfo
+from drivers.interfaces import Array, DeviceInfo
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station, sensor_name
-from ftdrive.checks.devices import belonging
-from ftdrive.commands.common import CELL, JSON, check_simulate, read_cell, simulate, stop_unless_accepted, write_json
+from ftdrive.checks.devices import AXES, belonging
+from ftdrive.commands.common import (
+    CELL,
+    FOLDER,
+    JSON,
+    check_simulate,
+    read_cell,
+    simulate,
+    stop_unless_accepted,
+    write_json,
+)
 from ftdrive.commands.emulated_run import rehearse
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
@@ -31,11 +39,9 @@ from ftdrive.terminal.console import talk
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.report import likely_error
 
-Array = NDArray[np.float64]
 Axes = Literal["sensor", "flange", "base"]
 
 _PERIOD_S = 0.1
-_NAMES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,11 +64,7 @@ class Look:
 )
 @CELL
 @simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
-@click.option(
-    "--replay",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
-    help="Show the samples of a recorded run.",
-)
+@click.option("--replay", type=FOLDER, help="Show the samples of a recorded run.")
 @click.option(
     "--axes", type=click.Choice(["sensor", "flange", "base"]), default="sensor", show_default=True, help="Axes to show."
 )
@@ -223,7 +225,7 @@ def _screen(reading: dict[str, Any], made: str) -> Group:
     for title, width in (("", 2), ("raw", 9), ("contact", 13), ("± 1 sigma", 9), ("", 20)):
         table.add_column(title, justify="right", min_width=width, no_wrap=True)  # else they move with every sign
     columns = [np.r_[reading[key]["force_N"], reading[key]["torque_Nm"]] for key in ("raw", "compensated", "sigma")]
-    for i, name in enumerate(_NAMES):
+    for i, name in enumerate(AXES):
         raw, contact, sigma = (column[i] for column in columns)
         unit, full, digits = ("N", 20.0, 3) if i < 3 else ("N·m", 2.0, 5)
         filled = min(20, round(20 * abs(contact) / full))

@@ -157,7 +157,6 @@ def plan(
 
 
 def _look(made: "Plan", certifier: "Certifier") -> None:
-    """Show the scene until Ctrl-C."""
     import threading
     from contextlib import suppress
 

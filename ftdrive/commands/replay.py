@@ -9,6 +9,7 @@ from calib import CalibrationResult
 from calib.routine import PoseRecord, Sampling, take_pose
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
+    FOLDER,
     JSON,
     check_simulate,
     simulate,
@@ -25,7 +26,7 @@ from ftdrive.terminal.report import print_result
 
 
 @click.command()
-@click.argument("folder", metavar="RUN", required=False, type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.argument("folder", metavar="RUN", required=False, type=FOLDER)
 @simulate("Record a short run of an emulated cell, then repeat it.")
 @EMULATED_SENSOR
 @JSON

@@ -18,9 +18,9 @@ from drivers.transcript.player import Player
 from drivers.transcript.recorder import INTERRUPTED, BadTranscript, Transcript, Writer
 from drivers.transcript.taps import recording
 from ftdrive.cell.config import clock_in_force
-from ftdrive.cell.emulated import EMULATED, sensor_clock, sensor_name, sensor_url
+from ftdrive.cell.emulated import EMULATED, sensor_name, sensor_reached
 from ftdrive.checks.computer import SensorAddress
-from ftdrive.commands.common import EMULATED_SENSOR, JSON, NewFile, Number, check_simulate, simulate, write_json
+from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import versions
 from ftdrive.terminal.console import talk
@@ -71,14 +71,13 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
         raise ConfigError(
             f"{sensor} is read over RTDE, which is not recorded: capture TCP port 30004 of the arm with Wireshark"
         )
-    url = sensor_url(sensor)
+    url, clock = sensor_reached(sensor, clock_in_force())
     address = SensorAddress.of(url)
     if address.serial_port is None and address.scheme != "ati-netft" and not address.scheme.endswith("-can"):
         raise ConfigError(
             f"{sensor} is neither on a serial port or a CAN bus nor an ati-netft: only these can be recorded; capture "
             "others with Wireshark"
         )
-    clock = sensor_clock(sensor, clock_in_force())
     device = _sensor(url, clock)
     header = {
         "url": url,
@@ -112,7 +111,7 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
 
 
 @transcript.command()
-@click.argument("file", required=False, type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("file", required=False, type=FILE)
 @simulate("Record a second of an emulated sensor first, and play that.")
 @EMULATED_SENSOR
 @JSON
@@ -124,7 +123,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     check_simulate(simulate, real={"FILE": file}, emulated={"--sensor": sensor})
     clock = clock_in_force()
     if simulate:
-        clock = sensor_clock(_emulated(sensor))
+        _, clock = sensor_reached(_emulated(sensor))
         with TemporaryDirectory(prefix="ftdrive-") as folder:
             path = Path(folder) / "sensor.jsonl"
             _record(_emulated(sensor), path, 1.0, kept=False)

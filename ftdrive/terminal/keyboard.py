@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from threading import Thread
-from types import TracebackType
 from typing import Self
 
 from ftdrive.session.operator import Key
@@ -53,9 +52,7 @@ class Keyboard:
         self._start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop()
 
     def pressed(self) -> Key | None:
@@ -96,9 +93,8 @@ class Keyboard:
         if self._before is None:
             return
         with suppress(termios.error):  # a terminal that was closed needs nothing
-            termios.tcsetattr(
-                self._fd, termios.TCSANOW, self._before
-            )  # at once: draining waits for Ctrl-Q after Ctrl-S
+            # at once: draining waits for Ctrl-Q after Ctrl-S
+            termios.tcsetattr(self._fd, termios.TCSANOW, self._before)
             termios.tcflush(self._fd, termios.TCIFLUSH)
         self._before = None
         atexit.unregister(self._restore)

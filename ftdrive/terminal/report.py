@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 from rich.text import Text
 from scipy.spatial.transform import Rotation
@@ -14,10 +13,9 @@ from calib import CalibrationResult
 from calib.assessment.verdict import SURE
 from calib.compare import Compared
 from calib.routine import DriftCheck, PoseRecord
+from drivers.interfaces import Array
 from ftdrive.runs.pose_hints import hints, names_of
 from ftdrive.terminal.console import hanging, talk
-
-Array = NDArray[np.float64]
 
 _STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
 _ROUNDED = 1e-9
@@ -57,21 +55,15 @@ def print_result(
     """
     talk.print(Text.assemble(("Result", "bold cyan"), f"  {result.n_poses} poses, method {result.method}"))
     talk.print(_table(result, truth))
-    talk.print(
-        hanging(
-            Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  "),
-            f"compensation error {error_in_words(result)}",
-        )
-    )
+    head = Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  ")
+    talk.print(hanging(head, f"compensation error {error_in_words(result)}"))
     if truth is not None:
         raw, left = free_tool_wrench(truth, _RANDOM), compensation_error(result, truth)
-        talk.print(
-            hanging(
-                " truth: ",
-                f"a free tool reads {left['force_rms_N']:.4f} N, {left['torque_rms_Nm']:.5f} N·m rms; "
-                f"before {_rms(raw[:, :3]):.1f} N, {_rms(raw[:, 3:]):.2f} N·m",
-            )
+        words = (
+            f"a free tool reads {left['force_rms_N']:.4f} N, {left['torque_rms_Nm']:.5f} N·m rms; "
+            f"before {_rms(raw[:, :3]):.1f} N, {_rms(raw[:, 3:]):.2f} N·m"
         )
+        talk.print(hanging(" truth: ", words))
     for reason in result.reasons:
         talk.print(hanging("   ", reason))
     if talk.verbose or result.verdict != "good":
@@ -117,13 +109,11 @@ def _error_style(error_sigma: float) -> str:
 
 def _print_fit(result: CalibrationResult, names: Sequence[str]) -> None:
     residual = result.to_dict()["residual"]
-    talk.print(
-        hanging(
-            " residuals: ",
-            f"force {residual['force_rms_N']:.4f} N rms, {residual['force_max_N']:.4f} max; "
-            f"torque {residual['torque_rms_Nm']:.5f} N·m rms, {residual['torque_max_Nm']:.5f} max",
-        )
+    words = (
+        f"force {residual['force_rms_N']:.4f} N rms, {residual['force_max_N']:.4f} max; "
+        f"torque {residual['torque_rms_Nm']:.5f} N·m rms, {residual['torque_max_Nm']:.5f} max"
     )
+    talk.print(hanging(" residuals: ", words))
     if (poses := poses_in_words(result, names)) is not None:
         talk.print(hanging(" worst: ", poses))
 
@@ -261,7 +251,6 @@ def print_comparison(compared: Sequence[Compared]) -> None:
 
 
 def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:
-    """Make the table, as wide as it needs to be."""
     table = Table(box=None, padding=(0, 1))
     for title, shown in (
         *(("method", True), ("mass\nkg", True)),

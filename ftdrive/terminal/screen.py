@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median
 from threading import RLock
-from types import TracebackType
 from typing import Literal, Self, TextIO
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from rich.cells import cell_len
 from rich.console import Console, Group
 from rich.live import Live
@@ -22,6 +21,7 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from calib.routine import DriftCheck
+from drivers.interfaces import Array
 from ftdrive.errors import Declined
 from ftdrive.session.events import (
     Asked,
@@ -41,8 +41,6 @@ from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, prompt, read_line
 from ftdrive.terminal.report import drift_in_words
 from ftdrive.terminal.session_text import Line, SessionText, in_words, rms_sigma
-
-Array = NDArray[np.float64]
 
 REFRESH_HZ = 4
 KEYS = {Key.KEEP: "finish", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "stop"}
@@ -370,7 +368,7 @@ class Screen:
     ) -> None:
         self._console, self._keyboard, self._stdin = console, keyboard, stdin or sys.stdin
         self._clock = clock
-        self._view = View()
+        self._view = View(ascii_only=console.options.ascii_only)
         self._text = SessionText(verbose=verbose, poses=False)
         self._lock = RLock()
         self._live = self._new_live()
@@ -384,9 +382,7 @@ class Screen:
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._view.keys = "over"
         with self._stack:
             self._print(self._text.pending())
@@ -424,8 +420,8 @@ class Screen:
 
     def _print(self, lines: Sequence[Line]) -> None:
         for line in lines:
-            head = self._plain(line.head)
-            self._console.print(hanging(head, self._plain(line.words), self._console), style=line.style)
+            head, words = self._view.shown(line.head), self._view.shown(line.words)
+            self._console.print(hanging(head, words, self._console), style=line.style)
 
     def _new_live(self) -> Live:
         return Live(console=self._console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
@@ -435,7 +431,7 @@ class Screen:
         used = len(self._frame().renderables)
         while True:
             width = self._console.width
-            *lines, last = Text(self._plain(prompt(question).rstrip()), "bold").wrap(self._console, width)
+            *lines, last = Text(self._view.shown(prompt(question).rstrip()), "bold").wrap(self._console, width)
             for line in lines:
                 self._console.print(line)
             self._console.print(last, end=" ", soft_wrap=True)
@@ -447,9 +443,8 @@ class Screen:
             used += len(lines) + (last.cell_len + 1 + cell_len(typed.rstrip("\n"))) // width + 1
             if (answer := match(question, typed)) is not None:
                 break
-            self._console.print(
-                Text(self._plain(f"'{typed.strip()}' is none of the answers.")), crop=True, no_wrap=True
-            )
+            other = Text(self._view.shown(f"'{typed.strip()}' is none of the answers."))
+            self._console.print(other, crop=True, no_wrap=True)
             used += 1
         self._console.file.write(f"\x1b[{used}F\x1b[J")
         return answer
@@ -458,12 +453,7 @@ class Screen:
         size = self._console.size
         with self._lock:
             self._view.waiting = () if self._keyboard is None else self._keyboard.waiting
-            self._view.ascii_only = self._console.options.ascii_only
             return frame(self._view, self._clock(), width=size.width, height=size.height)
-
-    def _plain(self, text: str) -> str:
-        """Replace what the terminal's encoding lacks."""
-        return text.translate(_ASCII) if self._console.options.ascii_only else text
 
 
 def _history(event: Event, view: View) -> bool:

@@ -131,7 +131,7 @@ def kill(station: Station) -> None:
 def signal_child(number: signal.Signals) -> Do:
     def do(_: Station, arm: UrArm) -> None:
         assert arm._control is not None
-        os.kill(arm._control.pid, number)
+        os.kill(arm._control._process.pid, number)
 
     return do
 

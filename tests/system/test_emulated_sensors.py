@@ -8,10 +8,11 @@ import time
 import numpy as np
 import pytest
 
+from drivers.clock import REAL
 from drivers.errors import DeviceFault, ProtocolError
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.devices import build_sensor
-from ftdrive.cell.emulated import SENSORS, Station, sensor_url
+from ftdrive.cell.emulated import SENSORS, Station, sensor_reached
 from ftdrive.errors import ConfigError
 from mocks.sensors.catalogue import CHOICES
 
@@ -71,14 +72,14 @@ def test_a_station_that_is_stopped_for_a_while_loses_no_sample(name: str) -> Non
 
 
 def test_an_emulated_address_starts_a_sensor_without_an_arm() -> None:
-    url = sensor_url("emulated://bota")
+    url, clock = sensor_reached("emulated://bota")
     assert url.startswith("bota:///dev/pts/")
-    assert sensor_url("emulated://bota") == url, "one process for one name"
+    assert sensor_reached("emulated://bota") == (url, clock), "one process for one name"
     with build_sensor(CellConfig(RobotConfig("127.0.0.1"), SensorConfig("emulated://bota"))) as sensor:
         assert len(sensor.collect(0.3)) >= 20
-    assert sensor_url("ati-can://can0") == "ati-can://can0"
+    assert sensor_reached("ati-can://can0") == ("ati-can://can0", REAL)
 
 
 def test_an_unknown_emulated_sensor_is_a_mistake_in_the_configuration() -> None:
     with pytest.raises(ConfigError, match="emulated://robotiq"):
-        sensor_url("emulated://lab")
+        sensor_reached("emulated://lab")

@@ -370,7 +370,7 @@ def test_a_driver_that_asks_something_else_is_told_what(recorded: list[str], tmp
 
 
 def test_an_emulated_arm_is_refused_before_it_is_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transcript, "sensor_url", lambda url: pytest.fail(f"{url} was started"))
+    monkeypatch.setattr(transcript, "sensor_reached", lambda url, _: pytest.fail(f"{url} was started"))
     outcome = run("record", "--simulate", "--sensor", "emulated://ur-ft", "-o", str(tmp_path / "a.jsonl"))
     assert isinstance(outcome.exception, ConfigError)
     assert "emulated://ur-ft" in str(outcome.exception)

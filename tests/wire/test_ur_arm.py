@@ -357,7 +357,7 @@ def test_a_controller_that_is_gone(station: Station, arm: UrArm) -> None:
 @pytest.mark.slow
 def test_a_control_process_that_is_gone(station: Station, arm: UrArm) -> None:
     assert arm._control is not None
-    pid = arm._control.pid
+    pid = arm._control._process.pid
     q = away(arm)
     with pytest.raises(StreamBroken, match="control"):
         arm.move_to(q, timeout_s=30, guard=Trigger(arm, lambda: os.kill(pid, signal.SIGKILL)))
@@ -374,7 +374,7 @@ def test_a_control_process_that_hangs(station: Station, new_arm: NewArm, caplog:
     arm = new_arm(timing=replace(UrTiming.emulated(), progress_s=2.0))
     arm.open(control=True)
     assert arm._control is not None
-    pid = arm._control.pid
+    pid = arm._control._process.pid
     with pytest.raises(DeviceTimeout, match="did not answer"):
         arm.move_to(away(arm), timeout_s=30, guard=Trigger(arm, lambda: os.kill(pid, signal.SIGSTOP)))
     station.wait_for(lambda state: not state["moving"] and state["runtime_state"] == "STOPPED")

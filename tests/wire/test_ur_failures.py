@@ -555,7 +555,7 @@ def test_a_program_that_took_the_place_of_ours_is_not_ended_when_the_arm_is_open
 @slow
 def test_what_runs_after_ours_was_seen_to_have_ended_is_not_ours(station: Station, arm: UrArm) -> None:
     assert arm._control is not None
-    os.kill(arm._control.pid, signal.SIGKILL)  # so that it cannot be asked whose program it runs
+    os.kill(arm._control._process.pid, signal.SIGKILL)  # so that it cannot be asked whose program it runs
     station.wait_for(lambda _: arm._control is not None and not arm._control.alive)
     station.ask("dashboard-stop")
     arm.open()
@@ -651,7 +651,7 @@ from drivers.errors import DriverError
 from drivers.ur.arm import UrArm
 arm = UrArm(sys.argv[1], speed_rad_s=float(sys.argv[2]), acceleration_rad_s2=3.0)
 arm.open(control=True)
-print(arm._control.pid, flush=True)
+print(arm._control._process.pid, flush=True)
 q = arm.state().q_rad
 q[5] += -1.2 if q[5] > 0.5 else 1.2
 try:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drivers.ati.calibration import NEWTON, NEWTON_METRE, Calibration, saturated_gauges
-from drivers.errors import ProtocolError
+from drivers.ati.calibration import NEWTON, NEWTON_METRE, Calibration, refuse_saturated
+from drivers.errors import DeviceFault, ProtocolError
 
 MATRIX = np.array(
     [
@@ -73,7 +73,8 @@ def test_a_matrix_of_no_transducer_is_refused(matrix: np.ndarray[tuple[int, int]
 
 def test_saturation_names_the_gauge() -> None:
     fine = np.array([[-32767, 32766, 0, 0, 0, 0]], dtype=np.int32)
-    assert saturated_gauges(fine) == []
+    refuse_saturated("sensor", fine)
     over = np.array([[0, 0, 32767, 0, 0, 0], [0, 0, 0, 0, 0, -32768]], dtype=np.int32)
-    assert saturated_gauges(over) == [2, 5]
-    assert saturated_gauges(over[:0]) == []
+    refuse_saturated("sensor", over[:0])
+    with pytest.raises(DeviceFault, match="gauge G2, G5 is"):
+        refuse_saturated("sensor", over)

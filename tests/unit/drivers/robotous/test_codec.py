@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from drivers.errors import ProtocolError
 from drivers.robotous import codec
 from drivers.robotous.codec import Command
-from drivers.robotous.serial import SerialLink
+from drivers.robotous.serial import RobotousSerial
 from drivers.wires.framing import Deframer
 
 SAMPLE = bytes.fromhex("55 0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000 3F AA")
@@ -124,4 +124,7 @@ def test_decoders_return_or_raise_protocol_error(decode: Callable[[bytes], objec
 
 @pytest.mark.parametrize(("baud", "fastest_Hz"), [(57_600, 303), (115_200, 500), (460_800, 500), (921_600, 1000)])
 def test_what_a_uart_carries(baud: int, fastest_Hz: int) -> None:
-    assert SerialLink("/dev/x", baud=baud).fastest_Hz == fastest_Hz
+    RobotousSerial("/dev/x", baud=baud, rate_Hz=max(rate for rate in codec.RATE_CODES if rate <= fastest_Hz))
+    if fastest_Hz < 1000:
+        with pytest.raises(ValueError, match=f"at most {fastest_Hz} Hz"):
+            RobotousSerial("/dev/x", baud=baud, rate_Hz=1000)

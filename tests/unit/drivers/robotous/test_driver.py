@@ -9,9 +9,9 @@ import pytest
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout
 from drivers.interfaces import Fact
-from drivers.robotous.can import CanLink
+from drivers.robotous.can import RobotousCan
 from drivers.robotous.sensor import RobotousSensor
-from drivers.robotous.serial import SerialLink
+from drivers.robotous.serial import RobotousSerial
 from tests.unit.drivers.dialogue import CanWire, SerialWire, Stream, Table
 from tests.unit.drivers.in_one_thread import InOneThread
 
@@ -31,7 +31,10 @@ OVERLOAD = bytes.fromhex("0B 01F4 FF06 03E8 07D0 FC18 0064 21 0000".replace(" ",
 OTHER = bytes.fromhex("0B FE0C 0102 FC18 F830 03E8 FF9C 00 0000".replace(" ", ""))
 
 
-class Sensor(InOneThread, RobotousSensor): ...
+class Uart(InOneThread, RobotousSerial): ...
+
+
+class Bus(InOneThread, RobotousCan): ...
 
 
 def counts(field: bytes) -> tuple[int, ...]:
@@ -59,12 +62,12 @@ def on_can(answers: dict[str, bytes], samples: Stream) -> list[tuple[str, Any]]:
     return [*(turn for question in asked for turn in (stop, question)), (f"064 {GO}", samples), stop]
 
 
-def uart(wire: SerialWire, rate_Hz: int | None = None) -> Sensor:
-    return Sensor(SerialLink("/dev/ttyUSB0", baud=921_600, clock=wire.clock), rate_Hz=rate_Hz)
+def uart(wire: SerialWire, rate_Hz: int | None = None) -> RobotousSensor:
+    return Uart("/dev/ttyUSB0", baud=921_600, rate_Hz=rate_Hz, clock=wire.clock)
 
 
-def bus(wire: CanWire, rate_Hz: int | None = None) -> Sensor:
-    return Sensor(CanLink("can0", clock=wire.clock), rate_Hz=rate_Hz)
+def bus(wire: CanWire, rate_Hz: int | None = None) -> RobotousSensor:
+    return Bus("can0", rate_Hz=rate_Hz, clock=wire.clock)
 
 
 def test_start_up_on_a_uart_is_golden(table: Table) -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.robotous.can import CanLink, RobotousCan
+from drivers.robotous.can import RobotousCan
 from drivers.robotous.halves import Halves
 from tests.fake_clock import FakeClock
 
@@ -178,7 +178,7 @@ def test_no_crosswise_pair_while_the_host_keeps_up(loss: float, swaps: float, se
 def test_a_silence_the_host_slept_through_is_none(slept_s: float, fields: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second half that comes twice shows that the first may be foreign: unless it came after a silence."""
     clock = FakeClock()
-    link = CanLink("can0", clock=clock)
+    sensor = RobotousCan("can0", clock=clock)
     frames: list[tuple[int, bytes] | None] = [(1, data(1)), (2, data(1)), None, (2, data(1))]
 
     def look(wait_s: float) -> tuple[int, bytes] | None:
@@ -187,22 +187,21 @@ def test_a_silence_the_host_slept_through_is_none(slept_s: float, fields: int, m
             clock.stall(wait_s + slept_s)
         return frame
 
-    monkeypatch.setattr(link._bus, "look", look)
-    assert len(link.receive()) == fields
+    monkeypatch.setattr(sensor._bus, "look", look)
+    assert len(sensor._receive()) == fields
 
 
 def test_a_silence_while_halves_come_is_not_the_fault_of_cable_or_supply(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = FakeClock()
-    link = CanLink("can0", clock=clock)
-    sensor = RobotousCan(link)
+    sensor = RobotousCan("can0", clock=clock)
     assert "cable" in sensor._stale(0.4).fix
 
     def look(_: float) -> tuple[int, bytes]:
         clock.stall(0.001)
         return 1, data(1)  # first halves only
 
-    monkeypatch.setattr(link._bus, "look", look)
-    assert link.receive() == []
+    monkeypatch.setattr(sensor._bus, "look", look)
+    assert sensor._receive() == []
     assert "to be paired" in sensor._stale(0.4).fix
     clock.stall(0.2)
     assert "cable" in sensor._stale(0.4).fix
