@@ -33,9 +33,9 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.runs.outcome import dataset_of
 from ftdrive.runs.pose_hints import hints
 from ftdrive.runs.run import Run, versions
-from ftdrive.session import dataset_of
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.report import print_comparison, print_result
 

@@ -12,6 +12,7 @@ from typing import Final, Protocol, TypeVar
 import numpy as np
 
 from calib.data.dwell_mean import CHANNELS, LEAST_SAMPLES, is_stationary, restless_channels
+from calib.model import Array
 from calib.routine import (
     LONGER,
     MOVED_RAD,
@@ -25,7 +26,6 @@ from drivers.clock import REAL, Clock
 from drivers.errors import DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, ForceTorqueSensor, FtSamples
 from ftdrive.session.events import (
-    Array,
     Estimated,
     Noted,
     PoseTaken,

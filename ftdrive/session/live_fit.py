@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult, NotObservable, solve
@@ -16,7 +16,7 @@ from calib.assessment.observability import (
     WEAK_GAP,
     different_orientations,
 )
-from calib.model import STANDARD_GRAVITY_M_S2
+from calib.model import STANDARD_GRAVITY_M_S2, Array
 from calib.poses.information import Guess, Prediction, predicted_sigma
 from calib.poses.selection import next_pose
 from calib.published.yu import weight_and_tilt
@@ -24,8 +24,6 @@ from calib.routine import PoseRecord, dataset_from, is_return
 from ftdrive.cell.config import USUAL_KG
 from ftdrive.checks.controller_settings import axes_along
 from ftdrive.session.events import Estimated
-
-Array = NDArray[np.float64]
 
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
 """As good as gravity directions within 50 to 60 degrees of one another; see `calib.poses.information.Prediction`."""

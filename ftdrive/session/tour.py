@@ -11,9 +11,9 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import TooFewSamples
+from calib.model import Array
 from calib.routine import PoseRecord, Sampling, Stage, TourPose, take_pose
 from drivers.errors import DriverError
 from ftdrive.checks.controller_settings import payload_in_words
@@ -42,8 +42,6 @@ from ftdrive.session.progress import Progress
 from ftdrive.session.recovery import GuardedCell, Recovery
 
 log = logging.getLogger(__name__)
-
-Array = NDArray[np.float64]
 
 APPROACH_RAD_S: Final = float(np.radians(15))
 BACK_RAD_S: Final = float(np.radians(10))
