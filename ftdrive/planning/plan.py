@@ -78,6 +78,11 @@ class Plan:
         """Record in the description, and so in the file and its hash, whether tool and scene were measured."""
         return replace(self, description={**self.description, "measured": measured})
 
+    @property
+    def sha256(self) -> str:
+        """Hash of the file."""
+        return str(self.to_dict()["sha256"])
+
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of the file; its hash over everything else reveals later changes."""
         document: dict[str, Any] = {
