@@ -20,8 +20,7 @@ from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan, make_plan
 from ftdrive.planning.search import constant_tour
 from ftdrive.planning.search.chosen import Chosen, chosen_tour
-from ftdrive.planning.search.free_box import box_tour
-from ftdrive.planning.search.nodes import WRIST_6_RAD, wrist_nodes
+from ftdrive.planning.search.nodes import WRIST_6_RAD, box_nodes, wrist_nodes
 from ftdrive.planning.search.postures import with_room
 from ftdrive.planning.search.tours import clear_tour
 
@@ -50,11 +49,9 @@ def plan_tour(
 
     Parameters
     ----------
-    certifier : Certifier
     q_rad : array_like, shape (6,)
         Present joint angles.
     poses : {24, 12, 6}
-    speeds : Speeds
     guess : Guess
         Of the tool and the noise.
 
@@ -128,7 +125,7 @@ def plan_cone(
 
     Parameters
     ----------
-    certifier, q_rad, speeds, guess
+    q_rad, guess
         As of `plan_tour`.
     poses : int
         6 or more.
@@ -167,7 +164,7 @@ def plan_box(
 
     Parameters
     ----------
-    certifier, q_rad, poses, speeds, guess
+    q_rad, poses, guess
         As of `plan_tour`.
     half_size_m : float
         Half the length of the edges of the box, which are along the base axes.
@@ -218,8 +215,14 @@ def _clear_tours(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
 def _box(
     certifier: Certifier, q_rad: Array, numbers: Sequence[int], centre_m: Array, half_size_m: float, speeds: Speeds
 ) -> Found | None:
-    found = box_tour(certifier, q_rad, _at_pan(q_rad, numbers), centre_m, half_size_m, speeds)
-    return None if found is None else ([numbers[g] for g in found[0]], found[1])
+    q, group = box_nodes(certifier, q_rad, _at_pan(q_rad, numbers), centre_m, half_size_m)
+    if len(np.unique(group)) < len(numbers):
+        return None
+    # Preferred: what moves base, shoulder and elbow least.
+    away = np.abs(q - q_rad)
+    calm = np.argsort(away[:, :3].max(axis=1) + 0.01 * away.sum(axis=1), kind="stable")
+    order = clear_tour(certifier, q[calm], group[calm], speeds)
+    return None if order is None else ([numbers[g] for g in group[calm][order]], q[calm][order])
 
 
 def _box_centres(certifier: Certifier, q_rad: Array) -> Array:
