@@ -156,7 +156,8 @@ def _solve_each(
 
 def _read(source: Path, orientation: Orientation) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
     if source.is_dir():
-        return dataset_of(Run(source))
+        run = Run(source)
+        return dataset_of(run, run.records())
     dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
     circumstances = {"g_m_s2": STANDARD_GRAVITY_M_S2, "up_in_base": UP_IN_BASE}
     return dataset, circumstances, {"source": source.name, "versions": versions()}

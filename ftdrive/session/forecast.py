@@ -36,8 +36,6 @@ def moves_s(plan: Plan, todo: Sequence[int], q_rad: Array, approach: Approach) -
         With the speeds it is driven at.
     todo : sequence of int
         Stops, from 1; where some are left out between two, there is an approach too, counted as a straight move.
-    q_rad : array, shape (6,)
-    approach : Approach
     """
     turns = np.abs(np.diff(np.vstack([q_rad, approach.q_rad]), axis=0)).max(axis=1)
     speeds = np.minimum(approach.speed_rad_s, APPROACH_RAD_S)
@@ -58,7 +56,6 @@ def prediction(plan: Plan, guess: Guess, average_s: float, sigma: Array, *, assu
 
     Parameters
     ----------
-    plan : Plan
     guess : Guess
         Of the tool.
     average_s : float

@@ -14,11 +14,11 @@ import numpy as np
 from calib.model import Array
 from drivers.errors import DeviceFault, DeviceTimeout, DriverError
 from drivers.interfaces import ArmState, ArmStatus
+from ftdrive.checks.devices import AXES
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session.hazards import Hazard
 
 G_M_S2: Final = 9.81
-AXES: Final = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 
 class Tripped(Exception):

@@ -100,7 +100,6 @@ def collect_manually(
     ----------
     arm, sensor
         Open; the arm for reading. An interrupted sensor with `recover` may reconnect.
-    recorder : Recorder
     down_base : array, shape (3,)
         Unit vector down in base, as mounted.
     listen : bool
