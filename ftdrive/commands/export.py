@@ -55,7 +55,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
         write_new(output, text)
         talk.print(f" Wrote {output}")
     if as_json:
-        about = {"format": target, "plan": made.to_dict()["sha256"], "file": None if output is None else str(output)}
+        about = {"format": target, "plan": made.sha256, "file": None if output is None else str(output)}
         write_json({"schema_version": 1, **about, "text": text})
     elif output is None:
         click.echo(text, nl=False)

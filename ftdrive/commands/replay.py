@@ -18,9 +18,9 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.runs.outcome import solve_records
 from ftdrive.runs.replay_source import RecordedRun
 from ftdrive.runs.run import Run
-from ftdrive.session import solve_records
 from ftdrive.terminal.console import hanging, talk
 from ftdrive.terminal.report import print_result
 

@@ -33,9 +33,9 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.runs.outcome import dataset_of
 from ftdrive.runs.pose_hints import hints
 from ftdrive.runs.run import Run, versions
-from ftdrive.session import dataset_of
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.report import print_comparison, print_result
 
@@ -156,7 +156,8 @@ def _solve_each(
 
 def _read(source: Path, orientation: Orientation) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
     if source.is_dir():
-        return dataset_of(Run(source))
+        run = Run(source)
+        return dataset_of(run, run.records())
     dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
     circumstances = {"g_m_s2": STANDARD_GRAVITY_M_S2, "up_in_base": UP_IN_BASE}
     return dataset, circumstances, {"source": source.name, "versions": versions()}

@@ -38,7 +38,7 @@ def program(plan: Plan, *, dwell_s: float) -> str:
 
 
 def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
-    sha256 = plan.to_dict()["sha256"]
+    sha256 = plan.sha256
     steps, model = plan.steps, plain(plan.description["model"])
     name = f"ftdrive plan {sha256[:12]}"
     first = _joints(steps[0].q_rad)

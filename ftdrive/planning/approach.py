@@ -65,16 +65,10 @@ def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, sp
 
     Parameters
     ----------
-    certifier : Certifier
     q_now : array_like, shape (6,)
         Present joint angles as reported, within one turn of zero, so that no move crosses a joint limit.
     q_first : array_like, shape (6,)
         First pose of the tour.
-    speeds : Speeds
-
-    Returns
-    -------
-    Approach
 
     Raises
     ------

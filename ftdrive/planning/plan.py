@@ -13,7 +13,7 @@ from calib.files import check_format, read_object, write_new
 from calib.poses.information import Guess, Prediction, predicted_sigma, special
 from drivers.ur.kinematics import Array
 from ftdrive.errors import BadPlan, PlanRefused
-from ftdrive.planning.geometry.certify import Certificate, Certifier
+from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
 
 PLAN_FORMAT = "ftdrive.plan/1"
@@ -77,6 +77,11 @@ class Plan:
     def marked(self, *, measured: bool) -> "Plan":
         """Record in the description, and so in the file and its hash, whether tool and scene were measured."""
         return replace(self, description={**self.description, "measured": measured})
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the file."""
+        return str(self.to_dict()["sha256"])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of the file; its hash over everything else reveals later changes."""
@@ -153,24 +158,19 @@ def make_plan(
     speeds: Speeds,
     guess: Guess,
 ) -> Plan:
-    """Certify a closed tour through joint vectors (n, 6) and predict its accuracy.
+    """Certify a closed tour and predict its accuracy for the guessed tool and noise.
 
     Parameters
     ----------
-    kind : str
     why : sequence of str
         Sentences; the predicted error is appended.
-    certifier : Certifier
     numbers : sequence of int
         Numbers of the orientations.
     q_rad : array, shape (n, 6)
         In the order of travel.
-    speeds : Speeds
-    guess : Guess
-        Expected tool and noise, for the prediction.
     """
     arm, following = certifier.arm, np.roll(q_rad, -1, axis=0)
-    certificate: Certificate = certifier.certify(q_rad, following)
+    certificate = certifier.certify(q_rad, following)
     R = arm.frames(q_rad).R_base_flange
     turn = np.abs(following - q_rad).max(axis=1)
     speed = speed_of_leading_joint(arm, q_rad, following, speeds)

@@ -4,7 +4,7 @@ All 24 orientations are preferred because they are the most informative. Tours t
 rest come first. If some orientations are out of reach, the most informative reachable poses replace them.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,8 +20,7 @@ from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan, make_plan
 from ftdrive.planning.search import constant_tour
 from ftdrive.planning.search.chosen import Chosen, chosen_tour
-from ftdrive.planning.search.free_box import box_tour
-from ftdrive.planning.search.nodes import WRIST_6_RAD, wrist_nodes
+from ftdrive.planning.search.nodes import WRIST_6_RAD, box_nodes, wrist_nodes
 from ftdrive.planning.search.postures import with_room
 from ftdrive.planning.search.tours import clear_tour
 
@@ -33,6 +32,8 @@ FEWEST_CHOSEN = 6
 
 Found = tuple[Sequence[int], Array]
 """Numbers of the orientations and joint vectors (n, 6), in the order of travel."""
+Attempt = tuple[str, Sequence[str], Found | None]
+"""Kind of a tour, the reason for it, and the tour where there is one."""
 
 
 def guess_of(certifier: Certifier, mass_kg: float | None = None) -> Guess:
@@ -48,11 +49,9 @@ def plan_tour(
 
     Parameters
     ----------
-    certifier : Certifier
     q_rad : array_like, shape (6,)
         Present joint angles.
     poses : {24, 12, 6}
-    speeds : Speeds
     guess : Guess
         Of the tool and the noise.
 
@@ -67,43 +66,50 @@ def plan_tour(
         No tour has only moves that are proven clear.
     """
     q_now = checked_joints(q_rad)
-    numbers = _numbers(poses)
+    _numbers(poses)
+    refusal = (
+        f"{_reason(poses)}. Another posture, a box for the flange, and other poses were tried: no tour of them is "
+        "proven clear and informative enough to estimate everything. Describe the tool more closely, or clear the "
+        "surroundings"
+    )
+    return _first_found(_attempts(certifier, q_now, poses, speeds, guess), refusal, certifier, speeds, guess)
 
-    def made(kind: str, why: Sequence[str], found: Found) -> Plan:
-        return make_plan(kind, why, certifier, *found, speeds, guess)
 
+def _attempts(certifier: Certifier, q_now: Array, poses: int, speeds: Speeds, guess: Guess) -> Iterator[Attempt]:
+    """Try each kind of tour, the preferred ones first."""
+    numbers, reason = NUMBERS[poses], _reason(poses)
     if poses == 24:
-        if (found := _constant(certifier, q_now)) is not None:
-            why = ["The constant tour is proven clear at the present posture; base, shoulder and elbow stay at rest."]
-            return made("constant", why, found)
-        reason = "The constant tour cannot be proven clear at the present posture"
-    else:
-        reason = f"{poses} of the 24 orientations were requested"
-    if (found := _wrist(certifier, q_now, numbers, speeds)) is not None:
-        why = [f"{reason}: the wrist visits them in the fastest order that is clear, base, shoulder and elbow at rest."]
-        return made("wrist", why, found)
+        why = "The constant tour is proven clear at the present posture; base, shoulder and elbow stay at rest."
+        yield "constant", [why], _constant(certifier, q_now)
+    why = f"{reason}: the wrist visits them in the fastest order that is clear, base, shoulder and elbow at rest."
+    yield "wrist", [why], _wrist(certifier, q_now, numbers, speeds)
     for tour in _clear_tours(certifier, q_now):
         elsewhere: Found | None = constant_tour.NUMBERS, tour
         if poses != 24 or not _winds_little(tour, q_now):
             elsewhere = _wrist(certifier, np.append(tour[0, :5], q_now[5]), numbers, speeds)
-        if elsewhere is not None:
-            return made(
-                "posture",
-                [f"{reason}, and the wrist alone has no clear tour there.", _elsewhere_words(tour[0])],
-                elsewhere,
-            )
+        why = f"{reason}, and the wrist alone has no clear tour there."
+        yield "posture", [why, _elsewhere_words(tour[0])], elsewhere
     nowhere = f"{reason}, and the wrist alone has no clear tour at any posture of joints 1 to 3 that was tried."
     for centre_m in _box_centres(certifier, q_now):
-        if (found := _box(certifier, q_now, numbers, centre_m, BOX_HALF_SIZE_M, speeds)) is not None:
-            return made("box", [nowhere, _box_words(centre_m, BOX_HALF_SIZE_M)], found)
-    chosen = chosen_tour(certifier, q_now, poses, np.pi, speeds, guess)
-    if chosen is not None:
-        why = ["Some orientations are out of reach: these are the most informative reachable poses.", nowhere]
-        return made("reachable", [*why, *_chosen_words(chosen)], (chosen.numbers, chosen.q_rad))
-    raise PlanRefused(
-        f"{reason}. Another posture, a box for the flange, and other poses were tried: no tour of them is proven clear "
-        "and informative enough to estimate everything. Describe the tool more closely, or clear the surroundings"
-    )
+        found = _box(certifier, q_now, numbers, centre_m, BOX_HALF_SIZE_M, speeds)
+        yield "box", [nowhere, _box_words(centre_m, BOX_HALF_SIZE_M)], found
+    if (chosen := chosen_tour(certifier, q_now, poses, np.pi, speeds, guess)) is not None:
+        why = "Some orientations are out of reach: these are the most informative reachable poses."
+        yield "reachable", [why, nowhere, *_chosen_words(chosen)], (chosen.numbers, chosen.q_rad)
+
+
+def _reason(poses: int) -> str:
+    """Return why the plan is not the constant tour."""
+    if poses == 24:
+        return "The constant tour cannot be proven clear at the present posture"
+    return f"{poses} of the 24 orientations were requested"
+
+
+def _first_found(attempts: Iterable[Attempt], refusal: str, certifier: Certifier, speeds: Speeds, guess: Guess) -> Plan:
+    for kind, why, found in attempts:
+        if found is not None:
+            return make_plan(kind, why, certifier, *found, speeds, guess)
+    raise PlanRefused(refusal)
 
 
 def plan_cone(
@@ -119,25 +125,12 @@ def plan_cone(
 
     Parameters
     ----------
-    certifier : Certifier
-    q_rad : array_like, shape (6,)
-        Present joint angles.
+    q_rad, guess
+        As of `plan_tour`.
     poses : int
         6 or more.
     half_angle_rad : float
         Between the tool axis (flange z) and straight down.
-    speeds : Speeds
-    guess : Guess
-
-    Returns
-    -------
-    Plan
-        Of kind "cone".
-
-    Raises
-    ------
-    PlanRefused
-        No tour has only moves that are proven clear.
     """
     q_now = checked_joints(q_rad)
     if not (0 < half_angle_rad <= np.pi and poses >= FEWEST_CHOSEN):
@@ -145,15 +138,16 @@ def plan_cone(
             f"a cone of {np.degrees(half_angle_rad):g} degrees with {poses} poses cannot be planned: give above 0 to "
             f"180 degrees, and {FEWEST_CHOSEN} poses or more"
         )
-    chosen = chosen_tour(certifier, q_now, poses, half_angle_rad, speeds, guess)
-    if chosen is None:
-        raise PlanRefused(
-            f"no tour of {poses} poses with the tool within {np.degrees(half_angle_rad):.0f} degrees of straight down "
-            "is reachable, proven clear and informative enough to estimate everything: widen the cone, or jog the arm "
-            "to another posture"
-        )
-    why = [f"The tool axis stays within {np.degrees(half_angle_rad):.0f} degrees of straight down."]
-    return make_plan("cone", [*why, *_chosen_words(chosen)], certifier, chosen.numbers, chosen.q_rad, speeds, guess)
+    cone = f"within {np.degrees(half_angle_rad):.0f} degrees of straight down"
+    attempts = list[Attempt]()
+    if (chosen := chosen_tour(certifier, q_now, poses, half_angle_rad, speeds, guess)) is not None:
+        why = [f"The tool axis stays {cone}.", *_chosen_words(chosen)]
+        attempts = [("cone", why, (chosen.numbers, chosen.q_rad))]
+    refusal = (
+        f"no tour of {poses} poses with the tool {cone} is reachable, proven clear and informative enough to estimate "
+        "everything: widen the cone, or jog the arm to another posture"
+    )
+    return _first_found(attempts, refusal, certifier, speeds, guess)
 
 
 def plan_box(
@@ -170,38 +164,23 @@ def plan_box(
 
     Parameters
     ----------
-    certifier : Certifier
-    q_rad : array_like, shape (6,)
-        Present joint angles.
-    poses : {24, 12, 6}
+    q_rad, poses, guess
+        As of `plan_tour`.
     half_size_m : float
         Half the length of the edges of the box, which are along the base axes.
     centre_m : array_like, shape (3,), optional
         Centre of the box, in base; default: the present flange position.
-    speeds : Speeds
-    guess : Guess
-
-    Returns
-    -------
-    Plan
-        Of kind "box".
-
-    Raises
-    ------
-    PlanRefused
-        No tour has only moves that are proven clear.
     """
     q_now = checked_joints(q_rad)
     if not 0 <= half_size_m <= 1:
         raise ConfigError(f"the box is {1e3 * half_size_m:g} mm to each side: give 0 to 1000")
     centre = certifier.arm.frames(q_now).flange_m[0] if centre_m is None else np.asarray(centre_m, dtype=np.float64)
     found = _box(certifier, q_now, _numbers(poses), centre, half_size_m, speeds)
-    if found is None:
-        raise PlanRefused(
-            f"with the flange within {1e3 * half_size_m:.0f} mm of {_point(centre)} not all {poses} orientations are "
-            "in reach, or no tour of them is proven clear: give a larger box, or another centre"
-        )
-    return make_plan("box", [_box_words(centre, half_size_m)], certifier, *found, speeds, guess)
+    refusal = (
+        f"with the flange within {1e3 * half_size_m:.0f} mm of {_point(centre)} not all {poses} orientations are in "
+        "reach, or no tour of them is proven clear: give a larger box, or another centre"
+    )
+    return _first_found([("box", [_box_words(centre, half_size_m)], found)], refusal, certifier, speeds, guess)
 
 
 def _numbers(poses: int) -> tuple[int, ...]:
@@ -236,8 +215,14 @@ def _clear_tours(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
 def _box(
     certifier: Certifier, q_rad: Array, numbers: Sequence[int], centre_m: Array, half_size_m: float, speeds: Speeds
 ) -> Found | None:
-    found = box_tour(certifier, q_rad, _at_pan(q_rad, numbers), centre_m, half_size_m, speeds)
-    return None if found is None else ([numbers[g] for g in found[0]], found[1])
+    q, group = box_nodes(certifier, q_rad, _at_pan(q_rad, numbers), centre_m, half_size_m)
+    if len(np.unique(group)) < len(numbers):
+        return None
+    # Preferred: what moves base, shoulder and elbow least.
+    away = np.abs(q - q_rad)
+    calm = np.argsort(away[:, :3].max(axis=1) + 0.01 * away.sum(axis=1), kind="stable")
+    order = clear_tour(certifier, q[calm], group[calm], speeds)
+    return None if order is None else ([numbers[g] for g in group[calm][order]], q[calm][order])
 
 
 def _box_centres(certifier: Certifier, q_rad: Array) -> Array:

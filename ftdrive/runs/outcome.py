@@ -31,19 +31,15 @@ def solve_and_save(run: Run) -> Outcome:
     return outcome
 
 
-def dataset_of(run: Run) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
-    """Read a run as a dataset, with gravity and up where it was made, as `solve` takes them, and the provenance."""
-    return _prepared(run, run.records())
-
-
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     """Solve records of a run, as they are on disk or as a replay gives them."""
-    dataset, circumstances, provenance = _prepared(run, records)
+    dataset, circumstances, provenance = dataset_of(run, records)
     result = solve(dataset, **circumstances, provenance=provenance)
     return Outcome(run, dataset, result, drift_check(records))
 
 
-def _prepared(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
+def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
+    """Return a run's records as a dataset, with gravity and up as `solve` takes them, and the provenance."""
     header = run.header()
     config, devices = header["config"], header.get("devices", {})
     dataset = dataset_from(records, {"run": run.folder.name, "devices": devices})

@@ -3,15 +3,13 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib import CalibrationResult
 from calib.assessment.load_shift import Change, lasting_change
 from calib.assessment.verdict import out_of_line
+from calib.model import Array
 from calib.routine import MOVED_RAD, PoseRecord, drift_check, is_return, turned_rad
 from ftdrive.checks.controller_settings import mismatches
-
-Array = NDArray[np.float64]
 
 _SIGNIFICANT = 4.0
 

@@ -27,10 +27,10 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import BadDataset
 from calib.files import check_format, read_object, write_new
+from calib.model import Array
 from calib.routine import PoseRecord, TourPose
 from drivers.clock import REAL, Clock
 from drivers.interfaces import FtSamples
@@ -47,7 +47,6 @@ _DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedErr
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 """Of a recording, named as in `FtSamples`."""
 
-Array = NDArray[np.float64]
 Mode = Literal["auto", "step", "manual", "listen"]
 """How a session moves from pose to pose."""
 

@@ -7,13 +7,11 @@ from enum import StrEnum
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib.model import Array
 from calib.routine import PoseRecord
 from drivers.interfaces import ForceTorqueSensor
 from ftdrive.planning.plan import Plan
-
-Array = NDArray[np.float64]
 
 SCHEMA_VERSION = 1
 

@@ -5,17 +5,14 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib.poses.information import predicted_sigma
+from calib.model import Array
+from calib.poses.information import Guess, predicted_sigma
 from ftdrive.planning.approach import Approach
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import guess_of
 from ftdrive.session.tour import APPROACH_RAD_S, SLOW
-
-Array = NDArray[np.float64]
 
 
 def at_most(plan: Plan, certifier: Certifier, speeds: Speeds) -> Plan:
@@ -39,8 +36,6 @@ def moves_s(plan: Plan, todo: Sequence[int], q_rad: Array, approach: Approach) -
         With the speeds it is driven at.
     todo : sequence of int
         Stops, from 1; where some are left out between two, there is an approach too, counted as a straight move.
-    q_rad : array, shape (6,)
-    approach : Approach
     """
     turns = np.abs(np.diff(np.vstack([q_rad, approach.q_rad]), axis=0)).max(axis=1)
     speeds = np.minimum(approach.speed_rad_s, APPROACH_RAD_S)
@@ -56,27 +51,27 @@ def moves_s(plan: Plan, todo: Sequence[int], q_rad: Array, approach: Approach) -
     return total_s
 
 
-def prediction(plan: Plan, certifier: Certifier, mass_kg: float | None, average_s: float, sigma: Array) -> str:
+def prediction(plan: Plan, guess: Guess, average_s: float, sigma: Array, *, assumed: bool) -> str:
     """Describe the accuracy that a plan's poses give.
 
     Parameters
     ----------
-    plan : Plan
-    certifier : Certifier
-    mass_kg : float, optional
-        Of the tool, as configured.
+    guess : Guess
+        Of the tool.
     average_s : float
         At each pose.
     sigma : array, shape (6,)
         Standard deviation of such an average, as measured, N and N·m.
+    assumed : bool
+        The mass of the tool is not configured.
     """
     force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (sigma[:3], sigma[3:]))
-    guess = replace(guess_of(certifier, mass_kg), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
+    guess = replace(guess, sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
     found = predicted_sigma(np.array([step.R_base_flange for step in plan.steps]), guess)
-    assumed = "" if mass_kg else " (assumed: [tool] mass_kg is not set)"
+    mass = f"{guess.mass_kg:g} kg" + (" (assumed: [tool] mass_kg is not set)" if assumed else "")
     return (
         f"sigma of {average_s:g} s averages: {force_N:.2g} N, {torque_Nm:.2g} N·m; predicted from "
-        f"that for {guess.mass_kg:g} kg{assumed}, one sigma: mass {1e3 * float(found.sigma['mass_kg']):.2g} g, force "
+        f"that for {mass}, one sigma: mass {1e3 * float(found.sigma['mass_kg']):.2g} g, force "
         f"bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
         f"{found.torque_rms_Nm:.2g} N·m"
     )

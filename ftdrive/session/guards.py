@@ -10,17 +10,15 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib.model import Array
 from drivers.errors import DeviceFault, DeviceTimeout, DriverError
 from drivers.interfaces import ArmState, ArmStatus
+from ftdrive.checks.devices import AXES
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session.hazards import Hazard
 
-Array = NDArray[np.float64]
-
 G_M_S2: Final = 9.81
-AXES: Final = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 
 class Tripped(Exception):

@@ -12,6 +12,7 @@ from typing import Final, Protocol, TypeVar
 import numpy as np
 
 from calib.data.dwell_mean import CHANNELS, LEAST_SAMPLES, is_stationary, restless_channels
+from calib.model import Array
 from calib.routine import (
     LONGER,
     MOVED_RAD,
@@ -25,7 +26,6 @@ from drivers.clock import REAL, Clock
 from drivers.errors import DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, ForceTorqueSensor, FtSamples
 from ftdrive.session.events import (
-    Array,
     Estimated,
     Noted,
     PoseTaken,
@@ -100,7 +100,6 @@ def collect_manually(
     ----------
     arm, sensor
         Open; the arm for reading. An interrupted sensor with `recover` may reconnect.
-    recorder : Recorder
     down_base : array, shape (3,)
         Unit vector down in base, as mounted.
     listen : bool

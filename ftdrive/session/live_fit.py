@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult, NotObservable, solve
@@ -16,7 +16,7 @@ from calib.assessment.observability import (
     WEAK_GAP,
     different_orientations,
 )
-from calib.model import STANDARD_GRAVITY_M_S2
+from calib.model import STANDARD_GRAVITY_M_S2, Array
 from calib.poses.information import Guess, Prediction, predicted_sigma
 from calib.poses.selection import next_pose
 from calib.published.yu import weight_and_tilt
@@ -24,8 +24,6 @@ from calib.routine import PoseRecord, dataset_from, is_return
 from ftdrive.cell.config import USUAL_KG
 from ftdrive.checks.controller_settings import axes_along
 from ftdrive.session.events import Estimated
-
-Array = NDArray[np.float64]
 
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
 """As good as gravity directions within 50 to 60 degrees of one another; see `calib.poses.information.Prediction`."""
@@ -55,12 +53,8 @@ class Running:
         self._advise = advise
         self._down_base = np.asarray(down_base, dtype=np.float64)
         self._records: dict[int, PoseRecord] = {}
-        self._result: CalibrationResult | None = None
-
-    @property
-    def result(self) -> CalibrationResult | None:
-        """Result of `calib.solve` for the poses so far; None while they do not determine it."""
-        return self._result
+        self.result: CalibrationResult | None = None
+        """Of `calib.solve` for the poses so far; None while they do not determine it."""
 
     @property
     def weighed_kg(self) -> float | None:
@@ -73,13 +67,13 @@ class Running:
     def add(self, record: PoseRecord) -> Estimated:
         """Add a pose, in place of one with the same `stop`; return the estimate."""
         self._records.pop(record.stop, None)
-        residual = _surprise(self._result, record)
+        residual = _surprise(self.result, record)
         self._records[record.stop] = record
         coverage = self._refit()
         R_base_flange, down = self._orientations(), self._down()
         gravity_flange = down @ R_base_flange
         light = _light(coverage)
-        values, sigma = ({}, {}) if self._result is None else _estimates(self._result)
+        values, sigma = ({}, {}) if self.result is None else _estimates(self.result)
         return Estimated(
             poses=len(R_base_flange),
             values=values,
@@ -101,7 +95,7 @@ class Running:
         if self._records:
             self._refit()
         else:
-            self._result = None
+            self.result = None
 
     def predict(self, R_base_flange: Array) -> Array | None:
         """Wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain.
@@ -118,7 +112,7 @@ class Running:
         return -result.compensate(np.zeros(6), R_base_flange)
 
     def _trusted(self) -> CalibrationResult | None:
-        result = self._result
+        result = self.result
         if result is None or result.n_poses < RECOMMENDED_POSES:
             return None
         second = result.second_basin_chi2
@@ -137,7 +131,7 @@ class Running:
         different = different_orientations(R_base_flange)
         # The poses alone show that the solver would fail; its advice would take time.
         hopeless = different < LEAST_POSES or np.isinf(coverage.cond9) or coverage.second_basin_gap < AMBIGUOUS_GAP
-        self._result = None if hopeless else self._solved()
+        self.result = None if hopeless else self._solved()
         return coverage
 
     def _solved(self) -> CalibrationResult | None:
@@ -147,7 +141,7 @@ class Running:
             return None
 
     def _down(self) -> Array:
-        result = self._result
+        result = self.result
         if result is None or result.p_wrong > 0.01 or result.weight_N == 0:
             return self._down_base
         return result.gravity_force_base_N / result.weight_N
@@ -163,7 +157,7 @@ class Running:
             "tilt_beta_rad": beta,
             "g_m_s2": self._g_m_s2,
         }
-        result = self._result
+        result = self.result
         if result is None or result.mass_kg == 0:
             return Guess(USUAL_KG, **noise)
         return Guess(
@@ -196,8 +190,6 @@ def hint(R_base_flange: Array, guess: Guess, down_base: Array) -> str:
     ----------
     R_base_flange : array, shape (n, 3, 3)
         Poses taken.
-    guess : Guess
-    down_base : array, shape (3,)
     """
     last = R_base_flange[-1]
     words, candidates = _motions(last, down_base)

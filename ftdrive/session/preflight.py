@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib.model import Array
 from drivers.clock import Clock
 from drivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
 from ftdrive.cell.config import CellConfig
@@ -25,8 +25,6 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.nodes import WRIST_6_RAD
 from ftdrive.session.events import Checked
 from ftdrive.session.guards import Limits, ModelGuard, Tripped
-
-Array = NDArray[np.float64]
 
 LISTEN_S: Final = 2.0
 _EDGE_RAD: Final = float(np.radians(5))

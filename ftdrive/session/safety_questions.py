@@ -1,10 +1,10 @@
 """Questions that only the operator can answer before the arm moves."""
 
+from calib.model import Array
 from drivers.interfaces import RobotArm
 from ftdrive.planning.approach import arm_moves
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.show.words import point_in_words, turns_in_words
-from ftdrive.session.events import Array
 from ftdrive.session.journal import Journal
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.data.averaging_time import averaging_time
 from calib.data.dwell_mean import LEAST_SAMPLES, mean_and_covariance, noise_level
+from calib.model import Array
 from calib.routine import PoseRecord, Sampling
 from drivers.errors import DriverError
 from drivers.interfaces import NOT_REPORTED, ForceTorqueSensor, FtSamples, RobotArm
@@ -24,6 +24,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.planning.motion import slower
 from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import guess_of
 from ftdrive.planning.search.constant_tour import constant_tour
 from ftdrive.planning.show.words import way_in_words
 from ftdrive.runs.outcome import Outcome, solve_and_save
@@ -54,8 +55,6 @@ from ftdrive.session.recovery import GuardedCell, Recovery
 from ftdrive.session.safety_questions import SafetyQuestions
 from ftdrive.session.tour import SLOW, Measuring, Pace, Tour
 from ftdrive.session.watchdog import Watcher
-
-Array = NDArray[np.float64]
 
 _GRID_RAD: Final = float(np.radians(0.1))
 """Joints 1 to 3 are rounded to this grid before planning, so that the same posture gives the same plan and hash."""
@@ -127,10 +126,11 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
         journal.show(StateChanged(state=State.PREFLIGHT))
         if not by_hand:
             preflight.require_no_program(arm, cell.clock, limits)
-            journal.show(Noted(words=kept_awake))
+            if options.real and not options.dry_run:
+                journal.show(Noted(words=kept_awake))
         devices = {"arm": asdict(arm.identify()), "sensor": asdict(sensor.identify())}
         session = _Session(cell, arm, sensor, journal, options, limits, run, devices)
-        run = _by_hand(session) if by_hand else _along_a_plan(session, plan)
+        run = _by_hand(session) if by_hand else _along_a_plan(session, *_certified_plan(cell, arm, options, plan))
     if run is None:
         return None
     if not run.stops():
@@ -175,6 +175,19 @@ def _plan_on_disk(options: Options, run: Run | None) -> Plan | None:
     return plan
 
 
+def _certified_plan(cell: CellConfig, arm: RobotArm, options: Options, plan: Plan | None) -> tuple[Certifier, Plan]:
+    """Describe the cell to a certifier; without a plan, make one where the arm stands."""
+    if not options.dry_run and arm.status().tcp_offset is None:
+        arm.open(control=True)  # an old controller reports no poses before
+    certifier = certifier_for(cell, arm.identify().model)
+    if plan is not None:
+        return certifier, plan
+    q = np.round(arm.state().q_rad / _GRID_RAD) * _GRID_RAD
+    with suppress(ConfigError):  # the planner reports it, with what to do
+        q[3:5] = constant_tour(q)[0, 3:5]  # joint 6 keeps its turn: it shows how the cable is wound
+    return certifier, plan_for(cell, certifier, q, options.poses)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Session:
     """Open devices, options and limits of a session."""
@@ -189,6 +202,11 @@ class _Session:
     """The run that is resumed."""
     devices: Mapping[str, Any]
     """Identities of arm and sensor."""
+
+    @property
+    def serial(self) -> str:
+        """Of the arm."""
+        return str(self.devices["arm"]["serial"])
 
     def note(self, words: str, *, warning: bool = False) -> None:
         self.journal.show(Noted(words=words, warning=warning))
@@ -215,8 +233,6 @@ class _Looked:
 
     session: _Session
     before: preflight.Before
-    serial: str
-    """Of the arm."""
     stands_rad: Array
     """(6,) posture of the arm."""
     todo: Sequence[int]
@@ -233,15 +249,8 @@ class _Looked:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Checked:
-    """Second stage: every preflight check passed."""
-
-    looked: _Looked
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Predicted:
-    """Third stage: how fast the plan is driven, how long each average takes."""
+    """Second stage: how fast the plan is driven, how long each average takes."""
 
     looked: _Looked
     driven: Plan
@@ -249,41 +258,28 @@ class _Predicted:
     sampling: Sampling
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Toured:
-    """Last stage: the arm has visited every pose that was left."""
-
-    run: Run
-    undriven: Sequence[int]
-    """As `Tour.undriven`."""
-
-
-def _along_a_plan(session: _Session, plan: Plan | None) -> Run | None:
+def _along_a_plan(session: _Session, certifier: Certifier, plan: Plan) -> Run | None:
     """Take the arm along a plan; None after a dry run, which never takes control of the arm."""
     dry_run, arm = session.options.dry_run, session.arm
-    if not dry_run and arm.status().tcp_offset is None:
-        arm.open(control=True)  # an old controller reports no poses before
-    checked = _check(_look(session, plan), preflight.CHECKS)
+    looked = _look(session, certifier, plan)
+    _check(session.journal, looked.before, preflight.CHECKS)
     if dry_run:
         session.note("the controller's safety limits are not checked: only a program on the controller can query them")
     else:
         arm.open(control=True)
-        checked = _check(checked.looked, preflight.IN_CONTROL)
-    predicted = _predict(checked)
+        _check(session.journal, looked.before, preflight.IN_CONTROL)
+    predicted = _predict(looked)
     if dry_run:
         return None
-    toured = _tour(predicted)
-    if predicted.looked.todo and not predicted.looked.before.known:
-        _judge_completed(predicted.looked, toured)
-    return toured.run
+    run, undriven = _tour(predicted)
+    if looked.todo and not looked.before.known:
+        _judge_completed(looked, run, undriven)
+    return run
 
 
-def _look(session: _Session, plan: Plan | None) -> _Looked:
+def _look(session: _Session, certifier: Certifier, plan: Plan) -> _Looked:
     """Find what is left to take, plan the approach, listen to the resting sensor; show all of it."""
     cell, arm, options = session.cell, session.arm, session.options
-    info = arm.identify()
-    certifier = certifier_for(cell, info.model)
-    plan = plan or _plan_here(session, certifier)
     running = Running(g_m_s2=cell.site.g_m_s2, down_base=certifier.scene.down_base, advise=False)
     q = arm.state().q_rad
     todo, taken = _what_is_left(session, plan)
@@ -299,22 +295,14 @@ def _look(session: _Session, plan: Plan | None) -> _Looked:
         plan=plan,
         approach=plan_approach(certifier, q, goal, SLOW),
         runs=options.runs,
-        known=not options.real or has_completed(info.serial, _sha256(plan)),
+        known=not options.real or has_completed(session.serial, plan.sha256),
         quiet=session.listen(preflight.LISTEN_S),
         resumed=session.run is not None,
         limits=session.limits,
         sensor_range=_range_of(session.sensor),
     )
     _show(session, before)
-    return _Looked(session, before, info.serial, q, todo, len(taken), running)
-
-
-def _plan_here(session: _Session, certifier: Certifier) -> Plan:
-    """Make a plan where the arm stands."""
-    q = np.round(session.arm.state().q_rad / _GRID_RAD) * _GRID_RAD
-    with suppress(ConfigError):  # the planner reports it, with what to do
-        q[3:5] = constant_tour(q)[0, 3:5]  # joint 6 keeps its turn: it shows how the cable is wound
-    return plan_for(session.cell, certifier, q, session.options.poses)
+    return _Looked(session, before, q, todo, len(taken), running)
 
 
 def _what_is_left(session: _Session, plan: Plan) -> tuple[list[int], list[PoseRecord]]:
@@ -352,27 +340,27 @@ def _show(session: _Session, before: preflight.Before) -> None:
             session.journal.require(f"The plan is shown at {url} until you answer. Go on?", assumed=False)
 
 
-def _check(looked: _Looked, rows: Sequence[preflight.Row]) -> _Checked:
+def _check(journal: Journal, before: preflight.Before, rows: Sequence[preflight.Row]) -> None:
     """Show what each check finds; raises `NotAccepted` if one failed."""
     failed = []
     for row in rows:
-        found = row(looked.before)
-        looked.session.journal.show(found)
+        found = row(before)
+        journal.show(found)
         if not found.passed:
             failed.append(f"{found.name}: {found.words}")
     if failed:
         raise NotAccepted("nothing moves: " + "; ".join(failed))
-    return _Checked(looked)
 
 
-def _predict(checked: _Checked) -> _Predicted:
+def _predict(looked: _Looked) -> _Predicted:
     """Choose how long to average; show the accuracy to expect with this sensor's noise, and the duration."""
-    looked, session, before = checked.looked, checked.looked.session, checked.looked.before
+    session, before = looked.session, looked.before
     sampling, noise = _chosen_sampling(looked)
     mass_kg, average_s = session.cell.tool.mass_kg, sampling.average_s
-    session.note(prediction(before.plan, before.certifier, mass_kg, average_s, noise))
+    assumed = session.options.real and not mass_kg
+    session.note(prediction(before.plan, guess_of(before.certifier, mass_kg), average_s, noise, assumed=assumed))
     if session.options.fast and looked.slow:
-        why = f": {_NO_SERIAL}" if looked.serial == NOT_REPORTED else ""
+        why = f": {_NO_SERIAL}" if session.serial == NOT_REPORTED else ""
         session.note(f"{'every' if why else 'the first'} run of a plan is slow, also with --fast{why}", warning=True)
     speeds = speeds_of(session.cell)
     driven = at_most(before.plan, before.certifier, slower(speeds, SLOW) if looked.slow else speeds)
@@ -407,8 +395,11 @@ def _chosen_sampling(looked: _Looked) -> tuple[Sampling, Array]:
     return replace(sampling, average_s=chosen.seconds), chosen.sigma
 
 
-def _tour(predicted: _Predicted) -> _Toured:
-    """Ask the safety questions, then visit every pose that is left; each is on disk before the next move."""
+def _tour(predicted: _Predicted) -> tuple[Run, list[int]]:
+    """Ask the safety questions, then visit every pose that is left; each is on disk before the next move.
+
+    Returns the run, and the poses of `Tour.undriven`.
+    """
     looked, session, before = predicted.looked, predicted.looked.session, predicted.looked.before
     journal, options, limits = session.journal, session.options, session.limits
     quiet = before.quiet.wrench
@@ -452,7 +443,7 @@ def _tour(predicted: _Predicted) -> _Toured:
         )
         with _kept(journal, run):
             tour.run(looked.todo)
-    return _Toured(run, tour.undriven)
+    return run, tour.undriven
 
 
 def _contact_guard(predicted: _Predicted, quiet_std: Array) -> ContactGuard:
@@ -478,7 +469,7 @@ def _recheck(looked: _Looked, questions: SafetyQuestions, asks: bool) -> None:
     stays = plan_approach(before.certifier, q, q, SLOW)  # the next approach is checked when its goal is known
     quiet = session.listen(preflight.LISTEN_S)
     again = replace(before, quiet=quiet, approach=stays, known=True, resumed=True)
-    _check(replace(looked, before=again), preflight.AGAIN)
+    _check(session.journal, again, preflight.AGAIN)
     if not session.options.questions:
         return
     if asks:
@@ -487,22 +478,18 @@ def _recheck(looked: _Looked, questions: SafetyQuestions, asks: bool) -> None:
         questions.ask_reduced(assumed=False)
 
 
-def _judge_completed(looked: _Looked, toured: _Toured) -> None:
+def _judge_completed(looked: _Looked, run: Run, undriven: Sequence[int]) -> None:
     """Record that the plan was driven to its end, slowly, or show why it does not count."""
-    plan = looked.before.plan
-    if toured.undriven or len(toured.run.stops()) <= len(plan.steps):
+    plan, serial = looked.before.plan, looked.session.serial
+    if undriven or len(run.stops()) <= len(plan.steps):
         why = "a plan counts as completed when one session takes every pose and drives every move of it; "
-        why += f"moves replaced: from {_poses(toured.undriven)} on" if toured.undriven else "poses are missing"
-    elif looked.serial == NOT_REPORTED:
+        why += f"moves replaced: from {_poses(undriven)} on" if undriven else "poses are missing"
+    elif serial == NOT_REPORTED:
         why = _NO_SERIAL
     else:
-        remember_completed(looked.serial, _sha256(plan))
+        remember_completed(serial, plan.sha256)
         return
     looked.session.note(f"the next run of this plan is slow again and needs the typed word: {why}")
-
-
-def _sha256(plan: Plan) -> str:
-    return str(plan.to_dict()["sha256"])
 
 
 def _poses(numbers: Sequence[int]) -> str:

@@ -11,10 +11,10 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import TooFewSamples
-from calib.routine import PoseRecord, Sampling, Stage, TourPose, take_pose
+from calib.model import Array
+from calib.routine import Sampling, Stage, TourPose, take_pose
 from drivers.errors import DriverError
 from ftdrive.checks.controller_settings import payload_in_words
 from ftdrive.checks.devices import SLOWEST_SLIDER
@@ -42,8 +42,6 @@ from ftdrive.session.progress import Progress
 from ftdrive.session.recovery import GuardedCell, Recovery
 
 log = logging.getLogger(__name__)
-
-Array = NDArray[np.float64]
 
 APPROACH_RAD_S: Final = float(np.radians(15))
 BACK_RAD_S: Final = float(np.radians(10))
@@ -98,21 +96,7 @@ class Measuring:
 
 
 class Tour:
-    """Takes the arm along one plan.
-
-    Parameters
-    ----------
-    cell : GuardedCell
-    plan : Plan
-        With the speeds of this session.
-    certifier : Certifier
-    run : Run
-        Keeps every pose.
-    running : Running
-    recovery : Recovery
-    measuring : Measuring
-    pace : Pace
-    """
+    """Takes the arm along one plan, which has the speeds of this session; the run keeps every pose."""
 
     def __init__(
         self,
@@ -130,8 +114,6 @@ class Tour:
         self._recovery, self._measuring, self._pace = recovery, measuring, pace
         self._nodes = np.array([step.q_rad for step in plan.steps])
         self._now = Progress(len(plan.steps))
-
-    # -------------------------------------------------------------------------------------------- the tour
 
     def run(self, todo: Sequence[int]) -> None:
         """Take the poses of these stops, counted from 1; the return to the first pose is the last.
@@ -284,7 +266,7 @@ class Tour:
             way = f"the arm goes on to pose {self._now.todo[0]}" if self._now.todo else "it was the last"
             self._note(f"skipped: {' and '.join(left)}, {way}; --resume takes skipped poses", warning=True)
 
-    def _take(self, stop: int, index: int) -> PoseRecord:
+    def _take(self, stop: int, index: int) -> None:
         step = self._plan.steps[index]
         pose = TourPose(step.number, np.array(step.q_rad))
         clock = self._watcher.clock
@@ -322,9 +304,6 @@ class Tour:
         )
         self._recovery.show_new()
         self._journal.show(self._running.add(record))
-        return record
-
-    # -------------------------------------------------------------------------------------------- moving
 
     def _go(self, index: int, stop: int) -> None:
         """Move the arm to a pose of the plan, along certified moves only."""
@@ -430,8 +409,6 @@ class Tour:
         self._watcher.check()
         self._obey_keys()
 
-    # -------------------------------------------------------------------------------------------- stop and hold
-
     def _hold(self, error: Exception) -> None:
         """Show why the arm has stopped, and wait for the operator; returns when the tour may go on."""
         self._arm.stop()
@@ -492,8 +469,6 @@ class Tour:
             return False
         self._journal.show(Noted(words=f"{trip}; the sensor was reopened, pose {stop} restarts", warning=True))
         return True
-
-    # -------------------------------------------------------------------------------------------- showing
 
     def _show_state(self, state: State, stop: int | None = None, words: str = "") -> None:
         number = None if stop is None else self._plan.steps[self._now.index(stop)].number

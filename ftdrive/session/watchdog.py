@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib.model import Array
 from calib.routine import turned_rad
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, DriverError
@@ -19,8 +19,6 @@ from ftdrive.session.guards import Guard, Limits, Motion, Seen, Tripped, arm_los
 from ftdrive.session.hazards import Hazard
 
 log = logging.getLogger(__name__)
-
-Array = NDArray[np.float64]
 
 
 class Watcher:

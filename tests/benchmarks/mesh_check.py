@@ -167,7 +167,7 @@ def compare(arm: Arm, certifier: Certifier) -> None:
     for name, first in (("wrist", 3), ("arm", 0)):
         q = np.tile(USUAL_POSTURE_RAD, (RANDOM, 1))
         q[:, first:] = random.uniform(-np.pi, np.pi, (RANDOM, 6 - first))
-        ours_m, _ = certifier.clearances(q)
+        ours_m = certifier.certify(q, q).self_clearance_m
         clear = ours_m >= certifier.margins.self_m
         hulls_m, words, worst = arm.closest(q[clear])
         close = np.sum(hulls_m < TARGET_M)

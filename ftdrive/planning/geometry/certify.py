@@ -72,14 +72,6 @@ class Certifier:
         ]
         self._names += [f"{arm.names[i]} - {things[k]}" for i, k in self._of_scene]
 
-    def clearances(self, q_rad: ArrayLike) -> tuple[Array, Array]:
-        """Smallest distances (n,) within arm and tool, and to the scene, at joint vectors (n, 6), to about 0.01 mm."""
-        q = np.asarray(q_rad, dtype=np.float64).reshape(-1, 6)
-        row, pair = (index.ravel() for index in np.indices((len(q), len(self._margin_m))))
-        distance = self._distance(q, row, pair, np.full(len(row), np.inf)).reshape(len(q), -1)
-        n = len(self._pairs)
-        return distance[:, :n].min(axis=1), distance[:, n:].min(axis=1, initial=np.inf)
-
     def free(self, q_rad: ArrayLike) -> NDArray[np.bool_]:
         """Return (n,) whether the margins are kept at joint vectors (n, 6)."""
         q = np.asarray(q_rad, dtype=np.float64).reshape(-1, 6)
@@ -162,21 +154,19 @@ class Certifier:
         near = apart < enough_m[own]
         apart[near] = separation(bodies[at[near], first[near]], bodies[at[near], second[near]], enough_m[own][near])
         distance[own] = apart
-        planes = len(self.scene.planes)
         body, thing = self._of_scene[pair[~own] - n].T
-        outside = self._to_scene(bodies, row[~own], body, thing, planes)
-        distance[~own] = outside
+        distance[~own] = self._to_scene(bodies, row[~own], body, thing)
         return distance
 
     def _to_scene(
-        self, bodies: Bodies, row: NDArray[np.intp], body: NDArray[np.intp], thing: NDArray[np.intp], planes: int
+        self, bodies: Bodies, row: NDArray[np.intp], body: NDArray[np.intp], thing: NDArray[np.intp]
     ) -> Array:
         distance = np.empty(len(row))
         for k, plane in enumerate(self.scene.planes):
             at = thing == k
             distance[at] = height_above(bodies[row[at], body[at]], np.array(plane.normal), plane.offset_m)
         for k, box in enumerate(self.scene.boxes):
-            at = thing == planes + k
+            at = thing == len(self.scene.planes) + k
             corners = np.array(box.low_m), np.array(box.high_m)
             distance[at] = separation_from_box(bodies[row[at], body[at]], *corners)
         return distance

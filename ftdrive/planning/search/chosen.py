@@ -61,15 +61,12 @@ def chosen_tour(
 
     Parameters
     ----------
-    certifier : Certifier
     q_rad : array_like, shape (6,)
         Present joint angles; another posture of joints 1 to 3 is used if it lowers the predicted error.
     poses : int
         4 or more.
     half_angle_rad : float
         Between the tool axis (flange z) and straight down; pi for any orientation.
-    speeds : Speeds
-    guess : Guess
 
     Returns
     -------

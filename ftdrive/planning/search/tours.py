@@ -37,7 +37,6 @@ def connected(certifier: Certifier, q_rad: Array, layer: Nodes) -> Nodes:
 
     Parameters
     ----------
-    certifier : Certifier
     q_rad : array, shape (n, 6)
         Free.
     layer : int array, shape (n,)

@@ -35,7 +35,6 @@ def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) 
 
     Parameters
     ----------
-    plan : Plan
     certifier : Certifier
         For the same arm, tool and scene.
     path : Path

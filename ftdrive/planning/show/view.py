@@ -32,7 +32,6 @@ def shown(plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Array = (
 
     Parameters
     ----------
-    plan : Plan
     certifier : Certifier
         For the same arm, tool and scene.
     way_rad : array, shape (k + 1, 6), optional
