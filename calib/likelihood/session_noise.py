@@ -147,6 +147,20 @@ class Noise:
         return np.asarray(W, dtype=np.float64)
 
 
+    @property
+    def walks(self) -> bool:
+        """Whether the bias of some channel walks."""
+        return self._walking.size > 0
+
+    def walk_trace(self, time: Array, channel: int, low_rank: tuple[Array, Array]) -> float:
+        """Give tr(K (V^-1 + Q core Q')) for a walk of one channel, where no channel walks yet."""
+        trace = float(np.cumsum(steps(time)) @ self.W[:, channel, channel])
+        for Q, core in (*self._low_rank, low_rank):
+            own = Q[:, channel]
+            trace += float(np.vdot(core, own.T @ walk_times(time, own)))
+        return trace
+
+
 def inverse_blocks(diagonal: Array, above: Array) -> tuple[Array, Array]:
     """Invert a symmetric block-tridiagonal matrix as far as its own blocks: diagonal (n, k, k), above it (n-1, k, k).
 

@@ -125,7 +125,7 @@ def problem(rng: np.random.Generator, n: int, components: tuple[Component, ...],
 def test_slope_and_curvature_are_those_of_the_restricted_likelihood(components: tuple[Component, ...]) -> None:
     rng = np.random.default_rng(5)
     p = problem(rng, N, ALL, THETA)
-    slope, information = _score(p, point(p, components, THETA))
+    slope, information = _score(p, point(p, components, THETA), components, THETA)
     h = 1e-4
     for k in range(len(components)):
         up, down = (point(p, components, THETA * np.exp(s * h * np.eye(len(components))[k])).loglik for s in (1, -1))
