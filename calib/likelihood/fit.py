@@ -380,7 +380,7 @@ class _Problem:
             return False
         share = chi2_cdf(6, np.sort(distances))
         apart = float(np.abs(share - (np.arange(self.n) + 0.5) / self.n).max())
-        return apart < np.sqrt(np.log(2 / SUSPICIOUS) / (2 * self.n))
+        return apart < float(np.sqrt(np.log(2 / SUSPICIOUS) / (2 * self.n)))
 
     def _stand_out(self, distances: Array) -> bool:
         """Whether poses stand out, or so many of them that none does."""

@@ -226,7 +226,7 @@ def _score(problem: Linearised, at: Point, components: Sequence[Component], thet
                         others += value * np.vdot(of_all[other][:, own], PT[other][:, own])
                 trace = (kept * len(own) - float(others)) / variance
             else:
-                trace = sum(noise.walk_trace(problem.time, channel, (WJ, -C)) for channel in own)
+                trace = noise.walk_trace(problem.time, own, (WJ, -C))
             Vu.append(variance * share * walk_times(problem.time, u))
         slope.append(variance * (square - trace) / 2)
     X = np.stack(Vu, axis=-1)
