@@ -1,97 +1,16 @@
-"""The interface of a fit that can be assessed, and leave-one-out cross-validation of independent poses."""
+"""What can be assessed: a fit, or estimates of another method with leave-one-out cross-validation of its poses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
 from calib.likelihood.descent import column_scale
-from calib.likelihood.gain_and_cross_talk import Response
+from calib.likelihood.fit import Fit
 from calib.likelihood.session_noise import Noise, summed_products
 from calib.likelihood.variance_components import left_out
 from calib.model import Array, Parameters, jacobian, predict
-
-
-class BiasDrift(Protocol):
-    """Change of the bias during the tour."""
-
-    @property
-    def change(self) -> Array:
-        """(6,) from the first pose to the last."""
-
-    @property
-    def sigma(self) -> Array:
-        """(6,) standard deviation of that."""
-
-
-class AssessedFit(Protocol):
-    """Estimates and how they fit. Rejected poses count only in arrays with n rows."""
-
-    @property
-    def parameters(self) -> Parameters:
-        """Estimates."""
-
-    @property
-    def covariance(self) -> Array:
-        """(15, 15) of the error coordinates; zero along what is exactly known."""
-
-    @property
-    def R_base_flange(self) -> Array:
-        """(n, 3, 3)."""
-
-    @property
-    def wrench(self) -> Array:
-        """(n, 6) N and N·m, as measured."""
-
-    @property
-    def weights(self) -> Array:
-        """(n,) 1 = used, 0 = rejected because it does not fit the others."""
-
-    @property
-    def chi2(self) -> float:
-        """Residuals squared, weighted by the noise model."""
-
-    @property
-    def dof(self) -> int:
-        """Of chi2."""
-
-    @property
-    def measured_chi2(self) -> float:
-        """Weighted by the measured noise alone; NaN if the noise was not measured."""
-
-    @property
-    def second_basin_chi2(self) -> float | None:
-        """Increase of chi2 at the best other solution; None if there is none."""
-
-    @property
-    def components(self) -> Mapping[str, float]:
-        """Standard deviations of the variance components beyond the measured noise, by name with unit."""
-
-    @property
-    def drift(self) -> BiasDrift | None:
-        """Drift of the bias; None if none was found."""
-
-    @property
-    def response(self) -> Response | None:
-        """Gain and cross-talk of the sensor; None if none were found."""
-
-    @property
-    def gain_sigma(self) -> float:
-        """Standard deviation of the gain entries that the data do not exclude."""
-
-    @property
-    def residuals(self) -> Array:
-        """(n, 6) measured minus predicted."""
-
-    @property
-    def left_out_residuals(self) -> Array:
-        """(n, 6) measured minus what all other poses predict."""
-
-    @property
-    def left_out_cov(self) -> Array:
-        """(n, 6, 6) covariance of these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +28,8 @@ class IndependentFit:
     weights: Array
     second_basin_chi2: float | None = None
     components: Mapping[str, float] = field(default_factory=dict)
-    response: Response | None = None
-    drift: BiasDrift | None = None
+    response: None = None
+    drift: None = None
     gain_sigma: float = 0.0
 
     @cached_property
@@ -153,6 +72,10 @@ class IndependentFit:
         scale = column_scale(information)
         C = np.asarray(np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)) / np.outer(scale, scale)
         return left_out(noise, WJ, noise.solve(self.residuals[..., None])[..., 0], C)
+
+
+AssessedFit = Fit | IndependentFit
+"""Rejected poses count only in arrays with n rows."""
 
 
 def standardized(residuals: Array, covariance: Array) -> Array:

@@ -96,7 +96,7 @@ def assess(
     free = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
     rank = 15 - int(free.sum())
     condition = float(eigenvalues[-1] / eigenvalues[0]) if rank == 15 else float("inf")
-    gap = second_basin_gap(R_base_flange, parameters)
+    gap = second_minimum(R_base_flange, parameters)[0]
     found = Observability(different_orientations(R_base_flange), rank, condition, (), (), np.zeros((0, 3, 3)), gap)
     if found.sound:
         return found
@@ -169,17 +169,12 @@ def scaled_information(
     return np.asarray(J.T @ J)
 
 
-def second_basin_gap(R_base_flange: Array, parameters: Parameters = NOMINAL) -> float:
-    """Mean squared force residual, over the squared weight, of the best solution with another mounting of the sensor.
+def second_minimum(R_base_flange: Array, parameters: Parameters = NOMINAL) -> tuple[float, Minimum | None]:
+    """Mean squared force residual, over the squared weight, of the best solution with another mounting; also that one.
 
     Without noise and from forces alone, because torques rarely decide. With white force noise sigma the wrong solution
-    of n poses is worse by n (weight / sigma)² times the gap. Infinite if there is no other minimum.
+    of n poses is worse by n (weight / sigma)² times the gap. Infinite and None if there is no other minimum.
     """
-    return second_minimum(R_base_flange, parameters)[0]
-
-
-def second_minimum(R_base_flange: Array, parameters: Parameters) -> tuple[float, Minimum | None]:
-    """Return the gap of `second_basin_gap` and the best solution with another mounting of the sensor, None if none."""
     force_N = gravity_wrench(parameters, R_base_flange)[:, :3]
     found = minima(force_cost(R_base_flange, force_N, np.ones(len(force_N))))
     others = (m for m in found if angle_between(m.R.T, parameters.R_flange_sensor) > _SAME_MINIMUM_RAD)

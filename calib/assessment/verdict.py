@@ -11,10 +11,11 @@ from scipy.special import chdtrc as chi2_sf
 from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtr as normal_cdf
 
-from calib.assessment.cross_validation import AssessedFit, BiasDrift, standardized
+from calib.assessment.cross_validation import AssessedFit, standardized
 from calib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, torque_units
 from calib.assessment.load_shift import lasting_change
 from calib.assessment.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
+from calib.likelihood.fit import DriftEstimate
 from calib.likelihood.gain_and_cross_talk import Response, predicted_covariance
 from calib.model import PARAMETER_NAMES, UP_IN_BASE, Array, Parameters
 from calib.published.yu import SPECIAL_R_flange_base
@@ -294,7 +295,7 @@ def _drift_share(change: Array, weight_N: float) -> float:
     return float(max(sizes) / weight_N) if weight_N else float("inf")
 
 
-def _drift_reasons(drift: BiasDrift | None) -> list[str]:
+def _drift_reasons(drift: DriftEstimate | None) -> list[str]:
     if drift is None or not (np.abs(drift.change) > 3 * drift.sigma).any():
         return []
     force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])

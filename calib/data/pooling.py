@@ -30,11 +30,12 @@ def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
     known = n_samples > 1
     if known.sum() < 2:
         return wrench_cov
-    S, freedom = wrench_cov[known], n_samples[known] - 1.0
+    S = (wrench_cov if known.all() else wrench_cov[known]).reshape(-1, 36)
+    freedom = n_samples[known] - 1.0
     size = np.ones(len(S))
     for _ in range(8):
-        shape = np.average(S / size[:, None, None], axis=0, weights=freedom)
-        before, size = size, np.einsum("ij,nji->n", np.linalg.inv(shape), S) / 6
+        shape = ((freedom / size) @ S / freedom.sum()).reshape(6, 6)
+        before, size = size, S @ np.linalg.inv(shape).ravel() / 6
         if np.abs(size - before).max() <= 1e-12 * size.max():
             break
     # Equal sizes scatter by 2 / (6 freedom) in the logarithm: remove that share.
@@ -43,7 +44,10 @@ def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
     mean = float(np.average(log_size, weights=freedom))
     real = max(float(np.average((log_size - mean) ** 2 - scatter, weights=freedom)), 0.0)
     size = np.exp(mean + (log_size - mean) * real / (real + scatter))
-    own = (freedom / (freedom + TRUSTED_SAMPLES))[:, None, None]
-    pooled = wrench_cov.copy()
-    pooled[known] = own * S + (1 - own) * size[:, None, None] * shape
+    own, common = np.ones(len(known)), np.zeros(len(known))
+    own[known] = freedom / (freedom + TRUSTED_SAMPLES)
+    common[known] = (1 - own[known]) * size
+    pooled = own[:, None, None] * wrench_cov
+    for i, j in np.ndindex(6, 6):  # without a second array of that size
+        pooled[:, i, j] += common * shape[i, j]
     return pooled

@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtr as chi2_cdf
 from scipy.special import chdtri as chi2_isf
 from scipy.special import fdtri as f_ppf
 
@@ -59,6 +60,7 @@ FEW_POSES_WITHOUT_NOISE = 12  # fewer cannot separate drift from unknown noise
 POSES_FOR_EACH_AXIS = 50  # fewer cannot separate the drifts of the axes of a group
 MANY_POSES = 20_000  # from here on single poses are looked at only when chi2 or `drift` asks for it
 FLOOR = 1e-3  # of the residuals: the least white noise where it was not measured
+POSES_FOR_THE_SHAPE = 500  # fewer do not show that poses are bumped by the shape of the distribution
 SUSPICIOUS = 0.01  # p-value below which more than the measured noise is looked for
 LIGHT_TAIL = 0.6  # the median of squared distances relative to their mean, in units of what Gaussian noise has
 ROUNDS = 12  # of the outer loop; it ends after two or three
@@ -372,6 +374,14 @@ class _Problem:
                     found.append(self._explained(*robust))
         return found
 
+    def _are_gaussian(self, distances: Array) -> bool:
+        """Whether so many poses are distributed as the noise alone would have them (Kolmogorov and Smirnov)."""
+        if self.n < POSES_FOR_THE_SHAPE or self._stand_out(distances):
+            return False
+        share = chi2_cdf(6, np.sort(distances))
+        apart = float(np.abs(share - (np.arange(self.n) + 0.5) / self.n).max())
+        return apart < float(np.sqrt(np.log(2 / SUSPICIOUS) / (2 * self.n)))
+
     def _stand_out(self, distances: Array) -> bool:
         """Whether poses stand out, or so many of them that none does."""
         if self.n < FEWEST_TO_REJECT_FROM:
@@ -419,6 +429,8 @@ class _Problem:
             criterion = self._criterion(at, distances)
             if criterion > best.criterion - 1e-3:
                 break
+            if kept.all() and self._are_gaussian(distances):
+                return _Explanation(p, kept, at.components, at.theta, criterion)
             noise_found = {c.kind for c in at.components[len(always) :]} - {"walk", "slope"}
             noticed = self.n >= FEWEST_TO_REJECT_FROM and (bool(noise_found) or self._stand_out(distances))
             best = _Explanation(p, kept, at.components, at.theta, criterion, noticed)

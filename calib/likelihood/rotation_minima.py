@@ -10,9 +10,7 @@ that no rotation costs less.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from calib.errors import BadDataset
 from calib.model import Array
 
 _CHUNK = 4096
@@ -56,11 +54,6 @@ def force_cost(R_base_flange: Array, force_N: Array, weights: Array, *, with_bia
         `min sum(w * |force - R_flange_sensor.T @ R_base_flange.T @ gravity - bias|**2)` over gravity and bias; exactly
         so for scalar weights.
 
-    Raises
-    ------
-    BadDataset
-        If shapes disagree, a value is not finite, or the weights are negative or all zero.
-
     Notes
     -----
     Yu et al. eliminate the same unknowns in eq. (32) (their `H.T @ H`, with r transposed), but minimise over the sphere
@@ -99,11 +92,6 @@ def given_rotation(
         Weight of what hangs on the sensor, base frame. The shortest one, if the poses do not determine it.
     force_bias_N : (3,)
         Sensor frame; zero without bias.
-
-    Raises
-    ------
-    BadDataset
-        As in `force_cost`.
     """
     gram, offset = _centred_gram(R_base_flange, force_N, weights, with_bias=with_bias)
     _, gravity_square, gravity_force = _blocks(gram, with_bias=with_bias)
@@ -193,24 +181,6 @@ def certificate(Q: Array, R: Array) -> float:
 # The data
 
 
-def _checked(R_base_flange: ArrayLike, force_N: ArrayLike, weights: ArrayLike) -> tuple[Array, Array, Array]:
-    """Rows, force and scalar weights as float64, or the reason why not."""
-    R, force, w = (np.asarray(x, dtype=np.float64) for x in (R_base_flange, force_N, weights))
-    n = len(force)
-    if R.shape != (n, 3, 3) or force.shape != (n, 3) or w.shape not in {(n,), (n, 3, 3)}:
-        raise BadDataset(
-            f"orientations {R.shape}, forces {force.shape} and weights {w.shape} must be (n, 3, 3), (n, 3) and (n,) or "
-            "(n, 3, 3): give one of each for every pose"
-        )
-    if w.ndim == 3:
-        w = np.trace(w, axis1=1, axis2=2) / 3
-    if not (w.min(initial=0) >= 0 and 0 < w.sum() < np.inf):
-        raise BadDataset(
-            f"weights from {w.min(initial=0):g} to {w.max(initial=0):g}: they must be finite, >= 0, some > 0"
-        )
-    return R, force, w
-
-
 def _gram(R_base_flange: Array, force_N: Array, weights: Array, offset: Array) -> Array:
     """Weighted sum of `row.T @ row` for rows less an offset, in chunks."""
     gram = np.zeros((13, 13))
@@ -219,24 +189,20 @@ def _gram(R_base_flange: Array, force_N: Array, weights: Array, offset: Array) -
         rows = np.column_stack((force_N[part], R_base_flange[part].reshape(-1, 9), np.ones(len(weights[part]))))
         rows -= offset
         gram += (rows * weights[part, None]).T @ rows
-    if not np.isfinite(gram).all():
-        bad = np.flatnonzero(~(np.isfinite(R_base_flange).all((1, 2)) & np.isfinite(force_N).all(1)))
-        raise BadDataset(f"rows {bad[:5].tolist()} of {len(force_N)} hold values that are not finite: leave them out")
     return gram
 
 
-def _centred_gram(
-    R_base_flange: ArrayLike, force_N: ArrayLike, weights: ArrayLike, *, with_bias: bool
-) -> tuple[Array, Array]:
+def _centred_gram(R: Array, force_N: Array, weights: Array, *, with_bias: bool) -> tuple[Array, Array]:
     """Gram matrix of the rows less their mean over the first chunk, and that mean.
 
     A bias takes up any constant, so this changes no result and keeps all digits when the bias is large.
     """
-    R, force, w = _checked(R_base_flange, force_N, weights)
+    if weights.ndim == 3:
+        weights = np.trace(weights, axis1=1, axis2=2) / 3
     offset = np.zeros(13)
     if with_bias:
-        offset[:3], offset[3:12] = force[:_CHUNK].mean(0), R[:_CHUNK].mean(0).ravel()
-    return _gram(R, force, w, offset), offset
+        offset[:3], offset[3:12] = force_N[:_CHUNK].mean(0), R[:_CHUNK].mean(0).ravel()
+    return _gram(R, force_N, weights, offset), offset
 
 
 def _blocks(gram: Array, *, with_bias: bool) -> tuple[Array, Array, Array]:

@@ -146,6 +146,18 @@ class Noise:
             W = W + Q @ core @ _transposed(Q)
         return np.asarray(W, dtype=np.float64)
 
+    @property
+    def walks(self) -> bool:
+        """Whether the bias of some channel walks."""
+        return self._walking.size > 0
+
+    def walk_trace(self, time: Array, channels: NDArray[np.intp], low_rank: tuple[Array, Array]) -> float:
+        """Give tr(K (V^-1 + Q core Q')) for walks of these channels, where none walks yet."""
+        trace = float(np.cumsum(steps(time)) @ self.W[:, channels, channels].sum(axis=1))
+        for Q, core in (*self._low_rank, low_rank):
+            trace += sum(float(np.vdot(core, Q[:, c].T @ walk_times(time, Q[:, c]))) for c in channels)
+        return trace
+
 
 def inverse_blocks(diagonal: Array, above: Array) -> tuple[Array, Array]:
     """Invert a symmetric block-tridiagonal matrix as far as its own blocks: diagonal (n, k, k), above it (n-1, k, k).

@@ -187,41 +187,48 @@ def noise_of(problem: Linearised, components: Sequence[Component], theta: Array)
     return Noise(D, problem.time, np.sqrt(walk), slope, together, problem.kept)
 
 
-def _score(problem: Linearised, at: Point) -> tuple[Array, Array]:
-    """Derivative (k,) of the restricted log-likelihood by the log variances, and average information (k, k)."""
+def _score(problem: Linearised, at: Point, components: Sequence[Component], theta: Array) -> tuple[Array, Array]:
+    """Derivative (k,) of the restricted log-likelihood by the log variances, and average information (k, k).
+
+    The noise at this point need not contain all of the components: for the others it is the derivative at zero, times
+    `theta`.
+    """
     u, WJ, C, noise = at.u, at.WJ, at.C, at.noise
     WJC = WJ @ C
     P = noise.blocks - WJC @ np.swapaxes(WJ, 1, 2)
-    of_all = {c: T for c in at.components if (T := problem.columns(c)) is not None}
+    of_all = {c: T for c in components if (T := problem.columns(c)) is not None}
     PT = {c: noise.solve(T) - WJC @ summed_products(WJ, T) for c, T in of_all.items()}
     kept = int(problem.kept.sum())
     slope, Vu = [], []
-    for c, theta in zip(at.components, at.theta, strict=True):
+    for c, variance in zip(components, theta, strict=True):
         share = np.array(c.share)
         if c in of_all:
             T = of_all[c]
             along = np.tensordot(u, T, 2)
             square, trace = float(along @ along), float(np.vdot(T, PT[c]))
-            Vu.append(theta * (T @ along))
+            Vu.append(variance * (T @ along))
         elif c.kind == "white":
             square, trace = float((u**2).sum(axis=0) @ share), float(np.einsum("ncc,c->", P, share))
-            Vu.append(theta * share * u)
+            Vu.append(variance * share * u)
         elif c.kind == "rotation":
             turned = (u[:, None] @ problem.turn)[:, 0]
             square, trace = float((turned**2).sum()), float(np.vdot(problem.turn, P @ problem.turn))
-            Vu.append(theta * (problem.turn @ turned[..., None])[..., 0])
+            Vu.append(variance * (problem.turn @ turned[..., None])[..., 0])
         else:
             square = float(walk_square(problem.time, u) @ share)
-            # K P = (V - D - effects) P, and V P = 1 - J C J' W.
             own = np.flatnonzero(share)
-            others = np.einsum("nck,nck->", problem.J[:, own], WJC[:, own])
-            others += np.einsum("ncd,ndc->", noise.D[:, own], P[:, :, own])
-            for other, value in zip(at.components, at.theta, strict=True):
-                if other in of_all:
-                    others += value * np.vdot(of_all[other][:, own], PT[other][:, own])
-            trace = (kept * len(own) - float(others)) / theta
-            Vu.append(theta * share * walk_times(problem.time, u))
-        slope.append(theta * (square - trace) / 2)
+            if c in at.components:
+                # K P = (V - D - effects) P, and V P = 1 - J C J' W.
+                others = np.einsum("nck,nck->", problem.J[:, own], WJC[:, own])
+                others += np.einsum("ncd,ndc->", noise.D[:, own], P[:, :, own])
+                for other, value in zip(components, theta, strict=True):
+                    if other in of_all:
+                        others += value * np.vdot(of_all[other][:, own], PT[other][:, own])
+                trace = (kept * len(own) - float(others)) / variance
+            else:
+                trace = noise.walk_trace(problem.time, own, (WJ, -C))
+            Vu.append(variance * share * walk_times(problem.time, u))
+        slope.append(variance * (square - trace) / 2)
     X = np.stack(Vu, axis=-1)
     WX = noise.solve(X)
     JWX = summed_products(WJ, X)
@@ -238,7 +245,7 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array)
     least = np.minimum(1e-3 * NEGLIGIBLE * np.array([_unit(problem, best, c) for c in components]), most)
     caution = 1e-3
     for _ in range(60):
-        slope, information = _score(problem, best)
+        slope, information = _score(problem, best, best.components, best.theta)
         gained = 0.0
         while caution < 1e6:
             damped = information + np.diag(caution * (np.diag(information) + 1e-3))
@@ -334,8 +341,9 @@ def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
 def predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Component]) -> tuple[Array, Array]:
     """Gain in log-likelihood that each candidate alone promises, and where to start climbing."""
     unit = np.array([_unit(problem, best, c) for c in waiting])
-    at = point(problem, [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * unit]))
-    slope, information = _score(problem, at)
+    components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * unit])
+    at = point(problem, components, theta) if best.noise.walks else best
+    slope, information = _score(problem, at, components, theta)
     k = len(best.components)
     curvature, slope_k = np.diag(information)[k:], slope[k:]
     if k:

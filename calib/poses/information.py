@@ -7,11 +7,9 @@ those that an arm can reach.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from calib.assessment.observability import second_minimum
 from calib.likelihood.rotation_minima import given_rotation
@@ -25,36 +23,8 @@ TOOL_DOWN_R_base_flange = np.diag([1.0, -1.0, -1.0])
 
 T12 = (1, 2, 5, 6, 11, 12, 15, 16, 17, 18, 21, 22)
 """Numbers of the tetrahedral subgroup of the paper's 24 orientations: per pose as good as all 24, for every tool."""
-SUBSET_12 = (2, 4, 5, 7, 10, 12, 13, 15, 18, 20, 21, 23)
-"""A-optimal for the forces; with torques 0.96 to 1 of `T12`, depending on the centre of mass."""
-SUBSET_8 = (2, 3, 6, 8, 17, 19, 22, 23)
-"""The best eight of the 24: second-basin gap 0.5."""
 SUBSET_6 = (9, 10, 16, 19, 21, 22)
-"""Nearly the best six of the 24 that have one solution, second-basin gap 0.28; `optimised(6)` is better."""
-AMBIGUOUS_6 = (4, 6, 9, 15, 18, 23)
-"""A-optimal for the forces, but another mounting of the sensor explains them exactly (gap 0): do not use."""
-
-# Found by tests/benchmarks/design_table.py --optimise; rotation vectors in rad of R_base_flange, tool down first.
-_OPTIMISED: Mapping[int, tuple[tuple[float, float, float], ...]] = {
-    6: (
-        (3.141593, 0.000000, 0.000000),
-        (-0.435672, 1.905989, -1.760305),
-        (-1.130622, -1.904908, -1.547113),
-        (0.914169, -0.138790, -1.156033),
-        (-0.774574, 1.437738, 1.067425),
-        (0.000059, -0.860257, 1.088217),
-    ),
-    8: (
-        (3.141593, 0.000000, 0.000000),
-        (0.001302, 3.140850, -0.006137),
-        (1.010150, -0.991248, 1.652328),
-        (-1.184080, 0.401703, 0.653962),
-        (0.490081, 1.439710, -2.023385),
-        (0.793096, -1.522294, -2.392674),
-        (1.096127, 0.574306, 0.209976),
-        (-0.909292, -0.925868, -1.044533),
-    ),
-}
+"""Nearly the best six of the 24 that have one solution, second-basin gap 0.28."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,36 +99,12 @@ class Prediction:
     cond_u1: float
     """Condition of gravity directions beside a constant, which LROM needs: 1.7 at best, above 8 fair, above 25 poor."""
     second_basin_gap: float
-    """See `second_basin_gap`."""
-
-
-class Efficiency(NamedTuple):
-    """Information per pose relative to the 24 special orientations: 1 is the best possible."""
-
-    D: float
-    """From the determinant of the information, per parameter."""
-    A: float
-    """From the trace of the covariance in the units of `Guess.scale`."""
-    I_F: float
-    """From the mean square error of force compensation over all orientations."""
-    I_T: float
-    """The same of torque."""
+    """See `second_basin`."""
 
 
 def special(numbers: Sequence[int]) -> Array:
     """Return the orientations R_base_flange (n, 3, 3) with these numbers, 1 to 24, of the paper (Yu, eq. 14)."""
     return np.swapaxes(SPECIAL_R_flange_base[np.asarray(numbers) - 1], 1, 2)
-
-
-def optimised(n: int) -> Array:
-    """Return n orientations R_base_flange (n, 3, 3), n = 6 or 8, nearly as good per pose as the special 24.
-
-    They have the least mean inverse efficiency for centres of mass in all directions. The first has the tool straight
-    down. A turn of the whole set about the vertical, or by one rotation of the flange, keeps its information.
-    """
-    if n not in _OPTIMISED:
-        raise ValueError(f"there is no stored set of {n} poses: take {' or '.join(map(str, _OPTIMISED))}, or `choose`")
-    return Rotation.from_rotvec(_OPTIMISED[n]).as_matrix()
 
 
 def whitened_jacobian(R_base_flange: Array, guess: Guess) -> Array:
@@ -232,31 +178,8 @@ def predicted_sigma(R_base_flange: Array, guess: Guess, t_s: ArrayLike | None = 
         torque_rms_Nm=float(np.sqrt(torque)),
         cond9=_condition(force_rows(R_base_flange, guess).reshape(-1, 9)),
         cond_u1=_condition(np.column_stack([u, np.ones(len(u))])),
-        second_basin_gap=second_basin_gap(R_base_flange, guess),
+        second_basin_gap=second_basin(R_base_flange, guess)[0],
     )
-
-
-def efficiency(R_base_flange: Array, guess: Guess) -> Efficiency:
-    """Compare the information per pose with that of the 24 special orientations.
-
-    Parameters
-    ----------
-    R_base_flange : array, shape (n, 3, 3)
-        A set that determines all parameters.
-    guess : Guess
-        Only the ratio of its torque and force noise matters.
-    """
-    own, best = (_per_pose(R, guess) for R in (np.asarray(R_base_flange, dtype=np.float64), special(range(1, 25))))
-    return Efficiency(*(b / o for o, b in zip(own, best, strict=True)))
-
-
-def _per_pose(R_base_flange: Array, guess: Guess) -> tuple[float, float, float, float]:
-    """Variances whose inverses are D, A, I_F and I_T, for the information of one average pose."""
-    J = whitened_jacobian(R_base_flange, guess)
-    covariance = np.linalg.inv(np.einsum("nki,nkj->ij", J, J) / len(J))
-    _, log_det = np.linalg.slogdet(covariance)
-    force, torque = (float(np.sum(covariance * M)) for M in prediction_weights(special(range(1, 25)), guess))
-    return float(np.exp(log_det / 15)), float(np.trace(covariance)), force, torque
 
 
 def prediction_weights(R_base_flange: Array, guess: Guess) -> tuple[Array, Array]:
@@ -269,19 +192,14 @@ def prediction_weights(R_base_flange: Array, guess: Guess) -> tuple[Array, Array
     return force, torque
 
 
-def second_basin_gap(R_base_flange: Array, guess: Guess) -> float:
-    """Compute the separation of the true mounting from the best other one by the forces.
+def second_basin(R_base_flange: Array, guess: Guess) -> tuple[float, Parameters | None]:
+    """Compute the separation of the true mounting from the best other one by the forces; also that solution or None.
 
     The gap is the lowest residual sum of squares of a second minimum over the rotations, fitted to exact forces of the
     guessed tool and divided by n weight². It is 8/9 for the special 24, weak below 0.05, and 0 if exactly
     ambiguous (all tool axes at one angle to the vertical, or too few poses). The chi2 of the
     second solution is larger by gap n (weight / sigma_force_N)².
     """
-    return second_basin(R_base_flange, guess)[0]
-
-
-def second_basin(R_base_flange: Array, guess: Guess) -> tuple[float, Parameters | None]:
-    """Return the gap of `second_basin_gap` and the other solution or None."""
     if len(R_base_flange) < 3:
         return 0.0, None  # the solutions form a continuum
     gap, other = second_minimum(R_base_flange, guess.parameters)

@@ -94,7 +94,7 @@ def choose(
     R_workspace : array, shape (k, 3, 3), optional
         Orientations for the compensation, all by default. Only for "prediction".
     least_gap : float
-        Smallest gap to the second solution (`second_basin_gap`): poses that contradict that solution are added until
+        Smallest gap to the second solution (`second_basin`): poses that contradict that solution are added until
         it is reached. If a narrow cone cannot reach it, the set with the widest gap is returned.
 
     Returns
@@ -144,7 +144,7 @@ def next_pose(
     R_workspace : array, shape (k, 3, 3), optional
         Orientations for the compensation, all by default.
     least_gap : float
-        From this gap on (`second_basin_gap`), the second solution is ignored.
+        From this gap on (`second_basin`), the second solution is ignored.
 
     Returns
     -------

@@ -156,8 +156,8 @@ def nullspace(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
     """Unknown gravity by the nullspace method (section 3.2) in O(n).
 
     The sum of squares over all pairwise differences is exactly n times `|(I - D D^+) F r|^2`, so the least singular
-    vector of `(I - D D^+) F` is the solution of `nullspace_all_pairs` without its n^2 blocks. With bias it is the LROM
-    of Yu et al. Consistent for isotropic noise.
+    vector of `(I - D D^+) F` is the published solution (eqs. 22-26) without its n^2 blocks. With bias it is the LROM of
+    Yu et al. Consistent for isotropic noise.
 
     Parameters
     ----------
@@ -171,32 +171,6 @@ def nullspace(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
     """
     eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the nullspace method")
     return _fit_vec(eq, _least_singular_vector(eq.D, eq.F))
-
-
-def nullspace_all_pairs(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
-    """Unknown gravity by the nullspace method as published, with all pairwise differences (eqs. 22-26, section 5).
-
-    Needs O(n^2) memory and time: for comparison with `nullspace`, which is equal. A must be base to flange in eq. 22
-    (the text says the opposite). With bias the constant h enters the differences as
-    `(A_k A_i^T F_i - F_k) r = (A_k A_i^T - I) h` and is eliminated by least squares.
-
-    Parameters
-    ----------
-    R_base_flange, force_N, bias
-        As in `eigen`.
-
-    Raises
-    ------
-    NotObservable
-        As in `eigen`.
-    """
-    eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the nullspace method")
-    i, k = np.triu_indices(len(force_N), 1)
-    A_k_i = R_base_flange[k].transpose(0, 2, 1) @ R_base_flange[i]
-    F = kron_identity(force_N).reshape(-1, 3, 9)
-    differences = (A_k_i @ F[i] - F[k]).reshape(-1, 9)
-    h_columns = (A_k_i - np.eye(3)).reshape(-1, 3) if bias else np.empty((len(differences), 0))
-    return _fit_vec(eq, _least_singular_vector(h_columns, differences))
 
 
 def iterative(

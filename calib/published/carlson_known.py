@@ -1,4 +1,4 @@
-"""Carlson's methods for a known gravity vector, from forces alone, and Umeyama's solution of the same problem.
+"""Carlson's methods for a known gravity vector, from forces alone.
 
 F. Bagge Carlson, "On the Calibration of Force/Torque Sensors in Robotics", 2019, section 2. Letters and the two forms,
 without and with a bias, are those of `calib.published.carlson`. A bias has the same effect on the form without bias
@@ -12,13 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import BadDataset, NotObservable
 from calib.model import Array, nearest_rotation, skew
-from calib.published.carlson import (
-    ForceEquations,
-    ForceFit,
-    force_equations,
-    require_weight,
-    spanned_dimensions,
-)
+from calib.published.carlson import ForceEquations, ForceFit, force_equations, require_weight, spanned_dimensions
 
 
 def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Array, *, bias: bool) -> ForceFit:
@@ -27,7 +21,7 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     The linear unknown is the matrix `X / weight`, nine free numbers, with `(X / weight) f_i = A_i d`. (Eq. 3 calls it
     mR; it is (1/m) R_TF^S, and R_TF^S is the inverse of the R_S^TF of eq. 1.) The noise of the regressor f shrinks it
     by a symmetric factor, which the projection on SO(3) removes; the weight is then the least-squares one given X.
-    Consistent, but `similarity` is better if the tool cannot be turned in all directions.
+    Consistent, but not efficient if the tool cannot be turned in all directions.
 
     Parameters
     ----------
@@ -48,7 +42,8 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     """
     eq, down = _equations(R_base_flange, force_N, gravity_direction_base, 3, bias=bias, method="the relaxation")
     a = eq.A @ down
-    return _with_weight(eq, down, nearest_rotation(np.asarray(np.linalg.lstsq(eq.f, a)[0], dtype=np.float64)))
+    R_sensor_flange = nearest_rotation(np.asarray(np.linalg.lstsq(eq.f, a)[0], dtype=np.float64))
+    return eq.fit(R_sensor_flange.T, _weight(eq.f, a, R_sensor_flange) * down)
 
 
 def cayley(
@@ -59,7 +54,7 @@ def cayley(
     The transform fails for rotations by 180 deg and is poor near them, so it is applied after each of four turns of
     the flange axes (by 0, and by 180 deg about x, y and z) and the best fit is kept; `cayley_rotation` is the published
     one. An error of the weight goes into the rotation: 10 % leave |dR|_F^2 at 1e-5 however small the noise.
-    `relaxation` and `similarity` need no weight.
+    `relaxation` needs no weight.
 
     Parameters
     ----------
@@ -117,32 +112,6 @@ def cayley_rotation(f: Array, a: Array, *, total: bool) -> Array:
     return Rotation.from_quat([*-s[:3], s[3]]).as_matrix()
 
 
-def similarity(R_base_flange: Array, force_N: Array, gravity_direction_base: Array, *, bias: bool) -> ForceFit:
-    """Weight and rotation, gravity known in direction, as the similarity between the directions `A_i d` and forces f_i.
-
-    S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE PAMI 13(4),
-    1991, eqs. 39-42. Not in Carlson's paper and better: the exact least-squares solution for rotation, weight and bias.
-    With the tool within 40 deg of straight down its mean square error of R is the smallest possible (0.95-1.02 times
-    the bound), that of `relaxation` 4 to 6 times as large, and that of the total least squares with a bias column in
-    Carlson's Robotlib 6 to 4000 times, depending on the configured mass and the size of the bias.
-
-    Parameters
-    ----------
-    R_base_flange, force_N, gravity_direction_base, bias
-        As in `relaxation`.
-
-    Raises
-    ------
-    NotObservable
-        Fewer than 2 poses (3 with bias), or gravity that changes along one flange axis only.
-    BadDataset
-        The forces point against the given gravity.
-    """
-    method = "the similarity solution"
-    eq, down = _equations(R_base_flange, force_N, gravity_direction_base, 2, bias=bias, method=method)
-    return _with_weight(eq, down, nearest_rotation(eq.f.T @ (eq.A @ down)))
-
-
 def _equations(
     R_base_flange: Array, force_N: Array, gravity_base: Array, needed: int, *, bias: bool, method: str
 ) -> tuple[ForceEquations, Array]:
@@ -164,10 +133,6 @@ def _equations(
     require_weight(eq)
     _require_pull_downwards(eq.f, eq.A @ down)
     return eq, down
-
-
-def _with_weight(eq: ForceEquations, down: Array, R_sensor_flange: Array) -> ForceFit:
-    return eq.fit(R_sensor_flange.T, _weight(eq.f, eq.A @ down, R_sensor_flange) * down)
 
 
 def _weight(f: Array, a: Array, R_sensor_flange: Array) -> float:

@@ -30,12 +30,12 @@ from calib.known import Known
 from calib.likelihood import fit as likelihood
 from calib.likelihood import rotation_minima
 from calib.model import UP_IN_BASE, Array
-from calib.poses.information import optimised
 from calib.published.methods import published
 from calib.published.yu import SPECIAL_R_flange_base, lrom, srom
 from tests.benchmarks import carlson_figures, speed
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.scenarios import Rng, Truth
+from tests.pose_sets import optimised
 
 GROSS_RAD = np.deg2rad(20.0)
 RANDOM_STARTS = 12

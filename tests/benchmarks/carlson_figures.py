@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.model import Array, nearest_rotation, skew
 from calib.published import carlson, carlson_known
+from tests import carlson_references
 
 FIG_1_SIGMA_N = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 FIG_1_CURVES = ("relaxation", "Cayley total", "Cayley ordinary", "Cayley total, 4 turns")
@@ -195,10 +196,10 @@ def report_bias(report: Report, quick: bool) -> None:
                 "iterative": carlson.iterative(R, force_N, bias=False),
                 "relaxation": carlson_known.relaxation(R, force_N, gravity, bias=False),
                 "Cayley": carlson_known.cayley(R, force_N, gravity, bias=False),
-                "similarity": carlson_known.similarity(R, force_N, gravity, bias=False),
+                "similarity": carlson_references.similarity(R, force_N, gravity, bias=False),
                 "eigendecomposition, with bias": carlson.eigen(R, force_N, bias=True),
                 "nullspace, with bias": carlson.nullspace(R, force_N, bias=True),
-                "similarity, with bias": carlson_known.similarity(R, force_N, gravity, bias=True),
+                "similarity, with bias": carlson_references.similarity(R, force_N, gravity, bias=True),
             }
             for name, fit in fits.items():
                 squares.setdefault(name, []).append(apart_deg(fit.R_flange_sensor, X) ** 2)
@@ -242,7 +243,7 @@ def report_known_direction(report: Report, quick: bool) -> None:
                 J = np.concatenate([skew(a), a[:, :, None]], axis=2).reshape(-1, 4)
                 bound += np.trace(np.linalg.inv(J.T @ J)[:3, :3]) * (20 / snr) ** 2
                 fits = (
-                    carlson_known.similarity(R, force_N, down, bias=True).R_flange_sensor,
+                    carlson_references.similarity(R, force_N, down, bias=True).R_flange_sensor,
                     carlson_known.relaxation(R, force_N, down, bias=True).R_flange_sensor,
                     total_least_squares(R, force_N, down),
                 )
@@ -257,14 +258,14 @@ def report_pairs(report: Report) -> None:
     X, R = Rotation.random(rng=rng).as_matrix(), Rotation.random(100, rng=rng).as_matrix()
     force_N = forces(X, R, np.array([0, 0, -20.0]), np.ones(3), 0.2, rng)
     seconds, rotation = {}, {}
-    for method in (carlson.nullspace, carlson.nullspace_all_pairs):
+    for method in (carlson.nullspace, carlson_references.nullspace_all_pairs):
         start = time.perf_counter()
         for _ in range(5):
             rotation[method] = method(R, force_N, bias=False).R_flange_sensor
         seconds[method] = (time.perf_counter() - start) / 5
-    slow, fast = seconds[carlson.nullspace_all_pairs], seconds[carlson.nullspace]
+    slow, fast = seconds[carlson_references.nullspace_all_pairs], seconds[carlson.nullspace]
     report.line(f"Nullspace, 100 poses: all pairs {1e3 * slow:.1f} ms, O(n) {1e3 * fast:.2f} ms")
-    apart = apart_deg(rotation[carlson.nullspace], rotation[carlson.nullspace_all_pairs])
+    apart = apart_deg(rotation[carlson.nullspace], rotation[carlson_references.nullspace_all_pairs])
     report.check("difference, deg", apart, 0, 1e-9)
 
 

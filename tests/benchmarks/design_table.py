@@ -14,22 +14,18 @@ from scipy.spatial.transform import Rotation
 
 from calib.model import Array
 from calib.poses.information import (
-    AMBIGUOUS_6,
     SUBSET_6,
-    SUBSET_8,
-    SUBSET_12,
     T12,
     Guess,
     TOOL_DOWN_R_base_flange,
-    efficiency,
-    optimised,
     predicted_sigma,
     prediction_weights,
-    second_basin_gap,
+    second_basin,
     special,
     whitened_jacobian,
 )
 from calib.poses.selection import choose, cone_candidates, next_pose, order
+from tests.pose_sets import AMBIGUOUS_6, SUBSET_8, SUBSET_12, efficiency, optimised
 
 GUESS = Guess(mass_kg=20 / 9.80665, sigma_force_N=0.2, sigma_torque_Nm=0.005)  # weight / sigma 100, lever 25 mm
 FORCES_ONLY = Guess(1.0, 0.05, 0.003, p_sensor_com_m=(0, 0, 0), tilt_alpha_rad=np.deg2rad(3))
@@ -90,7 +86,7 @@ def fixed_sets() -> None:
     for name, R in sets.items():
         e = efficiencies(R)
         mean, low = (" ".join(f"{x:.3f}" for x in row) for row in (e.mean(axis=0), e.min(axis=0)))
-        say(f"{name:12s} {len(R):2d} {mean} | {low} | {second_basin_gap(R, GUESS):.3f}")
+        say(f"{name:12s} {len(R):2d} {mean} | {low} | {second_basin(R, GUESS)[0]:.3f}")
 
 
 def cones() -> None:
@@ -135,7 +131,7 @@ def against_random() -> None:
                 R = candidates[chosen]
                 say(
                     f"{name:10s} n {n:2d}  gap >= {least_gap:.2f}: A x{efficiency(R, GUESS).A / A:.2f}  "
-                    f"I_F x{mse / (n * force_rms_N(R, R_workspace) ** 2):.2f}  gap {second_basin_gap(R, GUESS):.3f}  "
+                    f"I_F x{mse / (n * force_rms_N(R, R_workspace) ** 2):.2f}  gap {second_basin(R, GUESS)[0]:.3f}  "
                     f"{elapsed:.2f} s"
                 )
     say("\ngreedy next-best against random (median): force rms, N")

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from calib.errors import BadDataset
 from calib.likelihood import rotation_minima
 
 Array = NDArray[np.float64]
@@ -126,23 +125,6 @@ def test_undetermined_gravity_is_the_shortest() -> None:
     gravity, bias = rotation_minima.given_rotation(R, R_base_flange, force, np.ones(1))
     assert gravity == pytest.approx(np.zeros(3))
     assert bias == pytest.approx(force[0])
-
-
-@pytest.mark.parametrize(
-    ("poses", "force", "weights", "message"),
-    [
-        (np.zeros((3, 3)), np.zeros((3, 3)), np.ones(3), "must be"),
-        (CUBE[:5], np.zeros((4, 3)), np.ones(4), "must be"),
-        (CUBE[:2], np.zeros((2, 3)), np.ones(3), "must be"),
-        (CUBE[:2], np.array([[0, 0, 1.0], [0, np.nan, 0]]), np.ones(2), r"rows \[1\] of 2"),
-        (CUBE[:2], np.zeros((2, 3)), np.array([1, -1.0]), "weights from -1"),
-        (CUBE[:2], np.zeros((2, 3)), np.zeros(2), "some > 0"),
-        (CUBE[:2], np.zeros((2, 3)), np.array([1, np.nan]), "finite"),
-    ],
-)
-def test_bad_data_are_refused(poses: Array, force: Array, weights: Array, message: str) -> None:
-    with pytest.raises(BadDataset, match=message):
-        rotation_minima.force_cost(poses, force, weights)
 
 
 # The minima

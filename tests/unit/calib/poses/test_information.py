@@ -13,24 +13,19 @@ from calib import CalibrationDataset, solve
 from calib.errors import NotObservable
 from calib.model import Array, angle_between, jacobian, predict
 from calib.poses.information import (
-    AMBIGUOUS_6,
     SUBSET_6,
-    SUBSET_8,
-    SUBSET_12,
     T12,
     Guess,
     TOOL_DOWN_R_base_flange,
-    efficiency,
     information,
-    optimised,
     predicted_sigma,
     second_basin,
-    second_basin_gap,
     special,
     whitened_jacobian,
 )
 from calib.poses.selection import Criterion, choose, cone_candidates, next_pose, order
 from ftdrive.planning.search.constant_tour import NUMBERS
+from tests.pose_sets import AMBIGUOUS_6, SUBSET_8, SUBSET_12, efficiency, optimised
 
 ALL = special(range(1, 25))
 GUESS = Guess(mass_kg=20 / 9.80665, sigma_force_N=0.2, sigma_torque_Nm=0.005)  # weight / sigma 100, lever 25 mm
@@ -232,7 +227,7 @@ def test_a_centre_of_mass_near_the_sensor_is_observable() -> None:
     ids=["all", "T12", "8", "6", "ambiguous 6", "3 poses", "rim", "7 and centre", "5 and 3 centre"],
 )
 def test_published_gaps(R_base_flange: Array, gap: float, atol: float) -> None:
-    assert_allclose(second_basin_gap(R_base_flange, GUESS), gap, atol=atol)
+    assert_allclose(second_basin(R_base_flange, GUESS)[0], gap, atol=atol)
 
 
 @pytest.mark.parametrize("turn_rad", [0.0, 0.3, 0.6])
@@ -291,7 +286,7 @@ def test_optimised_sets(
     values = np.array([efficiency(R, guess) for guess in guesses])
     assert (values.mean(axis=0) > mean).all(), values.mean(axis=0)
     assert (values.min(axis=0)[: len(lowest)] > lowest).all(), values.min(axis=0)
-    assert second_basin_gap(R, guesses[0]) > gap - 2 * tilt_rad
+    assert second_basin(R, guesses[0])[0] > gap - 2 * tilt_rad
 
 
 def test_random_sets_have_the_published_efficiency() -> None:
@@ -330,7 +325,7 @@ def test_chosen_poses_beat_random_ones(criterion: Criterion, n: int) -> None:
     chosen = choose(candidates, n, GUESS, criterion=criterion, least_gap=0.02)
     assert len(set(chosen.tolist())) == n
     assert_allclose(chosen, choose(candidates, n, GUESS, criterion=criterion, least_gap=0.02))
-    assert second_basin_gap(candidates[chosen], GUESS) >= 0.02
+    assert second_basin(candidates[chosen], GUESS)[0] >= 0.02
     mine = efficiency(candidates[chosen], GUESS)
     others = np.array([efficiency(candidates[rng.choice(500, n, replace=False)], GUESS) for _ in range(100)])
     assert others[:, 1].max() < mine.A
@@ -358,10 +353,10 @@ def test_a_rim_gets_centre_poses() -> None:
     centre = np.array([tilted(0, 0, s) for s in range(0, 360, 60)])
     candidates = np.concatenate([rim, centre])
     only_rim = rim[choose(rim, 8, GUESS, criterion="prediction")]
-    assert second_basin_gap(only_rim, GUESS) < 1e-6  # nothing else to choose from, and the gap says so
+    assert second_basin(only_rim, GUESS)[0] < 1e-6  # nothing else to choose from, and the gap says so
     for least_gap in (0.02, 0.045):
         chosen = choose(candidates, 8, GUESS, criterion="prediction", least_gap=least_gap)
-        assert second_basin_gap(candidates[chosen], GUESS) >= least_gap
+        assert second_basin(candidates[chosen], GUESS)[0] >= least_gap
         assert 1 <= np.count_nonzero(chosen >= len(rim)) <= 4
 
 

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import BadDataset, NotObservable
 from calib.model import Array, nearest_rotation
-from calib.published.carlson import ForceFit, eigen, iterative, nullspace, nullspace_all_pairs, polynomial
-from calib.published.carlson_known import cayley, cayley_rotation, relaxation, similarity
+from calib.published.carlson import ForceFit, eigen, iterative, nullspace, polynomial
+from calib.published.carlson_known import cayley, cayley_rotation, relaxation
+from tests.carlson_references import nullspace_all_pairs, similarity
 
 Method = Callable[[Array, Array, Array, bool], ForceFit]
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from calib import Parameters, solve
 from calib.model import predict
-from calib.poses.information import AMBIGUOUS_6, T12, Prediction, TOOL_DOWN_R_base_flange, special
+from calib.poses.information import T12, Prediction, TOOL_DOWN_R_base_flange, special
 from calib.poses.selection import cone_candidates
 from calib.routine import PoseRecord, TourPose, dataset_from, drift_check
 from ftdrive.planning.search.constant_tour import NUMBERS
@@ -22,6 +22,7 @@ from ftdrive.runs.pose_hints import hints
 from ftdrive.session.events import Estimated
 from ftdrive.session.live_fit import Running, _light, empty_cap_deg, faces
 from ftdrive.terminal.report import print_result
+from tests.pose_sets import AMBIGUOUS_6
 
 Array = NDArray[np.float64]
 
