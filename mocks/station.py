@@ -184,8 +184,6 @@ class Station:
             "truth": self.world.truth.to_json(),
         }
 
-    # -- control channel ----------------------------------------------------------------------------------------------
-
     def _print(self, message: dict[str, Any]) -> None:
         try:
             sys.stdout.write(json.dumps(message) + "\n")

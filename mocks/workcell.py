@@ -48,8 +48,6 @@ class Workcell:
         }
         """Requests by the value of "do". A wrong request raises ValueError, TypeError or KeyError and does nothing."""
 
-    # -- the tool -----------------------------------------------------------------------------------------------------
-
     def _push(self, request: Request) -> dict[str, Any]:
         wrench = _numbers(request["wrench"], 6)
         push = self._contact(wrench, request, FOREVER_S)
@@ -96,8 +94,6 @@ class Workcell:
             raise KeyError("mass_kg")
         self._world.shift_payload(mass_kg, com_m)
         return {"done": "payload-shift", "truth": self._world.truth.to_json()}
-
-    # -- the sensor ---------------------------------------------------------------------------------------------------
 
     def _freeze_sensor(self, request: Request) -> dict[str, Any]:
         self._world.read_always(None)

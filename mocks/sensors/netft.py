@@ -167,8 +167,6 @@ class NetFtBox(Device[bytes]):
         self._http.server_close()
         self._socket.close()
 
-    # -- RDT ----------------------------------------------------------------------------------------------------------
-
     def _power_up(self) -> None:
         self._wire.clear()
         self._pacer.stop()
@@ -232,8 +230,6 @@ class NetFtBox(Device[bytes]):
         full = len(data) if last else len(data) - len(data) % size
         self._wire.put([data[i : min(i + size, full)] for i in range(0, full, size)], stream=not last)
         self._buffer = data[full:]
-
-    # -- HTTP ---------------------------------------------------------------------------------------------------------
 
     def page(self, path: str) -> bytes | None:
         """Content of a page, None when there is none; pages that set something do so."""

@@ -62,8 +62,6 @@ class Operator:
         }
         """Requests by the value of "do". A wrong request raises ValueError, TypeError or KeyError and does nothing."""
 
-    # -- the operator -------------------------------------------------------------------------------------------------
-
     def _protective_stop(self, _request: Request) -> dict[str, Any]:
         self._robot.protective_stop("requested")
         return {"done": "protective-stop"}
@@ -157,8 +155,6 @@ class Operator:
         accepted = self._robot.upload(pendant_program(self._robot, _rest_s(request)), by="operator")
         return {"done": "pendant-program", "accepted": accepted}
 
-    # -- other clients, and faults of the controller ------------------------------------------------------------------
-
     def _dashboard_stop(self, _request: Request) -> dict[str, Any]:
         return {"done": "dashboard-stop", "reply": dashboard.answer(self._robot, "stop", by="another dashboard client")}
 
@@ -177,8 +173,6 @@ class Operator:
     def _speed_scaling(self, request: Request) -> dict[str, Any]:
         self._robot.arm.scaling = _fraction(request)
         return {"done": "speed-scaling"}
-
-    # -- network ------------------------------------------------------------------------------------------------------
 
     def _freeze(self, request: Request) -> dict[str, Any]:
         self._server.frozen = _on(request)

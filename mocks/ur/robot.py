@@ -145,8 +145,6 @@ class Robot:
         self._wrench: tuple[tuple[object, ...], Vector6] | None = None
         self._poses: dict[str, tuple[Vector6, Vector6, Vector6]] = {}
 
-    # -- time ---------------------------------------------------------------------------------------------------------
-
     @property
     def timestamp_s(self) -> float:
         """Controller clock on the wire; it is the cell's clock where it stamps the samples of the station's sensor."""
@@ -202,8 +200,6 @@ class Robot:
 
     def _after(self, seconds: float, action: Callable[[], object]) -> None:
         self._later.append((self._physical_s + seconds, action))
-
-    # -- program ------------------------------------------------------------------------------------------------------
 
     @property
     def program_name(self) -> str:
@@ -316,8 +312,6 @@ class Robot:
             raise ValueError(f"the arm cannot be moved by hand: {self.hand_obstacle}")
         self.arm.start(HandMove(self.arm.dh, q, speed_rad_s, HAND_ACCELERATION_RAD_S2), "hand")
 
-    # -- safety and power ---------------------------------------------------------------------------------------------
-
     def protective_stop(self, reason: str) -> None:
         """Come to rest on the path and pause the program."""
         if self.safety_mode in PERMITTED:
@@ -416,8 +410,6 @@ class Robot:
         self._watchdog = (name, 1.0 / min_frequency_hz)
         self._watchdog_age_s = 0.0
 
-    # -- registers ----------------------------------------------------------------------------------------------------
-
     def write_inputs(self, fields: dict[str, Value]) -> None:
         """Store input variables from a client."""
         self._note_lost_command(fields)
@@ -446,8 +438,6 @@ class Robot:
         """Present value of input_double_register_`index`."""
         value = self.inputs.get(f"input_double_register_{index}", 0.0)
         return value if isinstance(value, float) else 0.0
-
-    # -- tool ---------------------------------------------------------------------------------------------------------
 
     @property
     def tcp_offset(self) -> Vector6:

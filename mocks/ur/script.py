@@ -157,8 +157,6 @@ class ControlScript:
             steps.close()
         self._threads.clear()
 
-    # -- the loop -----------------------------------------------------------------------------------------------------
-
     def _control_loop(self) -> Steps:
         self._report_async(-1)
         self._write_int(0, READY)
@@ -193,8 +191,6 @@ class ControlScript:
     def _accept(self) -> None:
         """Ignore a setting that has no counterpart here."""
 
-    # -- registers ----------------------------------------------------------------------------------------------------
-
     def _read_int(self, index: int) -> int:
         return self._robot.input_int(index + self._int_offset)
 
@@ -228,8 +224,6 @@ class ControlScript:
             self._operation = (self._operation + 1) % 128
         running = 0x8000 | min(progress, 0x7FFF) if progress >= 0 else 0
         self._write_int(2, self._operation << 24 | self._writes << 16 | running)
-
-    # -- motion -------------------------------------------------------------------------------------------------------
 
     def _movej(self) -> Steps:
         return self._move(JointMove(self._robot.arm.dh, self._vector(0), self._read(6), self._read(7)))
@@ -306,8 +300,6 @@ class ControlScript:
         self._robot.protective_stop("requested by the program")
         yield  # paused from here on: the command is not reported done
 
-    # -- kinematics ---------------------------------------------------------------------------------------------------
-
     def _solve(self, qnear: Vector6) -> Vector6 | None:
         X_base_flange = matrix_of(self._vector(0)) @ inverse_matrix(self._robot.X_flange_tcp)
         return inverse(self._robot.arm.dh, X_base_flange, qnear)
@@ -324,8 +316,6 @@ class ControlScript:
 
     def _target_waypoint(self) -> None:
         self._write_pose(forward(self._robot.arm.dh, self._robot.arm.q) @ self._robot.X_flange_tcp)
-
-    # -- settings -----------------------------------------------------------------------------------------------------
 
     def _set_payload(self) -> None:
         self._robot.payload_kg = self._read(0)

@@ -131,8 +131,6 @@ class Device(ABC, Generic[Frame]):
         if self._threads:
             os.write(self._wake_write, _RESET)
 
-    # -- for subclasses -----------------------------------------------------------------------------------------------
-
     @abstractmethod
     def _power_up(self) -> None:
         """Set the state the device has after power-up."""
@@ -176,8 +174,6 @@ class Device(ABC, Generic[Frame]):
             readings = readings.copy()
             readings[:, self.saturated_axis] = limit[self.saturated_axis]
         return readings.clip(-limit, limit), np.any(np.abs(readings) >= limit, axis=1)
-
-    # -- the thread ---------------------------------------------------------------------------------------------------
 
     def _require_stopped(self) -> None:
         if self._threads:
