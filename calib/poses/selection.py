@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from calib.model import Array, Parameters, predict
@@ -39,7 +39,9 @@ CLEARLY_WIDER = 1.1
 RANDOM_ORDERS = 8
 
 
-def cone_candidates(half_angle_rad: float, spins: int = 8, directions: int = 150) -> Array:
+def cone_candidates(
+    half_angle_rad: float, spins: int = 8, directions: int = 150, down_base: ArrayLike = (0.0, 0.0, -1.0)
+) -> Array:
     """Orientations with the tool axis (flange z) within a cone about straight down, and any turn about that axis.
 
     Parameters
@@ -50,6 +52,8 @@ def cone_candidates(half_angle_rad: float, spins: int = 8, directions: int = 150
         Turns about the tool axis for each direction.
     directions : int
         About how many directions of the tool axis: evenly spaced rings, the outermost on the rim.
+    down_base : array_like, shape (3,)
+        Direction of gravity in base, a unit vector.
 
     Returns
     -------
@@ -66,7 +70,12 @@ def cone_candidates(half_angle_rad: float, spins: int = 8, directions: int = 150
     azimuth = np.repeat(np.concatenate([2 * np.pi * np.arange(count) / count for count in counts]), spins)
     spin = np.tile(2 * np.pi * np.arange(spins) / spins, counts.sum())
     tilted = Rotation.from_euler("ZYZ", np.column_stack([azimuth, tilt, spin - azimuth]))
-    return np.asarray(tilted.as_matrix() @ TOOL_DOWN_R_base_flange)
+    down = np.asarray(down_base, dtype=np.float64)
+    normal = np.cross([0.0, 0.0, -1.0], down)
+    sine = float(np.linalg.norm(normal))
+    turn_rad = np.arctan2(sine, -down[2])
+    mounted = Rotation.from_rotvec(turn_rad * (normal / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])))
+    return np.asarray((mounted * tilted).as_matrix() @ TOOL_DOWN_R_base_flange)
 
 
 def choose(

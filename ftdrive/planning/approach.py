@@ -78,8 +78,21 @@ def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, sp
     if np.abs(np.subtract(q_now, q_first)).max() < AT_RAD:
         return Approach(np.zeros((0, 6)), np.zeros(0), certified=True, clearance_m=np.inf, limited_by="")
     now, first = checked_joints(q_now), checked_joints(q_first)
-    if certifier.certify(now, first, tight=False).clear[0]:
-        return _approach(certifier, now, first[None], speeds)
+    direct = certifier.certify(now, first, tight=False).clear[0]
+    whole = np.vstack([now, first if direct else _around(certifier, now, first, speeds)])
+    certificate = certifier.certify(whole[:-1], whole[1:])
+    nearest = int(np.argmin(certificate.clearance_m))
+    return Approach(
+        whole,
+        speed_of_leading_joint(certifier.arm, whole[:-1], whole[1:], speeds),
+        bool(certificate.clear.all()),
+        float(certificate.clearance_m[nearest]),
+        certificate.limited_by[nearest],
+    )
+
+
+def _around(certifier: Certifier, now: Array, first: Array, speeds: Speeds) -> Array:
+    """Via-poses and the first pose (k, 6). Raises `PlanRefused` if there is no proven path."""
     here = certifier.certify(now, now)
     if not here.clear[0]:
         raise PlanRefused(_too_near(certifier, here) + _where_to_jog(first))
@@ -90,20 +103,7 @@ def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, sp
         raise PlanRefused(
             "no approach from the present posture to the first pose is proven clear: " + _where_to_jog(first)
         )
-    return _approach(certifier, now, path, speeds)
-
-
-def _approach(certifier: Certifier, now: Array, path: Array, speeds: Speeds) -> Approach:
-    whole = np.vstack([now, path])
-    certificate = certifier.certify(whole[:-1], path)
-    nearest = int(np.argmin(certificate.clearance_m))
-    return Approach(
-        whole,
-        speed_of_leading_joint(certifier.arm, whole[:-1], path, speeds),
-        bool(certificate.clear.all()),
-        float(certificate.clearance_m[nearest]),
-        certificate.limited_by[nearest],
-    )
+    return path
 
 
 def _through_roadmap(certifier: Certifier, now: Array, first: Array, speeds: Speeds) -> Array | None:

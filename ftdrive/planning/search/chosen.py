@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from calib.poses.information import Guess, predicted_sigma
 from calib.poses.selection import choose, cone_candidates
@@ -76,8 +75,7 @@ def chosen_tour(
     q_now = np.asarray(q_rad, dtype=np.float64)
     lumps = certifier.arm.travel_m[:, 5].any()
     spins, directions = (SPINS_OF_A_LUMP, DIRECTIONS_OF_A_LUMP) if lumps else (SPINS, DIRECTIONS)
-    candidates = cone_candidates(half_angle_rad, spins, directions)
-    candidates = _from_down(certifier.scene.down_base) @ candidates
+    candidates = cone_candidates(half_angle_rad, spins, directions, certifier.scene.down_base)
     ideal = predicted_sigma(candidates[choose(candidates, poses, guess)], guess).force_rms_N
     best = _at(certifier, q_now, candidates, spins, poses, speeds, guess, ideal)
     if best is None or best.force_rms_N > NEARLY * ideal:
@@ -128,12 +126,3 @@ def _others(certifier: Certifier, q_now: Array, candidates: Array) -> Array:
     q = np.array([wrist_inverse(posture, looks) for posture in postures])  # (m, LOOKS, 2, 6)
     free = certifier.free(q.reshape(-1, 6)).reshape(q.shape[:3]).any(axis=2)
     return np.asarray(postures[np.argsort(-free.sum(axis=1), kind="stable")][:OTHER_POSTURES])
-
-
-def _from_down(axis: Array) -> Array:
-    """Turn (3, 3) of base -z onto a unit vector, the shortest one."""
-    down = np.array([0.0, 0.0, -1.0])
-    normal = np.cross(down, axis)
-    sine = float(np.linalg.norm(normal))
-    turn = np.arctan2(sine, float(down @ axis))
-    return Rotation.from_rotvec(turn * (normal / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0]))).as_matrix()
