@@ -464,3 +464,15 @@ def test_the_blocks_of_the_inverse_are_those_of_the_dense_one(n: int) -> None:
     own, beside = inverse_blocks(diagonal, above)
     np.testing.assert_allclose(own, inverse[range(n), :, range(n)], atol=1e-12)
     np.testing.assert_allclose(beside, inverse[range(n - 1), :, range(1, n)], atol=1e-12)
+
+
+@pytest.mark.parametrize("bumped", [0, 12])
+def test_among_many_poses_larger_noise_rejects_none_and_bumped_poses_are_rejected(bumped: int) -> None:
+    rng = np.random.default_rng(4)
+    p, R = truth(rng), haar(rng, 600)
+    wrench = predict(p, R) + noise(rng, 600, 1.5 * SIGMA)
+    wrench[:bumped] += 12 * SIGMA * rng.choice([-1, 1], size=(bumped, 6))
+    found = fit(R, wrench, np.broadcast_to(WHITE, (600, 6, 6)))
+    rejected = np.flatnonzero(found.weights == 0)
+    assert rejected[:bumped].tolist() == list(range(bumped))
+    assert len(rejected) <= bumped + bool(bumped)  # among so many, one that is not bumped
