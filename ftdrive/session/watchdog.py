@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.model import Array
 from calib.routine import turned_rad
-from drivers.clock import Clock
+from drivers.clock import Clock, Follower
 from drivers.errors import DeviceFault, DriverError
 from drivers.interfaces import ArmState, ForceTorqueSensor, RobotArm
 from ftdrive.session.guards import Guard, Limits, Motion, Seen, Tripped, arm_lost, by_safety, fault
@@ -67,7 +67,7 @@ class Watcher:
         self._begun = False
         self._last: tuple[float, ArmState] | None = None
         self._looked_s = 0.0
-        self._thread = threading.Thread(target=self._run, name="guards", daemon=True)
+        self._thread = Follower(clock, self._run, "guards")
 
     def __enter__(self) -> "Watcher":
         self._thread.start()
@@ -173,10 +173,9 @@ class Watcher:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
-        with self.clock.keeping_up():
-            while not self._end.is_set():
-                pause_s = self.turn()
-                self.clock.wait(self._wake if self._motion is None else self._end, pause_s)
+        while not self._end.is_set():
+            pause_s = self.turn()
+            self.clock.wait(self._wake if self._motion is None else self._end, pause_s)
 
     def _look(self, motion: Motion) -> None:
         status = self._arm.status()
