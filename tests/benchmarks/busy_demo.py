@@ -12,10 +12,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 from ftdrive.cell.emulated import SENSORS
+from tests.busy_loops import busy_loops
 
 SEEDS = range(10)
 COMMANDS = (
@@ -32,18 +32,6 @@ COMMANDS = (
     ("transcript", "record", "--output", "sensor.jsonl", "--duration", "1"),
     ("transcript", "play"),
 )
-
-
-@contextmanager
-def busy_loops(count: int) -> Iterator[None]:
-    """Keep as many processes computing."""
-    loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for loop in loops:
-            loop.kill()
-            loop.wait()
 
 
 def passes(arguments: Sequence[str]) -> bool:

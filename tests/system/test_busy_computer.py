@@ -3,32 +3,19 @@
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from tests.busy_loops import busy_loops
 from tests.system.command_line import CommandLine
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 LOOPS = 2
-
-
-@contextmanager
-def busy_loops() -> Iterator[None]:
-    """Take all the computing time there is on two cores."""
-    loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(LOOPS)]
-    try:
-        yield
-    finally:
-        for loop in loops:
-            loop.kill()
-            loop.wait()
+"""They take all the computing time there is on two cores."""
 
 
 def station_of(program: int) -> int:
@@ -45,7 +32,7 @@ def station_of(program: int) -> int:
 
 
 def test_a_session_beside_two_busy_loops_ends_well(ftdrive: CommandLine) -> None:
-    with busy_loops():
+    with busy_loops(LOOPS):
         process = ftdrive.start("calibrate", "--simulate", "--minimal", "--yes", "--json")
         _, err = process.communicate()
     assert process.returncode == 0, err
