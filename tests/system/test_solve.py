@@ -127,7 +127,7 @@ def test_a_rejected_result_is_saved_only_by_force_and_stays_marked(solve: Solve,
     refused = solve(path, "-o", output)
     assert refused.returncode == 7, refused.stderr
     assert "rejected and was not saved" in refused.stderr
-    assert "is rejected: " in solve(path).stderr  # nobody asked for a file
+    assert "is rejected: " in solve(path).stderr  # without --output
     assert not output.exists()
     assert solve(path, "-o", output, "--force").returncode == 0
     assert json.loads(output.read_text())["verdict"] == "rejected"

@@ -377,7 +377,7 @@ class Lab:
         monkeypatch.setattr("calib.poses.information.second_minimum", second_minimum_once)
         monkeypatch.setattr(session, "Watcher", self._watcher)
         monkeypatch.setattr("shutil.which", lambda _: None)
-        monkeypatch.setattr("os.fsync", lambda _: None)  # the disk of whoever runs the tests is slow
+        monkeypatch.setattr("os.fsync", lambda _: None)  # the disk may be slow
 
     def _watcher(self, *args: Any, **kwargs: Any) -> SteppedWatcher:
         self.watchers.append(SteppedWatcher(*args, **kwargs))

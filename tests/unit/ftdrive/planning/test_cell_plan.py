@@ -28,7 +28,7 @@ def cell(planes: Sequence[Row] = (), boxes: Sequence[Row] = (), tool: Rows = ((0
 @pytest.mark.parametrize(
     ("plane", "named"),
     [
-        ((1, 0, 0, 800), ["base", "[-1, 0, 0, -800]", "[1, 0, 0, -800]"]),  # both ways to mend it
+        ((1, 0, 0, 800), ["base", "[-1, 0, 0, -800]", "[1, 0, 0, -800]"]),  # both ways to fix it
         ((0, 0, 1, 300), ["base", "[0, 0, -1, -300]", "[0, 0, 1, -300]"]),
         ((0, 0, -1, 0), ["shoulder", "[0, 0, 1, 0]"]),
         ((0, 0, -1, -100), ["shoulder", " 0 mm"]),  # a ceiling at its height
