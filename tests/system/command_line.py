@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
@@ -132,11 +132,20 @@ def end_of(process: subprocess.Popen[str], typed: str = "") -> tuple[int, str]:
     return process.returncode, said
 
 
+def assert_found(errors_in_sigma: Mapping[str, Any]) -> None:
+    """Each parameter within six of its sigmas.
+
+    The noise of a session differs from run to run, and a CI run checks some hundred numbers: a limit of four sigmas
+    would fail one CI run in fifty without a defect, six fail none. That the sigmas are right is tested in `calib`.
+    """
+    for key, errors in errors_in_sigma.items():
+        assert np.abs(errors).max() < 6, (key, errors)
+
+
 def assert_demo_found_the_truth(demo: dict[str, Any]) -> None:
     """Each parameter within its sigmas, the compensation within its prediction."""
     assert demo["schema_version"] == 1
-    for key, errors in demo["error_in_sigma"].items():
-        assert np.abs(errors).max() < 4, (key, errors)
+    assert_found(demo["error_in_sigma"])
     for key, error in demo["compensation_error"].items():
         assert error < 3 * demo["result"]["predicted_error"][key]
     assert demo["result"]["verdict"] == "good"

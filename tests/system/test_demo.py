@@ -23,7 +23,7 @@ def test_the_run_of_a_demo_is_replayed_to_the_same_result(demo: dict[str, Any], 
 
 def test_the_run_of_a_demo_is_solved_by_another_method(demo: dict[str, Any], ftdrive: CommandLine) -> None:
     srom = ftdrive.json("solve", demo["run"], "--method", "srom")
-    assert srom["mass_kg"] == pytest.approx(demo["truth"]["mass_kg"], abs=4 * srom["sigma"]["mass_kg"])
+    assert srom["mass_kg"] == pytest.approx(demo["truth"]["mass_kg"], abs=6 * srom["sigma"]["mass_kg"])
 
 
 @pytest.mark.parametrize("source", ["--simulate", "--replay"])
@@ -34,7 +34,7 @@ def test_the_calibration_of_a_demo_compensates_live(source: str, demo: dict[str,
     assert look["about"] == "sensor origin"
     for key, limit in (("force_N", 0.05), ("torque_Nm", 0.005)):
         assert np.abs(look["compensated"][key]).max() < limit
-        assert np.abs(np.divide(look["compensated"][key], look["sigma"][key])).max() < 5
+        assert np.abs(np.divide(look["compensated"][key], look["sigma"][key])).max() < 6
     assert np.linalg.norm(look["raw"]["force_N"]) > 1
 
 

@@ -18,6 +18,7 @@ from ftdrive.session.events import Event, GuardTripped, PoseTaken, State, StateC
 from ftdrive.session.operator import Question
 from ftdrive.session.session import Options, calibrate
 from ftdrive.terminal.report import errors_in_sigma, print_result
+from tests.system.command_line import assert_found
 
 pytestmark = pytest.mark.slow
 
@@ -94,14 +95,6 @@ def begins(event: Event, state: State, stop: int) -> bool:
     return isinstance(event, StateChanged) and event.state is state and event.stop == stop
 
 
-def assert_near(outcome: Outcome, truth: dict[str, Any]) -> None:
-    """Within 3 standard deviations, save one of fifteen numbers: it is beyond 3 in every 25th undisturbed run."""
-    errors = errors_in_sigma(outcome.result, truth)
-    away = np.sort(np.abs(np.concatenate(list(errors.values()))))
-    assert away[-2] < 3, errors
-    assert away[-1] < 4, errors
-
-
 def test_pushes_and_a_tap_while_poses_are_averaged(
     station: Station,
     tour: Callable[[Happening], tuple[Outcome, Nobody]],
@@ -129,7 +122,7 @@ def test_pushes_and_a_tap_while_poses_are_averaged(
     assert outcome.result.rejected_poses == (pushed,)
     assert f"? {first} reads otherwise at the end" in text
     assert text.count(" ? ") == 2 + LEANS
-    assert_near(outcome, dict(station.truth))
+    assert_found(errors_in_sigma(outcome.result, station.truth))
 
 
 def test_a_cable_that_pulls_in_three_poses(
@@ -145,7 +138,7 @@ def test_a_cable_that_pulls_in_three_poses(
     assert f"something pulls in {', '.join(names(outcome, *wound))}: a cable" in words_of(outcome)
     assert outcome.result.rejected_poses == tuple(wound)
     assert outcome.result.verdict == "usable"
-    assert_near(outcome, dict(station.truth))
+    assert_found(errors_in_sigma(outcome.result, station.truth))
 
 
 def test_a_sensor_that_drifts_by_half_a_newton(
@@ -172,10 +165,10 @@ def test_a_sensor_that_drifts_by_half_a_newton(
     assert text.count(" ? ") == 1 + LEANS
     found = outcome.result.drift
     assert found is not None
-    assert found.change[2] == pytest.approx(drifted_N[-1] - drifted_N[0], abs=4 * found.sigma[2])
+    assert found.change[2] == pytest.approx(drifted_N[-1] - drifted_N[0], abs=6 * found.sigma[2])
     truth = dict(station.truth)  # the bias is the mean over the poses
     truth["force_bias_N"] = np.add(truth["force_bias_N"], [0, 0, drifted_N.mean()])
-    assert_near(outcome, truth)
+    assert_found(errors_in_sigma(outcome.result, truth))
 
 
 @pytest.mark.parametrize(

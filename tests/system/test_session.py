@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from calib import CalibrationResult
 from ftdrive.cell.emulated import Station
 from ftdrive.planning.plan import Plan
 from ftdrive.terminal.report import errors_in_sigma
-from tests.system.command_line import CommandLine, end_of, listen_for, say, wait_until
+from tests.system.command_line import CommandLine, assert_found, end_of, listen_for, say, wait_until
 
 QUESTIONS = "yes\nyes\nyes\n"
 """Tool free, ball free, emergency stop in reach."""
@@ -126,7 +125,7 @@ def test_a_push_stops_the_arm_until_a_person_says_go_on(station: Station, config
     trips = [event for event in events_of(ftdrive) if event["event"] == "guard-tripped"]
     assert {trip["hazard"] for trip in trips} == {14}
     result = CalibrationResult.load(ftdrive.poses()[0].parent.parent / "calibration.json")
-    assert result.mass_kg == pytest.approx(station.truth["mass_kg"], abs=4 * float(result.sigma["mass_kg"]))
+    assert result.mass_kg == pytest.approx(station.truth["mass_kg"], abs=6 * float(result.sigma["mass_kg"]))
 
 
 @pytest.mark.slow
@@ -178,8 +177,7 @@ def test_a_run_that_was_killed_goes_on_and_finds_the_truth(
     assert (ftdrive.folder / resumed["run"]).resolve() == run.resolve()
     assert {name: (run / "poses" / name).read_bytes() for name in kept} == kept
     assert len(ftdrive.poses()) == 7
-    for name, errors in errors_in_sigma(CalibrationResult.load(run / "calibration.json"), station.truth).items():
-        assert np.abs(errors).max() < 4, name
+    assert_found(errors_in_sigma(CalibrationResult.load(run / "calibration.json"), station.truth))
     assert ftdrive.json("replay", run)["mass_kg"] == resumed["mass_kg"]
 
     # Its plan has not run to its end in one session: another run begins like a first one.
