@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib import CalibrationResult
+from calib import CalibrationDataset, CalibrationResult
 from calib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
 from calib.poses.information import Guess, predicted_sigma, special
 from drivers.clock import Clock
@@ -34,6 +34,7 @@ from ftdrive.checks.controller_settings import PAYLOAD_KG, PAYLOAD_SHARE
 _PUSH_N = 2.0
 _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs on this computer"
 _RATE_TOLERANCE = 0.1
+_MUCH_NOISE: Final = 2.0
 _LOAD: Final = 0.8
 _PAYLOAD_MM: Final = 100.0
 """The centre of the payload may be this far outside the described tool."""
@@ -232,6 +233,26 @@ def check_noise(wrench: Array, duration_s: float, average_s: float, mass_kg: flo
         f"centre of mass {com_mm:.2g} mm, rotation {turn_deg:.2g}°"
     )
     return [level, Check("noise.accuracy", "ok", accuracy)]
+
+
+def check_noise_change(wrench: Array, dataset: CalibrationDataset) -> Check:
+    """Compare the noise of a resting sensor (n, 6) with that of the poses of a calibration.
+
+    Compared is the variance of a mean times its number of samples, which does not depend on the averaging time.
+    """
+    name = "noise.change"
+    if dataset.wrench_cov is None or not (sampled := dataset.n_samples > 0).any():
+        return Check(name, "skipped", "the noise of the calibration is not known")
+    if len(wrench) < LEAST_SAMPLES or not is_stationary(wrench):
+        return Check(name, "skipped", "the reading is not steady")
+    then = np.einsum("nii,n->ni", dataset.wrench_cov[sampled], dataset.n_samples[sampled])
+    now = np.diag(mean_and_covariance(wrench).covariance) * len(wrench)
+    ratio = np.sqrt(now / np.median(then, axis=0))
+    most = int(np.argmax(ratio))
+    found = f"noise is {ratio[most]:.1f} times that of the calibration in {AXES[most]}"
+    if ratio[most] < _MUCH_NOISE:
+        return Check(name, "ok", found)
+    return Check(name, "warning", found, "look for vibration and loose cables, then ftdrive doctor")
 
 
 def check_level(wrench: Array) -> Check:

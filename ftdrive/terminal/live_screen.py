@@ -1,12 +1,13 @@
 """The live screen: the compensated wrench in a terminal, with keys and mouse.
 
-`Feed` reads the stream in a thread and keeps a summary of fixed size. Ten times a second the app asks it for a `View`,
-`layout.frame` draws that as lines, and only the lines that changed are sent to the terminal.
+`Feed` reads the stream in a thread. Ten times a second `Summary` takes what is new, `layout.frame` draws its `View` as
+lines, and only the lines that changed are sent to the terminal.
 """
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from pathlib import Path
 from typing import ClassVar, TypeVar, get_args
 
 from rich.segment import Segment
@@ -18,14 +19,17 @@ from textual.strip import Strip
 from textual.widget import Widget
 from textual.widgets import Input
 
+from calib import CalibrationDataset
+from calib.errors import BadDataset
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import check_calibration
 from ftdrive.errors import ConfigError
-from ftdrive.live.samples import Axes, Point, WrenchFrame
+from ftdrive.live.samples import Axes, Point, StreamInfo, WrenchFrame
 from ftdrive.terminal.live.feed import Feed, Sink, Stream
 from ftdrive.terminal.live.history import SPANS_S
 from ftdrive.terminal.live.layout import frame
-from ftdrive.terminal.live.view import Line, Part
+from ftdrive.terminal.live.summary import Summary
+from ftdrive.terminal.live.view import BAD, Line, Part
 
 T = TypeVar("T")
 
@@ -35,26 +39,23 @@ _LOWPASS_HZ = 40.0
 _HELP = """\
  ftdrive live: the wrench on the tool, ten times a second
 
- now      mean of the last 0.1 s          ± σ   one sigma of one sample: noise and calibration
- peak     extremes since p                bar   the scale follows the recent extremes
+ now      mean of the last 0.1 s
+ ± σ      one sigma of one sample: noise and calibration
+ peak     extremes since p
+ bars     their scale follows the recent extremes
 
- t        tare: the bias changes so that a free tool reads zero; refused with a load or in motion
- u        undo the last tare
- x        axes: sensor, flange, base, tcp
- a        reference point: sensor, flange, tcp
- 1 2 3 4  stages: bias, gravity, inertia, low-pass
- z        freeze the screen; a recording goes on
- b        mark: text for recording and plots
- r        start or complete a recording
- p        reset the peaks
- g        time span of the plots: 2, 10, 60, 600 s
- q        quit
+ t tare: change the bias so that a free tool reads zero        u undo the tare
+ x axes: sensor, flange, base, tcp     a reference point: sensor, flange, tcp
+ 1 2 3 4 stages: bias, gravity, inertia, low-pass
+ z freeze the screen; a recording goes on
+ b mark: text for recording and plots  r start or complete a recording
+ p reset the peaks                     g span of the plots: 2, 10, 60, 600 s
 
- Replay: space pauses, ← and → seek by 5 s, . shows the next samples, + and - change the speed
+ Replay: space pause    ← → seek 5 s    . next samples    + - speed
 
- Plots: smallest and largest value of each column; dotted lines at 0 and ± 1 sigma of a sample;
-        ━ contact, ◆ mark, tare or change of stages
- The words of the screen can be clicked: stages, axes, point, span, peaks, keys.
+ Plots: smallest and largest value of each column; dotted lines at 0 and at
+        ± 1 sigma of a sample; ━ contact, ◆ mark, tare or change of stages
+ The mouse works on stages, axes, point, peaks, span and keys.
 
  Any key returns."""
 
@@ -78,16 +79,30 @@ def run_live(stream: Stream, *, recorder: Callable[[], Sink] | None = None, chec
     """
     info = stream.info
     devices = check_calibration(info.calibration, {"arm": info.arm, "sensor": info.sensor})
-    feed = Feed(stream, recorder, [devices, *checks])
+    feed = Feed(stream, recorder)
+    app = LiveApp(feed, Summary(feed, [devices, *checks], _dataset_of(info)))
     feed.start()
     try:
-        LiveApp(feed).run()
+        app.run()
     finally:
         feed.stop()
     if feed.crash is not None:
         raise feed.crash
     if feed.failure is not None:
         raise feed.failure
+
+
+def _dataset_of(info: StreamInfo) -> CalibrationDataset | None:
+    """Read the poses of a calibration from its folder; None where they are not there."""
+    place = Path(info.calibration_name)
+    for path in (place if place.is_dir() else place.parent).glob("dataset*.json"):
+        try:
+            dataset = CalibrationDataset.load(path)
+        except (BadDataset, OSError):
+            continue
+        if dataset.sha256() == info.calibration.provenance.get("dataset_sha256"):
+            return dataset
+    return None
 
 
 class Canvas(Widget):
@@ -129,10 +144,10 @@ class LiveApp(App[None]):
     BINDINGS: ClassVar = [("ctrl+c", "press('q')", "quit")]
     TITLE = "ftdrive live"
 
-    def __init__(self, feed: Feed) -> None:
+    def __init__(self, feed: Feed, summary: Summary) -> None:
         super().__init__(ansi_color=True)  # the terminal's own colours, light or dark
         self.theme = "ansi-dark"
-        self._feed = feed
+        self._feed, self._summary = feed, summary
         self._canvas = Canvas()
         self._helping = False
 
@@ -158,7 +173,7 @@ class LiveApp(App[None]):
             lines = [Line(text).fit(width) for text in _HELP.split("\n")]
             self._canvas.show((lines + [Line().to(width)] * height)[:height])
         else:
-            self._canvas.show(frame(self._feed.view(), width, height))
+            self._canvas.show(frame(self._summary.view(), width, height))
 
     def on_key(self, event: events.Key) -> None:
         """Do what a key stands for."""
@@ -182,11 +197,11 @@ class LiveApp(App[None]):
         elif key == "q":
             self.exit()
         elif key == "z":
-            self._feed.is_frozen = not self._feed.is_frozen
+            self._summary.is_frozen = not self._summary.is_frozen
         elif key == "p":
-            self._feed.reset_peaks()
+            self._summary.reset_peaks()
         elif key == "g":
-            self._feed.span_s = _after(self._feed.span_s, SPANS_S)[0]
+            self._summary.span_s = _after(self._summary.span_s, SPANS_S)[0]
         elif key == "b":
             self.mount(entry := Input(placeholder="text of the mark, then Enter; Esc leaves"))
             entry.focus()
@@ -221,11 +236,11 @@ def _press(feed: Feed, key: str) -> None:
 
 def _set_frame(feed: Feed, frames: Iterable[WrenchFrame]) -> None:
     """Choose the first frame that the cell has; the others say what to configure."""
-    for frame in frames:
+    for each in frames:
         try:
-            feed.stream.frame = frame
+            feed.stream.frame = each
         except ConfigError as error:
-            feed.note(str(error), "red bold")
+            feed.note(str(error), BAD)
         else:
             return
 

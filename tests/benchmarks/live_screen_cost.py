@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from ftdrive.live.samples import Block
 from ftdrive.terminal.live.feed import Feed
+from ftdrive.terminal.live.summary import Summary
 from ftdrive.terminal.live_screen import LiveApp
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream
 
@@ -39,7 +40,7 @@ class Paced(FakeStream):
 
 
 def run(rate_Hz: float, duration_s: float, with_screen: bool) -> dict[str, float]:
-    """Run app, or its reading thread alone, for a while; return CPU seconds per second, and the growth of memory."""
+    """Run the app, or the stream alone, for a while; return CPU seconds per second, and the growth of memory."""
     feed = Feed(Paced("contact", rate_Hz))
     feed.start()
     used, memory_kB = list[float](), list[int]()
@@ -56,7 +57,7 @@ def run(rate_Hz: float, duration_s: float, with_screen: bool) -> dict[str, float
             finish()
 
     if with_screen:
-        app = LiveApp(feed)
+        app = LiveApp(feed, Summary(feed))
         threading.Thread(target=watch, args=(lambda: app.call_from_thread(app.exit),), daemon=True).start()
         app.run()
     else:
@@ -97,7 +98,7 @@ if __name__ == "__main__":
         os.write(options.report, json.dumps(figures).encode())
         sys.exit()
     reading = run(options.rate, options.seconds, with_screen=False)
-    print(f"reading thread alone  {100 * reading['cpu']:5.1f} % of a core")  # noqa: T201
+    print(f"stream alone          {100 * reading['cpu']:5.1f} % of a core")  # noqa: T201
     for width, height in SIZES:
         figures, size_kB = on_terminal(width, height, sys.argv[1:])
         print(  # noqa: T201

@@ -5,7 +5,7 @@ import numpy as np
 from ftdrive.checks.devices import AXES
 from ftdrive.terminal.live import braille, panels
 from ftdrive.terminal.live.history import Columns
-from ftdrive.terminal.live.view import Line, View
+from ftdrive.terminal.live.view import CONTACT, FAINT, STRONG, Line, View
 
 _WIDE = 120
 """From this width on the plots stand beside the table."""
@@ -37,7 +37,7 @@ def frame(view: View, width: int, height: int) -> list[Line]:
 
 def _narrow(view: View, width: int, rows: int) -> list[Line]:
     body = panels.table(view, width, with_trace=True)
-    separator = Line("─" * width, "dim")
+    separator = Line("─" * width, FAINT)
     if rows - len(body) >= 3 * _LEAST_PLOT_ROWS + 10:
         plot_rows = min(7, (rows - len(body) - 10) // 3)
         body += _plots(view, width, 3 * plot_rows, across=2)
@@ -52,7 +52,7 @@ def _narrow(view: View, width: int, rows: int) -> list[Line]:
 
 
 def _wide(view: View, width: int, rows: int) -> list[Line]:
-    separator = Line("─" * _LEFT, "dim")
+    separator = Line("─" * _LEFT, FAINT)
     left = [*panels.table(view, _LEFT, with_trace=False), separator, *panels.links(view, _LEFT), separator]
     for extra in (panels.others(view, _LEFT), panels.sphere(view, _LEFT), panels.identity(view, _LEFT)):
         if rows - len(left) >= len(extra) + 5:
@@ -61,7 +61,7 @@ def _wide(view: View, width: int, rows: int) -> list[Line]:
     right = _plots(view, width - _LEFT - 1, rows, across=1)
     right += [Line()] * (rows - len(right))
     return [
-        Line().join(a.fit(_LEFT)).add("│", "dim").join(b.fit(width - _LEFT - 1))
+        Line().join(a.fit(_LEFT)).add("│", FAINT).join(b.fit(width - _LEFT - 1))
         for a, b in zip(left[:rows], right, strict=True)
     ]
 
@@ -73,7 +73,7 @@ def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
         return []
     columns = view.columns(2 * cells)
     full = [panels.full_scale(columns, view.reading, first) for first in (0, 3)]
-    drawn = [plot(view, columns, i, full[i // 3], each, cells) for i in range(6)]
+    drawn = [plot(view, columns, i, full[i // 3], each, with_value=across == 1) for i in range(6)]
     lines = []
     for first in range(6 // across):
         beside = drawn[first::3] if across == 2 else [drawn[first]]
@@ -90,21 +90,22 @@ def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
 
 def _time_axis(columns: Columns, cells: int) -> Line:
     span, half = f"-{panels.span(columns)}", f"-{columns.span_s / 2:.0f}"
-    line = Line(" " * _GUTTER).add(span, "dim", "g")
-    line.to(_GUTTER + cells // 2 - len(half)).add(half, "dim")
-    return line.to(_GUTTER + cells - 3).add("now", "dim")
+    line = Line(" " * _GUTTER).add(span, FAINT, "g")
+    line.to(_GUTTER + cells // 2 - len(half)).add(half, FAINT)
+    return line.to(_GUTTER + cells - 3).add("now", FAINT)
 
 
-def plot(view: View, columns: Columns, i: int, full: float, rows: int, cells: int) -> list[Line]:
-    """Draw one component: a line with its value, contacts and marks, then `rows` - 1 lines of Braille.
+def plot(view: View, columns: Columns, i: int, full: float, rows: int, *, with_value: bool) -> list[Line]:
+    """Draw one component: a line with contacts, marks and perhaps the value, then `rows` - 1 lines of Braille.
 
     The envelope of the samples stands before the zero line and the band of ±1 sigma about it.
     """
     reading, unit, digits = view.reading, "N" if i < 3 else "N·m", 2 if i < 3 else 3
-    head = Line(f"{AXES[i]:>{_GUTTER - 1}} ", "bold")
-    if reading is not None and not view.silent:
-        head.add(f"{reading.wrench[i]:+.{digits}f} ± {reading.sigma[i]:.{digits}f} {unit} ")
+    head = Line(f"{AXES[i]:>{_GUTTER - 1}} ", STRONG)
+    if with_value and reading is not None and not view.silent:
+        head.add(f"{reading.wrench[i]:+z.{digits}f} ± {reading.sigma[i]:.{digits}f} {unit} ")
     contact = columns.contact_cells
+    cells = len(contact)
     marks = {
         column // 2
         for note in view.notes
@@ -112,14 +113,14 @@ def plot(view: View, columns: Columns, i: int, full: float, rows: int, cells: in
     }
     for cell in range(head.width - _GUTTER, cells):
         if cell in marks:
-            head.add("◆", "bold")
+            head.add("◆", STRONG)
         else:
-            head.add("━" if contact[cell] else "─", panels.CONTACT if contact[cell] else "dim")
+            head.add("━" if contact[cell] else "─", CONTACT if contact[cell] else FAINT)
 
     rows -= 1
     ink = braille.characters(braille.envelope(columns.low[i], columns.high[i], rows, full))
     under = np.zeros((4 * rows, 2 * cells), np.bool_)
-    if reading is not None:
+    if reading is not None and np.isfinite(reading.sigma[i]):
         for value in (-reading.sigma[i], 0.0, reading.sigma[i]):
             if (dot := braille.level(value, rows, full)) is not None:
                 under[dot, ::4] = True
@@ -128,6 +129,6 @@ def plot(view: View, columns: Columns, i: int, full: float, rows: int, cells: in
     lines = [head]
     for row in range(rows):
         label = f"{full:+g}" if row == 0 else f"{-full:+g}" if row == rows - 1 else "0" if row == rows // 2 else ""
-        line = Line(f"{label:>{_GUTTER - 1}} ", "dim")
+        line = Line(f"{label:>{_GUTTER - 1}} ", FAINT)
         lines.append(line.join(panels.layers(ink[row], paper[row], contact)))
     return lines

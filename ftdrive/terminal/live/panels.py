@@ -12,14 +12,27 @@ from drivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 from ftdrive.checks.check import Check
 from ftdrive.checks.controller_settings import axes_along
 from ftdrive.checks.devices import AXES
+from ftdrive.errors import ConfigError
+from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import LinkStatus, Stages, StreamInfo, WrenchFrame
 from ftdrive.terminal.live import braille
 from ftdrive.terminal.live.braille import Codes
 from ftdrive.terminal.live.history import Columns
-from ftdrive.terminal.live.view import Line, Part, Reading, Replay, View
+from ftdrive.terminal.live.view import (
+    BAD,
+    CONTACT,
+    FAINT,
+    GOOD,
+    STRONG,
+    TRACE,
+    WARNING,
+    Line,
+    Part,
+    Reading,
+    Replay,
+    View,
+)
 
-BAD, WARNING, GOOD = "red bold", "bold black on yellow", "green"
-TRACE, CONTACT, FAINT, STRONG = "green", "magenta", "dim", "bold"
 LEAST_FULL_SIGMA = 10.0
 """The scale of a still tool, so that noise looks like noise."""
 _SIGNIFICANT = 4.0
@@ -71,7 +84,7 @@ def provenance(view: View, width: int) -> Line:
     arrow = " ▸ " if room >= 3 * (len(chain) - 1) else "▸"
     for i, part in enumerate(chain):
         line.add(arrow if i else "", FAINT).add(*part)
-    return line.fit(max(width - right.width, line.width + 1)).join(right).fit(width)
+    return line.fit(max(width - right.width, 0)).join(right).fit(width)
 
 
 def _stages(stages: Stages) -> list[tuple[str, bool]]:
@@ -177,7 +190,8 @@ def full_scale(columns: Columns, reading: Reading | None, first: int) -> float:
     """Return a round full scale for three components: the recent extremes fit, and noise alone stays small."""
     rows = slice(first, first + 3)
     largest = np.abs([columns.low[rows], columns.high[rows]])
-    least = 0.0 if reading is None else LEAST_FULL_SIGMA * float(reading.sigma[rows].max())
+    sigma = np.zeros(3) if reading is None else np.nan_to_num(reading.sigma[rows])
+    least = LEAST_FULL_SIGMA * float(sigma.max())
     wanted = max(least, 1.05 * float(largest[np.isfinite(largest)].max(initial=0.0)), 1e-6)
     decade = 10.0 ** np.floor(np.log10(wanted))
     return float(next(step * decade for step in (1, 2, 5, 10) if step * decade >= wanted))
@@ -188,15 +202,20 @@ def _component(view: View, i: int, digits: int) -> Line:
     if reading is None or view.silent:
         line.add(f"{'--.--':>8}", BAD if view.silent else FAINT).add(f"{'--':>8}", FAINT)
         return line.join(_peaks(view, i, digits))
-    line.add(f"{reading.wrench[i]:+8.{digits}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
-    return line.add(f"{reading.sigma[i]:8.{digits}f}", FAINT).join(_peaks(view, i, digits))
+    line.add(f"{reading.wrench[i]:+z8.{digits}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
+    return line.add(_sigma(reading.sigma[i], digits), FAINT).join(_peaks(view, i, digits))
+
+
+def _sigma(sigma: float, digits: int) -> str:
+    """Return a standard deviation in 8 cells; it is NaN until the noise is known."""
+    return f"{'--':>8}" if np.isnan(sigma) else f"{sigma:8.{digits}f}"
 
 
 def _peaks(view: View, i: int, digits: int) -> Line:
     low, high = view.peaks.low[i], view.peaks.high[i]
     if low > high:
         return Line()
-    return Line(f"{low:+8.{digits - 1}f}{high:+8.{digits - 1}f}", "", "p")
+    return Line(f"{low:+z8.{digits - 1}f}{high:+z8.{digits - 1}f}", "", "p")
 
 
 def _size(view: View, first: int, digits: int) -> Line:
@@ -208,7 +227,7 @@ def _size(view: View, first: int, digits: int) -> Line:
     size = float(np.linalg.norm(part))
     along = float(np.linalg.norm(part * sigma)) / size if size else float(sigma.max())
     line.add(f"{size:8.{digits}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
-    return line.add(f"{along:8.{digits}f}", FAINT).add(" " * 8).add(f"{peak:8.{digits - 1}f}", "", "p")
+    return line.add(_sigma(along, digits), FAINT).add(" " * 8).add(f"{peak:8.{digits - 1}f}", "", "p")
 
 
 def _scale(full: float, unit: str, cells: int) -> Line:
@@ -255,7 +274,11 @@ def _contact(view: View) -> Line:
         return Line()
     rate = f"1 in {1 / status.false_alarm_rate:.0f}" if status.false_alarm_rate else ""
     sign = ">" if reading.chi2 > status.contact_limit else "<"
-    test = f"χ² {reading.chi2:.0f} {sign} {status.contact_limit:.1f}, {rate}"
+    test = (
+        "noise not known yet"
+        if np.isnan(reading.chi2)
+        else f"χ² {reading.chi2:.0f} {sign} {status.contact_limit:.1f}, {rate}"
+    )
     if reading.in_contact:
         return Line("▲ CONTACT ", f"bold {CONTACT}").add(f"{view.contact_s:.1f} s  ").add(test, FAINT)
     return Line("free  ", GOOD).add(test, FAINT)
@@ -267,7 +290,7 @@ def line_of_force(reading: Reading | None) -> Line:
         return Line()
     force, torque = reading.wrench[:3], reading.wrench[3:]
     square = float(force @ force)
-    if square < (_SIGNIFICANT * float(reading.sigma[:3].max())) ** 2:
+    if not square > (_SIGNIFICANT * float(reading.sigma[:3].max())) ** 2:  # or the noise is not known
         return Line()
     p_m = np.cross(force, torque) / square
     distance_m = float(np.linalg.norm(p_m))
@@ -348,43 +371,34 @@ def _checked(check: Check) -> Line:
 
 def others(view: View, width: int) -> list[Line]:
     """Show the wrench with fewer stages, and in other frames."""
-    reading, info = view.reading, view.info
+    reading, calibration = view.reading, view.info.calibration
     if reading is None:
         return []
-    calibration, raw = info.calibration, reading.raw
+    raw = reading.raw
     bias = np.r_[calibration.force_bias_N, calibration.torque_bias_Nm]
     tare = np.zeros(6) if view.status.tare is None else view.status.tare
     contact = calibration.compensate(raw, reading.R_base_flange) - tare
     now = reading.frame
     rows = [("as measured", raw, now), ("without bias", raw - bias - tare, now), ("and without gravity", contact, now)]
     rows += [(f"{frame.axes} @ {_point(frame)}", contact, frame) for frame in _FRAMES if frame != now]
-    lines = [Line(" ").to(21).add("".join(f"{name:>9}" for name in AXES), FAINT)]
+    lines = [Line(f" in {now.axes} @ {_point(now)}", FAINT).to(21).add("".join(f"{name:>9}" for name in AXES), FAINT)]
     for name, wrench, frame in rows:
-        shown = in_frame(wrench, frame, info, reading.R_base_flange)
-        numbers = [f"{value:9.{2 if i < 3 else 3}f}" for i, value in enumerate(shown)]
-        line = Line(f" {name:<20}", FAINT)
-        lines.append(line.add(f"{'--.--':>9}" * 6 if view.silent else "".join(numbers).replace("nan", "  -")))
+        shown, line = _in_frame(wrench, frame, view, reading.R_base_flange), Line(f" {name:<20}", FAINT)
+        if view.silent:
+            line.add(f"{'--.--':>9}" * 6, BAD)
+        elif shown is None:
+            line.add("  not configured", FAINT)
+        else:
+            line.add("".join(f"{value:z9.{2 if i < 3 else 3}f}" for i, value in enumerate(shown)))
+        lines.append(line)
     return [line.fit(width) for line in lines]
 
 
-def in_frame(wrench: Array, frame: WrenchFrame, info: StreamInfo, R_base_flange: Array) -> Array:
-    """Return a wrench (6,), given in sensor axes about the sensor origin, in a frame."""
-    R_flange_sensor = info.calibration.R_flange_sensor
-    R = {
-        "sensor": R_flange_sensor.T,
-        "flange": np.eye(3),
-        "base": R_base_flange,
-        "tcp": info.R_flange_tcp.T,
-    }[frame.axes]
-    if isinstance(frame.about, str):
-        origins = {"sensor": info.p_flange_sensor_m, "flange": np.zeros(3), "tcp": info.p_flange_tcp_m}
-        about_m = origins[frame.about]
-    else:
-        about_m = np.array(frame.about)
-    force, torque = R_flange_sensor @ wrench[:3], R_flange_sensor @ wrench[3:]
-    if frame.about != "sensor":
-        torque = torque + np.cross(info.p_flange_sensor_m - about_m, force)
-    return np.r_[R @ force, R @ torque]
+def _in_frame(wrench: Array, frame: WrenchFrame, view: View, R_base_flange: Array) -> Array | None:
+    try:
+        return FrameTransform(frame, view.info).matrix(R_base_flange) @ wrench
+    except ConfigError:
+        return None
 
 
 def sphere(view: View, width: int) -> list[Line]:
@@ -437,7 +451,7 @@ def _half_sphere(known: Array, down: Array | None) -> list[Line]:
 
 
 def _unit(vector: Array) -> Array:
-    return np.asarray(vector / np.linalg.norm(vector))
+    return np.asarray(vector / np.linalg.norm(vector), np.float64)
 
 
 def identity(view: View, width: int) -> list[Line]:
@@ -459,7 +473,7 @@ def _who(info: DeviceInfo) -> str:
 
 
 def events(view: View, width: int, rows: int) -> list[Line]:
-    """List the newest events first; where few lines are left, several in a line and none folded."""
+    """List the newest events first; where few lines are left, several in a line."""
     lines = list[Line]()
     for note in view.notes:
         if len(lines) > rows:
@@ -467,14 +481,11 @@ def events(view: View, width: int, rows: int) -> list[Line]:
         head = Line(" ")
         if note.t_host_ns is not None:
             head.add(f"{_time_of_day(view.info, note.t_host_ns)} ", FAINT)
-        if rows > 3:
-            lines += _hanging(head, [Part(note.text, note.style)], width)
-            continue
-        item = head.add(note.text, note.style)
-        if lines and lines[-1].width + item.width + 3 <= width:
-            lines[-1].add("   ").join(item)
+        item = _hanging(head, [Part(note.text, note.style)], width)
+        if rows <= 3 and lines and lines[-1].width + item[0].width + 3 <= width and len(item) == 1:
+            lines[-1].add("   ").join(item[0])
         else:
-            lines.append(item)
+            lines += item
     return [line.fit(width) for line in [*lines, *[Line()] * rows][:rows]]
 
 

@@ -12,6 +12,9 @@ from ftdrive.checks.check import Check
 from ftdrive.live.samples import Stages, StreamInfo, StreamStatus, WrenchFrame
 from ftdrive.terminal.live.history import Columns
 
+BAD, WARNING, GOOD = "red bold", "bold black on yellow", "green"
+TRACE, CONTACT, FAINT, STRONG = "green", "magenta", "dim", "bold"
+
 
 class Part(NamedTuple):
     """A piece of a line."""
@@ -92,7 +95,6 @@ class Reading:
     """Of the newest sample."""
     in_contact: bool
     R_base_flange: Array
-    p_base_flange_m: Array
     frame: WrenchFrame
     stages: Stages
 

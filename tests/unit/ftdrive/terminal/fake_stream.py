@@ -9,6 +9,7 @@ from calib import CalibrationResult, Parameters
 from calib.model import predict
 from drivers.errors import DeviceTimeout
 from drivers.interfaces import DeviceInfo, Fact
+from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import Block, LinkStatus, Stages, StreamEvent, StreamInfo, StreamStatus, WrenchFrame
 
 Scenario = Literal["still", "contact", "stale", "tare-refused"]
@@ -31,6 +32,11 @@ PARAMETERS = Parameters(
     p_sensor_com_m=np.array([0.004, -0.002, 0.06]),
     torque_bias_Nm=np.array([0.1, -0.1, -1.0]),
 )
+
+
+FREE = predict(PARAMETERS, R_BASE_FLANGE[None])[0]
+BIAS = np.concatenate([PARAMETERS.force_bias_N, PARAMETERS.torque_bias_Nm])
+TARE = np.array([0.3, -0.2, 0.2, 0.0, 0.0, 0.0])
 
 
 def calibration() -> CalibrationResult:
@@ -116,15 +122,20 @@ class FakeStream:
         noise = self._noise[self.blocks % len(self._noise)]
         self.blocks += 1
         rotations = np.broadcast_to(R_BASE_FLANGE, (n, 3, 3))
-        raw = predict(PARAMETERS, R_BASE_FLANGE[None])[0] + noise
+        wrench = noise + contact
+        raw = wrench + FREE
+        if not self.stages.bias:
+            wrench = wrench + BIAS
+        if not self.stages.gravity:
+            wrench = wrench + FREE - BIAS
         in_contact = np.abs(contact).max(axis=1) > 0.2
         return Block(
             t_host_ns=t_ns,
             t_device_s=np.full(n, np.nan),
             seq=np.arange(n) + self.blocks * n,
             status=np.zeros(n, np.uint32),
-            raw=raw + contact,
-            wrench=noise + contact,
+            raw=raw + TARE,
+            wrench=FrameTransform(self.frame, INFO)(wrench, rotations),
             chi2=np.where(in_contact, 812.0, 5.1),
             in_contact=in_contact,
             q_rad=np.zeros((n, 6)),
@@ -141,14 +152,14 @@ class FakeStream:
         push = 8.0 * np.clip(np.sin((t_s - 5.5) * np.pi / 0.6), 0, 1) * ((t_s > 5.5) & (t_s < 6.1))
         if self.scenario == "contact":
             push = push - 5.1 * np.clip((t_s - 11.6) / 0.1, 0, 1)
-        return np.outer(push, [0.1, -0.05, 1.0, -0.01, 0.04, 0.0])
+        return np.outer(push, [0.1, -0.05, -1.0, -0.01, 0.04, 0.0])
 
     def take_events(self) -> list[StreamEvent]:
         at_5 = START_NS + 5_000_000_000
         if self.blocks == 500:
             self._events.append(StreamEvent(at_5, "mark", 'mark "peg in"'))
         if self.blocks == 610:
-            self._events.append(StreamEvent(at_5 + 500_000_000, "contact", "contact 8.0 N for 0.6 s along +z of base"))
+            self._events.append(StreamEvent(at_5 + 500_000_000, "contact", "contact 8.0 N, 0.6 s"))
         taken, self._events = self._events, []
         return taken
 
@@ -159,7 +170,7 @@ class FakeStream:
             arm=LinkStatus(500.0, 500.0, 0, 0.002),
             delay_s=0.0031,
             delay_sigma_s=0.0002,
-            tare=np.array([0.3, -0.2, 0.2, 0.0, 0.0, 0.0]),
+            tare=TARE,
             tare_t_host_ns=START_NS - 3_600_000_000_000,
             drift_N_h=0.1,
             drift_sigma_N_h=0.05,
@@ -169,9 +180,10 @@ class FakeStream:
 
     def tare(self) -> StreamEvent:
         if self.scenario == "tare-refused":
-            text = "tare refused: 3.4 N (40 sigma) from the free tool: remove hand or contact"
+            difference = "3.40 N and 0.120 N·m (6.8 sigma)"
+            text = f"tare refused: {difference} from the free tool; take hand or contact away, then tare"
             return self._add("tare-refused", text)
-        return self._add("tare", "tare 0.41 N")
+        return self._add("tare", "tare: bias changed by 0.41 N and 0.002 N·m (0.8 sigma)")
 
     def undo_tare(self) -> StreamEvent:
         return self._add("tare-undone", "tare undone")
