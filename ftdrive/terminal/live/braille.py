@@ -30,7 +30,11 @@ def envelope(low: Array, high: Array, rows: int, full: float) -> Dots:
     array, shape (4 rows, n)
     """
     low, high = low.copy(), high.copy()
-    low[1:], high[1:] = np.fmin(low[1:], high[:-1]), np.fmax(high[1:], low[:-1])
+    joined = np.isfinite(low[1:]) & np.isfinite(low[:-1])
+    low[1:], high[1:] = (
+        np.where(joined, np.minimum(low[1:], high[:-1]), low[1:]),
+        np.where(joined, np.maximum(high[1:], low[:-1]), high[1:]),
+    )
     with np.errstate(invalid="ignore"):
         top, bottom = (np.clip(_dot(value, rows, full), 0, 4 * rows - 1) for value in (high, low))
         dot = np.arange(4 * rows)[:, None]

@@ -84,7 +84,7 @@ def provenance(view: View, width: int) -> Line:
     arrow = " ▸ " if room >= 3 * (len(chain) - 1) else "▸"
     for i, part in enumerate(chain):
         line.add(arrow if i else "", FAINT).add(*part)
-    return line.fit(max(width - right.width, 0)).join(right).fit(width)
+    return line.fit(max(width - right.width - 1, 0)).add(" ").join(right).fit(width)
 
 
 def _stages(stages: Stages) -> list[tuple[str, bool]]:

@@ -10,7 +10,16 @@ from calib.model import predict
 from drivers.errors import DeviceTimeout
 from drivers.interfaces import DeviceInfo, Fact
 from ftdrive.live.frames import FrameTransform
-from ftdrive.live.samples import Block, LinkStatus, Stages, StreamEvent, StreamInfo, StreamStatus, WrenchFrame
+from ftdrive.live.samples import (
+    Block,
+    EventKind,
+    LinkStatus,
+    Stages,
+    StreamEvent,
+    StreamInfo,
+    StreamStatus,
+    WrenchFrame,
+)
 
 Scenario = Literal["still", "contact", "stale", "tare-refused"]
 
@@ -81,17 +90,29 @@ INFO = StreamInfo(
 )
 
 
+PAST: tuple[tuple[float, EventKind, str], ...] = (
+    (5.0, "mark", 'mark "peg in"'),
+    (6.1, "contact", "contact 8.0 N, 0.6 s"),
+)
+
+
 class FakeStream:
-    """Blocks of 10 ms at once, as fast as they are read.
+    """Blocks of samples, as fast as they are read.
 
     Parameters
     ----------
     scenario : str
         "stale": the sensor is silent after `silent_after` blocks.
-    rate_Hz : float
+    rate_Hz, block_s : float
     """
 
-    def __init__(self, scenario: Scenario = "still", rate_Hz: float = 1000.0, silent_after: int | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario = "still",
+        rate_Hz: float = 1000.0,
+        silent_after: int | None = None,
+        block_s: float = 0.01,
+    ) -> None:
         self.info = INFO
         self.frame = WrenchFrame("base", "tcp")
         self.stages = Stages(lowpass_Hz=40.0)
@@ -99,25 +120,29 @@ class FakeStream:
         self.blocks = 0
         self.called: list[str] = []
         self._silent_after = silent_after
-        self._per_block = round(rate_Hz / 100)
+        self._block_ns = round(block_s * 1e9)
+        self._per_block = round(rate_Hz * block_s)
         self._rng = np.random.default_rng(1)
         self._noise = self._rng.normal(size=(64, self._per_block, 6)) * SIGMA
         self._events: list[StreamEvent] = []
 
     @property
     def now_ns(self) -> int:
-        return START_NS + self.blocks * 10_000_000
+        return START_NS + self.blocks * self._block_ns
 
     @property
     def _is_silent(self) -> bool:
         return self._silent_after is not None and self.blocks >= self._silent_after
+
+    def wake(self) -> None:
+        self._silent_after = None
 
     def read(self, timeout_s: float = 0.1) -> Block:
         assert timeout_s > 0
         if self._is_silent:
             raise DeviceTimeout("ATI Mini45 FT12345 sent no sample for 0.31 s", "check its cable and supply")
         n = self._per_block
-        t_ns = self.now_ns + (np.arange(n) + 1) * (10_000_000 // n)
+        t_ns = self.now_ns + (np.arange(n) + 1) * (self._block_ns // n)
         contact = self._contact(t_ns)
         noise = self._noise[self.blocks % len(self._noise)]
         self.blocks += 1
@@ -155,11 +180,10 @@ class FakeStream:
         return np.outer(push, [0.1, -0.05, -1.0, -0.01, 0.04, 0.0])
 
     def take_events(self) -> list[StreamEvent]:
-        at_5 = START_NS + 5_000_000_000
-        if self.blocks == 500:
-            self._events.append(StreamEvent(at_5, "mark", 'mark "peg in"'))
-        if self.blocks == 610:
-            self._events.append(StreamEvent(at_5 + 500_000_000, "contact", "contact 8.0 N, 0.6 s"))
+        for t_s, kind, text in PAST:
+            t_ns = START_NS + round(t_s * 1e9)
+            if t_ns <= self.now_ns < t_ns + self._block_ns:
+                self._events.append(StreamEvent(t_ns, kind, text))
         taken, self._events = self._events, []
         return taken
 
