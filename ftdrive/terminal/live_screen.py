@@ -24,6 +24,7 @@ from calib.errors import BadDataset
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import check_calibration
 from ftdrive.errors import ConfigError
+from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Axes, Point, StreamInfo, WrenchFrame
 from ftdrive.terminal.live.feed import Feed, Sink, Stream
 from ftdrive.terminal.live.history import SPANS_S
@@ -34,13 +35,14 @@ from ftdrive.terminal.live.view import BAD, Line, Part
 T = TypeVar("T")
 
 _REFRESH_S = 0.1
+_SEEK_S = 5.0
 _LOWPASS_HZ = 40.0
 """Cut-off of the low-pass that key 4 switches on."""
 _HELP = """\
  ftdrive live: the wrench on the tool, ten times a second
 
  now      mean of the last 0.1 s
- ± σ      one sigma of one sample: noise and calibration
+ ± σ      one sigma of that mean: noise and calibration
  peak     extremes since p
  bars     their scale follows the recent extremes
 
@@ -232,6 +234,24 @@ def _press(feed: Feed, key: str) -> None:
     elif key == "4":
         highest_Hz = min(_LOWPASS_HZ, stream.info.sensor_rate_Hz / 4)
         stream.stages = replace(stream.stages, lowpass_Hz=None if stream.stages.lowpass_Hz else highest_Hz)
+    elif isinstance(stream, ReplayedStream):
+        _press_of_replay(stream, feed, key)
+
+
+def _press_of_replay(stream: ReplayedStream, feed: Feed, key: str) -> None:
+    """Do what a key stands for in a replay."""
+    if key == "space":
+        (stream.resume if stream.is_paused else stream.pause)()
+    elif key == "left":
+        stream.seek(stream.at_s - _SEEK_S)
+    elif key == "right":
+        stream.seek(stream.at_s + _SEEK_S)
+    elif key == ".":
+        feed.take(stream.step())
+    elif key in {"+", "="}:
+        stream.speed *= 2
+    elif key == "-":
+        stream.speed /= 2
 
 
 def _set_frame(feed: Feed, frames: Iterable[WrenchFrame]) -> None:

@@ -34,9 +34,9 @@ class Paced(FakeStream):
 
     begun_s = time.monotonic()
 
-    def read(self, timeout_s: float = 0.1) -> Block:
+    def read(self) -> Block:
         time.sleep(max(0.0, self.begun_s + 0.01 * self.blocks - time.monotonic()))
-        return super().read(timeout_s)
+        return super().read()
 
 
 def run(rate_Hz: float, duration_s: float, with_screen: bool) -> dict[str, float]:

@@ -7,11 +7,16 @@ from operator import methodcaller
 from queue import SimpleQueue
 from typing import Protocol
 
+import numpy as np
+
 from drivers.errors import DriverError
+from drivers.interfaces import Array
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, Stages, StreamEvent, StreamInfo, StreamStatus, WrenchFrame
 from ftdrive.terminal.live.view import BAD, CONTACT, GOOD, STRONG, WARNING, Note
 
+MEAN_S = 0.1
+"""The screen shows means of so long."""
 _STATUS_NS = 50_000_000
 _RETRY_S = 0.05
 """A failed stream may raise at once; this long the thread waits before it reads again."""
@@ -38,14 +43,17 @@ class Stream(Protocol):
     frame: WrenchFrame
     stages: Stages
 
-    def read(self, timeout_s: float = 0.1) -> Block:
-        """Return at least one row."""
+    def read(self) -> Block:
+        """Return the next samples; none while a recording pauses."""
 
     def take_events(self) -> list[StreamEvent]:
         """Return the events since the last call."""
 
     def status(self) -> StreamStatus:
         """Return rates, ages, delay, tare and drift."""
+
+    def sigma_of_mean(self, R_base_flange: Array, duration_s: float) -> Array:
+        """Return the standard deviation (6,) of a mean of the wrench; NaN until the noise is known."""
 
     def tare(self) -> StreamEvent:
         """Set the bias so that a free tool reads zero."""
@@ -86,7 +94,8 @@ class Feed:
     blocks, notes : deque
         What is new; the screen takes it.
     status : StreamStatus
-        At most 50 ms of the stream older than the newest block.
+    sigma : array, shape (6,)
+        Of a mean over `MEAN_S`; like the status at most 50 ms of the stream older than the newest block.
     failure : DriverError or None
         Why the stream gives no samples now.
     crash : BaseException or None
@@ -102,6 +111,7 @@ class Feed:
         self.blocks: deque[Block] = deque(maxlen=_MOST_BLOCKS)
         self.notes: deque[Note] = deque()
         self.status = stream.status()
+        self.sigma = np.full(6, np.nan)
         self.failure: DriverError | None = None
         self.crash: BaseException | None = None
         self.newest_ns: int | None = None
@@ -143,6 +153,18 @@ class Feed:
             self._record(methodcaller("event", event))
             self.notes.append(Note(event.t_host_ns, event.text, _STYLES.get(event.kind, ""), event.kind in _MARKS))
 
+    def take(self, block: Block) -> None:
+        """Hand samples on, if there are any."""
+        if not len(block):
+            return
+        self.newest_ns = int(block.t_host_ns[-1])
+        self.blocks.append(block)
+        self._record(methodcaller("write", block))
+        if abs(self.newest_ns - self._status_ns) > _STATUS_NS:
+            self._status_ns = self.newest_ns
+            self.status = self.stream.status()
+            self.sigma = self.stream.sigma_of_mean(block.R_base_flange[-1], MEAN_S)
+
     def switch_recording(self) -> None:
         """Start a recording, or complete the one that runs; for `request`."""
         if self._sink is not None:
@@ -168,11 +190,7 @@ class Feed:
             self._ended.wait(_RETRY_S)
             return
         self.failure = None
-        self.newest_ns = int(block.t_host_ns[-1])
-        self.blocks.append(block)
-        self._record(methodcaller("write", block))
-        if abs(self.newest_ns - self._status_ns) > _STATUS_NS:
-            self.status, self._status_ns = self.stream.status(), self.newest_ns
+        self.take(block)
 
     def _record(self, act: Callable[[Sink], object]) -> None:
         """Let the recorder do something; its failure ends the recording, never the screen."""

@@ -98,12 +98,12 @@ def _time_axis(columns: Columns, cells: int) -> Line:
 def plot(view: View, columns: Columns, i: int, full: float, rows: int, *, with_value: bool) -> list[Line]:
     """Draw one component: a line with contacts, marks and perhaps the value, then `rows` - 1 lines of Braille.
 
-    The envelope of the samples stands before the zero line and the band of ±1 sigma about it.
+    The envelope of the samples stands before the zero line and the band of ±1 sigma of a sample about it.
     """
-    reading, unit, digits = view.reading, "N" if i < 3 else "N·m", 2 if i < 3 else 3
+    reading, unit, places = view.reading, "N" if i < 3 else "N·m", 2 if i < 3 else 3
     head = Line(f"{AXES[i]:>{_GUTTER - 1}} ", STRONG)
     if with_value and reading is not None and not view.silent:
-        head.add(f"{reading.wrench[i]:+z.{digits}f} ± {reading.sigma[i]:.{digits}f} {unit} ")
+        head.add(f"{reading.wrench[i]:+z.{places}f} ± {panels.digits(reading.sigma[i], places)} {unit} ")
     contact = columns.contact_cells
     cells = len(contact)
     marks = {
@@ -120,8 +120,8 @@ def plot(view: View, columns: Columns, i: int, full: float, rows: int, *, with_v
     rows -= 1
     ink = braille.characters(braille.envelope(columns.low[i], columns.high[i], rows, full))
     under = np.zeros((4 * rows, 2 * cells), np.bool_)
-    if reading is not None and np.isfinite(reading.sigma[i]):
-        for value in (-reading.sigma[i], 0.0, reading.sigma[i]):
+    if reading is not None and np.isfinite(sigma := reading.sample_sigma[i]):
+        for value in (-sigma, 0.0, sigma):
             if (dot := braille.level(value, rows, full)) is not None:
                 under[dot, ::4] = True
     under[::2, [2 * cell for cell in marks]] = True

@@ -129,9 +129,13 @@ def state(view: View, width: int) -> Line:
         force_N = float(np.linalg.norm(status.tare[:3]))
         line.add(f"{_time_of_day(view.info, status.tare_t_host_ns)[:5]} {force_N:.2f} N")
     is_drifting = abs(status.drift_N_h) > _SIGNIFICANT * status.drift_sigma_N_h > 0
-    drift = f"{status.drift_N_h:.2g} ± {status.drift_sigma_N_h:.1g} N/h"
+    drift = f"{_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h"
     line.add("   drift ").add(drift, WARNING if is_drifting else "")
     return line.fit(width)
+
+
+def _rounded(value: float) -> str:
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
 def _age(view: View) -> str:
@@ -162,7 +166,7 @@ def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
     bar_cells = 0 if bar_cells < 11 else bar_cells - 1 + bar_cells % 2
     columns = view.columns(2 * trace_cells or 20)
     lines = []
-    for first, unit, digits in ((0, "N", 2), (3, "N·m", 3)):
+    for first, unit, places in ((0, "N", 2), (3, "N·m", 3)):
         full = full_scale(columns, view.reading, first)
         head = Line("        now     ± σ   -peak   +peak " if first == 0 else "", FAINT).to(_NUMBERS)
         head.join(_scale(full, unit, bar_cells))
@@ -170,13 +174,13 @@ def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
             head.to(_NUMBERS + bar_cells + 4).add(span(columns), FAINT, "g")
         lines.append(head.fit(width))
         for i in range(first, first + 3):
-            line = _component(view, i, digits)
+            line = _component(view, i, places)
             if bar_cells:
                 line.to(_NUMBERS).join(_bar(view, i, full, bar_cells))
             if trace_cells:
                 line.add("  ").join(trace(columns, i, full))
             lines.append(line.fit(width))
-        size = _size(view, first, digits).to(_NUMBERS)
+        size = _size(view, first, places).to(_NUMBERS)
         lines.append(size.join(_contact(view) if first == 0 else line_of_force(view.reading)).fit(width))
     return lines
 
@@ -190,35 +194,35 @@ def full_scale(columns: Columns, reading: Reading | None, first: int) -> float:
     """Return a round full scale for three components: the recent extremes fit, and noise alone stays small."""
     rows = slice(first, first + 3)
     largest = np.abs([columns.low[rows], columns.high[rows]])
-    sigma = np.zeros(3) if reading is None else np.nan_to_num(reading.sigma[rows])
+    sigma = np.zeros(3) if reading is None else np.nan_to_num(reading.sample_sigma[rows])
     least = LEAST_FULL_SIGMA * float(sigma.max())
     wanted = max(least, 1.05 * float(largest[np.isfinite(largest)].max(initial=0.0)), 1e-6)
     decade = 10.0 ** np.floor(np.log10(wanted))
     return float(next(step * decade for step in (1, 2, 5, 10) if step * decade >= wanted))
 
 
-def _component(view: View, i: int, digits: int) -> Line:
+def _component(view: View, i: int, places: int) -> Line:
     reading, line = view.reading, Line(f" {AXES[i]} ", STRONG)
     if reading is None or view.silent:
         line.add(f"{'--.--':>8}", BAD if view.silent else FAINT).add(f"{'--':>8}", FAINT)
-        return line.join(_peaks(view, i, digits))
-    line.add(f"{reading.wrench[i]:+z8.{digits}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
-    return line.add(_sigma(reading.sigma[i], digits), FAINT).join(_peaks(view, i, digits))
+        return line.join(_peaks(view, i, places))
+    line.add(f"{reading.wrench[i]:+z8.{places}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
+    return line.add(f"{digits(reading.sigma[i], places):>8}", FAINT).join(_peaks(view, i, places))
 
 
-def _sigma(sigma: float, digits: int) -> str:
-    """Return a standard deviation in 8 cells; it is NaN until the noise is known."""
-    return f"{'--':>8}" if np.isnan(sigma) else f"{sigma:8.{digits}f}"
+def digits(sigma: float, places: int) -> str:
+    """Return a standard deviation as text; it is NaN until the noise is known."""
+    return "--" if np.isnan(sigma) else f"{sigma:.{places}f}"
 
 
-def _peaks(view: View, i: int, digits: int) -> Line:
+def _peaks(view: View, i: int, places: int) -> Line:
     low, high = view.peaks.low[i], view.peaks.high[i]
     if low > high:
         return Line()
-    return Line(f"{low:+z8.{digits - 1}f}{high:+z8.{digits - 1}f}", "", "p")
+    return Line(f"{low:+z8.{places - 1}f}{high:+z8.{places - 1}f}", "", "p")
 
 
-def _size(view: View, first: int, digits: int) -> Line:
+def _size(view: View, first: int, places: int) -> Line:
     reading, peak = view.reading, view.peaks.torque_Nm if first else view.peaks.force_N
     line = Line("|T| " if first else "|F| ", STRONG)
     if reading is None or view.silent:
@@ -226,8 +230,8 @@ def _size(view: View, first: int, digits: int) -> Line:
     part, sigma = reading.wrench[first : first + 3], reading.sigma[first : first + 3]
     size = float(np.linalg.norm(part))
     along = float(np.linalg.norm(part * sigma)) / size if size else float(sigma.max())
-    line.add(f"{size:8.{digits}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
-    return line.add(_sigma(along, digits), FAINT).add(" " * 8).add(f"{peak:8.{digits - 1}f}", "", "p")
+    line.add(f"{size:8.{places}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
+    return line.add(f"{digits(along, places):>8}", FAINT).add(" " * 8).add(f"{peak:8.{places - 1}f}", "", "p")
 
 
 def _scale(full: float, unit: str, cells: int) -> Line:
@@ -307,7 +311,10 @@ def links(view: View, width: int) -> list[Line]:
     """Show down in tool axes, the raw wrench, the used range, both links and the controller's payload."""
     dial = _dial(view)
     rows = [_raw(view), _range(view), _link("sensor", view.status.sensor), _link("robot", view.status.arm)]
-    rows[3].add(f"  delay {1e3 * view.status.delay_s:.1f} ± {1e3 * view.status.delay_sigma_s:.1f} ms")
+    if view.replay is None:
+        sigma_s = view.status.delay_sigma_s
+        known = f" ± {1e3 * sigma_s:.1f} ms" if sigma_s else " ms, configured"
+        rows[3].add(f"  delay {1e3 * view.status.delay_s:.1f}{known}")
     payload = next((check for check in view.checks if check.name == "robot.payload"), None)
     rows.append(Line(" payload   ", FAINT).join(_checked(payload) if payload else Line("not checked", FAINT)))
     return [Line(left).to(12).join(right).fit(width) for left, right in zip(dial, rows, strict=True)]

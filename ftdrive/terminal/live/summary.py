@@ -12,14 +12,15 @@ from calib import CalibrationDataset
 from drivers.interfaces import Array
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import check_noise_change
+from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Block
-from ftdrive.terminal.live.feed import Feed
+from ftdrive.terminal.live.feed import MEAN_S, Feed, Stream
 from ftdrive.terminal.live.history import SPANS_S, Columns, History
-from ftdrive.terminal.live.view import WARNING, Note, Peaks, Reading, View
+from ftdrive.terminal.live.view import WARNING, Note, Peaks, Reading, Replay, View
 
 T = TypeVar("T")
 
-_MEAN_NS = 100_000_000
+_MEAN_NS = round(MEAN_S * 1e9)
 _REST_NS = 2_000_000_000
 _STALE_S = 0.3
 """An older number is not shown."""
@@ -97,6 +98,7 @@ class Summary:
             recording_s=recording_s,
             is_frozen=self.is_frozen,
             calibrated=self._calibrated,
+            replay=_replay(feed.stream),
         )
 
     @property
@@ -121,7 +123,8 @@ class Summary:
             t_host_ns=int(newest.t_host_ns[-1]),
             wrench=np.sum([each.wrench for each in self._recent], axis=0) / n,
             raw=np.sum([each.raw for each in self._recent], axis=0) / n,
-            sigma=newest.sigma,
+            sigma=self._feed.sigma,
+            sample_sigma=newest.sigma,
             chi2=float(newest.chi2[-1]),
             in_contact=bool(newest.in_contact[-1]),
             R_base_flange=newest.R_base_flange[-1],
@@ -183,6 +186,12 @@ class Summary:
         if check.state in {"failed", "warning"}:
             text = f"{check.found}. Fix: {check.fix}" if check.fix else check.found
             self._notes.appendleft(Note(None, text, WARNING))
+
+
+def _replay(stream: Stream) -> Replay | None:
+    if not isinstance(stream, ReplayedStream):
+        return None
+    return Replay(stream.at_s, stream.duration_s, stream.speed, stream.is_paused, stream.has_ended)
 
 
 def _taken(queue: deque[T]) -> list[T]:

@@ -90,7 +90,9 @@ class Reading:
     raw: Array
     """(6,) N and N·m, sensor axes, about the sensor origin."""
     sigma: Array
-    """(6,) of one sample of `wrench`: noise and calibration."""
+    """(6,) of `wrench`: noise and calibration; NaN until the noise is known."""
+    sample_sigma: Array
+    """(6,) of one sample."""
     chi2: float
     """Of the newest sample."""
     in_contact: bool

@@ -8,7 +8,7 @@ import numpy as np
 from calib import CalibrationResult, Parameters
 from calib.model import predict
 from drivers.errors import DeviceTimeout
-from drivers.interfaces import DeviceInfo, Fact
+from drivers.interfaces import Array, DeviceInfo, Fact
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import (
     Block,
@@ -23,7 +23,8 @@ from ftdrive.live.samples import (
 
 Scenario = Literal["still", "contact", "stale", "tare-refused"]
 
-SIGMA = np.repeat([0.03, 0.001], 3)
+SIGMA = np.repeat([0.1, 0.004], 3)
+"""Of one sample."""
 LIMIT = 22.46
 START_NS = 1_000_000_000_000
 UTC_OFFSET_NS = 1_794_841_200_000_000_000 - START_NS
@@ -68,7 +69,7 @@ def calibration() -> CalibrationResult:
                 "sensor": {"model": "ATI Mini45", "serial": "FT12345"},
             },
         },
-        measured_sigma=SIGMA / 10,
+        measured_sigma=SIGMA / 30,
     )
 
 
@@ -137,8 +138,7 @@ class FakeStream:
     def wake(self) -> None:
         self._silent_after = None
 
-    def read(self, timeout_s: float = 0.1) -> Block:
-        assert timeout_s > 0
+    def read(self) -> Block:
         if self._is_silent:
             raise DeviceTimeout("ATI Mini45 FT12345 sent no sample for 0.31 s", "check its cable and supply")
         n = self._per_block
@@ -201,6 +201,11 @@ class FakeStream:
             contact_limit=LIMIT,
             false_alarm_rate=0.001,
         )
+
+    def sigma_of_mean(self, R_base_flange: Array, duration_s: float) -> Array:
+        assert R_base_flange.shape == (3, 3)
+        assert duration_s == 0.1
+        return SIGMA / 3
 
     def tare(self) -> StreamEvent:
         if self.scenario == "tare-refused":

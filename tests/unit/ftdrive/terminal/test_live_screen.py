@@ -5,6 +5,7 @@ import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.cells import cell_len
 from syrupy.assertion import SnapshotAssertion
@@ -12,12 +13,14 @@ from textual.pilot import Pilot
 
 from ftdrive.checks.check import Check
 from ftdrive.errors import ConfigError
-from ftdrive.live.samples import Stages, WrenchFrame
+from ftdrive.live.replay import STEP_S, ReplayedStream
+from ftdrive.live.samples import Paired, Stages, WrenchFrame
 from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.layout import frame
 from ftdrive.terminal.live.summary import Summary
 from ftdrive.terminal.live_screen import LiveApp
-from tests.unit.ftdrive.terminal.fake_stream import FakeStream, Scenario
+from tests.fake_clock import FakeClock
+from tests.unit.ftdrive.terminal.fake_stream import FREE, INFO, R_BASE_FLANGE, SIGMA, START_NS, FakeStream, Scenario
 
 CHECKS = (
     Check("calibration.devices", "ok", "verdict good, with these devices"),
@@ -167,6 +170,46 @@ def test_freeze_span_and_peaks() -> None:
     assert "FROZEN" in lines[0]
     assert "0.1 free" in lines[8]
     assert "60 s" in lines[4]
+
+
+def recording(seconds: int) -> ReplayedStream:
+    """A free tool at rest, 100 Hz."""
+    n = 100 * seconds
+    rng = np.random.default_rng(1)
+    rows = Paired(
+        t_host_ns=START_NS + np.arange(n) * 10_000_000,
+        t_device_s=np.full(n, np.nan),
+        seq=np.arange(n),
+        status=np.zeros(n, np.uint32),
+        raw=FREE + rng.normal(size=(n, 6)) * SIGMA,
+        q_rad=np.zeros((n, 6)),
+        R_base_flange=np.tile(R_BASE_FLANGE, (n, 1, 1)),
+        p_base_flange_m=np.full((n, 3), np.nan),
+    )
+    return ReplayedStream(INFO, rows, clock=FakeClock())
+
+
+def test_a_replay_pauses_steps_seeks_and_says_where_it_is() -> None:
+    async def act(screen: Screen, pilot: Pilot[None]) -> None:
+        await screen.press(pilot, "space")
+        assert replayed.is_paused
+        begin_s = replayed.at_s
+        await screen.press(pilot, ".", ".")
+        assert replayed.at_s == pytest.approx(begin_s + 2 * STEP_S)
+        assert "REPLAY 00:00:00 of 00:00:19, paused" in (await screen.lines(pilot))[0]
+        await screen.press(pilot, "right", "right", "left", "right", "plus", "space")
+        screen.step(40)
+        assert replayed.at_s > 10
+
+    replayed = recording(20)
+    screen = Screen(blocks=0)
+    screen.feed = Feed(replayed)
+    screen.summary = Summary(screen.feed)
+    screen.step(3)
+    lines = screen.run(act)
+    assert ", x 2" in lines[0]
+    assert "space pause" in lines[-1]
+    assert "+0.0" in lines[5] or "-0.0" in lines[5]
 
 
 def test_help_covers_the_screen_until_a_key() -> None:

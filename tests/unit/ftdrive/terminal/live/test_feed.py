@@ -93,11 +93,11 @@ def test_the_thread_reads_until_it_is_stopped_and_completes_the_recording() -> N
     tape, enough = Tape(), threading.Event()
 
     class Counted(FakeStream):
-        def read(self, timeout_s: float = 0.1) -> Block:
+        def read(self) -> Block:
             if self.blocks >= 50:
                 enough.set()
                 threading.Event().wait(0.001)
-            return super().read(timeout_s)
+            return super().read()
 
     feed = Feed(Counted(), lambda: tape)
     feed.request(feed.switch_recording)
@@ -110,8 +110,8 @@ def test_the_thread_reads_until_it_is_stopped_and_completes_the_recording() -> N
 
 def test_what_ends_the_thread_is_kept() -> None:
     class Broken(FakeStream):
-        def read(self, timeout_s: float = 0.1) -> Any:
-            raise ConfigError(f"another device answers within {timeout_s}: start again")
+        def read(self) -> Any:
+            raise ConfigError("another device answers: start again")
 
     feed = Feed(Broken())
     feed.start()
