@@ -488,7 +488,8 @@ def events(view: View, width: int, rows: int) -> list[Line]:
         head = Line(" ")
         if note.t_host_ns is not None:
             head.add(f"{_time_of_day(view.info, note.t_host_ns)} ", FAINT)
-        item = _hanging(head, [Part(note.text, note.style)], width)
+        text = note.text if note.times == 1 else f"{note.text} ({note.times} times)"
+        item = _hanging(head, [Part(text, note.style)], width)
         if rows <= 3 and lines and lines[-1].width + item[0].width + 3 <= width and len(item) == 1:
             lines[-1].add("   ").join(item[0])
         else:

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import groupby
 from typing import NamedTuple, TypeVar
 
@@ -75,7 +76,11 @@ class Summary:
     def view(self) -> View:
         """Take what is new and return the state to draw."""
         feed, status = self._feed, self._feed.status
-        self._notes.extendleft(_taken(feed.notes))
+        for note in _taken(feed.notes):
+            times = 1
+            if self._notes and self._notes[0].text == note.text:
+                times += self._notes.popleft().times
+            self._notes.appendleft(replace(note, times=times))
         blocks = _taken(feed.blocks)
         if not self.is_frozen:
             for _, alike in groupby(blocks, lambda block: (block.frame, block.stages)):

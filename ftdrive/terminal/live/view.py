@@ -35,9 +35,11 @@ class Line:
 
     def add(self, text: str, style: str = "", key: str = "") -> Self:
         """Append text."""
-        if text:
+        self.width += cell_len(text)
+        if self.parts and self.parts[-1][1:] == (style, key):
+            self.parts[-1] = Part(self.parts[-1].text + text, style, key)
+        elif text:
             self.parts.append(Part(text, style, key))
-            self.width += cell_len(text)
         return self
 
     def to(self, column: int) -> Self:
@@ -46,8 +48,8 @@ class Line:
 
     def join(self, other: "Line") -> Self:
         """Append another line."""
-        self.parts += other.parts
-        self.width += other.width
+        for part in other.parts:
+            self.add(*part)
         return self
 
     def fit(self, width: int) -> "Line":
@@ -78,6 +80,8 @@ class Note:
     style: str = ""
     is_mark: bool = False
     """Whether the plots show its time."""
+    times: int = 1
+    """How often it came in a row."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -121,6 +121,14 @@ def test_the_noise_is_compared_once_with_that_of_the_calibration(noise: float, s
     assert len(view.notes) == (state == "warning")
 
 
+def test_an_event_that_repeats_is_one_line() -> None:
+    rig = Rig(FakeStream())
+    for text in ("a", "b", "b", "b"):
+        rig.feed.note(text)
+    view = rig.run(1)
+    assert [(note.text, note.times) for note in view.notes] == [("b", 3), ("a", 1)]
+
+
 def test_a_failed_check_is_among_the_events() -> None:
     check = Check("calibration.devices", "failed", "the calibration was made with the sensor A", "ftdrive calibrate")
     view = Rig(FakeStream(), None, check).run(1)
