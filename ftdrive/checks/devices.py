@@ -29,7 +29,7 @@ from drivers.ur.kinematics import MODELS
 from ftdrive.cell.config import CellConfig, RobotConfig, ToolConfig
 from ftdrive.checks.check import Check, State
 from ftdrive.checks.computer import SensorAddress, latency_command
-from ftdrive.checks.controller_settings import PAYLOAD_KG, PAYLOAD_SHARE
+from ftdrive.checks.controller_settings import PAYLOAD_KG, PAYLOAD_SHARE, payload_in_words
 
 _PUSH_N = 2.0
 _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs on this computer"
@@ -368,6 +368,27 @@ def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) 
         fix = "set the centre of gravity at the pendant: Installation, Payload"
         return Check(name, "warning", f"{found}; nothing hangs in the middle of the flange face", fix)
     return Check(name, "ok", found)
+
+
+def check_weighed_payload(payload_kg: float | None, result: CalibrationResult, sensor_kg: float | None) -> Check:
+    """Compare the payload configured in the controller with the load that a calibration has weighed.
+
+    Parameters
+    ----------
+    payload_kg : float, optional
+        As the controller reports it.
+    result : CalibrationResult
+    sensor_kg : float, optional
+        Mass of sensor and adapter, which the sensor cannot weigh.
+    """
+    name = "robot.payload"
+    if payload_kg is None:
+        return Check(name, "skipped", "this controller does not report its payload")
+    if words := payload_in_words(payload_kg, result.mass_kg, sensor_kg):
+        found, _, fix = words.partition(": ")
+        return Check(name, "warning", found, fix)
+    known = "sensor" if sensor_kg is None else f"{sensor_kg:.2f} kg sensor"
+    return Check(name, "ok", f"robot {payload_kg:.2f} kg; weighed {result.mass_kg:.2f} kg + {known}")
 
 
 def _at_tool(p_flange_m: Sequence[float], tool: ToolConfig) -> bool:

@@ -25,7 +25,7 @@ SIZE = (80, 24)
 BLOCKS = 1200
 CHECKS = (
     Check("calibration.devices", "ok", "verdict good, with these devices"),
-    Check("robot.payload", "ok", "1.74 kg = 1.44 kg on the sensor + 0.30 kg"),
+    Check("robot.payload", "ok", "robot 1.74 kg; weighed 1.44 kg + 0.30 kg sensor"),
 )
 CELL_PX, ROW_PX = 12.2, 24.4
 """Of rich's SVG."""

@@ -12,7 +12,7 @@ _WIDE = 120
 _LEFT = 78
 _GUTTER = 7
 """Columns for the scale of a plot."""
-_LEAST_PLOT_ROWS = 3
+_LEAST_PLOT_ROWS, _LEAST_EVENTS = 3, 3
 
 
 def frame(view: View, width: int, height: int) -> list[Line]:
@@ -55,7 +55,7 @@ def _wide(view: View, width: int, rows: int) -> list[Line]:
     separator = Line("─" * _LEFT, FAINT)
     left = [*panels.table(view, _LEFT, with_trace=False), separator, *panels.links(view, _LEFT), separator]
     for extra in (panels.others(view, _LEFT), panels.sphere(view, _LEFT), panels.identity(view, _LEFT)):
-        if rows - len(left) >= len(extra) + 5:
+        if rows - len(left) >= len(extra) + 1 + _LEAST_EVENTS:
             left += [*extra, separator]
     left += panels.events(view, _LEFT, max(0, rows - len(left)))
     right = _plots(view, width - _LEFT - 1, rows, across=1)
@@ -100,9 +100,10 @@ def plot(view: View, columns: Columns, i: int, full: float, rows: int, *, with_v
 
     The envelope of the samples stands before the zero line and the band of ±1 sigma of a sample about it.
     """
-    reading, unit, places = view.reading, "N" if i < 3 else "N·m", 2 if i < 3 else 3
+    reading, unit = view.reading, "N" if i < 3 else "N·m"
     head = Line(f"{AXES[i]:>{_GUTTER - 1}} ", STRONG)
     if with_value and reading is not None and not view.silent:
+        places = panels.decimals(reading, i // 3 * 3)
         head.add(f"{reading.wrench[i]:+z.{places}f} ± {panels.digits(reading.sigma[i], places)} {unit} ")
     contact = columns.contact_cells
     cells = len(contact)

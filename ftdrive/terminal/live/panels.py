@@ -166,7 +166,8 @@ def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
     bar_cells = 0 if bar_cells < 11 else bar_cells - 1 + bar_cells % 2
     columns = view.columns(2 * trace_cells or 20)
     lines = []
-    for first, unit, places in ((0, "N", 2), (3, "N·m", 3)):
+    for first, unit in ((0, "N"), (3, "N·m")):
+        places = decimals(view.reading, first)
         full = full_scale(columns, view.reading, first)
         head = Line("        now     ± σ   -peak   +peak " if first == 0 else "", FAINT).to(_NUMBERS)
         head.join(_scale(full, unit, bar_cells))
@@ -188,6 +189,12 @@ def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
 def span(columns: Columns) -> str:
     """Return the duration of all columns in words."""
     return f"{columns.span_s:.{0 if columns.span_s > 5 else 1}f} s"
+
+
+def decimals(reading: Reading | None, first: int) -> int:
+    """Return how many decimals three components need to show their standard deviations."""
+    usual = 3 if first else 2
+    return usual if reading is None or not reading.sigma[first : first + 3].max() < 0.5 * 10**-usual else usual + 1
 
 
 def full_scale(columns: Columns, reading: Reading | None, first: int) -> float:
@@ -313,7 +320,7 @@ def links(view: View, width: int) -> list[Line]:
     rows = [_raw(view), _range(view), _link("sensor", view.status.sensor), _link("robot", view.status.arm)]
     if view.replay is None:
         sigma_s = view.status.delay_sigma_s
-        known = f" ± {1e3 * sigma_s:.1f} ms" if sigma_s else " ms, configured"
+        known = f" ± {1e3 * sigma_s:.{0 if sigma_s > 0.01 else 1}f} ms" if sigma_s else " ms, set"
         rows[3].add(f"  delay {1e3 * view.status.delay_s:.1f}{known}")
     payload = next((check for check in view.checks if check.name == "robot.payload"), None)
     rows.append(Line(" payload   ", FAINT).join(_checked(payload) if payload else Line("not checked", FAINT)))
@@ -361,8 +368,8 @@ def _range(view: View) -> Line:
 def _link(name: str, link: LinkStatus) -> Line:
     line = Line(f" {name:<10}", FAINT)
     slow = link.nominal_rate_Hz > 0 and abs(link.rate_Hz / link.nominal_rate_Hz - 1) > 0.1
-    nominal = f" of {link.nominal_rate_Hz:4.0f}" if link.nominal_rate_Hz > 0 else ""
-    line.add(f"{link.rate_Hz:4.0f}{nominal} Hz", WARNING if slow else "")
+    nominal = f" of {link.nominal_rate_Hz:.0f}" if link.nominal_rate_Hz > 0 else ""
+    line.add(f"{link.rate_Hz:.0f}{nominal} Hz", WARNING if slow else "")
     line.add("  ").add(f"lost {link.lost}", WARNING if link.lost else "")
     return line.add("  ").add(f"age {_short(link.age_s)}", BAD if link.error else "")
 
@@ -470,6 +477,8 @@ def identity(view: View, width: int) -> list[Line]:
         Line(" cal       ", FAINT).add(info.calibration_name),
     ]
     for check in view.checks:
+        if check.name == "robot.payload" and check.state == "ok":  # stands beside the links
+            continue
         words = _checked(check).parts
         lines += _hanging(Line(f" {check.name.partition('.')[2]:<10}", FAINT).add(*words[0]), words[1:], width)
     return [line.fit(width) for line in lines]

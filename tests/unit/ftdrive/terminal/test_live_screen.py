@@ -24,7 +24,7 @@ from tests.unit.ftdrive.terminal.fake_stream import FREE, INFO, R_BASE_FLANGE, S
 
 CHECKS = (
     Check("calibration.devices", "ok", "verdict good, with these devices"),
-    Check("robot.payload", "ok", "1.74 kg = 1.44 kg on the sensor + 0.30 kg"),
+    Check("robot.payload", "ok", "robot 1.74 kg; weighed 1.44 kg + 0.30 kg sensor"),
 )
 
 
