@@ -276,6 +276,11 @@ class Processor:
             self._recent.clear()
             self._buffer, self._done, self._newest_seq = None, 0, None
 
+    @property
+    def contact_limit(self) -> float:
+        """Of `Block.chi2`."""
+        return self._test.limit
+
     def status(self, sensor: LinkStatus, arm: LinkStatus, delay: tuple[float, float]) -> StreamStatus:
         """Return the state of a stream with these links and this delay and its sigma, s."""
         drift_N_h, drift_sigma_N_h = self._drift.force_rate_N_h
