@@ -82,12 +82,11 @@ class Timeline:
         return np.asarray(self._origin[1] + np.rint(times).astype(np.int64))
 
     def _learn_rate(self, x: Array, y: Array) -> None:
-        self._points.append((float(x[-1]), float(y[-1])))
-        (x_0, y_0), (x_1, y_1) = self._points[0], self._points[-1]
-        if y_1 - y_0 > _LEAST_SPAN_S * 1e9:
-            self._slope = (y_1 - y_0) / (x_1 - x_0)
+        x_end, y_end = float(x[-1]), float(y[-1])
+        if y_end > _LEAST_SPAN_S * 1e9:
+            self._slope = y_end / x_end
             self._offset = float((y - self._slope * x).min())
-            self._points.clear()
+            self._last = x_end, y_end
 
     def _note(self, x: float, y: float) -> None:
         """Keep the least delayed sample of each bucket, and fit the line."""

@@ -162,7 +162,7 @@ class Processor:
             end = end if last else max(ready, self._done)
             inertial = inertial[self._done : end]
         rows = buffer.rows(slice(self._done, end))
-        keep = max(0, end - neighbours - self._stride)
+        keep = max(0, end - neighbours - self._stride) // self._stride * self._stride  # knots stay where they are
         self._buffer, self._done = buffer.rows(slice(keep, None)), end - keep
         block = self._processed(rows, inertial)
         if last:
