@@ -45,11 +45,14 @@ def stream(samples: FtSamples, states: ArmStates, stages: Stages, frame: WrenchF
 
 
 def recording(rows: Paired, frame: WrenchFrame) -> float:
-    """Samples per CPU second, a recording at once."""
-    processor = Processor(info(calibrated(), RATE_HZ), frame)
-    begin_s = time.process_time()
-    processor.process(rows, last=True)
-    return len(rows) / (time.process_time() - begin_s)
+    """Samples per CPU second, a recording at once, best of three."""
+    best_s = float("inf")
+    for _ in range(3):
+        processor = Processor(info(calibrated(), RATE_HZ), frame)
+        begin_s = time.process_time()
+        processor.process(rows, last=True)
+        best_s = min(best_s, time.process_time() - begin_s)
+    return len(rows) / best_s
 
 
 def loop(rows: Paired) -> float:
