@@ -283,13 +283,11 @@ def _contact(view: View) -> Line:
     reading, status = view.reading, view.status
     if reading is None or view.silent:
         return Line()
+    if np.isnan(reading.chi2):
+        return Line("noise not known yet", FAINT)
     rate = f"1 in {1 / status.false_alarm_rate:.0f}" if status.false_alarm_rate else ""
     sign = ">" if reading.chi2 > status.contact_limit else "<"
-    test = (
-        "noise not known yet"
-        if np.isnan(reading.chi2)
-        else f"χ² {reading.chi2:.0f} {sign} {status.contact_limit:.1f}, {rate}"
-    )
+    test = f"χ² {reading.chi2:.0f} {sign} {status.contact_limit:.1f}, {rate}"
     if reading.in_contact:
         return Line("▲ CONTACT ", f"bold {CONTACT}").add(f"{view.contact_s:.1f} s  ").add(test, FAINT)
     return Line("free  ", GOOD).add(test, FAINT)

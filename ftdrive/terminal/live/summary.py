@@ -152,7 +152,7 @@ class Summary:
                     history.clear()
         if has_gone_back:
             self._recent.clear()
-        self._follow_contact(t_ns, in_contact, anew=has_gone_back)
+        self._follow_contact(t_ns, in_contact, restarted=has_gone_back)
         self._newest = newest
         for block in blocks:
             end_ns = int(block.t_host_ns[-1])
@@ -164,11 +164,11 @@ class Summary:
             history.add(t_ns, wrench, in_contact)
         self._check_noise(blocks)
 
-    def _follow_contact(self, t_ns: NDArray[np.int64], in_contact: NDArray[np.bool_], *, anew: bool) -> None:
+    def _follow_contact(self, t_ns: NDArray[np.int64], in_contact: NDArray[np.bool_], *, restarted: bool) -> None:
         if not in_contact[-1]:
             return
         free = np.flatnonzero(~in_contact)
-        if len(free) or anew or self._newest is None or not self._newest.in_contact[-1]:
+        if len(free) or restarted or self._newest is None or not self._newest.in_contact[-1]:
             self._contact_since_ns = int(t_ns[free[-1] + 1 if len(free) else 0])
 
     def _check_noise(self, blocks: list[Block]) -> None:
