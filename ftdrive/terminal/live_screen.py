@@ -171,11 +171,12 @@ class LiveApp(App[None]):
             self.exit()
             return
         width, height = self.size
+        view = self._summary.view()
         if self._helping:
             lines = [Line(text).fit(width) for text in _HELP.split("\n")]
             self._canvas.show((lines + [Line().to(width)] * height)[:height])
         else:
-            self._canvas.show(frame(self._summary.view(), width, height))
+            self._canvas.show(frame(view, width, height))
 
     def on_key(self, event: events.Key) -> None:
         """Do what a key stands for."""

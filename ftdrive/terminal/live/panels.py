@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +12,7 @@ from rich.cells import cell_len
 from drivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 from ftdrive.checks.check import Check
 from ftdrive.checks.controller_settings import axes_along
-from ftdrive.checks.devices import AXES
+from ftdrive.checks.devices import AXES, check_rate
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import LinkStatus, Stages, StreamInfo, WrenchFrame
@@ -51,7 +52,7 @@ _STATE = {"ok": ("✔", GOOD), "warning": ("!", WARNING), "failed": ("✘", BAD)
 def title(view: View, width: int) -> Line:
     """Name the devices, and whether the numbers are live."""
     line = Line(" ftdrive live", STRONG).add("  ")
-    line.add(" · ".join([view.info.arm.model, _named(view.info.sensor), view.info.tool]))
+    line.add(" · ".join(filter(None, [view.info.arm.model, _named(view.info.sensor), view.info.tool])))
     right = Line()
     if view.is_frozen:
         right.add(" FROZEN ", "reverse bold", "z").add(" ")
@@ -128,9 +129,7 @@ def state(view: View, width: int) -> Line:
     else:
         force_N = float(np.linalg.norm(status.tare[:3]))
         line.add(f"{_time_of_day(view.info, status.tare_t_host_ns)[:5]} {force_N:.2f} N")
-    is_drifting = abs(status.drift_N_h) > _SIGNIFICANT * status.drift_sigma_N_h > 0
-    drift = f"{_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h"
-    line.add("   drift ").add(drift, WARNING if is_drifting else "")
+    line.add(f"   drift {_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h")
     return line.fit(width)
 
 
@@ -365,9 +364,9 @@ def _range(view: View) -> Line:
 
 def _link(name: str, link: LinkStatus) -> Line:
     line = Line(f" {name:<10}", FAINT)
-    slow = link.nominal_rate_Hz > 0 and abs(link.rate_Hz / link.nominal_rate_Hz - 1) > 0.1
-    nominal = f" of {link.nominal_rate_Hz:.0f}" if link.nominal_rate_Hz > 0 else ""
-    line.add(f"{link.rate_Hz:.0f}{nominal} Hz", WARNING if slow else "")
+    nominal = "" if np.isnan(link.nominal_rate_Hz) else f" of {link.nominal_rate_Hz:.0f}"
+    is_usual = check_rate(link.rate_Hz, link.nominal_rate_Hz).state == "ok"
+    line.add(f"{link.rate_Hz:.0f}{nominal} Hz", "" if is_usual else WARNING)
     line.add("  ").add(f"lost {link.lost}", WARNING if link.lost else "")
     return line.add("  ").add(f"age {_short(link.age_s)}", BAD if link.error else "")
 
@@ -438,28 +437,34 @@ def sphere(view: View, width: int) -> list[Line]:
 
 def _half_sphere(known: Array, down: Array | None) -> list[Line]:
     """Draw one half of the sphere, seen along z; the distance from the middle is the angle."""
-    rows = _DISC // 2
-    angle = np.linspace(0, 2 * np.pi, 200)
-    dots = np.zeros((4 * rows, 2 * _DISC), np.bool_)
-    for radius in (0.5, 1.0):
-        y = np.round((2 * rows - 0.5) * (1 - radius * np.sin(angle)))
-        x = np.round((_DISC - 0.5) * (1 + radius * np.cos(angle)))
-        dots[y.astype(int), x.astype(int)] = True
-    rim = [list(braille.text(row)) for row in braille.characters(dots)]
-    styles = [[FAINT] * _DISC for _ in range(rows)]
+    disc = [list(row) for row in _rings()]
+    rows = len(disc)
+    styles = [[FAINT] * _DISC for _ in disc]
     for directions, sign, style in ((known, "∘", ""), (() if down is None else down[None], "●", BAD)):
         for x, y, z in directions:
             radius = np.arccos(min(abs(z), 1.0)) / (np.pi / 2) / max(np.hypot(x, y), 1e-9)
             row = min(rows - 1, int((1 - radius * y) * rows / 2))
             column = min(_DISC - 1, int((1 + radius * x) * _DISC / 2))
-            rim[row][column], styles[row][column] = sign, style
+            disc[row][column], styles[row][column] = sign, style
     lines = []
-    for signs, kinds in zip(rim, styles, strict=True):
+    for signs, kinds in zip(disc, styles, strict=True):
         line = Line()
         for sign, kind in zip(signs, kinds, strict=True):
             line.add(sign, kind)
         lines.append(line)
     return lines
+
+
+@cache
+def _rings() -> list[str]:
+    """Draw circles at 45° and 90°."""
+    rows, angle = _DISC // 2, np.linspace(0, 2 * np.pi, 200)
+    dots = np.zeros((4 * rows, 2 * _DISC), np.bool_)
+    for radius in (0.5, 1.0):
+        y = np.round((2 * rows - 0.5) * (1 - radius * np.sin(angle)))
+        x = np.round((_DISC - 0.5) * (1 + radius * np.cos(angle)))
+        dots[y.astype(int), x.astype(int)] = True
+    return [braille.text(row) for row in braille.characters(dots)]
 
 
 def _unit(vector: Array) -> Array:
