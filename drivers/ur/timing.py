@@ -16,7 +16,13 @@ class UrTiming:
     stale_s: float = 0.2
     """The longest time without a sample."""
     status_s: float = 0.05
-    """The greatest age of a status."""
+    """The greatest age of a status, from its receipt."""
+    late_s: float = 0.05
+    """A sample that is later than this by the controller's clock is too old for a state or a status."""
+    pause_s: float = 0.1
+    """After a longer pause between two samples, the next is used that the reader waited for."""
+    waited_s: float = 0.001
+    """A sample that comes after this time was waited for; accumulated samples come without waiting."""
     glance_s: float = 0.1
     """The wait of a stop for a sample, before it uses the dashboard server."""
     reason_s: float = 0.05

@@ -5,14 +5,16 @@ the control process and ur_rtde inside it. Everything else, `Calls` of the contr
 """
 
 import json
+import struct
 import subprocess
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drivers.clock import Clock
@@ -23,6 +25,7 @@ from drivers.ur.control import ControlProcess
 from drivers.ur.dashboard import Dashboard
 from drivers.ur.kinematics import MODELS, Pose, forward
 from drivers.ur.reading import Reader
+from drivers.ur.rtde import Recipe
 from drivers.ur.sample import OUTPUTS
 from drivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
@@ -69,7 +72,8 @@ class Controller:
         """What it was asked to do."""
         self.dashboard_limits_s: list[float] = []
         self.stopping_works = True
-        self._sent: deque[list[tuple[float, ...]]] = deque()
+        self.period_s = CYCLE_S
+        self._sent: deque[bytes] = deque()
         self._operation = 0
 
     # ------------------------------------------------------------------ RTDE
@@ -80,13 +84,20 @@ class Controller:
     def missing(self) -> list[str]:
         return sorted(self.unknown)
 
-    def read(self, timeout_s: float) -> list[tuple[float, ...]]:
+    @property
+    def _known(self) -> dict[str, str]:
+        return {name: kind for name, kind in OUTPUTS.items() if name not in self.unknown}
+
+    def read(self, timeout_s: float) -> list[bytes]:
         assert timeout_s <= 0.05
         if self.failure:
             raise self.failure
         if not self._sent:
             raise TimeoutError
-        return self._sent.popleft()
+        return [self._sent.popleft() for _ in range(-(-len(self._sent) // 2))]  # a burst comes in pieces
+
+    def decode(self, samples: Sequence[bytes]) -> dict[str, NDArray[Any]]:
+        return dict(zip(self._known, Recipe(1, tuple(self._known.values())).columns(samples), strict=True))
 
     def close(self) -> None:
         pass
@@ -111,32 +122,37 @@ class Controller:
             "payload_cog": (0.0, 0.0, 0.05),
         }
 
+    def _packed(self) -> bytes:
+        """Pack the sample, after the number of the recipe."""
+        sample = self.sample()
+        letters = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "VECTOR3D": "3d", "VECTOR6D": "6d"}
+        layout = ">B" + "".join(letters[kind] for kind in self._known.values())
+        return struct.pack(layout, 1, *(number for name in self._known for number in sample[name]))
+
     def run(self, reader: Reader) -> None:
-        """Send a sample every 8 ms to a reader that has nothing else to do."""
+        """Send a sample every `period_s` to a reader that has nothing else to do."""
 
         def cycle() -> None:
-            self.t_s += CYCLE_S
+            self.t_s += self.period_s
             self._move()
             if not self.silent:
-                sample = self.sample()
-                self._sent.append([sample[name] for name in OUTPUTS if name not in self.unknown])
+                self._sent.append(self._packed())
+            receive()
+            self.clock.at(self.period_s, cycle)
+
+        def receive() -> None:
             if not self.held_back:
-                receive(max(1, len(self._sent) // 2))
-                if self._sent:  # a backlog is read in no time, and a caller may look meanwhile
-                    self.clock.at(1e-4, lambda: receive(len(self._sent)))
-            self.clock.at(CYCLE_S, cycle)
-
-        def receive(n: int) -> None:
-            for _ in range(n):
                 reader._follow()
+                if self._sent:  # and a caller may look meanwhile
+                    self.clock.at(1e-4, receive)
 
-        self.clock.at(CYCLE_S, cycle)
+        self.clock.at(self.period_s, cycle)
 
     def _move(self) -> None:
         if self.goal_rad is None or self.program != 2 or self.safety_bits != 1:
             return
         left_rad = self.goal_rad[5] - self.q_rad[5]
-        step_rad = self.speed_rad_s * CYCLE_S
+        step_rad = self.speed_rad_s * self.period_s
         if abs(left_rad) <= step_rad:
             self.q_rad, self.goal_rad = self.goal_rad, None
         else:

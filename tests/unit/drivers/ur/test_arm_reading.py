@@ -211,10 +211,10 @@ def test_a_flange_that_does_not_fit_the_joints_is_refused(
     sample = reader.look()
     flange = forward(MODELS["UR5e"], sample.q_rad) @ nudge
     if not wrong:
-        reader._check_model(sample, flange)
+        reader._check_model(sample.q_rad, flange)
         return
     with pytest.raises(DeviceFault, match=f"{moved_mm}.0 mm and {turned_deg:.2f} degrees .* UR5e"):
-        reader._check_model(sample, flange)
+        reader._check_model(sample.q_rad, flange)
 
 
 # ---------------------------------------------------------------------- who it is
