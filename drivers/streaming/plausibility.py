@@ -58,35 +58,13 @@ class Liveness:
             )
 
 
-class Lateness:
-    """How late samples are by the device's clock, compared with the quickest so far. Only durations are compared."""
-
-    def __init__(self) -> None:
-        self._first: tuple[float, float] | None = None
-        self._lead_s = 0.0
-        self.gained_s = 0.0
-        """By how much the last sample was earlier than the quickest before it."""
-
-    def late_s(self, t_device_s: float, heard_s: float) -> float:
-        """Return how late a sample is that was heard now; 0 for the first."""
-        if self._first is None:
-            self._first, self._heard_s = (t_device_s, heard_s), heard_s
-        first_device_s, first_heard_s = self._first
-        lead_s = (t_device_s - first_device_s) - (heard_s - first_heard_s)
-        self.gained_s = lead_s - self._lead_s
-        # a slow clock falls behind steadily, and its samples are not late
-        self._lead_s = max(lead_s, self._lead_s - _CLOCK_DRIFT * (heard_s - self._heard_s))
-        self._heard_s = heard_s
-        return self._lead_s - lead_s
-
-
 class DeviceClock:
-    """The device's clock against ours: lateness and jumps."""
+    """The device's clock against ours. Only durations are compared."""
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._lateness = Lateness()
-        self._newest_s = math.nan
+        self._first: tuple[float, float] | None = None
+        self._lead_s = 0.0
 
     def late_s(self, t_device_s: Array, heard_s: float) -> Array:
         """Return how late each sample is, compared with the quickest so far; 0 where the device has no clock.
@@ -96,20 +74,27 @@ class DeviceClock:
         newest_s = float(t_device_s[-1])
         if math.isnan(newest_s):
             return np.zeros(len(t_device_s))
-        before_s = float(t_device_s[0]) if math.isnan(self._newest_s) else self._newest_s
-        self._newest_s = newest_s
-        late_s = self._lateness.late_s(newest_s, heard_s)
+        if self._first is None:
+            self._first = newest_s, heard_s
+            self._newest = float(t_device_s[0]), heard_s
+        before_s, heard_before_s = self._newest
+        self._newest = newest_s, heard_s
+        leads_s = (t_device_s - self._first[0]) - (heard_s - self._first[1])
+        lead_s = float(leads_s[-1])
+        step_s = lead_s - self._lead_s
+        # a slow clock falls behind steadily, and its samples are not late
+        self._lead_s = max(lead_s, self._lead_s - _CLOCK_DRIFT * (heard_s - heard_before_s))
         back_s = -float(np.diff(t_device_s, prepend=before_s).min())
         if back_s > 0:
             raise StreamBroken(
                 f"{self._name}: the device's clock jumped back by {back_s:.3f} s to {newest_s:.3f} s: it has restarted",
                 "open it again",
             )
-        if (ahead_s := self._lateness.gained_s) > _CLOCK_JUMP_S:
+        if step_s > _CLOCK_JUMP_S:
             raise StreamBroken(
-                f"{self._name}: the device's clock jumped ahead by {ahead_s:.3f} s to {newest_s:.3f} s", "open it again"
+                f"{self._name}: the device's clock jumped ahead by {step_s:.3f} s to {newest_s:.3f} s", "open it again"
             )
-        return late_s + newest_s - t_device_s
+        return self._lead_s - leads_s
 
 
 class Rate:

@@ -1,9 +1,9 @@
 """The reader of a Universal Robots arm: new samples, and a flange pose that does not depend on the TCP setting.
 
-One RTDE subscription carries everything. After a suspension of this process the socket holds seconds of old samples,
-whose time stamps advance like new ones. So a sample is used only if it is not late by the controller's clock, and after
-a pause only from the first one that the reader waited for. Followers get every sample. The TCP offset of the same
-sample is removed from its pose, and the flange pose is compared with nominal forward kinematics.
+One RTDE subscription carries everything. After a suspension of this process or a stall of the network, samples arrive
+that are seconds old, and their time stamps advance like new ones. So the controller's clock is compared with ours, and
+a late sample is never used for a state or a status. Followers get every sample. The TCP offset of the same sample is
+removed from its pose, and the flange pose is compared with nominal forward kinematics.
 
 Checked on hardware: no.
 """
@@ -25,17 +25,18 @@ from drivers.clock import Clock, Follower
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ModelUnknown, StreamBroken
 from drivers.follow import Follow, Unread
 from drivers.interfaces import NOT_REPORTED, ArmState, ArmStates, ArmStatus, Array, DeviceInfo
-from drivers.streaming.plausibility import Lateness
 from drivers.ur.dashboard import Dashboard, ask_dashboard
 from drivers.ur.kinematics import MODELS, Pose, flange_poses, forward, model_named
 from drivers.ur.rtde import Subscription
 from drivers.ur.sample import MEASURING, OPTIONAL, OUTPUTS, Sample
-from drivers.ur.timing import Patience, UrTiming
+from drivers.ur.timing import Lateness, Patience, UrTiming
 
 log = logging.getLogger(__name__)
 
 _MOST_UNREAD: Final = 1_000_000
 """Samples that may wait for one follower: 33 minutes at 500 Hz."""
+_PAUSE_S: Final = 0.1
+"""A reader that has had no turn for so long was suspended, or starved."""
 _TIMESTAMP: Final = struct.Struct(">xd")
 """The first output, after the number of the recipe."""
 _MODEL_POSITION_M: Final = 0.005
@@ -58,8 +59,7 @@ class Reader:
         self._turn_s = self._read_s = self._live_s = clock.awake_s()
         """When a read last returned, when with a sample, and when with one that may be used."""
         self._t_device_s = math.nan
-        self._lateness: Lateness | None = None
-        """None while accumulated samples may be waiting in the socket."""
+        self._lateness, self._late_s = Lateness(), 0.0
         self._followers: list[Unread[tuple[int, list[bytes]]]] = []
         self._failure: DriverError | None = None
         self.silent = False
@@ -242,11 +242,16 @@ class Reader:
             raise copy.copy(self._failure) from self._failure
 
     def _silence(self, silent_s: float) -> DeviceTimeout:
-        if self._clock.awake_s() - self._turn_s > self._timing.pause_s:
+        if self._clock.awake_s() - self._turn_s > _PAUSE_S:
             return DeviceTimeout(
                 f"no sample of {self._host} was read for {silent_s:.2f} s, because this program or computer was "
                 "suspended or too busy",
                 "try again with less load, and press the emergency stop if the arm moves",
+            )
+        if self._late_s > self._timing.late_s and self._clock.awake_s() - self._read_s < silent_s:
+            return DeviceTimeout(
+                f"samples of {self._host} arrive {self._late_s:.2f} s late by the controller's clock",
+                "check the network and the load of the controller, and press the emergency stop if the arm moves",
             )
         at = "" if math.isnan(self._t_device_s) else f" at {self._t_device_s:.3f} s"
         return DeviceTimeout(
@@ -274,14 +279,15 @@ class Reader:
         except DriverError as error:
             failure = error
         else:
-            self._turn_s, t_host_ns = self._clock.awake_s(), self._clock.now_ns()
+            self._turn_s = self._read_s = self._clock.awake_s()
+            t_host_ns = self._clock.now_ns()
+            (self._t_device_s,) = _TIMESTAMP.unpack_from(samples[-1])
+            self._late_s = self._lateness.late_s(self._t_device_s, self._read_s)
             with self._changed:
-                waited_s, self._read_s = self._turn_s - self._read_s, self._turn_s
                 self.silent = False
-                (self._t_device_s,) = _TIMESTAMP.unpack_from(samples[-1])
                 for unread in self._followers:
                     unread.put((t_host_ns, samples), len(samples))
-                if self._is_new(waited_s):
+                if self._late_s <= self._timing.late_s:
                     self._live, self._live_s = (t_host_ns, samples[-1]), self._read_s
                 self._changed.notify_all()
             return True
@@ -289,14 +295,3 @@ class Reader:
             self._failure = failure
             self._changed.notify_all()
         return False
-
-    def _is_new(self, waited_s: float) -> bool:
-        """Whether the newest sample was taken just now, as far as its time stamp and our wait for it show."""
-        if waited_s > self._timing.pause_s:
-            self._lateness = None
-            return False
-        if self._lateness is None:
-            if waited_s < self._timing.waited_s:
-                return False
-            self._lateness = Lateness()
-        return self._lateness.late_s(self._t_device_s, self._read_s) <= self._timing.late_s

@@ -46,6 +46,7 @@ class Controller:
     def __init__(self, clock: FakeClock) -> None:
         self.clock = clock
         self.t_s = 100.0
+        self._began_s: float | None = None
         self.q_rad = [0.1, -1.2, 1.5, -0.7, -1.4, 0.3]
         self.qd_rad_s = [0.0] * 6
         self.goal_rad: list[float] | None = None
@@ -73,6 +74,9 @@ class Controller:
         self.dashboard_limits_s: list[float] = []
         self.stopping_works = True
         self.period_s = CYCLE_S
+        self.stood_still_s = 0.0
+        """For how long its clock has not run."""
+        self.stalled_until_s = self._arrives_s = 0.0
         self._sent: deque[bytes] = deque()
         self._operation = 0
 
@@ -133,10 +137,12 @@ class Controller:
         """Send a sample every `period_s` to a reader that has nothing else to do."""
 
         def cycle() -> None:
-            self.t_s += self.period_s
+            if self._reader is not reader:
+                return
+            self.t_s = 100.0 + self.clock.now_s() - began_s - self.stood_still_s
             self._move()
             if not self.silent:
-                self._sent.append(self._packed())
+                self._send(self._packed(), receive)
             receive()
             self.clock.at(self.period_s, cycle)
 
@@ -146,7 +152,22 @@ class Controller:
                 if self._sent:  # and a caller may look meanwhile
                     self.clock.at(1e-4, receive)
 
+        self._reader = reader
+        began_s = self._began_s = self.clock.now_s() if self._began_s is None else self._began_s
         self.clock.at(self.period_s, cycle)
+
+    def _send(self, sample: bytes, receive: Callable[[], None]) -> None:
+        """Send through a network that holds samples back until `stalled_until_s`, and is quicker than we are then."""
+        self._arrives_s = max(self.clock.now_s(), self.stalled_until_s, self._arrives_s + 0.6 * self.period_s)
+
+        def arrive() -> None:
+            self._sent.append(sample)
+            receive()
+
+        if self._arrives_s > self.clock.now_s():
+            self.clock.at(self._arrives_s - self.clock.now_s(), arrive)
+        else:
+            arrive()
 
     def _move(self) -> None:
         if self.goal_rad is None or self.program != 2 or self.safety_bits != 1:
