@@ -85,6 +85,10 @@ class Controller:
     version = (5, 15, 0, 1)
 
     @property
+    def rate_Hz(self) -> float:
+        return 1.0 / self.period_s
+
+    @property
     def missing(self) -> list[str]:
         return sorted(self.unknown)
 

@@ -107,7 +107,7 @@ def test_a_busy_computer_at_the_full_rate_finds_new_samples(
         controller.held_back = False
         begin_s = clock.now_s()
         full_rate.look()
-        assert clock.now_s() - begin_s < 0.0021
+        assert clock.now_s() - begin_s < 0.0081
 
 
 @pytest.mark.parametrize("stalled_s", [0.06, 0.19, 5.0])
@@ -126,7 +126,7 @@ def test_what_the_network_has_delayed_is_not_now(
             status = full_rate.status()
         except DeviceTimeout:
             continue
-        assert controller.t_s - status.t_device_s <= STRICT.status_s + STRICT.late_s + 0.002
+        assert controller.t_s - status.t_device_s <= STRICT.status_s + STRICT.late_s + 0.008
     assert max(late) > 0.04
 
 
@@ -146,11 +146,11 @@ def test_a_clock_of_another_speed_is_not_late(
     controller: Controller, full_rate: Reader, clock: FakeClock, slower: float
 ) -> None:
     begin_s = clock.now_s()
-    for _ in range(1000):
+    for _ in range(250):
         controller.stood_still_s = slower * (clock.now_s() - begin_s)
         before_s = clock.now_s()
         full_rate.look()
-        assert clock.now_s() - before_s < 0.0021
+        assert clock.now_s() - before_s == pytest.approx(0.008, abs=1e-6)
 
 
 # ---------------------------------------------------------------------- silence
