@@ -85,6 +85,7 @@ class Reader:
 
     def close(self) -> None:
         """Close the connection. Idempotent."""
+        self._end(StreamBroken(f"the arm at {self._host} was closed", "open it again"))
         self._stream.close()
         self._thread.join(timeout=1.0)
 
@@ -298,7 +299,11 @@ class Reader:
                 if self._followers or not self._since_live:
                     self._changed.notify_all()
             return True
-        with self._changed:
-            self._failure = failure
-            self._changed.notify_all()
+        self._end(failure)
         return False
+
+    def _end(self, failure: DriverError) -> None:
+        """Let every later call raise this failure; the first one counts."""
+        with self._changed:
+            self._failure = self._failure or failure
+            self._changed.notify_all()

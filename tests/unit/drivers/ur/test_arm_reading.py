@@ -361,6 +361,19 @@ def test_the_end_of_the_stream_is_raised_at_a_follower(
         pytest.fail("a stream that has failed was followed")
 
 
+def test_a_follower_of_an_arm_that_was_closed_is_not_left_waiting(
+    controller: Controller, full_rate: Reader, clock: FakeClock
+) -> None:
+    with full_rate.follow() as follow:
+        clock.advance(0.004)
+        full_rate.close()
+        controller.failure = OSError("Bad file descriptor")
+        full_rate._follow()
+        assert len(follow.read(1.0)) == 2
+        with pytest.raises(StreamBroken, match="was closed; open it again"):
+            follow.read(1.0)
+
+
 def test_poses_without_power_over_the_joints_are_not_read(
     controller: Controller, full_rate: Reader, clock: FakeClock
 ) -> None:
