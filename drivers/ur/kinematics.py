@@ -60,17 +60,6 @@ class Pose:
     p_m: Array
     """(3,)"""
 
-    @classmethod
-    def from_ur(cls, pose: Sequence[float]) -> "Pose":
-        """Read a UR pose: x, y, z in metres, then a rotation vector in radians."""
-        return cls(
-            Rotation.from_rotvec(np.asarray(pose[3:6], dtype=float)).as_matrix(), np.array(pose[:3], dtype=float)
-        )
-
-    def inverse(self) -> "Pose":
-        """Return the pose of a in b."""
-        return Pose(self.R.T, -self.R.T @ self.p_m)
-
     def __matmul__(self, other: "Pose") -> "Pose":
         return Pose(self.R @ other.R, self.R @ other.p_m + self.p_m)
 

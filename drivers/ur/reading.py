@@ -38,6 +38,8 @@ _STATES_HZ: Final = 125.0
 """The full rate of the CB3 generation, and every fourth sample of the e-Series."""
 _MOST_UNREAD: Final = 1_000_000
 """Samples that may wait for one follower: 33 minutes at 500 Hz."""
+Received = tuple[int, list[bytes]]
+"""Samples of one read, and their `t_host_ns`."""
 _PAUSE_S: Final = 0.1
 """A reader that has had no turn for so long was suspended, or starved."""
 _TIMESTAMP: Final = struct.Struct(">xd")
@@ -65,7 +67,7 @@ class Reader:
         """When a read last returned, when with a sample, and when with `_live`."""
         self._t_device_s = math.nan
         self._lateness, self._late_s = Lateness(), 0.0
-        self._followers: list[Unread[tuple[int, list[bytes]]]] = []
+        self._followers: list[Unread[Received]] = []
         self._failure: DriverError | None = None
         self.silent = False
         """Whether no sample has arrived since `DeviceTimeout` was raised."""
@@ -121,7 +123,7 @@ class Reader:
     @contextmanager
     def follow(self) -> Iterator[Follow[ArmStates]]:
         """Read every sample from now on, late ones too. The controller has to report its TCP."""
-        unread: Unread[tuple[int, list[bytes]]] = Unread(self._host, _MOST_UNREAD)
+        unread: Unread[Received] = Unread(self._host, _MOST_UNREAD)
         with self._changed:
             self._raise_failure()
             self._followers.append(unread)
@@ -131,7 +133,7 @@ class Reader:
             with self._changed:
                 self._followers.remove(unread)
 
-    def _read_on(self, unread: Unread[tuple[int, list[bytes]]], timeout_s: float) -> ArmStates:
+    def _read_on(self, unread: Unread[Received], timeout_s: float) -> ArmStates:
         """Return what a follower has not read."""
         with self._changed:
             for left_s in self._clock.looks(timeout_s):
@@ -146,7 +148,7 @@ class Reader:
                 received = unread.take()
         return self._states(received)
 
-    def _states(self, received: list[tuple[int, list[bytes]]]) -> ArmStates:
+    def _states(self, received: list[Received]) -> ArmStates:
         """Convert samples to flange poses; those without power over the joints are left out."""
         outputs = self._stream.decode([sample for _, samples in received for sample in samples])
         t_host_ns = [t_ns for t_ns, samples in received for _ in samples]

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -34,9 +35,14 @@ CYCLE_S = 0.008
 HOST = "192.0.2.1"
 
 
+def pose_from_ur(pose: Sequence[float]) -> Pose:
+    """Read x, y, z in metres, then a rotation vector in radians."""
+    return Pose(Rotation.from_rotvec(pose[3:]).as_matrix(), np.array(pose[:3]))
+
+
 @lru_cache(maxsize=1)
 def tcp_pose(*q_and_tcp: float) -> tuple[float, ...]:
-    pose = forward(MODELS["UR5e"], q_and_tcp[:6]) @ Pose.from_ur(q_and_tcp[6:])
+    pose = forward(MODELS["UR5e"], q_and_tcp[:6]) @ pose_from_ur(q_and_tcp[6:])
     return (*pose.p_m, *Rotation.from_matrix(pose.R).as_rotvec())
 
 

@@ -9,12 +9,12 @@ import pytest
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import ArmStates
-from drivers.ur.kinematics import MODELS, Pose, forward
+from drivers.ur.kinematics import MODELS, forward
 from drivers.ur.reading import Reader
 from drivers.ur.sample import Sample
 from drivers.ur.timing import STRICT
 from tests.fake_clock import FakeClock
-from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, ReaderInMemory
+from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, ReaderInMemory, pose_from_ur
 
 
 @pytest.fixture
@@ -272,7 +272,7 @@ def test_joints_without_power_are_not_measured(controller: Controller, reader: R
 def test_a_flange_that_does_not_fit_the_joints_is_refused(
     reader: Reader, moved_mm: float, turned_deg: float, wrong: bool
 ) -> None:
-    nudge = Pose.from_ur([1e-3 * moved_mm, 0.0, 0.0, 0.0, math.radians(turned_deg), 0.0])
+    nudge = pose_from_ur([1e-3 * moved_mm, 0.0, 0.0, 0.0, math.radians(turned_deg), 0.0])
     sample = reader.look()
     flange = forward(MODELS["UR5e"], sample.q_rad) @ nudge
     if not wrong:
