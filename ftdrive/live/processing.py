@@ -283,14 +283,19 @@ class Processor:
         )
         return np.asarray(predicted + np.diag(self._beyond))
 
-    def restart(self) -> None:
-        """Forget the samples before an interruption; noise, tares and drift remain."""
+    def restart(self, *, elsewhere: bool = False) -> None:
+        """Forget the samples before an interruption; noise, tares and drift remain.
+
+        With `elsewhere` the next sample is at another place of a recording, and none were lost.
+        """
         with self._lock:
             self._report_contacts(self._tracker.end())
             self._test.restart()
             self._filter = self._filter_of(self._stages)
             self._recent.clear()
-            self._buffer, self._done, self._newest_seq = None, 0, None
+            self._buffer, self._done = None, 0
+            if elsewhere:
+                self._newest_seq = None
 
     @property
     def contact_limit(self) -> float:

@@ -121,7 +121,7 @@ class ReplayedStream(ProcessedStream):
     def seek(self, t_s: float) -> None:
         """Go to a time in the recording; filters and contacts restart there."""
         self._next = int(np.searchsorted(self._seconds, min(max(t_s, 0.0), self.duration_s)))
-        self._processor.restart()
+        self._processor.restart(elsewhere=True)
         self._set_out(float(self._seconds[self._next]))
 
     def step(self) -> Block:
