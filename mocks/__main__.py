@@ -81,6 +81,15 @@ def _parser() -> argparse.ArgumentParser:
     add = truth.add_argument
     add("--mass", type=float, metavar="kg")
     add("--com", type=_vector(3), metavar="x,y,z", help="centre of mass in the sensor frame, m")
+    add(
+        "--inertia",
+        metavar="ixx,iyy,izz,ixy,ixz,iyz",
+        help="inertia tensor about the centre of mass, sensor axes, kg·m²; zeros for a point mass; "
+        "'none': the payload has weight, but no inertia",
+    )
+    add(
+        "--sensor-origin", type=_vector(3), metavar="x,y,z", help="of the sensor in the flange frame, m (default 0,0,0)"
+    )
     add("--sensor-rotvec-deg", type=_vector(3), metavar="x,y,z", help="R_flange_sensor as a rotation vector, degrees")
     add("--mount", choices=sorted(MOUNTS_RAD), default="floor")
     add("--tilt-deg", type=_vector(2), metavar="alpha,beta", help="tilt of the base; beta counts from the mount")

@@ -19,6 +19,7 @@ import numpy as np
 
 from mocks.arrays import Array
 from mocks.clock import CellClock
+from mocks.inertia import inertia_tensor
 from mocks.kinematics import MODELS, Vector6, rotation, vector3, vector6
 from mocks.sensors.catalogue import WRIST, Sensor
 from mocks.ur.operator import Operator
@@ -37,35 +38,49 @@ START_SCATTER_DEG = 5.0
 """The wrist starts this far off at most, so that the arm moves to the first pose."""
 
 
+VECTORS = {
+    "com": "p_sensor_com_m",
+    "sensor_origin": "p_flange_sensor_m",
+    "force_bias": "force_bias_N",
+    "torque_bias": "torque_bias_Nm",
+    "force_drift": "force_drift_N_min",
+    "torque_drift": "torque_drift_Nm_min",
+}
+"""Options that give a vector of the truth, by its name."""
+
+
 def truth_from(options: Namespace) -> Truth:
     """Draw the truth from the seed, then replace every quantity given on the command line."""
     truth = Truth.drawn(options.seed, options.mount)
-    changes: dict[str, Any] = {}
+    given = {name: getattr(options, option) for option, name in VECTORS.items()}
+    changes: dict[str, Any] = {name: np.array(vector) for name, vector in given.items() if vector is not None}
     if options.mass is not None:
         changes["mass_kg"] = options.mass
-    if options.com is not None:
-        changes["p_sensor_com_m"] = np.array(options.com)
     if options.sensor_rotvec_deg is not None:
         changes["R_flange_sensor"] = rotation(np.radians(options.sensor_rotvec_deg))
     if options.tilt_deg is not None:
         alpha, beta = np.radians(options.tilt_deg).tolist()
         changes["tilt_alpha_rad"] = alpha
         changes["tilt_beta_rad"] = math.remainder(MOUNTS_RAD[options.mount] + beta, 2 * math.pi)
-    if options.force_bias is not None:
-        changes["force_bias_N"] = np.array(options.force_bias)
-    if options.torque_bias is not None:
-        changes["torque_bias_Nm"] = np.array(options.torque_bias)
+    if options.inertia is not None:
+        changes["gyration_m2"] = _gyration(options.inertia, changes.get("mass_kg", truth.mass_kg))
     if options.noise is not None:
         changes["noise_force_N"], changes["noise_torque_Nm"] = options.noise
-    if options.force_drift is not None:
-        changes["force_drift_N_min"] = np.array(options.force_drift)
-    if options.torque_drift is not None:
-        changes["torque_drift_Nm_min"] = np.array(options.torque_drift)
     if options.sensor == WRIST:
         if options.sensor_rotvec_deg is not None:
             raise ValueError(f"the axes of {WRIST} are those of the flange: leave --sensor-rotvec-deg out")
         changes["R_flange_sensor"] = np.eye(3)
     return replace(truth, **changes)
+
+
+def _gyration(inertia: str, mass_kg: float) -> Array | None:
+    """Return the inertia tensor per mass of what --inertia gives; the payload has none for "none"."""
+    if inertia == "none":
+        return None
+    tensor = inertia_tensor(parse_vector(inertia, 6))
+    if tensor.any() and not mass_kg > 0.0:
+        raise ValueError(f"--inertia: a payload of {mass_kg} kg has no inertia tensor: set --mass too")
+    return tensor / (mass_kg or 1.0)
 
 
 def start_posture(options: Namespace) -> Vector6:
@@ -164,10 +179,10 @@ class Station:
     def _start_sensors(self) -> None:
         wanted = {"both": ("can", "serial"), "none": ()}.get(self._options.sensor, (self._options.sensor,))
         if WRIST in wanted:
-            self.robot.wrist_sensor = self.world.measure
+            self.robot.wrist_sensor = lambda n: self.world.measure_at(np.full(n, self.robot.cycle_s))
         for name in wanted:
             self._sensors[name] = Sensor(
-                name, self.world.measure, seed=self._options.seed, host=self.server.host, clock=self._clock
+                name, self.world.measure_at, seed=self._options.seed, host=self.server.host, clock=self._clock
             )
 
     def _hello(self) -> dict[str, Any]:

@@ -109,6 +109,8 @@ class Robot:
         self.frequency_hz = 125 if settings.polyscope[0] <= 3 else 500
         self.period_s = 1.0 / self.frequency_hz
         self.cycle = 0
+        self.cycle_s = world.now_s
+        """When the present cycle was due, on the cell's clock."""
         self.runtime = Runtime.STOPPED
         self.robot_mode = RobotMode.RUNNING
         self.safety_mode = SafetyMode.NORMAL
@@ -151,8 +153,9 @@ class Robot:
         scale = 1.0 if self.wrist_sensor else self.settings.time_scale
         return 100.0 + self.cycle * self.period_s * scale
 
-    def tick(self) -> None:
-        """One control cycle: program, then motion."""
+    def tick(self, t_s: float | None = None) -> None:
+        """One control cycle, due at `t_s` of the cell's clock (None: now): program, then motion."""
+        self.cycle_s = self.clock.now_s() if t_s is None else t_s
         self.cycle += 1
         dt = self.period_s * self.settings.time_scale
         self._physical_s += dt
@@ -178,7 +181,13 @@ class Robot:
             self.protective_stop("safety limit reached")
         if stood != self.arm.at_rest:
             self.note("arm", "moves" if stood else "stands", q_rad=list(self.arm.q))
-        self.world.q = self.arm.actual_q
+        self._move_world()
+
+    def _move_world(self) -> None:
+        """Let the world follow the arm, whose time runs `time_scale` times faster."""
+        begun_s, scale, motion = self.cycle_s, self.settings.time_scale, self.arm.motion
+        at = None if motion is None else lambda t_s: motion.at((t_s - begun_s) * scale)
+        self.world.move(begun_s, self.arm.actual_q, at)
 
     def note(self, by: str, what: str, *, accepted: bool = True, why: str = "", **detail: Any) -> None:
         """Add an entry to the event log."""
@@ -475,9 +484,10 @@ class Robot:
 
     def flange_wrench(self) -> Array:
         """Return the wrench on the arm's own sensor, (6,): N and N·m, exerted on the flange, its axes and origin."""
-        R = self.world.truth.R_flange_sensor
-        felt = self.world.load_wrench() + self.world.contact_wrench()
-        return np.concatenate((R @ felt[:3], R @ felt[3:]))
+        truth = self.world.truth
+        felt = self.world.load_wrench(self.cycle_s) + self.world.contact_wrench(self.cycle_s)
+        force = truth.R_flange_sensor @ felt[:3]
+        return np.concatenate((force, truth.R_flange_sensor @ felt[3:] + cross(truth.p_flange_sensor_m, force)))
 
     def raw_wrench(self) -> Vector6:
         """ft_raw_wrench: a new reading in every cycle, flange axes."""
@@ -490,7 +500,7 @@ class Robot:
     def tcp_wrench(self) -> Vector6:
         """actual_TCP_force: payload-compensated and zeroed, base axes, at the TCP, exerted on the tool."""
         world = self.world
-        felt_now = (world.q, world.truth, world.contact_wrench())
+        felt_now = (world.q, world.truth, world.contact_wrench(self.cycle_s))
         key = (*felt_now, self.payload_kg, self.payload_cog_m, self._tcp_offset, self._ft_zero)
         if self._wrench is None or any(a is not b for a, b in zip(self._wrench[0], key, strict=True)):
             felt = self._compensated() - self._ft_zero

@@ -374,10 +374,10 @@ class UrServer:
             while not ended():
                 now_ns = clock.follow()
                 while due_ns <= now_ns:
-                    due_ns += period_ns
                     if not self.frozen:
-                        self.robot.tick()
+                        self.robot.tick(1e-9 * due_ns)
                         self._send_samples()
+                    due_ns += period_ns
                 if not self.frozen and clock.real_ns() - self._sent_real_ns >= KEEP_ALIVE_NS:
                     self._send_samples(again=True)
                 for key in self._ready(time_out_s(1e-9 * (due_ns - now_ns))):
