@@ -55,6 +55,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--host", help="loopback address to listen on (default: a free 127.x.y.z)")
     add("--time-scale", type=_positive, default=1.0, metavar="K", help="the arm moves K times faster than real")
     add("--sensor", choices=CHOICES, default="can", metavar="NAME", help=f"{', '.join(CHOICES)} (default can)")
+    add("--sensor-delay-ms", type=float, metavar="D", help="time between the measurement of a sample and its sending")
+    add("--rtde-delay-ms", type=float, metavar="D", help="the same for the samples of the arm")
     add("--do", action="append", default=[], metavar="JSON", help="a request of the control channel to begin with")
 
     arm = station.add_argument_group("arm")

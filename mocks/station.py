@@ -30,6 +30,7 @@ from mocks.world import MOUNTS_RAD, Truth, World
 
 FORMAT = "mocks.station/1"
 HOST_TRIALS = 20
+LONGEST_DELAY_MS = 1000
 
 START_Q_DEG = (45.0, -100.0, 60.0, -50.0, 90.0, 45.0)
 """Near the first pose of the tour: q4 = -90° - q2 - q3."""
@@ -140,6 +141,7 @@ class Station:
         self._line = bytearray()
         self._verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
             "state": self._state,
+            "delay": self._delay,
             **Workcell(self.world, self._sensors).verbs,
             **Operator(self.robot, self.server).verbs,
         }
@@ -151,7 +153,7 @@ class Station:
             signal.signal(number, self._on_signal)
         try:
             self._start_sensors()
-            for request in self._options.do:
+            for request in (*self._delays(), *self._options.do):
                 if "error" in (answer := self._answer(request.encode())):
                     sys.stderr.write(f"--do {request}: {answer['error']}\n")
                     return 2
@@ -228,6 +230,29 @@ class Station:
             return verb(request)
         except (ValueError, TypeError, KeyError, OSError) as error:
             return {"error": f"{request['do']}: {error!r}"}
+
+    def _delays(self) -> list[str]:
+        """Return the request that the options stand for."""
+        delays = {"sensor_ms": self._options.sensor_delay_ms, "rtde_ms": self._options.rtde_delay_ms}
+        given = {link: delay_ms for link, delay_ms in delays.items() if delay_ms is not None}
+        return [json.dumps({"do": "delay", **given})] if given else []
+
+    def _delay(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Set the time between measurement and sending."""
+        given = {link: float(request[link]) for link in ("sensor_ms", "rtde_ms") if link in request}
+        if not given:
+            raise KeyError("sensor_ms")
+        if not all(0.0 <= delay_ms <= LONGEST_DELAY_MS for delay_ms in given.values()):
+            raise ValueError(f"a delay is 0 to {LONGEST_DELAY_MS} ms, not {given}")
+        if "sensor_ms" in given:
+            emulators = [sensor.emulator for sensor in self._sensors.values()]
+            if not emulators:
+                raise ValueError("this station has no sensor")
+            for emulator in emulators:
+                emulator.faults.delay_s = 1e-3 * given["sensor_ms"]
+        self.server.delay_s = 1e-3 * given.get("rtde_ms", 1e3 * self.server.delay_s)
+        self.robot.note("network", "delay", why=json.dumps(given))
+        return {"done": "delay"}
 
     def _state(self, request: dict[str, Any]) -> dict[str, Any]:
         robot, arm = self.robot, self.robot.arm

@@ -132,7 +132,7 @@ def test_another_client_moves_the_arm(station: StationProcess) -> None:
     assert station.ask("foreign_program", q_rad=goal, speed_rad_s=0.5)["accepted"]
     station.wait_for(lambda s: s["runtime_state"] == "STOPPED" and s["q_rad"] == pytest.approx(goal, abs=1e-6))
     what = [event["what"] for event in station.ask("state", since=len(before["events"]))["events"]]
-    assert what == ["program other", "started other", "moves", "stopped other", "stands"]
+    assert what == ["program other", "started other", "moves", "stands", "stopped other"]
 
 
 def test_a_silent_arm_keeps_its_connections_and_answers_later(station: StationProcess) -> None:
