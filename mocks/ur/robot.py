@@ -18,6 +18,7 @@ from mocks.ur.modes import PAUSING, PERMITTED, POWERED, POWERLESS, RobotMode, Ru
 from mocks.ur.motion import Arm, CannotFollow, HandMove, MotionError
 from mocks.ur.rtde import Value
 from mocks.ur.script import STOP_SCRIPT, ControlScript, Upload
+from mocks.ur.swing import SwingProgram
 from mocks.ur.urscript.library import ScriptError
 from mocks.ur.urscript.program import Program
 from mocks.ur.urscript.syntax import UrscriptSyntaxError
@@ -29,6 +30,8 @@ PROGRAM_START_S = 0.1
 POWER_STEP_S = 0.5
 COMMAND_REGISTERS = {"input_int_register_0", "input_int_register_24"}
 HAND_ACCELERATION_RAD_S2 = 1.5
+
+AnyProgram = ControlScript | Program | SwingProgram
 
 
 @dataclass(frozen=True)
@@ -132,7 +135,7 @@ class Robot:
         """The operator who guides the arm by hand; one `next` per control cycle."""
         self._remote_control = True
         self._reduced = False
-        self._program: ControlScript | Program | None = None
+        self._program: AnyProgram | None = None
         self.popup: str | None = None
         """Text of the popup that a program shows, until the operator closes it."""
         self.wrist_sensor: Callable[[int], Array] | None = None
@@ -248,16 +251,27 @@ class Robot:
         self.note(by, f"program {upload.name}", accepted=obstacle is None, why=obstacle or "")
         if obstacle or program is None:
             return False
+        self._start_soon(program)
+        return True
+
+    def pendant_start(self, program: SwingProgram) -> bool:
+        """Start a program of the operator, which replaces the running one; return False when it is refused."""
+        obstacle = self.obstacle
+        self.note("operator", f"program {program.name}", accepted=obstacle is None, why=obstacle or "")
+        if obstacle is None:
+            self._start_soon(program)
+        return obstacle is None
+
+    def _start_soon(self, program: AnyProgram) -> None:
         self.stop_program("replaced")
         self._after(PROGRAM_START_S, lambda: self._start(program))
-        return True
 
     def _program_of(self, upload: Upload) -> ControlScript | Program:
         if upload.is_control_script:
             return ControlScript(self, upload.register_offset("int"), upload.register_offset("float"))
         return Program(self, upload.name, upload.text)
 
-    def _start(self, program: ControlScript | Program) -> None:
+    def _start(self, program: AnyProgram) -> None:
         if self.obstacle is not None:
             self.note("program", f"started {program.name}", accepted=False, why=self.obstacle)
             return
