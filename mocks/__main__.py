@@ -1,8 +1,10 @@
 """Command line: ``python -m mocks station``."""
 
 import argparse
+import math
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 from mocks.arrays import Array
 from mocks.kinematics import MODELS
@@ -41,6 +43,13 @@ def _positive(text: str) -> float:
     return value
 
 
+def _pace(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is negative or not finite")
+    return value
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m mocks", description="Emulated robot cells.", allow_abbrev=False)
     station = parser.add_subparsers(dest="what", required=True).add_parser(
@@ -57,6 +66,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--sensor", choices=CHOICES, default="can", metavar="NAME", help=f"{', '.join(CHOICES)} (default can)")
     add("--sensor-delay-ms", type=float, metavar="D", help="time between the measurement of a sample and its sending")
     add("--rtde-delay-ms", type=float, metavar="D", help="the same for the samples of the arm")
+    add("--recording", type=Path, metavar="FILE.csv", help="serve the raw wrench and the joints of a recording")
+    add(
+        "--pace", type=_pace, default=1.0, metavar="K", help="play it K times faster (default 1; 0: hold the first row)"
+    )
     add("--do", action="append", default=[], metavar="JSON", help="a request of the control channel to begin with")
 
     arm = station.add_argument_group("arm")

@@ -21,6 +21,7 @@ from mocks.arrays import Array
 from mocks.clock import CellClock
 from mocks.inertia import inertia_tensor
 from mocks.kinematics import MODELS, Vector6, rotation, vector3, vector6
+from mocks.recording import RecordedArm, RecordedWorld, Recording
 from mocks.sensors.catalogue import WRIST, Sensor
 from mocks.ur.operator import Operator
 from mocks.ur.robot import Robot, RobotSettings
@@ -31,6 +32,7 @@ from mocks.world import MOUNTS_RAD, Truth, World
 FORMAT = "mocks.station/1"
 HOST_TRIALS = 20
 LONGEST_DELAY_MS = 1000
+WITHOUT_EFFECT_ON_A_RECORDING = ("payload-shift", "push-joint", "hand-guide", "slider", "speed-scaling")
 
 START_Q_DEG = (45.0, -100.0, 60.0, -50.0, 90.0, 45.0)
 """Near the first pose of the tour: q4 = -90° - q2 - q3."""
@@ -53,6 +55,9 @@ VECTORS = {
 def truth_from(options: Namespace) -> Truth:
     """Draw the truth from the seed, then replace every quantity given on the command line."""
     truth = Truth.drawn(options.seed, options.mount)
+    if options.recording is not None:  # has its own bias and noise
+        nothing = np.zeros(3)
+        truth = replace(truth, force_bias_N=nothing, torque_bias_Nm=nothing, noise_force_N=0.0, noise_torque_Nm=0.0)
     given = {name: getattr(options, option) for option, name in VECTORS.items()}
     changes: dict[str, Any] = {name: np.array(vector) for name, vector in given.items() if vector is not None}
     if options.mass is not None:
@@ -82,6 +87,17 @@ def _gyration(inertia: str, mass_kg: float) -> Array | None:
     if tensor.any() and not mass_kg > 0.0:
         raise ValueError(f"--inertia: a payload of {mass_kg} kg has no inertia tensor: set --mass too")
     return tensor / (mass_kg or 1.0)
+
+
+def _recording(options: Namespace) -> Recording | None:
+    if options.recording is None:
+        return None
+    if options.time_scale != 1.0 or options.start_q_deg is not None:
+        raise ValueError("--recording gives time and joints: leave --time-scale and --start-q-deg out")
+    try:
+        return Recording.read(options.recording)
+    except OSError as error:
+        raise ValueError(f"cannot read the recording: {error}") from None
 
 
 def start_posture(options: Namespace) -> Vector6:
@@ -118,7 +134,12 @@ class Station:
         options.model = options.model or ("UR5" if options.polyscope[0] <= 3 else "UR5e")
         nominal = MODELS[options.model]
         dh = nominal.disturbed(options.seed, 1e-3 * options.dh_noise, 3e-4 * options.dh_noise)
-        self.world = World(truth_from(options), dh, start_posture(options), options.seed, self._clock)
+        truth = truth_from(options)
+        self._recording = recording = _recording(options)
+        if recording is None:
+            self.world = World(truth, dh, start_posture(options), options.seed, self._clock)
+        else:
+            self.world = RecordedWorld(recording, truth, dh, options.seed, self._clock)
         self.robot = Robot(
             self.world,
             RobotSettings(
@@ -133,6 +154,7 @@ class Station:
                 unknown_outputs=frozenset({"tcp_offset"} if options.no_tcp_offset else ()),
                 time_scale=options.time_scale,
             ),
+            None if recording is None else RecordedArm(dh, recording),
         )
         self._selector = selectors.SelectSelector()  # the only one that waits for less than a millisecond
         self.server = self._listen()
@@ -145,6 +167,9 @@ class Station:
             **Workcell(self.world, self._sensors).verbs,
             **Operator(self.robot, self.server).verbs,
         }
+        if recording is not None:
+            self._verbs = {verb: do for verb, do in self._verbs.items() if verb not in WITHOUT_EFFECT_ON_A_RECORDING}
+            self._verbs["recording"] = lambda request: self._play(recording, request)
 
     def run(self) -> int:
         """Serve until standard input closes or SIGTERM arrives; return the exit code."""
@@ -157,6 +182,8 @@ class Station:
                 if "error" in (answer := self._answer(request.encode())):
                     sys.stderr.write(f"--do {request}: {answer['error']}\n")
                     return 2
+            if self._recording is not None:
+                self._recording.play(self._clock.now_s(), 0.0, self._options.pace)
             self._selector.register(sys.stdin.fileno(), selectors.EVENT_READ, self._on_stdin)
             self._print(self._hello())
             self.server.run(lambda: self._ended)
@@ -198,8 +225,16 @@ class Station:
                 "serial_number": self._options.serial_number,
             },
             "sensors": sensors,
-            "truth": self.world.truth.to_json(),
+            **self._content(),
         }
+
+    def _content(self) -> dict[str, Any]:
+        """Return what is known about the cell: its truth, or the recording, whose truth is unknown."""
+        recording = self._recording
+        if recording is None:
+            return {"truth": self.world.truth.to_json()}
+        played = {"file": str(self._options.recording), "samples": len(recording), "duration_s": recording.duration_s}
+        return {"truth": None, "recording": played}
 
     def _print(self, message: dict[str, Any]) -> None:
         try:
@@ -254,6 +289,13 @@ class Station:
         self.robot.note("network", "delay", why=json.dumps(given))
         return {"done": "delay"}
 
+    def _play(self, recording: Recording, request: dict[str, Any]) -> dict[str, Any]:
+        """Continue the recording at another place, at another pace."""
+        now_s = self._clock.now_s()
+        at_s = float(request.get("at_s", recording.at_s(now_s)))
+        recording.play(now_s, at_s, float(request.get("pace", recording.pace)))
+        return {"done": "recording", "at_s": at_s, "pace": recording.pace}
+
     def _state(self, request: dict[str, Any]) -> dict[str, Any]:
         robot, arm = self.robot, self.robot.arm
         return {
@@ -272,6 +314,7 @@ class Station:
             "payload_cog_m": list(robot.payload_cog_m),
             "speed_fraction": arm.speed_fraction,
             "speed_scaling": arm.pace,
+            **({} if self._recording is None else {"recording_s": self._recording.at_s(self._clock.now_s())}),
             "true_wrench": self.world.true_wrench().tolist(),
             "bad_inputs": self.server.bad_inputs,
             "t_host_ns": self._clock.now_ns(),

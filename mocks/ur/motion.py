@@ -270,6 +270,9 @@ class Arm:
         Joint angles (rad) to start with.
     """
 
+    obstacle: str | None = None
+    """Why this arm cannot be moved."""
+
     def __init__(self, dh: Dh, q: Vector6) -> None:
         self.dh = dh
         self.q = self.actual_q = q
@@ -339,8 +342,8 @@ class Arm:
             self._owner = None
             self._follow([self._rundown()] if not self.at_rest else [])
 
-    def step(self, dt: float) -> None:
-        """Let `dt` seconds pass.
+    def step(self, dt: float, _t_s: float = 0.0) -> None:
+        """Let `dt` seconds pass, up to a time of the cell's clock.
 
         Raises
         ------

@@ -101,13 +101,15 @@ class Robot:
     ----------
     world
         The shared truth; its `q` is written in every cycle. Its clock is the controller's.
+    arm
+        None makes one that stands where the world has it.
     """
 
-    def __init__(self, world: World, settings: RobotSettings) -> None:
+    def __init__(self, world: World, settings: RobotSettings, arm: Arm | None = None) -> None:
         self.world = world
         self.clock = world.clock
         self.settings = settings
-        self.arm = Arm(world.dh, world.q)
+        self.arm = arm or Arm(world.dh, world.q)
         self.limits = Limits(world.dh, settings.joint_limit_rad, settings.plane)
         self.frequency_hz = 125 if settings.polyscope[0] <= 3 else 500
         self.period_s = 1.0 / self.frequency_hz
@@ -177,7 +179,7 @@ class Robot:
                 self.stop_program(f"run-time error: {error}")
         before, stood = self.arm.q, self.arm.at_rest
         try:
-            self.arm.step(dt)
+            self.arm.step(dt, self.cycle_s)
         except CannotFollow as error:
             self.protective_stop(str(error))
         if self.arm.q is not before and self._leaves_limits(before):
@@ -235,7 +237,7 @@ class Robot:
             return f"robot mode {self.robot_mode.name}"
         if self.safety_mode not in PERMITTED:
             return f"safety mode {self.safety_mode.name}"
-        return None
+        return self.arm.obstacle
 
     def upload(self, upload: Upload, *, by: str = "script port") -> bool:
         """Accept a program from the script port, which replaces the running one; return False when it is refused."""
