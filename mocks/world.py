@@ -24,6 +24,8 @@ MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
 
 AHEAD_S = 0.02
 """The arm of a controller that has run no cycle for so long stands still."""
+BURST_GAP_S = 0.001
+"""A burst begins so soon behind the last one, where it is measured from: half the work."""
 REMEMBERED = 8
 """Control cycles whose motion is known: a sensor may be later than the controller."""
 _MINUTE_S = 60.0
@@ -166,6 +168,8 @@ class World:
         self._noise_sd = np.repeat([truth.noise_force_N, truth.noise_torque_Nm], 3)
         self._load: tuple[Vector6, Truth, Array] | None = None
         self._override: Array | None = None
+        self._known: tuple[float, Array] = (-math.inf, _NOTHING)
+        """The truth at the end of the last burst, where the next one begins."""
 
     @property
     def now_s(self) -> float:
@@ -260,7 +264,7 @@ class World:
         Parameters
         ----------
         t_s
-            (n,) on the cell's clock. The truth is exact at the first and the last one, and linear in between.
+            (n,) on the cell's clock. The truth is exact at the ends of a burst, and linear in between.
         """
         override = self._override
         if override is not None:
@@ -273,10 +277,14 @@ class World:
     def _true_wrenches(self, t_s: Array) -> Array:
         """Return the wrench on the sensor at these times, (n, 6), or (6,) where it is the same."""
         first_s, last_s = float(t_s[0]), float(t_s[-1])
-        first = self.true_wrench(first_s)
+        last = self.true_wrench(last_s)
         if first_s == last_s or not (self._joints(last_s)[1] or self.contacts):
-            return first
-        wrenches: Array = first + np.outer((t_s - first_s) / (last_s - first_s), self.true_wrench(last_s) - first)
+            return last
+        known_s, known = self._known
+        if not 0.0 <= first_s - known_s < BURST_GAP_S:
+            known_s, known = first_s, self.true_wrench(first_s)
+        self._known = (last_s, last)
+        wrenches: Array = known + np.outer((t_s - known_s) / (last_s - known_s), last - known)
         return wrenches
 
     def touch(self, name: str, contact: Contact | None) -> None:

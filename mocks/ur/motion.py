@@ -7,8 +7,7 @@ is paused. A motion that meets a moving arm first brings it to rest: position an
 import math
 from collections import deque
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -227,8 +226,7 @@ class Stop:
         )
 
 
-@dataclass(frozen=True)
-class Following:
+class Following(NamedTuple):
     """The actual joints from one control cycle on: they follow a set-point that accelerates evenly.
 
     Parameters
