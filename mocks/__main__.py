@@ -67,9 +67,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--sensor-delay-ms", type=float, metavar="D", help="time between the measurement of a sample and its sending")
     add("--rtde-delay-ms", type=float, metavar="D", help="the same for the samples of the arm")
     add("--recording", type=Path, metavar="FILE.csv", help="serve the raw wrench and the joints of a recording")
-    add(
-        "--pace", type=_pace, default=1.0, metavar="K", help="play it K times faster (default 1; 0: hold the first row)"
-    )
+    add("--pace", type=_pace, metavar="K", help="play it K times faster (default 1; 0: hold the first row)")
     add("--do", action="append", default=[], metavar="JSON", help="a request of the control channel to begin with")
 
     arm = station.add_argument_group("arm")

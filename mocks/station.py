@@ -91,6 +91,8 @@ def _gyration(inertia: str, mass_kg: float) -> Array | None:
 
 def _recording(options: Namespace) -> Recording | None:
     if options.recording is None:
+        if options.pace is not None:
+            raise ValueError("--pace is that of a --recording")
         return None
     if options.time_scale != 1.0 or options.start_q_deg is not None:
         raise ValueError("--recording gives time and joints: leave --time-scale and --start-q-deg out")
@@ -183,7 +185,8 @@ class Station:
                     sys.stderr.write(f"--do {request}: {answer['error']}\n")
                     return 2
             if self._recording is not None:
-                self._recording.play(self._clock.now_s(), 0.0, self._options.pace)
+                pace = 1.0 if self._options.pace is None else self._options.pace
+                self._recording.play(self._clock.now_s(), 0.0, pace)
             self._selector.register(sys.stdin.fileno(), selectors.EVENT_READ, self._on_stdin)
             self._print(self._hello())
             self.server.run(lambda: self._ended)

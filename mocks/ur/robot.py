@@ -516,7 +516,7 @@ class Robot:
     def tcp_wrench(self) -> Vector6:
         """actual_TCP_force: payload-compensated and zeroed, base axes, at the TCP, exerted on the tool."""
         world = self.world
-        felt_now = (world.q, world.truth, world.contact_wrench(self.cycle_s))
+        felt_now = (world.q, world.load_wrench(self.cycle_s), world.contact_wrench(self.cycle_s))
         key = (*felt_now, self.payload_kg, self.payload_cog_m, self._tcp_offset, self._ft_zero)
         if self._wrench is None or any(a is not b for a, b in zip(self._wrench[0], key, strict=True)):
             felt = self._compensated() - self._ft_zero

@@ -88,6 +88,19 @@ def test_the_arm_has_the_recorded_joints_and_takes_no_command() -> None:
         robot.hand_move(robot.arm.q, 0.3)
 
 
+def test_the_controller_feels_the_recorded_wrench_while_the_arm_stands() -> None:
+    k = np.arange(3.0)
+    recording = Recording(k, np.outer(k, np.ones(6)), np.tile(HOME, (3, 1)))
+    world = RecordedWorld(recording, Truth.drawn(1), DH, 0, CellClock(RealTime()))
+    robot = Robot(world, RobotSettings(), RecordedArm(DH, recording))
+    recording.play(world.now_s, 0.0, 1.0)
+    felt = []
+    for at_s in (0.0, 1.0, 2.0):
+        robot.tick(robot.clock.now_s() + at_s)
+        felt.append(robot.tcp_wrench())
+    np.testing.assert_allclose(np.linalg.norm(np.diff(felt, axis=0)[:, :3], axis=1), np.sqrt(3))
+
+
 def test_a_push_comes_on_top_of_the_recorded_wrench() -> None:
     recording = made()
     truth = Truth.drawn(1)
