@@ -65,7 +65,8 @@ def title(view: View, width: int) -> Line:
 
 def _replay(replay: Replay) -> Line:
     state = "ended" if replay.has_ended else "paused" if replay.is_paused else f"x {replay.speed:g}"
-    return Line(f"REPLAY {_clock(replay.at_s)} of {_clock(replay.duration_s)}, {state}", STRONG, "space")
+    at, end = (f"{int(t_s // 60):02d}:{t_s % 60:04.1f}" for t_s in (replay.at_s, replay.duration_s))
+    return Line(f"REPLAY {at} of {end}, {state}", STRONG, "space")
 
 
 def provenance(view: View, width: int) -> Line:
@@ -142,7 +143,7 @@ def _age(view: View) -> str:
     if not isinstance(created, str) or view.reading is None:
         return ""
     now_s = (view.reading.t_host_ns + view.info.utc_offset_ns) * 1e-9
-    hours = (now_s - datetime.fromisoformat(created).timestamp()) / 3600
+    hours = max(0.0, now_s - datetime.fromisoformat(created).timestamp()) / 3600
     return f" {hours * 60:.0f} min" if hours < 1 else f" {hours:.0f} h" if hours < 48 else f" {hours / 24:.0f} d"
 
 
