@@ -1,4 +1,4 @@
-"""CPU and memory of the live screen: `uv run python tests/benchmarks/live_screen_cost.py`.
+"""CPU, memory and delay of the live screen: `uv run python tests/benchmarks/live_screen_cost.py`.
 
 A stream without devices gives blocks of 10 ms at 7 kHz to the real app on a pseudo-terminal, whose output is read and
 counted. The cost of devices, pairing and processing is not in these figures.
@@ -34,15 +34,35 @@ class Paced(FakeStream):
 
     begun_s = time.monotonic()
 
+    def __init__(self, rate_Hz: float) -> None:
+        super().__init__("contact", rate_Hz)
+        self.unseen_s = list[float]()
+        """When each block was read that is not on the screen yet."""
+
     def read(self) -> Block:
         time.sleep(max(0.0, self.begun_s + 0.01 * self.blocks - time.monotonic()))
+        self.unseen_s.append(time.monotonic())
         return super().read()
+
+
+class Timed(LiveApp):
+    """Notes how long each block has waited when the terminal gets it."""
+
+    waits_s: list[float]
+    stream: Paced
+
+    def draw(self) -> None:
+        seen, self.stream.unseen_s = self.stream.unseen_s, []
+        super().draw()
+        self.call_after_refresh(lambda: self.waits_s.extend(time.monotonic() - read_s for read_s in seen))
 
 
 def run(rate_Hz: float, duration_s: float, with_screen: bool) -> dict[str, float]:
     """Run the app, or the stream alone, for a while; return CPU seconds per second, and the growth of memory."""
-    feed = Feed(Paced("contact", rate_Hz))
+    stream = Paced(rate_Hz)
+    feed = Feed(stream)
     feed.start()
+    waits_s = [0.0]
     used, memory_kB = list[float](), list[int]()
 
     def note() -> None:
@@ -57,13 +77,16 @@ def run(rate_Hz: float, duration_s: float, with_screen: bool) -> dict[str, float
             finish()
 
     if with_screen:
-        app = LiveApp(feed, Summary(feed))
+        app = Timed(feed, Summary(feed))
+        app.stream, app.waits_s = stream, waits_s
         threading.Thread(target=watch, args=(lambda: app.call_from_thread(app.exit),), daemon=True).start()
         app.run()
     else:
         watch(None)
     feed.stop()
-    return {"cpu": (used[1] - used[0]) / duration_s, "grown_MB": (memory_kB[1] - memory_kB[0]) / 1e3}
+    late_s = sorted(waits_s)[round(0.95 * (len(waits_s) - 1))]
+    grown_MB = (memory_kB[1] - memory_kB[0]) / 1e3
+    return {"cpu": (used[1] - used[0]) / duration_s, "grown_MB": grown_MB, "late_ms": 1e3 * late_s}
 
 
 def on_terminal(width: int, height: int, arguments: list[str]) -> tuple[dict[str, float], float]:
@@ -103,5 +126,6 @@ if __name__ == "__main__":
         figures, size_kB = on_terminal(width, height, sys.argv[1:])
         print(  # noqa: T201
             f"{width:3d}x{height:<3d}               {100 * figures['cpu']:5.1f} % of a core, "
-            f"{size_kB / (options.seconds + 3):5.1f} kB/s, memory grown by {figures['grown_MB']:.1f} MB"
+            f"{size_kB / (options.seconds + 3):5.1f} kB/s, memory grown by {figures['grown_MB']:.1f} MB, "
+            f"block to terminal {figures['late_ms']:.0f} ms p95"
         )

@@ -56,7 +56,7 @@ def characters(dots: Dots) -> Codes:
 
 def text(row: Codes) -> str:
     """Return one row of packed characters as text, with a blank for an empty one."""
-    return "".join(chr(0x2800 + code) if code else " " for code in row.tolist())
+    return np.where(row, 0x2800 + row.astype("<u4"), ord(" ")).astype("<u4").tobytes().decode("utf-32-le")
 
 
 def _dot(value: Array, rows: int, full: float) -> Array:

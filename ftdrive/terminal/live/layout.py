@@ -112,11 +112,11 @@ def plot(view: View, columns: Columns, i: int, full: float, rows: int, *, with_v
         for note in view.notes
         if note.is_mark and note.t_host_ns is not None and (column := columns.column_of(note.t_host_ns)) is not None
     }
-    for cell in range(head.width - _GUTTER, cells):
-        if cell in marks:
-            head.add("◆", STRONG)
-        else:
-            head.add("━" if contact[cell] else "─", CONTACT if contact[cell] else FAINT)
+    shown = slice(head.width - _GUTTER, cells)
+    text, styles = (["━" if it else "─" for it in contact], [CONTACT if it else FAINT for it in contact])
+    for cell in marks:
+        text[cell], styles[cell] = "◆", STRONG
+    head.join(Line.of_cells(text[shown], styles[shown]))
 
     rows -= 1
     ink = braille.characters(braille.envelope(columns.low[i], columns.high[i], rows, full))

@@ -447,13 +447,7 @@ def _half_sphere(known: Array, down: Array | None) -> list[Line]:
             row = min(rows - 1, int((1 - radius * y) * rows / 2))
             column = min(_DISC - 1, int((1 + radius * x) * _DISC / 2))
             disc[row][column], styles[row][column] = sign, style
-    lines = []
-    for signs, kinds in zip(disc, styles, strict=True):
-        line = Line()
-        for sign, kind in zip(signs, kinds, strict=True):
-            line.add(sign, kind)
-        lines.append(line)
-    return lines
+    return [Line.of_cells(signs, kinds) for signs, kinds in zip(disc, styles, strict=True)]
 
 
 @cache

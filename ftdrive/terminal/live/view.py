@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -48,24 +49,32 @@ class Line:
 
     def join(self, other: "Line") -> Self:
         """Append another line."""
-        for part in other.parts:
-            self.add(*part)
+        self.parts += other.parts
+        self.width += other.width
         return self
 
     def fit(self, width: int) -> "Line":
-        """Return the line padded or cut to `width` cells; an ellipsis shows the cut."""
-        fitted, left = Line(), width
-        cut = self.width > width
+        """Return this line padded to `width` cells, or a cut one that ends in an ellipsis."""
+        if self.width <= width:
+            return self.to(width)
+        fitted = Line()
         for part in self.parts:
-            room = left - 1 if cut else left
+            room = width - 1 - fitted.width
             if cell_len(part.text) > room:
                 fitted.add(set_cell_size(part.text, max(room, 0)), part.style, part.key)
                 break
             fitted.add(*part)
-            left -= cell_len(part.text)
-        if cut:
-            fitted.add("…")
-        return fitted.to(width)
+        return fitted.add("…"[:width])
+
+    @classmethod
+    def of_cells(cls, text: Sequence[str], styles: Sequence[str]) -> Self:
+        """Build a line of characters, each with its own style."""
+        line, start = cls(), 0
+        for style, alike in groupby(styles):
+            end = start + sum(1 for _ in alike)
+            line.add("".join(text[start:end]), style)
+            start = end
+        return line
 
     def __str__(self) -> str:
         return "".join(part.text for part in self.parts)
