@@ -19,7 +19,11 @@ from ftdrive.live.samples import Ns, Paired
 
 _BUCKET_S, _BUCKETS = 0.25, 40
 _LEAST_SPAN_S = 2.0
-"""Before, the rate of the device counts as the nominal one."""
+"""After this an unknown rate is learnt."""
+_LEAST_SCATTER_NS = 1e4
+CLOCK_TOLERANCE, RATE_TOLERANCE = 2e-4, 3e-3
+"""Of a device's clock, and of the nominal rate of a sensor without one."""
+_IMPLAUSIBLE = 4.0
 _SLEW = 0.05
 """Times never jump and never run backwards: they approach a better estimate at this fraction of the time passing."""
 _PASSES = 4
@@ -39,12 +43,16 @@ class Timeline:
     period_s : float
         Nominal duration of one count: 1 for a clock in seconds, 1 / rate for a sample number. NaN is unknown; then the
         first two seconds keep their times of receipt.
+    tolerance : float
+        Relative error of that duration, one standard deviation. It counts as long as the times of receipt scatter too
+        much to show the rate, as on a computer that is too busy.
     """
 
-    def __init__(self, period_s: float = 1.0) -> None:
+    def __init__(self, period_s: float = 1.0, tolerance: float = CLOCK_TOLERANCE) -> None:
         self.shift_s = 0.0
         """Subtracted from every time; a change is followed slowly."""
         self._nominal_ns = period_s * 1e9
+        self._tolerance = tolerance
         self._restart()
 
     def _restart(self) -> None:
@@ -83,7 +91,7 @@ class Timeline:
     def _learn_rate(self, x: Array, y: Array) -> None:
         x_end, y_end = float(x[-1]), float(y[-1])
         if y_end > _LEAST_SPAN_S * 1e9:
-            self._slope = y_end / x_end
+            self._slope = self._nominal_ns = y_end / x_end
             self._offset = float((y - self._slope * x).min())
             self._last = x_end, y_end
 
@@ -101,13 +109,17 @@ class Timeline:
             while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
                 hull.pop()
             hull.append(point)
-        if (hull[-1][0] - hull[0][0]) * self._slope < _LEAST_SPAN_S * 1e9:
-            self._offset = min(b - self._slope * a for a, b in self._points)
-            return
-        middle = sum(a for a, _ in self._points) / len(self._points)
-        (x_0, y_0), (x_1, y_1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
-        self._slope = (y_1 - y_0) / (x_1 - x_0)
-        self._offset = y_0 - self._slope * x_0
+        if len(hull) > 1:
+            middle = sum(a for a, _ in self._points) / len(self._points)
+            (x_0, y_0), (x_1, y_1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
+            slope = (y_1 - y_0) / (x_1 - x_0)
+            above_ns = sum(b - y_0 - slope * (a - x_0) for a, b in self._points) / len(self._points)
+            error = (above_ns + _LEAST_SCATTER_NS) / ((hull[-1][0] - hull[0][0]) * self._nominal_ns)
+            weight = 1 / (1 + (error / self._tolerance) ** 2)
+            if abs(slope / self._nominal_ns - 1) > _IMPLAUSIBLE * self._tolerance:
+                weight = 0.0  # no drift of a clock, but a growing delay
+            self._slope = weight * slope + (1 - weight) * self._nominal_ns
+        self._offset = min(b - self._slope * a for a, b in self._points)
 
 
 def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
@@ -247,7 +259,7 @@ class Pairing:
             return
         has_clock = bool(np.isfinite(samples.t_device_s).all())
         if self._sensor is None:
-            self._sensor = Timeline(1.0 if has_clock else 1 / self._rate_Hz)
+            self._sensor = Timeline() if has_clock else Timeline(1 / self._rate_Hz, RATE_TOLERANCE)
         self._sensor.shift_s = self.delay_s
         count = samples.t_device_s if has_clock else samples.seq.astype(np.float64)
         self._waiting.append((samples, self._sensor.stamp(count, samples.t_host_ns)))
