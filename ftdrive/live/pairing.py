@@ -26,6 +26,10 @@ CLOCK_TOLERANCE, RATE_TOLERANCE = 2e-4, 3e-3
 _IMPLAUSIBLE = 4.0
 _SLEW = 0.05
 """Times never jump and never run backwards: they approach a better estimate at this fraction of the time passing."""
+_FAR_NS, _FASTEST_SLEW = 2e8, 0.9
+"""They approach one that is farther away faster."""
+_SCALED_S, _SCALED = 0.2, 0.05
+"""A clock is no clock of seconds if it differs by so much over this time."""
 _PASSES = 4
 """A recording is paired so often until its delay has converged."""
 _LOST_S = 1.0
@@ -83,7 +87,8 @@ class Timeline:
         else:
             x_0, y_0 = self._last
             due = self._slope * (x[-1] - x_0)
-            end = min(max(end, y_0 + (1 - _SLEW) * due), y_0 + (1 + _SLEW) * due)
+            slew = min(max(_SLEW, abs(end - y_0 - due) / _FAR_NS), _FASTEST_SLEW)
+            end = min(max(end, y_0 + (1 - slew) * due), y_0 + (1 + slew) * due)
             times = y_0 + (x - x_0) * ((end - y_0) / (x[-1] - x_0))
         self._last = float(x[-1]), float(end)
         return np.asarray(self._origin[1] + np.rint(times).astype(np.int64))
@@ -225,7 +230,7 @@ class Pairing:
         self._estimator = delay if isinstance(delay, DelayEstimator) else None
         self._rate_Hz = sensor_rate_Hz
         self._sensor: Timeline | None = None
-        self._arm = Timeline()
+        self._arm: Timeline | None = None
         self._poses = PoseTrack(keep_s=2.0)
         self._waiting: list[tuple[FtSamples, Ns]] = []
         self._delay_s = 0.0 if isinstance(delay, DelayEstimator) else delay
@@ -249,8 +254,11 @@ class Pairing:
         """Add what the arm has sent."""
         if not len(states.t_host_ns):
             return
-        has_clock = bool(np.isfinite(states.t_device_s).all())
-        t_ns = self._arm.stamp(states.t_device_s, states.t_host_ns) if has_clock else states.t_host_ns
+        t_ns = states.t_host_ns
+        if np.isfinite(states.t_device_s).all():
+            if self._arm is None:
+                self._arm = _clock_of(states)
+            t_ns = self._arm.stamp(states.t_device_s, t_ns)
         self._poses.add(t_ns, states.q_rad, states.R_base_flange, states.p_base_flange_m)
 
     def add_samples(self, samples: FtSamples) -> None:
@@ -286,6 +294,15 @@ class Pairing:
         """Drop what waits, after an interruption of either link."""
         self._waiting = []
         self._poses = PoseTrack(keep_s=2.0)
+
+
+def _clock_of(states: ArmStates) -> Timeline:
+    """Return the timeline of a controller from its first states; an emulated one may run many times faster."""
+    host_s = float(states.t_host_ns[-1] - states.t_host_ns[0]) * 1e-9
+    device_s = float(states.t_device_s[-1] - states.t_device_s[0])
+    if host_s < _SCALED_S or abs(host_s / device_s - 1) < _SCALED:
+        return Timeline()
+    return Timeline(host_s / device_s, _SCALED)
 
 
 def paired_with(poses: PoseTrack, t_ns: Ns, samples: FtSamples) -> Paired:
