@@ -51,8 +51,8 @@ def test_brackets_and_colons_are_no_markup(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_the_live_screen_shows_a_path_as_it_is() -> None:
     numbers = {"force_N": [1.0, -2.0, 3.0], "torque_Nm": [0.1, 0.2, 0.3]}
-    reading = {"axes": "base", "about": "sensor origin", "verdict": "good", "rate_Hz": 100.0, "lost": 0}
-    reading |= {"raw": numbers, "compensated": numbers, "sigma": numbers}
+    reading = {"verdict": "good", "rate_Hz": 100.0, "lost": 0, "contact": False, "stale": None}
+    reading |= {"delay_s": {"value": 0.0, "sigma": 0.0}, "raw": numbers, "compensated": numbers, "sigma": numbers}
     reading |= {"contact": False, "stale": None, "delay_s": {"value": 0.0, "sigma": 0.0}}
     with talk.capture() as shown:
         talk.print(_screen(reading, WrenchFrame("base"), "my [old] runs/calibration.json"))
