@@ -16,6 +16,9 @@ from ftdrive.live.samples import Block, WrenchFrame
 
 RAW, COMPENSATED, POSE, JOINTS = "/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states"
 
+ENCODING = b"\0\1\0\0"
+"""The first bytes of a message: CDR, little endian."""
+
 JOINT_NAMES = (
     "shoulder_pan_joint",
     "shoulder_lift_joint",
@@ -106,7 +109,12 @@ def pack_wrenches(t_utc_ns: NDArray[np.int64], wrench: Array, frame: str) -> lis
 def pack_poses(t_utc_ns: NDArray[np.int64], R_base_flange: Array, p_base_flange_m: Array) -> list[bytes]:
     """Pack poses (n, 3, 3) and (n, 3) of the flange in base as PoseStamped."""
     xyzw = Rotation.from_matrix(R_base_flange).as_quat()
-    return _pack(t_utc_ns, _strings("base"), np.hstack([p_base_flange_m, xyzw]))
+    return pack_pose_numbers(t_utc_ns, np.hstack([p_base_flange_m, xyzw]))
+
+
+def pack_pose_numbers(t_utc_ns: NDArray[np.int64], pose: Array) -> list[bytes]:
+    """Pack (n, 7) poses, position in m and quaternion x, y, z, w, as PoseStamped."""
+    return _pack(t_utc_ns, _strings("base"), pose)
 
 
 def pack_joints(t_utc_ns: NDArray[np.int64], q_rad: Array) -> list[bytes]:
@@ -138,7 +146,7 @@ def _pack(t_utc_ns: NDArray[np.int64], same: bytes, numbers: Array, end: bytes =
         ("end", f"V{len(end)}"),
     ]
     records = np.zeros(n, layout)
-    records["encoding"] = np.void(b"\0\1\0\0")
+    records["encoding"] = np.void(ENCODING)
     records["sec"], records["nanosec"] = np.divmod(t_utc_ns, 1_000_000_000)
     records["same"] = np.void(same)
     records["numbers"] = numbers
