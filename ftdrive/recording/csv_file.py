@@ -13,7 +13,7 @@ A reader that skips lines with `#`, such as `pandas.read_csv(path, comment="#")`
 import csv
 import io
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +60,7 @@ class CsvFile:
         self._file.discard()
 
 
-def read_csv(path: Path) -> Recording:
+def read_csv(path: Path, _columns: Collection[str] = ()) -> Recording:
     """Read a recording. Raises `BadRecording` or `OSError`."""
     with path.open(encoding="utf-8", errors="replace", newline="") as file:
         lines = _whole_lines(file)

@@ -1,6 +1,6 @@
 """The file formats by their endings."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -10,7 +10,7 @@ from ftdrive.live.samples import StreamEvent
 from ftdrive.recording.csv_file import CsvFile, read_csv
 from ftdrive.recording.mcap_file import McapFile, read_mcap
 from ftdrive.recording.parquet_file import ParquetFile, read_parquet
-from ftdrive.recording.recording import Header, Recording, Rows
+from ftdrive.recording.recording import ROW, Header, Recording, Rows
 
 _PIECE_ROWS = 7000
 
@@ -32,7 +32,7 @@ class Format(NamedTuple):
     """A file format."""
 
     new: Callable[[Path, Header], RecordingFile]
-    read: Callable[[Path], Recording]
+    read: Callable[[Path, Collection[str]], Recording]
     package: str
     """Needed for it."""
 
@@ -56,13 +56,15 @@ def format_of(path: Path) -> Format:
     return _FORMATS[ending]
 
 
-def read_recording(path: Path) -> Recording:
+def read_recording(path: Path, columns: Collection[str] = ROW.names or ()) -> Recording:
     """Read a recording, also the `.partial` of one that was interrupted.
 
     Parameters
     ----------
     path : Path
         Its ending names the format: .mcap, .csv or .parquet.
+    columns : collection of str
+        Fields of `Recording.rows` that are needed. Others may be 0, which makes reading Parquet faster.
 
     Raises
     ------
@@ -75,7 +77,7 @@ def read_recording(path: Path) -> Recording:
     """
     file_format = format_of(path)
     try:
-        recording = file_format.read(path)
+        recording = file_format.read(path, columns)
     except BadRecording as error:
         raise BadRecording(f"{path}: {error}") from error
     if not len(recording.rows):

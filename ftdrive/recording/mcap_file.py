@@ -12,7 +12,7 @@ import json
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
@@ -232,7 +232,7 @@ def _bytes(*records: "McapRecord") -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
-def read_mcap(path: Path) -> Recording:
+def read_mcap(path: Path, _columns: Collection[str] = ()) -> Recording:
     """Read a recording, also one that was interrupted. Raises `BadRecording` or `OSError`."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Attachment, Chunk

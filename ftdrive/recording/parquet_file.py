@@ -6,7 +6,7 @@ complete files of some seconds each, which these programs and `read_recording` r
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from calib.files import require_new
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording.growing_file import partial_of
-from ftdrive.recording.recording import COLUMNS, ROW, Header, Recording, Rows, event_of, event_text
+from ftdrive.recording.recording import COLUMNS, NUMBERS, ROW, Header, Recording, Rows, event_of, event_text
 
 _PART_NS = 10_000_000_000
 
@@ -78,7 +78,7 @@ class ParquetFile:
         metadata = f"KV_METADATA {{header: {_quoted(header)}, events: {_quoted(events)}}}"
         try:
             self._database.execute(
-                f"COPY (SELECT * FROM {source}) TO {_quoted(str(path))} (FORMAT parquet, COMPRESSION zstd, {metadata})",
+                f"COPY (SELECT * FROM {source}) TO {_quoted(str(path))} (FORMAT parquet, {metadata})",
                 values,
             )
         except duckdb.Error as error:
@@ -86,13 +86,14 @@ class ParquetFile:
             raise OSError(f"{path} cannot be written ({error}): make room there; the parts are kept") from error
 
 
-def read_parquet(path: Path) -> Recording:
+def read_parquet(path: Path, columns: Collection[str]) -> Recording:
     """Read a recording, or the folder of one that was interrupted. Raises `BadRecording` or `OSError`."""
     import duckdb
 
     parts = sorted(map(str, path.glob("*.parquet"))) if path.is_dir() else [str(path)]
     if not parts:
         raise BadRecording("the folder contains no complete part")
+    names = [one for name in ROW.names or () if name in columns for one in NUMBERS[name]]
     with duckdb.connect() as database:
         try:
             pairs = database.execute("SELECT key, value FROM parquet_kv_metadata($1)", [parts[-1]]).fetchall()
@@ -101,16 +102,14 @@ def read_parquet(path: Path) -> Recording:
                 raise BadRecording("the file has no header of ftdrive")
             header = Header.from_dict(json.loads(metadata["header"]))
             events = [event_of(json.dumps(one)) for one in json.loads(metadata["events"])]
-            columns = database.execute("SELECT * FROM read_parquet($1)", [parts]).fetchnumpy()
+            found = database.execute(f"SELECT {', '.join(names)} FROM read_parquet($1)", [parts]).fetchnumpy()
         except (duckdb.Error, KeyError, ValueError) as error:
             raise BadRecording(
                 f"{error}: the file is damaged or was cut; a Parquet file cannot be read then"
             ) from error
-    if missing := [name for name in COLUMNS.names or () if name not in columns]:
-        raise BadRecording(f"the column {missing[0]} is missing")
-    rows = np.zeros(len(columns["seq"]), COLUMNS)
-    for name in COLUMNS.names or ():
-        rows[name] = np.ma.filled(columns[name], np.nan) if np.ma.isMaskedArray(columns[name]) else columns[name]
+    rows = np.zeros(len(found[names[0]]), COLUMNS)
+    for name in names:
+        rows[name] = np.ma.filled(found[name], np.nan) if np.ma.isMaskedArray(found[name]) else found[name]
     return Recording(header, rows.view(ROW), events, "the recording was interrupted" if path.is_dir() else "")
 
 

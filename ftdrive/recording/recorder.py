@@ -19,7 +19,7 @@ _FLUSH_NS = 1_000_000_000
 class Recorder:
     """Writes a stream to files, with everything since the first sample; a consumer of blocks and events.
 
-    Missing samples and changes of frame and stages become events, whose times are those of the samples after them.
+    Changes of frame and stages become events with the time of the first sample after them.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class Recorder:
     """
 
     def __init__(self, paths: Sequence[Path], info: StreamInfo, configuration: Mapping[str, JSON]) -> None:
-        self.samples, self.gaps, self.lost = 0, 0, 0
+        self.samples, self.gaps = 0, 0
         self.duration_s = 0.0
         for path in paths:
             format_of(path)
@@ -48,7 +48,7 @@ class Recorder:
         self._header: Header | None = None
         self._rows: list[Rows] = []
         self._events: list[StreamEvent] = []
-        self._first_ns = self._next_seq = 0
+        self._first_ns = 0
         self._failed = False
 
     def write(self, block: Block) -> None:
@@ -57,26 +57,32 @@ class Recorder:
             return
         rows = rows_of(block)
         self._follow(block, rows)
-        self._find_gaps(rows)
         self._rows.append(rows)
         self.samples += len(rows)
         self.duration_s = float(rows["t_host_ns"][-1] - self._first_ns) * 1e-9
         if rows["t_host_ns"][-1] - self._rows[0]["t_host_ns"][0] >= _FLUSH_NS:
-            self._flush(self._files)
+            self._flush()
 
     def event(self, event: StreamEvent) -> None:
-        """Record an event of the stream; what the recorder finds itself is left out."""
-        if event.kind not in ("frame", "stages", "gap"):
+        """Record an event of the stream."""
+        self.gaps += event.kind == "gap"
+        if event.kind not in ("frame", "stages"):  # `_follow` finds the first sample of each
             self._events.append(event)
 
     def close(self) -> None:
         """Complete all files; without a sample there is none. Raises the first `OSError`, after all were tried."""
-        files, self._files = self._files, []
         with ExitStack() as stack:  # runs every callback, then raises
-            for file in files:
+            for file in self._files:
                 stack.callback(file.complete)
-            if not self._failed and files:
-                self._flush(files)
+            if not self._failed:
+                self._flush()
+        self._files = []
+
+    def discard(self) -> None:
+        """Delete what was written."""
+        for file in self._files:
+            file.discard()
+        self._files = []
 
     def _follow(self, block: Block, rows: Rows) -> None:
         """Begin with the first block; record a change of frame or stages."""
@@ -84,7 +90,7 @@ class Recorder:
         if self._header is None:
             self._header = Header(self._info, block.frame, block.stages, self._configuration)
             self._files = [format_of(path).new(path, self._header) for path in self._paths]
-            self._first_ns, self._next_seq = t_ns, int(rows["seq"][0])
+            self._first_ns = t_ns
         changes = []
         if block.frame != self._header.frame:
             text = f"The compensated wrench is in {block.frame}"
@@ -92,27 +98,16 @@ class Recorder:
         if block.stages != self._header.stages:
             changes.append(StreamEvent(t_ns, "stages", f"The stages are {block.stages}", asdict(block.stages)))
         if changes:
-            self._flush(self._files)  # the samples of one flush are in one frame
+            self._flush()  # the samples of one flush are in one frame
             self._events += changes
             self._header = replace(self._header, frame=block.frame, stages=block.stages)
 
-    def _find_gaps(self, rows: Rows) -> None:
-        missing = np.diff(rows["seq"], prepend=self._next_seq - 1) - 1
-        for i in np.flatnonzero(missing).tolist():
-            lost, seq = int(missing[i]), int(rows["seq"][i])
-            words = f"{lost} samples are missing" if lost > 0 else "The sample numbers go back"
-            values = {"lost": max(0, lost), "seq": seq}
-            self._events.append(StreamEvent(int(rows["t_host_ns"][i]), "gap", f"{words} before sample {seq}", values))
-            self.gaps += 1
-            self.lost += max(0, lost)
-        self._next_seq = int(rows["seq"][-1]) + 1
-
-    def _flush(self, files: Sequence[RecordingFile]) -> None:
+    def _flush(self) -> None:
         rows, self._rows = np.concatenate([np.zeros(0, ROW), *self._rows]), []
         events, self._events = self._events, []
         if not len(rows) and not events:
             return
         self._failed = True
-        for file in files:
+        for file in self._files:
             file.append(rows, events)
         self._failed = False

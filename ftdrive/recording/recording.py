@@ -6,7 +6,6 @@ The pose is stored as a quaternion, so that all formats hold the same bits.
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from datetime import UTC, datetime
 from itertools import pairwise
 from typing import Any, Final, Self
 
@@ -19,7 +18,7 @@ from calib.errors import CalibError
 from calib.files import JSON, check_format
 from drivers.interfaces import DeviceInfo, Fact
 from ftdrive.errors import BadRecording
-from ftdrive.live.samples import Block, Stages, StreamEvent, StreamInfo, WrenchFrame
+from ftdrive.live.samples import Block, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame
 
 FORMAT: Final = "ftdrive.recording/1"
 
@@ -44,18 +43,20 @@ ROW: Final = np.dtype(
     [(name, kind, (len(names),)) if names else (name, kind) for name, (kind, names) in _GROUPS.items()]
 )
 """One sample, fields as in `Block`; the quaternion is x, y, z, w."""
-COLUMNS: Final = np.dtype([(one, kind) for name, (kind, names) in _GROUPS.items() for one in names or (name,)])
-"""The same bytes, one field a number: the columns of the table formats."""
+NUMBERS: Final = {name: names or (name,) for name, (_, names) in _GROUPS.items()}
+"""The columns of the table formats, by the field of `ROW` that holds them."""
+COLUMNS: Final = np.dtype([(one, kind) for name, (kind, _) in _GROUPS.items() for one in NUMBERS[name]])
+"""The same bytes, one field a number."""
 
 
-def rows_of(block: Block) -> Rows:
-    """Return the samples of a block as records."""
-    rows = np.zeros(len(block), ROW)
+def rows_of(samples: Block | Paired) -> Rows:
+    """Return samples as records; what paired samples do not have is 0."""
+    rows = np.zeros(len(samples), ROW)
     for name in _GROUPS:
-        if name != "quaternion_base_flange":
-            rows[name] = getattr(block, name)
+        if hasattr(samples, name):
+            rows[name] = getattr(samples, name)
     if len(rows):
-        rows["quaternion_base_flange"] = Rotation.from_matrix(block.R_base_flange).as_quat()
+        rows["quaternion_base_flange"] = Rotation.from_matrix(samples.R_base_flange).as_quat()
     return rows
 
 
@@ -164,22 +165,21 @@ class Recording:
         return float(np.ptp(self.rows["t_host_ns"])) * 1e-9 if len(self.rows) else 0.0
 
     @property
-    def started(self) -> datetime:
-        """Time of the first sample."""
-        return datetime.fromtimestamp((int(self.rows["t_host_ns"][0]) + self.header.info.utc_offset_ns) * 1e-9, UTC)
-
-    @property
     def gaps(self) -> int:
         """Number of places where samples are missing."""
         return int(np.count_nonzero(np.diff(self.rows["seq"]) != 1))
 
-    def blocks(self, length: int = 1 << 16) -> Iterator[Block]:
-        """Give the samples in blocks of at most `length`; sigma is not recorded, it is NaN."""
-        for rows, _, header in self.pieces(length):
-            values = {name: rows[name] for name in _GROUPS if name != "quaternion_base_flange"}
-            R_base_flange = Rotation.from_quat(rows["quaternion_base_flange"]).as_matrix()
-            sigma = np.full(6, np.nan)
-            yield Block(**values, R_base_flange=R_base_flange, sigma=sigma, frame=header.frame, stages=header.stages)
+    def paired(self, which: slice = slice(None)) -> Paired:
+        """Return samples as measured, each with its pose."""
+        rows = self.rows[which]
+        names = ("t_host_ns", "t_device_s", "seq", "status", "raw", "q_rad", "p_base_flange_m")
+        R_base_flange = Rotation.from_quat(rows["quaternion_base_flange"]).as_matrix()
+        return Paired(R_base_flange=R_base_flange, **{name: rows[name] for name in names})
+
+    def with_calibration(self, calibration: CalibrationResult, name: str) -> Self:
+        """Return the recording with another calibration in its header."""
+        info = replace(self.header.info, calibration=calibration, calibration_name=name)
+        return replace(self, header=replace(self.header, info=info))
 
     def pieces(self, length: int) -> Iterator[tuple[Rows, Sequence[StreamEvent], Header]]:
         """Give samples in pieces of one frame, the events since the piece before, and the header that holds there."""

@@ -144,18 +144,6 @@ def test_an_unknown_ending_is_refused_before_any_work(tmp_path: Path) -> None:
         Recorder([tmp_path / "a.bag"], info(), {})
 
 
-def test_numbers_that_go_back_are_a_gap(tmp_path: Path) -> None:
-    recorder = Recorder([tmp_path / "a.csv"], info(), {})
-    recorder.write(block(10))
-    recorder.write(block(10, 15))
-    recorder.write(block(10, 3))
-    recorder.close()
-    assert (recorder.samples, recorder.gaps, recorder.lost) == (30, 2, 5)
-    events = read_recording(tmp_path / "a.csv").events
-    assert [event.values["lost"] for event in events] == [5, 0]
-    assert "go back" in events[1].text
-
-
 @pytest.mark.parametrize(("missing", "ending"), [("mcap", ".mcap"), ("duckdb", ".parquet")])
 def test_a_missing_package_is_named_with_its_extra(
     missing: str, ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
