@@ -114,19 +114,18 @@ def _read(
 
 
 def _words(result: dict[str, Any], frame: str) -> Iterator[str]:
-    yield f" {result['samples']} samples, {result['duration_s']:.2f} s, {result['gaps']} gaps"
+    yield f" {result['samples']} samples, {result['duration_s']:.2f} s, gaps: {result['gaps']}"
     if delay := result["delay_s"]:
         yield f" wrench after pose: {1e3 * delay['value']:.2f} ± {1e3 * delay['sigma']:.2f} ms (1 sigma)"
     if change := result["bias_change"]:
-        for i, (unit, digits) in enumerate((("N", 3), ("N·m", 5))):
-            part = slice(3 * i, 3 * i + 3)
-            pairs = zip(change["value"][part], change["sigma"][part], strict=True)
-            yield f" bias changed by {', '.join(f'{v:.{digits}f} ± {s:.{digits}f}' for v, s in pairs)} {unit} (1 sigma)"
+        pairs = [f"{v:.5f} ± {s:.5f}" for v, s in zip(change["value"], change["sigma"], strict=True)]
+        yield f" bias change ± 1 sigma:\n   {', '.join(pairs[:3])} N\n   {', '.join(pairs[3:])} N·m"
     yield f" {'':12}{'force rms':>10}{'max N':>10}{'torque rms':>12}{'max N·m':>10}"
     for name in ("raw", "compensated"):
         f_rms, f_max, t_rms, t_max = result[name].values()
         yield f" {name:12}{f_rms:10.3f}{f_max:10.3f}{t_rms:12.5f}{t_max:10.5f}"
-    yield f" raw: sensor axes, about the sensor origin; compensated: {frame}"
+    yield " raw: sensor axes, about the sensor origin"
+    yield f" compensated: {frame}"
     for contact in result["contacts"]:
         x, y, z = contact["direction"]
         begin = f"contact at {contact['t_s']:8.2f} s for {contact['duration_s']:6.2f} s"

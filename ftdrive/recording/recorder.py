@@ -38,8 +38,8 @@ class Recorder:
     """
 
     def __init__(self, paths: Sequence[Path], info: StreamInfo, configuration: Mapping[str, JSON]) -> None:
-        self.samples, self.gaps = 0, 0
-        self.duration_s = 0.0
+        self.samples, self.gaps, self.lost = 0, 0, 0
+        self.first_ns = self.last_ns = 0
         for path in paths:
             format_of(path)
             partial_of(path)
@@ -48,8 +48,12 @@ class Recorder:
         self._header: Header | None = None
         self._rows: list[Rows] = []
         self._events: list[StreamEvent] = []
-        self._first_ns = 0
         self._failed = False
+
+    @property
+    def duration_s(self) -> float:
+        """From the first sample to the last."""
+        return (self.last_ns - self.first_ns) * 1e-9
 
     def write(self, block: Block) -> None:
         """Record samples. Raises `OSError`; then close: what was written before remains."""
@@ -59,13 +63,15 @@ class Recorder:
         self._follow(block, rows)
         self._rows.append(rows)
         self.samples += len(rows)
-        self.duration_s = float(rows["t_host_ns"][-1] - self._first_ns) * 1e-9
-        if rows["t_host_ns"][-1] - self._rows[0]["t_host_ns"][0] >= _FLUSH_NS:
+        self.last_ns = int(rows["t_host_ns"][-1])
+        if self.last_ns - self._rows[0]["t_host_ns"][0] >= _FLUSH_NS:
             self._flush()
 
     def event(self, event: StreamEvent) -> None:
         """Record an event of the stream."""
-        self.gaps += event.kind == "gap"
+        if event.kind == "gap":
+            self.gaps += 1
+            self.lost += int(event.values.get("lost", 0))
         if event.kind not in ("frame", "stages"):  # `_follow` finds the first sample of each
             self._events.append(event)
 
@@ -90,7 +96,7 @@ class Recorder:
         if self._header is None:
             self._header = Header(self._info, block.frame, block.stages, self._configuration)
             self._files = [format_of(path).new(path, self._header) for path in self._paths]
-            self._first_ns = t_ns
+            self.first_ns = t_ns
         changes = []
         if block.frame != self._header.frame:
             text = f"The compensated wrench is in {block.frame}"

