@@ -17,9 +17,10 @@ from ftdrive.live.samples import StreamEvent, WrenchFrame
 from ftdrive.recording.recorder import Recorder
 from ftdrive.recording.recording import Recording
 
-_PIECE_ROWS = 1 << 18
-"""Processed together: the noise of the first piece is estimated from all of it."""
-_CHUNK_ROWS = 7000
+_PIECE_ROWS = 1 << 13
+_NOISE_S = 30.0
+"""The noise is that of the beginning of a recording."""
+_OF_FORCE_AND_TORQUE = np.kron(np.eye(2), np.ones((3, 1)))
 NEEDED = ("t_host_ns", "seq", "raw", "p_base_flange_m", "quaternion_base_flange")
 """Columns without which there is no compensation."""
 _READING_S = 0.1
@@ -51,7 +52,9 @@ def compensated(recording: Recording, frame: WrenchFrame, output: Path | None = 
     OSError
         The result cannot be written.
     """
-    processor = Processor(recording.header.info, frame)
+    info = recording.header.info
+    processor = Processor(info, frame)
+    processor.learn_noise(recording.paired(slice(round(_NOISE_S * info.sensor_rate_Hz))))
     n, start_ns = len(recording.rows), int(recording.rows["t_host_ns"][0])
     squares, largest = np.zeros((2, 2)), np.zeros((2, 2))  # raw and compensated, force and torque
     events = [event for event in recording.events if event.kind in ("mark", "delay", "stale", "recovered")]
@@ -59,19 +62,20 @@ def compensated(recording: Recording, frame: WrenchFrame, output: Path | None = 
     with ExitStack() as stack:
         recorder = None
         if output is not None:
-            recorder = Recorder([output], recording.header.info, recording.header.configuration)
+            recorder = Recorder([output], info, recording.header.configuration)
             stack.callback(recorder.discard)
         for start in range(0, n, _PIECE_ROWS):
             paired = recording.paired(slice(start, start + _PIECE_ROWS))
             block = processor.process(paired, last=start + _PIECE_ROWS >= n)
-            norms = np.array([(wrench.reshape(-1, 2, 3) ** 2).sum(axis=2) for wrench in (block.raw, block.wrench)])
-            squares, largest = squares + norms.sum(axis=1), np.maximum(largest, norms.max(axis=1))
+            for i, wrench in enumerate((block.raw, block.wrench)):
+                norms = np.square(wrench) @ _OF_FORCE_AND_TORQUE
+                squares[i] += norms.sum(axis=0)
+                largest[i] = np.maximum(largest[i], norms.max(axis=0))
             new = processor.take_events()
             contacts += [_contact(event, start_ns) for event in new if event.kind == "contact"]
             events += new
             if recorder is not None:
-                for first in range(0, len(block), _CHUNK_ROWS):
-                    recorder.write(block.rows(slice(first, first + _CHUNK_ROWS)))
+                recorder.write(block)
         if recorder is not None:
             for event in events:
                 recorder.event(event)

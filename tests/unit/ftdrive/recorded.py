@@ -58,7 +58,7 @@ def block(
     """Make n samples from number `start` on: the flange turns, numbers have all their digits."""
     rng = np.random.default_rng(start)
     i = np.arange(start, start + n)
-    R = Rotation.from_rotvec(np.outer(i / 300, [0.6, -0.5, 0.3])).as_matrix()
+    R = Rotation.from_rotvec(np.outer(i * step_ns * 1e-9, [0.6, -0.5, 0.3])).as_matrix()
     return Block(
         t_host_ns=(5_000_000_000 + step_ns * i + rng.integers(0, 1000, n)).astype(np.int64),
         t_device_s=np.where(i % 7 == 0, np.nan, i * 1e-3 + 1 / 3),
