@@ -1,5 +1,6 @@
 """`ftdrive live`: raw and compensated wrench, ten times a second."""
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
@@ -106,6 +107,10 @@ def live(
                 talk.print(f" {words}")
         if once or as_json:
             _print(stream, once=once, as_json=as_json)
+        elif talk.is_terminal and sys.stdout.isatty() and sys.stdin.isatty() and not plain:
+            from ftdrive.terminal.live_screen import run_live
+
+            run_live(stream)
         else:
             _show_table(stream)
 
@@ -168,7 +173,8 @@ def _looks(stream: CompensatedStream | ReplayedStream, *, raises: bool = False) 
     blocks: list[Block] = []
     look: Look | None = None
     failing_since_s: float | None = None
-    while not (isinstance(stream, ReplayedStream) and stream.has_ended):
+    ended = False
+    while not ended:
         try:
             block = stream.read()
         except DriverError as error:
@@ -180,14 +186,13 @@ def _looks(stream: CompensatedStream | ReplayedStream, *, raises: bool = False) 
             yield replace(look, stale=str(error))
             continue
         failing_since_s = None
+        ended = isinstance(stream, ReplayedStream) and stream.has_ended
         if len(block):
             blocks.append(block)
         if not blocks:
             continue
         span_s = (blocks[-1].t_host_ns[-1] - blocks[0].t_host_ns[0]) * 1e-9
-        if span_s >= _PERIOD_S - 0.5 / stream.info.sensor_rate_Hz or (
-            isinstance(stream, ReplayedStream) and stream.has_ended
-        ):
+        if span_s >= _PERIOD_S - 0.5 / stream.info.sensor_rate_Hz or (ended and look is None):
             if np.isfinite(block.sigma).all() or isinstance(stream, ReplayedStream):
                 look = _look(blocks, stream, span_s)
                 yield look

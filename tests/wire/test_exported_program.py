@@ -59,7 +59,7 @@ def test_it_asks_and_then_visits_every_pose_at_rest(plan: Plan, start: Callable[
     state = station.wait_for(lambda state: state["runtime_state"] == "STOPPED")
     diary = [event for event in state["events"] if event["what"] in ("moves", "stands") or ": pose " in event["why"]]
     steps = [*plan.steps, plan.steps[0]]
-    assert [event["what"] for event in diary] == ["moves", "textmsg", "stands"] * len(steps)
+    assert [event["what"] for event in diary] == ["moves", "stands", "textmsg"] * len(steps)
     for step, said, stands in zip(steps, diary[1::3], diary[2::3], strict=True):
         assert re.findall(r"R(\d\d)", said["why"])[0] == f"{step.number:02}"
         np.testing.assert_allclose(stands["q_rad"], step.q_rad, atol=2e-3)

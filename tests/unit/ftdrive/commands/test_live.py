@@ -1,9 +1,10 @@
-"""The live readout: enough samples from slow sensors, and a screen that stands still and says when it ends."""
+"""The live readout: means of a stream with honest sigmas, one object a line, and a table that stands still."""
 
 import io
+import json
 import re
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,99 +13,96 @@ from click.testing import CliRunner
 from rich.console import Console
 
 from calib import CalibrationDataset, CalibrationResult, Known, Parameters, solve
-from calib.data.dwell_mean import LEAST_SAMPLES, PoseMean
 from calib.model import predict
 from calib.published.yu import SPECIAL_R_flange_base
-from drivers.interfaces import Health
+from drivers.errors import DeviceTimeout
 from ftdrive.commands import live
+from ftdrive.live.processing import Processor
+from ftdrive.live.replay import ReplayedStream
+from ftdrive.live.samples import Block, Stages, WrenchFrame
+from tests.fake_clock import FakeClock
+from tests.unit.ftdrive.live.simulated import NOISE, calibrated, dwells, info, paired
 
 
-class Slow:
-    """A sensor of 70 Hz and an arm at rest."""
-
-    def __init__(self) -> None:
-        self.sent = 0
-
-    def open(self, **_: Any) -> None: ...
-
-    def close(self) -> None: ...
-
-    def __enter__(self) -> "Slow":
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def identify(self) -> SimpleNamespace:
-        return SimpleNamespace(serial="1", model="M")
-
-    def state(self) -> SimpleNamespace:
-        return SimpleNamespace(R_base_flange=np.eye(3))
-
-    def health(self) -> Health:
-        return Health(received=self.sent, lost=0, malformed=0, rate_Hz=70.0, age_s=0.0)
-
-    def collect(self, duration_s: float) -> SimpleNamespace:
-        n = round(70 * duration_s)
-        first, self.sent = self.sent, self.sent + n
-        return SimpleNamespace(wrench=np.add.outer(np.arange(first, self.sent, dtype=float), np.arange(6.0)))
-
-
-def test_a_slow_sensor_is_averaged_over_the_newest_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    sensor = Slow()
-    monkeypatch.setattr(live, "build_sensor", lambda _: sensor)
-    monkeypatch.setattr(live, "build_arm", lambda _: Slow())
-    calibration: Any = SimpleNamespace(provenance={})
-    with live._live_looks(SimpleNamespace(), calibration) as looks:  # type: ignore[arg-type]  # nothing is asked of it
-        for _ in range(3):
-            look = next(looks)
-            newest = np.arange(sensor.sent - LEAST_SAMPLES, sensor.sent)
-            np.testing.assert_allclose(look.mean.mean[0], newest.mean())
-
-
-def test_a_slow_recording_is_shown_in_pieces_long_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("time.sleep", lambda _: None)
-    n = 95
-    samples = SimpleNamespace(
-        t_host_ns=np.arange(n) * 10_000_000, wrench=np.add.outer(np.arange(n) * 1.0, np.zeros(6)), seq=np.arange(n)
-    )
-    record = SimpleNamespace(samples=samples, before=SimpleNamespace(R_base_flange=np.eye(3)))
-    run: Any = SimpleNamespace(records=lambda: [record])
-    looks = list(live._recorded_looks(run))
-    assert [look.mean.mean[0] for look in looks] == [9.5, 29.5, 49.5, 69.5]
-    assert looks[0].rate_Hz == pytest.approx(100)
+def replayed(seconds: float = 2.0, **options: Any) -> ReplayedStream:
+    rows = paired(dwells(1, round(seconds * 1000), seed=1), push=np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+    return ReplayedStream(info(calibrated()), rows, clock=FakeClock(), **options)
 
 
 @pytest.fixture
-def recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
-    """A recording of three looks with changing signs, and a calibration of nothing; the command's arguments."""
-    calibration: Any = SimpleNamespace(
-        provenance={},
-        verdict="good",
-        compensate=lambda raw, _: raw - 9.5,
-        wrench_covariance=lambda _: np.zeros((6, 6)),
-        predicted_error=lambda: (0.0, 0.0),
-        quality={},
-        R_flange_sensor=np.eye(3),
+def arguments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
+    """The command with a recording in place of a run."""
+    path = tmp_path / "calibration.json"
+    calibrated().save(path)
+
+    def stream(_run: Any, _calibration: CalibrationResult, _name: str, **options: Any) -> ReplayedStream:
+        return replayed(**options)
+
+    monkeypatch.setattr(live, "replay_run", stream)
+    return ["--calibration", str(path), "--replay", str(tmp_path)]
+
+
+def run(arguments: list[str], *more: str) -> Any:
+    return CliRunner().invoke(live.live, [*arguments, *more], catch_exceptions=False)
+
+
+def test_each_line_is_the_mean_of_a_tenth_of_a_second(arguments: list[str]) -> None:
+    lines = [json.loads(line) for line in run(arguments, "--json").stdout.splitlines()]
+    assert len(lines) == pytest.approx(19, abs=2)
+    for line in lines:
+        assert line["compensated"]["force_N"] == pytest.approx([1.0, 2.0, 3.0], abs=6 * NOISE[0] / 10)
+        assert line["sigma"]["force_N"] == pytest.approx(NOISE[:3] / 10, rel=0.3)
+        assert (line["axes"], line["about"], line["contact"], line["stale"]) == ("sensor", "sensor origin", True, None)
+        assert line["delay_s"] == {"value": 0.0, "sigma": 0.0}
+    assert np.diff([line["t_s"] for line in lines]) == pytest.approx(0.1, abs=0.02)
+
+
+def test_axes_and_point_are_chosen_separately(arguments: list[str]) -> None:
+    sensor = json.loads(run(arguments, "--json", "--once").stdout)
+    base = json.loads(run(arguments, "--json", "--once", "--axes", "base").stdout)
+    point = json.loads(run(arguments, "--json", "--once", "--about", "0,0,0.13").stdout)
+    R = dwells(1, 1, seed=1)[0] @ calibrated().R_flange_sensor
+    for key in ("raw", "compensated"):
+        np.testing.assert_allclose(R @ sensor[key]["force_N"], base[key]["force_N"], atol=1e-9)
+        lever = calibrated().R_flange_sensor.T @ [0, 0, -0.1]  # from the point to the sensor origin
+        moved = np.array(sensor[key]["torque_Nm"]) + np.cross(lever, sensor[key]["force_N"])
+        np.testing.assert_allclose(point[key]["torque_Nm"], moved, atol=1e-9)
+    assert (base["axes"], base["about"], point["about"]) == ("base", "sensor origin", [0.0, 0.0, 0.13])
+
+
+@pytest.mark.parametrize(
+    ("more", "why"),
+    [
+        (["--about", "nowhere"], "--about is 'nowhere'"),
+        (["--speed", "2"], None),
+        (["--axes", "base", "--about", "tcp"], None),
+    ],
+)
+def test_options_are_checked(arguments: list[str], more: list[str], why: str | None) -> None:
+    result = CliRunner().invoke(live.live, [*arguments, *more, "--once"])
+    assert (str(result.exception) if result.exception else "").startswith(why or "")
+    assert (result.exception is None) == (why is None)
+
+
+def test_speed_needs_a_recording() -> None:
+    result = CliRunner().invoke(live.live, ["--speed", "2"])
+    assert "--replay" in str(result.exception)
+
+
+def test_once_prints_one_line(arguments: list[str]) -> None:
+    (line,) = run(arguments, "--once").stdout.splitlines()
+    assert re.fullmatch(
+        r"F( +-?\d+\.\d{3}){3} N   T( +-?\d+\.\d{5}){3} N·m   \(sensor axes, about the sensor origin\)", line
     )
-    n = 60
-    wrench = np.add.outer(np.repeat([9.4, -3.0, 12.0], 20), np.linspace(0.0, 1e-3, 6)) + np.arange(n)[:, None] % 2
-    samples = SimpleNamespace(t_host_ns=np.arange(n) * 10_000_000, wrench=wrench, seq=np.arange(n))
-    record = SimpleNamespace(samples=samples, before=SimpleNamespace(R_base_flange=np.eye(3)))
-    monkeypatch.setattr(CalibrationResult, "load", lambda _: calibration)
-    monkeypatch.setattr(live, "Run", lambda _: SimpleNamespace(records=lambda: [record]))
-    monkeypatch.setattr("time.sleep", lambda _: None)
-    file = tmp_path / "calibration.json"
-    file.touch()
-    return ["--calibration", str(file), "--replay", str(tmp_path)]
 
 
-def test_the_end_of_a_recording_is_said(recorded: list[str]) -> None:
-    shown = CliRunner().invoke(live.live, recorded, catch_exceptions=False).stderr
+def test_the_end_of_a_recording_is_shown(arguments: list[str]) -> None:
+    shown = run(arguments, "--plain").stderr
     assert shown.rstrip().endswith("The recording has ended.")
     assert "Ctrl-C" not in shown
 
 
-def test_what_is_typed_does_not_break_the_screen(recorded: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_typed_keys_do_not_break_the_table(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     quiet: list[str] = []
 
     class Keyboard:
@@ -119,14 +117,57 @@ def test_what_is_typed_does_not_break_the_screen(recorded: list[str], monkeypatc
         def __exit__(self, *_: object) -> None:
             quiet.append("as before")
 
-    def screen(*_: object) -> str:
-        quiet.append("shown")
-        return "a screen"
-
-    monkeypatch.setattr(live, "_screen", screen)
     monkeypatch.setattr(live, "Keyboard", Keyboard)
-    CliRunner().invoke(live.live, recorded, catch_exceptions=False)
-    assert quiet == ["echo off", "shown", "shown", "shown", "as before"]
+    monkeypatch.setattr(live, "_screen", lambda *_: quiet.append("shown") or "a table")  # type: ignore[func-returns-value]
+    run(arguments, "--plain")
+    assert (quiet[0], quiet[-1], set(quiet[1:-1])) == ("echo off", "as before", {"shown"})
+
+
+class Interrupted:
+    """A stream that fails for some reads."""
+
+    def __init__(self, failures: int) -> None:
+        self.stream = replayed(10.0)
+        self.clock, self.info, self.frame = self.stream.clock, self.stream.info, self.stream.frame
+        self.status, self.sigma_of_mean = self.stream.status, self.stream.sigma_of_mean
+        self.reads, self.failures = 0, failures
+
+    def read(self) -> Block:
+        self.reads += 1
+        if 50 < self.reads <= 50 + self.failures:
+            self.clock.sleep(0.3)
+            raise DeviceTimeout("sensor: no new sample for 0.300 s", "check cable and supply")
+        return self.stream.step()
+
+
+def test_a_silent_device_is_shown_and_no_old_number() -> None:
+    stream: Any = Interrupted(2)
+    readings = []
+    for look in live._looks(stream):
+        readings.append(live._reading(look, stream))
+        if len(readings) == 12:
+            break
+    stale = [reading for reading in readings if reading["stale"]]
+    assert len(stale) == 2
+    for reading in stale:
+        assert reading["stale"].startswith("sensor: no new sample for 0.300 s")
+        assert reading["compensated"] is reading["raw"] is reading["sigma"] is reading["contact"] is None
+        assert live._line(reading, stream.frame).startswith("stale: sensor")
+    assert readings[-1]["stale"] is None
+    console = Console(width=80, file=io.StringIO(), color_system=None)
+    console.print(live._screen(stale[0], stream.frame, "calibration.json"))
+    assert isinstance(console.file, io.StringIO)
+    shown = console.file.getvalue()
+    assert "no new sample for 0.300 s" in shown
+    assert "--.--" in shown
+    assert not re.search(r"\d\.\d\d\d", shown.partition("Fx")[2])
+
+
+def test_a_failure_that_lasts_ends_the_command() -> None:
+    with pytest.raises(DeviceTimeout):
+        list(live._looks(Interrupted(1000)))  # type: ignore[arg-type]
+    with pytest.raises(DeviceTimeout):
+        list(live._looks(Interrupted(1), raises=True))  # type: ignore[arg-type]
 
 
 def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
@@ -140,31 +181,47 @@ def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
     )
     headline = calibration.likely_error()
     assert (headline > 1.1 * np.array(calibration.predicted_error())).all()
-    mean = PoseMean(np.zeros(6), np.zeros((6, 6)), 20)
-    beyond = live._beyond_noise(calibration)
-    shown = [live._reading(live.Look(mean, one, 1e3, 0), calibration, beyond, "base")["sigma"] for one in R]
-    rms = [float(np.sqrt(np.mean([np.sum(np.square(one[key])) for one in shown]))) for key in ("force_N", "torque_Nm")]
-    np.testing.assert_allclose(rms, headline)
-    assert min(min(one["force_N"]) for one in shown) > 0.5 * headline[0] / np.sqrt(3)
+    shown = []
+    for one in R:
+        processor = Processor(replace(info(calibration), calibration=calibration), WrenchFrame("base"), Stages())
+        rows = paired(np.tile(one, (1000, 1, 1)), noise=1e-3)
+        processor.process(rows)
+        shown.append(processor.sigma(one, 0.1))
+    rms = np.sqrt(np.square(shown).reshape(24, 2, 3).sum(axis=2).mean(axis=0))
+    np.testing.assert_allclose(rms, headline, rtol=0.01)
+    assert np.min(np.array(shown)[:, :3]) > 0.5 * headline[0] / np.sqrt(3)
+
+
+READING: dict[str, Any] = {
+    "verdict": "good",
+    "rate_Hz": 1e3,
+    "lost": 0,
+    "contact": False,
+    "stale": None,
+    "delay_s": {"value": 0.0031, "sigma": 2e-4},
+}
 
 
 @pytest.mark.parametrize("axes", ["sensor", "flange", "base"])
-def test_what_stands_above_the_numbers_fits_into_80_columns(axes: str) -> None:
+def test_the_table_fits_into_80_columns(axes: Any) -> None:
     three = {"force_N": [1.0] * 3, "torque_Nm": [0.1] * 3}
-    reading = {"axes": axes, "about": "sensor origin", "verdict": "good", "rate_Hz": 1e3, "lost": 0}
     console = Console(width=80, file=io.StringIO(), color_system=None)
-    console.print(live._screen(reading | {"raw": three, "compensated": three, "sigma": three}, "made for this"))
+    console.print(
+        live._screen(READING | {"raw": three, "compensated": three, "sigma": three}, WrenchFrame(axes), "made for this")
+    )
     assert isinstance(console.file, io.StringIO)
-    assert "± 1 sigma" in console.file.getvalue().splitlines()[2]
+    lines = console.file.getvalue().splitlines()
+    assert "delay 3.1 ± 0.2 ms" in lines[2]
+    assert "± 1 sigma" in lines[3]
 
 
 def test_columns_stand_still_when_a_sign_changes() -> None:
     def ends(contact: float) -> list[int]:
         three = {"force_N": [contact] * 3, "torque_Nm": [contact / 10] * 3}
-        reading = {"axes": "base", "about": "sensor origin", "verdict": "good", "rate_Hz": 1e3, "lost": 0}
-        reading |= {"raw": three, "compensated": three, "sigma": {"force_N": [0.1] * 3, "torque_Nm": [0.1] * 3}}
+        sigma = {"force_N": [0.1] * 3, "torque_Nm": [0.1] * 3}
+        reading = READING | {"raw": three, "compensated": three, "sigma": sigma}
         console = Console(width=80, file=io.StringIO(), color_system=None)
-        console.print(live._screen(reading, "made for this"))
+        console.print(live._screen(reading, WrenchFrame("base"), "made for this"))
         assert isinstance(console.file, io.StringIO)
         (line,) = [line for line in console.file.getvalue().splitlines() if line.startswith(" Fx")]
         return [match.end() for match in re.finditer(r"\S+", line)]

@@ -47,7 +47,8 @@ def processed(rows: Paired, *, block: int = 10, rate_Hz: float = 1000.0, **optio
 def run(processor: Processor, rows: Paired, block: int = 10) -> Block:
     blocks = [processor.process(rows.rows(slice(i, i + block))) for i in range(0, len(rows), block)]
     columns = ("t_host_ns", "wrench", "chi2", "in_contact", "seq")
-    return replace(blocks[-1], **{name: np.concatenate([getattr(b, name) for b in blocks]) for name in columns})
+    joined: dict[str, Any] = {name: np.concatenate([getattr(b, name) for b in blocks]) for name in columns}
+    return replace(blocks[-1], **joined)
 
 
 def kinds(processor: Processor) -> list[str]:
@@ -115,7 +116,7 @@ def test_a_frame_needs_the_height_of_the_sensor() -> None:
     FrameTransform(WrenchFrame("base", "sensor"), without)
     for about in ("flange", "tcp", (0.0, 0.0, 0.1)):
         with pytest.raises(ConfigError, match=r"\[sensor\] height_mm"):
-            FrameTransform(WrenchFrame("sensor", about), without)  # type: ignore[arg-type]
+            FrameTransform(WrenchFrame("sensor", about), without)
     processor = Processor(without)
     with pytest.raises(ConfigError, match="height_mm"):
         processor.frame = WrenchFrame("base", "tcp")
@@ -275,7 +276,7 @@ def test_two_touches_with_a_short_pause_are_one_contact() -> None:
     for start in (1500, 1700, 3000):
         push[start : start + 180, 2] = 8.0
     processor, _ = processed(paired(still(4.0), push=push))
-    assert [round(event.values["duration_s"], 1) for event in processor.take_events()] == [0.4, 0.2]  # type: ignore[call-overload]
+    assert [round(event.values["duration_s"], 1) for event in processor.take_events()] == [0.4, 0.2]
 
 
 def test_a_contact_from_the_beginning_is_seen_when_the_noise_is_known() -> None:
