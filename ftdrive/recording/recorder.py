@@ -11,7 +11,7 @@ from calib.files import JSON
 from ftdrive.live.samples import Block, StreamEvent, StreamInfo
 from ftdrive.recording.files import RecordingFile, format_of
 from ftdrive.recording.growing_file import partial_of
-from ftdrive.recording.recording import ROW, Header, Rows, frame_values, rows_of
+from ftdrive.recording.recording import ROW, Header, frame_values, rows_of
 
 _FLUSH_NS = 1_000_000_000
 
@@ -46,7 +46,7 @@ class Recorder:
         self._paths, self._info, self._configuration = paths, info, configuration
         self._files: list[RecordingFile] = []
         self._header: Header | None = None
-        self._rows: list[Rows] = []
+        self._blocks: list[Block] = []
         self._events: list[StreamEvent] = []
         self._failed = False
 
@@ -59,12 +59,11 @@ class Recorder:
         """Record samples. Raises `OSError`; then close: what was written before remains."""
         if not len(block):
             return
-        rows = rows_of(block)
-        self._follow(block, rows)
-        self._rows.append(rows)
-        self.samples += len(rows)
-        self.last_ns = int(rows["t_host_ns"][-1])
-        if self.last_ns - self._rows[0]["t_host_ns"][0] >= _FLUSH_NS:
+        self._follow(block)
+        self._blocks.append(block)
+        self.samples += len(block)
+        self.last_ns = int(block.t_host_ns[-1])
+        if self.last_ns - self._blocks[0].t_host_ns[0] >= _FLUSH_NS:
             self._flush()
 
     def event(self, event: StreamEvent) -> None:
@@ -90,13 +89,17 @@ class Recorder:
             file.discard()
         self._files = []
 
-    def _follow(self, block: Block, rows: Rows) -> None:
+    def _follow(self, block: Block) -> None:
         """Begin with the first block; record a change of frame or stages."""
-        t_ns = int(rows["t_host_ns"][0])
+        t_ns = int(block.t_host_ns[0])
         if self._header is None:
-            self._header = Header(self._info, block.frame, block.stages, self._configuration)
-            self._files = [format_of(path).new(path, self._header) for path in self._paths]
-            self.first_ns = t_ns
+            header = Header(self._info, block.frame, block.stages, self._configuration)
+            with ExitStack() as stack:
+                stack.callback(self.discard)
+                for path in self._paths:
+                    self._files.append(format_of(path).new(path, header))
+                stack.pop_all()
+            self._header, self.first_ns = header, t_ns
         changes = []
         if block.frame != self._header.frame:
             text = f"The compensated wrench is in {block.frame}"
@@ -109,10 +112,11 @@ class Recorder:
             self._header = replace(self._header, frame=block.frame, stages=block.stages)
 
     def _flush(self) -> None:
-        rows, self._rows = np.concatenate([np.zeros(0, ROW), *self._rows]), []
+        blocks, self._blocks = self._blocks, []
         events, self._events = self._events, []
-        if not len(rows) and not events:
+        if not blocks and not events:
             return
+        rows = rows_of(Block.concatenate(blocks)) if blocks else np.zeros(0, ROW)
         self._failed = True
         for file in self._files:
             file.append(rows, events)
