@@ -19,9 +19,17 @@ from ftdrive.live.samples import Ns, Paired
 
 _BUCKET_S, _BUCKETS = 0.25, 40
 _LEAST_SPAN_S = 2.0
-"""Before, the rate of the device counts as the nominal one."""
+"""After this an unknown rate is learnt."""
+_LEAST_SCATTER_NS = 1e4
+CLOCK_TOLERANCE, RATE_TOLERANCE = 2e-4, 3e-3
+"""Of a device's clock, and of the nominal rate of a sensor without one."""
+_IMPLAUSIBLE = 4.0
 _SLEW = 0.05
 """Times never jump and never run backwards: they approach a better estimate at this fraction of the time passing."""
+_FAR_NS, _FASTEST_SLEW = 2e8, 0.9
+"""They approach one that is farther away faster."""
+_SCALED_S, _SCALED = 0.2, 0.05
+"""A clock is no clock of seconds if it differs by so much over this time."""
 _PASSES = 4
 """A recording is paired so often until its delay has converged."""
 _LOST_S = 1.0
@@ -39,12 +47,16 @@ class Timeline:
     period_s : float
         Nominal duration of one count: 1 for a clock in seconds, 1 / rate for a sample number. NaN is unknown; then the
         first two seconds keep their times of receipt.
+    tolerance : float
+        Relative error of that duration, one standard deviation. It counts as long as the times of receipt scatter too
+        much to show the rate, as on a computer that is too busy.
     """
 
-    def __init__(self, period_s: float = 1.0) -> None:
+    def __init__(self, period_s: float = 1.0, tolerance: float = CLOCK_TOLERANCE) -> None:
         self.shift_s = 0.0
         """Subtracted from every time; a change is followed slowly."""
         self._nominal_ns = period_s * 1e9
+        self._tolerance = tolerance
         self._restart()
 
     def _restart(self) -> None:
@@ -75,7 +87,8 @@ class Timeline:
         else:
             x_0, y_0 = self._last
             due = self._slope * (x[-1] - x_0)
-            end = min(max(end, y_0 + (1 - _SLEW) * due), y_0 + (1 + _SLEW) * due)
+            slew = min(max(_SLEW, abs(end - y_0 - due) / _FAR_NS), _FASTEST_SLEW)
+            end = min(max(end, y_0 + (1 - slew) * due), y_0 + (1 + slew) * due)
             times = y_0 + (x - x_0) * ((end - y_0) / (x[-1] - x_0))
         self._last = float(x[-1]), float(end)
         return np.asarray(self._origin[1] + np.rint(times).astype(np.int64))
@@ -83,7 +96,7 @@ class Timeline:
     def _learn_rate(self, x: Array, y: Array) -> None:
         x_end, y_end = float(x[-1]), float(y[-1])
         if y_end > _LEAST_SPAN_S * 1e9:
-            self._slope = y_end / x_end
+            self._slope = self._nominal_ns = y_end / x_end
             self._offset = float((y - self._slope * x).min())
             self._last = x_end, y_end
 
@@ -101,13 +114,17 @@ class Timeline:
             while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
                 hull.pop()
             hull.append(point)
-        if (hull[-1][0] - hull[0][0]) * self._slope < _LEAST_SPAN_S * 1e9:
-            self._offset = min(b - self._slope * a for a, b in self._points)
-            return
-        middle = sum(a for a, _ in self._points) / len(self._points)
-        (x_0, y_0), (x_1, y_1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
-        self._slope = (y_1 - y_0) / (x_1 - x_0)
-        self._offset = y_0 - self._slope * x_0
+        if len(hull) > 1:
+            middle = sum(a for a, _ in self._points) / len(self._points)
+            (x_0, y_0), (x_1, y_1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
+            slope = (y_1 - y_0) / (x_1 - x_0)
+            above_ns = sum(b - y_0 - slope * (a - x_0) for a, b in self._points) / len(self._points)
+            error = (above_ns + _LEAST_SCATTER_NS) / ((hull[-1][0] - hull[0][0]) * self._nominal_ns)
+            weight = 1 / (1 + (error / self._tolerance) ** 2)
+            if abs(slope / self._nominal_ns - 1) > _IMPLAUSIBLE * self._tolerance:
+                weight = 0.0  # no drift of a clock, but a growing delay
+            self._slope = weight * slope + (1 - weight) * self._nominal_ns
+        self._offset = min(b - self._slope * a for a, b in self._points)
 
 
 def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
@@ -213,7 +230,7 @@ class Pairing:
         self._estimator = delay if isinstance(delay, DelayEstimator) else None
         self._rate_Hz = sensor_rate_Hz
         self._sensor: Timeline | None = None
-        self._arm = Timeline()
+        self._arm: Timeline | None = None
         self._poses = PoseTrack(keep_s=2.0)
         self._waiting: list[tuple[FtSamples, Ns]] = []
         self._delay_s = 0.0 if isinstance(delay, DelayEstimator) else delay
@@ -237,8 +254,11 @@ class Pairing:
         """Add what the arm has sent."""
         if not len(states.t_host_ns):
             return
-        has_clock = bool(np.isfinite(states.t_device_s).all())
-        t_ns = self._arm.stamp(states.t_device_s, states.t_host_ns) if has_clock else states.t_host_ns
+        t_ns = states.t_host_ns
+        if np.isfinite(states.t_device_s).all():
+            if self._arm is None:
+                self._arm = _clock_of(states)
+            t_ns = self._arm.stamp(states.t_device_s, t_ns)
         self._poses.add(t_ns, states.q_rad, states.R_base_flange, states.p_base_flange_m)
 
     def add_samples(self, samples: FtSamples) -> None:
@@ -247,7 +267,7 @@ class Pairing:
             return
         has_clock = bool(np.isfinite(samples.t_device_s).all())
         if self._sensor is None:
-            self._sensor = Timeline(1.0 if has_clock else 1 / self._rate_Hz)
+            self._sensor = Timeline() if has_clock else Timeline(1 / self._rate_Hz, RATE_TOLERANCE)
         self._sensor.shift_s = self.delay_s
         count = samples.t_device_s if has_clock else samples.seq.astype(np.float64)
         self._waiting.append((samples, self._sensor.stamp(count, samples.t_host_ns)))
@@ -274,6 +294,15 @@ class Pairing:
         """Drop what waits, after an interruption of either link."""
         self._waiting = []
         self._poses = PoseTrack(keep_s=2.0)
+
+
+def _clock_of(states: ArmStates) -> Timeline:
+    """Return the timeline of a controller from its first states; an emulated one may run many times faster."""
+    host_s = float(states.t_host_ns[-1] - states.t_host_ns[0]) * 1e-9
+    device_s = float(states.t_device_s[-1] - states.t_device_s[0])
+    if host_s < _SCALED_S or abs(host_s / device_s - 1) < _SCALED:
+        return Timeline()
+    return Timeline(host_s / device_s, _SCALED)
 
 
 def paired_with(poses: PoseTrack, t_ns: Ns, samples: FtSamples) -> Paired:

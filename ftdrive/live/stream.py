@@ -112,7 +112,7 @@ class CompensatedStream(ProcessedStream):
             nominal_Hz = self._sensor.health().nominal_rate_Hz
             sensor_rate_Hz = nominal_Hz if np.isfinite(nominal_Hz) else _rate(samples.t_host_ns)
             arm_rate_Hz = _rate(states.t_host_ns)
-            self._arm_period_s = 1 / arm_rate_Hz
+            self._arm_step_s = float(np.median(np.diff(states.t_device_s)))
             self.info = self._described(arm, sensor, sensor_rate_Hz, arm_rate_Hz, self._arm.status())
             frame, stages, false_alarm_rate = self._begin
             self._processor = Processor(self.info, frame, stages, false_alarm_rate=false_alarm_rate)
@@ -169,7 +169,8 @@ class CompensatedStream(ProcessedStream):
                 self._next_ns = self.clock.now_ns() + round(_BLOCK_S * 1e9)
                 self._report_recovery()
                 return block
-        self._fail("sensor", DeviceTimeout(f"no sample for {timeout_s:g} s", "check cable and supply"))
+        role = "arm" if self._pairing.waits_for_pose else "sensor"
+        self._fail(role, DeviceTimeout(f"the {role} sent nothing new for {timeout_s:g} s", "check cable and supply"))
 
     def _next_block(self, wait_s: float) -> Block | None:
         waits_for_pose = self._pairing.waits_for_pose
@@ -275,7 +276,7 @@ class CompensatedStream(ProcessedStream):
         while self._arrivals[0][0] < t_ns - _RATE_WINDOW_NS:
             self._arrivals.popleft()
         if self._arm_newest is not None and np.isfinite(states.t_device_s).all():
-            steps = np.diff(states.t_device_s, prepend=self._arm_newest[1]) / self._arm_period_s
+            steps = np.diff(states.t_device_s, prepend=self._arm_newest[1]) / self._arm_step_s
             self._arm_lost += int(np.maximum(np.rint(steps) - 1, 0).sum())
         self._arm_newest = t_ns, float(states.t_device_s[-1])
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib import BadDataset, NotObservable, Parameters
-from calib.extras.inertia import LoadInertia, Motion, estimate_inertia, regressor
+from calib.extras.inertia import LoadInertia, Motion, estimate_inertia, inertial_wrench, motion_of_poses, regressor
 from calib.model import Array, predict
 
 G = 9.80665
@@ -225,3 +225,39 @@ def test_data_that_do_not_fit_are_rejected() -> None:
         estimate_inertia(PARAMETERS, MOVING, wrench, g_m_s2=G, most_delay_s=6)
     with pytest.raises(NotObservable, match="no delay within 5 ms"):
         estimate_inertia(PARAMETERS, MOVING, noisy(0, 0.05), g_m_s2=G, most_delay_s=0.005)
+
+
+def test_the_inertial_wrench_is_what_the_reading_has_beside_weight_and_bias() -> None:
+    at = motion(TIMES[:300])
+    inertial = reading(at) - predict(PARAMETERS, at.R_base_flange)
+    np.testing.assert_allclose(inertial_wrench(MASS_KG, COM_M, at, INERTIA), inertial, atol=1e-9)
+
+
+def test_poses_give_the_motion_of_the_sensor() -> None:
+    p_flange_sensor_m = np.array([0.01, -0.02, 0.05])
+
+    def poses(t_s: Array) -> tuple[Array, Array]:
+        angles = np.stack([multisine(t_s, k, 0.25) for k in range(3)], axis=1)
+        R = Rotation.from_euler("XYZ", angles).as_matrix()
+        return R, np.stack([multisine(t_s, 10 + k, 0.05) for k in range(3)], axis=1)
+
+    t_s = np.arange(1000) * 0.002 + np.random.default_rng(1).uniform(0, 5e-4, 1000)  # at uneven spacing
+    R_flange_sensor = PARAMETERS.R_flange_sensor
+    found = motion_of_poses(
+        t_s, *poses(t_s), R_flange_sensor=R_flange_sensor, p_flange_sensor_m=p_flange_sensor_m, reach=5
+    )
+    h = 1e-4
+    before, now, after = (poses(found.t_s + k * h) for k in (-1, 0, 1))
+    sensor = [p + R @ p_flange_sensor_m for R, p in (before, now, after)]
+    base_to_sensor = now[0] @ R_flange_sensor
+    acceleration = ((sensor[0] - 2 * sensor[1] + sensor[2]) / h**2)[:, None] @ base_to_sensor
+    steps = [Rotation.from_matrix(np.swapaxes(now[0], 1, 2) @ R).as_rotvec() for R, _ in (before, after)]
+    expected = (
+        (found.R_base_flange, now[0], 1e-12),
+        (found.linear_acceleration_m_s2, acceleration[:, 0], 0.02),
+        (found.angular_velocity_rad_s, (steps[1] - steps[0]) / (2 * h) @ R_flange_sensor, 0.002),
+        (found.angular_acceleration_rad_s2, (steps[1] + steps[0]) / h**2 @ R_flange_sensor, 0.05),
+    )
+    assert len(found.t_s) == 990
+    for value, wanted, tolerance in expected:
+        np.testing.assert_allclose(value, wanted, atol=tolerance)
