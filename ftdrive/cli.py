@@ -23,6 +23,9 @@ _COMMANDS = {
     "devices": ("ftdrive.commands.devices", "List serial ports and CAN interfaces."),
     "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
     "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
+    "record": ("ftdrive.commands.record", "Record raw and compensated wrench with pose and events."),
+    "convert": ("ftdrive.commands.convert", "Convert a recording between MCAP, CSV and Parquet."),
+    "compensate": ("ftdrive.commands.compensate", "Compensate a recording. Needs no device."),
     "replay": ("ftdrive.commands.replay", "Repeat a recorded run through the same routine and solver."),
     "export": ("ftdrive.commands.export", "Write a plan as a program for the pendant or as a table."),
     "transcript": ("ftdrive.commands.transcript", "Record or play the bytes on a sensor's wire."),
@@ -30,7 +33,8 @@ _COMMANDS = {
 
 _EPILOG = """\
 Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,
-5 device fault, 6 file cannot be read or written, 7 check or acceptance failed, 130 interrupted (data kept)."""
+5 device fault, 6 file cannot be read or written, 7 check or acceptance failed, 8 recording has gaps,
+130 interrupted (data kept)."""
 
 
 class _LazyGroup(click.Group):
@@ -80,15 +84,16 @@ def exit_code(error: BaseException) -> int | None:
     from calib.errors import BadCalibration, BadDataset, CalibError, TooFewSamples
     from drivers.errors import ConnectError, DeviceFault, DriverError
     from drivers.transcript.recorder import BadTranscript
-    from ftdrive.errors import BadPlan, ConfigError, NotAccepted
+    from ftdrive.errors import BadPlan, BadRecording, ConfigError, NotAccepted, RecordingHasGaps
 
     codes: list[tuple[int, tuple[type[BaseException], ...]]] = [
         (2, (ConfigError,)),
         (3, (ConnectError,)),
         (5, (DeviceFault,)),
         (4, (DriverError, TooFewSamples)),
-        (6, (BadDataset, BadCalibration, BadTranscript, BadPlan)),
+        (6, (BadDataset, BadCalibration, BadTranscript, BadPlan, BadRecording)),
         (7, (CalibError, NotAccepted)),
+        (8, (RecordingHasGaps,)),
         (6, (OSError,)),
     ]
     return next((code for code, kinds in codes if isinstance(error, kinds)), None)

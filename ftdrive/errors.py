@@ -13,6 +13,14 @@ class BadPlan(Exception):
     """A file does not contain a valid plan."""
 
 
+class BadRecording(Exception):
+    """A file does not contain a recording that this version can read."""
+
+
+class RecordingHasGaps(Exception):
+    """Samples are missing in a recording that is otherwise complete."""
+
+
 class PlanRefused(NotAccepted):
     """No motion is proven clear, or a plan was made for another cell."""
 

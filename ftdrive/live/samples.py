@@ -174,7 +174,18 @@ class Sample:
 
 
 EventKind = Literal[
-    "contact", "tare", "tare-refused", "tare-undone", "stages", "frame", "drift", "gap", "stale", "recovered", "mark"
+    "contact",
+    "tare",
+    "tare-refused",
+    "tare-undone",
+    "stages",
+    "frame",
+    "drift",
+    "gap",
+    "delay",
+    "stale",
+    "recovered",
+    "mark",
 ]
 
 

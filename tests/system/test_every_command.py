@@ -36,9 +36,13 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
     "calibrate": ("--minimal", "--yes"),
     "live": ("--once",),
     "export plan": ("--format", "csv"),
+    "record": ("--output", "a.csv", "--count", "500"),
     "transcript record": ("--output", "sensor.jsonl", "--duration", "0.5"),
 }
 """What a command cannot do without; any other must work with --simulate and --json alone."""
+
+OFFLINE = ("convert", "compensate")
+"""They read files and know no cell."""
 
 REHEARSED = ("replay", "solve")
 """They calibrate an emulated cell first, as do live, and demo, which is run and looked at in test_demo.py."""
@@ -54,6 +58,7 @@ SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     "init": lambda answer: answer["config"]["tool"]["cylinders_mm"] == [[0, 60, 90]] and "UR5e" in answer["robot"],
     "live": lambda answer: sum(f**2 for f in answer["compensated"]["force_N"]) ** 0.5 < 0.2,
     "plan": lambda answer: answer["description"]["model"] == "UR5e" and answer["poses"] == 24,
+    "record": lambda answer: answer["samples"] == 500,
     "replay": lambda answer: answer["n_poses"] >= 6,
     "solve": lambda answer: answer["n_poses"] >= 6,
     "transcript play": lambda answer: answer["played"]["samples"] > 1000,
@@ -119,7 +124,7 @@ def test_a_full_disk_and_a_reader_that_is_gone_are_no_crash() -> None:
     [
         pytest.param(name, marks=pytest.mark.slow) if name == "calibrate" else name
         for name in names(cli)
-        if name not in ("demo", "live", *REHEARSED)
+        if name not in ("demo", "live", "record", *REHEARSED, *OFFLINE)
     ],
 )
 def test_every_command_works_with_simulate_and_json(
@@ -142,7 +147,7 @@ def test_a_command_that_needs_a_run_works_with_simulate_and_json(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["live", "solve"])
+@pytest.mark.parametrize("command", ["live", "record", "solve"])
 def test_a_command_that_needs_a_calibration_makes_one(
     command: str, ftdrive: CommandLine, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -188,6 +193,7 @@ def test_the_sensor_that_is_named_is_emulated(
         (("solve", "--simulate", "."), "DATASET does not go with --simulate"),
         (("solve", "--sensor", "emulated://bota", "."), "--sensor goes only with --simulate"),
         *(((command,), "--simulate") for command in ("solve", "replay", "live")),
+        (("record", "-o", "a.csv"), "--simulate"),
         (("transcript", "play"), "--simulate"),
         (("export", "plan", "--format", "csv"), "--simulate"),
     ],

@@ -1,0 +1,132 @@
+"""`ftdrive compensate`: a recording compensated at once, without a device."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ftdrive.commands.common import FILE, FRAME, JSON, NewFile, numbers, read_frame, write_json
+
+if TYPE_CHECKING:
+    from ftdrive.live.samples import Axes
+    from ftdrive.recording import Recording
+
+_EXISTING = click.Path(exists=True, path_type=Path)
+
+
+@click.command()
+@click.argument("path", metavar="[RECORDING]", required=False, type=_EXISTING)
+@click.option("--calibration", metavar="PATH", type=_EXISTING, help="A calibration.json or its run folder.")
+@click.option("--wrench", metavar="FILE", type=FILE, help="Instead of RECORDING: CSV with t,fx,fy,fz,tx,ty,tz.")
+@click.option("--orientation-file", metavar="FILE", type=FILE, help="With --wrench: CSV with t and the orientation.")
+@click.option("--delay", metavar="S|auto", help="With --wrench: delay of the wrench, s.  [default: auto]")
+@click.option(
+    "--bias",
+    type=click.Choice(["keep", "estimate"]),
+    default="keep",
+    show_default=True,
+    help="Of the calibration, or estimated from the recording: for sensors that are zeroed at start.",
+)
+@FRAME
+@click.option("-o", "--output", type=NewFile(), help="Save the result as a new .mcap, .csv or .parquet.")
+@JSON
+def compensate(
+    path: Path | None,
+    calibration: Path | None,
+    wrench: Path | None,
+    orientation_file: Path | None,
+    delay: str | None,
+    bias: str,
+    axes: "Axes",
+    about: str,
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    """Compensate a whole recording with a calibration; no device is needed.
+
+    RECORDING is a file of `ftdrive record`; without --calibration its own is used. Recordings of other programs come as
+    two CSV files on one clock, each at its own rate: the wrench in N and N·m, and the orientation of the flange in base
+    as r11..r33, qx,qy,qz,qw or rx,ry,rz in rad.
+    """
+    from ftdrive.recording.compensation import compensated, with_estimated_bias
+    from ftdrive.terminal.console import talk
+
+    frame = read_frame(axes, about)
+    recording, found = _read(path, calibration, wrench, orientation_file, delay, everything=output is not None)
+    change = None
+    if bias == "estimate":
+        recording, change = with_estimated_bias(recording)
+    result = {
+        **compensated(recording, frame, output),
+        "delay_s": found,
+        "bias_change": change,
+        "axes": frame.axes,
+        "about": frame.about,
+        "calibration": recording.header.info.calibration_name,
+        "file": None if output is None else str(output),
+    }
+    if as_json:
+        write_json({"schema_version": 1, **result})
+    else:
+        click.echo("\n".join(_words(result, str(frame))))
+    if output is not None:
+        talk.print(f" Saved {output}")
+
+
+def _read(
+    path: Path | None,
+    calibration: Path | None,
+    wrench: Path | None,
+    orientation: Path | None,
+    delay: str | None,
+    *,
+    everything: bool,
+) -> tuple["Recording", dict[str, float] | None]:
+    """Return the recording with the calibration, and the delay of the wrench with one sigma, where it is known."""
+    from ftdrive.checks.devices import belonging
+    from ftdrive.errors import ConfigError
+    from ftdrive.live.stream import load_calibration
+    from ftdrive.recording import read_recording
+    from ftdrive.recording.compensation import NEEDED
+    from ftdrive.recording.csv_pair import read_pair
+    from ftdrive.recording.recording import ROW
+    from ftdrive.terminal.console import talk
+
+    loaded = None if calibration is None else load_calibration(calibration)
+    if path is None:
+        if wrench is None or orientation is None or loaded is None:
+            raise ConfigError("no recording: give its file, or --wrench, --orientation-file and --calibration")
+        delay_s = None if delay in (None, "auto") else numbers("--delay", str(delay), ",", [1])[0]
+        return read_pair(wrench, orientation, loaded, str(calibration), delay_s)
+    if wrench or orientation or delay:
+        raise ConfigError("--wrench, --orientation-file and --delay do not go with RECORDING: leave it or them out")
+    recording = read_recording(path, ROW.names or () if everything else NEEDED)
+    if recording.cut:
+        talk.print(f" {path} is incomplete: {recording.duration_s:.1f} s of it are used.")
+    info = recording.header.info
+    if loaded is not None:
+        if others := belonging(loaded, {"arm": info.arm, "sensor": info.sensor}).others:
+            raise ConfigError(f"{path} is of other devices than the calibration: {others[0]}")
+        recording = recording.with_calibration(loaded, str(calibration))
+    delays = [event.values for event in recording.events if event.kind == "delay"]
+    return recording, {name: delays[-1][name] for name in ("value", "sigma")} if delays else None
+
+
+def _words(result: dict[str, Any], frame: str) -> Iterator[str]:
+    yield f" {result['samples']} samples, {result['duration_s']:.2f} s, gaps: {result['gaps']}"
+    if delay := result["delay_s"]:
+        yield f" wrench after pose: {1e3 * delay['value']:.2f} ± {1e3 * delay['sigma']:.2f} ms (1 sigma)"
+    if change := result["bias_change"]:
+        pairs = [f"{v:.5f} ± {s:.5f}" for v, s in zip(change["value"], change["sigma"], strict=True)]
+        yield f" bias change ± 1 sigma:\n   {', '.join(pairs[:3])} N\n   {', '.join(pairs[3:])} N·m"
+    yield f" {'':12}{'force rms':>10}{'max N':>10}{'torque rms':>12}{'max N·m':>10}"
+    for name in ("raw", "compensated"):
+        f_rms, f_max, t_rms, t_max = result[name].values()
+        yield f" {name:12}{f_rms:10.3f}{f_max:10.3f}{t_rms:12.5f}{t_max:10.5f}"
+    yield " raw: sensor axes, about the sensor origin"
+    yield f" compensated: {frame}"
+    for contact in result["contacts"]:
+        x, y, z = contact["direction"]
+        begin = f"contact at {contact['t_s']:8.2f} s for {contact['duration_s']:6.2f} s"
+        yield f" {begin}, peak {contact['peak_N']:7.2f} N along ({x:.2f}, {y:.2f}, {z:.2f})"

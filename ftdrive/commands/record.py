@@ -1,0 +1,168 @@
+"""`ftdrive record`: the raw and the compensated wrench, with pose and events, to files."""
+
+import re
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ftdrive.commands.common import (
+    CELL,
+    FRAME,
+    JSON,
+    NewFile,
+    check_simulate,
+    read_cell,
+    read_frame,
+    simulate,
+    write_json,
+)
+from ftdrive.errors import ConfigError, RecordingHasGaps
+
+if TYPE_CHECKING:
+    from ftdrive.live.samples import Axes, WrenchFrame
+    from ftdrive.live.stream import CompensatedStream
+    from ftdrive.recording import Recorder
+
+
+class Duration(click.ParamType[float]):
+    """A time such as 90, 60s, 10min or 1h, in s."""
+
+    name = "duration"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return seconds."""
+        if isinstance(value, float):
+            return value
+        found = re.fullmatch(r"(\d+\.?\d*)(s|min|h)?", value)
+        if found is None or not float(found[1]):
+            self.fail(f"'{value}' is not a duration such as 60s, 10min or 1h.", param, ctx)
+        return float(found[1]) * {"min": 60.0, "h": 3600.0}.get(found[2], 1.0)
+
+
+@click.command()
+@click.option(
+    "-o",
+    "--output",
+    "paths",
+    metavar="FILE",
+    multiple=True,
+    required=True,
+    type=NewFile(),
+    help="A new .mcap, .csv or .parquet. Repeatable.",
+)
+@click.option("--duration", "duration_s", type=Duration(), help="Such as 60s, 10min or 1h; otherwise Ctrl-C ends.")
+@click.option("--count", type=click.IntRange(1), help="Number of samples.")
+@click.option(
+    "--calibration",
+    "calibration_path",
+    metavar="PATH",
+    type=click.Path(exists=True, path_type=Path),
+    help="A calibration.json or its run folder. With --simulate the default is a new one.",
+)
+@CELL
+@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
+@FRAME
+@JSON
+def record(
+    paths: Sequence[Path],
+    duration_s: float | None,
+    count: int | None,
+    calibration_path: Path | None,
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    simulate: bool,
+    axes: "Axes",
+    about: str,
+    as_json: bool,
+) -> None:
+    """Record every sample: raw and compensated wrench, pose, joint angles, status, events and the calibration.
+
+    Foxglove, Lichtblick, PlotJuggler and ROS 2 open .mcap. The arm is only read, never moved. However the recording
+    ends, the files hold what was received until then. Exit code 8 if samples are missing.
+    """
+    from ftdrive.live.stream import CompensatedStream, load_calibration
+    from ftdrive.recording import Recorder
+    from ftdrive.recording.files import format_of
+    from ftdrive.terminal.console import talk
+
+    check_simulate(simulate, real={"--config": config, "--robot": robot})
+    for path in paths:
+        format_of(path)
+    if len(set(paths)) < len(paths):
+        raise ConfigError("two -o name the same file: leave one out")
+    frame = read_frame(axes, about)
+    calibration = None if calibration_path is None else load_calibration(calibration_path)
+    with ExitStack() as stack:
+        if simulate:
+            from ftdrive.commands.live import _emulated as emulated
+
+            calibration, cell = emulated(calibration, sensor, stack)
+        elif calibration is None:
+            raise ConfigError("no calibration: give --calibration PATH, or --simulate")
+        else:
+            cell = read_cell(config, robot, sensor)
+        name = "temporary calibration" if calibration_path is None else str(calibration_path)
+        stream = stack.enter_context(CompensatedStream(cell, calibration, name=name, frame=frame))
+        for words in stream.warnings:
+            talk.print(f" {words}")
+        recorder = Recorder(paths, stream.info, cell.to_dict())
+        talk.print(f" Recording at {stream.info.sensor_rate_Hz:.0f} Hz, {frame}. Ctrl-C ends.")
+        try:
+            record_stream(stream, recorder, duration_s, count)
+        finally:
+            if recorder.samples:
+                _report(recorder, paths, frame, name, as_json=as_json)
+    if recorder.gaps:
+        raise RecordingHasGaps(
+            f"gaps: {recorder.gaps}, samples lost: {recorder.lost}; check cable, supply and load of the computer, then "
+            "record again; the events in the file have the times"
+        )
+
+
+def record_stream(
+    stream: "CompensatedStream", recorder: "Recorder", duration_s: float | None = None, count: int | None = None
+) -> None:
+    """Record until the end or an exception, and complete the files. Raises what the stream or a file raises."""
+    import numpy as np
+
+    from ftdrive.live.samples import StreamEvent
+
+    try:
+        while True:
+            block = stream.read()
+            for event in stream.take_events():
+                recorder.event(event)
+            left = len(block) if count is None else count - recorder.samples
+            if duration_s is not None and len(block):
+                end_ns = (recorder.first_ns or int(block.t_host_ns[0])) + round(duration_s * 1e9)
+                left = min(left, int(np.searchsorted(block.t_host_ns, end_ns)))
+            recorder.write(block.rows(slice(left)))
+            if left < len(block) or recorder.samples == count:
+                return
+    finally:
+        for event in stream.take_events():
+            recorder.event(event)
+        status = stream.status()
+        text = (
+            f"the wrench is {1e3 * status.delay_s:.2f} ± {1e3 * status.delay_sigma_s:.2f} ms (1 sigma) after the pose"
+        )
+        values = {"value": status.delay_s, "sigma": status.delay_sigma_s}
+        recorder.event(StreamEvent(recorder.last_ns, "delay", text, values))
+        recorder.close()
+
+
+def _report(recorder: "Recorder", paths: Sequence[Path], frame: "WrenchFrame", name: str, *, as_json: bool) -> None:
+    from ftdrive.terminal.console import talk
+
+    saved = [path for path in paths if path.exists()]
+    words = f"{recorder.samples} samples, {recorder.duration_s:.2f} s, gaps: {recorder.gaps}"
+    for path in saved:
+        talk.print(f" Saved {path}: {words}")
+    if as_json:
+        counts = {name: getattr(recorder, name) for name in ("samples", "duration_s", "gaps", "lost")}
+        about = {"axes": frame.axes, "about": frame.about, "calibration": name}
+        write_json({"schema_version": 1, "files": [str(path) for path in saved], **counts, **about})

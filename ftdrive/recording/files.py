@@ -1,0 +1,97 @@
+"""The file formats by their endings."""
+
+from collections.abc import Callable, Collection, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from ftdrive.errors import BadRecording, ConfigError
+from ftdrive.live.samples import StreamEvent
+from ftdrive.recording.csv_file import CsvFile, read_csv
+from ftdrive.recording.mcap_file import McapFile, read_mcap
+from ftdrive.recording.parquet_file import ParquetFile, read_parquet
+from ftdrive.recording.recording import ROW, Header, Recording, Rows
+
+_PIECE_ROWS = 7000
+
+
+class RecordingFile(Protocol):
+    """A new file of one format."""
+
+    def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
+        """Write samples of one frame, and the events since the samples before."""
+
+    def complete(self) -> None:
+        """Write the end, fsync the file and give it its name."""
+
+    def discard(self) -> None:
+        """Delete what was written."""
+
+
+class Format(NamedTuple):
+    """A file format."""
+
+    new: Callable[[Path, Header], RecordingFile]
+    read: Callable[[Path, Collection[str]], Recording]
+    package: str
+    """Needed for it."""
+
+
+_FORMATS = {
+    ".mcap": Format(McapFile, read_mcap, "mcap"),
+    ".csv": Format(CsvFile, read_csv, "csv"),
+    ".parquet": Format(ParquetFile, read_parquet, "duckdb"),
+}
+
+
+def format_of(path: Path) -> Format:
+    """Return the format of a recording, complete or not; raises `ConfigError` if it is unknown or lacks its package."""
+    ending = Path(path.name.removesuffix(".partial")).suffix
+    if ending not in _FORMATS:
+        raise ConfigError(f"{path} has no ending of a recording: name it .mcap, .csv or .parquet")
+    try:
+        import_module(_FORMATS[ending].package)
+    except ImportError:
+        raise ConfigError(f"{ending} needs {_FORMATS[ending].package}: pip install 'ftdrive[record]'") from None
+    return _FORMATS[ending]
+
+
+def read_recording(path: Path, columns: Collection[str] = ROW.names or ()) -> Recording:
+    """Read a recording, also the `.partial` of one that was interrupted.
+
+    Parameters
+    ----------
+    path : Path
+        Its ending names the format: .mcap, .csv or .parquet.
+    columns : collection of str
+        Fields of `Recording.rows` that are needed. Others may be 0, which makes reading Parquet faster.
+
+    Raises
+    ------
+    ConfigError
+        Another ending, or the package for the format is missing.
+    BadRecording
+        Damaged, without a sample, or of another program. A file that was cut is read up to there; `cut` says so.
+    OSError
+        The file does not exist or cannot be read.
+    """
+    file_format = format_of(path)
+    try:
+        recording = file_format.read(path, columns)
+    except BadRecording as error:
+        raise BadRecording(f"{path}: {error}") from error
+    if not len(recording.rows):
+        raise BadRecording(f"{path}: it contains no sample: the file was cut, or the stream ended at once")
+    return recording
+
+
+def write_recording(path: Path, recording: Recording) -> None:
+    """Write a new file with all of a recording, or none. Raises `ConfigError` or `OSError`."""
+    file = format_of(path).new(path, recording.header)
+    try:
+        for rows, events, _ in recording.pieces(_PIECE_ROWS):
+            file.append(rows, events)
+        file.complete()
+    except BaseException:
+        file.discard()
+        raise

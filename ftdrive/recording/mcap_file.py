@@ -1,0 +1,325 @@
+"""Recordings as MCAP, for Foxglove, Lichtblick, PlotJuggler and ROS 2 bags. Needs the extra `record`.
+
+Channels of CDR messages: those of `ftdrive.live.ros2`, `/ft_sample` with the other columns, and `/events`. All times
+are UTC. The attachments `calibration.json` and `recording.json` hold the header.
+
+The samples of about a second are packed as one array and become one chunk. The writer of the package `mcap` takes
+messages one by one, which costs half a core at 7 kHz. The format: https://mcap.dev/spec
+"""
+
+import io
+import json
+import struct
+import zlib
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ftdrive import __version__
+from ftdrive.errors import BadRecording
+from ftdrive.live import ros2
+from ftdrive.live.samples import StreamEvent
+from ftdrive.recording.growing_file import GrowingFile
+from ftdrive.recording.recording import ROW, Header, Recording, Rows, changed
+
+if TYPE_CHECKING:
+    from mcap.records import McapRecord
+
+SAMPLE, EVENTS = "/ft_sample", "/events"
+_SCHEMAS: Final[Mapping[str, ros2.Schema]] = {
+    **ros2.SCHEMAS,
+    SAMPLE: ros2.Schema(
+        "ftdrive_msgs/msg/Sample", "float64 t_device_s\nfloat64 chi2\nint64 seq\nuint32 status\nbool in_contact"
+    ),
+    EVENTS: ros2.Schema(
+        "rcl_interfaces/msg/Log",
+        "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line"
+        f"\n{'=' * 80}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec",
+    ),
+}
+_CHANNELS: Final = {topic: number for number, topic in enumerate(_SCHEMAS, 1)}
+_SAMPLE: Final = [("t_device_s", "<f8"), ("chi2", "<f8"), ("seq", "<i8"), ("status", "<u4"), ("in_contact", "?")]
+_COLUMNS: Final[Mapping[int, tuple[Any, int]]] = {
+    _CHANNELS[ros2.RAW]: (np.dtype([("raw", "<f8", 6)]), 0),
+    _CHANNELS[ros2.COMPENSATED]: (np.dtype([("wrench", "<f8", 6)]), 0),
+    _CHANNELS[ros2.POSE]: (np.dtype([("p_base_flange_m", "<f8", 3), ("quaternion_base_flange", "<f8", 4)]), 0),
+    _CHANNELS[ros2.JOINTS]: (np.dtype([("q_rad", "<f8", 6)]), 8),
+    _CHANNELS[SAMPLE]: (np.dtype(_SAMPLE), 0),
+}
+"""The columns in the messages of a channel, and the number of bytes behind them."""
+_WARNINGS: Final = ("gap", "stale", "drift", "tare-refused")
+
+_MAGIC: Final = b"\x89MCAP0\r\n"
+_MESSAGE, _CHUNK, _INDEX, _ATTACHMENT, _DATA_END = 5, 6, 7, 9, 15
+_HEAD: Final = np.dtype(
+    [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
+)
+"""What precedes the body of a message."""
+_LARGEST: Final = 1 << 32
+
+
+class McapFile:
+    """A new recording."""
+
+    def __init__(self, path: Path, header: Header) -> None:
+        from mcap.records import Attachment, AttachmentIndex, Channel, Schema
+        from mcap.records import Header as Start
+
+        self._header = header
+        self._file = GrowingFile(path)
+        self._chunks: list[McapRecord] = []
+        self._counts: defaultdict[int, int] = defaultdict(int)
+        self._first_ns, self._last_ns = 1 << 63, 0
+        self._channels: list[McapRecord] = []
+        for topic, number in _CHANNELS.items():
+            schema = _SCHEMAS[topic]
+            self._channels.append(Schema(data=schema.text.encode(), encoding="ros2msg", id=number, name=schema.name))
+            self._channels.append(Channel(number, topic, "cdr", {}, number))
+        self._file.add(_MAGIC + _bytes(Start("ros2", f"ftdrive {__version__}"), *self._channels))
+        self._attachments: list[McapRecord] = []
+        document = header.to_dict()
+        for name, content in (("calibration.json", document.pop("calibration")), ("recording.json", document)):
+            data = json.dumps(content, indent=1).encode()
+            record = _bytes(Attachment(0, 0, name, "application/json", data))
+            place = self._file.add(record)
+            self._attachments.append(AttachmentIndex(place, len(record), 0, 0, len(data), name, "application/json"))
+
+    def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
+        """Write samples and events as one chunk. Raises `OSError`."""
+        from mcap.records import Chunk, ChunkIndex
+        from zstandard import compress
+
+        for event in events:
+            self._header = changed(self._header, event)
+        content, tables = self._messages(rows, events)
+        if not tables:
+            return
+        times = np.concatenate([table[:, 0] for table in tables.values()])
+        first_ns, last_ns = int(times.min()), int(times.max())
+        packed = compress(content, 1)
+        chunk = _bytes(Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(content), len(content)))
+        indexes, places = b"", {}
+        for number, table in tables.items():
+            places[number] = self._file.size + len(chunk) + len(indexes)
+            indexes += struct.pack("<BQHI", _INDEX, 6 + table.nbytes, number, table.nbytes) + table.tobytes()
+        index = ChunkIndex(
+            chunk_length=len(chunk),
+            chunk_start_offset=self._file.add(chunk + indexes),
+            compression="zstd",
+            compressed_size=len(packed),
+            message_end_time=last_ns,
+            message_index_length=len(indexes),
+            message_index_offsets=places,
+            message_start_time=first_ns,
+            uncompressed_size=len(content),
+        )
+        self._chunks.append(index)
+        self._first_ns, self._last_ns = min(first_ns, self._first_ns), max(last_ns, self._last_ns)
+        for number, table in tables.items():
+            self._counts[number] += len(table)
+
+    def _messages(self, rows: Rows, events: Sequence[StreamEvent]) -> tuple[bytes, dict[int, NDArray[np.uint64]]]:
+        """Return the messages of a chunk, and for each channel (n, 2) times and places in it."""
+        offset_ns = self._header.info.utc_offset_ns
+        content, tables = b"", {}
+        if len(rows):
+            t_ns = rows["t_host_ns"] + offset_ns
+            bodies = _bodies(rows, t_ns, ros2.frame_id(self._header.frame))
+            parts = [_records(_CHANNELS[topic], t_ns, rows["seq"], body) for topic, body in bodies.items()]
+            content = np.hstack(parts).tobytes()
+            *starts, width = np.cumsum([0, *(part.shape[1] for part in parts)]).tolist()
+            for topic, start in zip(bodies, starts, strict=True):
+                tables[_CHANNELS[topic]] = _table(t_ns, start + width * np.arange(len(rows)))
+        if events:
+            times = np.array([event.t_host_ns for event in events]) + offset_ns
+            logs = [
+                _records(_CHANNELS[EVENTS], t, 0, _log(event, int(t))) for t, event in zip(times, events, strict=True)
+            ]
+            places = len(content) + np.cumsum([0, *(log.size for log in logs)])
+            tables[_CHANNELS[EVENTS]] = _table(times, places[:-1])
+            content += b"".join(log.tobytes() for log in logs)
+        return content, tables
+
+    def complete(self) -> None:
+        """Write the summary and give the file its name. Raises `OSError`."""
+        from mcap.records import DataEnd, Footer, Statistics
+
+        statistics = Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(_CHANNELS),
+            channel_message_counts=self._counts,
+            chunk_count=len(self._chunks),
+            message_count=sum(self._counts.values()),
+            message_end_time=self._last_ns,
+            message_start_time=self._first_ns,
+            metadata_count=0,
+            schema_count=len(_SCHEMAS),
+        )
+        end = _bytes(DataEnd(0))
+        summary = _bytes(*self._channels, statistics, *self._attachments, *self._chunks)
+        footer = _bytes(Footer(summary_start=self._file.size + len(end), summary_offset_start=0, summary_crc=0))
+        with self._file:
+            self._file.add(end + summary + footer + _MAGIC)
+            self._file.complete()
+
+    def discard(self) -> None:
+        """Delete what was written."""
+        self._file.discard()
+
+
+def _bodies(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, NDArray[np.void]]:
+    """Pack the messages (n,) of each topic."""
+    sample = np.zeros(len(rows), [("encoding", "V4"), *_SAMPLE])
+    sample["encoding"] = np.void(ros2.ENCODING)
+    for name, _ in _SAMPLE:
+        sample[name] = rows[name]
+    pose = np.hstack([rows["p_base_flange_m"], rows["quaternion_base_flange"]])
+    packed = {
+        ros2.RAW: ros2.pack_wrenches(t_ns, rows["raw"], "sensor"),
+        ros2.COMPENSATED: ros2.pack_wrenches(t_ns, rows["wrench"], frame),
+        ros2.POSE: ros2.pack_pose_numbers(t_ns, pose),
+        ros2.JOINTS: ros2.pack_joints(t_ns, rows["q_rad"]),
+    }
+    bodies = {topic: np.frombuffer(b"".join(each), f"V{len(each[0])}") for topic, each in packed.items()}
+    return bodies | {SAMPLE: sample.view(f"V{sample.itemsize}")}
+
+
+def _records(channel: int, t_ns: ArrayLike, sequence: ArrayLike, bodies: NDArray[np.void]) -> NDArray[np.uint8]:
+    """Return message records as bytes (n, size)."""
+    records = np.zeros(len(bodies), [*_HEAD.descr, ("body", bodies.dtype)])
+    records["opcode"], records["length"] = _MESSAGE, _HEAD.itemsize - 9 + bodies.itemsize
+    records["channel"], records["sequence"] = channel, np.bitwise_and(sequence, 0xFFFFFFFF)
+    records["log"] = records["publish"] = t_ns
+    records["body"] = bodies
+    return records.view(np.uint8).reshape(len(bodies), records.itemsize)
+
+
+def _table(t_ns: ArrayLike, places: ArrayLike) -> NDArray[np.uint64]:
+    return np.stack([t_ns, places], axis=1).astype("<u8")
+
+
+def _log(event: StreamEvent, t_ns: int) -> NDArray[np.void]:
+    """Pack an event as Log: its kind is the name, its values stand in `function` as JSON."""
+    packed = ros2.ENCODING + struct.pack("<iIB3x", *divmod(t_ns, 1_000_000_000), 30 if event.kind in _WARNINGS else 20)
+    for text in (event.kind, event.text, "", json.dumps(dict(event.values))):
+        data = text.encode() + b"\0"
+        packed += struct.pack("<I", len(data)) + data + bytes(-len(data) % 4)
+    packed += struct.pack("<I", 0)
+    return np.frombuffer(packed, f"V{len(packed)}")
+
+
+def _event(body: bytes, t_host_ns: int) -> StreamEvent:
+    texts, place = [], 16
+    for _ in range(4):
+        (length,) = struct.unpack_from("<I", body, place)
+        texts.append(body[place + 4 : place + 3 + length].decode())
+        place += 4 + length + -length % 4
+    kind, text, _, values = texts
+    return StreamEvent(t_host_ns, kind, text, json.loads(values))  # type: ignore[arg-type]  # a newer version has more
+
+
+def _bytes(*records: "McapRecord") -> bytes:
+    from mcap.data_stream import RecordBuilder
+
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]
+
+
+def read_mcap(path: Path, _columns: Collection[str] = ()) -> Recording:
+    """Read a recording, also one that was interrupted. Raises `BadRecording` or `OSError`."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Attachment, Chunk
+    from mcap.stream_reader import get_chunk_data_stream
+    from zstandard import ZstdError
+
+    documents: dict[str, Any] = {}
+    content = _Content()
+    messages, cut = b"", "its last record is incomplete"
+    with path.open("rb") as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise BadRecording("the first bytes are not those of MCAP")
+        try:
+            for opcode, data in _data_section(file):
+                if opcode == _ATTACHMENT:
+                    attachment = Attachment.read(ReadDataStream(io.BytesIO(data)))
+                    documents[attachment.name] = json.loads(attachment.data)
+                elif opcode == _CHUNK:
+                    stream, size = get_chunk_data_stream(
+                        Chunk.read(ReadDataStream(io.BytesIO(data))), validate_crc=True
+                    )
+                    messages = stream.read(size)
+                elif opcode == _INDEX:
+                    content.add(messages, data)
+                elif opcode == _DATA_END:
+                    cut = ""
+            if not {"calibration.json", "recording.json"} <= documents.keys():
+                raise BadRecording("the header is missing: the file was cut within it, or another program wrote it")
+            header = Header.from_dict(documents["recording.json"] | {"calibration": documents["calibration.json"]})
+            return Recording(header, *content.on_the_clock_of(header), cut)
+        except (MemoryError, OverflowError, TypeError, ValueError, ZstdError, struct.error) as error:
+            raise BadRecording(f"a record cannot be read ({error!r}): the file is damaged") from error
+
+
+def _data_section(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
+    """Give the records of the data section that are complete."""
+    while len(start := file.read(9)) == 9:
+        opcode, length = struct.unpack("<BQ", start)
+        if length > _LARGEST:
+            raise ValueError(f"a record of {length} bytes")
+        data = file.read(length)
+        if len(data) < length:
+            return
+        yield opcode, data
+        if opcode == _DATA_END:
+            return
+
+
+class _Content:
+    """Columns and events as read so far, with times in UTC."""
+
+    def __init__(self) -> None:
+        self._columns: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
+        self._events: list[StreamEvent] = []
+
+    def add(self, messages: bytes, index: bytes) -> None:
+        """Take the messages of one channel of a chunk; other programs may have divided the file into other chunks."""
+        channel, size = struct.unpack_from("<HI", index)
+        t_ns, places = np.frombuffer(index, "<i8", size // 8, 6).reshape(-1, 2).T
+        ends = places + 9 + _at(messages, places + 1, np.dtype("<u8")).astype(np.int64)
+        if channel == _CHANNELS[EVENTS]:
+            for t, place, end in zip(t_ns.tolist(), places.tolist(), ends.tolist(), strict=True):
+                self._events.append(_event(messages[place + _HEAD.itemsize : end], t))
+        elif channel in _COLUMNS:
+            kind, behind = _COLUMNS[channel]
+            values = _at(messages, ends - behind - kind.itemsize, kind)
+            for name in kind.names:
+                self._columns[name].append(values[name].copy())
+            if channel == _CHANNELS[SAMPLE]:
+                self._columns["t_host_ns"].append(t_ns)
+
+    def on_the_clock_of(self, header: Header) -> tuple[Rows, list[StreamEvent]]:
+        """Return samples and events with the times of the cell."""
+        names = ROW.names or ()
+        rows = np.zeros(min(sum(map(len, self._columns[name])) for name in names), ROW)
+        for name in names if len(rows) else ():
+            rows[name] = np.concatenate(self._columns.pop(name))[: len(rows)]
+        offset_ns = header.info.utc_offset_ns
+        rows["t_host_ns"] -= offset_ns
+        return rows, [replace(event, t_host_ns=event.t_host_ns - offset_ns) for event in self._events]
+
+
+def _at(data: bytes, places: NDArray[np.int64], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Return the values at these places; without a copy if they are equally far apart."""
+    if len(places) and (places.min() < 0 or places.max() + kind.itemsize > len(data)):
+        raise ValueError("an index points out of its chunk")
+    steps = np.unique(np.diff(places))
+    if len(steps) == 1:
+        return np.ndarray(len(places), kind, data, int(places[0]), (int(steps[0]),))
+    return np.array([np.frombuffer(data, kind, 1, place)[0] for place in places.tolist()], kind)

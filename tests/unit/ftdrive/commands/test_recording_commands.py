@@ -1,0 +1,264 @@
+"""`record`, `convert` and `compensate`: when they end, with what exit code, and what is in the files then."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import click
+import numpy as np
+import pytest
+
+from drivers.errors import DeviceTimeout
+from ftdrive import cli
+from ftdrive.commands.record import Duration
+from ftdrive.live.samples import Block, StreamEvent
+from ftdrive.recording import Recorder, read_recording
+from tests.unit.ftdrive.recorded import UTC_OFFSET_NS, block, calibration, info
+
+END = KeyboardInterrupt()
+
+
+class FakeStream:
+    """Blocks and what follows them: an error, or nothing more."""
+
+    def __init__(
+        self, blocks: list[Block], end: BaseException = END, events: dict[int, StreamEvent] | None = None
+    ) -> None:
+        self.info, self.frame, self.warnings = info(), block(1).frame, ("the serial number is unknown",)
+        self._blocks, self._end, self._events = blocks, end, events or {}
+        self._read = 0
+
+    def __enter__(self) -> "FakeStream":
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def read(self) -> Block:
+        if self._read == len(self._blocks):
+            raise self._end
+        self._read += 1
+        return self._blocks[self._read - 1]
+
+    def take_events(self) -> list[StreamEvent]:
+        event = self._events.pop(self._read, None)
+        return [] if event is None else [event]
+
+    def status(self) -> Any:
+        return SimpleNamespace(delay_s=0.0031, delay_sigma_s=0.0002)
+
+
+Run = Callable[..., tuple[int, dict[str, Any] | None, str]]
+
+
+@pytest.fixture
+def run_record(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Record a stream with these options; return the exit code, the object on stdout, and stderr."""
+    monkeypatch.chdir(tmp_path)
+    calibration().save(tmp_path / "c.json")
+
+    def run(stream: FakeStream, *options: str) -> tuple[int, dict[str, Any] | None, str]:
+        monkeypatch.setattr("ftdrive.live.stream.CompensatedStream", lambda *_, **__: stream)
+        given = ["--calibration", "c.json", "--robot", "10.0.0.2", "--sensor", "ati-can://can0", "--json", *options]
+        code = cli.run(["record", *given])
+        out, err = capsys.readouterr()
+        return code, json.loads(out) if out else None, err
+
+    return run
+
+
+def blocks(n: int, size: int = 100) -> list[Block]:
+    return [block(size, start) for start in range(0, n * size, size)]
+
+
+def test_count_ends_exactly_and_files_are_equal(run_record: Run) -> None:
+    code, told, err = run_record(FakeStream(blocks(30)), "-o", "a.mcap", "-o", "a.csv", "--count", "1234")
+    assert code == 0
+    assert told is not None
+    assert (told["files"], told["samples"], told["gaps"], told["lost"]) == (["a.mcap", "a.csv"], 1234, 0, 0)
+    assert (told["axes"], told["about"], told["calibration"]) == ("sensor", "sensor", "c.json")
+    assert "the serial number is unknown" in err
+    one, other = (read_recording(Path(name)) for name in told["files"])
+    assert one.rows.tobytes() == other.rows.tobytes()
+    assert len(one.rows) == 1234
+    assert one.header.configuration["robot"]["host"] == "10.0.0.2"
+    (delay,) = one.events
+    assert delay.values == {"value": 0.0031, "sigma": 0.0002}
+    assert one.header.info.utc_offset_ns == UTC_OFFSET_NS
+
+
+def test_duration_ends_by_the_times_of_the_samples(run_record: Run) -> None:
+    code, told, _ = run_record(FakeStream(blocks(30)), "-o", "a.csv", "--duration", "0.5s")
+    assert code == 0
+    assert told is not None
+    assert told["samples"] in (500, 501)
+    assert told["duration_s"] < 0.5
+
+
+def test_control_c_keeps_the_data(run_record: Run) -> None:
+    code, told, err = run_record(FakeStream(blocks(3)), "-o", "a.mcap")
+    assert code == 130
+    assert told is not None
+    assert told["samples"] == 300
+    assert "Saved a.mcap: 300 samples" in err
+    assert read_recording(Path("a.mcap")).cut == ""
+
+
+def test_a_lost_link_keeps_the_data(run_record: Run) -> None:
+    stale = StreamEvent(5_300_000_000, "stale", "sensor: silent")
+    stream = FakeStream(blocks(3), DeviceTimeout("sensor silent for 0.3 s", "check its cable"), {3: stale})
+    code, told, err = run_record(stream, "-o", "a.csv")
+    assert code == 4
+    assert "error: sensor silent for 0.3 s; check its cable" in err
+    assert told is not None
+    assert [event.kind for event in read_recording(Path("a.csv")).events] == ["stale", "delay"]
+
+
+def test_a_stream_without_a_sample_leaves_no_file(run_record: Run, tmp_path: Path) -> None:
+    code, told, _ = run_record(FakeStream([], DeviceTimeout("sensor silent")), "-o", "a.csv")
+    assert (code, told) == (4, None)
+    assert [path.name for path in tmp_path.iterdir()] == ["c.json"]
+
+
+def test_a_gap_is_exit_code_8(run_record: Run) -> None:
+    gap = StreamEvent(5_100_000_000, "gap", "7 samples lost", {"lost": 7, "seq": 1})
+    code, told, err = run_record(FakeStream(blocks(3), events={2: gap}), "-o", "a.csv", "--count", "300")
+    assert code == 8
+    assert told is not None
+    assert (told["gaps"], told["lost"]) == (1, 7)
+    assert "error: gaps: 1, samples lost: 7" in err
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["-o", "a.bag"], "name it .mcap, .csv or .parquet"),
+        (["-o", "a.csv", "-o", "a.csv"], "the same file"),
+        (["-o", "a.csv", "--simulate"], "--robot does not go with --simulate"),
+        (["-o", "a.csv", "--duration", "soon"], "not a duration"),
+        (["-o", "c.json"], "never overwritten"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_before_any_work(run_record: Run, options: list[str], words: str) -> None:
+    code, told, err = run_record(FakeStream([], AssertionError("the stream was read")), *options)
+    assert (code, told) == (2, None)
+    assert words in " ".join(err.split())
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90", 90.0), ("0.5s", 0.5), ("10min", 600.0), ("1.5h", 5400.0)])
+def test_a_duration_has_a_unit(text: str, seconds: float) -> None:
+    assert Duration().convert(text, None, None) == seconds
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "5m", "nan", "1e3", ""])
+def test_another_text_is_no_duration(text: str) -> None:
+    with pytest.raises(click.BadParameter, match="60s"):
+        Duration().convert(text, None, None)
+
+
+def test_a_conversion_is_complete_and_says_what_was_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    recorder = Recorder([Path("a.csv")], info(), {})
+    recorder.write(block(1500))
+    Path("b.csv.partial").write_bytes(Path("a.csv.partial").read_bytes()[:-5])
+    recorder.close()
+    assert cli.run(["convert", "a.csv", "b.mcap", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["samples"] == 1500
+    assert json.loads(out)["complete"]
+    assert read_recording(Path("b.mcap")).rows.tobytes() == read_recording(Path("a.csv")).rows.tobytes()
+    assert cli.run(["convert", "b.csv.partial", "b.parquet", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert (json.loads(out)["samples"], json.loads(out)["complete"]) == (1499, False)
+    assert "incomplete" in err
+    assert cli.run(["convert", "a.csv", "b.mcap"]) == 2
+    Path("d.csv").write_text("t,fx\n")
+    assert cli.run(["convert", "d.csv", "e.mcap"]) == 6
+    assert "first line" in capsys.readouterr().err
+    assert not Path("e.mcap.partial").exists()
+
+
+@pytest.fixture
+def recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Three seconds at 1 kHz, and a calibration."""
+    monkeypatch.chdir(tmp_path)
+    calibration().save(tmp_path / "c.json")
+    path = tmp_path / "a.mcap"
+    recorder = Recorder([path], info(), {})
+    recorder.write(block(3000))
+    recorder.event(StreamEvent(0, "delay", "…", {"value": 0.0031, "sigma": 0.0002}))
+    recorder.close()
+    return path
+
+
+KEYS = {"force_rms_N", "force_max_N", "torque_rms_Nm", "torque_max_Nm"}
+
+
+def test_compensate_answers_as_documented(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--calibration", "c.json", "--axes", "base", "--json", "-o", "b.parquet"]
+    assert cli.run(["compensate", str(recorded), *options]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["schema_version"] == 1
+    assert (told["samples"], told["gaps"], told["contacts"]) == (3000, 0, [])
+    assert told["delay_s"] == {"value": 0.0031, "sigma": 0.0002}
+    assert told["raw"].keys() == told["compensated"].keys() == KEYS
+    assert told["compensated"]["force_rms_N"] == pytest.approx(np.sqrt(3) * 0.05, rel=0.1)
+    assert told["raw"]["force_rms_N"] > 10
+    assert (told["axes"], told["about"], told["calibration"], told["file"]) == ("base", "sensor", "c.json", "b.parquet")
+    assert str(read_recording(Path("b.parquet")).header.frame) == "base axes, about the sensor origin"
+
+
+def test_compensate_prints_a_table(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["compensate", str(recorded), "--bias", "estimate"]) == 0
+    out = capsys.readouterr().out
+    assert "bias change ± 1 sigma" in out
+    assert "compensated: sensor axes, about the sensor origin" in out
+    assert max(map(len, out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ([], "no recording"),
+        (["--wrench", "c.json"], "--orientation-file"),
+        (["a.mcap", "--delay", "auto"], "do not go with RECORDING"),
+        (["a.mcap", "--about", "here"], "--about is 'here'"),
+        (
+            ["--wrench", "c.json", "--orientation-file", "c.json", "--calibration", "c.json", "--delay", "x"],
+            "--delay is",
+        ),
+    ],
+)
+@pytest.mark.usefixtures("recorded")
+def test_compensate_refuses_what_it_would_ignore(
+    options: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["compensate", *options]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_compensate_refuses_the_calibration_of_another_sensor(
+    recorded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    devices = {"sensor": {"model": "Mini45", "serial": "FT9"}}
+    replace(calibration(), provenance={"devices": devices}).save(Path("other.json"))
+    assert cli.run(["compensate", str(recorded), "--calibration", "other.json"]) == 2
+    assert "FT9" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_compensate_imports_no_driver_of_a_device(recorded: Path) -> None:
+    code = (
+        "import sys; from ftdrive.cli import run\n"
+        f"assert run(['compensate', {str(recorded)!r}, '--json']) == 0\n"
+        "hardware = {'can', 'serial', 'rtde_receive', 'rtde_control', 'pynetft', 'drivers.ati', 'drivers.ur.arm'}\n"
+        "assert not hardware & sys.modules.keys(), hardware & sys.modules.keys()\n"
+    )
+    outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert outcome.returncode == 0, outcome.stderr

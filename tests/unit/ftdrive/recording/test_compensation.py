@@ -1,0 +1,178 @@
+"""A recording compensated at once."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import Parameters
+from calib.errors import BadDataset
+from calib.model import predict
+from drivers.interfaces import Array
+from ftdrive.errors import ConfigError
+from ftdrive.live.samples import Block, Stages, StreamEvent, WrenchFrame
+from ftdrive.recording import Header, Recording, read_recording
+from ftdrive.recording.compensation import compensated, with_estimated_bias
+from ftdrive.recording.csv_pair import read_pair
+from ftdrive.recording.recording import rows_of
+from tests.unit.ftdrive.recorded import NOISE, TRUTH, calibration, info
+
+RATE_HZ = 500.0
+SHIFT = np.array([8.0, -5.0, 11.0, 0.2, 0.1, -0.3])
+ZEROED = Parameters(
+    TRUTH.R_flange_sensor,
+    TRUTH.gravity_force_base_N,
+    TRUTH.force_bias_N + SHIFT[:3],
+    TRUTH.p_sensor_com_m,
+    TRUTH.torque_bias_Nm + SHIFT[3:],
+)
+
+
+def turning(t_s: Array) -> Array:
+    """Orientations (n, 3, 3) of a tool that turns about changing axes, about 1 rad/s."""
+    angles = np.stack([np.sin(1.1 * t_s), 0.8 * np.sin(0.7 * t_s + 1), 0.5 * np.sin(1.3 * t_s + 2)], axis=1)
+    return Rotation.from_rotvec(angles).as_matrix()
+
+
+def recording(parameters: Parameters = TRUTH, seconds: float = 8.0, push_N: float = 6.0) -> Recording:
+    """A free tool, but for a push of 6 N along x of the sensor from 4 to 5 s."""
+    rng, n = np.random.default_rng(0), round(seconds * RATE_HZ)
+    t_s = np.arange(n) / RATE_HZ
+    R = turning(t_s)
+    push = np.where((t_s >= 4) & (t_s < 5), push_N, 0.0)[:, None] * np.eye(6)[0]
+    nothing, t_ns = np.zeros((n, 6)), np.rint(t_s * 1e9).astype(np.int64) + 10**12
+    samples = Block(
+        t_host_ns=t_ns,
+        t_device_s=t_s,
+        seq=np.arange(n),
+        status=np.zeros(n, np.uint32),
+        raw=predict(parameters, R) + rng.normal(0, NOISE, (n, 6)) + push,
+        wrench=nothing,
+        chi2=nothing[:, 0],
+        in_contact=np.zeros(n, bool),
+        q_rad=nothing,
+        R_base_flange=R,
+        p_base_flange_m=nothing[:, :3],
+        sigma=NOISE,
+        frame=WrenchFrame(),
+        stages=Stages(),
+    )
+    header = Header(replace(info(), sensor_rate_Hz=RATE_HZ), WrenchFrame(), Stages())
+    return Recording(
+        header, rows_of(samples), [StreamEvent(10**12, "mark", "begin"), StreamEvent(10**12, "contact", "old")]
+    )
+
+
+def test_the_push_is_found_and_the_weight_is_gone(tmp_path: Path) -> None:
+    source, output = recording(), tmp_path / "a.csv"
+    result = compensated(source, WrenchFrame("flange", "sensor"), output)
+    assert (result["samples"], result["gaps"]) == (4000, 0)
+    assert result["duration_s"] == pytest.approx(7.998)
+    assert result["raw"]["force_rms_N"] == pytest.approx(np.sqrt((source.rows["raw"][:, :3] ** 2).sum() / 4000))
+    assert result["compensated"]["force_max_N"] == pytest.approx(6, abs=6 * 0.05)
+    assert result["compensated"]["torque_rms_Nm"] == pytest.approx(np.sqrt(3) * 0.002, rel=0.3)
+    (contact,) = result["contacts"]
+    assert contact["t_s"] == pytest.approx(4, abs=0.05)
+    assert contact["duration_s"] == pytest.approx(1, abs=0.05)
+    assert contact["peak_N"] == pytest.approx(6, abs=0.2)
+    np.testing.assert_allclose(contact["direction"], TRUTH.R_flange_sensor[:, 0], atol=0.05)
+    saved = read_recording(output)
+    assert saved.header.frame == WrenchFrame("flange", "sensor")
+    assert np.sqrt((saved.rows["wrench"][:, :3] ** 2).sum() / 4000) == pytest.approx(
+        result["compensated"]["force_rms_N"]
+    )
+    np.testing.assert_array_equal(saved.rows["raw"], source.rows["raw"])
+    assert [event.text for event in saved.events if event.kind != "contact"] == ["begin"]
+    assert [event.values["peak_N"] for event in saved.events if event.kind == "contact"] == [contact["peak_N"]]
+
+
+def test_a_frame_that_is_not_configured_leaves_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="height_mm"):
+        compensated(recording(seconds=1.0), WrenchFrame("base", "flange"), tmp_path / "a.csv")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_bias_of_a_zeroed_sensor_is_estimated_with_an_honest_sigma() -> None:
+    source = recording(ZEROED, seconds=10.0)
+    old, new = calibration().parameters, np.r_[ZEROED.force_bias_N, ZEROED.torque_bias_Nm]
+    estimated, change = with_estimated_bias(source)
+    found = estimated.header.info.calibration.parameters
+    before = np.r_[old.force_bias_N, old.torque_bias_Nm]
+    np.testing.assert_allclose(np.r_[found.force_bias_N, found.torque_bias_Nm], before + change["value"])
+    error = before + change["value"] - new
+    assert (np.abs(error) < 6 * np.array(change["sigma"])).all()
+    assert (np.array(change["sigma"]) < 0.3 * NOISE).all()
+    assert compensated(estimated, WrenchFrame())["compensated"]["force_max_N"] == pytest.approx(6, abs=0.3)
+    assert compensated(source, WrenchFrame())["compensated"]["force_max_N"] > 14
+
+
+def test_a_short_recording_shows_no_bias() -> None:
+    with pytest.raises(BadDataset, match="too short"):
+        with_estimated_bias(recording(seconds=1.0))
+
+
+def write_pair(folder: Path, delay_s: float, orientation: str) -> tuple[Path, Path]:
+    """The recording as two files: wrench at 500 Hz, late by the delay, orientation at 125 Hz."""
+    source = recording(seconds=15.0, push_N=0.0)
+    wrench, poses = folder / "wrench.csv", folder / "poses.csv"
+    t_s = np.arange(len(source.rows)) / RATE_HZ + 100.0
+    table = np.c_[t_s + delay_s, source.rows["raw"]]
+    np.savetxt(wrench, table, delimiter=",", header="t, fx,fy,fz,tx,ty,tz", comments="")
+    t_s = np.arange(-1.0, 16.0, 1 / 125)
+    R = Rotation.from_matrix(turning(t_s))
+    numbers = {
+        "r11,r12,r13,r21,r22,r23,r31,r32,r33": R.as_matrix().reshape(-1, 9),
+        "qx,qy,qz,qw": R.as_quat(),
+        "rx,ry,rz": R.as_rotvec(),
+    }[orientation]
+    np.savetxt(poses, np.c_[numbers, t_s + 100.0], delimiter=",", header=f"{orientation},t", comments="")
+    return wrench, poses
+
+
+@pytest.mark.parametrize("orientation", ["r11,r12,r13,r21,r22,r23,r31,r32,r33", "qx,qy,qz,qw", "rx,ry,rz"])
+def test_a_pair_of_files_is_paired_with_its_delay(orientation: str, tmp_path: Path) -> None:
+    files = write_pair(tmp_path, 0.012, orientation)
+    found, delay = read_pair(*files, calibration(), "c", None)
+    assert delay["value"] == pytest.approx(0.012, abs=1e-3)
+    assert 0 < delay["sigma"] < 1e-3
+    rms = compensated(found, WrenchFrame())["compensated"]["torque_rms_Nm"]
+    fixed, given = read_pair(*files, calibration(), "c", 0.0)
+    assert given == {"value": 0.0, "sigma": 0.0}
+    assert rms < 1.2 * np.sqrt(3) * 0.002
+    assert compensated(fixed, WrenchFrame())["compensated"]["torque_rms_Nm"] > 1.5 * rms
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("wrench", "t,fx,fy,fz,tx,ty\n", "must name t and fx, fy, fz, tx, ty, tz; it names t, fx"),
+        ("wrench", "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n", "1 rows"),
+        ("wrench", "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n1,1,2,x,4,5,6\n", "'x'"),
+        ("wrench", "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n-1,1,2,3,4,5,6\n", "row 2: .* t = -1 goes back"),
+        ("wrench", "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n1,1,nan,3,4,5,6\n", "row 2: a number is not finite"),
+        ("poses", "t,rx,ry,rz\n0,0,90,0\n1,0,90,0\n", "convert degrees"),
+        ("poses", "t,qx,qy,qz,qw\n0,0,0,0,1\n1,0,0,0,2\n", "row 2: the quaternion has length 2"),
+        ("poses", "t,r11,r12,r13,r21,r22,r23,r31,r32,r33\n" + "0,1,0,0,0,1,0,0,0,-1\n" * 2, "reflection"),
+        ("poses", "t,rx,ry,rz\n900,0,0,0\n901,0,0,0\n", "no time in common"),
+    ],
+)
+def test_files_that_cannot_be_used_are_named_with_the_fault(
+    name: str, content: str, words: str, tmp_path: Path
+) -> None:
+    good = {"wrench": "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n1,1,2,3,4,5,6\n", "poses": "t,rx,ry,rz\n0,0,0,0\n1,0,0,0\n"}
+    for file, text in (good | {name: content}).items():
+        (tmp_path / file).write_text(text)
+    with pytest.raises(BadDataset, match=words):
+        read_pair(tmp_path / "wrench", tmp_path / "poses", calibration(), "c", 0.0)
+
+
+def test_a_pause_of_another_program_is_a_gap(tmp_path: Path) -> None:
+    t_s = np.delete(np.arange(100) / 100, [40, 41])
+    table = np.c_[t_s, np.tile(np.arange(6.0), (98, 1))]
+    np.savetxt(tmp_path / "w", table, delimiter=",", header="t,fx,fy,fz,tx,ty,tz", comments="")
+    (tmp_path / "p").write_text("t,rx,ry,rz\n0,0,0,0\n1,0,0,0\n")
+    found, _ = read_pair(tmp_path / "w", tmp_path / "p", calibration(), "c", 0.0)
+    assert found.gaps == 1
+    assert found.rows["seq"][-1] == 99

@@ -1,0 +1,231 @@
+"""Three formats hold the same bits, and other programs read them."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Attachment, Channel, DataEnd, Message, Schema
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from ftdrive.errors import BadRecording
+from ftdrive.live.samples import Stages, StreamEvent, WrenchFrame
+from ftdrive.recording import Recorder, Recording, read_recording, write_recording
+from tests.unit.ftdrive.recorded import BASE_TCP, CONFIGURATION, UTC_OFFSET_NS, block, info
+
+ENDINGS = (".mcap", ".csv", ".parquet")
+PUSH = WrenchFrame("flange", (0.0, 0.01, 0.15))
+GAP = StreamEvent(6_503_000_000, "gap", "3 samples lost", {"lost": 3})
+MARK = StreamEvent(5_000_700_000, "mark", "Peg “in”", {"peak_N": [1.5, -2.0], "n": 3})
+
+
+@pytest.fixture(scope="module")
+def paths(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """2.6 s with a gap, a mark and another frame, in all formats."""
+    folder = tmp_path_factory.mktemp("recording")
+    files = [folder / f"peg{ending}" for ending in ENDINGS]
+    recorder = Recorder(files, info(), CONFIGURATION)
+    for start in range(0, 1500, 100):
+        recorder.write(block(100, start))
+        if start == 700:
+            recorder.event(MARK)
+    recorder.event(GAP)
+    for start in range(1503, 2603, 110):
+        recorder.write(block(110, start, frame=PUSH, stages=Stages(lowpass_Hz=40.0)))
+    assert not any(path.exists() for path in files)
+    recorder.close()
+    assert sorted(folder.iterdir()) == sorted(files)
+    return files
+
+
+def same(one: Recording, other: Recording) -> None:
+    assert one.rows.tobytes() == other.rows.tobytes()
+    assert list(one.events) == list(other.events)
+    assert one.header.to_dict() == other.header.to_dict()
+    assert (one.cut, other.cut) == ("", "")
+
+
+def test_all_formats_hold_the_same_bits(paths: Sequence[Path]) -> None:
+    first, *others = map(read_recording, paths)
+    for other in others:
+        same(first, other)
+
+
+def test_a_recording_holds_what_was_measured(paths: Sequence[Path]) -> None:
+    recording = read_recording(paths[0])
+    frames = [(len(rows), header.frame, header.stages) for rows, _, header in recording.pieces(10_000)]
+    assert frames == [(1500, BASE_TCP, Stages()), (1100, PUSH, Stages(lowpass_Hz=40.0))]
+    measured, found = block(100, 300), recording.paired(slice(300, 400))
+    for name in ("t_host_ns", "t_device_s", "seq", "status", "raw", "q_rad", "p_base_flange_m"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(measured, name))
+    for name in ("wrench", "chi2", "in_contact"):
+        np.testing.assert_array_equal(recording.rows[name][300:400], getattr(measured, name))
+    np.testing.assert_allclose(found.R_base_flange, measured.R_base_flange, atol=1e-15)
+    assert [event.kind for event in recording.events] == ["mark", "gap", "frame", "stages"]
+    assert recording.events[0] == MARK
+    assert recording.gaps == 1
+    assert recording.duration_s == pytest.approx(2.602, abs=1e-5)
+    assert recording.header.configuration == CONFIGURATION
+    assert recording.header.info.sensor == info().sensor
+    assert recording.header.info.calibration.to_dict() == info().calibration.to_dict()
+    assert np.isnan(recording.header.info.p_flange_sensor_m[2])
+
+
+@pytest.mark.parametrize("of", ENDINGS)
+@pytest.mark.parametrize("to", ENDINGS)
+def test_conversion_is_lossless(paths: Sequence[Path], of: str, to: str, tmp_path: Path) -> None:
+    source = read_recording(paths[ENDINGS.index(of)])
+    write_recording(tmp_path / f"copy{to}", source)
+    same(source, read_recording(tmp_path / f"copy{to}"))
+
+
+def test_rosbags_reads_the_messages(paths: Sequence[Path]) -> None:
+    rows, frames = read_recording(paths[0]).rows, set()
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with AnyReader([paths[0]], default_typestore=store) as reader:
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        assert counts == dict.fromkeys(
+            ["/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states", "/ft_sample"], 2600
+        ) | {"/events": 4}
+        seen: dict[str, list[Any]] = {topic: [] for topic in counts}
+        for connection, t_ns, data in reader.messages():
+            message: Any = reader.deserialize(data, connection.msgtype)
+            seen[connection.topic].append((t_ns, message))
+    for i in (0, 1, 1499, 1500, 2599):
+        row, t_utc_ns = rows[i], int(rows["t_host_ns"][i]) + UTC_OFFSET_NS
+        for topic, column in (("/ft_raw", "raw"), ("/ft_compensated", "wrench")):
+            t_ns, message = seen[topic][i]
+            force, torque = message.wrench.force, message.wrench.torque
+            assert [force.x, force.y, force.z, torque.x, torque.y, torque.z] == row[column].tolist()
+            assert t_ns == t_utc_ns == message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            frames.add((topic, message.header.frame_id))
+        pose = seen["/flange_pose"][i][1].pose
+        assert [pose.position.x, pose.position.y, pose.position.z] == row["p_base_flange_m"].tolist()
+        q = pose.orientation
+        assert [q.x, q.y, q.z, q.w] == row["quaternion_base_flange"].tolist()
+        assert seen["/joint_states"][i][1].position.tolist() == row["q_rad"].tolist()
+        sample = seen["/ft_sample"][i][1]
+        assert (sample.seq, sample.status, sample.in_contact) == (row["seq"], row["status"], row["in_contact"])
+    assert frames == {
+        ("/ft_raw", "sensor"),
+        ("/ft_compensated", "base_at_tcp"),
+        ("/ft_compensated", "flange_at_0_0.01_0.15_m"),
+    }
+    t_ns, log = seen["/events"][0]
+    assert (log.name, log.msg, log.level) == ("mark", MARK.text, 20)
+    assert t_ns == MARK.t_host_ns + UTC_OFFSET_NS
+
+
+def test_mcap_ros2_reads_the_messages(paths: Sequence[Path]) -> None:
+    rows = read_recording(paths[0]).rows
+    with paths[0].open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        attachments = {one.name: one for one in reader.iter_attachments()}
+        summary = reader.get_summary()
+        first_ns = int(rows["t_host_ns"][1400]) + UTC_OFFSET_NS
+        found = list(reader.iter_decoded_messages(["/ft_compensated"], starting_at=first_ns, log_time_order=True))
+    assert attachments.keys() == {"calibration.json", "recording.json"}
+    assert json.loads(attachments["calibration.json"].data) == info().calibration.to_dict()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_start_time == rows["t_host_ns"][0] + UTC_OFFSET_NS
+    assert len(summary.chunk_indexes) == 3  # a second, the rest before the new frame, a second
+    assert [decoded.wrench.force.x for *_, decoded in found] == rows["wrench"][1400:, 0].tolist()
+
+
+def test_a_plain_reader_of_the_format_finds_no_fault(paths: Sequence[Path]) -> None:
+    with paths[0].open("rb") as file:
+        kinds = [type(record).__name__ for record in StreamReader(file, validate_crcs=True).records]
+    assert kinds.count("Message") == 5 * 2600 + 4
+    assert kinds[-1] == "Footer"
+
+
+def test_a_file_that_another_program_has_divided_otherwise_is_read(paths: Sequence[Path], tmp_path: Path) -> None:
+    with paths[0].open("rb") as file, (tmp_path / "other.mcap").open("wb") as new:
+        writer = Writer(new, chunk_size=20_000)
+        writer.start("ros2", "another")
+        for one in StreamReader(file).records:
+            if isinstance(one, Attachment):
+                writer.add_attachment(0, 0, one.name, one.media_type, one.data)
+            elif isinstance(one, Schema):
+                writer.register_schema(one.name, one.encoding, one.data)
+            elif isinstance(one, Channel):
+                writer.register_channel(one.topic, one.message_encoding, one.schema_id)
+            elif isinstance(one, Message):
+                writer.add_message(one.channel_id, one.log_time, one.data, one.publish_time, one.sequence)
+            elif isinstance(one, DataEnd):
+                break
+        writer.finish()  # type: ignore[no-untyped-call]
+    same(read_recording(paths[0]), read_recording(tmp_path / "other.mcap"))
+
+
+def test_the_table_is_plain_to_other_programs(paths: Sequence[Path]) -> None:
+    recording = read_recording(paths[0])
+    lines = [line for line in paths[1].read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    names = lines[0].split(",")
+    assert names[:6] == ["t_s", "t_host_ns", "t_device_s", "seq", "status", "raw_fx"]
+    assert "base axes, about the tcp origin" in paths[1].read_text(encoding="utf-8").partition("\n")[0]
+    with duckdb.connect() as database:
+        table = database.execute(f"SELECT t_s, fz, q5, in_contact FROM '{paths[2]}'").fetchnumpy()
+    column = [float(line.split(",")[names.index("t_s")]) for line in lines[1:]]
+    np.testing.assert_array_equal(table["t_s"], column)
+    assert column[0] == 0.0
+    np.testing.assert_array_equal(table["fz"], recording.rows["wrench"][:, 2])
+    np.testing.assert_array_equal(table["q5"], recording.rows["q_rad"][:, 5])
+    np.testing.assert_array_equal(table["in_contact"], recording.rows["in_contact"])
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Five seconds at 30 Hz."""
+    files = [tmp_path_factory.mktemp("small") / f"small{ending}" for ending in ENDINGS]
+    recorder = Recorder(files, info(), {})
+    for start in range(0, 150, 10):
+        recorder.write(block(10, start, step_ns=33_000_000))
+    recorder.close()
+    return files
+
+
+@pytest.mark.parametrize(("ending", "cuts", "least"), [(".mcap", 30, 5), (".csv", 30, 10), (".parquet", 5, 1)])
+def test_a_file_cut_anywhere_is_read_up_to_there_or_rejected(
+    small: Sequence[Path], ending: str, cuts: int, least: int, tmp_path: Path
+) -> None:
+    whole, path = read_recording(small[0]).rows, small[ENDINGS.index(ending)]
+    content = path.read_bytes()
+    sizes = np.r_[0, 8, np.linspace(9, len(content) - 1, cuts)].astype(int)
+    cut, lengths = tmp_path / f"cut{ending}", []
+    for size in sizes.tolist():
+        cut.write_bytes(content[:size])
+        try:
+            found = read_recording(cut)
+        except BadRecording:
+            lengths.append(0)
+        else:
+            assert found.rows.tobytes() == whole[: len(found.rows)].tobytes()
+            assert found.cut or len(found.rows) == len(whole)
+            lengths.append(len(found.rows))
+    assert lengths == sorted(lengths)
+    assert len(set(lengths)) >= least
+
+
+@pytest.mark.parametrize("ending", [".mcap", ".csv"])
+def test_damage_is_no_traceback(small: Sequence[Path], ending: str, tmp_path: Path) -> None:
+    content = small[ENDINGS.index(ending)].read_bytes()
+    rng = np.random.default_rng(3)
+    damaged, rejected = tmp_path / f"damaged{ending}", 0
+    for place in rng.integers(0, len(content), 40).tolist():
+        flipped = bytes([content[place] ^ 1 << int(rng.integers(8))])
+        damaged.write_bytes(content[:place] + flipped + content[place + 1 :])
+        try:
+            read_recording(damaged)
+        except BadRecording:
+            rejected += 1
+    assert rejected

@@ -1,0 +1,171 @@
+"""The recorder: what is in the files when something goes wrong, and what it does not do."""
+
+import errno
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ftdrive.errors import BadRecording, ConfigError
+from ftdrive.live.samples import StreamEvent
+from ftdrive.recording import Recorder, read_recording, write_recording
+from ftdrive.recording.growing_file import GrowingFile
+from ftdrive.recording.recording import Header
+from tests.unit.ftdrive.recorded import BASE_TCP, USUAL, block, info
+
+TABLES = (".mcap", ".csv")
+ENDINGS = (*TABLES, ".parquet")
+
+
+class FullDisk:
+    """A file on a disk with little room; the last write is a partial one."""
+
+    def __init__(self, file: Any, room: int) -> None:
+        self._file, self._room = file, room
+
+    def write(self, data: bytes) -> int:
+        left = self._room - self._file.tell()
+        if left <= 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return int(self._file.write(data[:left]))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+@pytest.fixture
+def fill_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    init = GrowingFile.__init__
+
+    def fill(room: int) -> None:
+        def full(file: GrowingFile, path: Path) -> None:
+            init(file, path)
+            file._file = FullDisk(file._file, room)  # type: ignore[assignment]
+
+        monkeypatch.setattr(GrowingFile, "__init__", full)
+
+    return fill
+
+
+@pytest.mark.parametrize("ending", TABLES)
+def test_a_full_disk_ends_with_what_was_written(ending: str, tmp_path: Path, fill_disk: Callable[[int], None]) -> None:
+    path = tmp_path / f"a{ending}"
+    fill_disk(1_000_000)
+    recorder = Recorder([path], info(), {})
+    with pytest.raises(OSError, match="No space left"):  # noqa: PT012  # some write fails
+        for start in range(0, 5000, 100):
+            recorder.write(block(100, start))
+    recorder.close()  # the end needs less room than the chunk that did not fit
+    found = read_recording(path)
+    assert found.cut == ""
+    assert 0 < len(found.rows) < 5000
+    np.testing.assert_array_equal(found.rows["seq"], found.rows["seq"][0] + np.arange(len(found.rows)))
+
+
+@pytest.mark.parametrize("ending", TABLES)
+def test_without_room_for_the_end_the_partial_file_is_readable(
+    ending: str, tmp_path: Path, fill_disk: Callable[[int], None]
+) -> None:
+    path = tmp_path / f"a{ending}"
+    whole = Recorder([tmp_path / f"b{ending}"], info(), {})
+    whole.write(block(1100))
+    size = (tmp_path / f"b{ending}.partial").stat().st_size
+    whole.close()
+    fill_disk(size)
+    recorder = Recorder([path], info(), {})
+    recorder.write(block(1100))
+    with pytest.raises(OSError, match="No space left"):
+        recorder.close()
+    assert not path.exists()
+    partial = tmp_path / f"a{ending}.partial"
+    found = read_recording(partial)
+    assert len(found.rows) == 1100
+    assert found.cut
+    with pytest.raises(OSError, match="No space left"):
+        write_recording(tmp_path / f"c{ending}", found)
+    assert not list(tmp_path.glob("c*"))
+    fill_disk(10**9)
+    write_recording(tmp_path / f"c{ending}", found)
+    assert read_recording(tmp_path / f"c{ending}").rows.tobytes() == found.rows.tobytes()
+    with pytest.raises(FileExistsError, match=r"ftdrive convert .*partial"):
+        Recorder([path], info(), {})
+
+
+def test_an_interrupted_parquet_recording_is_a_folder_of_parts(tmp_path: Path) -> None:
+    path = tmp_path / "a.parquet"
+    recorder = Recorder([path], info(), {})
+    mark = StreamEvent(5_000_000_000, "mark", "begin")
+    for start in range(26):
+        recorder.write(block(1, start, step_ns=1_000_000_000))
+        recorder.event(mark if start == 1 else StreamEvent(0, "frame", "the recorder notices it itself"))
+    found = read_recording(tmp_path / "a.parquet.partial")  # as after a power failure
+    np.testing.assert_array_equal(found.rows["seq"], block(len(found.rows)).seq)
+    assert len(found.rows) > 15
+    assert list(found.events) == [mark]
+    assert found.cut
+    recorder.close()
+    assert len(read_recording(path).rows) == 26
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_nothing_is_overwritten(ending: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a{ending}"
+    recorder = Recorder([path], info(), {})
+    recorder.write(block(3))
+    path.write_text("another program's")
+    with pytest.raises(FileExistsError, match="never overwritten"):
+        recorder.close()
+    assert path.read_text() == "another program's"
+    assert len(read_recording(tmp_path / f"a{ending}.partial").rows) == 3
+    with pytest.raises(FileExistsError, match="never overwritten"):
+        Recorder([path], info(), {})
+
+
+def test_without_a_sample_there_is_no_file(tmp_path: Path) -> None:
+    recorder = Recorder([tmp_path / f"a{ending}" for ending in ENDINGS], info(), {})
+    recorder.event(StreamEvent(0, "mark", "x"))
+    recorder.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_of_one_file_completes_the_others(tmp_path: Path) -> None:
+    recorder = Recorder([tmp_path / "a.csv", tmp_path / "b.csv"], info(), {})
+    recorder.write(block(3))
+    (tmp_path / "a.csv").touch()
+    with pytest.raises(FileExistsError):
+        recorder.close()
+    assert len(read_recording(tmp_path / "b.csv").rows) == 3
+
+
+def test_an_unknown_ending_is_refused_before_any_work(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"name it \.mcap, \.csv or \.parquet"):
+        Recorder([tmp_path / "a.bag"], info(), {})
+
+
+@pytest.mark.parametrize(("missing", "ending"), [("mcap", ".mcap"), ("duckdb", ".parquet")])
+def test_a_missing_package_is_named_with_its_extra(
+    missing: str, ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, missing, None)
+    with pytest.raises(ConfigError, match=r"ftdrive\[record\]"):
+        Recorder([tmp_path / f"a{ending}"], info(), {})
+    (tmp_path / f"b{ending}").touch()
+    with pytest.raises(ConfigError, match=r"ftdrive\[record\]"):
+        read_recording(tmp_path / f"b{ending}")
+    assert not (tmp_path / f"a{ending}.partial").exists()
+
+
+@pytest.mark.parametrize(("content", "words"), [("", "first line"), ("# ftdrive.recording/1\n", "header is missing")])
+def test_a_file_of_another_kind_is_named_with_its_fault(content: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(content)
+    with pytest.raises(BadRecording, match=f"a.csv: .*{words}"):
+        read_recording(path)
+
+
+def test_a_newer_version_is_refused() -> None:
+    document = Header(info(), BASE_TCP, USUAL).to_dict() | {"format": "ftdrive.recording/2"}
+    with pytest.raises(BadRecording, match="use a newer program"):
+        Header.from_dict(document)
