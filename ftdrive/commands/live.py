@@ -4,9 +4,10 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
@@ -45,6 +46,9 @@ from ftdrive.live.stream import CompensatedStream, load_calibration
 from ftdrive.runs.run import Run
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.keyboard import Keyboard
+
+if TYPE_CHECKING:
+    from ftdrive.recording import Recorder
 
 _PERIOD_S = 0.1
 _RECOVER_S = 10.0
@@ -113,9 +117,16 @@ def live(
         elif talk.is_terminal and sys.stdout.isatty() and sys.stdin.isatty() and not plain:
             from ftdrive.terminal.live_screen import run_live
 
-            run_live(stream, checks=checks)
+            recorder = None if replay is not None else partial(_record, stream, cell)
+            run_live(stream, recorder=recorder, checks=checks)
         else:
             _show_table(stream)
+
+
+def _record(stream: ProcessedStream, cell: CellConfig, path: Path) -> "Recorder":
+    from ftdrive.recording import Recorder
+
+    return Recorder([path], stream.info, cell.to_dict())
 
 
 def _print(stream: CompensatedStream | ReplayedStream, *, once: bool, as_json: bool) -> None:
