@@ -154,7 +154,8 @@ class Feed:
         self._read()
         for event in self.stream.take_events():
             self._record(methodcaller("event", event))
-            self.notes.append(Note(event.t_host_ns, event.text, _STYLES.get(event.kind, ""), event.kind in _MARKS))
+            text = f'mark "{event.text}"' if event.kind == "mark" else event.text
+            self.notes.append(Note(event.t_host_ns, text, _STYLES.get(event.kind, ""), event.kind in _MARKS))
 
     def take(self, block: Block) -> None:
         """Hand samples on, if there are any."""

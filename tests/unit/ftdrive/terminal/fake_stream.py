@@ -92,7 +92,7 @@ INFO = StreamInfo(
 
 
 PAST: tuple[tuple[float, EventKind, str], ...] = (
-    (5.0, "mark", 'mark "peg in"'),
+    (5.0, "mark", "peg in"),
     (6.1, "contact", "contact 8.0 N, 0.6 s"),
 )
 
@@ -218,7 +218,7 @@ class FakeStream:
         return self._add("tare-undone", "tare undone")
 
     def mark(self, text: str) -> StreamEvent:
-        return self._add("mark", f'mark "{text}"')
+        return self._add("mark", text)
 
     def _add(self, kind: Any, text: str) -> StreamEvent:
         self.called.append(kind)
