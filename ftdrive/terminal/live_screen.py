@@ -26,6 +26,7 @@ from ftdrive.checks.devices import check_calibration
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Axes, Point, StreamInfo, WrenchFrame
+from ftdrive.terminal.console import talk
 from ftdrive.terminal.live.feed import Feed, Sink, Stream
 from ftdrive.terminal.live.history import SPANS_S
 from ftdrive.terminal.live.layout import frame
@@ -88,6 +89,8 @@ def run_live(stream: Stream, *, recorder: Callable[[Path], Sink] | None = None, 
         app.run()
     finally:
         feed.stop()
+        for path in feed.recorded:
+            talk.print(f" Recorded: {path}")
     if feed.crash is not None:
         raise feed.crash
     if feed.failure is not None:

@@ -107,6 +107,8 @@ class Feed:
         Time of the newest sample.
     recording_since_ns : int or None
         None without a recording.
+    recorded : list of Path
+        Files of all recordings.
     """
 
     def __init__(self, stream: Stream, recorder: Callable[[Path], Sink] | None = None) -> None:
@@ -119,6 +121,7 @@ class Feed:
         self.crash: BaseException | None = None
         self.newest_ns: int | None = None
         self.recording_since_ns: int | None = None
+        self.recorded: list[Path] = []
         self._recorder = recorder
         self._sink: Sink | None = None
         self._status_ns = 0
@@ -177,9 +180,10 @@ class Feed:
             self.note("recording is not available here: use `ftdrive record -o FILE`")
         else:
             utc = datetime.fromtimestamp((self._now_ns + self.stream.info.utc_offset_ns) * 1e-9, UTC)
-            path = Path(f"live-{utc:%Y-%m-%dT%H%M%SZ}.mcap")
+            path = Path(f"live-{utc:%Y-%m-%dT%H%M%SZ}.mcap").absolute()
             self._sink, self.recording_since_ns = self._recorder(path), self._now_ns
-            self.note(f"recording to {path.absolute()}")
+            self.recorded.append(path)
+            self.note(f"recording to {path}")
 
     def _run(self) -> None:
         try:

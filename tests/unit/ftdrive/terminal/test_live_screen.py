@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from ftdrive.checks.check import Check
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import STEP_S, ReplayedStream
 from ftdrive.live.samples import Block, Paired, Stages, StreamInfo, WrenchFrame
+from ftdrive.terminal.console import talk
 from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.layout import frame
 from ftdrive.terminal.live.summary import Summary
@@ -262,6 +264,22 @@ def no_app(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_stream_that_has_failed_is_the_end_of_the_command() -> None:
     with pytest.raises(DeviceTimeout, match="sent no sample"):
         run_live(FakeStream(silent_after=3))
+
+
+def test_recordings_are_named_at_the_end(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def run(app: LiveApp) -> None:
+        app.action_press("r")
+        while not app._feed.recorded:
+            threading.Event().wait(0.001)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(LiveApp, "run", run)
+    monkeypatch.setattr(LiveApp, "draw", lambda _: None)
+    tape = MagicMock()
+    with talk.capture() as said:
+        run_live(FakeStream(), recorder=lambda _: tape)
+    assert f"Recorded: {tmp_path}/live-" in said.get().replace("\n", "")
+    tape.close.assert_called_once()
 
 
 @pytest.mark.usefixtures("no_app")
