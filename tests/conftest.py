@@ -15,7 +15,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # Before numpy is loaded: matrices are small, and the threads of two workers would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# The configuration of whoever runs the tests, and the plans they have run, are none of their business.
+# The tests ignore the configuration and the completed plans of the user who runs them.
 _state = TemporaryDirectory(prefix="ftdrive-state-")
 os.environ["XDG_CONFIG_HOME"] = _state.name + "/config"
 os.environ["XDG_STATE_HOME"] = _state.name

@@ -58,7 +58,7 @@ def test_a_tour_that_would_wind_up_the_cable_is_refused(lab: Lab, tmp_path: Path
     assert lab.calibrate(dry_run=True, output=made_there) is None
     assert "wrist 3 stands at -90°" in next(e.words for e in lab.operator.of(Checked) if e.name == "cable")
     lab.arm.q[5] = np.radians(160)
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     refuse_plan = pytest.raises(NotAccepted, match=r"160°.* -?\d+° and -?\d+°")
     with refuse_plan:
         lab.calibrate(plan=made_there)
