@@ -102,8 +102,8 @@ class FoxgloveServer:
         }
         self._sent = dict.fromkeys(self._channels, 0)
         self._arm, self._scene, self._status = Picked(self._info.arm_rate_Hz), Picked(SCENE_HZ), Picked(STATUS_HZ)
-        sdk.set_log_level("INFO")
         self._slow_clients = _SlowClients()
+        sdk.set_log_level("INFO")
         try:
             self._server = sdk.start_server(
                 name=f"ftdrive: {self._info.tool}, {self._info.calibration_name}",
@@ -287,6 +287,7 @@ class _SlowClients(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
+        logging.getLogger("foxglove").setLevel(logging.WARNING)
         self._source = logging.getLogger("foxglove.websocket.connected_client.send_lossy")
         self._source.setLevel(logging.INFO)
         self._source.propagate = False
