@@ -11,7 +11,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from scipy.special import expit
 
-from calib.assessment.verdict import Verdict, expected_error
+from calib.assessment.verdict import SURE, Verdict, expected_error
 from calib.compensation import Compensator
 from calib.errors import BadCalibration
 from calib.files import JSON, check_format, read_object, write_new
@@ -276,6 +276,23 @@ class CalibrationResult:
     def predicted_error(self) -> tuple[float, float]:
         """Expected root mean square error of `compensate` over all orientations, N and N·m, from noise alone."""
         return expected_error(self.parameters, self.covariance, self.response)
+
+    @property
+    def noise_explains(self) -> bool:
+        """Whether the residuals agree with the noise model; True for files of the first version, which lack it."""
+        return not self.quality or (self.p_value is not None and self.p_value >= SURE)
+
+    def likely_error(self) -> Array:
+        """Root mean square error (2,) of compensating a free tool over all orientations, N and N·m.
+
+        It is `predicted_error` where the measured noise explains the residuals. Elsewhere it is the larger of that and
+        of the error in predicting each pose from all others.
+        """
+        predicted = np.array(self.predicted_error())
+        if self.noise_explains:
+            return predicted
+        left_out = [self.quality["loo_force_rms_N"], self.quality["loo_torque_rms_Nm"]]
+        return np.asarray(np.maximum(predicted, np.array(left_out, dtype=np.float64)))
 
     def residual_summary(self) -> dict[str, float]:
         """Root mean square and largest norm of the force and torque residuals over the poses."""

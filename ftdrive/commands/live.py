@@ -37,7 +37,6 @@ from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.keyboard import Keyboard
-from ftdrive.terminal.report import likely_error
 
 Axes = Literal["sensor", "flange", "base"]
 
@@ -182,7 +181,7 @@ def _refuse_other_devices(calibration: CalibrationResult, found: dict[str, Devic
 
 def _beyond_noise(calibration: CalibrationResult) -> Array:
     """Return the variance (6,) beyond the predicted one, as in the report, spread over all axes."""
-    total = likely_error(calibration) ** 2 - np.square(calibration.predicted_error())
+    total = calibration.likely_error() ** 2 - np.square(calibration.predicted_error())
     return np.repeat(total / 3, 3)
 
 

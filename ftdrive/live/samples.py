@@ -1,6 +1,6 @@
 """The values of a compensated stream: blocks of samples, the frame they are given in, the stages applied, events."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Literal, Self
 
@@ -13,6 +13,7 @@ from drivers.interfaces import Array, DeviceInfo
 
 Axes = Literal["sensor", "flange", "base", "tcp"]
 Point = Literal["sensor", "flange", "tcp"]
+Ns = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +44,43 @@ class Stages:
     lowpass_Hz: float | None = None
     deadband_N: float = 0.0
     deadband_Nm: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Paired:
+    """n consecutive samples of the sensor, each with the pose at its time; the fields are those of `Block`."""
+
+    t_host_ns: Ns
+    """(n,) time of the measurement on the clock of the cell."""
+    t_device_s: Array
+    """(n,) NaN where the sensor has no clock."""
+    seq: Ns
+    """(n,)"""
+    status: NDArray[np.uint32]
+    """(n,)"""
+    raw: Array
+    """(n, 6) as measured, N and N·m, sensor axes, about the sensor origin."""
+    q_rad: Array
+    """(n, 6) NaN where unknown."""
+    R_base_flange: Array
+    """(n, 3, 3)"""
+    p_base_flange_m: Array
+    """(n, 3) NaN where unknown."""
+
+    def __len__(self) -> int:
+        """Count the samples."""
+        return len(self.t_host_ns)
+
+    def rows(self, which: slice | NDArray[np.bool_]) -> Self:
+        """Select samples."""
+        return type(self)(*(getattr(self, column.name)[which] for column in fields(self)))
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence[Self]) -> Self:
+        """Join blocks in the order given."""
+        if len(blocks) == 1:
+            return blocks[0]
+        return cls(*(np.concatenate([getattr(block, column.name) for block in blocks]) for column in fields(cls)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

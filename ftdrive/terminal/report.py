@@ -10,7 +10,6 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult
-from calib.assessment.verdict import SURE
 from calib.compare import Compared
 from calib.routine import DriftCheck, PoseRecord
 from drivers.interfaces import Array
@@ -135,29 +134,11 @@ def _print_drift(result: CalibrationResult, drift: DriftCheck | None) -> None:
 def error_in_words(result: CalibrationResult) -> str:
     """Describe the compensation error of a free tool, N and N·m, and its source."""
     words = "{:.4f} N, {:.5f} N·m".format(*result.predicted_error())
-    if _noise_explains(result):
+    if result.noise_explains:
         return f"{words} rms (predicted)"
-    seen = "{:.4f} N, {:.5f} N·m".format(*likely_error(result))
+    seen = "{:.4f} N, {:.5f} N·m".format(*result.likely_error())
     why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
     return f"{seen} rms (cross-validated, as {why}; predicted: {words})"
-
-
-def likely_error(result: CalibrationResult) -> Array:
-    """Root mean square error (2,) of compensating a free tool over all orientations, N and N·m.
-
-    What noise makes uncertain says it all only where the measured noise explains the residuals. Elsewhere it is the
-    larger of that and of the error in predicting each pose from all others.
-    """
-    predicted = np.array(result.predicted_error())
-    if _noise_explains(result):
-        return predicted
-    left_out = [result.quality["loo_force_rms_N"], result.quality["loo_torque_rms_Nm"]]
-    return np.asarray(np.maximum(predicted, left_out))
-
-
-def _noise_explains(result: CalibrationResult) -> bool:
-    """Whether the residuals agree with the noise model; True for files of the first version, which do not say."""
-    return not result.quality or (result.p_value is not None and result.p_value >= SURE)
 
 
 def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:

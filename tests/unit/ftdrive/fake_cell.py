@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +18,7 @@ from calib.model import Parameters
 from calib.routine import Sampling
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, DriverError
+from drivers.follow import Follow
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import Declined
@@ -218,6 +220,9 @@ class FakeSensor(ForceTorqueSensor):
             rows,
             np.zeros(n, np.uint32),
         )
+
+    def follow(self) -> AbstractContextManager[Follow[FtSamples]]:
+        raise NotImplementedError
 
     def latest(self, *, timeout_s: float) -> FtSamples:
         assert timeout_s == 0

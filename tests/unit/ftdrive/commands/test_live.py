@@ -17,7 +17,6 @@ from calib.model import predict
 from calib.published.yu import SPECIAL_R_flange_base
 from drivers.interfaces import Health
 from ftdrive.commands import live
-from ftdrive.terminal.report import likely_error
 
 
 class Slow:
@@ -139,7 +138,7 @@ def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
     calibration = solve(
         CalibrationDataset(R, predict(truth, R) + off, cov, np.zeros(24, np.int64), np.full(24, np.nan)), known=known
     )
-    headline = likely_error(calibration)
+    headline = calibration.likely_error()
     assert (headline > 1.1 * np.array(calibration.predicted_error())).all()
     mean = PoseMean(np.zeros(6), np.zeros((6, 6)), 20)
     beyond = live._beyond_noise(calibration)

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from calib.errors import TooFewSamples
 from calib.model import Array
 from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
 from drivers.errors import DeviceFault, DeviceTimeout, StreamBroken
+from drivers.follow import Follow
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
 from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.hand_guided import Recorder, collect_manually
@@ -118,6 +120,9 @@ class Cell(ForceTorqueSensor):
     def close(self) -> None: ...
 
     def identify(self) -> DeviceInfo:
+        raise AssertionError
+
+    def follow(self) -> AbstractContextManager[Follow[FtSamples]]:
         raise AssertionError
 
     def latest(self, *, timeout_s: float) -> FtSamples:

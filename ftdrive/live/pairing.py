@@ -1,0 +1,299 @@
+"""Wrench and pose on one time axis: times of measurement, the delay between the two links, the pose at each wrench.
+
+A sample is received some time after it was measured, and never before. `Timeline` therefore lays a straight line under
+the times of receipt over the device's own count; the device's clock may drift slowly. What the line cannot show is the
+shortest delay of each link. Only the difference between the two links matters, and `DelayEstimator` finds it from
+motion.
+"""
+
+import math
+from collections import deque
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.errors import BadDataset
+from drivers.interfaces import ArmStates, Array, FtSamples
+from ftdrive.live.delay import DelayEstimator
+from ftdrive.live.samples import Ns, Paired
+
+_BUCKET_S, _BUCKETS = 0.25, 40
+_LEAST_SPAN_S = 2.0
+"""Before, the rate of the device counts as the nominal one."""
+_SLEW = 0.05
+"""Times never jump and never run backwards: they approach a better estimate at this fraction of the time passing."""
+_PASSES = 4
+"""A recording is paired so often until its delay has converged."""
+_LOST_S = 1.0
+"""A device whose count is so far from the line has restarted."""
+
+
+class Timeline:
+    """Time of measurement of every sample of one device: the supporting line below its times of receipt.
+
+    Each quarter of a second contributes its least delayed sample. Of the last ten seconds' samples, the edge of the
+    lower convex hull at their middle is the line: the clock skew estimator of Moon, Skelly, Towsley, INFOCOM 1999.
+
+    Parameters
+    ----------
+    period_s : float
+        Nominal duration of one count: 1 for a clock in seconds, 1 / rate for a sample number. NaN is unknown; then the
+        first two seconds keep their times of receipt.
+    """
+
+    def __init__(self, period_s: float = 1.0) -> None:
+        self.shift_s = 0.0
+        """Subtracted from every time; a change is followed slowly."""
+        self._nominal_ns = period_s * 1e9
+        self._restart()
+
+    def _restart(self) -> None:
+        self._points: deque[tuple[float, float]] = deque(maxlen=_BUCKETS)
+        self._origin: tuple[float, int] | None = None
+        self._slope, self._offset = self._nominal_ns, 0.0
+        self._last: tuple[float, float] | None = None
+
+    def stamp(self, count: Array, t_host_ns: Ns) -> Ns:
+        """Return the times of measurement (n,) of samples with these counts (n,) and times of receipt (n,)."""
+        if self._origin is None:
+            self._origin = float(count[0]), int(t_host_ns[0])
+        x, y = count - self._origin[0], (t_host_ns - self._origin[1]).astype(np.float64)
+        if math.isnan(self._slope):  # keep the times of receipt until they show the rate
+            self._learn_rate(x, y)
+            return t_host_ns
+        behind_ns = y - self._slope * x
+        k = int(np.argmin(behind_ns))
+        if self._last is not None and (
+            x[0] <= self._last[0] or abs(behind_ns[k] - self._offset) > _LOST_S * 1e9  # the device has restarted
+        ):
+            self._restart()
+            return self.stamp(count, t_host_ns)
+        self._note(float(x[k]), float(y[k]))
+        end = self._slope * x[-1] + self._offset - self.shift_s * 1e9
+        if self._last is None:
+            times = self._slope * (x - x[-1]) + end
+        else:
+            x_0, y_0 = self._last
+            due = self._slope * (x[-1] - x_0)
+            end = min(max(end, y_0 + (1 - _SLEW) * due), y_0 + (1 + _SLEW) * due)
+            times = y_0 + (x - x_0) * ((end - y_0) / (x[-1] - x_0))
+        self._last = float(x[-1]), float(end)
+        return np.asarray(self._origin[1] + np.rint(times).astype(np.int64))
+
+    def _learn_rate(self, x: Array, y: Array) -> None:
+        self._points.append((float(x[-1]), float(y[-1])))
+        (x_0, y_0), (x_1, y_1) = self._points[0], self._points[-1]
+        if y_1 - y_0 > _LEAST_SPAN_S * 1e9:
+            self._slope = (y_1 - y_0) / (x_1 - x_0)
+            self._offset = float((y - self._slope * x).min())
+            self._points.clear()
+
+    def _note(self, x: float, y: float) -> None:
+        """Keep the least delayed sample of each bucket, and fit the line."""
+        width = _BUCKET_S * 1e9 / self._slope
+        if not self._points or x // width > self._points[-1][0] // width:
+            self._points.append((x, y))
+        elif y - self._slope * x < self._points[-1][1] - self._slope * self._points[-1][0]:
+            self._points[-1] = x, y
+        elif len(self._points) > 1:
+            return
+        hull: list[tuple[float, float]] = []
+        for point in self._points:
+            while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
+                hull.pop()
+            hull.append(point)
+        if (hull[-1][0] - hull[0][0]) * self._slope < _LEAST_SPAN_S * 1e9:
+            self._offset = min(b - self._slope * a for a, b in self._points)
+            return
+        middle = sum(a for a, _ in self._points) / len(self._points)
+        (x_0, y_0), (x_1, y_1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
+        self._slope = (y_1 - y_0) / (x_1 - x_0)
+        self._offset = y_0 - self._slope * x_0
+
+
+def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+class PoseTrack:
+    """Poses of the flange over time, interpolated to any time between the first and the last.
+
+    Positions and joint angles are interpolated linearly, orientations by slerp: constant angular velocity.
+
+    Parameters
+    ----------
+    keep_s : float
+        Older poses are dropped.
+    """
+
+    def __init__(self, keep_s: float = math.inf) -> None:
+        self._keep_s = keep_s
+        self._t_ns = np.empty(0, np.int64)
+        self._columns = np.empty((0, 14))  # unit quaternion x y z w, position, joint angles, half the angle to the next
+
+    @property
+    def span_ns(self) -> tuple[int, int] | None:
+        """First and last time; None while there is no pose."""
+        return (int(self._t_ns[0]), int(self._t_ns[-1])) if len(self._t_ns) else None
+
+    def add(self, t_host_ns: Ns, q_rad: Array, R_base_flange: Array, p_base_flange_m: Array) -> None:
+        """Append n poses; one that is not later than the pose before it is dropped."""
+        newest = self._t_ns[-1] if len(self._t_ns) else np.iinfo(np.int64).min
+        later = t_host_ns > np.maximum.accumulate(np.concatenate([[newest], t_host_ns[:-1]]))
+        if not later.any():
+            return
+        new = np.zeros((int(later.sum()), 14))
+        new[:, :4] = Rotation.from_matrix(R_base_flange[later]).as_quat()
+        new[:, 4:7], new[:, 7:13] = p_base_flange_m[later], q_rad[later]
+        t_ns = np.concatenate([self._t_ns, t_host_ns[later]])
+        columns = np.concatenate([self._columns, new])
+        start = max(0, len(self._t_ns) - 1)
+        quat = columns[start:, :4]
+        # q and -q are one orientation: take the one on the side of its predecessor
+        side = np.where((quat[1:] * quat[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+        quat[1:] *= np.cumprod(side)[:, None]
+        chord = np.linalg.norm(np.diff(quat, axis=0), axis=1)
+        columns[start:-1, 13] = np.maximum(2 * np.arcsin(np.minimum(chord / 2, 1.0)), 1e-9)
+        keep = 0
+        if math.isfinite(self._keep_s):
+            keep = int(np.searchsorted(t_ns, t_ns[-1] - round(self._keep_s * 1e9)))
+        self._t_ns, self._columns = t_ns[keep:], columns[keep:]
+
+    def at(self, t_ns: Ns) -> tuple[Array, Array, Array]:
+        """Return joint angles (n, 6), R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) at times inside `span_ns`."""
+        if len(self._t_ns) == 1:
+            i = np.zeros(len(t_ns), np.intp)
+            before = after = self._columns[i]
+            f = np.zeros((len(t_ns), 1))
+        else:
+            i = np.clip(np.searchsorted(self._t_ns, t_ns, "right") - 1, 0, len(self._t_ns) - 2)
+            before, after = self._columns[i], self._columns[i + 1]
+            f = ((t_ns - self._t_ns[i]) / (self._t_ns[i + 1] - self._t_ns[i]))[:, None]
+        linear = before[:, 4:13] + f * (after[:, 4:13] - before[:, 4:13])
+        angle = np.maximum(before[:, 13:], 1e-9)
+        quat = (np.sin((1 - f) * angle) * before[:, :4] + np.sin(f * angle) * after[:, :4]) / np.sin(angle)
+        return linear[:, 3:], _matrices(quat), linear[:, :3]
+
+
+def _matrices(quat: Array) -> Array:
+    """Rotation matrices (n, 3, 3) of unit quaternions x y z w (n, 4)."""
+    x, y, z, w = quat.T
+    x2, y2, z2 = x + x, y + y, z + z
+    xx, yy, zz = x * x2, y * y2, z * z2
+    xy, xz, yz, wx, wy, wz = x * y2, x * z2, y * z2, w * x2, w * y2, w * z2
+    columns = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
+    return np.stack(columns, axis=1).reshape(-1, 3, 3)
+
+
+class Pairing:
+    """Puts the samples of both links on one time axis and finds the pose of each wrench.
+
+    Parameters
+    ----------
+    sensor_rate_Hz : float
+        Nominal; NaN where unknown. Used where the sensor has no clock of its own.
+    delay : DelayEstimator or float
+        Finds the delay of the wrench after the pose, or is that delay in s.
+    """
+
+    def __init__(self, sensor_rate_Hz: float, delay: DelayEstimator | float) -> None:
+        self._estimator = delay if isinstance(delay, DelayEstimator) else None
+        self._rate_Hz = sensor_rate_Hz
+        self._sensor: Timeline | None = None
+        self._arm = Timeline()
+        self._poses = PoseTrack(keep_s=2.0)
+        self._waiting: list[tuple[FtSamples, Ns]] = []
+        self._delay_s = 0.0 if isinstance(delay, DelayEstimator) else delay
+
+    @property
+    def delay_s(self) -> float:
+        """Of the wrench after the pose."""
+        return self._estimator.delay_s if self._estimator else self._delay_s
+
+    @property
+    def delay_sigma_s(self) -> float:
+        """One standard deviation; 0 if the delay is configured."""
+        return self._estimator.sigma_s if self._estimator else 0.0
+
+    def add_states(self, states: ArmStates) -> None:
+        """Add what the arm has sent."""
+        if not len(states.t_host_ns):
+            return
+        has_clock = bool(np.isfinite(states.t_device_s).all())
+        t_ns = self._arm.stamp(states.t_device_s, states.t_host_ns) if has_clock else states.t_host_ns
+        self._poses.add(t_ns, states.q_rad, states.R_base_flange, states.p_base_flange_m)
+
+    def add_samples(self, samples: FtSamples) -> None:
+        """Add what the sensor has sent."""
+        if not len(samples):
+            return
+        has_clock = bool(np.isfinite(samples.t_device_s).all())
+        if self._sensor is None:
+            self._sensor = Timeline(1.0 if has_clock else 1 / self._rate_Hz)
+        self._sensor.shift_s = self.delay_s
+        count = samples.t_device_s if has_clock else samples.seq.astype(np.float64)
+        self._waiting.append((samples, self._sensor.stamp(count, samples.t_host_ns)))
+
+    def take(self) -> Paired | None:
+        """Return the samples whose pose is known by now; None if there is none.
+
+        Samples before the first pose are dropped.
+        """
+        if not self._waiting or (span_ns := self._poses.span_ns) is None:
+            return None
+        samples = FtSamples.concatenate([block for block, _ in self._waiting])
+        t_ns = np.concatenate([times for _, times in self._waiting])
+        first, end = np.searchsorted(t_ns, span_ns[0]), np.searchsorted(t_ns, span_ns[1], "right")
+        self._waiting = [(samples.rows(slice(end, None)), t_ns[end:])] if end < len(t_ns) else []
+        if first >= end:
+            return None
+        paired = paired_with(self._poses, t_ns[first:end], samples.rows(slice(first, end)))
+        if self._estimator:
+            self._estimator.add(paired)
+        return paired
+
+    def forget(self) -> None:
+        """Drop what waits, after an interruption of either link."""
+        self._waiting = []
+        self._poses = PoseTrack(keep_s=2.0)
+
+
+def paired_with(poses: PoseTrack, t_ns: Ns, samples: FtSamples) -> Paired:
+    """Give each sample the pose at its time, which must be inside the track."""
+    return Paired(t_ns, samples.t_device_s, samples.seq, samples.status, samples.wrench, *poses.at(t_ns))
+
+
+def pair_recording(samples: FtSamples, states: ArmStates, delay: DelayEstimator | float) -> Paired:
+    """Pair a recording whose times are those of measurement; both are sorted by time.
+
+    Parameters
+    ----------
+    samples, states
+        Samples before the first and after the last state are dropped.
+    delay : DelayEstimator or float
+        An estimator with a window as long as the recording, which then has the result; or the delay of the wrench after
+        the pose in s.
+
+    Raises
+    ------
+    BadDataset
+        The two do not overlap.
+    """
+    poses = PoseTrack()
+    poses.add(states.t_host_ns, states.q_rad, states.R_base_flange, states.p_base_flange_m)
+
+    def paired(delay_s: float) -> Paired:
+        t_ns = samples.t_host_ns - round(delay_s * 1e9)
+        span_ns = poses.span_ns or (0, -1)
+        inside = slice(*np.searchsorted(t_ns, [span_ns[0], span_ns[1] + 1]).tolist())
+        if not len(t_ns[inside]):
+            raise BadDataset("wrench and pose have no time in common: give files of the same recording and one clock")
+        return paired_with(poses, t_ns[inside], samples.rows(inside))
+
+    if not isinstance(delay, DelayEstimator):
+        return paired(delay)
+    for _ in range(_PASSES):
+        delay.restart()
+        delay.add(paired(delay.delay_s))
+    return paired(delay.delay_s)

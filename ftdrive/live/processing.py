@@ -1,0 +1,399 @@
+"""From paired samples to a block: stages, frame, uncertainty, contact, tare, drift."""
+
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+
+from calib.compensation import Compensator
+from calib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
+from calib.errors import BadDataset
+from calib.extras.inertia import REACH_S, inertial_wrench, motion_of_poses
+from calib.extras.update import Calibrated, tare
+from calib.files import JSON
+from calib.likelihood.gain_and_cross_talk import predicted_covariance
+from drivers.interfaces import Array
+from ftdrive.errors import ConfigError
+from ftdrive.live.contact import Contact, ContactTest, ContactTracker
+from ftdrive.live.drift import DriftFilter
+from ftdrive.live.filters import LOWPASS_ORDER, NOTCH_Q, Filter, deadband
+from ftdrive.live.frames import FrameTransform
+from ftdrive.live.noise import NoiseEstimator
+from ftdrive.live.samples import Block, EventKind, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame
+
+SENSOR_FRAME = WrenchFrame()
+STANDARD = Stages()
+FALSE_ALARM_RATE = 1e-3
+TARE_S = 0.5
+TARE_DRIFT_N, TARE_DRIFT_NM = 0.5, 0.015
+"""A tare accepts this much drift of the bias since the calibration or the tare before, one standard deviation."""
+
+_KNOT_S = 0.002
+"""Poses of this spacing give the acceleration."""
+_STILL_RAD, _STILL_M = 5e-4, 5e-4
+"""Largest motion of the flange during a tare."""
+_DRIFT_SIGMAS = 5.0
+
+
+class Processor:
+    """Compensates paired samples, one block after the other; a whole recording may be one block.
+
+    Parameters
+    ----------
+    info : StreamInfo
+    frame : WrenchFrame
+    stages : Stages
+    false_alarm_rate : float
+        Share of independent readings of a free tool that count as contact. See `ftdrive.live.contact`.
+    inertia_com_kg_m2 : array, shape (3, 3), optional
+        Inertia of the load about its centre of mass, in sensor axes; without it the load counts as a point.
+
+    Raises
+    ------
+    ConfigError
+        Frame or stages need something that is not configured.
+    """
+
+    def __init__(
+        self,
+        info: StreamInfo,
+        frame: WrenchFrame = SENSOR_FRAME,
+        stages: Stages = STANDARD,
+        *,
+        false_alarm_rate: float = FALSE_ALARM_RATE,
+        inertia_com_kg_m2: Array | None = None,
+    ) -> None:
+        self.info = info
+        calibration = info.calibration
+        self._compensator: Compensator = calibration.compensator
+        self._inertia = inertia_com_kg_m2
+        self._tares: list[tuple[Calibrated, int]] = [(calibration, 0)]
+        likely_error = calibration.likely_error()
+        self._usual_error_N = float(likely_error[0])
+        beyond = likely_error**2 - np.square(calibration.predicted_error())
+        self._beyond = np.repeat(beyond / 3, 3)
+        self._noise = NoiseEstimator(info.sensor_rate_Hz)
+        self._test = ContactTest(info.sensor_rate_Hz, false_alarm_rate, self._beyond)
+        self._tracker = ContactTracker()
+        self._drift = DriftFilter()
+        self._drift_warned = False
+        self._recent: deque[Paired] = deque()
+        self._stride = max(1, round(_KNOT_S * info.sensor_rate_Hz))
+        knot_s = self._stride / info.sensor_rate_Hz
+        self._reach = max(2, round(max(REACH_S, 2 / info.arm_rate_Hz) / knot_s))
+        self._buffer: Paired | None = None
+        self._done = 0
+        """Rows of the buffer that are processed; they remain as neighbours for the acceleration."""
+        self._newest_ns = 0
+        self._newest_seq: int | None = None
+        self._events: list[StreamEvent] = []
+        self._frame, self._transform = frame, FrameTransform(frame, info)
+        self._stages, self._filter = stages, self._filter_of(stages)
+
+    # ------------------------------------------------------------------------------------------------ what is settable
+
+    @property
+    def frame(self) -> WrenchFrame:
+        """Axes and reference point of the wrench; setting them is an event. Raises `ConfigError`."""
+        return self._frame
+
+    @frame.setter
+    def frame(self, frame: WrenchFrame) -> None:
+        if frame != self._frame:
+            self._transform = FrameTransform(frame, self.info)
+            self._report_contacts(self._tracker.end())
+            self._frame = frame
+            self._note("frame", str(frame), {"axes": frame.axes, "about": _listed(frame.about)})
+
+    @property
+    def stages(self) -> Stages:
+        """What is done to the raw wrench; setting it is an event. Raises `ConfigError`."""
+        return self._stages
+
+    @stages.setter
+    def stages(self, stages: Stages) -> None:
+        if stages != self._stages:
+            self._filter = self._filter_of(stages)
+            self._stages = stages
+            self._note("stages", stages_in_words(stages), {})
+
+    def _filter_of(self, stages: Stages) -> Filter:
+        if stages.inertia and not np.isfinite(self.info.p_flange_sensor_m).all():
+            raise ConfigError(
+                "the inertia stage needs the position of the sensor: set [sensor] height_mm, the height of its origin "
+                "above the flange face"
+            )
+        return Filter(stages, self.info.sensor_rate_Hz)
+
+    # ------------------------------------------------------------------------------------------------------ processing
+
+    def process(self, paired: Paired, *, last: bool = False) -> Block:
+        """Process the next samples.
+
+        With the inertia stage the last milliseconds wait for the poses after them, unless these samples are the `last`;
+        a block may then be empty.
+        """
+        self._note_gaps(paired)
+        self._recent.append(paired)
+        since_ns = int(paired.t_host_ns[-1]) - round(TARE_S * 1e9)
+        while self._recent[0].t_host_ns[-1] < since_ns:
+            self._recent.popleft()
+        self._newest_ns = int(paired.t_host_ns[-1])
+        buffer = paired if self._buffer is None else Paired.concatenate([self._buffer, paired])
+        end, inertial = len(buffer), None
+        neighbours = self._reach * self._stride
+        if self._stages.inertia:
+            inertial, ready = self._inertial(buffer)
+            end = end if last else max(ready, self._done)
+            inertial = inertial[self._done : end]
+        rows = buffer.rows(slice(self._done, end))
+        keep = max(0, end - neighbours - self._stride)
+        self._buffer, self._done = buffer.rows(slice(keep, None)), end - keep
+        block = self._processed(rows, inertial)
+        if last:
+            self._report_contacts(self._tracker.end())
+        return block
+
+    def _inertial(self, buffer: Paired) -> tuple[Array, int]:
+        """Return the inertial wrench of all rows, and the number of those with neighbours on both sides."""
+        knots = np.arange(0, len(buffer), self._stride)
+        if len(knots) < 2 * self._reach + 2:
+            return np.zeros((len(buffer), 6)), 0
+        t_s = (buffer.t_host_ns - buffer.t_host_ns[0]) * 1e-9
+        knots = knots[np.diff(t_s[knots], prepend=-1.0) > 0]
+        parameters = self.info.calibration.parameters
+        motion = motion_of_poses(
+            t_s[knots],
+            buffer.R_base_flange[knots],
+            buffer.p_base_flange_m[knots],
+            R_flange_sensor=parameters.R_flange_sensor,
+            p_flange_sensor_m=self.info.p_flange_sensor_m,
+            reach=self._reach,
+        )
+        mass_kg = self.info.calibration.mass_kg
+        at_knots = inertial_wrench(mass_kg, parameters.p_sensor_com_m, motion, self._inertia)
+        wrench = np.stack([np.interp(t_s, motion.t_s, column) for column in at_knots.T], axis=1)
+        return wrench, int(knots[-1 - self._reach]) + 1
+
+    def _processed(self, rows: Paired, inertial: Array | None) -> Block:
+        stages, calibration = self._stages, self.info.calibration
+        n = len(rows)
+        gravity = rows.R_base_flange.reshape(-1, 9) @ self._compensator.matrix.T
+        bias = self._compensator.offset if self.tare_wrench is None else self._compensator.offset + self.tare_wrench
+        # chi2 is that of a free tool, whatever is switched off
+        residual = rows.raw - gravity - bias
+        if inertial is not None:
+            residual -= inertial
+        if n:
+            self._noise.add(residual, rows.R_base_flange, rows.p_base_flange_m)
+        current = self._tares[-1][0]
+        uncertain = (current.parameters, current.covariance, calibration.response)
+        self._test.expect(self._noise.noise, uncertain)
+        if n:
+            readings, chi2 = self._test.judge(residual, rows.R_base_flange)
+        else:
+            readings, chi2 = np.empty((0, 6)), np.empty(0)
+        in_contact = chi2 > self._test.limit
+        wrench = residual
+        if not stages.gravity:
+            wrench = wrench + gravity
+        if not stages.bias:
+            wrench = wrench + bias
+        wrench = self._transform(self._filter(wrench), rows.R_base_flange)
+        wrench = deadband(wrench, stages.deadband_N, stages.deadband_Nm)
+        if self._tracker.open is not None or in_contact.any():
+            readings = self._transform(readings, rows.R_base_flange)
+            self._report_contacts(self._tracker.follow(rows.t_host_ns, in_contact, readings))
+        self._follow_drift(rows, residual)
+        return Block(
+            rows.t_host_ns,
+            rows.t_device_s,
+            rows.seq,
+            rows.status,
+            rows.raw,
+            wrench,
+            chi2,
+            in_contact,
+            rows.q_rad,
+            rows.R_base_flange,
+            rows.p_base_flange_m,
+            self._sigma(rows),
+            self._frame,
+            stages,
+        )
+
+    def _sigma(self, rows: Paired) -> Array:
+        """Standard deviation (6,) of one sample in the frame; NaN until the noise is known."""
+        noise = self._noise.noise
+        if noise is None or not len(rows):
+            return np.full(6, np.nan)
+        covariance = noise.sample * self._filter.power_gain
+        R = rows.R_base_flange[-1]
+        if self._stages.gravity or self._stages.bias:
+            covariance = covariance + self._uncertainty(R)
+        T = self._transform.matrix(R)
+        return np.asarray(np.sqrt(np.diag(T @ covariance @ T.T)))
+
+    def _uncertainty(self, R_base_flange: Array) -> Array:
+        """Covariance (6, 6) of the prediction of a free tool, sensor axes."""
+        current = self._tares[-1][0]
+        predicted = predicted_covariance(
+            current.parameters, current.covariance, self.info.calibration.response, R_base_flange
+        )
+        return np.asarray(predicted + np.diag(self._beyond))
+
+    # ---------------------------------------------------------------------------------------------------------- events
+
+    def take_events(self) -> list[StreamEvent]:
+        """Return the events since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def mark(self, text: str) -> StreamEvent:
+        """Add a mark of the operator."""
+        return self._note("mark", text, {})
+
+    def _note(self, kind: EventKind, text: str, values: Mapping[str, JSON], t_ns: int | None = None) -> StreamEvent:
+        event = StreamEvent(self._newest_ns if t_ns is None else t_ns, kind, text, values)
+        self._events.append(event)
+        return event
+
+    def _note_gaps(self, paired: Paired) -> None:
+        before = int(paired.seq[0]) - 1 if self._newest_seq is None else self._newest_seq
+        self._newest_seq = int(paired.seq[-1])
+        if self._newest_seq - before == len(paired):
+            return
+        missing = np.diff(paired.seq, prepend=before) - 1
+        for i in np.flatnonzero(missing > 0):
+            lost = int(missing[i])
+            text = f"{lost} sample{'s' if lost > 1 else ''} lost before sample {int(paired.seq[i])}"
+            self._note("gap", text, {"lost": lost, "seq": int(paired.seq[i])}, int(paired.t_host_ns[i]))
+
+    def _report_contacts(self, contacts: list[Contact]) -> None:
+        for contact in contacts:
+            values: dict[str, JSON] = {
+                "duration_s": contact.duration_s,
+                "peak_N": contact.peak_N,
+                "peak_wrench": contact.peak.tolist(),
+                "direction": contact.direction.tolist(),
+                "line_point_m": contact.line_m.tolist(),
+                "line_distance_m": float(np.linalg.norm(contact.line_m)),
+                "axes": self._frame.axes,
+                "about": _listed(self._frame.about),
+            }
+            words = f"contact {contact.peak_N:.1f} N, {contact.duration_s:.1f} s"
+            self._note("contact", words, values, contact.begin_ns)
+
+    # ---------------------------------------------------------------------------------------------------- bias, noise
+
+    @property
+    def tare_wrench(self) -> Array | None:
+        """(6,) change of the bias by tares, N and N·m, sensor axes; None without a tare."""
+        if len(self._tares) == 1:
+            return None
+        new, old = self._tares[-1][0].parameters, self.info.calibration.parameters
+        return np.concatenate([new.force_bias_N - old.force_bias_N, new.torque_bias_Nm - old.torque_bias_Nm])
+
+    @property
+    def tare_t_host_ns(self) -> int | None:
+        """Time of the last tare; None without one."""
+        return self._tares[-1][1] if len(self._tares) > 1 else None
+
+    def tare(self) -> StreamEvent:
+        """Set the bias so that the free tool reads zero in the last half second, or refuse.
+
+        It is refused when arm or reading are not still, and when the reading differs from the prediction of a free tool
+        by more than noise, calibration and a usual drift explain. The returned event has the reason.
+        """
+        if not self._recent:
+            return self._note("tare-refused", "tare refused: no sample yet; tare again", {})
+        rows = Paired.concatenate(list(self._recent))
+        R = rows.R_base_flange[-1]
+        moved = np.abs(rows.R_base_flange - R).max() > _STILL_RAD
+        moved |= bool((np.abs(rows.p_base_flange_m - rows.p_base_flange_m[-1]) > _STILL_M).any())
+        enough = len(rows) >= LEAST_SAMPLES and rows.t_host_ns[-1] - rows.t_host_ns[0] > 0.5e9 * TARE_S
+        if moved or not enough:
+            why = "the arm moves" if moved else "too few samples"
+            return self._note("tare-refused", f"tare refused: {why}; tare again when it has rested 0.5 s", {})
+        # the weight as the sensor responds to it, which `calib.extras.update.tare` does not know
+        gravity = R.reshape(-1) @ (self._compensator.matrix - Compensator(self.info.calibration.parameters).matrix).T
+        dwell = rows.raw - gravity
+        current = self._tares[-1][0]
+        bias = np.concatenate([current.parameters.force_bias_N, current.parameters.torque_bias_Nm])
+        mean = mean_and_covariance(dwell)
+        change = rows.raw.mean(axis=0) - R.reshape(-1) @ self._compensator.matrix.T - bias
+        drift = np.diag(np.repeat([TARE_DRIFT_N**2, TARE_DRIFT_NM**2], 3))
+        total = mean.covariance + self._uncertainty(R) + drift
+        sigmas = float(np.sqrt(change @ np.linalg.solve(total, change)))
+        force_N, torque_Nm = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
+        values: dict[str, JSON] = {"change": change.tolist(), "force_N": force_N, "sigmas": sigmas}
+        difference = f"{force_N:.2f} N and {torque_Nm:.3f} N·m ({sigmas:.1f} sigma)"
+        if not is_stationary(dwell):
+            return self._note("tare-refused", "tare refused: the reading changes; free the tool, then tare", values)
+        try:
+            update = tare(current, R[None], [dwell], drift_N=TARE_DRIFT_N, drift_Nm=TARE_DRIFT_NM)
+        except BadDataset:
+            text = f"tare refused: {difference} from the free tool; take hand or contact away, then tare"
+            return self._note("tare-refused", text, values)
+        self._set_tare([*self._tares, (update, self._newest_ns)])
+        return self._note("tare", f"tare: bias changed by {difference}", values)
+
+    def undo_tare(self) -> StreamEvent:
+        """Take the last tare back."""
+        if len(self._tares) == 1:
+            return self._note("tare-refused", "there is no tare to undo", {})
+        self._set_tare(self._tares[:-1])
+        return self._note(
+            "tare-undone", "tare undone", {"tare": None if (t := self.tare_wrench) is None else t.tolist()}
+        )
+
+    def _set_tare(self, tares: list[tuple[Calibrated, int]]) -> None:
+        before, self._tares = self.tare_wrench, tares
+        now = np.zeros(6) if self.tare_wrench is None else self.tare_wrench
+        self._drift.shift(now - (np.zeros(6) if before is None else before))
+        self._test.restart()
+        self._filter = self._filter_of(self._stages)
+
+    @property
+    def drift_N_h(self) -> tuple[float, float]:
+        """Drift of the force bias and one standard deviation, N/h."""
+        return self._drift.force_rate_N_h
+
+    @property
+    def contact_limit(self) -> float:
+        """Of `Block.chi2`."""
+        return self._test.limit
+
+    @property
+    def false_alarm_rate(self) -> float:
+        """Share of independent readings of a free tool beyond the limit."""
+        return self._test.false_alarm_rate
+
+    def _follow_drift(self, rows: Paired, residual: Array) -> None:
+        noise = self._noise.noise
+        if noise is None or not self._drift.follow(
+            rows.t_host_ns, residual, rows.R_base_flange, noise, self._uncertainty
+        ):
+            return
+        rate, sigma = self._drift.force_rate_N_h
+        worth = max(self._usual_error_N, _DRIFT_SIGMAS * sigma)
+        if rate > worth and not self._drift_warned:
+            text = f"the bias drifts by {rate:.2g} ± {sigma:.1g} N/h (1 sigma); tare when the tool is free"
+            self._note("drift", text, {"drift_N_h": rate, "sigma_N_h": sigma})
+        self._drift_warned = rate > (0.5 if self._drift_warned else 1.0) * worth
+
+
+def stages_in_words(stages: Stages) -> str:
+    """Return the stages that are on, in their order."""
+    words = ["raw"] + [name for name in ("bias", "gravity", "inertia") if getattr(stages, name)]
+    if stages.notch_Hz is not None:
+        words.append(f"notch {stages.notch_Hz:g} Hz (Q {NOTCH_Q:g})")
+    if stages.lowpass_Hz is not None:
+        words.append(f"low-pass {stages.lowpass_Hz:g} Hz (Butterworth, order {LOWPASS_ORDER})")
+    if stages.deadband_N or stages.deadband_Nm:
+        words.append(f"deadband {stages.deadband_N:g} N, {stages.deadband_Nm:g} N·m")
+    return ", ".join(words)
+
+
+def _listed(about: str | tuple[float, float, float]) -> JSON:
+    return about if isinstance(about, str) else list(about)
