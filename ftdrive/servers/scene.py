@@ -33,29 +33,27 @@ def stamp(t_utc_ns: int) -> Timestamp:
 def transforms(block: Block, info: StreamInfo, t_utc_ns: int) -> FrameTransforms:
     """Return the frames of the last sample of a block: flange in base; sensor, tcp and the wrench's frame in flange."""
     R_base_flange = block.R_base_flange[-1]
-    places = {
-        "sensor": (info.calibration.R_flange_sensor, info.p_flange_sensor_m),
-        "tcp": (info.R_flange_tcp, info.p_flange_tcp_m),
-    }
-    places.setdefault(ros2.frame_id(block.frame), _wrench_frame(block.frame, R_base_flange, info))
+    places = {"sensor": (info.calibration.R_flange_sensor, info.p_flange_sensor_m)}
+    if np.isfinite(info.p_flange_tcp_m).all():
+        places["tcp"] = (info.R_flange_tcp, info.p_flange_tcp_m)
+    if (name := ros2.frame_id(block.frame)) not in ("base", "flange", *places):
+        places[name] = _wrench_frame(block.frame, R_base_flange, info)
     return FrameTransforms(
         transforms=[
-            FrameTransform(
-                timestamp=stamp(t_utc_ns),
-                parent_frame_id=parent,
-                child_frame_id=child,
-                translation=_vector(np.nan_to_num(p)),  # a sensor whose position is not configured: at the flange
-                rotation=Quaternion(**dict(zip("xyzw", Rotation.from_matrix(R).as_quat().tolist(), strict=True))),
-            )
-            for parent, child, (R, p) in [
-                ("base", "flange", (R_base_flange, block.p_base_flange_m[-1])),
-                *(
-                    ("flange", name, (R, p))
-                    for name, (R, p) in places.items()
-                    if name != "flange" and np.isfinite(R).all()
-                ),
-            ]
+            _transform("base", "flange", R_base_flange, block.p_base_flange_m[-1], t_utc_ns),
+            *(_transform("flange", name, R, p, t_utc_ns) for name, (R, p) in places.items()),
         ]
+    )
+
+
+def _transform(parent: str, child: str, R: Array, p_m: Array, t_utc_ns: int) -> FrameTransform:
+    x, y, z = np.nan_to_num(p_m).tolist()  # a sensor at an unknown height is drawn at the flange
+    return FrameTransform(
+        timestamp=stamp(t_utc_ns),
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=Vector3(x=x, y=y, z=z),
+        rotation=Quaternion(**dict(zip("xyzw", Rotation.from_matrix(R).as_quat().tolist(), strict=True))),
     )
 
 
@@ -101,7 +99,3 @@ def _arrow(vector_m: Array, color: Color) -> ArrowPrimitive:
         head_diameter=0.8 * _HEAD_M,
         color=color,
     )
-
-
-def _vector(p_m: Array) -> Vector3:
-    return Vector3(**dict(zip("xyz", p_m.tolist(), strict=True)))

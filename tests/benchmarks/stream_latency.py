@@ -85,7 +85,8 @@ def measure(clients: int, duration_s: float) -> bool:
     p50, most = (max((outcome[key] for outcome in outcomes), default=0.0) for key in ("p50", "max"))
     sys.stdout.write(
         f"{clients} clients: latency p50 {p50:.2f} p95 {worst_ms:.2f} max {most:.1f} ms "
-        f"(target p95 {TARGET_P95_MS:g}), lost {lost} of {clients * blocks * n}, write p95 {np.percentile(writing_s, 95) * 1e3:.2f} ms, "
+        f"(target p95 {TARGET_P95_MS:g}), "
+        f"lost {lost} of {clients * blocks * n}, write p95 {np.percentile(writing_s, 95) * 1e3:.2f} ms, "
         f"CPU {100 * cpu_s / duration_s:.1f} %   {'pass' if passed else 'FAIL'}\n"
     )
     return passed

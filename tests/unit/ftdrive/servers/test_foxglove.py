@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -162,6 +163,26 @@ def test_frames_lead_from_base_to_the_frame_of_the_wrench(server: FoxgloveServer
     for name, (R, p) in expected.items():
         assert np.allclose(poses[name][0], R), name
         assert np.allclose(poses[name][1], p), name
+
+
+def test_frames_that_are_not_configured_are_left_out_and_never_nan(stream: FakeStream) -> None:
+    unknown = np.full(3, np.nan)
+    stream.info = replace(INFO, p_flange_sensor_m=unknown, p_flange_tcp_m=unknown)
+    with closing(FoxgloveServer(cast(Any, stream), port=0)) as server, Client.to(server.port) as client:
+        client.subscribe(TRANSFORMS)
+        server.write(block())
+        found = {
+            item.child_frame_id: item for item in read_protobuf(client, TRANSFORMS, client.message()[2]).transforms
+        }
+    assert found.keys() == {"flange", "sensor"}
+    assert numbers(found["sensor"].translation) == [0, 0, 0]
+
+
+def test_a_block_without_samples_sends_nothing(server: FoxgloveServer, client: Client) -> None:
+    client.subscribe(*client.channels)
+    server.write(block(0))
+    server.event(StreamEvent(0, "mark", ""))
+    assert client.message()[0] == EVENTS
 
 
 @pytest.mark.parametrize("force_N", [(3.0, -4.0, 12.0), (-5.0, 0.0, 0.0), (0.0, 0.0, 0.0)])
