@@ -340,6 +340,29 @@ def test_a_client_that_never_reads_delays_nobody(
         assert f"the client {host}:{port} reads too slowly: its oldest messages are dropped" in caplog.text
 
 
+def test_a_slow_client_can_count_what_it_lost(stream: FakeStream, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foxglove, "BACKLOG", 128)
+    with (
+        closing(FoxgloveServer(cast(Any, stream), port=0)) as server,
+        Client.to(server.port, reads=False) as slow,
+    ):
+        slow.subscribe(ros2.RAW, STATUS, EVENTS)
+        for i in range(100):
+            server.write(block(100, 100 * i))
+            server.event(StreamEvent(0, "mark", "long" * 50_000))  # fills the buffers of the system
+        server.write(block(100, 20_000))
+        received, sent = [0], [0]
+        while sent[-1] < 101 * 100:
+            topic, _, payload = slow.message()
+            if topic == STATUS:
+                sent.append(json.loads(payload)["sent"][ros2.RAW])
+                received.append(received[-1])
+            received[-1] += topic == ros2.RAW
+        lost = np.diff(sent) - np.diff(received, prepend=0)[: len(sent) - 1]
+        assert lost[0] == 0
+        assert lost[-1] > 1000
+
+
 def test_without_a_client_nothing_is_packed(server: FoxgloveServer, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise AssertionError
