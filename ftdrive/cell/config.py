@@ -76,6 +76,9 @@ class SensorConfig:
         (0, 20),
         option="--sensor-mass",
     )
+    delay_ms: float | None = entry(
+        "delay of the wrench after the pose; estimated from motion if it is not set", None, "ms", (-100, 100)
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,13 +4,14 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from os import fsdecode
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args
 
 import click
 
 if TYPE_CHECKING:
     from calib import CalibrationResult
     from ftdrive.cell.config import CellConfig
+    from ftdrive.live.samples import Axes, WrenchFrame
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -114,6 +115,31 @@ def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> li
 def rows(option: str, texts: Sequence[str], counts: Sequence[int]) -> list[list[float]] | None:
     """Read a repeatable option, numbers separated by colons; None if it was not given."""
     return [numbers(option, text, ":", counts) for text in texts] or None
+
+
+def FRAME(command: F) -> F:
+    """Add the options --axes and --about, which `read_frame` takes."""
+    about = click.option(
+        "--about",
+        default="sensor",
+        show_default=True,
+        metavar="POINT",
+        help="Reference point of the torque: sensor, flange, tcp, or x,y,z in m from the flange along its axes.",
+    )
+    axes = click.Choice(["sensor", "flange", "base", "tcp"])
+    return click.option("--axes", type=axes, default="sensor", show_default=True, help="Axes of the wrench.")(
+        about(command)
+    )
+
+
+def read_frame(axes: "Axes", about: str) -> "WrenchFrame":
+    """Return axes and reference point from the options; raises `ConfigError`."""
+    from ftdrive.live.samples import Point, WrenchFrame
+
+    if about in get_args(Point):
+        return WrenchFrame(axes, cast("Point", about))
+    x, y, z = numbers("--about", about, ",", [3])
+    return WrenchFrame(axes, (x, y, z))
 
 
 def write_json(value: Mapping[str, Any]) -> None:

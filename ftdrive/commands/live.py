@@ -1,12 +1,11 @@
 """`ftdrive live`: raw and compensated wrench, ten times a second."""
 
-import time
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager, nullcontext
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any
 
 import click
 import numpy as np
@@ -16,41 +15,38 @@ from rich.table import Table
 from rich.text import Text
 
 from calib import CalibrationResult
-from calib.data.dwell_mean import LEAST_SAMPLES, PoseMean, mean_and_covariance
-from drivers.interfaces import Array, DeviceInfo
+from drivers.errors import DriverError
+from drivers.interfaces import Array
 from ftdrive.cell.config import CellConfig
-from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station, sensor_name
-from ftdrive.checks.devices import AXES, belonging
+from ftdrive.checks.devices import AXES
 from ftdrive.commands.common import (
     CELL,
     FOLDER,
+    FRAME,
     JSON,
+    Number,
     check_simulate,
     read_cell,
+    read_frame,
     simulate,
     stop_unless_accepted,
     write_json,
 )
 from ftdrive.commands.emulated_run import rehearse
 from ftdrive.errors import ConfigError
+from ftdrive.live.frames import FrameTransform
+from ftdrive.live.processing import ProcessedStream
+from ftdrive.live.replay import ReplayedStream, replay_run
+from ftdrive.live.samples import Axes, Block, WrenchFrame
+from ftdrive.live.stream import CompensatedStream, load_calibration
 from ftdrive.runs.run import Run
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.keyboard import Keyboard
 
-Axes = Literal["sensor", "flange", "base"]
-
 _PERIOD_S = 0.1
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Look:
-    """The mean of `_PERIOD_S`."""
-
-    mean: PoseMean
-    R_base_flange: Array
-    rate_Hz: float
-    lost: int
+_RECOVER_S = 10.0
+"""So long a stream with an interruption may take to deliver again."""
 
 
 @click.command()
@@ -64,10 +60,10 @@ class Look:
 @CELL
 @simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
 @click.option("--replay", type=FOLDER, help="Show the samples of a recorded run.")
-@click.option(
-    "--axes", type=click.Choice(["sensor", "flange", "base"]), default="sensor", show_default=True, help="Axes to show."
-)
+@click.option("--speed", type=Number(0, min_open=True), help="Of --replay; 1 is that of the recording.")
+@FRAME
 @click.option("--once", is_flag=True, help="Print one reading, then end.")
+@click.option("--plain", is_flag=True, help="Show a table instead of the full screen.")
 @JSON
 def live(
     path: Path | None,
@@ -76,51 +72,65 @@ def live(
     sensor: str | None,
     simulate: bool,
     replay: Path | None,
+    speed: float | None,
     axes: Axes,
+    about: str,
     once: bool,
+    plain: bool,
     as_json: bool,
 ) -> None:
     """Show the raw and the compensated wrench, refreshed ten times a second.
 
-    The compensated wrench is the contact wrench: measured minus bias and gravity. Both are about the sensor origin,
-    along the chosen axes. The arm is only read, never moved. With --json, one object per line.
+    The compensated wrench is the contact wrench: measured minus bias and gravity, along the chosen axes and about the
+    chosen point. The arm is only read, never moved. With --json, one object per line.
     """
     check_simulate(simulate, real={"--config": config, "--robot": robot, "--replay": replay})
-    calibration = None if path is None else _load(path)
+    if speed is not None and replay is None:
+        raise ConfigError("--speed goes only with --replay: add it, or leave --speed out")
+    frame = read_frame(axes, about)
+    calibration = None if path is None else load_calibration(path)
+    name = "temporary calibration" if path is None else str(path)
     with ExitStack() as stack:
         if simulate:
             calibration, cell = _emulated(calibration, sensor, stack)
         if calibration is None:
             raise ConfigError("no calibration: give --calibration PATH, or --simulate")
+        stream: CompensatedStream | ReplayedStream
         if replay is not None:
-            looks = _recorded_looks(Run(replay))
+            stream = replay_run(Run(replay), calibration, name, frame=frame, speed=1.0 if speed is None else speed)
         else:
             if not simulate:
                 cell = read_cell(config, robot, sensor)
-            looks = stack.enter_context(_live_looks(cell, calibration))
-        beyond = _beyond_noise(calibration)
+            stream = stack.enter_context(CompensatedStream(cell, calibration, name=name, frame=frame))
+            for words in stream.warnings:
+                talk.print(f" {words}")
         if once or as_json:
-            for look in looks:
-                reading = _reading(look, calibration, beyond, axes)
-                if as_json:
-                    write_json(reading)
-                else:
-                    click.echo(_line(reading))
-                if once:
-                    break
+            _print(stream, once=once, as_json=as_json)
         else:
-            made = "temporary calibration" if path is None else str(path)
-            stack.enter_context(Keyboard(0) if Keyboard.usable(0) else nullcontext())  # Enter would break the screen
-            with Live(console=talk, refresh_per_second=10) as screen:
-                shown = Group()
-                for look in looks:
-                    shown = _screen(_reading(look, calibration, beyond, axes), made)
-                    screen.update(Group(shown, "Ctrl-C ends"))
-                screen.update(Group(shown, "The recording has ended."))
+            _show_table(stream)
 
 
-def _load(path: Path) -> CalibrationResult:
-    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path)
+def _print(stream: CompensatedStream | ReplayedStream, *, once: bool, as_json: bool) -> None:
+    for look in _looks(stream, raises=once):
+        reading = _reading(look, stream)
+        if as_json:
+            write_json(reading)
+        else:
+            click.echo(_line(reading, stream.frame))
+        if once:
+            break
+
+
+def _show_table(stream: CompensatedStream | ReplayedStream) -> None:
+    shown = Group()
+    with (
+        Keyboard(0) if Keyboard.usable(0) else nullcontext(),  # Enter would break the screen
+        Live(console=talk, refresh_per_second=10) as screen,
+    ):
+        for look in _looks(stream):
+            shown = _screen(_reading(look, stream), stream.frame, stream.info.calibration_name)
+            screen.update(Group(shown, "Ctrl-C ends"))
+        screen.update(Group(shown, "The recording has ended."))
 
 
 def _emulated(
@@ -138,103 +148,131 @@ def _emulated(
     return result, station.cell
 
 
-@contextmanager
-def _live_looks(cell: CellConfig, calibration: CalibrationResult) -> Iterator[Iterator[Look]]:
-    with build_sensor(cell) as sensor, closing(build_arm(cell)) as arm:
-        arm.open()
-        _refuse_other_devices(calibration, {"arm": arm.identify(), "sensor": sensor.identify()})
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """The mean over about `_PERIOD_S`."""
 
-        def looks() -> Iterator[Look]:
-            recent = np.empty((0, 6))
-            while True:
-                wrench = sensor.collect(_PERIOD_S).wrench
-                # One period of a slow sensor has too few samples to estimate its noise.
-                recent = np.concatenate([recent, wrench])[-max(len(wrench), LEAST_SAMPLES) :]
-                R_base_flange = arm.state().R_base_flange
-                health = sensor.health()
-                if len(recent) >= LEAST_SAMPLES:
-                    yield Look(mean_and_covariance(recent), R_base_flange, health.rate_Hz, health.lost)
-
-        yield looks()
+    t_s: float
+    R_base_flange: Array
+    raw: Array
+    wrench: Array
+    sigma: Array
+    chi2: float
+    in_contact: bool
+    stale: str = ""
+    """Why there is no newer one."""
 
 
-def _recorded_looks(run: Run) -> Iterator[Look]:
-    for record in run.records():
-        samples = record.samples
-        n = len(samples.wrench)
-        rate_Hz = (n - 1) / (float(samples.t_host_ns[-1] - samples.t_host_ns[0]) * 1e-9)
-        lost = int(np.ptp(samples.seq)) + 1 - n
-        size = max(LEAST_SAMPLES, round(rate_Hz * _PERIOD_S))
-        for start in range(0, n - size + 1, size):
-            mean = mean_and_covariance(samples.wrench[start : start + size])
-            yield Look(mean, record.before.R_base_flange, rate_Hz, lost)
-            time.sleep(size / rate_Hz)  # at the speed of the recording
+def _looks(stream: CompensatedStream | ReplayedStream, *, raises: bool = False) -> Iterator[Look]:
+    """Yield a mean for each period from when the noise is known; raise a failure at once or when it lasts."""
+    blocks: list[Block] = []
+    look: Look | None = None
+    failing_since_s: float | None = None
+    while not (isinstance(stream, ReplayedStream) and stream.has_ended):
+        try:
+            block = stream.read()
+        except DriverError as error:
+            now_s = stream.clock.now_s()
+            failing_since_s = now_s if failing_since_s is None else failing_since_s
+            if raises or look is None or now_s - failing_since_s > _RECOVER_S:
+                raise
+            blocks.clear()
+            yield replace(look, stale=str(error))
+            continue
+        failing_since_s = None
+        if len(block):
+            blocks.append(block)
+        if not blocks:
+            continue
+        span_s = (blocks[-1].t_host_ns[-1] - blocks[0].t_host_ns[0]) * 1e-9
+        if span_s >= _PERIOD_S - 0.5 / stream.info.sensor_rate_Hz or (
+            isinstance(stream, ReplayedStream) and stream.has_ended
+        ):
+            if np.isfinite(block.sigma).all() or isinstance(stream, ReplayedStream):
+                look = _look(blocks, stream, span_s)
+                yield look
+            blocks.clear()
 
 
-def _refuse_other_devices(calibration: CalibrationResult, found: dict[str, DeviceInfo]) -> None:
-    belongs = belonging(calibration, found)
-    if belongs.others:
-        raise ConfigError(f"{belongs.others[0]}: calibrate this cell")
-    for words in belongs.unknown:
-        talk.print(f" {words}")
+def _look(blocks: Sequence[Block], stream: ProcessedStream, span_s: float) -> Look:
+    newest, frame = blocks[-1], blocks[-1].frame
+    alike = [block for block in blocks if block.frame == frame and block.stages == newest.stages]
+    to_frame = FrameTransform(frame, stream.info)
+    raw = np.concatenate([to_frame(block.raw, block.R_base_flange) for block in alike])
+    return Look(
+        t_s=newest.t_host_ns[-1] * 1e-9,
+        R_base_flange=newest.R_base_flange[-1],
+        raw=raw.mean(axis=0),
+        wrench=np.concatenate([block.wrench for block in alike]).mean(axis=0),
+        sigma=stream.sigma_of_mean(newest.R_base_flange[-1], span_s),
+        chi2=float(newest.chi2[-1]),
+        in_contact=bool(newest.in_contact[-1]),
+    )
 
 
-def _beyond_noise(calibration: CalibrationResult) -> Array:
-    """Return the variance (6,) beyond the predicted one, as in the report, spread over all axes."""
-    total = calibration.likely_error() ** 2 - np.square(calibration.predicted_error())
-    return np.repeat(total / 3, 3)
+def _reading(look: Look, stream: ProcessedStream) -> dict[str, Any]:
+    status, frame, calibration = stream.status(), stream.frame, stream.info.calibration
 
+    def wrench(values: Array) -> dict[str, Any] | None:
+        if look.stale:
+            return None
+        numbers = [float(value) if np.isfinite(value) else None for value in values]
+        return {"force_N": numbers[:3], "torque_Nm": numbers[3:]}
 
-def _reading(look: Look, calibration: CalibrationResult, beyond: Array, axes: Axes) -> dict[str, Any]:
-    raw = look.mean.mean
-    contact = calibration.compensate(raw, look.R_base_flange)
-    covariance = look.mean.covariance + calibration.wrench_covariance(look.R_base_flange) + np.diag(beyond)
-    R_axes_sensor = {
-        "sensor": np.eye(3),
-        "flange": calibration.R_flange_sensor,
-        "base": look.R_base_flange @ calibration.R_flange_sensor,
-    }[axes]
-    turn = np.kron(np.eye(2), R_axes_sensor)
-    raw, contact, covariance = turn @ raw, turn @ contact, turn @ covariance @ turn.T
-    sigma = np.sqrt(np.diag(covariance))
     return {
         "schema_version": 1,
-        "axes": axes,
-        "about": "sensor origin",
-        "raw": {"force_N": raw[:3].tolist(), "torque_Nm": raw[3:].tolist()},
-        "compensated": {"force_N": contact[:3].tolist(), "torque_Nm": contact[3:].tolist()},
-        "sigma": {"force_N": sigma[:3].tolist(), "torque_Nm": sigma[3:].tolist()},
-        "rate_Hz": look.rate_Hz,
-        "lost": look.lost,
+        "t_s": look.t_s,
+        "axes": frame.axes,
+        "about": "sensor origin" if frame.about == "sensor" else frame.about,
+        "raw": wrench(look.raw),
+        "compensated": wrench(look.wrench),
+        "sigma": wrench(look.sigma),
+        "contact": None if look.stale else look.in_contact,
+        "stale": look.stale or None,
+        "delay_s": {"value": status.delay_s, "sigma": status.delay_sigma_s},
+        "rate_Hz": status.sensor.rate_Hz,
+        "lost": status.sensor.lost,
         "calibration": calibration.provenance.get("created_utc"),
         "verdict": calibration.verdict,
     }
 
 
-def _line(reading: dict[str, Any]) -> str:
+def _line(reading: dict[str, Any], frame: WrenchFrame) -> str:
     contact = reading["compensated"]
+    if contact is None:
+        return f"stale: {reading['stale']}"
     force, torque = (
         " ".join(f"{value:9.{n}f}" for value in contact[key]) for key, n in (("force_N", 3), ("torque_Nm", 5))
     )
-    return f"F {force} N   T {torque} N·m   ({reading['axes']} axes, about the {reading['about']})"
+    return f"F {force} N   T {torque} N·m   ({frame})"
 
 
-def _screen(reading: dict[str, Any], made: str) -> Group:
+def _screen(reading: dict[str, Any], frame: WrenchFrame, made: str) -> Group:
     table = Table(box=None)
     for title, width in (("", 2), ("raw", 9), ("contact", 13), ("± 1 sigma", 9), ("", 20)):
         table.add_column(title, justify="right", min_width=width, no_wrap=True)  # else they move with every sign
-    columns = [np.r_[reading[key]["force_N"], reading[key]["torque_Nm"]] for key in ("raw", "compensated", "sigma")]
+    columns = [_six(reading[key]) for key in ("raw", "compensated", "sigma")]
     for i, name in enumerate(AXES):
         raw, contact, sigma = (column[i] for column in columns)
         unit, full, digits = ("N", 20.0, 3) if i < 3 else ("N·m", 2.0, 5)
-        filled = min(20, round(20 * abs(contact) / full))
-        bar = Text.assemble(("█" * filled, "red" if contact < 0 else "green"), "·" * (20 - filled))
-        table.add_row(name, f"{raw:.{digits}f}", f"{contact:.{digits}f} {unit}", f"{sigma:.{digits}f}", bar)
+        filled = 0 if contact is None else min(20, round(20 * abs(contact) / full))
+        bar = Text.assemble(("█" * filled, "red" if contact and contact < 0 else "green"), "·" * (20 - filled))
+        shown = [_digits(value, digits) for value in (raw, contact, sigma)]
+        table.add_row(name, shown[0], f"{shown[1]} {unit}", shown[2], bar)
+    delay, state = reading["delay_s"], "CONTACT" if reading["contact"] else "free"
     return Group(
-        Text.assemble(
-            (f"{reading['axes']} axes, about the {reading['about']}", "bold"),
-            "   contact: raw minus bias and gravity",
-        ),
+        Text.assemble((str(frame), "bold"), "   contact: raw minus bias and gravity"),
         f"{made}, {reading['verdict']}   mean of {_PERIOD_S} s   {reading['rate_Hz']:.0f} Hz, lost {reading['lost']}",
+        Text(f"{reading['stale']}", "red")
+        if reading["stale"]
+        else f"{state}   delay {1e3 * delay['value']:.1f} ± {1e3 * delay['sigma']:.1f} ms (1 sigma)",
         table,
     )
+
+
+def _six(wrench: dict[str, Any] | None) -> list[float | None]:
+    return [None] * 6 if wrench is None else [*wrench["force_N"], *wrench["torque_Nm"]]
+
+
+def _digits(value: float | None, digits: int) -> str:
+    return "--.--" if value is None else f"{value:.{digits}f}"

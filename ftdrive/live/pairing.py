@@ -216,6 +216,11 @@ class Pairing:
         """One standard deviation; 0 if the delay is configured."""
         return self._estimator.sigma_s if self._estimator else 0.0
 
+    @property
+    def waits_for_pose(self) -> bool:
+        """Whether there are samples without a pose."""
+        return bool(self._waiting)
+
     def add_states(self, states: ArmStates) -> None:
         """Add what the arm has sent."""
         if not len(states.t_host_ns):

@@ -1,37 +1,43 @@
 """From paired samples to a block: stages, frame, uncertainty, contact, tare, drift."""
 
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping
+from threading import RLock
 
 import numpy as np
 
 from calib.compensation import Compensator
-from calib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
-from calib.errors import BadDataset
 from calib.extras.inertia import REACH_S, inertial_wrench, motion_of_poses
-from calib.extras.update import Calibrated, tare
+from calib.extras.update import Calibrated
 from calib.files import JSON
 from calib.likelihood.gain_and_cross_talk import predicted_covariance
+from drivers.clock import Clock
 from drivers.interfaces import Array
 from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact, ContactTest, ContactTracker
 from ftdrive.live.drift import DriftFilter
 from ftdrive.live.filters import LOWPASS_ORDER, NOTCH_Q, Filter, deadband
 from ftdrive.live.frames import FrameTransform
-from ftdrive.live.noise import NoiseEstimator
-from ftdrive.live.samples import Block, EventKind, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame
+from ftdrive.live.noise import READING_S, NoiseEstimator
+from ftdrive.live.samples import (
+    Block,
+    EventKind,
+    LinkStatus,
+    Paired,
+    Stages,
+    StreamEvent,
+    StreamInfo,
+    StreamStatus,
+    WrenchFrame,
+)
+from ftdrive.live.tare import TARE_S, try_tare
 
 SENSOR_FRAME = WrenchFrame()
 STANDARD = Stages()
 FALSE_ALARM_RATE = 1e-3
-TARE_S = 0.5
-TARE_DRIFT_N, TARE_DRIFT_NM = 0.5, 0.015
-"""A tare accepts this much drift of the bias since the calibration or the tare before, one standard deviation."""
-
 _KNOT_S = 0.002
 """Poses of this spacing give the acceleration."""
-_STILL_RAD, _STILL_M = 5e-4, 5e-4
-"""Largest motion of the flange during a tare."""
 _DRIFT_SIGMAS = 5.0
 
 
@@ -64,6 +70,7 @@ class Processor:
         inertia_com_kg_m2: Array | None = None,
     ) -> None:
         self.info = info
+        self._lock = RLock()  # frame, stages and tare may come from another thread
         calibration = info.calibration
         self._compensator: Compensator = calibration.compensator
         self._inertia = inertia_com_kg_m2
@@ -99,11 +106,13 @@ class Processor:
 
     @frame.setter
     def frame(self, frame: WrenchFrame) -> None:
-        if frame != self._frame:
-            self._transform = FrameTransform(frame, self.info)
+        if frame == self._frame:
+            return
+        transform = FrameTransform(frame, self.info)
+        with self._lock:
             self._report_contacts(self._tracker.end())
-            self._frame = frame
-            self._note("frame", str(frame), {"axes": frame.axes, "about": _listed(frame.about)})
+            self._frame, self._transform = frame, transform
+            self.note("frame", str(frame), {"axes": frame.axes, "about": _listed(frame.about)})
 
     @property
     def stages(self) -> Stages:
@@ -112,10 +121,12 @@ class Processor:
 
     @stages.setter
     def stages(self, stages: Stages) -> None:
-        if stages != self._stages:
-            self._filter = self._filter_of(stages)
-            self._stages = stages
-            self._note("stages", stages_in_words(stages), {})
+        if stages == self._stages:
+            return
+        new = self._filter_of(stages)
+        with self._lock:
+            self._filter, self._stages = new, stages
+            self.note("stages", stages_in_words(stages), {})
 
     def _filter_of(self, stages: Stages) -> Filter:
         if stages.inertia and not np.isfinite(self.info.p_flange_sensor_m).all():
@@ -133,6 +144,10 @@ class Processor:
         With the inertia stage the last milliseconds wait for the poses after them, unless these samples are the `last`;
         a block may then be empty.
         """
+        with self._lock:
+            return self._process(paired, last) if len(paired) else self._processed(paired, None)
+
+    def _process(self, paired: Paired, last: bool) -> Block:
         self._note_gaps(paired)
         self._recent.append(paired)
         since_ns = int(paired.t_host_ns[-1]) - round(TARE_S * 1e9)
@@ -153,6 +168,17 @@ class Processor:
         if last:
             self._report_contacts(self._tracker.end())
         return block
+
+    def learn_noise(self, paired: Paired) -> None:
+        """Learn the noise from samples that are not processed, such as all of a recording."""
+        with self._lock:
+            self._noise.add(self._free(paired)[0], paired.R_base_flange, paired.p_base_flange_m)
+
+    def _free(self, rows: Paired) -> tuple[Array, Array, Array]:
+        """Return the residual of a free tool at rest, (n, 6), its weight (n, 6) and the bias (6,)."""
+        gravity = rows.R_base_flange.reshape(-1, 9) @ self._compensator.matrix.T
+        bias = self._compensator.offset if self.tare_wrench is None else self._compensator.offset + self.tare_wrench
+        return rows.raw - gravity - bias, gravity, np.asarray(bias)
 
     def _inertial(self, buffer: Paired) -> tuple[Array, int]:
         """Return the inertial wrench of all rows, and the number of those with neighbours on both sides."""
@@ -178,10 +204,7 @@ class Processor:
     def _processed(self, rows: Paired, inertial: Array | None) -> Block:
         stages, calibration = self._stages, self.info.calibration
         n = len(rows)
-        gravity = rows.R_base_flange.reshape(-1, 9) @ self._compensator.matrix.T
-        bias = self._compensator.offset if self.tare_wrench is None else self._compensator.offset + self.tare_wrench
-        # chi2 is that of a free tool, whatever is switched off
-        residual = rows.raw - gravity - bias
+        residual, gravity, bias = self._free(rows)  # chi2 is that of a free tool, whatever is switched off
         if inertial is not None:
             residual -= inertial
         if n:
@@ -217,21 +240,23 @@ class Processor:
             rows.q_rad,
             rows.R_base_flange,
             rows.p_base_flange_m,
-            self._sigma(rows),
+            self.sigma(rows.R_base_flange[-1]) if n else np.full(6, np.nan),
             self._frame,
             stages,
         )
 
-    def _sigma(self, rows: Paired) -> Array:
-        """Standard deviation (6,) of one sample in the frame; NaN until the noise is known."""
+    def sigma(self, R_base_flange: Array, mean_s: float = 0.0) -> Array:
+        """Standard deviation (6,) of one sample in the frame, or of the mean over `mean_s`; NaN until it is known."""
         noise = self._noise.noise
-        if noise is None or not len(rows):
+        if noise is None:
             return np.full(6, np.nan)
-        covariance = noise.sample * self._filter.power_gain
-        R = rows.R_base_flange[-1]
+        if mean_s > 0:
+            covariance = noise.reading * min(READING_S / mean_s, 1.0)
+        else:
+            covariance = noise.sample * self._filter.power_gain
         if self._stages.gravity or self._stages.bias:
-            covariance = covariance + self._uncertainty(R)
-        T = self._transform.matrix(R)
+            covariance = covariance + self._uncertainty(R_base_flange)
+        T = self._transform.matrix(R_base_flange)
         return np.asarray(np.sqrt(np.diag(T @ covariance @ T.T)))
 
     def _uncertainty(self, R_base_flange: Array) -> Array:
@@ -242,6 +267,32 @@ class Processor:
         )
         return np.asarray(predicted + np.diag(self._beyond))
 
+    def restart(self) -> None:
+        """Forget the samples before an interruption; noise, tares and drift remain."""
+        with self._lock:
+            self._report_contacts(self._tracker.end())
+            self._test.restart()
+            self._filter = self._filter_of(self._stages)
+            self._recent.clear()
+            self._buffer, self._done, self._newest_seq = None, 0, None
+
+    def status(self, sensor: LinkStatus, arm: LinkStatus, delay: tuple[float, float]) -> StreamStatus:
+        """Return the state of a stream with these links and this delay and its sigma, s."""
+        drift_N_h, drift_sigma_N_h = self._drift.force_rate_N_h
+        tare_wrench = self.tare_wrench
+        return StreamStatus(
+            sensor=sensor,
+            arm=arm,
+            delay_s=delay[0],
+            delay_sigma_s=delay[1],
+            tare=tare_wrench,
+            tare_t_host_ns=None if tare_wrench is None else self._tares[-1][1],
+            drift_N_h=drift_N_h,
+            drift_sigma_N_h=drift_sigma_N_h,
+            contact_limit=self._test.limit,
+            false_alarm_rate=self._test.false_alarm_rate,
+        )
+
     # ---------------------------------------------------------------------------------------------------------- events
 
     def take_events(self) -> list[StreamEvent]:
@@ -249,11 +300,8 @@ class Processor:
         events, self._events = self._events, []
         return events
 
-    def mark(self, text: str) -> StreamEvent:
-        """Add a mark of the operator."""
-        return self._note("mark", text, {})
-
-    def _note(self, kind: EventKind, text: str, values: Mapping[str, JSON], t_ns: int | None = None) -> StreamEvent:
+    def note(self, kind: EventKind, text: str, values: Mapping[str, JSON], t_ns: int | None = None) -> StreamEvent:
+        """Add an event, by default at the time of the newest sample."""
         event = StreamEvent(self._newest_ns if t_ns is None else t_ns, kind, text, values)
         self._events.append(event)
         return event
@@ -267,7 +315,7 @@ class Processor:
         for i in np.flatnonzero(missing > 0):
             lost = int(missing[i])
             text = f"{lost} sample{'s' if lost > 1 else ''} lost before sample {int(paired.seq[i])}"
-            self._note("gap", text, {"lost": lost, "seq": int(paired.seq[i])}, int(paired.t_host_ns[i]))
+            self.note("gap", text, {"lost": lost, "seq": int(paired.seq[i])}, int(paired.t_host_ns[i]))
 
     def _report_contacts(self, contacts: list[Contact]) -> None:
         for contact in contacts:
@@ -282,7 +330,7 @@ class Processor:
                 "about": _listed(self._frame.about),
             }
             words = f"contact {contact.peak_N:.1f} N, {contact.duration_s:.1f} s"
-            self._note("contact", words, values, contact.begin_ns)
+            self.note("contact", words, values, contact.begin_ns)
 
     # ---------------------------------------------------------------------------------------------------- bias, noise
 
@@ -294,58 +342,26 @@ class Processor:
         new, old = self._tares[-1][0].parameters, self.info.calibration.parameters
         return np.concatenate([new.force_bias_N - old.force_bias_N, new.torque_bias_Nm - old.torque_bias_Nm])
 
-    @property
-    def tare_t_host_ns(self) -> int | None:
-        """Time of the last tare; None without one."""
-        return self._tares[-1][1] if len(self._tares) > 1 else None
-
     def tare(self) -> StreamEvent:
-        """Set the bias so that the free tool reads zero in the last half second, or refuse.
-
-        It is refused when arm or reading are not still, and when the reading differs from the prediction of a free tool
-        by more than noise, calibration and a usual drift explain. The returned event has the reason.
-        """
-        if not self._recent:
-            return self._note("tare-refused", "tare refused: no sample yet; tare again", {})
-        rows = Paired.concatenate(list(self._recent))
-        R = rows.R_base_flange[-1]
-        moved = np.abs(rows.R_base_flange - R).max() > _STILL_RAD
-        moved |= bool((np.abs(rows.p_base_flange_m - rows.p_base_flange_m[-1]) > _STILL_M).any())
-        enough = len(rows) >= LEAST_SAMPLES and rows.t_host_ns[-1] - rows.t_host_ns[0] > 0.5e9 * TARE_S
-        if moved or not enough:
-            why = "the arm moves" if moved else "too few samples"
-            return self._note("tare-refused", f"tare refused: {why}; tare again when it has rested 0.5 s", {})
-        # the weight as the sensor responds to it, which `calib.extras.update.tare` does not know
-        gravity = R.reshape(-1) @ (self._compensator.matrix - Compensator(self.info.calibration.parameters).matrix).T
-        dwell = rows.raw - gravity
-        current = self._tares[-1][0]
-        bias = np.concatenate([current.parameters.force_bias_N, current.parameters.torque_bias_Nm])
-        mean = mean_and_covariance(dwell)
-        change = rows.raw.mean(axis=0) - R.reshape(-1) @ self._compensator.matrix.T - bias
-        drift = np.diag(np.repeat([TARE_DRIFT_N**2, TARE_DRIFT_NM**2], 3))
-        total = mean.covariance + self._uncertainty(R) + drift
-        sigmas = float(np.sqrt(change @ np.linalg.solve(total, change)))
-        force_N, torque_Nm = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
-        values: dict[str, JSON] = {"change": change.tolist(), "force_N": force_N, "sigmas": sigmas}
-        difference = f"{force_N:.2f} N and {torque_Nm:.3f} N·m ({sigmas:.1f} sigma)"
-        if not is_stationary(dwell):
-            return self._note("tare-refused", "tare refused: the reading changes; free the tool, then tare", values)
-        try:
-            update = tare(current, R[None], [dwell], drift_N=TARE_DRIFT_N, drift_Nm=TARE_DRIFT_NM)
-        except BadDataset:
-            text = f"tare refused: {difference} from the free tool; take hand or contact away, then tare"
-            return self._note("tare-refused", text, values)
-        self._set_tare([*self._tares, (update, self._newest_ns)])
-        return self._note("tare", f"tare: bias changed by {difference}", values)
+        """Set the bias so that the free tool reads zero in the last half second, or refuse; see `try_tare`."""
+        with self._lock:
+            if not self._recent:
+                return self.note("tare-refused", "tare refused: no sample has arrived yet; tare again", {})
+            rows = Paired.concatenate(list(self._recent))
+            update, text, values = try_tare(rows, self.info.calibration, self._tares[-1][0])
+            if update is None:
+                return self.note("tare-refused", text, values)
+            self._set_tare([*self._tares, (update, self._newest_ns)])
+            return self.note("tare", text, values)
 
     def undo_tare(self) -> StreamEvent:
         """Take the last tare back."""
-        if len(self._tares) == 1:
-            return self._note("tare-refused", "there is no tare to undo", {})
-        self._set_tare(self._tares[:-1])
-        return self._note(
-            "tare-undone", "tare undone", {"tare": None if (t := self.tare_wrench) is None else t.tolist()}
-        )
+        with self._lock:
+            if len(self._tares) == 1:
+                return self.note("tare-refused", "there is no tare to undo", {})
+            self._set_tare(self._tares[:-1])
+            left = self.tare_wrench
+            return self.note("tare-undone", "tare undone", {"tare": None if left is None else left.tolist()})
 
     def _set_tare(self, tares: list[tuple[Calibrated, int]]) -> None:
         before, self._tares = self.tare_wrench, tares
@@ -353,21 +369,6 @@ class Processor:
         self._drift.shift(now - (np.zeros(6) if before is None else before))
         self._test.restart()
         self._filter = self._filter_of(self._stages)
-
-    @property
-    def drift_N_h(self) -> tuple[float, float]:
-        """Drift of the force bias and one standard deviation, N/h."""
-        return self._drift.force_rate_N_h
-
-    @property
-    def contact_limit(self) -> float:
-        """Of `Block.chi2`."""
-        return self._test.limit
-
-    @property
-    def false_alarm_rate(self) -> float:
-        """Share of independent readings of a free tool beyond the limit."""
-        return self._test.false_alarm_rate
 
     def _follow_drift(self, rows: Paired, residual: Array) -> None:
         noise = self._noise.noise
@@ -379,8 +380,61 @@ class Processor:
         worth = max(self._usual_error_N, _DRIFT_SIGMAS * sigma)
         if rate > worth and not self._drift_warned:
             text = f"the bias drifts by {rate:.2g} ± {sigma:.1g} N/h (1 sigma); tare when the tool is free"
-            self._note("drift", text, {"drift_N_h": rate, "sigma_N_h": sigma})
+            self.note("drift", text, {"drift_N_h": rate, "sigma_N_h": sigma})
         self._drift_warned = rate > (0.5 if self._drift_warned else 1.0) * worth
+
+
+class ProcessedStream(ABC):
+    """What a live and a replayed stream share: everything that the processing shows and lets set."""
+
+    info: StreamInfo
+    clock: Clock
+    _processor: Processor
+
+    @property
+    def frame(self) -> WrenchFrame:
+        """Axes and reference point of the wrench. Setting raises `ConfigError` if it needs what is not configured."""
+        return self._processor.frame
+
+    @frame.setter
+    def frame(self, frame: WrenchFrame) -> None:
+        self._processor.frame = frame
+
+    @property
+    def stages(self) -> Stages:
+        """What is done to the raw wrench. Setting raises `ConfigError` for an impossible filter."""
+        return self._processor.stages
+
+    @stages.setter
+    def stages(self, stages: Stages) -> None:
+        self._processor.stages = stages
+
+    def take_events(self) -> list[StreamEvent]:
+        """Return the events since the last call."""
+        return self._processor.take_events()
+
+    def tare(self) -> StreamEvent:
+        """Change the bias so that the free tool reads zero; the event says how much, or why it was refused."""
+        return self._processor.tare()
+
+    def undo_tare(self) -> StreamEvent:
+        """Take the last tare back."""
+        return self._processor.undo_tare()
+
+    def mark(self, text: str) -> StreamEvent:
+        """Add a mark to the events."""
+        return self._processor.note("mark", text, {})
+
+    @abstractmethod
+    def status(self) -> StreamStatus:
+        """Return rates, losses, ages, delay, tare and drift."""
+
+    def sigma_of_mean(self, R_base_flange: Array, duration_s: float) -> Array:
+        """Standard deviation (6,) of the mean of the wrench over `duration_s`, `READING_S` or longer, in the frame.
+
+        NaN until the noise is known. `R_base_flange` is (3, 3).
+        """
+        return self._processor.sigma(R_base_flange, duration_s)
 
 
 def stages_in_words(stages: Stages) -> str:
