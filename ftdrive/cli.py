@@ -23,6 +23,7 @@ _COMMANDS = {
     "devices": ("ftdrive.commands.devices", "List serial ports and CAN interfaces."),
     "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
     "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
+    "stream": ("ftdrive.commands.stream", "Serve the wrench to Foxglove, Lichtblick and PlotJuggler."),
     "replay": ("ftdrive.commands.replay", "Repeat a recorded run through the same routine and solver."),
     "export": ("ftdrive.commands.export", "Write a plan as a program for the pendant or as a table."),
     "transcript": ("ftdrive.commands.transcript", "Record or play the bytes on a sensor's wire."),

@@ -9,21 +9,49 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import CELL, check_simulate, simulate
+from drivers.errors import DriverError
+from ftdrive.commands.common import CELL, FRAME, check_simulate, read_cell, read_frame, simulate
+from ftdrive.commands.live import _emulated as emulated
 from ftdrive.errors import ConfigError
+from ftdrive.live.processing import ProcessedStream
+from ftdrive.live.samples import Axes
+from ftdrive.live.stream import CompensatedStream, load_calibration
+from ftdrive.servers.udp import UdpSender
 from ftdrive.terminal.console import talk
 
 if TYPE_CHECKING:
-    from ftdrive.live.stream import CompensatedStream
     from ftdrive.servers.foxglove import FoxgloveServer
-    from ftdrive.servers.udp import UdpSender
+
+RECOVER_S = 10.0
+"""So long a device may be silent: the viewers stay connected. Then the command ends."""
 
 
 @click.command()
+@click.option(
+    "--calibration",
+    "path",
+    metavar="PATH",
+    type=click.Path(exists=True, path_type=Path),
+    help="A calibration.json or its run folder. With --simulate the default is a new one.",
+)
+@CELL
+@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
+@FRAME
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve at. Another one is unprotected.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="Port; 0 is a free one.")
 @click.option("--udp", metavar="HOST:PORT", help="Also send JSON to a PlotJuggler before 3.16, which listens on 9870.")
-def stream(host: str, port: int, udp: str | None) -> None:
+def stream(
+    path: Path | None,
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    simulate: bool,
+    axes: Axes,
+    about: str,
+    host: str,
+    port: int,
+    udp: str | None,
+) -> None:
     """Serve the raw and the compensated wrench to viewers.
 
     Foxglove, Lichtblick and PlotJuggler from 3.16 connect to one WebSocket server. They receive every sample of the
@@ -31,32 +59,52 @@ def stream(host: str, port: int, udp: str | None) -> None:
     read, never moved. Ctrl-C ends.
     """
     from ftdrive.servers.foxglove import FoxgloveServer
-    from ftdrive.servers.udp import UdpSender
 
+    check_simulate(simulate, real={"--config": config, "--robot": robot})
+    frame = read_frame(axes, about)
+    udp_address = None if udp is None else _address(udp)
+    calibration = None if path is None else load_calibration(path)
+    name = "temporary calibration" if path is None else str(path)
     with ExitStack() as stack:
-        source = stack.enter_context(open_stream())
+        if simulate:
+            calibration, cell = emulated(calibration, sensor, stack)
+        elif calibration is None:
+            raise ConfigError("no calibration: give --calibration PATH, or --simulate")
+        else:
+            cell = read_cell(config, robot, sensor)
+        source = stack.enter_context(CompensatedStream(cell, calibration, name=name, frame=frame))
+        for words in source.warnings:
+            talk.print(f" {words}")
         server = stack.enter_context(closing(FoxgloveServer(source, host, port)))
         sinks: list[FoxgloveServer | UdpSender] = [server]
-        if udp is not None:
-            sinks.append(stack.enter_context(closing(UdpSender(source.info, *_address(udp)))))
-        _introduce(source, server, host, udp)
+        if udp_address is not None:
+            sinks.append(stack.enter_context(closing(UdpSender(source.info, *udp_address))))
+        _introduce(source, server, host, udp_address)
         serve(source, sinks)
 
 
-def serve(source: "CompensatedStream", sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
-    """Send blocks and events until a device fails or Ctrl-C is pressed; the last events are sent too."""
+def serve(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
+    """Send blocks and events until Ctrl-C is pressed, or a device fails for `RECOVER_S`."""
+    delivered_s = source.clock.now_s()
     try:
         while True:
-            block = source.read()
-            for sink in sinks:
-                sink.write(block)
+            try:
+                block = source.read()
+                delivered_s = source.clock.now_s()
+                for sink in sinks:
+                    sink.write(block)
+            except DriverError:
+                if source.clock.now_s() - delivered_s > RECOVER_S:
+                    raise
             _send_events(source, sinks)
     finally:
         _send_events(source, sinks)
 
 
-def _send_events(source: "CompensatedStream", sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
+def _send_events(source: ProcessedStream, sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
     for event in source.take_events():
+        if event.kind in ("stale", "recovered", "gap"):
+            talk.print(event.text)
         for sink in sinks:
             sink.event(event)
 
@@ -68,20 +116,17 @@ def _address(text: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
-def _introduce(source: "CompensatedStream", server: "FoxgloveServer", host: str, udp: str | None) -> None:
+def _introduce(source: ProcessedStream, server: "FoxgloveServer", host: str, udp: tuple[str, int] | None) -> None:
     """Print what is served, and how to open it."""
-    reached_as = socket.gethostname() if host in ("0.0.0.0", "::") else host
-    url = f"ws://{f'[{reached_as}]' if ':' in reached_as else reached_as}:{server.port}"
-    info = source.info
-    talk.print(f"Serving {source.frame}, compensated with {info.calibration_name or 'a new calibration'}.")
-    talk.print(f"  Foxglove, Lichtblick   Open connection > Foxglove WebSocket > {url}")
-    talk.print(f"  PlotJuggler from 3.16  Streaming > Foxglove Bridge > {url}")
+    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
+    url = f"ws://{f'[{name}]' if ':' in name else name}:{server.port}"
+    talk.print(f"Serving the wrench in {source.frame}; {source.info.calibration_name}.")
+    talk.print(f"  Foxglove, Lichtblick:  Open connection > Foxglove WebSocket > {url}")
+    talk.print(f"  PlotJuggler from 3.16: Streaming > Foxglove Bridge > {url}")
     if udp is not None:
-        talk.print(
-            f"  PlotJuggler before     Streaming > UDP Server > port {udp.rpartition(':')[2]}, JSON, use its timestamp"
-        )
+        talk.print(f"  PlotJuggler before:    Streaming > UDP Server > port {udp[1]}, JSON, use the timestamp")
     if _is_loopback(host):
-        talk.print(f"  Foxglove in a browser  {server.app_url}")
+        talk.print(f"  In a browser:          {server.app_url}")
     else:
         talk.print(
             f"Unprotected: any computer that reaches port {server.port} can read the stream, tare it and change its "

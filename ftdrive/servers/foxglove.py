@@ -6,12 +6,10 @@ encoding. Frames, arrows and events are Foxglove's own. A client can tare, and s
 
 import json
 import logging
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import CancelledError, Future
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from math import isfinite
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +17,8 @@ from numpy.typing import NDArray
 from calib.files import JSON
 from ftdrive.errors import ConfigError
 from ftdrive.live import ros2
-from ftdrive.live.samples import Axes, Block, Point, Stages, StreamEvent, WrenchFrame
+from ftdrive.live.processing import ProcessedStream
+from ftdrive.live.samples import Block, StreamEvent
 from ftdrive.servers.picked import Picked
 
 try:
@@ -27,17 +26,13 @@ try:
 except ImportError:
     raise ConfigError("a server needs foxglove-sdk: install ftdrive with its extra stream, `ftdrive[stream]`") from None
 
-from foxglove import Channel, Context, MessageSchema, Parameter, Schema, Service, ServiceRequest, ServiceSchema
+from foxglove import Channel, Context, MessageSchema, Schema, Service, ServiceRequest, ServiceSchema
 from foxglove.channels import FrameTransformsChannel, LogChannel, SceneUpdateChannel
 from foxglove.messages import Log, LogLevel
-from foxglove.websocket import Capability, Client, ServerListener, StatusLevel
+from foxglove.websocket import Capability, StatusLevel
 
 from ftdrive.servers import scene
-
-if TYPE_CHECKING:
-    from ftdrive.live.stream import CompensatedStream
-
-T = TypeVar("T")
+from ftdrive.servers.parameters import Parameters
 
 TRANSFORMS, ARROWS, EVENTS, STATUS = "/tf", "/wrench_arrows", "/events", "/stream_status"
 
@@ -49,14 +44,6 @@ BACKLOG = 1 << 15
 
 _WARNINGS = ("tare-refused", "drift", "gap", "stale")
 
-_EXPECTED = {
-    "axes": f"set one of {', '.join(get_args(Axes))}",
-    "about": f"set one of {', '.join(get_args(Point))}, or x, y, z in metres from the flange",
-    **dict.fromkeys(("bias", "gravity", "inertia"), "set true or false"),
-    **dict.fromkeys(("notch_Hz", "lowpass_Hz"), "set a frequency; 0 switches the filter off"),
-    **dict.fromkeys(("deadband_N", "deadband_Nm"), "set a number from 0"),
-}
-
 _log = logging.getLogger(__name__)
 
 
@@ -67,7 +54,7 @@ class FoxgloveServer:
     does not count them. Therefore `STATUS` has how many messages of each topic were sent: a client that received fewer
     since the status before has lost the others. The SDK names a slow client at most every 30 s; that is logged.
 
-    What a client requests is done by `write`, in the thread that reads the stream.
+    What a client requests is done in a thread of the SDK.
 
     Parameters
     ----------
@@ -80,11 +67,9 @@ class FoxgloveServer:
         The address cannot be used.
     """
 
-    def __init__(self, stream: "CompensatedStream", host: str = "127.0.0.1", port: int = 8765) -> None:
+    def __init__(self, stream: ProcessedStream, host: str = "127.0.0.1", port: int = 8765) -> None:
         self._stream = stream
         self._info = stream.info
-        self._requests: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
-        self._closed = False
         self._context = context = Context()  # server and channels keep only weak references
         self._channels: dict[str, Any] = {
             topic: Channel(
@@ -112,7 +97,7 @@ class FoxgloveServer:
                 capabilities=[Capability.Parameters, Capability.Services],
                 supported_encodings=["json"],
                 services=[self._service("tare", stream.tare), self._service("undo_tare", stream.undo_tare)],
-                server_listener=_Listener(self._parameters, self._set_parameters),
+                server_listener=Parameters(stream, self._warn),
                 context=context,
                 message_backlog_size=BACKLOG,
             )
@@ -134,8 +119,7 @@ class FoxgloveServer:
         return self._server.app_url() or ""
 
     def write(self, block: Block) -> None:
-        """Send a block and do what clients have requested; never waits."""
-        self._do_requests()
+        """Send a block; never waits."""
         t_ns = block.t_host_ns + self._info.utc_offset_ns
         frame = ros2.frame_id(block.frame)
         self._send(ros2.RAW, t_ns, lambda: ros2.pack_wrenches(t_ns, block.raw, "sensor"))
@@ -160,10 +144,7 @@ class FoxgloveServer:
         self._send(EVENTS, t_ns, lambda: [log])
 
     def close(self) -> None:
-        """Disconnect the clients; requests that are not done are cancelled."""
-        self._closed = True
-        while self._requests:
-            self._requests.popleft()[0].cancel()
+        """Disconnect the clients."""
         self._server.stop()
         self._slow_clients.close()
 
@@ -185,26 +166,12 @@ class FoxgloveServer:
             "sent": self._sent,
         }
 
-    def _request(self, work: Callable[[], T]) -> T:
-        """Let `write` do something and wait for it; called in threads of the SDK."""
-        answer: Future[T] = Future()
-        self._requests.append((answer, work))
-        if self._closed:
-            answer.cancel()
-        return answer.result()
-
-    def _do_requests(self) -> None:
-        while self._requests:
-            answer, work = self._requests.popleft()
-            if answer.set_running_or_notify_cancel():
-                try:
-                    answer.set_result(work())
-                except Exception as error:
-                    answer.set_exception(error)
+    def _warn(self, text: str) -> None:
+        self._server.publish_status(text, StatusLevel.Warning)
 
     def _service(self, name: str, action: Callable[[], StreamEvent]) -> Service:
         def handle(_: ServiceRequest) -> bytes:
-            event = self._request(action)
+            event = action()
             return json.dumps({"success": event.kind != "tare-refused", "message": event.text}).encode()
 
         # Like the type of the same name in ROS 2, as JSON.
@@ -216,70 +183,6 @@ class FoxgloveServer:
         )
         schema = ServiceSchema(name="std_srvs/srv/Trigger", request=request, response=response)
         return Service(name, schema=schema, handler=handle)
-
-    def _parameters(self) -> dict[str, JSON]:
-        """Return frame and stages by their names; a parameter cannot be None, so a filter that is off has 0 Hz."""
-        frame = self._stream.frame
-        stages = {name: 0.0 if value is None else value for name, value in asdict(self._stream.stages).items()}
-        return {
-            "axes": frame.axes,
-            "about": frame.about if isinstance(frame.about, str) else list(frame.about),
-        } | stages
-
-    def _set_parameters(self, values: Mapping[str, Any]) -> None:
-        """Set frame and stages of the stream; every client sees why a value is rejected."""
-        try:
-            self._request(lambda: _apply(self._stream, values))
-        except CancelledError:
-            pass  # the stream has ended, and with it the connection
-        except ConfigError as error:
-            self._server.publish_status(str(error), StatusLevel.Warning)
-
-
-def _apply(stream: "CompensatedStream", values: Mapping[str, Any]) -> None:
-    frame, stages = asdict(stream.frame), asdict(stream.stages)
-    for name, value in values.items():
-        group = frame if name in frame else stages
-        match name, value:
-            case "axes", str() if value in get_args(Axes):
-                group[name] = value
-            case "about", str() if value in get_args(Point):
-                group[name] = value
-            case "about", [_, _, _] if all(map(_is_number, value)):
-                group[name] = tuple(float(x) for x in value)
-            case (("bias" | "gravity" | "inertia"), bool()):
-                group[name] = value
-            case (("notch_Hz" | "lowpass_Hz"), int() | float()) if _is_number(value) and value >= 0:
-                group[name] = float(value) or None
-            case (("deadband_N" | "deadband_Nm"), int() | float()) if _is_number(value) and value >= 0:
-                group[name] = float(value)
-            case _:
-                raise ConfigError(f"{name} cannot be {value!r}: {_EXPECTED.get(name, 'there is no such parameter')}")
-    if (wanted := WrenchFrame(**frame)) != stream.frame:
-        stream.frame = wanted
-    if (wanted_stages := Stages(**stages)) != stream.stages:
-        stream.stages = wanted_stages
-
-
-class _Listener(ServerListener):
-    """Passes parameters; the defaults of its base do nothing."""
-
-    def __init__(self, read: Callable[[], dict[str, JSON]], write: Callable[[Mapping[str, Any]], None]) -> None:
-        self._read = read
-        self._write = write
-
-    def on_get_parameters(
-        self, _client: Client, param_names: list[str], _request: str | None = None
-    ) -> list[Parameter]:
-        """Return those named; all if there are no names."""
-        return [Parameter(name, value=value) for name, value in self._read().items() if name in (param_names or [name])]
-
-    def on_set_parameters(
-        self, client: Client, parameters: list[Parameter], _request: str | None = None
-    ) -> list[Parameter]:
-        """Set them; return all as they are then."""
-        self._write({parameter.name: parameter.get_value() for parameter in parameters})
-        return self.on_get_parameters(client, [])
 
 
 class _SlowClients(logging.Handler):
@@ -302,10 +205,6 @@ class _SlowClients(logging.Handler):
         """Stop."""
         self._source.removeHandler(self)
         super().close()
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
 
 
 def _without_nan(value: JSON) -> JSON:

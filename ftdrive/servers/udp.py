@@ -2,6 +2,7 @@
 
 import json
 import socket
+from math import isfinite
 
 from ftdrive.errors import ConfigError
 from ftdrive.live import ros2
@@ -50,7 +51,7 @@ class UdpSender:
                 "timestamp": t_ns * 1e-9,
                 "raw_sensor": _named(few.raw[i].tolist()),
                 compensated: _named(few.wrench[i].tolist()),
-                "chi2": float(few.chi2[i]),
+                "chi2": chi2 if isfinite(chi2 := float(few.chi2[i])) else None,
                 "in_contact": int(few.in_contact[i]),
             }
             try:

@@ -4,10 +4,8 @@ import base64
 import importlib
 import json
 import sys
-import threading
 from collections.abc import Iterator
-from concurrent.futures import CancelledError
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import replace
 from typing import Any, cast
 
@@ -42,24 +40,6 @@ def server(stream: FakeStream) -> Iterator[FoxgloveServer]:
 def client(server: FoxgloveServer) -> Iterator[Client]:
     with Client.to(server.port) as client:
         yield client
-
-
-@contextmanager
-def writing(server: FoxgloveServer) -> Iterator[None]:
-    """Write blocks in a thread, as the command does."""
-    ended = threading.Event()
-
-    def write() -> None:
-        while not ended.wait(0.005):
-            server.write(block(1))
-
-    thread = threading.Thread(target=write)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
 
 
 def read_cdr(client: Client, topic: str, payload: bytes) -> Any:
@@ -234,32 +214,19 @@ def test_the_status_says_what_is_shown_and_is_valid_json(server: FoxgloveServer,
     assert status["status"]["drift_N_h"] is None  # NaN there
 
 
-def test_tare_is_a_service(server: FoxgloveServer, stream: FakeStream, client: Client) -> None:
-    with writing(server):
-        client.call("tare")
-        assert client.answer() == {"success": True, "message": "bias +0.4 N"}
-        assert stream.tares == 1
-        client.call("undo_tare")
-        assert client.answer()["success"]
-        assert stream.tares == 0
-        stream.contact = True
-        client.call("tare")
-        assert client.answer() == {"success": False, "message": "3.4 N from the free tool"}
-
-
-def test_no_request_waits_for_a_stream_that_has_ended(server: FoxgloveServer, client: Client) -> None:
+def test_tare_is_a_service(stream: FakeStream, client: Client) -> None:
     client.call("tare")
-    client.set(axes="base")
-    while len(server._requests) < 2:
-        threading.Event().wait(0.001)
-    waiting = [answer for answer, _ in server._requests]
-    server.close()
-    assert all(answer.cancelled() for answer in waiting)
-    with pytest.raises(CancelledError):
-        server._request(lambda: None)
+    assert client.answer() == {"success": True, "message": "bias +0.4 N"}
+    assert stream.tares == 1
+    client.call("undo_tare")
+    assert client.answer()["success"]
+    assert stream.tares == 0
+    stream.contact = True
+    client.call("tare")
+    assert client.answer() == {"success": False, "message": "3.4 N from the free tool"}
 
 
-def test_parameters_are_the_frame_and_the_stages(server: FoxgloveServer, stream: FakeStream, client: Client) -> None:
+def test_parameters_are_the_frame_and_the_stages(stream: FakeStream, client: Client) -> None:
     at_first = {
         "axes": "sensor",
         "about": "sensor",
@@ -273,20 +240,19 @@ def test_parameters_are_the_frame_and_the_stages(server: FoxgloveServer, stream:
     }
     assert client.parameters() == at_first
     assert client.parameters("axes", "gravity") == {"axes": "sensor", "gravity": True}
-    with writing(server):
-        wanted = {"axes": "base", "about": [0, 0.5, 1], "gravity": False, "lowpass_Hz": 40, "deadband_N": 0.5}
-        client.set(**wanted)
-        assert client.was_set() == at_first | wanted
-        assert stream.frame == WrenchFrame("base", (0.0, 0.5, 1.0))
-        assert stream.stages == Stages(gravity=False, lowpass_Hz=40.0, deadband_N=0.5)
-        client.set(about="flange", lowpass_Hz=0)
-        client.was_set()
-        assert stream.frame == WrenchFrame("base", "flange")
-        assert stream.stages == Stages(gravity=False, deadband_N=0.5)
+    wanted = {"axes": "base", "about": [0, 0.5, 1], "gravity": False, "lowpass_Hz": 40, "deadband_N": 0.5}
+    client.set(**wanted)
+    assert client.was_set() == at_first | wanted
+    assert stream.frame == WrenchFrame("base", (0.0, 0.5, 1.0))
+    assert stream.stages == Stages(gravity=False, lowpass_Hz=40.0, deadband_N=0.5)
+    client.set(about="flange", lowpass_Hz=0)
+    client.was_set()
+    assert stream.frame == WrenchFrame("base", "flange")
+    assert stream.stages == Stages(gravity=False, deadband_N=0.5)
 
 
 def test_other_clients_see_a_changed_parameter(server: FoxgloveServer, client: Client) -> None:
-    with Client.to(server.port) as other, writing(server):
+    with Client.to(server.port) as other:
         other.send("subscribeParameterUpdates", parameterNames=["axes"])
         other.parameters()
         client.set(axes="tcp")
@@ -308,13 +274,12 @@ def test_other_clients_see_a_changed_parameter(server: FoxgloveServer, client: C
     ],
 )
 def test_a_wrong_parameter_changes_nothing(
-    server: FoxgloveServer, stream: FakeStream, client: Client, values: dict[str, object], words: str
+    stream: FakeStream, client: Client, values: dict[str, object], words: str
 ) -> None:
     before = client.parameters()
-    with writing(server):
-        client.set(**values)
-        assert words in client.read("status")["message"]
-        assert client.was_set() == before
+    client.set(**values)
+    assert words in client.read("status")["message"]
+    assert client.was_set() == before
     assert (stream.frame, stream.stages) == (WrenchFrame(), Stages())
 
 
@@ -359,7 +324,7 @@ def test_a_slow_client_can_count_what_it_lost(stream: FakeStream, monkeypatch: p
                 received.append(received[-1])
             received[-1] += topic == ros2.RAW
         lost = np.diff(sent) - np.diff(received, prepend=0)[: len(sent) - 1]
-        assert lost[0] == 0
+        assert (lost >= 0).all()
         assert lost[-1] > 1000
 
 
