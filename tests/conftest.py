@@ -25,8 +25,9 @@ for _name in [name for name in os.environ if name.startswith("FTDRIVE_") and nam
 
 def pytest_configure(config: pytest.Config) -> None:
     """Keep the byte code of the processes that tests start, which would each compile numpy and scipy again."""
-    if os.environ.pop("PYTHONDONTWRITEBYTECODE", None) and config.cache is not None:
-        os.environ["PYTHONPYCACHEPREFIX"] = str(config.cache.mkdir("bytecode"))
+    cache = getattr(config, "cache", None)  # none with `-p no:cacheprovider`
+    if os.environ.pop("PYTHONDONTWRITEBYTECODE", None) and cache is not None:
+        os.environ["PYTHONPYCACHEPREFIX"] = str(cache.mkdir("bytecode"))
 
 
 def pytest_collection_finish() -> None:

@@ -65,6 +65,14 @@ def test_a_tour_that_would_wind_up_the_cable_is_refused(lab: Lab, tmp_path: Path
     assert lab.arm.moves == []
 
 
+def test_a_plan_that_has_run_before_does_not_excuse_a_wound_cable(lab: Lab) -> None:
+    lab.calibrate()
+    lab.arm.q[5] -= 2 * np.pi
+    lab.operator.shown.clear()
+    with pytest.raises(NotAccepted, match="wrist 3 stands at"):
+        lab.calibrate(plan=lab.run().folder / "plan.json")
+
+
 def test_a_payload_that_is_not_that_of_the_tool_is_refused(lab: Lab) -> None:
     lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=3.0))
     refuse(lab, "payload 1.50 kg .* sensor and tool are 3.00 kg")
