@@ -84,27 +84,32 @@ def stream(
 
 
 def serve(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
-    """Send blocks and events until Ctrl-C is pressed, or a device fails for `RECOVER_S`."""
-    delivered_s = source.clock.now_s()
+    """Send blocks and events until Ctrl-C is pressed, or a device is silent for `RECOVER_S`."""
+    silent_since_s: float | None = None
     try:
         while True:
             try:
                 block = source.read()
-                delivered_s = source.clock.now_s()
+            except DriverError as error:
+                now_s = source.clock.now_s()
+                if silent_since_s is None:
+                    silent_since_s = now_s
+                    talk.print(f"{error}. Viewers stay connected for {RECOVER_S:g} s.")
+                elif now_s - silent_since_s > RECOVER_S:
+                    raise
+            else:
+                if silent_since_s is not None:
+                    silent_since_s = None
+                    talk.print("Samples arrive again.")
                 for sink in sinks:
                     sink.write(block)
-            except DriverError:
-                if source.clock.now_s() - delivered_s > RECOVER_S:
-                    raise
             _send_events(source, sinks)
     finally:
         _send_events(source, sinks)
 
 
-def _send_events(source: ProcessedStream, sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
+def _send_events(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
     for event in source.take_events():
-        if event.kind in ("stale", "recovered", "gap"):
-            talk.print(event.text)
         for sink in sinks:
             sink.event(event)
 

@@ -2,6 +2,7 @@
 
 import re
 import signal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from tests.unit.ftdrive.servers.fake_stream import Client
 
 @pytest.mark.slow
 def test_a_viewer_sees_no_force_on_a_free_tool(ftdrive: CommandLine) -> None:
-    process = ftdrive.start("stream", "--simulate", "--port", "0", "--axes", "base")
+    process = ftdrive.start("stream", "--simulate", "--sensor", "emulated://serial", "--port", "0", "--axes", "base")
     printed = listen_for(process, "Ctrl-C ends.")
     (port,) = set(re.findall(r"ws://127\.0\.0\.1:(\d+)", printed))
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -24,7 +25,7 @@ def test_a_viewer_sees_no_force_on_a_free_tool(ftdrive: CommandLine) -> None:
             viewer.subscribe(topic)
             while (received := viewer.message())[0] != topic:
                 pass
-            message = store.deserialize_cdr(received[2], ros2.SCHEMAS[topic].name)
+            message: Any = store.deserialize_cdr(received[2], ros2.SCHEMAS[topic].name)
             force_N[message.header.frame_id] = np.linalg.norm([getattr(message.wrench.force, axis) for axis in "xyz"])
         viewer.call("tare")
         assert viewer.answer()["success"]
