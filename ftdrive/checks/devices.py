@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib import CalibrationResult
+from calib import CalibrationDataset, CalibrationResult
 from calib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
 from calib.poses.information import Guess, predicted_sigma, special
 from drivers.clock import Clock
@@ -29,11 +29,12 @@ from drivers.ur.kinematics import MODELS
 from ftdrive.cell.config import CellConfig, RobotConfig, ToolConfig
 from ftdrive.checks.check import Check, State
 from ftdrive.checks.computer import SensorAddress, latency_command
-from ftdrive.checks.controller_settings import PAYLOAD_KG, PAYLOAD_SHARE
+from ftdrive.checks.controller_settings import PAYLOAD_KG, PAYLOAD_SHARE, payload_in_words
 
 _PUSH_N = 2.0
 _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs on this computer"
 _RATE_TOLERANCE = 0.1
+_MUCH_NOISE: Final = 2.0
 _LOAD: Final = 0.8
 _PAYLOAD_MM: Final = 100.0
 """The centre of the payload may be this far outside the described tool."""
@@ -234,6 +235,26 @@ def check_noise(wrench: Array, duration_s: float, average_s: float, mass_kg: flo
     return [level, Check("noise.accuracy", "ok", accuracy)]
 
 
+def check_noise_change(wrench: Array, dataset: CalibrationDataset) -> Check:
+    """Compare the noise of a resting sensor (n, 6) with that of the poses of a calibration.
+
+    Compared is the variance of a mean times its number of samples, which does not depend on the averaging time.
+    """
+    name = "noise.change"
+    if dataset.wrench_cov is None or not (sampled := dataset.n_samples > 0).any():
+        return Check(name, "skipped", "the noise of the calibration is not known")
+    if len(wrench) < LEAST_SAMPLES or not is_stationary(wrench):
+        return Check(name, "skipped", "the reading is not steady")
+    then = np.einsum("nii,n->ni", dataset.wrench_cov[sampled], dataset.n_samples[sampled])
+    now = np.diag(mean_and_covariance(wrench).covariance) * len(wrench)
+    ratio = np.sqrt(now / np.median(then, axis=0))
+    most = int(np.argmax(ratio))
+    found = f"noise is {ratio[most]:.1f} times that of the calibration in {AXES[most]}"
+    if ratio[most] < _MUCH_NOISE:
+        return Check(name, "ok", found)
+    return Check(name, "warning", found, "look for vibration and loose cables, then ftdrive doctor")
+
+
 def check_level(wrench: Array) -> Check:
     """Check that all six axes of a resting sensor (n, 6) are alive, finite and steady."""
     name = "noise.level"
@@ -347,6 +368,27 @@ def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) 
         fix = "set the centre of gravity at the pendant: Installation, Payload"
         return Check(name, "warning", f"{found}; nothing hangs in the middle of the flange face", fix)
     return Check(name, "ok", found)
+
+
+def check_weighed_payload(payload_kg: float | None, result: CalibrationResult, sensor_kg: float | None) -> Check:
+    """Compare the payload configured in the controller with the load that a calibration has weighed.
+
+    Parameters
+    ----------
+    payload_kg : float, optional
+        As the controller reports it.
+    result : CalibrationResult
+    sensor_kg : float, optional
+        Mass of sensor and adapter, which the sensor cannot weigh.
+    """
+    name = "robot.payload"
+    if payload_kg is None:
+        return Check(name, "skipped", "this controller does not report its payload")
+    if words := payload_in_words(payload_kg, result.mass_kg, sensor_kg):
+        found, _, fix = words.partition(": ")
+        return Check(name, "warning", found, fix)
+    known = "sensor" if sensor_kg is None else f"{sensor_kg:.2f} kg sensor"
+    return Check(name, "ok", f"robot {payload_kg:.2f} kg; weighed {result.mass_kg:.2f} kg + {known}")
 
 
 def _at_tool(p_flange_m: Sequence[float], tool: ToolConfig) -> bool:

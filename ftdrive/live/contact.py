@@ -43,6 +43,8 @@ class ContactTest:
         self._calibration: tuple[Parameters, Array, Response | None] | None = None
         self._known: tuple[Array, Array] | None = None
         """Orientation and the matrix that makes its readings white."""
+        self.uncertainty = np.zeros((6, 6))
+        """Covariance of the prediction at the newest orientation, sensor axes."""
         self.limit = contact_threshold(false_alarm_rate)
         """Of the squared distance."""
         self.restart()
@@ -84,8 +86,9 @@ class ContactTest:
         cell = np.floor(np.cumsum(turned) / _TURN_RAD)
         starts = [0, *(np.flatnonzero(np.diff(cell, prepend=0.0)) + 1).tolist()]
         R = R_base_flange[starts]
-        covariance = noise.reading + self._beyond + predicted_covariance(*calibration, R)
-        whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+        uncertainty = predicted_covariance(*calibration, R) + self._beyond
+        whiten = np.linalg.inv(np.linalg.cholesky(uncertainty + noise.reading))
+        self.uncertainty = uncertainty[-1]
         self._known = R[-1], whiten[-1]
         return starts, list(whiten)
 

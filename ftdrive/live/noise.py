@@ -4,7 +4,6 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.data.dwell_mean import RESOLUTION
 from drivers.interfaces import Array
@@ -13,7 +12,7 @@ READING_S = 0.02
 """A reading is the mean of the samples of this time: contact is judged by readings."""
 
 _STILL_RAD, _STILL_M = 1e-4, 1e-4
-"""Largest motion of the flange within a reading at rest."""
+"""Largest motion of the flange between two readings at rest."""
 _WINDOW = 25
 """Differences of successive readings."""
 _WINDOWS = 60
@@ -54,7 +53,8 @@ class NoiseEstimator:
     def __init__(self, rate_Hz: float) -> None:
         self._size = samples_in_reading(rate_Hz)
         self._unread = np.empty((0, 18))
-        self._before: tuple[Array, bool] | None = None
+        self._before: tuple[Array, Array] | None = None
+        """Mean and last pose of the reading before."""
         self._open: dict[bool, list[Array]] = {True: [], False: []}
         self._windows: dict[bool, deque[tuple[Array, Array]]] = {
             still: deque(maxlen=_WINDOWS) for still in (True, False)
@@ -71,26 +71,31 @@ class NoiseEstimator:
         if not n:
             return
         groups = rows[: n * self._size].reshape(n, self._size, 18)
-        moved = np.abs(groups[:, -1, 6:] - groups[:, 0, 6:])
-        still = (moved[:, :9].max(axis=1) < _STILL_RAD) & ~(moved[:, 9:].max(axis=1) > _STILL_M)  # NaN is still
         means = groups[:, :, :6].mean(axis=1)
         inside = groups[:, :, :6] - means[:, None]
         within = np.einsum("nsi,nsj->nij", inside, inside) / self._size
-        self._collect(means, within, still)
+        poses = groups[:, -1, 6:]
+        if self._before is None:
+            self._before = means[0], poses[0]
+            means, poses, within, groups = means[1:], poses[1:], within[1:], groups[1:]
+        self._collect(
+            np.concatenate([self._before[0][None], means]), np.concatenate([self._before[1][None], poses]), within
+        )
+        if len(means):
+            self._before = means[-1], poses[-1]
 
-    def _collect(self, means: Array, within: Array, still: NDArray[np.bool_]) -> None:
-        if self._before is not None:
-            means, still = np.concatenate([self._before[0][None], means]), np.append(self._before[1], still)
-        else:
-            within = within[1:]
-        self._before = means[-1], bool(still[-1])
+    def _collect(self, means: Array, poses: Array, within: Array) -> None:
+        """Add the differences of n + 1 successive readings to the windows."""
+        moved = np.abs(np.diff(poses, axis=0))
+        # as `not >`, so that an unknown position is still
+        still = (moved[:, :9].max(axis=1, initial=0.0) < _STILL_RAD) & ~(moved[:, 9:] > _STILL_M).any(axis=1)
         steps = np.diff(means, axis=0)
         changed = False
         for kind in (True, False):
-            both = (still[1:] == kind) & (still[:-1] == kind)
-            if not both.any():
+            alike = still == kind
+            if not alike.any():
                 continue
-            self._open[kind].append(np.concatenate([steps[both], within[both].reshape(-1, 36)], axis=1))
+            self._open[kind].append(np.concatenate([steps[alike], within[alike].reshape(-1, 36)], axis=1))
             if sum(map(len, self._open[kind])) >= _WINDOW:
                 rows = np.concatenate(self._open[kind])
                 full = len(rows) // _WINDOW

@@ -11,7 +11,6 @@ from collections import deque
 from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib.errors import BadDataset
 from drivers.interfaces import ArmStates, Array, FtSamples
@@ -82,12 +81,11 @@ class Timeline:
         return np.asarray(self._origin[1] + np.rint(times).astype(np.int64))
 
     def _learn_rate(self, x: Array, y: Array) -> None:
-        self._points.append((float(x[-1]), float(y[-1])))
-        (x_0, y_0), (x_1, y_1) = self._points[0], self._points[-1]
-        if y_1 - y_0 > _LEAST_SPAN_S * 1e9:
-            self._slope = (y_1 - y_0) / (x_1 - x_0)
+        x_end, y_end = float(x[-1]), float(y[-1])
+        if y_end > _LEAST_SPAN_S * 1e9:
+            self._slope = y_end / x_end
             self._offset = float((y - self._slope * x).min())
-            self._points.clear()
+            self._last = x_end, y_end
 
     def _note(self, x: float, y: float) -> None:
         """Keep the least delayed sample of each bucket, and fit the line."""
@@ -144,7 +142,7 @@ class PoseTrack:
         if not later.any():
             return
         new = np.zeros((int(later.sum()), 14))
-        new[:, :4] = Rotation.from_matrix(R_base_flange[later]).as_quat()
+        new[:, :4] = _quaternions(R_base_flange[later])
         new[:, 4:7], new[:, 7:13] = p_base_flange_m[later], q_rad[later]
         t_ns = np.concatenate([self._t_ns, t_host_ns[later]])
         columns = np.concatenate([self._columns, new])
@@ -153,7 +151,7 @@ class PoseTrack:
         # q and -q are one orientation: take the one on the side of its predecessor
         side = np.where((quat[1:] * quat[:-1]).sum(axis=1) < 0, -1.0, 1.0)
         quat[1:] *= np.cumprod(side)[:, None]
-        chord = np.linalg.norm(np.diff(quat, axis=0), axis=1)
+        chord = np.sqrt(np.square(quat[1:] - quat[:-1]).sum(axis=1))
         columns[start:-1, 13] = np.maximum(2 * np.arcsin(np.minimum(chord / 2, 1.0)), 1e-9)
         keep = 0
         if math.isfinite(self._keep_s):
@@ -174,6 +172,20 @@ class PoseTrack:
         angle = np.maximum(before[:, 13:], 1e-9)
         quat = (np.sin((1 - f) * angle) * before[:, :4] + np.sin(f * angle) * after[:, :4]) / np.sin(angle)
         return linear[:, 3:], _matrices(quat), linear[:, :3]
+
+
+def _quaternions(R: Array) -> Array:
+    """Unit quaternions x y z w (n, 4) of rotation matrices (n, 3, 3), by the largest component (Shepperd 1978)."""
+    x, y, z = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
+    squares = np.stack([1 + x - y - z, 1 - x + y - z, 1 - x - y + z, 1 + x + y + z], axis=1)  # 4 times
+    largest = squares.argmax(axis=1)
+    outer = np.empty((len(R), 4, 4))  # 4 q q^T
+    outer[:, :3, :3] = R + np.swapaxes(R, 1, 2)
+    for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0))):
+        outer[:, i, 3] = outer[:, 3, i] = R[:, j, k] - R[:, k, j]
+    outer[:, range(4), range(4)] = squares
+    row = outer[np.arange(len(R)), largest]
+    return np.asarray(row / np.sqrt(np.square(row).sum(axis=1, keepdims=True)))
 
 
 def _matrices(quat: Array) -> Array:

@@ -36,6 +36,8 @@ from ftdrive.live.tare import TARE_S, try_tare
 SENSOR_FRAME = WrenchFrame()
 STANDARD = Stages()
 FALSE_ALARM_RATE = 1e-3
+_CHUNK_ROWS = 8192
+"""More rows are processed in pieces that stay in the cache."""
 _KNOT_S = 0.002
 """Poses of this spacing give the acceleration."""
 _DRIFT_SIGMAS = 5.0
@@ -80,6 +82,7 @@ class Processor:
         beyond = likely_error**2 - np.square(calibration.predicted_error())
         self._beyond = np.repeat(beyond / 3, 3)
         self._noise = NoiseEstimator(info.sensor_rate_Hz)
+        self._noise_is_learnt = False
         self._test = ContactTest(info.sensor_rate_Hz, false_alarm_rate, self._beyond)
         self._tracker = ContactTracker()
         self._drift = DriftFilter()
@@ -145,7 +148,14 @@ class Processor:
         a block may then be empty.
         """
         with self._lock:
-            return self._process(paired, last) if len(paired) else self._processed(paired, None)
+            if not len(paired):
+                return self._processed(paired, None)
+            if len(paired) <= 2 * _CHUNK_ROWS:
+                return self._process(paired, last)
+            chunks = [paired.rows(slice(i, i + _CHUNK_ROWS)) for i in range(0, len(paired), _CHUNK_ROWS)]
+            if self._noise.noise is None:
+                self.learn_noise(paired)
+            return Block.concatenate([self._process(chunk, last and chunk is chunks[-1]) for chunk in chunks])
 
     def _process(self, paired: Paired, last: bool) -> Block:
         self._note_gaps(paired)
@@ -162,7 +172,7 @@ class Processor:
             end = end if last else max(ready, self._done)
             inertial = inertial[self._done : end]
         rows = buffer.rows(slice(self._done, end))
-        keep = max(0, end - neighbours - self._stride)
+        keep = max(0, end - neighbours - self._stride) // self._stride * self._stride  # knots stay where they are
         self._buffer, self._done = buffer.rows(slice(keep, None)), end - keep
         block = self._processed(rows, inertial)
         if last:
@@ -170,9 +180,12 @@ class Processor:
         return block
 
     def learn_noise(self, paired: Paired) -> None:
-        """Learn the noise from samples that are not processed, such as all of a recording."""
+        """Learn the noise from all of a recording, before it is processed and instead of during that."""
         with self._lock:
-            self._noise.add(self._free(paired)[0], paired.R_base_flange, paired.p_base_flange_m)
+            self._noise_is_learnt = True
+            for i in range(0, len(paired), _CHUNK_ROWS):
+                rows = paired.rows(slice(i, i + _CHUNK_ROWS))
+                self._noise.add(self._free(rows)[0], rows.R_base_flange, rows.p_base_flange_m)
 
     def _free(self, rows: Paired) -> tuple[Array, Array, Array]:
         """Return the residual of a free tool at rest, (n, 6), its weight (n, 6) and the bias (6,)."""
@@ -207,7 +220,7 @@ class Processor:
         residual, gravity, bias = self._free(rows)  # chi2 is that of a free tool, whatever is switched off
         if inertial is not None:
             residual -= inertial
-        if n:
+        if n and not self._noise_is_learnt:
             self._noise.add(residual, rows.R_base_flange, rows.p_base_flange_m)
         current = self._tares[-1][0]
         uncertain = (current.parameters, current.covariance, calibration.response)
@@ -246,7 +259,10 @@ class Processor:
         )
 
     def sigma(self, R_base_flange: Array, mean_s: float = 0.0) -> Array:
-        """Standard deviation (6,) of one sample in the frame, or of the mean over `mean_s`; NaN until it is known."""
+        """Standard deviation (6,) of the newest sample in the frame, or of the mean over `mean_s`.
+
+        NaN until it is known. `R_base_flange` (3, 3) is that of the sample.
+        """
         noise = self._noise.noise
         if noise is None:
             return np.full(6, np.nan)
@@ -255,9 +271,9 @@ class Processor:
         else:
             covariance = noise.sample * self._filter.power_gain
         if self._stages.gravity or self._stages.bias:
-            covariance = covariance + self._uncertainty(R_base_flange)
+            covariance = covariance + self._test.uncertainty
         T = self._transform.matrix(R_base_flange)
-        return np.asarray(np.sqrt(np.diag(T @ covariance @ T.T)))
+        return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", T, covariance, T)))
 
     def _uncertainty(self, R_base_flange: Array) -> Array:
         """Covariance (6, 6) of the prediction of a free tool, sensor axes."""
@@ -267,14 +283,24 @@ class Processor:
         )
         return np.asarray(predicted + np.diag(self._beyond))
 
-    def restart(self) -> None:
-        """Forget the samples before an interruption; noise, tares and drift remain."""
+    def restart(self, *, elsewhere: bool = False) -> None:
+        """Forget the samples before an interruption; noise, tares and drift remain.
+
+        With `elsewhere` the next sample is at another place of a recording, and none were lost.
+        """
         with self._lock:
             self._report_contacts(self._tracker.end())
             self._test.restart()
             self._filter = self._filter_of(self._stages)
             self._recent.clear()
-            self._buffer, self._done, self._newest_seq = None, 0, None
+            self._buffer, self._done = None, 0
+            if elsewhere:
+                self._newest_seq = None
+
+    @property
+    def contact_limit(self) -> float:
+        """Of `Block.chi2`."""
+        return self._test.limit
 
     def status(self, sensor: LinkStatus, arm: LinkStatus, delay: tuple[float, float]) -> StreamStatus:
         """Return the state of a stream with these links and this delay and its sigma, s."""

@@ -26,7 +26,6 @@ from ftdrive.runs.run import Run
 
 STEP_S = 0.01
 """Of the recording: one block."""
-_LEARN_ROWS = 100_000
 
 
 class ReplayedStream(ProcessedStream):
@@ -67,8 +66,7 @@ class ReplayedStream(ProcessedStream):
         self._seconds = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
         self.clock = clock
         self._processor = Processor(info, frame, stages, false_alarm_rate=false_alarm_rate)
-        for start in range(0, len(rows), _LEARN_ROWS):
-            self._processor.learn_noise(rows.rows(slice(start, start + _LEARN_ROWS)))
+        self._processor.learn_noise(rows)
         self._speed = speed
         self._next = 0
         """The first row that was not read."""
@@ -123,7 +121,7 @@ class ReplayedStream(ProcessedStream):
     def seek(self, t_s: float) -> None:
         """Go to a time in the recording; filters and contacts restart there."""
         self._next = int(np.searchsorted(self._seconds, min(max(t_s, 0.0), self.duration_s)))
-        self._processor.restart()
+        self._processor.restart(elsewhere=True)
         self._set_out(float(self._seconds[self._next]))
 
     def step(self) -> Block:

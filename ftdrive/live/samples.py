@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +83,10 @@ class Paired:
         return cls(*(np.concatenate([getattr(block, column.name) for block in blocks]) for column in fields(cls)))
 
 
+_ALIKE = ("sigma", "frame", "stages")
+"""Fields of a block that its samples share."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
     """n consecutive samples of the sensor, each with the pose at its time."""
@@ -120,13 +124,23 @@ class Block:
 
     def rows(self, which: slice | NDArray[np.bool_]) -> Self:
         """Select samples."""
-        alike = ("sigma", "frame", "stages")
         return type(self)(
             **{
-                item.name: getattr(self, item.name) if item.name in alike else getattr(self, item.name)[which]
+                item.name: getattr(self, item.name) if item.name in _ALIKE else getattr(self, item.name)[which]
                 for item in fields(self)
             }
         )
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence[Self]) -> Self:
+        """Join blocks of one frame and stages in the order given; sigma is that of the last."""
+        columns: dict[str, Any] = {
+            item.name: getattr(blocks[-1], item.name)
+            if item.name in _ALIKE
+            else np.concatenate([getattr(block, item.name) for block in blocks])
+            for item in fields(cls)
+        }
+        return cls(**columns)
 
     def __iter__(self) -> Iterator["Sample"]:
         force_sigma, torque_sigma = self.sigma[:3], self.sigma[3:]

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationResult
+from calib import CalibrationDataset, CalibrationResult
 from drivers.errors import (
     ConnectError,
     DeviceFault,
@@ -289,6 +289,41 @@ def test_push_names_axis_and_sign(R_base_flange: Any, R_flange_sensor: Any, size
     check, moved = diagnosis.check_push(R_sensor_base @ [0, -size_N, 0], R_base_flange, R_flange_sensor, 1)
     assert (check.state, moved["base"]["axis"]) == ("failed", "-Y")
     assert "sign" not in str(check.fix)
+
+
+@pytest.mark.parametrize(
+    ("payload_kg", "sensor_kg", "state", "words"),
+    [
+        (None, 0.3, "skipped", "does not report"),
+        (1.72, 0.3, "ok", "robot 1.72 kg; weighed 1.44 kg + 0.30 kg sensor"),
+        (1.72, None, "ok", "weighed 1.44 kg + sensor"),
+        (3.0, 0.3, "warning", "payload of 3.00 kg, but 1.44 kg hang"),
+    ],
+)
+def test_the_payload_is_compared_with_the_weighed_load(
+    payload_kg: float | None, sensor_kg: float | None, state: str, words: str
+) -> None:
+    calibration = cast(CalibrationResult, SimpleNamespace(mass_kg=1.44))
+    check = diagnosis.check_weighed_payload(payload_kg, calibration, sensor_kg)
+    assert (check.name, check.state) == ("robot.payload", state)
+    assert words in check.found
+    assert (state == "warning") == bool(check.fix and check.fix.startswith("set the payload in PolyScope"))
+
+
+@pytest.mark.parametrize(
+    ("factor", "drifts", "state"), [(1.0, 0.0, "ok"), (3.0, 0.0, "warning"), (1.0, 5.0, "skipped")]
+)
+def test_noise_is_compared_with_that_of_the_calibration(factor: float, drifts: float, state: str) -> None:
+    sigma = np.repeat([0.1, 0.004], 3)
+    cov = np.tile(np.diag(sigma**2 / 500), (6, 1, 1))
+    R = Rotation.random(6, rng=1).as_matrix()
+    dataset = CalibrationDataset(R, np.zeros((6, 6)), cov, np.full(6, 500), np.full(6, np.nan))
+    rng = np.random.default_rng(1)
+    wrench = factor * sigma * rng.normal(size=(1000, 6)) + drifts * sigma * np.linspace(0, 1, 1000)[:, None]
+    check = diagnosis.check_noise_change(wrench, dataset)
+    assert check.state == state
+    unknown = CalibrationDataset(R, np.zeros((6, 6)), None, np.zeros(6, np.int64), np.full(6, np.nan))
+    assert diagnosis.check_noise_change(wrench, unknown).state == "skipped"
 
 
 def test_push_without_mounting_or_without_a_push() -> None:

@@ -1,0 +1,271 @@
+"""The live screen: the compensated wrench in a terminal, with keys and mouse.
+
+`Feed` reads the stream in a thread. Ten times a second `Summary` takes what is new, `layout.frame` draws its `View` as
+lines, and only the lines that changed are sent to the terminal.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import ClassVar, TypeVar, get_args
+
+from rich.segment import Segment
+from rich.style import Style
+from textual import events
+from textual.app import App, ComposeResult
+from textual.geometry import Region
+from textual.strip import Strip
+from textual.widget import Widget
+from textual.widgets import Input
+
+from calib import CalibrationDataset
+from calib.errors import BadDataset
+from ftdrive.checks.check import Check
+from ftdrive.checks.devices import check_calibration
+from ftdrive.errors import ConfigError
+from ftdrive.live.replay import ReplayedStream
+from ftdrive.live.samples import Axes, Point, StreamInfo, WrenchFrame
+from ftdrive.terminal.live.feed import Feed, Sink, Stream
+from ftdrive.terminal.live.history import SPANS_S
+from ftdrive.terminal.live.layout import frame
+from ftdrive.terminal.live.summary import Summary
+from ftdrive.terminal.live.view import BAD, Line, Part
+
+T = TypeVar("T")
+
+_REFRESH_S = 0.1
+_SEEK_S = 5.0
+_LOWPASS_HZ = 40.0
+"""Cut-off of the low-pass that key 4 switches on."""
+_HELP = """\
+ ftdrive live: the wrench on the tool, ten times a second
+
+ now      mean of the last 0.1 s
+ ± σ      one sigma of that mean: noise and calibration
+ peak     extremes since p
+ bars     their scale follows the recent extremes
+
+ t tare: change the bias so that a free tool reads zero        u undo the tare
+ x axes: sensor, flange, base, tcp     a reference point: sensor, flange, tcp
+ 1 2 3 4 stages: bias, gravity, inertia, low-pass
+ z freeze the screen; a recording goes on
+ b mark: text for recording and plots  r start or complete a recording
+ p reset the peaks                     g span of the plots: 2, 10, 60, 600 s
+
+ Replay: space pause    ← → seek 5 s    . next samples    + - speed
+
+ Plots: smallest and largest value of each column; dotted lines at 0 and at
+        ± 1 sigma of a sample; ━ contact, ◆ mark, tare or change of stages
+ The mouse works on stages, axes, point, peaks, span and keys.
+
+ Any key returns."""
+
+
+def run_live(stream: Stream, *, recorder: Callable[[], Sink] | None = None, checks: Sequence[Check] = ()) -> None:
+    """Show a stream until the user quits.
+
+    Parameters
+    ----------
+    stream : CompensatedStream or ReplayedStream
+        Open; it is read here, and closed by the caller.
+    recorder : callable, optional
+        Opens a recording; the key r starts and completes one.
+    checks : sequence of Check
+        Findings about the cell that the stream does not know, such as "robot.payload".
+
+    Raises
+    ------
+    DriverError
+        The stream had failed when the user quit.
+    """
+    info = stream.info
+    devices = check_calibration(info.calibration, {"arm": info.arm, "sensor": info.sensor})
+    feed = Feed(stream, recorder)
+    app = LiveApp(feed, Summary(feed, [devices, *checks], _dataset_of(info)))
+    feed.start()
+    try:
+        app.run()
+    finally:
+        feed.stop()
+    if feed.crash is not None:
+        raise feed.crash
+    if feed.failure is not None:
+        raise feed.failure
+
+
+def _dataset_of(info: StreamInfo) -> CalibrationDataset | None:
+    """Read the poses of a calibration from its folder; None where they are not there."""
+    place = Path(info.calibration_name)
+    for path in (place if place.is_dir() else place.parent).glob("dataset*.json"):
+        try:
+            dataset = CalibrationDataset.load(path)
+        except (BadDataset, OSError):
+            continue
+        if dataset.sha256() == info.calibration.provenance.get("dataset_sha256"):
+            return dataset
+    return None
+
+
+class Canvas(Widget):
+    """Shows lines; only those that changed are drawn again."""
+
+    DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[list[Part]] = []
+
+    def show(self, lines: Sequence[Line]) -> None:
+        """Replace the lines."""
+        new, old = [line.parts for line in lines], self.lines
+        self.lines = new
+        width = self.size.width
+        changed = [Region(0, y, width, 1) for y, parts in enumerate(new) if y >= len(old) or parts != old[y]]
+        if changed:
+            self.refresh(*changed)
+
+    def render_line(self, y: int) -> Strip:
+        """Return a line as Textual draws it."""
+        if y >= len(self.lines):
+            return Strip.blank(self.size.width)
+        return Strip([Segment(part.text, _style(part.style, part.key)) for part in self.lines[y]])
+
+
+@lru_cache
+def _style(name: str, key: str) -> Style:
+    style = Style.parse(name)
+    return style + Style.from_meta({"@click": f"app.press('{key}')"}) if key else style
+
+
+class LiveApp(App[None]):
+    """Draws what a `Feed` knows."""
+
+    ENABLE_COMMAND_PALETTE = False
+    CSS = "Input { dock: bottom; height: 1; border: none; padding: 0 1; }"
+    BINDINGS: ClassVar = [("ctrl+c", "press('q')", "quit")]
+    TITLE = "ftdrive live"
+
+    def __init__(self, feed: Feed, summary: Summary) -> None:
+        super().__init__(ansi_color=True)  # the terminal's own colours, light or dark
+        self.theme = "ansi-dark"
+        self._feed, self._summary = feed, summary
+        self._canvas = Canvas()
+        self._helping = False
+
+    def compose(self) -> ComposeResult:
+        """Build the screen."""
+        yield self._canvas
+
+    def on_mount(self) -> None:
+        """Start to draw."""
+        self.set_interval(_REFRESH_S, self.draw)
+
+    def on_resize(self) -> None:
+        """Draw at the new size."""
+        self.draw()
+
+    def draw(self) -> None:
+        """Draw the present state."""
+        if self._feed.crash is not None:
+            self.exit()
+            return
+        width, height = self.size
+        if self._helping:
+            lines = [Line(text).fit(width) for text in _HELP.split("\n")]
+            self._canvas.show((lines + [Line().to(width)] * height)[:height])
+        else:
+            self._canvas.show(frame(self._summary.view(), width, height))
+
+    def on_key(self, event: events.Key) -> None:
+        """Do what a key stands for."""
+        if not self.query(Input):
+            self.action_press(event.character if event.character and event.character > " " else event.key)
+        elif event.key == "escape":
+            self.query_one(Input).remove()
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        """Put the entered mark into the stream."""
+        event.input.remove()
+        if event.value:
+            self._feed.request(partial(self._feed.stream.mark, event.value))
+
+    def action_press(self, key: str) -> None:
+        """Do what a key stands for."""
+        if self._helping:
+            self._helping = False
+        elif key == "?":
+            self._helping = True
+        elif key == "q":
+            self.exit()
+        elif key == "z":
+            self._summary.is_frozen = not self._summary.is_frozen
+        elif key == "p":
+            self._summary.reset_peaks()
+        elif key == "g":
+            self._summary.span_s = _after(self._summary.span_s, SPANS_S)[0]
+        elif key == "b":
+            self.mount(entry := Input(placeholder="text of the mark, then Enter; Esc leaves"))
+            entry.focus()
+        else:
+            self._feed.request(partial(_press, self._feed, key))
+        self.draw()
+
+
+def _press(feed: Feed, key: str) -> None:
+    """Do what a key stands for; called in the thread that reads."""
+    stream = feed.stream
+    if key == "t":
+        stream.tare()
+    elif key == "u":
+        stream.undo_tare()
+    elif key == "r":
+        feed.switch_recording()
+    elif key == "x":
+        _set_frame(feed, [replace(stream.frame, axes=axes) for axes in _after(stream.frame.axes, get_args(Axes))])
+    elif key == "a":
+        _set_frame(feed, [replace(stream.frame, about=point) for point in _after(stream.frame.about, get_args(Point))])
+    elif key == "1":
+        stream.stages = replace(stream.stages, bias=not stream.stages.bias)
+    elif key == "2":
+        stream.stages = replace(stream.stages, gravity=not stream.stages.gravity)
+    elif key == "3":
+        stream.stages = replace(stream.stages, inertia=not stream.stages.inertia)
+    elif key == "4":
+        highest_Hz = min(_LOWPASS_HZ, stream.info.sensor_rate_Hz / 4)
+        stream.stages = replace(stream.stages, lowpass_Hz=None if stream.stages.lowpass_Hz else highest_Hz)
+    elif isinstance(stream, ReplayedStream):
+        _press_of_replay(stream, feed, key)
+
+
+def _press_of_replay(stream: ReplayedStream, feed: Feed, key: str) -> None:
+    """Do what a key stands for in a replay."""
+    if key == "space":
+        (stream.resume if stream.is_paused else stream.pause)()
+    elif key == "left":
+        stream.seek(stream.at_s - _SEEK_S)
+    elif key == "right":
+        stream.seek(stream.at_s + _SEEK_S)
+    elif key == ".":
+        feed.take(stream.step())
+    elif key in {"+", "="}:
+        stream.speed *= 2
+    elif key == "-":
+        stream.speed /= 2
+
+
+def _set_frame(feed: Feed, frames: Iterable[WrenchFrame]) -> None:
+    """Choose the first frame that the cell has; the others say what to configure."""
+    for each in frames:
+        try:
+            feed.stream.frame = each
+        except ConfigError as error:
+            feed.note(str(error), BAD)
+        else:
+            return
+
+
+def _after(value: object, values: Sequence[T]) -> Sequence[T]:
+    """Return the values in turn, beginning after `value`."""
+    start = values.index(value) + 1 if value in values else 0
+    return [*values[start:], *values[:start]]

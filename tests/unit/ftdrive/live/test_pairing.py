@@ -1,0 +1,173 @@
+"""Times of measurement, interpolated poses, and which sample gets which pose."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+
+from calib.errors import BadDataset
+from calib.model import angle_between
+from drivers.interfaces import ArmStates, FtSamples
+from ftdrive.live.delay import DelayEstimator
+from ftdrive.live.pairing import Pairing, PoseTrack, Timeline, pair_recording
+from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, T0_NS, Motion, calibrated
+
+
+def received(seconds: float, rate_Hz: float, batch: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Counts and times of receipt: batches, each later than its newest sample by at least 0.2 ms."""
+    count = np.arange(round(seconds * rate_Hz) // batch * batch)
+    newest = count.reshape(-1, batch)[:, -1]
+    late_s = 2e-4 + np.random.default_rng(seed).exponential(2e-3, len(newest))
+    at_s = np.maximum.accumulate(newest / rate_Hz + late_s)
+    return count, T0_NS + np.repeat(at_s * 1e9, batch).astype(np.int64)
+
+
+@pytest.mark.parametrize("true_Hz", [1000.0, 1004.0, 998.5])
+def test_times_are_those_of_the_measurement_though_batches_come_late(true_Hz: float) -> None:
+    count, t_ns = received(20.0, true_Hz, 8)
+    line = Timeline(1 / 1000.0)  # the nominal rate is a little wrong
+    stamps = np.concatenate(
+        [line.stamp(count[i : i + 8].astype(float), t_ns[i : i + 8]) for i in range(0, len(count), 8)]
+    )
+    error_s = (stamps - T0_NS) * 1e-9 - count / true_Hz - 2e-4
+    assert np.abs(error_s[5000:]).max() < 2e-4  # the batches scatter by 2 ms
+    assert (np.diff(stamps) > 0).all()
+
+
+def test_a_shift_is_followed_slowly_and_time_never_runs_backwards() -> None:
+    count, t_ns = received(8.0, 1000.0, 8)
+    line, stamps = Timeline(1e-3), []
+    for i in range(0, len(count), 8):
+        line.shift_s = 0.02 if i > 4000 else 0.0
+        stamps.append(line.stamp(count[i : i + 8].astype(float), t_ns[i : i + 8]))
+    all_ns = np.concatenate(stamps)
+    assert (np.diff(all_ns) > 0.9e6).all()
+    assert all_ns[-1] - T0_NS == pytest.approx(count[-1] * 1e6 + 0.2e6 - 20e6, abs=0.2e6)
+
+
+def test_without_a_nominal_rate_it_is_learnt() -> None:
+    count, t_ns = received(10.0, 70.0, 1)
+    line = Timeline(float("nan"))
+    stamps = np.concatenate([line.stamp(count[i : i + 1].astype(float), t_ns[i : i + 1]) for i in range(len(count))])
+    assert np.abs((stamps - T0_NS)[400:] * 1e-9 - count[400:] / 70 - 2e-4).max() < 1e-3
+
+
+def test_a_restarted_device_begins_a_new_line() -> None:
+    line = Timeline(1.0)
+    first = line.stamp(np.array([5000.0, 5000.1]), T0_NS + np.array([0, 100_000_000]))
+    again = line.stamp(np.array([3.0, 3.1]), T0_NS + np.array([900_000_000, 1_000_000_000]))
+    np.testing.assert_array_equal(np.concatenate([first, again]) - T0_NS, [0, 100_000_000, 900_000_000, 1_000_000_000])
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**32 - 1), st.floats(0.001, 1.5))
+def test_orientations_are_interpolated_as_by_scipy(seed: int, step_rad: float) -> None:
+    rng = np.random.default_rng(seed)
+    steps = rng.normal(size=(9, 3))
+    steps *= step_rad / np.linalg.norm(steps, axis=1, keepdims=True)
+    rotations = [Rotation.random(rng=rng)]
+    for step in steps:
+        rotations.append(rotations[-1] * Rotation.from_rotvec(step))
+    keys = Rotation.concatenate(rotations)
+    t_ns = T0_NS + np.cumsum(rng.integers(1_000_000, 9_000_000, 10))
+    poses = PoseTrack()
+    for piece in (slice(0, 4), slice(4, 10)):
+        poses.add(t_ns[piece], np.zeros((10, 6))[piece], keys.as_matrix()[piece], np.zeros((10, 3))[piece])
+    at_ns = np.sort(rng.integers(t_ns[0], t_ns[-1], 30))
+    expected = Slerp((t_ns - T0_NS).astype(float), keys)((at_ns - T0_NS).astype(float)).as_matrix()
+    assert angle_between(poses.at(at_ns)[1], expected).max() < 1e-7
+
+
+def test_positions_and_joints_are_interpolated_between_neighbours() -> None:
+    poses = PoseTrack(keep_s=1.0)
+    t_ns = T0_NS + np.arange(2000) * 2_000_000
+    x = np.arange(2000.0)
+    poses.add(t_ns, np.outer(x, np.ones(6)), np.tile(np.eye(3), (2000, 1, 1)), np.outer(x, [1, 2, 3]))
+    q, R, p = poses.at(np.array([t_ns[-3] + 500_000]))
+    np.testing.assert_allclose(q[0], 1997.25)
+    np.testing.assert_allclose(p[0], np.array([1, 2, 3]) * 1997.25)
+    np.testing.assert_allclose(R[0], np.eye(3), atol=1e-15)
+    assert poses.span_ns == (t_ns[-501], t_ns[-1])  # the rest was dropped
+
+
+def test_a_sample_waits_for_the_pose_after_it() -> None:
+    pairing = Pairing(1000.0, 0.0)
+    samples, states = Motion().links(0.2, 0.0, rate_Hz=1000.0, batch_s=0.001)
+    pairing.add_samples(samples)
+    assert pairing.take() is None
+    half = slice(0, 50)
+    pairing.add_states(states.rows(half))
+    first = pairing.take()
+    assert first is not None
+    assert first.t_host_ns[-1] <= states.t_host_ns[49]
+    assert pairing.waits_for_pose
+    pairing.add_states(states.rows(slice(50, None)))
+    second = pairing.take()
+    assert second is not None
+    seq = np.concatenate([first.seq, second.seq])
+    assert (np.diff(seq) == 1).all()
+    assert len(seq) > 190
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.013])
+def test_the_pose_is_that_of_the_measurement(delay_s: float) -> None:
+    motion = Motion()
+    samples, states = motion.links(2.0, delay_s, rate_Hz=1000.0)
+    pairing, found = Pairing(1000.0, delay_s), []
+    for i in range(100):
+        pairing.add_states(states.rows(slice(10 * i, 10 * i + 10)))
+        pairing.add_samples(samples.rows(slice(20 * i, 20 * i + 20)))
+        if (paired := pairing.take()) is not None:
+            found.append(paired)
+    late = found[-50:]
+    R = np.concatenate([paired.R_base_flange for paired in late])
+    seq = np.concatenate([paired.seq for paired in late])
+    assert angle_between(R, motion.pose(seq * 1e-3)[0]).max() < 5e-4  # half a millisecond at 1 rad/s
+
+
+def recording(delay_s: float, scale: float = 1.0, touch: bool = False) -> tuple[FtSamples, ArmStates]:
+    """A recording with exact times, but the wrench is late."""
+    motion = Motion(scale, 2 * scale)
+    samples, states = motion.links(12.0, 0.0, rate_Hz=500.0, batch_s=1e-9)
+    t_ns = T0_NS + np.arange(len(samples)) * 2_000_000
+    wrench = samples.wrench.copy()
+    if touch:
+        wrench[1500:2500, :3] += np.array([5.0, -8.0, 3.0]) * np.sin(np.arange(1000) * 0.02)[:, None]
+    samples = FtSamples.of(t_ns + round(delay_s * 1e9), samples.seq, wrench)
+    exact = T0_NS + np.arange(len(states)) * 2_000_000
+    return samples, ArmStates(exact, *(getattr(states, n) for n in ArmStates._names()[1:]))
+
+
+@pytest.mark.parametrize(("delay_s", "touch"), [(0.0, False), (0.02, False), (-0.015, False), (0.01, True)])
+def test_the_delay_between_the_links_is_found_from_motion(delay_s: float, touch: bool) -> None:
+    estimator = DelayEstimator(calibrated(6), P_FLANGE_SENSOR_M, window=60)
+    pair_recording(*recording(delay_s, touch=touch), estimator)
+    assert estimator.delay_s == pytest.approx(delay_s, abs=max(6 * estimator.sigma_s, 5e-5))
+    assert estimator.sigma_s < 2e-4
+
+
+def test_an_unknown_height_of_the_sensor_is_not_taken_for_a_delay() -> None:
+    estimator = DelayEstimator(calibrated(), np.full(3, np.nan), window=60)
+    pair_recording(*recording(0.01), estimator)
+    assert estimator.delay_s == pytest.approx(0.01, abs=max(6 * estimator.sigma_s, 1e-4))
+
+
+def test_a_wrong_bias_is_not_taken_for_a_delay() -> None:
+    samples, states = recording(0.005)
+    drifted = FtSamples.of(samples.t_host_ns, samples.seq, samples.wrench + np.array([1.0, -1.0, 2.0, 0, 0, 0]))
+    estimator = DelayEstimator(calibrated(), P_FLANGE_SENSOR_M, window=60)
+    pair_recording(drifted, states, estimator)
+    assert estimator.delay_s == pytest.approx(0.005, abs=max(6 * estimator.sigma_s, 1e-4))
+
+
+def test_an_arm_at_rest_shows_no_delay() -> None:
+    estimator = DelayEstimator(calibrated(), P_FLANGE_SENSOR_M)
+    pair_recording(*recording(0.02, scale=0.0), estimator)
+    assert (estimator.delay_s, estimator.sigma_s) == (0.0, 0.05)
+
+
+def test_recordings_of_different_times_are_rejected() -> None:
+    samples, states = recording(0.0)
+    with pytest.raises(BadDataset, match="no time in common"):
+        pair_recording(samples, states, 100.0)

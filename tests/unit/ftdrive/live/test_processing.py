@@ -1,0 +1,380 @@
+"""Stages, frames, noise, contact, tare and drift of the processing."""
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from calib.model import Array, predict
+from ftdrive.errors import ConfigError
+from ftdrive.live.frames import FrameTransform
+from ftdrive.live.processing import Processor, stages_in_words
+from ftdrive.live.samples import Axes, Block, Paired, Point, Stages, WrenchFrame
+from tests.unit.ftdrive.live.simulated import (
+    NOISE,
+    P_FLANGE_SENSOR_M,
+    P_FLANGE_TCP_M,
+    R_FLANGE_TCP,
+    T0_NS,
+    TRUTH,
+    Motion,
+    calibrated,
+    dwells,
+    info,
+    paired,
+)
+
+AXES: tuple[Axes, ...] = ("sensor", "flange", "base", "tcp")
+POINTS: tuple[Point | tuple[float, float, float], ...] = ("sensor", "flange", "tcp", (0.1, -0.2, 0.3))
+UPSIDE_DOWN = Rotation.from_euler("xz", [170, 25], degrees=True).as_matrix()
+
+
+def still(seconds: float, rate_Hz: float = 1000.0) -> Array:
+    return np.tile(UPSIDE_DOWN, (round(seconds * rate_Hz), 1, 1))
+
+
+def processed(rows: Paired, *, block: int = 10, rate_Hz: float = 1000.0, **options: Any) -> tuple[Processor, Block]:
+    """Process in blocks; the block returned has all rows."""
+    processor = Processor(info(calibrated(), rate_Hz), **options)
+    return processor, run(processor, rows, block)
+
+
+def run(processor: Processor, rows: Paired, block: int = 10) -> Block:
+    blocks = [processor.process(rows.rows(slice(i, i + block))) for i in range(0, len(rows), block)]
+    columns = ("t_host_ns", "wrench", "chi2", "in_contact", "seq")
+    return replace(blocks[-1], **{name: np.concatenate([getattr(b, name) for b in blocks]) for name in columns})
+
+
+def kinds(processor: Processor) -> list[str]:
+    return [event.kind for event in processor.take_events()]
+
+
+# ------------------------------------------------------------------------------------------------------------- frames
+
+
+@pytest.mark.parametrize("axes", AXES)
+@pytest.mark.parametrize("about", POINTS)
+@settings(max_examples=5)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_power_is_the_same_in_every_frame(axes: Axes, about: Point | tuple[float, float, float], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    R_base_flange = Rotation.random(rng=rng).as_matrix()
+    wrench, twist = rng.normal(size=6), rng.normal(size=6)  # velocity of the sensor origin, rate; sensor axes
+    R_flange_sensor = calibrated().R_flange_sensor
+    points = {"sensor": P_FLANGE_SENSOR_M, "flange": np.zeros(3), "tcp": P_FLANGE_TCP_M}
+    point = points[about] if isinstance(about, str) else np.array(about)
+    R_axes_sensor = {
+        "sensor": np.eye(3),
+        "flange": R_flange_sensor,
+        "base": R_base_flange @ R_flange_sensor,
+        "tcp": R_FLANGE_TCP.T @ R_flange_sensor,
+    }[axes]
+    velocity, rate = twist[:3], twist[3:]
+    at_point = velocity + np.cross(rate, R_flange_sensor.T @ (point - P_FLANGE_SENSOR_M))
+    there = FrameTransform(WrenchFrame(axes, about), info(calibrated()))(wrench[None], R_base_flange[None])[0]
+    power = there[:3] @ (R_axes_sensor @ at_point) + there[3:] @ (R_axes_sensor @ rate)
+    assert power == pytest.approx(wrench @ twist, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("axes", AXES)
+@pytest.mark.parametrize("about", POINTS)
+def test_rows_and_matrix_agree_and_can_be_undone(axes: Axes, about: Point | tuple[float, float, float]) -> None:
+    rng = np.random.default_rng(1)
+    R, wrench = Rotation.random(5, rng=rng).as_matrix(), rng.normal(size=(5, 6))
+    transform = FrameTransform(WrenchFrame(axes, about), info(calibrated()))
+    there = transform(wrench, R)
+    for i in range(5):
+        np.testing.assert_allclose(transform.matrix(R[i]) @ wrench[i], there[i], atol=1e-12)
+        np.testing.assert_allclose(np.linalg.solve(transform.matrix(R[i]), there[i]), wrench[i], atol=1e-10)
+
+
+@pytest.mark.parametrize("axes", AXES)
+def test_a_push_along_x_of_the_base_is_that_in_every_frame(axes: Axes) -> None:
+    R = dwells(40, 25, seed=5)
+    push = np.zeros((len(R), 6))
+    push[:, :3] = 10.0 * (R @ TRUTH.R_flange_sensor)[:, 0, :]  # x of the base, in sensor axes
+    _, block = processed(paired(R, push=push), block=500, frame=WrenchFrame(axes))
+    R_base_axes = {
+        "sensor": R @ calibrated().R_flange_sensor,
+        "flange": R,
+        "base": np.tile(np.eye(3), (len(R), 1, 1)),
+        "tcp": R @ R_FLANGE_TCP,
+    }[axes]
+    in_base = (R_base_axes @ block.wrench[:, :3, None])[..., 0]
+    np.testing.assert_allclose(in_base.mean(axis=0), [10.0, 0, 0], atol=0.03)
+    assert block.frame.axes == axes
+
+
+def test_a_frame_needs_the_height_of_the_sensor() -> None:
+    without = info(calibrated(), height=False)
+    FrameTransform(WrenchFrame("base", "sensor"), without)
+    for about in ("flange", "tcp", (0.0, 0.0, 0.1)):
+        with pytest.raises(ConfigError, match=r"\[sensor\] height_mm"):
+            FrameTransform(WrenchFrame("sensor", about), without)  # type: ignore[arg-type]
+    processor = Processor(without)
+    with pytest.raises(ConfigError, match="height_mm"):
+        processor.frame = WrenchFrame("base", "tcp")
+    with pytest.raises(ConfigError, match="height_mm"):
+        processor.stages = Stages(inertia=True)
+    assert processor.frame == WrenchFrame()
+    assert kinds(processor) == []
+
+
+def test_a_frame_needs_the_tcp_of_the_controller() -> None:
+    without = replace(info(calibrated()), p_flange_tcp_m=np.full(3, np.nan))
+    with pytest.raises(ConfigError, match="TCP"):
+        FrameTransform(WrenchFrame("tcp", "sensor"), without)
+
+
+# ------------------------------------------------------------------------------------------------------------- stages
+
+
+def test_each_stage_is_what_it_says() -> None:
+    rows = paired(still(0.2), push=np.array([1.0, 2, 3, 0.1, 0.2, 0.3]), noise=0.0)
+    weight = predict(TRUTH, UPSIDE_DOWN) - np.r_[TRUTH.force_bias_N, TRUTH.torque_bias_Nm]
+    push = np.array([1.0, 2, 3, 0.1, 0.2, 0.3])
+    for stages, expected in (
+        (Stages(), push),
+        (Stages(gravity=False), push + weight),
+        (Stages(bias=False), push + np.r_[TRUTH.force_bias_N, TRUTH.torque_bias_Nm]),
+        (Stages(bias=False, gravity=False), rows.raw[0]),
+        (Stages(deadband_N=1.0, deadband_Nm=10.0), np.r_[push[:3] * (1 - 1 / np.sqrt(14)), 0, 0, 0]),
+        (Stages(lowpass_Hz=10.0, notch_Hz=50.0), push),  # no transient at the beginning
+    ):
+        _, block = processed(rows, block=50, stages=stages)
+        np.testing.assert_allclose(block.wrench, np.tile(expected, (200, 1)), atol=0.02)
+
+
+def test_blocks_of_any_size_give_the_same() -> None:
+    rows = moving(1.2)
+    stages = Stages(lowpass_Hz=30.0, notch_Hz=100.0, inertia=True)
+    _, small = processed(rows, block=7, stages=stages)
+    processor = Processor(info(calibrated()), stages=stages)
+    large = processor.process(rows, last=True)
+    n = len(small.t_host_ns)
+    assert n > 1150  # the last rows wait for poses after them
+    np.testing.assert_array_equal(small.seq, np.arange(n))
+    np.testing.assert_allclose(small.wrench, large.wrench[:n], atol=1e-9)
+    np.testing.assert_array_equal(large.seq, np.arange(1200))
+
+
+def test_a_lowpass_reduces_the_noise_as_its_sigma_says() -> None:
+    rows = paired(still(8.0))
+    processor, block = processed(rows, block=400, stages=Stages(lowpass_Hz=40.0))
+    assert block.wrench[2000:].std(axis=0) == pytest.approx(block.sigma, rel=0.1)
+    assert block.sigma[0] < 0.4 * NOISE[0]
+    _, plain = processed(rows, block=400)
+    assert plain.sigma == pytest.approx(NOISE, rel=0.05)
+    assert stages_in_words(processor.stages) == "raw, bias, gravity, low-pass 40 Hz (Butterworth, order 2)"
+
+
+def test_a_switch_of_stages_has_no_transient() -> None:
+    push = np.array([0, 0, 20.0, 0, 0, 0])
+    processor = Processor(info(calibrated()), stages=Stages(lowpass_Hz=5.0))
+    run(processor, paired(still(0.3), push=push, noise=0.01))
+    processor.stages = Stages(gravity=False, lowpass_Hz=5.0)
+    weight = predict(TRUTH, UPSIDE_DOWN)[:3] - TRUTH.force_bias_N
+    block = run(processor, paired(still(0.3), push=push, noise=0.01))
+    np.testing.assert_allclose(block.wrench[:, :3] - weight, np.tile(push[:3], (300, 1)), atol=0.02)
+    assert next(event.kind for event in processor.take_events() if event.kind != "contact") == "stages"
+
+
+def test_an_impossible_filter_is_rejected() -> None:
+    with pytest.raises(ConfigError, match="less than 500 Hz"):
+        Processor(info(calibrated()), stages=Stages(lowpass_Hz=600.0))
+
+
+def moving(seconds: float) -> Paired:
+    motion, t_s = Motion(), np.arange(0, seconds, 1e-3)
+    R, p = motion.pose(t_s)
+    rows = paired(R)
+    raw = motion.wrench(t_s) + NOISE * np.random.default_rng(3).normal(size=(len(t_s), 6))
+    return replace(rows, raw=raw, p_base_flange_m=p)
+
+
+def test_inertia_leaves_only_noise_of_a_moving_tool() -> None:
+    rows = moving(3.0)
+    _, static = processed(rows, block=20)
+    _, dynamic = processed(rows, block=20, stages=Stages(inertia=True))
+    assert (static.wrench.std(axis=0) > 4 * NOISE).all()
+    assert dynamic.wrench.std(axis=0) == pytest.approx(NOISE, rel=0.1)
+    assert len(static.seq) - len(dynamic.seq) <= 13  # milliseconds
+
+
+def test_a_known_inertia_tensor_is_subtracted_too() -> None:
+    tensor = np.diag([0.01, 0.02, 0.03])
+    rows = moving(3.0)
+    _, point = processed(rows, block=500, stages=Stages(inertia=True))
+    _, body = processed(rows, block=500, stages=Stages(inertia=True), inertia_com_kg_m2=tensor)
+    difference = body.wrench - point.wrench
+    assert np.abs(difference[:, :3]).max() < 1e-9
+    t_s, h = np.arange(0, 3, 1e-3), 1e-4
+    R = [Motion().pose(t_s + k * h)[0] @ calibrated().R_flange_sensor for k in (-1, 0, 1)]
+    rotvec = [Rotation.from_matrix(np.swapaxes(R[1], 1, 2) @ R[k]).as_rotvec() for k in (0, 2)]
+    omega, alpha = (rotvec[1] - rotvec[0]) / (2 * h), (rotvec[1] + rotvec[0]) / h**2
+    expected = alpha @ tensor + np.cross(omega, omega @ tensor)
+    n = len(difference)
+    np.testing.assert_allclose(difference[30 : n - 30, 3:], expected[30 : n - 30], atol=0.02 * np.abs(expected).max())
+
+
+# -------------------------------------------------------------------------------------------------- noise and contact
+
+
+def test_a_free_tool_is_noise_and_no_contact() -> None:
+    processor, block = processed(paired(dwells(30, 200, seed=7)), block=200)
+    assert np.sqrt(np.square(block.wrench).mean(axis=0)) == pytest.approx(NOISE, rel=0.05)
+    assert np.nanmean(block.chi2[3000:]) == pytest.approx(6.0, rel=0.2)
+    assert block.in_contact[3000:].mean() < 0.02
+    assert kinds(processor) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("poses", [24, 6])
+def test_false_alarms_are_as_rare_as_stated(poses: int) -> None:
+    alarms = readings = 0
+    for seed in range(25):
+        R = np.concatenate([np.repeat(dwells(1, 1, seed), 4000, axis=0), dwells(100, 200, seed + 1000)])
+        processor = Processor(info(calibrated(poses, seed)), false_alarm_rate=0.01)
+        chi2 = processor.process(paired(R, seed=seed)).chi2[4000:][19::20]
+        alarms, readings = alarms + int((chi2 > processor.contact_limit).sum()), readings + len(chi2)
+    assert readings == 25_000
+    assert 0.007 < alarms / readings < 0.014
+
+
+def test_a_contact_is_one_event_with_its_line_of_force() -> None:
+    R = still(3.0)
+    force_base, at_tcp = np.array([4.0, 0, -3.0]), np.array([0.03, 0.0, 0.0])  # off the TCP by 30 mm, in tcp axes
+    R_base_sensor = UPSIDE_DOWN @ TRUTH.R_flange_sensor
+    force = R_base_sensor.T @ force_base
+    point = TRUTH.R_flange_sensor.T @ (P_FLANGE_TCP_M + R_FLANGE_TCP @ at_tcp - P_FLANGE_SENSOR_M)
+    push = np.zeros((3000, 6))
+    push[1500:2100] = np.r_[force, np.cross(point, force)]
+    processor, block = processed(paired(R, push=push), frame=WrenchFrame("base", "tcp"))
+    (event,) = processor.take_events()
+    assert event.kind == "contact"
+    assert event.t_host_ns == pytest.approx(T0_NS + 1500e6, abs=20e6)
+    values: Any = event.values
+    assert values["duration_s"] == pytest.approx(0.62, abs=0.03)
+    assert values["peak_N"] == pytest.approx(5.0, abs=0.05)
+    np.testing.assert_allclose(values["direction"], force_base / 5, atol=0.02)
+    assert (values["axes"], values["about"]) == ("base", "tcp")
+    arm = UPSIDE_DOWN @ R_FLANGE_TCP @ at_tcp
+    direction = force_base / 5
+    np.testing.assert_allclose(values["line_point_m"], arm - (arm @ direction) * direction, atol=3e-3)
+    assert block.in_contact[1520:2100].all()
+    assert not block.in_contact[2130:].any()
+
+
+def test_two_touches_with_a_short_pause_are_one_contact() -> None:
+    push = np.zeros((4000, 6))
+    for start in (1500, 1700, 3000):
+        push[start : start + 180, 2] = 8.0
+    processor, _ = processed(paired(still(4.0), push=push))
+    assert [round(event.values["duration_s"], 1) for event in processor.take_events()] == [0.4, 0.2]  # type: ignore[call-overload]
+
+
+def test_a_contact_from_the_beginning_is_seen_when_the_noise_is_known() -> None:
+    _, block = processed(paired(still(1.5), push=np.array([0, 0, 2.0, 0, 0, 0])))
+    assert np.isnan(block.chi2[:400]).all()
+    assert block.in_contact[700:].all()
+
+
+def test_noise_that_is_correlated_in_time_makes_no_alarms() -> None:
+    rng = np.random.default_rng(4)
+    slow = np.repeat(rng.normal(size=(800, 6)), 10, axis=0) * NOISE  # each value holds for 10 samples
+    _, block = processed(paired(still(8.0), push=slow, noise=0.1), block=100)
+    assert block.in_contact[2000:].mean() < 0.01
+    assert np.nanmean(block.chi2[2000:]) == pytest.approx(6.0, rel=0.25)
+
+
+def test_a_hand_on_the_tool_does_not_make_the_noise_larger() -> None:
+    rng = np.random.default_rng(5)
+    hand = np.zeros((12000, 6))
+    hand[6000:9000] = np.cumsum(rng.normal(size=(3000, 6)), axis=0) * 0.05
+    _, block = processed(paired(still(12.0), push=hand), block=100)
+    assert block.sigma == pytest.approx(NOISE, rel=0.1)
+
+
+def test_lost_samples_are_events() -> None:
+    rows = paired(still(0.3))
+    kept = np.ones(300, bool)
+    kept[[100, 101, 205]] = False
+    processor, _ = processed(rows.rows(kept))
+    events = processor.take_events()
+    assert [(event.kind, event.values["lost"], event.values["seq"]) for event in events] == [
+        ("gap", 2, 102),
+        ("gap", 1, 206),
+    ]
+
+
+# ------------------------------------------------------------------------------------------------------ tare and drift
+
+
+def test_a_tare_takes_drift_of_the_bias_away_in_every_orientation() -> None:
+    drift = np.array([0.4, -0.3, 0.5, 0.01, 0.0, -0.01])
+    processor, _ = processed(paired(still(1.0), push=drift))
+    event = processor.tare()
+    assert event.kind == "tare"
+    assert event.values["force_N"] == pytest.approx(np.linalg.norm(drift[:3]), abs=0.02)
+    block = run(processor, paired(dwells(10, 100, seed=3), push=drift), 100)
+    np.testing.assert_allclose(block.wrench.mean(axis=0), 0.0, atol=0.02)
+    assert processor.tare_wrench == pytest.approx(drift, abs=0.02)
+    assert processor.undo_tare().kind == "tare-undone"
+    assert processor.tare_wrench is None
+    block = run(processor, paired(still(1.0), push=drift))
+    np.testing.assert_allclose(block.wrench.mean(axis=0), drift, atol=0.02)
+    assert processor.undo_tare().kind == "tare-refused"
+    assert kinds(processor)[:3] == ["tare", "tare-undone", "tare-refused"]
+
+
+@pytest.mark.parametrize(
+    ("push", "why"),
+    [
+        (np.array([0, 0, 3.4, 0, 0, 0]), r"3\.\d+ N .* sigma\) from the free tool"),
+        (np.array([0.8, 0, 0, 0, 0.15, 0]), "take hand or contact away"),
+        (np.outer(np.linspace(0, 1, 1000), [0, 0, 2.0, 0, 0, 0]), "the reading changes"),
+    ],
+)
+def test_a_tare_is_refused_with_a_hand_on_the_tool(push: Array, why: str) -> None:
+    processor, _ = processed(paired(still(1.0), push=push))
+    event = processor.tare()
+    assert event.kind == "tare-refused"
+    assert processor.tare_wrench is None
+    assert re.search(why, event.text)
+
+
+def test_a_tare_is_refused_while_the_arm_moves() -> None:
+    processor, _ = processed(moving(1.0))
+    assert "the arm moves" in processor.tare().text
+
+
+def test_a_tare_without_samples_is_refused() -> None:
+    assert Processor(info(calibrated())).tare().kind == "tare-refused"
+    processor, _ = processed(paired(still(0.1)))
+    assert "only 100 samples" in processor.tare().text
+
+
+def test_drift_is_found_with_its_sigma_and_warned_of_once() -> None:
+    n, per_h = 90_000, 12.0  # 15 minutes at 100 Hz
+    drift = np.zeros((n, 6))
+    drift[:, 0] = per_h * np.arange(n) / 100 / 3600
+    rows = paired(np.tile(UPSIDE_DOWN, (n, 1, 1)), 100.0, push=drift)
+    processor, _ = processed(rows, block=2000, rate_Hz=100.0)
+    rate, sigma = processor._drift.force_rate_N_h
+    assert sigma < 2.0
+    assert rate == pytest.approx(per_h, abs=6 * sigma)
+    assert [event for event in kinds(processor) if event == "drift"] == ["drift"]
+    assert processor.tare_wrench is None
+
+
+def test_without_drift_there_is_no_warning() -> None:
+    rows = paired(np.tile(UPSIDE_DOWN, (60_000, 1, 1)), 100.0)
+    processor, _ = processed(rows, block=2000, rate_Hz=100.0)
+    rate, sigma = processor._drift.force_rate_N_h
+    assert rate < 5 * sigma
+    assert "drift" not in kinds(processor)

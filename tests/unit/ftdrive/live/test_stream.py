@@ -1,0 +1,253 @@
+"""The stream of a cell: what it opens and refuses, gaps and silence, recovery, and what it reports."""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib import CalibrationResult
+from drivers.errors import DeviceTimeout, DriverError
+from drivers.follow import Follow
+from drivers.interfaces import ArmStates, DeviceInfo, FtSamples, Health
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
+from ftdrive.errors import ConfigError
+from ftdrive.live import stream as module
+from ftdrive.live.samples import Stages, WrenchFrame
+from ftdrive.live.stream import CompensatedStream, load_calibration, open_stream
+from tests.fake_clock import FakeClock
+from tests.unit.ftdrive.fake_cell import STATUS
+from tests.unit.ftdrive.live.simulated import DEVICE, NOISE, Motion, calibrated
+
+RATE_HZ, ARM_HZ = 1000.0, 500.0
+
+
+class Link:
+    """A device that measures at a fixed rate and delivers what was measured until now, each time it is read."""
+
+    def __init__(self, clock: FakeClock, rate_Hz: float) -> None:
+        self.clock, self.rate_Hz = clock, rate_Hz
+        self.begin_ns = clock.now_ns()
+        self.sent = 0
+        self.silent = False
+        self.failure: DriverError | None = None
+        self.opened = 0
+        self.info = DEVICE
+        self.motion = Motion(turn_rad_s=0.0, acceleration_m_s2=0.0)
+
+    def open(self, **_: Any) -> None:
+        self.opened += 1
+        if self.silent:
+            raise DeviceTimeout("no sample for 1 s", "check cable and supply")
+        self.failure = None
+
+    def close(self) -> None: ...
+
+    def check(self) -> None: ...
+
+    def __enter__(self) -> "Link":
+        self.open()
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def identify(self) -> DeviceInfo:
+        return self.info
+
+    def health(self) -> Health:
+        return Health(self.sent, 3, 0, self.rate_Hz, 0.001, nominal_rate_Hz=float("nan"))
+
+    def status(self) -> Any:
+        return STATUS
+
+    def follow(self) -> AbstractContextManager[Follow[Any]]:
+        self.sent = self._due()
+        return nullcontext(Follow(self._read))
+
+    def _due(self) -> int:
+        return max(0, int((self.clock.now_ns() - self.begin_ns) * 1e-9 * self.rate_Hz))
+
+    def _read(self, timeout_s: float) -> Any:
+        if self.failure is not None:
+            raise self.failure
+        for left_s in self.clock.looks(timeout_s):
+            if self._due() > self.sent and not self.silent:
+                break
+            self.clock.advance(min(left_s, 0.005))
+        if self.silent and timeout_s:
+            self.clock.advance(0.3)
+        if self.silent:
+            self.failure = DeviceTimeout("no sample for 0.3 s", "check cable and supply")
+            raise self.failure
+        numbers = np.arange(self.sent, max(self.sent, self._due()))
+        self.sent += len(numbers)
+        return self.rows(numbers, self.begin_ns + np.rint(numbers * 1e9 / self.rate_Hz).astype(np.int64))
+
+    def rows(self, numbers: Any, t_ns: Any) -> Any:
+        raise NotImplementedError
+
+
+class Sensor(Link):
+    def rows(self, numbers: Any, t_ns: Any) -> FtSamples:
+        rng = np.random.default_rng(int(numbers[0]) if len(numbers) else 0)
+        noise = rng.normal(size=(len(numbers), 6)) * NOISE
+        return FtSamples.of(t_ns, numbers, self.motion.wrench(numbers / self.rate_Hz) + noise)
+
+
+class Arm(Link):
+    def rows(self, numbers: Any, t_ns: Any) -> ArmStates:
+        nothing = np.zeros((len(numbers), 6))
+        return ArmStates(t_ns, numbers / self.rate_Hz, nothing, nothing, *self.motion.pose(numbers / self.rate_Hz))
+
+
+class Cell:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.clock = FakeClock()
+        self.sensor, self.arm = Sensor(self.clock, RATE_HZ), Arm(self.clock, ARM_HZ)
+        monkeypatch.setattr(module, "build_sensor", lambda _: self.sensor)
+        monkeypatch.setattr(module, "build_arm", lambda _: self.arm)
+        self.config = CellConfig(
+            RobotConfig("fake"), SensorConfig("fake://", height_mm=30.0), ToolConfig("gripper"), clock=self.clock
+        )
+        self.calibration: CalibrationResult = calibrated()
+
+    def stream(self, **options: Any) -> CompensatedStream:
+        return CompensatedStream(self.config, self.calibration, **options)
+
+
+@pytest.fixture
+def cell(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cell]:
+    return Cell(monkeypatch)  # type: ignore[return-value]
+
+
+def until(stream: CompensatedStream, done: Callable[[], bool]) -> None:
+    for _ in range(2000):
+        stream.read()
+        if done():
+            return
+    pytest.fail("it never happened")
+
+
+def test_every_sample_arrives_once_with_its_pose(cell: Cell) -> None:
+    with cell.stream() as stream:
+        blocks = [stream.read() for _ in range(200)]
+    seq = np.concatenate([block.seq for block in blocks])
+    assert (np.diff(seq) == 1).all()
+    assert len(seq) > 1000
+    wrench = np.concatenate([block.wrench for block in blocks])
+    assert np.sqrt(np.square(wrench).mean(axis=0)) == pytest.approx(NOISE, rel=0.1)
+    assert blocks[-1].sigma == pytest.approx(NOISE, rel=0.15)
+    assert (stream.info.sensor_rate_Hz, stream.info.arm_rate_Hz) == (pytest.approx(1000, rel=0.01), pytest.approx(500))
+    assert [event.kind for event in stream.take_events()] == []
+
+
+def test_samples_name_axes_point_and_uncertainty(cell: Cell) -> None:
+    with cell.stream(frame=WrenchFrame("base", "flange")) as stream:
+        sample = next(islice(stream, 1100, None))
+    assert str(sample.frame) == "base axes, about the flange"
+    assert sample.force_sigma_N == pytest.approx(NOISE[:3], rel=0.2)
+    assert np.abs(sample.force_N).max() < 6 * NOISE[0]
+    assert sample.t_s == pytest.approx(cell.clock.now_s(), abs=0.05)
+
+
+@pytest.mark.parametrize("device", ["sensor", "arm"])
+def test_a_silent_device_raises_and_recovers_with_events(cell: Cell, device: str) -> None:
+    link: Link = getattr(cell, device)
+    with cell.stream() as stream:
+        before = [stream.read() for _ in range(20)][-1]
+        link.silent = True
+        with pytest.raises(DeviceTimeout, match="no sample"):
+            until(stream, lambda: False)
+        assert getattr(stream.status(), device).error.startswith("no sample")
+        with pytest.raises(DeviceTimeout):  # still silent: no old value is delivered
+            stream.read()
+        link.silent = False
+        after = stream.read()
+        stale, gap, recovered = stream.take_events()
+        status = stream.status()
+    assert (stale.kind, stale.values["device"]) == ("stale", device)
+    assert (gap.kind, recovered.kind) == ("gap", "recovered")
+    assert after.t_host_ns[0] > before.t_host_ns[-1]
+    assert (status.sensor.error, status.arm.error) == ("", "")
+
+
+def test_another_device_after_an_interruption_is_refused(cell: Cell) -> None:
+    with cell.stream() as stream:
+        stream.read()
+        cell.sensor.failure = DeviceTimeout("no sample for 0.3 s")
+        with pytest.raises(DeviceTimeout):
+            stream.read()
+        cell.sensor.info = DeviceInfo("model", "other", "1")
+        with pytest.raises(ConfigError, match="another device"):
+            stream.read()
+
+
+def test_a_calibration_of_another_sensor_is_refused(cell: Cell) -> None:
+    made_with = {
+        "devices": {"sensor": {"model": "model", "serial": "S2"}, "arm": {"model": "model", "serial": "serial"}}
+    }
+    cell.calibration = replace(cell.calibration, provenance=made_with)
+    with pytest.raises(ConfigError, match="S2"), cell.stream():
+        pass
+
+
+def test_a_device_that_sends_nothing_is_named(cell: Cell) -> None:
+    cell.arm.rate_Hz = 0.1
+    with pytest.raises(DeviceTimeout, match="arm sent"), cell.stream():
+        pass
+
+
+def test_the_delay_is_configured_or_found(cell: Cell) -> None:
+    cell.sensor.motion = cell.arm.motion = Motion()
+    cell.sensor.begin_ns += 8_000_000  # the wrench comes 8 ms after the pose of the same time
+    with cell.stream() as stream:
+        until(stream, lambda: 0 < stream.status().delay_sigma_s < 5e-4)
+        until(stream, lambda: abs(stream.status().delay_s - 0.008) < 1e-3)
+    cell.config = replace(cell.config, sensor=replace(cell.config.sensor, delay_ms=8.0))
+    with cell.stream() as stream:
+        stream.read()
+        assert (stream.status().delay_s, stream.status().delay_sigma_s) == (0.008, 0.0)
+
+
+def test_frame_stages_marks_and_tare_are_events(cell: Cell) -> None:
+    with cell.stream() as stream:
+        until(stream, lambda: np.isfinite(stream.read().sigma).all())
+        stream.frame = WrenchFrame("base", "tcp")
+        stream.stages = Stages(lowpass_Hz=40.0)
+        block = stream.read()
+        stream.mark("peg in")
+        stream.tare()
+        status = stream.status()
+        stream.undo_tare()
+        kinds = [event.kind for event in stream.take_events()]
+    assert (block.frame, block.stages) == (WrenchFrame("base", "tcp"), Stages(lowpass_Hz=40.0))
+    assert kinds == ["frame", "stages", "mark", "tare", "tare-undone"]
+    assert status.tare is not None
+    assert np.abs(status.tare).max() < 0.05
+    assert status.tare_t_host_ns == block.t_host_ns[-1]
+    assert status.sensor.lost == 3
+    assert status.contact_limit > 22
+
+
+def test_without_a_height_only_the_sensor_origin_is_offered(cell: Cell) -> None:
+    cell.config = replace(cell.config, sensor=SensorConfig("fake://"))
+    with pytest.raises(ConfigError, match="height_mm"), cell.stream(frame=WrenchFrame("base", "tcp")):
+        pass
+    with cell.stream(frame=WrenchFrame("base", "sensor")) as stream:
+        assert len(stream.read())
+
+
+def test_a_stream_is_opened_from_paths(cell: Cell, tmp_path: Any) -> None:
+    path = tmp_path / "calibration.json"
+    cell.calibration.save(path)
+    with open_stream(cell.config, path, frame=WrenchFrame("flange")) as stream:
+        assert stream.info.calibration_name == str(path)
+        assert stream.info.calibration.mass_kg == pytest.approx(cell.calibration.mass_kg)
+        assert stream.info.tool == "gripper"
+        np.testing.assert_allclose(stream.info.p_flange_sensor_m, [0, 0, 0.03])
+    assert load_calibration(tmp_path).mass_kg == pytest.approx(cell.calibration.mass_kg)  # as a run folder
+    with pytest.raises(ConfigError, match="no calibration"):
+        open_stream(cell.config)

@@ -1,0 +1,37 @@
+"""Plots of dots."""
+
+import numpy as np
+
+from ftdrive.terminal.live import braille
+
+
+def drawn(low: list[float], high: list[float], rows: int, full: float) -> list[str]:
+    codes = braille.characters(braille.envelope(np.array(low), np.array(high), rows, full))
+    return [braille.text(row) for row in codes]
+
+
+def test_the_bits_are_those_of_unicode() -> None:
+    for dot, code in enumerate((0x01, 0x02, 0x04, 0x40, 0x08, 0x10, 0x20, 0x80)):  # dots 1, 2, 3, 7, 4, 5, 6, 8
+        dots = np.zeros((4, 2), np.bool_)
+        dots[dot % 4, dot // 4] = True
+        assert braille.characters(dots)[0, 0] == code
+
+
+def test_noise_about_zero_is_one_line() -> None:
+    assert drawn([-0.01, 0.01], [0.01, 0.02], 1, 1.0) == ["⠤"]
+    assert drawn([-0.01] * 2, [0.01] * 2, 3, 1.0) == [" ", "⠤", " "]
+
+
+def test_the_edges_hold_what_is_larger() -> None:
+    assert drawn([5.0, 5.0], [9.0, 9.0], 2, 1.0) == ["⠉", " "]
+    assert drawn([-9.0, -9.0], [-5.0, -5.0], 2, 1.0) == [" ", "⣀"]
+
+
+def test_a_step_is_joined_and_a_gap_is_not() -> None:
+    assert drawn([-1.0, 1.0], [-1.0, 1.0], 1, 1.0) == ["⣸"]
+    assert drawn([0.0, np.nan, 0.0, 0.0], [0.0, np.nan, 0.0, 0.0], 1, 1.0) == ["⠄⠤"]
+
+
+def test_a_level_outside_is_not_drawn() -> None:
+    assert braille.level(0.0, 3, 1.0) == 6
+    assert braille.level(1.5, 3, 1.0) is None
