@@ -94,15 +94,13 @@ def force_units(mass_kg: float, payload_kg: float) -> list[str]:
 
 
 def _force_units(mass_kg: float, true_kg: float, tolerance: float) -> list[str]:
-    return [
-        unit for unit, size in FORCE_UNITS_N.items() if size > 1 and abs(mass_kg * size / true_kg - 1) < tolerance
-    ]
+    return [unit for unit, size in FORCE_UNITS_N.items() if size > 1 and abs(mass_kg * size / true_kg - 1) < tolerance]
 
 
 def _as_with(found: Parameters, forces: list[str]) -> str:
     """Name these units of force, and those of torque that give a usual centre of mass."""
     named = units(float(np.linalg.norm(found.p_sensor_com_m)), forces) or [f"forces in {unit}" for unit in forces]
-    return f", as with {' or '.join(named)}" if named else ""
+    return f", as with {', or '.join(named)}" if named else ""
 
 
 def _axes_taken(Q: Array) -> str:

@@ -121,7 +121,7 @@ def judge(
     rejected = [
         *broken,
         *explanation,
-        *_weight_reasons(fit, weight_N),
+        *_weight_reasons(fit, weight_N, up_in_base),
         *_second_solution_reasons(fit),
         *com_too_far,
         *(inexact if at.largest_share > REJECTED_SHARE else []),
@@ -332,13 +332,13 @@ def _inside_m(parameters: Parameters, covariance: Array) -> float:
     return inside_m if inside_m > max(INSIDE_M, 3 * sigma_m) else 0.0
 
 
-def _weight_reasons(fit: AssessedFit, weight_N: float) -> list[str]:
+def _weight_reasons(fit: AssessedFit, weight_N: float, up_in_base: ArrayLike) -> list[str]:
     along = fit.parameters.gravity_force_base_N / (weight_N or 1.0)
     variance = float(along @ fit.covariance[3:6, 3:6] @ along)
     sigma_N = np.sqrt(max(variance, 0.0))  # below 0 only by rounding, if the weight is exactly known
     if weight_N > SIGNIFICANT_SIGMAS * sigma_N:
         return []
-    if given_in_base := constant_weight(fit.wrench):
+    if given_in_base := constant_weight(fit.wrench, up_in_base):
         return given_in_base
     return [
         f"the weight, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty of {sigma_N:.2g} N: "
@@ -418,7 +418,7 @@ def _com_too_far(parameters: Parameters, farthest_com_m: float) -> list[str]:
     com_m = float(np.linalg.norm(parameters.p_sensor_com_m))
     if com_m <= farthest_com_m:
         return []
-    like = f", as with {' or '.join(found)}" if (found := units(com_m)) else ""
+    like = f", as with {', or '.join(found)}" if (found := units(com_m)) else ""
     return [
         f"the centre of mass is {com_m:.2f} m from the sensor, farther than {farthest_com_m:g} m{like}: "
         "check the units of force and torque"

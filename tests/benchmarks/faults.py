@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, NotObservable, read_csv, solve
+from calib import CalibrationDataset, CalibrationResult, NotObservable, Parameters, read_csv, solve
 from calib.errors import BadDataset
 from calib.known import Known
 from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array
@@ -267,7 +267,7 @@ def leads_to_the_truth(reason: str, case: Case, clean: Case, *, measured: bool) 
     return False
 
 
-def close(truth: Truth, estimate: object) -> bool:
+def close(truth: Truth, estimate: Parameters) -> bool:
     x = sim.error(truth, estimate)
     force_N, torque_Nm = np.sqrt(sim.prediction_square(truth, estimate))
     return bool(
@@ -307,7 +307,7 @@ def from_file(case: Case) -> CalibrationDataset:
         return read_csv(path)
 
 
-def answer(case: Case, *, measured: bool) -> tuple[object | None, tuple[str, ...], bool]:
+def answer(case: Case, *, measured: bool) -> tuple[Parameters | None, tuple[str, ...], bool]:
     """Parameters, reasons, and whether the verdict is good."""
     try:
         result = solved(case, measured=measured)
@@ -361,7 +361,7 @@ def main() -> int:
                 for measured in (True, False):
                     jobs = [(name, n, measured, seed, options.poses) for seed in range(options.runs)]
                     found = pool.map(faulty, jobs, chunksize=max(1, min(10, options.runs // 2)))
-                    named, good, truth = (sum(one[k] for one in found) for k in range(3))
+                    named, good, truth = np.sum([one[:3] for one in found], axis=0).tolist()
                     passed = min(named, truth) >= 0.95 * options.runs and not good
                     failed += not passed
                     noise = "measured" if measured else "unknown"

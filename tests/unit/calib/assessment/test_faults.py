@@ -114,7 +114,7 @@ LBF_N, KGF_N, LBF_IN_NM = 4.4482216, 9.80665, 0.11298483
 @pytest.mark.parametrize(
     ("force", "torque", "units"),
     [
-        (LBF_N, 1.0, "forces in lbf or forces in lbf and torques in lbf·ft"),
+        (LBF_N, 1.0, "forces in lbf, or forces in lbf and torques in lbf·ft"),
         (KGF_N, 1.0, "forces in kgf"),
         (LBF_N, LBF_IN_NM, "forces in lbf and torques in lbf·in"),
         (KGF_N, KGF_N, "forces in kgf and torques in kgf·m"),
@@ -141,7 +141,7 @@ def test_no_unit_is_suspected_where_another_does_not_explain_the_payload(payload
 def test_forces_and_torques_in_other_units_are_named_where_only_their_ratio_shows_it() -> None:
     _, R, wrench = session(7)
     both = first(R, wrench / np.repeat([LBF_N, LBF_IN_NM], 3))
-    assert "as with forces in lbf and torques in lbf·in or forces in kgf and torques in kgf·cm: check" in both
+    assert "as with forces in lbf and torques in lbf·in, or forces in kgf and torques in kgf·cm: check" in both
 
 
 def test_reversed_torques_are_usable_at_best() -> None:

@@ -173,6 +173,15 @@ def test_a_wrong_payload_is_told_once_when_the_fit_knows_and_at_the_end(lab: Lab
     assert [one for one in hints(outcome.result, outcome.run.records()) if "2.50 kg" in one]
 
 
+def test_a_run_whose_payload_is_right_in_pounds_is_not_good(lab: Lab) -> None:
+    lab.arm.set_status(payload_kg=1.2 * 4.448)
+    outcome = lab.calibrate()
+    assert outcome is not None
+    assert outcome.result.verdict == "usable"
+    assert outcome.result.reasons[0].startswith("the load is 1.20 kg, but 5.34 kg by the payload in the controller")
+    assert "as with forces in lbf" in outcome.result.reasons[0]
+
+
 @pytest.mark.parametrize(
     ("payload_kg", "sensor_kg", "reported"), [(1.9, 0.8, False), (1.9, None, False), (2.8, 0.8, True)]
 )
