@@ -7,7 +7,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.assessment.contradictions import contradictions
+from calib.assessment.contradictions import contradictions, other_unit
 from calib.assessment.cross_validation import AssessedFit, IndependentFit
 from calib.assessment.faults import faults
 from calib.assessment.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
@@ -38,6 +38,7 @@ def solve(
     known: Known | None = None,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
     up_in_base: ArrayLike = UP_IN_BASE,
+    payload_kg: float | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> CalibrationResult:
     """Calibrate from a dataset.
@@ -59,6 +60,9 @@ def solve(
     up_in_base : array_like, shape (3,)
         Expected up direction in base: +z for a robot on a table. For the verdict, and for the published methods that
         need gravity.
+    payload_kg : float, optional
+        Set in the controller, without the sensor if its mass is known. For the verdict: forces in lbf or kgf make a
+        load that is lighter than the payload by such a factor.
     provenance : mapping, optional
         Stored with the result, beside the hash of the dataset. Must be valid JSON.
 
@@ -122,7 +126,7 @@ def solve(
     contradicted: list[str] = []
     if known is not None and unconstrained is not None:
         contradicted = contradictions(
-            known, unconstrained.parameters, unconstrained.covariance, g_m_s2, SIGNIFICANT_SIGMAS
+            known, unconstrained.parameters, unconstrained.covariance, g_m_s2, SIGNIFICANT_SIGMAS, up_in_base
         )
     quality = judge(
         assessed,
@@ -131,6 +135,7 @@ def solve(
         up_in_base=up_in_base,
         unconstrained=unconstrained,
         contradicted=contradicted,
+        other_unit=[] if payload_kg is None else other_unit(assessed.parameters, payload_kg, g_m_s2),
     )
     chi2 = assessed.chi2 if wrench_cov is None else assessed.measured_chi2
     drifted = best.drift if estimator is None else None

@@ -1,14 +1,29 @@
 """Known values that the data contradict."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from calib.assessment.faults import force_unit
+from calib.assessment.faults import FORCE_UNITS_N, SAME_UNIT, axis_order, units
 from calib.known import Known, turn_between, unit_vector
-from calib.model import Array, Parameters
+from calib.model import UP_IN_BASE, Array, Parameters
+
+PAYLOAD_KG = 0.8
+"""A payload that is larger than the load by no more than this may include a sensor and cables."""
+PAYLOAD_SHARE = 0.3
+"""A payload is set this accurately at worst."""
+SAME_AXES = 0.1
+"""Entries of a rotation this close to -1, 0 and 1 permute the axes."""
 
 
-def contradictions(known: Known, found: Parameters, covariance: Array, g_m_s2: float, sigmas: float) -> list[str]:
+def contradictions(
+    known: Known,
+    found: Parameters,
+    covariance: Array,
+    g_m_s2: float,
+    sigmas: float,
+    up_in_base: ArrayLike = UP_IN_BASE,
+) -> list[str]:
     """List the known values that the data contradict, each with the value from the data.
 
     Parameters
@@ -21,6 +36,8 @@ def contradictions(known: Known, found: Parameters, covariance: Array, g_m_s2: f
     g_m_s2 : float
     sigmas : float
         Smallest difference to list, in standard deviations.
+    up_in_base : array_like, shape (3,)
+        Where up should be.
     """
     words = []
     if known.mass_kg is not None:
@@ -28,8 +45,7 @@ def contradictions(known: Known, found: Parameters, covariance: Array, g_m_s2: f
         along = found.gravity_force_base_N / (weight_N or 1.0)
         mass_kg, sigma_kg = weight_N / g_m_s2, float(np.sqrt(along @ covariance[3:6, 3:6] @ along)) / g_m_s2
         if abs(mass_kg - known.mass_kg) > sigmas * np.hypot(sigma_kg, known.mass_tolerance_kg):
-            unit = force_unit(known.mass_kg / mass_kg) if mass_kg else None
-            why = f", as if the forces were in {unit}" if unit else ""
+            why = _as_with(found, _force_units(mass_kg, known.mass_kg, SAME_UNIT))
             words.append(f"mass {known.mass_kg:g} kg (data: {_with_sigma(mass_kg, sigma_kg, ' kg')}{why})")
     if known.gravity_direction_base is not None:
         direction = np.asarray(known.gravity_direction_base)
@@ -46,8 +62,53 @@ def contradictions(known: Known, found: Parameters, covariance: Array, g_m_s2: f
         axis = unit_vector(turn)
         sigma = float(np.sqrt(axis @ covariance[:3, :3] @ axis))
         if np.linalg.norm(turn) > sigmas * np.hypot(sigma, known.R_tolerance_rad):
-            words.append(f"mounting of the sensor (data: {_angle(turn, sigma)})")
+            upwards = float(found.gravity_force_base_N @ np.asarray(up_in_base)) > 0  # as mirrored axes read
+            Q = np.asarray(known.R_flange_sensor).T @ found.R_flange_sensor * (-1 if upwards else 1)
+            why = "" if known.yaw_only else _axes_taken(Q)
+            words.append(f"mounting of the sensor (data: {_angle(turn, sigma)}{why})")
     return words
+
+
+def other_unit(found: Parameters, payload_kg: float, g_m_s2: float) -> list[str]:
+    """Name the units, if any, with which the load would agree with the controller's payload.
+
+    Parameters
+    ----------
+    found : Parameters
+    payload_kg : float
+        As set in the controller, without the sensor if its mass is known.
+    g_m_s2 : float
+    """
+    mass_kg = float(np.linalg.norm(found.gravity_force_base_N)) / g_m_s2
+    if not force_units(mass_kg, payload_kg):
+        return []
+    return [
+        f"the load is {mass_kg:.2f} kg, but {payload_kg:.2f} kg by the payload in the controller"
+        f"{_as_with(found, force_units(mass_kg, payload_kg))}: check the units of the sensor, or correct the payload"
+    ]
+
+
+def force_units(mass_kg: float, payload_kg: float) -> list[str]:
+    """Name the units of force that make a load (kg) of the data agree with a payload (kg), if it is much lighter."""
+    return _force_units(mass_kg, payload_kg, PAYLOAD_SHARE) if payload_kg - mass_kg > PAYLOAD_KG else []
+
+
+def _force_units(mass_kg: float, true_kg: float, tolerance: float) -> list[str]:
+    return [unit for unit, size in FORCE_UNITS_N.items() if size > 1 and abs(mass_kg * size / true_kg - 1) < tolerance]
+
+
+def _as_with(found: Parameters, forces: list[str]) -> str:
+    """Name these units of force, and those of torque that give a usual centre of mass."""
+    named = units(float(np.linalg.norm(found.p_sensor_com_m)), forces) or [f"forces in {unit}" for unit in forces]
+    return f", as with {', or '.join(named)}" if named else ""
+
+
+def _axes_taken(Q: Array) -> str:
+    """Name the permutation of the axes that explains another mounting, if it is one."""
+    order = np.round(Q)
+    if np.abs(Q - order).max() > SAME_AXES or (order == np.eye(3)).all():
+        return ""
+    return f", as with wrench {axis_order(order)}"
 
 
 def _angle(turn_rad: Array, sigma_rad: float) -> str:

@@ -1,6 +1,6 @@
 """Mistakes in the data of a bad fit: orientations, pairs, axes, units. Named only if undoing one helps."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Self
 
@@ -30,9 +30,21 @@ STEADY = 0.05
 """A force that varies by less than this share of it is constant."""
 SAME_UNIT = 0.04
 """A ratio this close to that of two units is one."""
-USUAL_COM_M = (0.01, 0.25)
-FORCE_UNITS_N = {"lbf": 4.4482216, "kgf": 9.80665}
-TORQUE_UNITS_NM = {"N·mm": 1e-3, "lbf·in": 0.11298483, "lbf·ft": 1.3558179, "kgf·m": 9.80665}
+USUAL_COM_M = (0.02, 0.2)
+FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216, "kgf": 9.80665}
+TORQUE_UNITS_NM = {
+    "N·m": 1.0,
+    "N·mm": 1e-3,
+    "lbf·in": 0.11298483,
+    "lbf·ft": 1.3558179,
+    "kgf·cm": 0.0980665,
+    "kgf·m": 9.80665,
+}
+UNITS = (
+    *(("N", "N·mm"), ("N", "lbf·in"), ("lbf", "N·m"), ("kgf", "N·m")),
+    *(("lbf", "lbf·in"), ("lbf", "lbf·ft"), ("kgf", "kgf·cm"), ("kgf", "kgf·m")),
+)
+"""Units that are taken for N and N·m, the simplest mistake first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,18 +158,18 @@ def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[str]:
         return []
     upwards, mirrored = bool(as_read.F_b @ up > 0), bool(np.linalg.det(Q) < 0)
     if upwards and mirrored:  # a mirrored force reads like a weight that pulls upwards
-        undone = f"with force {_order(Q.T)}"
+        undone = f"with force {axis_order(Q.T)}"
     else:
-        other = f" (or force {_order(Q.T).removesuffix(' reversed')})" if not mirrored and not upwards else ""
-        undone = f"with torque {_order(Q)}{other}"
+        other = f" (or force {axis_order(Q.T).removesuffix(' reversed')})" if not mirrored and not upwards else ""
+        undone = f"with torque {axis_order(Q)}{other}"
     return [
         f"force and torque axes disagree, {undone} the torque residual drops from {as_read.torque_rms_Nm:.2g} to "
         f"{rms:.2g} N·m: check the wiring of the axes or the sensor's matrix"
     ]
 
 
-def _order(Q: Array) -> str:
-    """Name the channels from which the axes come."""
+def axis_order(Q: Array) -> str:
+    """Name the channels from which the axes of the wrench should be taken, given the signed permutation (3, 3)."""
     if np.abs(np.diag(Q)).min() > 0.5:
         return " and ".join("xyz"[k] for k in range(3) if Q[k, k] < 0) + " reversed"
     channels = ", ".join(("-" if row[k] < 0 else "") + "xyz"[k] for row in Q for k in [int(np.abs(row).argmax())])
@@ -169,15 +181,14 @@ def _torque_rms(weight_sensor_N: Array, torque_Nm: Array, P: Array, T0: Array) -
     return float(np.sqrt(np.mean(np.sum(e**2, axis=1)))) + ROUNDING * float(np.abs(torque_Nm).max())
 
 
-def force_unit(ratio: float) -> str | None:
-    """Name the unit of a force that was taken for newtons, by how much too small it reads."""
-    return next((unit for unit, size in FORCE_UNITS_N.items() if abs(ratio / size - 1) < SAME_UNIT), None)
-
-
-def torque_units(com_m: float) -> list[str]:
-    """Name the units of torque that make a usual distance of one that is too far."""
+def units(com_m: float, forces: Collection[str] = tuple(FORCE_UNITS_N)) -> list[str]:
+    """Name the wrong units, with one of these units of force, that make a usual distance of the centre of mass."""
     low, high = USUAL_COM_M
-    return [unit for unit, size in TORQUE_UNITS_NM.items() if low <= com_m * size <= high]
+    return [
+        " and ".join([f"forces in {force}"] * (force != "N") + [f"torques in {torque}"] * (torque != "N·m"))
+        for force, torque in UNITS
+        if force in forces and low <= com_m * TORQUE_UNITS_NM[torque] / FORCE_UNITS_N[force] <= high
+    ]
 
 
 def broken_channels(wrench: Array, R_base_flange: Array) -> list[str]:
@@ -194,7 +205,6 @@ def broken_channels(wrench: Array, R_base_flange: Array) -> list[str]:
     for rows in copied:
         same = bool(np.ptp(R_base_flange[rows], axis=0).max() == 0)
         listed = ", ".join(str(row + 1) for row in rows)
-        found.append(
-            f"poses {listed} have identical wrenches{' and orientations' if same else ''}: keep one of the copies"
-        )
+        what = "and orientations: keep one of the copies" if same else "in different orientations: repeat these poses"
+        found.append(f"poses {listed} have identical wrenches {what}")
     return found

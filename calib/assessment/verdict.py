@@ -12,7 +12,7 @@ from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtr as normal_cdf
 
 from calib.assessment.cross_validation import AssessedFit, standardized
-from calib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, torque_units
+from calib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, units
 from calib.assessment.load_shift import lasting_change
 from calib.assessment.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
 from calib.likelihood.fit import DriftEstimate
@@ -77,6 +77,7 @@ def judge(
     up_in_base: ArrayLike = UP_IN_BASE,
     unconstrained: AssessedFit | None = None,
     contradicted: Sequence[str] = (),
+    other_unit: Sequence[str] = (),
 ) -> Quality:
     """Judge a fit.
 
@@ -99,12 +100,15 @@ def judge(
         The best fit to the same poses without known values, if `fit` used some.
     contradicted : sequence of str
         Known values that the unconstrained fit contradicts, from `calib.assessment.contradictions`.
+    other_unit : sequence of str
+        That the controller's payload agrees with forces in another unit, from the same module.
     """
     at = _statistics(fit, t_s)
     parameters, weight_N, n = fit.parameters, at.weight_N, int(at.used.sum())
     few_rejected = n >= (1 - FEW_LEFT_OUT) * len(at.used)
     inexact = [words for words, share in at.shares if share > USABLE_SHARE]
-    explanation = [] if few_rejected and not inexact else _faults(fit, at.used, t_s, up_in_base)
+    suspect = inexact or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
+    explanation = _faults(fit, at.used, t_s, up_in_base) if suspect else []
     plausible = not explanation and at.largest_share < SENSELESS_SHARE
     com_too_far = _com_too_far(parameters, farthest_com_m)
     noise, left_out = _noise_reasons(fit, at), _left_out_reasons(at.used)
@@ -112,10 +116,12 @@ def judge(
     changed = _change_reasons(fit, at, measured_sigma, t_s)
     drifted = _drift_reasons(fit.drift)
 
+    broken = broken_channels(fit.wrench, fit.R_base_flange) if fit.chi2 > NOISELESS * fit.dof else []
+
     rejected = [
-        *(broken_channels(fit.wrench, fit.R_base_flange) if fit.chi2 > NOISELESS * fit.dof else []),
+        *broken,
         *explanation,
-        *_weight_reasons(fit, weight_N),
+        *_weight_reasons(fit, weight_N, up_in_base),
         *_second_solution_reasons(fit),
         *com_too_far,
         *(inexact if at.largest_share > REJECTED_SHARE else []),
@@ -140,12 +146,14 @@ def judge(
         *([] if at.chi2_p is not None else ["the noise was estimated from the residuals: chi2 does not test the fit"]),
     ]
     drift_matters = fit.drift is not None and _drift_share(fit.drift.change, weight_N) > USABLE_SHARE
-    if drift_matters and not explanation and not changed:
+    if drift_matters and not (broken or explanation or changed):
         (rejected or usable)[:0] = drifted  # before its consequences
     else:
         notes += drifted
+    if other_unit and plausible and not broken:
+        (rejected or usable)[:0] = other_unit  # before its consequences
     if contradicted and not at.fits_measured_noise:
-        cause = f"the known values contradict the data: {'; '.join(contradicted)}: correct them, or leave them out"
+        cause = f"the known values contradict the data: {'; '.join(contradicted)}: correct the data or the known values"
         (rejected or usable or notes).insert(0, cause)  # before its consequences
     return Quality(
         verdict="rejected" if rejected else "usable" if usable else "good",
@@ -274,7 +282,7 @@ def reversed_signs(
         ]
     return [
         f"the weight pulls upwards ({angle_deg:.0f}° from down): the sensor reports the reaction (set sign = -1), or "
-        "one axis is reversed in forces and torques alike, or the robot hangs from the ceiling"
+        "one axis is reversed or two are swapped in forces and torques alike, or the robot hangs from the ceiling"
     ]
 
 
@@ -296,13 +304,17 @@ def _drift_share(change: Array, weight_N: float) -> float:
 
 
 def _drift_reasons(drift: DriftEstimate | None) -> list[str]:
-    if drift is None or not (np.abs(drift.change) > 3 * drift.sigma).any():
+    if drift is None:
         return []
-    force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
-    return [
-        f"the bias drifted by {force_N:.2g} N and {torque_Nm:.2g} N·m from the first pose to the last: let the sensor "
-        "warm up and calibrate again"
+    found = [
+        f"{np.linalg.norm(drift.change[part]):.2g} {unit}"
+        for unit, part in (("N", slice(0, 3)), ("N·m", slice(3, 6)))
+        if (np.abs(drift.change[part]) > 3 * drift.sigma[part]).any()
     ]
+    return [
+        f"the bias drifted by {' and '.join(found)} from the first pose to the last: let the sensor warm up and "
+        "calibrate again"
+    ] * bool(found)
 
 
 def _tilt_deg(parameters: Parameters, up_in_base: ArrayLike) -> float:
@@ -320,13 +332,13 @@ def _inside_m(parameters: Parameters, covariance: Array) -> float:
     return inside_m if inside_m > max(INSIDE_M, 3 * sigma_m) else 0.0
 
 
-def _weight_reasons(fit: AssessedFit, weight_N: float) -> list[str]:
+def _weight_reasons(fit: AssessedFit, weight_N: float, up_in_base: ArrayLike) -> list[str]:
     along = fit.parameters.gravity_force_base_N / (weight_N or 1.0)
     variance = float(along @ fit.covariance[3:6, 3:6] @ along)
     sigma_N = np.sqrt(max(variance, 0.0))  # below 0 only by rounding, if the weight is exactly known
     if weight_N > SIGNIFICANT_SIGMAS * sigma_N:
         return []
-    if given_in_base := constant_weight(fit.wrench):
+    if given_in_base := constant_weight(fit.wrench, up_in_base):
         return given_in_base
     return [
         f"the weight, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty of {sigma_N:.2g} N: "
@@ -406,9 +418,11 @@ def _com_too_far(parameters: Parameters, farthest_com_m: float) -> list[str]:
     com_m = float(np.linalg.norm(parameters.p_sensor_com_m))
     if com_m <= farthest_com_m:
         return []
-    units = torque_units(com_m)
-    advice = f"the torques are in {' or '.join(units)}, not N·m" if units else "check the units of force and torque"
-    return [f"the centre of mass is {com_m:.2f} m from the sensor, farther than {farthest_com_m:g} m: {advice}"]
+    like = f", as with {', or '.join(found)}" if (found := units(com_m)) else ""
+    return [
+        f"the centre of mass is {com_m:.2f} m from the sensor, farther than {farthest_com_m:g} m{like}: "
+        "check the units of force and torque"
+    ]
 
 
 def _com_too_near(parameters: Parameters) -> list[str]:

@@ -5,6 +5,7 @@ from typing import Any, Final
 import numpy as np
 
 from calib import CalibrationResult
+from calib.assessment.contradictions import force_units
 from drivers.interfaces import Array
 from ftdrive.planning.geometry.scene import down_of
 
@@ -55,6 +56,9 @@ def payload_in_words(payload_kg: float, weighed_kg: float, sensor_kg: float | No
     if least_kg - limit_kg <= payload_kg <= most_kg + limit_kg:
         return ""
     found = f"the controller has a payload of {payload_kg:.2f} kg, but {weighed_kg:.2f} kg hang on the sensor"
+    if units := force_units(weighed_kg, payload_kg - (sensor_kg or 0.0)):
+        forces = f"forces in {' or '.join(units)}"
+        return f"{found}, as with {forces}: check the sensor's units before you change the payload"
     if sensor_kg is None:
         return (
             f"{found} and [sensor] mass_kg is not set (up to {SENSOR_KG:g} kg are allowed for it): set the payload in "

@@ -124,6 +124,7 @@ def _solve_each(
     for source in sources:
         try:
             dataset, circumstances, provenance = _read(source, orientation)
+            payload_kg = circumstances.pop("payload_kg", None)
             known = options["known"]
             if known is not None and known.gravity_direction_base is not None:  # level with respect to the mounting
                 known = replace(known, gravity_direction_base=-circumstances["up_in_base"])
@@ -131,7 +132,7 @@ def _solve_each(
             if method == "all":
                 _show_all(source, dataset, here, as_json)
                 continue
-            result = _solve(dataset, method, {**here, "provenance": provenance})
+            result = _solve(dataset, method, {**here, "payload_kg": payload_kg, "provenance": provenance})
             records = Run(source).records() if source.is_dir() else []  # for hints and drift
             if as_json:
                 found = list(hints(result, records)) if records else []

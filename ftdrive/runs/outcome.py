@@ -39,11 +39,11 @@ def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
 
 
 def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
-    """Return a run's records as a dataset, with gravity and up as `solve` takes them, and the provenance."""
+    """Return a run's records as a dataset, the circumstances as `solve` takes them, and the provenance."""
     header = run.header()
     config, devices = header["config"], header.get("devices", {})
     dataset = dataset_from(records, {"run": run.folder.name, "devices": devices})
-    provenance = {
+    provenance: dict[str, Any] = {
         "created_utc": datetime.now(UTC).isoformat(),
         "argv": sys.argv,
         "versions": versions(),
@@ -53,7 +53,12 @@ def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationData
         "setup": _setup(run, config),
     }
     mounting = config.get("workcell", {}).get("mounting", "floor")
-    circumstances = {"g_m_s2": float(config["site"]["g_m_s2"]), "up_in_base": -down_of(mounting)}
+    setup = provenance["setup"]
+    circumstances = {
+        "g_m_s2": float(config["site"]["g_m_s2"]),
+        "up_in_base": -down_of(mounting),
+        "payload_kg": None if setup["payload_kg"] is None else setup["payload_kg"] - (setup["sensor_mass_kg"] or 0.0),
+    }
     return dataset, circumstances, provenance
 
 

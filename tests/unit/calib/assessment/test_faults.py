@@ -24,19 +24,20 @@ def session(seed: int, n: int = 12) -> tuple[Parameters, Array, Array]:
     return p, R, np.asarray(predict(p, R) + SIGMA * rng.normal(size=(n, 6)))
 
 
-def first(R: Array, wrench: Array, known: Known | None = None) -> str:
+def first(R: Array, wrench: Array, known: Known | None = None, payload_kg: float | None = None) -> str:
     """Give the first reason, or the refusal."""
     try:
-        result = solved(R, wrench, known)
+        result = solved(R, wrench, known, payload_kg)
     except NotObservable as exc:
         return str(exc)
     assert result.verdict != "good"
     return result.reasons[0]
 
 
-def solved(R: Array, wrench: Array, known: Known | None = None) -> CalibrationResult:
+def solved(R: Array, wrench: Array, known: Known | None = None, payload_kg: float | None = None) -> CalibrationResult:
     n = len(R)
-    return solve(CalibrationDataset(R, wrench, None, np.zeros(n, np.int64), np.arange(float(n))), known=known)
+    dataset = CalibrationDataset(R, wrench, None, np.zeros(n, np.int64), np.arange(float(n)))
+    return solve(dataset, known=known, payload_kg=payload_kg)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -69,6 +70,17 @@ def test_axes_that_disagree_are_named_with_their_order(Q: Array, group: str) -> 
     assert f"{group} x, y, z taken from {order}" in reason
 
 
+@pytest.mark.parametrize(("Q", "order"), [(SWAP, "(y, x, z)"), (CYCLE, "(z, x, y)")])
+def test_axes_permuted_in_both_are_named_where_the_mounting_is_known(Q: Array, order: str) -> None:
+    p, R, wrench = session(4)
+    turned = np.concatenate([part @ Q.T for part in np.hsplit(wrench, 2)], axis=1)
+    reason = first(R, turned, Known(R_flange_sensor=p.R_flange_sensor))
+    assert "known values contradict the data: mounting" in reason
+    assert f"as with wrench x, y, z taken from {order}" in reason
+    askew = p.R_flange_sensor @ Rotation.from_rotvec([0, 0, 30], degrees=True).as_matrix()
+    assert "taken from" not in first(R, wrench, Known(R_flange_sensor=askew))
+
+
 def test_a_wrench_in_base_axes_is_named() -> None:
     p, R, wrench = session(5)
     turned = R @ p.R_flange_sensor
@@ -83,16 +95,53 @@ def test_a_channel_that_is_stuck_and_rows_that_were_copied_are_named() -> None:
     _, R, wrench = session(6)
     rows = np.append(np.arange(12), 3)
     assert "poses 4, 13 have identical wrenches and orientations" in first(R[rows], wrench[rows])
+    stale = wrench.copy()
+    stale[7] = stale[6]
+    assert "poses 7, 8 have identical wrenches in different orientations" in first(R, stale)
     wrench[:, 4] = wrench[0, 4]
     assert "ty reads the same in all poses" in first(R, wrench)
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(4.4482216, "lbf"), (9.80665, "kgf")])
-def test_a_force_in_other_units_is_named_where_the_mass_is_known(factor: float, unit: str) -> None:
+def test_a_stuck_channel_is_named_before_the_drift_that_it_makes_up() -> None:
+    _, R, wrench = session(1)
+    wrench[:, 5] = wrench[0, 5]
+    assert "tz reads the same in all poses" in first(R, wrench)
+
+
+LBF_N, KGF_N, LBF_IN_NM = 4.4482216, 9.80665, 0.11298483
+
+
+@pytest.mark.parametrize(
+    ("force", "torque", "units"),
+    [
+        (LBF_N, 1.0, "forces in lbf, or forces in lbf and torques in lbf·ft"),
+        (KGF_N, 1.0, "forces in kgf"),
+        (LBF_N, LBF_IN_NM, "forces in lbf and torques in lbf·in"),
+        (KGF_N, KGF_N, "forces in kgf and torques in kgf·m"),
+    ],
+)
+def test_a_force_in_other_units_is_named_where_mass_or_payload_is_known(
+    force: float, torque: float, units: str
+) -> None:
     p, R, wrench = session(7)
     mass_kg = float(np.linalg.norm(p.gravity_force_base_N)) / 9.80665
-    reason = first(R, wrench / factor, Known(mass_kg=mass_kg, mass_tolerance_kg=0.01))
-    assert f"forces were in {unit}" in reason
+    wrench /= np.repeat([force, torque], 3)
+    assert f", as with {units})" in first(R, wrench, Known(mass_kg=mass_kg, mass_tolerance_kg=0.01))
+    reason = first(R, wrench, payload_kg=2.2)
+    assert reason.startswith(f"the load is {mass_kg / force:.2f} kg, but 2.20 kg by the payload")
+    assert f", as with {units}: check" in reason
+
+
+@pytest.mark.parametrize("payload_kg", [0.5, 2.0, 2.8, 5.0, 15.0])
+def test_no_unit_is_suspected_where_another_does_not_explain_the_payload(payload_kg: float) -> None:
+    _, R, wrench = session(7)
+    assert solved(R, wrench, payload_kg=payload_kg).verdict == "good"
+
+
+def test_forces_and_torques_in_other_units_are_named_where_only_their_ratio_shows_it() -> None:
+    _, R, wrench = session(7)
+    both = first(R, wrench / np.repeat([LBF_N, LBF_IN_NM], 3))
+    assert "as with forces in lbf and torques in lbf·in, or forces in kgf and torques in kgf·cm: check" in both
 
 
 def test_reversed_torques_are_usable_at_best() -> None:

@@ -113,6 +113,13 @@ def test_a_payload_is_compared_with_all_that_hangs_on_the_flange(
     assert ("[sensor] mass_kg" in words) is (sensor_kg is None)
 
 
+@pytest.mark.parametrize("sensor_kg", [None, 0.3])
+def test_no_payload_is_advised_that_would_be_right_in_pounds(sensor_kg: float | None) -> None:
+    words = payload_in_words(1.5 + (sensor_kg or 0), 1.5 / 4.448, sensor_kg)
+    assert "0.34 kg hang on the sensor, as with forces in lbf: check the sensor's units" in words
+    assert "set the payload" not in words
+
+
 @pytest.mark.parametrize("payload_kg", np.arange(0.1, 4.0, 0.07))
 def test_the_limit_is_that_of_the_check_before_the_tour(payload_kg: float, lab: Lab) -> None:
     lab.cell = replace(
@@ -164,6 +171,15 @@ def test_a_wrong_payload_is_told_once_when_the_fit_knows_and_at_the_end(lab: Lab
     assert lab.holds() == []
     assert outcome is not None
     assert [one for one in hints(outcome.result, outcome.run.records()) if "2.50 kg" in one]
+
+
+def test_a_run_whose_payload_is_right_in_pounds_is_not_good(lab: Lab) -> None:
+    lab.arm.set_status(payload_kg=1.2 * 4.448)
+    outcome = lab.calibrate()
+    assert outcome is not None
+    assert outcome.result.verdict == "usable"
+    assert outcome.result.reasons[0].startswith("the load is 1.20 kg, but 5.34 kg by the payload in the controller")
+    assert "as with forces in lbf" in outcome.result.reasons[0]
 
 
 @pytest.mark.parametrize(
