@@ -18,7 +18,7 @@ from scipy.special import fdtri as f_ppf
 
 from calib.errors import NotObservable
 from calib.known import Constraints, Known
-from calib.likelihood.descent import MAX_STEPS, Descent, Equations, Minimum, column_scale
+from calib.likelihood.descent import MAX_STEPS, Descent, Minimum, column_scale
 from calib.likelihood.gain_and_cross_talk import SIZE, Response, response_columns
 from calib.likelihood.outliers import (
     FALSE_REJECTION,
@@ -29,7 +29,7 @@ from calib.likelihood.outliers import (
     fewest_kept,
 )
 from calib.likelihood.session_noise import Noise, summed_products
-from calib.likelihood.sufficient_statistics import Statistics, features
+from calib.likelihood.sufficient_statistics import Statistics, coefficients, features
 from calib.likelihood.variance_components import (
     FORCE,
     RESPONSE,
@@ -396,7 +396,7 @@ class _Problem:
         phi = features(self.R)
 
         def down(statistics: Statistics, p: Parameters, steps: int) -> Parameters:
-            return self.descent.down(statistics.normal_equations, p, steps).parameters
+            return self.descent.down(statistics, p, steps).parameters
 
         if not scaled:
             return agreeing_poses(phi, self.wrench, weights, starts, down) if self.measured else None
@@ -424,7 +424,7 @@ class _Problem:
             at = select(problem, components, theta, candidates, len(always))
             if self.drift == "auto":
                 at = with_slopes_instead(problem, at, len(always))
-            p, problem, at = self._settled(p, kept, at)
+            p, problem, at = self._settled(p, kept, problem, at)
             distances = squared_length(*at.left_out())
             criterion = self._criterion(at, distances)
             if criterion > best.criterion - 1e-3:
@@ -440,14 +440,16 @@ class _Problem:
                 problem = self._linearised(p, kept)
         return best
 
-    def _settled(self, p: Parameters, kept: Kept, at: Point) -> tuple[Parameters, Linearised, Point]:
+    def _settled(
+        self, p: Parameters, kept: Kept, problem: Linearised, at: Point
+    ) -> tuple[Parameters, Linearised, Point]:
         """Go down with the noise as it is and estimate its variances again, until they agree."""
         for _ in range(ROUNDS):
-            p = self.descent.down(self._equations(at.noise), p).parameters
-            problem = self._linearised(p, kept)
-            at = maximise(problem, at.components, at.theta)
             if float(at.step @ np.linalg.solve(at.C, at.step)) < SETTLED:
                 break
+            p = self.descent.down(self._statistics(at.noise, p), p).parameters
+            problem = self._linearised(p, kept)
+            at = maximise(problem, at.components, at.theta)
         return p, problem, at
 
     def _membership(self, kept: Kept, distances: Array, at: Point) -> Kept:
@@ -480,13 +482,17 @@ class _Problem:
 
     def _with_all_minima(self, e: _Explanation, others: list[Minimum]) -> list[Minimum]:
         """Find the minima again, under the noise of the explanation."""
-        logdet = self._noise(e, e.parameters).logdet
+        noise = self._noise(e, e.parameters)
+        moves = bool({"rotation", "gain", "cross_talk"} & {c.kind for c in e.components})  # with the parameters
+        statistics, logdet = self._statistics(noise, e.parameters), noise.logdet
         ends = []
         for start in (e.parameters, *(minimum.parameters for minimum in others)):
             q = start
-            for _ in range(3 if {"rotation", "gain", "cross_talk"} & {c.kind for c in e.components} else 1):
-                noise = self._noise(e, q)  # which depends on the parameters
-                end = self.descent.down(self._equations(noise), q)
+            for _ in range(3 if moves else 1):
+                if moves:
+                    noise = self._noise(e, q)
+                    statistics = self._statistics(noise, q)
+                end = self.descent.down(statistics, q)
                 q = end.parameters
             ends.append(replace(end, chi2=end.chi2 + noise.logdet - logdet))
         return self.descent.distinct(ends)
@@ -494,15 +500,9 @@ class _Problem:
     def _noise(self, e: _Explanation, p: Parameters) -> Noise:
         return noise_of(self._linearised(p, e.kept), e.components, e.theta)
 
-    def _equations(self, noise: Noise) -> Equations:
-        """Weighted least squares for any noise."""
-
-        def equations(p: Parameters) -> tuple[Array, Array, float]:
-            X = np.concatenate([jacobian(p, self.R), (self.wrench - predict(p, self.R))[..., None]], axis=2)
-            G = summed_products(X, noise.solve(X))
-            return G[:15, :15], G[:15, 15], float(G[15, 15])
-
-        return equations
+    def _statistics(self, noise: Noise, p: Parameters) -> Statistics:
+        """Sum up under any noise, around parameters."""
+        return Statistics.of_noise(features(self.R), self.wrench, noise, coefficients(p))
 
     def _fit(self, e: _Explanation, minima: list[Minimum], static_chi2: float) -> Fit:
         best = minima[0]

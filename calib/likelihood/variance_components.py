@@ -20,6 +20,7 @@ GAIN_OF_RESPONSE = 3.0
 """The same for gain and cross-talk of the sensor, whose 5 and 6 numbers come in by chance in 0.4 %."""
 SURE = 20.0  # a gain or loss that no other component can regain
 WORTH_A_TRY = 1.0  # gain predicted from slope and curvature at zero
+SETTLED = 1e-4  # squared distance from the best variances, in their standard deviations
 NEGLIGIBLE = 1e-4  # of the white noise: where slope and curvature "at zero" are taken
 LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2}
 """Variances that no arm or sensor in working order exceeds. A larger one has another cause."""
@@ -197,7 +198,7 @@ def _score(problem: Linearised, at: Point, components: Sequence[Component], thet
     WJC = WJ @ C
     P = noise.blocks - WJC @ np.swapaxes(WJ, 1, 2)
     of_all = {c: T for c in components if (T := problem.columns(c)) is not None}
-    PT = {c: noise.solve(T) - WJC @ summed_products(WJ, T) for c, T in of_all.items()}
+    WT = {c: (noise.solve(T), summed_products(WJ, T)) for c, T in of_all.items()}
     kept = int(problem.kept.sum())
     slope, Vu = [], []
     for c, variance in zip(components, theta, strict=True):
@@ -205,7 +206,8 @@ def _score(problem: Linearised, at: Point, components: Sequence[Component], thet
         if c in of_all:
             T = of_all[c]
             along = np.tensordot(u, T, 2)
-            square, trace = float(along @ along), float(np.vdot(T, PT[c]))
+            solved, JWT = WT[c]
+            square, trace = float(along @ along), float(np.vdot(T, solved) - np.vdot(JWT, C @ JWT))
             Vu.append(variance * (T @ along))
         elif c.kind == "white":
             square, trace = float((u**2).sum(axis=0) @ share), float(np.einsum("ncc,c->", P, share))
@@ -223,7 +225,8 @@ def _score(problem: Linearised, at: Point, components: Sequence[Component], thet
                 others += np.einsum("ncd,ndc->", noise.D[:, own], P[:, :, own])
                 for other, value in zip(components, theta, strict=True):
                     if other in of_all:
-                        others += value * np.vdot(of_all[other][:, own], PT[other][:, own])
+                        solved, JWT = WT[other]
+                        others += value * np.vdot(of_all[other][:, own], solved[:, own] - WJC[:, own] @ JWT)
                 trace = (kept * len(own) - float(others)) / variance
             else:
                 trace = noise.walk_trace(problem.time, own, (WJ, -C))
@@ -242,10 +245,12 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array)
         return point(problem, components, theta)
     most = np.array([LARGEST.get(c.kind, np.inf) for c in components])
     best = point(problem, components, np.minimum(theta, most))
-    least = np.minimum(1e-3 * NEGLIGIBLE * np.array([_unit(problem, best, c) for c in components]), most)
+    least = np.minimum(1e-3 * NEGLIGIBLE * _units(problem, best, components), most)
     caution = 1e-3
     for _ in range(60):
         slope, information = _score(problem, best, best.components, best.theta)
+        if float(slope @ np.linalg.lstsq(information, slope)[0]) < SETTLED:
+            break
         gained = 0.0
         while caution < 1e6:
             damped = information + np.diag(caution * (np.diag(information) + 1e-3))
@@ -288,6 +293,7 @@ def select(
     needed = len(components) if needed is None else needed
     best = _pruned(problem, maximise(problem, components, theta), needed)
     waiting = [c for c in candidates if c not in best.components]
+    last = len(best.components)  # how many came in at once
     while waiting:
         gains, start = predicted_gains(problem, best, waiting)
         k = int(np.argmax(gains))
@@ -300,9 +306,9 @@ def select(
         )
         too_large = any(v >= LARGEST.get(c.kind, np.inf) for c, v in zip(trial.components, trial.theta, strict=True))
         if trial.loglik > best.loglik + waiting[k].needed and not too_large:
-            best = trial
+            best, last = trial, len(together)
         waiting = [c for i, c in enumerate(waiting) if i not in together]
-    return _pruned(problem, best, needed)
+    return best if len(best.components) - needed <= last else _pruned(problem, best, needed)
 
 
 def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
@@ -340,8 +346,8 @@ def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
 
 def predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Component]) -> tuple[Array, Array]:
     """Gain in log-likelihood that each candidate alone promises, and where to start climbing."""
-    unit = np.array([_unit(problem, best, c) for c in waiting])
-    components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * unit])
+    start = _units(problem, best, waiting)
+    components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * start])
     at = point(problem, components, theta) if best.noise.walks else best
     slope, information = _score(problem, at, components, theta)
     k = len(best.components)
@@ -351,16 +357,26 @@ def predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Componen
         curvature = curvature - np.einsum("ki,ki->i", information[:k, k:], known[:, :-1])
         slope_k = slope_k - information[:k, k:].T @ known[:, -1]
     gains = np.where(slope_k > 0, slope_k**2 / (2 * np.maximum(curvature, 1e-300)), 0.0)
-    return gains, unit
+    square = np.mean(problem.r[problem.kept] ** 2, axis=0)
+    for i, c in enumerate(waiting):
+        if c.kind == "white":
+            share = np.array(c.share)
+            start[i] = max(0.1 * start[i], float(square @ share) / share.sum() - start[i])
+    return gains, start
 
 
-def _unit(problem: Linearised, best: Point, c: Component) -> float:
-    """Variance at which a component is about as large as the white noise."""
-    variance = np.diagonal(best.noise.D[problem.kept], axis1=1, axis2=2).mean(axis=0)
-    n = int(problem.kept.sum())
-    columns = problem.columns(c) if c.kind != "slope" else None
-    if columns is not None or c.kind == "rotation":
-        columns = problem.turn if columns is None else np.sqrt(n) * columns
-        return float(1 / np.max((columns[problem.kept] ** 2).mean(axis=(0, 2)) / variance))
-    share = np.array(c.share)
-    return float((variance * share).sum() / share.sum()) / (n if c.kind == "walk" else 1)
+def _units(problem: Linearised, best: Point, components: Sequence[Component]) -> Array:
+    """Variances (k,) at which each component is about as large as the white noise."""
+    kept, n = problem.kept, int(problem.kept.sum())
+    variance = np.einsum("ncc,n->c", best.noise.D, kept) / n
+    units = []
+    for c in components:
+        columns = problem.columns(c) if c.kind != "slope" else None
+        if columns is not None or c.kind == "rotation":
+            columns = problem.turn if columns is None else np.sqrt(n) * columns
+            square = np.einsum("ncd,ncd,n->c", columns, columns, kept.astype(np.float64)) / (n * columns.shape[2])
+            units.append(float(1 / np.max(square / variance)))
+        else:
+            share = np.array(c.share)
+            units.append(float((variance @ share) / share.sum()) / (n if c.kind == "walk" else 1))
+    return np.array(units)
