@@ -63,7 +63,7 @@ FLOOR = 1e-3  # of the residuals: the least white noise where it was not measure
 POSES_FOR_THE_SHAPE = 500  # fewer do not show that poses are bumped by the shape of the distribution
 SUSPICIOUS = 0.01  # p-value below which more than the measured noise is looked for
 LIGHT_TAIL = 0.6  # the median of squared distances relative to their mean, in units of what Gaussian noise has
-ROUNDS = 12  # of the outer loop; it ends after two or three
+ROUNDS = 20  # of the outer loop; it ends after a few
 SETTLED = 1e-4  # squared step, in standard deviations of the estimates
 MEDIAN_DISTANCE = float(chi2_isf(6, 0.5))
 
@@ -258,6 +258,13 @@ class _Explanation:
     """-2 log restricted likelihood, plus what each component and each rejected pose must bring."""
     noticed: bool = False
     """Whether bumped poses may be hidden in it."""
+    noise: Noise | None = None
+    """At the parameters."""
+
+    @property
+    def noise_moves(self) -> bool:
+        """Whether the noise depends on the parameters."""
+        return not {"rotation", "gain", "cross_talk"}.isdisjoint(c.kind for c in self.components)
 
 
 class _Problem:
@@ -418,26 +425,29 @@ class _Problem:
         """Improve parameters, variances, components and rejected poses in turn, until nothing changes."""
         always, candidates = self._always(), self._candidates()
         problem = self._linearised(p, kept)
-        components, theta = tuple(always), self._start(problem, always)
+        at = select(problem, always, self._start(problem, always), candidates, len(always))
         best = _Explanation(p, kept)
         for _ in range(ROUNDS):
-            at = select(problem, components, theta, candidates, len(always))
             if self.drift == "auto":
                 at = with_slopes_instead(problem, at, len(always))
             p, problem, at = self._settled(p, kept, problem, at)
             distances = squared_length(*at.left_out())
             criterion = self._criterion(at, distances)
-            if criterion > best.criterion - 1e-3:
+            if criterion < best.criterion - 1e-3:
+                if kept.all() and self._are_gaussian(distances):
+                    return _Explanation(p, kept, at.components, at.theta, criterion, noise=at.noise)
+                noise_found = {c.kind for c in at.components[len(always) :]} - {"walk", "slope"}
+                noticed = self.n >= FEWEST_TO_REJECT_FROM and (bool(noise_found) or self._stand_out(distances))
+                best = _Explanation(p, kept, at.components, at.theta, criterion, noticed, at.noise)
+                kept = self._membership(kept, distances, at)
+                if not (kept == best.kept).all():
+                    problem = self._linearised(p, kept)
+                    at = maximise(problem, at.components, at.theta)
+                    continue
+            again = select(problem, at.components, at.theta, candidates, len(always))
+            if set(again.components) == set(at.components):
                 break
-            if kept.all() and self._are_gaussian(distances):
-                return _Explanation(p, kept, at.components, at.theta, criterion)
-            noise_found = {c.kind for c in at.components[len(always) :]} - {"walk", "slope"}
-            noticed = self.n >= FEWEST_TO_REJECT_FROM and (bool(noise_found) or self._stand_out(distances))
-            best = _Explanation(p, kept, at.components, at.theta, criterion, noticed)
-            components, theta = at.components, at.theta
-            kept = self._membership(kept, distances, at)
-            if not (kept == best.kept).all():
-                problem = self._linearised(p, kept)
+            at = again
         return best
 
     def _settled(
@@ -483,13 +493,12 @@ class _Problem:
     def _with_all_minima(self, e: _Explanation, others: list[Minimum]) -> list[Minimum]:
         """Find the minima again, under the noise of the explanation."""
         noise = self._noise(e, e.parameters)
-        moves = bool({"rotation", "gain", "cross_talk"} & {c.kind for c in e.components})  # with the parameters
         statistics, logdet = self._statistics(noise, e.parameters), noise.logdet
         ends = []
         for start in (e.parameters, *(minimum.parameters for minimum in others)):
             q = start
-            for _ in range(3 if moves else 1):
-                if moves:
+            for _ in range(3 if e.noise_moves else 1):
+                if e.noise_moves:
                     noise = self._noise(e, q)
                     statistics = self._statistics(noise, q)
                 end = self.descent.down(statistics, q)
@@ -498,6 +507,8 @@ class _Problem:
         return self.descent.distinct(ends)
 
     def _noise(self, e: _Explanation, p: Parameters) -> Noise:
+        if e.noise is not None and not e.noise_moves:
+            return e.noise
         return noise_of(self._linearised(p, e.kept), e.components, e.theta)
 
     def _statistics(self, noise: Noise, p: Parameters) -> Statistics:

@@ -209,11 +209,6 @@ def walk_times(time: Array, X: Array) -> Array:
     return np.asarray(np.cumsum(steps(time)[:, None] * _following(X), axis=0))
 
 
-def walk_square(time: Array, X: Array) -> Array:
-    """Give the diagonal (k,) of X' K X: the sum over steps of dt (sum of what follows)²."""
-    return np.asarray(steps(time) @ _following(X) ** 2)
-
-
 def _following(X: Array) -> Array:
     return np.asarray(np.cumsum(X[::-1], axis=0)[::-1])
 

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.likelihood.session_noise import Noise, centred, summed_products, walk_square, walk_times
+from calib.likelihood.session_noise import Noise, centred, summed_products, walk_times
 from calib.model import Array
 
 GAIN = 2.0
@@ -199,25 +199,27 @@ def _score(problem: Linearised, at: Point, components: Sequence[Component], thet
     P = noise.blocks - WJC @ np.swapaxes(WJ, 1, 2)
     of_all = {c: T for c in components if (T := problem.columns(c)) is not None}
     WT = {c: (noise.solve(T), summed_products(WJ, T)) for c, T in of_all.items()}
+    Ku = walk_times(problem.time, u) if any(c.kind == "walk" for c in components) else u
+    white_square, white_trace, walk_square = (u**2).sum(axis=0), np.einsum("ncc->c", P), (u * Ku).sum(axis=0)
     kept = int(problem.kept.sum())
-    slope, Vu = [], []
-    for c, variance in zip(components, theta, strict=True):
+    slope, Vu = [], np.empty((*u.shape, len(components)))
+    for k, (c, variance) in enumerate(zip(components, theta, strict=True)):
         share = np.array(c.share)
         if c in of_all:
             T = of_all[c]
             along = np.tensordot(u, T, 2)
             solved, JWT = WT[c]
             square, trace = float(along @ along), float(np.vdot(T, solved) - np.vdot(JWT, C @ JWT))
-            Vu.append(variance * (T @ along))
+            Vu[..., k] = variance * (T @ along)
         elif c.kind == "white":
-            square, trace = float((u**2).sum(axis=0) @ share), float(np.einsum("ncc,c->", P, share))
-            Vu.append(variance * share * u)
+            square, trace = float(white_square @ share), float(white_trace @ share)
+            Vu[..., k] = variance * share * u
         elif c.kind == "rotation":
             turned = (u[:, None] @ problem.turn)[:, 0]
             square, trace = float((turned**2).sum()), float(np.vdot(problem.turn, P @ problem.turn))
-            Vu.append(variance * (problem.turn @ turned[..., None])[..., 0])
+            Vu[..., k] = variance * (problem.turn @ turned[..., None])[..., 0]
         else:
-            square = float(walk_square(problem.time, u) @ share)
+            square = float(walk_square @ share)
             own = np.flatnonzero(share)
             if c in at.components:
                 # K P = (V - D - effects) P, and V P = 1 - J C J' W.
@@ -230,12 +232,10 @@ def _score(problem: Linearised, at: Point, components: Sequence[Component], thet
                 trace = (kept * len(own) - float(others)) / variance
             else:
                 trace = noise.walk_trace(problem.time, own, (WJ, -C))
-            Vu.append(variance * share * walk_times(problem.time, u))
+            Vu[..., k] = variance * share * Ku
         slope.append(variance * (square - trace) / 2)
-    X = np.stack(Vu, axis=-1)
-    WX = noise.solve(X)
-    JWX = summed_products(WJ, X)
-    information = (summed_products(X, WX) - JWX.T @ C @ JWX) / 2
+    JWX = summed_products(WJ, Vu)
+    information = (summed_products(Vu, noise.solve(Vu)) - JWX.T @ C @ JWX) / 2
     return np.array(slope), np.asarray(information)
 
 

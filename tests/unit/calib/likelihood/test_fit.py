@@ -10,7 +10,7 @@ from calib.data.pooling import pooled_covariance
 from calib.known import Constraints, Known
 from calib.likelihood.descent import Descent
 from calib.likelihood.fit import Drift, Fit, fit
-from calib.likelihood.session_noise import inverse_blocks
+from calib.likelihood.session_noise import CHUNK, inverse_blocks
 from calib.likelihood.sufficient_statistics import (
     Statistics,
     coefficients,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib.likelihood.session_noise import Noise, centred, walk_square, walk_times
+from calib.likelihood.session_noise import Noise, centred, walk_times
 from calib.likelihood.variance_components import (
     FORCE,
     ROTATION,
@@ -86,7 +86,6 @@ def test_the_walk_multiplies_as_its_covariance() -> None:
     tau = np.cumsum(np.diff(time, prepend=time[0] - 1))
     K = np.minimum.outer(tau, tau)
     np.testing.assert_allclose(walk_times(time, X), K @ X)
-    np.testing.assert_allclose(walk_square(time, X), np.diag(X.T @ K @ X))
 
 
 ALL = (
