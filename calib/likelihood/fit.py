@@ -47,6 +47,7 @@ from calib.likelihood.variance_components import (
     select,
     squared_length,
     with_slopes_instead,
+    with_walks_instead,
 )
 from calib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict
 
@@ -429,6 +430,7 @@ class _Problem:
         best = _Explanation(p, kept)
         for _ in range(ROUNDS):
             if self.drift == "auto":
+                at = with_walks_instead(problem, at, candidates, len(always))
                 at = with_slopes_instead(problem, at, len(always))
             p, problem, at = self._settled(p, kept, problem, at)
             distances = squared_length(*at.left_out())

@@ -109,6 +109,11 @@ class Point:
         """The log-likelihood less what each component must bring."""
         return self.loglik - sum(c.needed for c in self.components)
 
+    @property
+    def too_large(self) -> bool:
+        """Whether a variance is at the limit of what has this cause."""
+        return any(v >= LARGEST.get(c.kind, np.inf) for c, v in zip(self.components, self.theta, strict=True))
+
     def left_out(self) -> tuple[Array, Array]:
         """Residual (n, 6) of each pose when all others predict it, and its covariance (n, 6, 6)."""
         return left_out(self.noise, self.WJ, self.u, self.C)
@@ -304,8 +309,7 @@ def select(
         trial = maximise(
             problem, [*best.components, *(waiting[i] for i in together)], np.append(best.theta, start[together])
         )
-        too_large = any(v >= LARGEST.get(c.kind, np.inf) for c, v in zip(trial.components, trial.theta, strict=True))
-        if trial.loglik > best.loglik + waiting[k].needed and not too_large:
+        if trial.loglik > best.loglik + waiting[k].needed and not trial.too_large:
             best, last = trial, len(together)
         waiting = [c for i, c in enumerate(waiting) if i not in together]
     return best if len(best.components) - needed <= last else _pruned(problem, best, needed)
@@ -326,6 +330,26 @@ def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
     components = [*(best.components[k] for k in rest), *slopes]
     trial = maximise(problem, components, np.append(best.theta[rest], start))
     return _pruned(problem, trial, needed) if trial.loglik > best.loglik else best
+
+
+def with_walks_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
+    """Try a walk, gain and cross-talk together in place of the white noise of a group.
+
+    One at a time they may bring less than white noise, which then takes their place.
+    """
+    for group in (FORCE, TORQUE):
+        walk = component("walk", group)
+        drifts = any(c.kind in ("walk", "slope") and c.share[group[0]] for c in best.components)
+        if walk not in candidates or drifts or len(best.components) == needed:
+            continue
+        rest = [k for k, c in enumerate(best.components) if k < needed or c.kind != "white" or not c.share[group[0]]]
+        kept = [best.components[k] for k in rest]
+        added = [walk, *(c for c in RESPONSE if c in candidates and c not in kept)]
+        start = np.append(best.theta[rest], _units(problem, best, added))
+        trial = _pruned(problem, maximise(problem, [*kept, *added], start), needed)
+        if trial.worth > best.worth and not trial.too_large:
+            best = trial
+    return best
 
 
 def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
