@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.special import chdtr as chi2_cdf
 from scipy.special import chdtri as chi2_isf
 from scipy.special import fdtri as f_ppf
@@ -40,9 +41,11 @@ from calib.likelihood.variance_components import (
     Linearised,
     Point,
     component,
+    estimates_of_unknown_variances,
     left_out,
     maximise,
     noise_of,
+    point,
     predicted_gains,
     select,
     squared_length,
@@ -112,14 +115,12 @@ class Fit:
     """(n, 3, 3)"""
     wrench: Array
     """(n, 6)"""
-    effects: tuple[NDArray[np.intp], Array]
-    """Which of the 11 numbers of gain and cross-talk were estimated (k,), and their variances (k,)."""
-
-    @cached_property
-    def covariance(self) -> Array:
-        """(15, 15) zero along what is exactly known; without meaning where the information lacks rank."""
-        Z = self.free
-        return np.asarray(Z @ _inverse(Z.T @ self.information @ Z) @ Z.T)
+    given_noise: Array
+    """(15, 15) covariance of the parameters if the noise model is taken as known."""
+    covariance: Array
+    """(15, 15) zero along what is exactly known; without meaning where the information lacks rank."""
+    response: Response | None
+    """Gain and cross-talk of the sensor, best linear prediction; None where none was found."""
 
     @property
     def wrench_cov(self) -> Array:
@@ -164,38 +165,16 @@ class Fit:
             WX = noise.solve(X)
             G += summed_products(X, WX)
             # With a prior the best parameters leave some of J' W r.
-            e[rows], S[rows] = left_out(noise, WX[..., :15], WX[..., 15], self.covariance)
+            e[rows], S[rows] = left_out(noise, WX[..., :15], WX[..., 15], self.given_noise)
         return e, S, G
-
-    def _response_equations(self, which: NDArray[np.intp]) -> tuple[Array, Array, Array]:
-        """Give J' W T (15, k), T' W r (k,) and T' P T (k, k), T the columns of these numbers of gain and cross-talk."""
-        G, own = self._pass[2], 16 + which
-        JWT = G[:15, own]
-        return JWT, G[own, 15], G[np.ix_(own, own)] - JWT.T @ self.covariance @ JWT
-
-    @cached_property
-    def response(self) -> Response | None:
-        """Gain and cross-talk of the sensor, best linear prediction; None where none was found."""
-        which, variance = self.effects
-        if not which.size:
-            return None
-        JWT, Tu, TPT = self._response_equations(which)
-        C, total = self.covariance, np.zeros((15 + SIZE, 15 + SIZE))
-        own = 15 + which
-        total[:15, :15] = C
-        total[:15, own] = -C @ JWT * variance
-        total[own, :15] = total[:15, own].T
-        total[np.ix_(own, own)] = np.diag(variance) - variance[:, None] * TPT * variance
-        coefficients = np.zeros(SIZE)
-        coefficients[which] = variance * Tu
-        return Response(coefficients, total)
 
     @cached_property
     def gain_sigma(self) -> float:
         """Standard deviation of the entries of the gain: as found, else what the data leave room for, by moments."""
         if "gain" in self.components or len(self.weights) < FEW_POSES_FOR_RESPONSE:
             return self.components.get("gain", 0.0)
-        _, Tu, M = self._response_equations(np.arange(5))
+        G, own = self._pass[2], slice(16, 21)
+        Tu, M = G[own, 15], G[own, own] - G[own, :15] @ self.given_noise @ G[:15, own]
         excess = float(Tu @ np.linalg.lstsq(M, Tu, rcond=1e-9)[0]) - len(M)
         return float(np.sqrt(max(excess, 0.0) / np.trace(M)))
 
@@ -531,8 +510,15 @@ class _Problem:
         weights[self.order] = e.kept
         drifts = self.drift == "linear" or any(c.kind in ("walk", "slope") for c in e.components)
         found = dict(zip(e.components, e.theta, strict=True))
-        variance = np.repeat([found.get(c, 0.0) for c in RESPONSE], [5, 6])
-        effects = np.flatnonzero(variance), variance[variance > 0]
+        Z = self.constraints.free(best.parameters)
+        given_noise = covariance = np.asarray(Z @ _inverse(Z.T @ best.information @ Z) @ Z.T)
+        response = None
+        if e.components:
+            problem = self._linearised(best.parameters, e.kept)
+            x, C = estimates_of_unknown_variances(problem, point(problem, e.components, e.theta))
+            Z = block_diag(Z, np.eye(SIZE))
+            covariance = (Z @ C @ Z.T)[:15, :15]
+            response = Response(x[-SIZE:], Z @ C @ Z.T) if x[-SIZE:].any() else None
         return Fit(
             parameters=best.parameters,
             information=best.information,
@@ -543,12 +529,14 @@ class _Problem:
             measured_chi2=static_chi2 if self.measured else float("nan"),
             weights=weights,
             components={c.name: self._deviation(c, v) for c, v in found.items()},
-            drift=self._drift(best, noise, effects) if drifts else None,
+            drift=self._drift(best, noise, given_noise, found) if drifts else None,
             noise=noise,
             order=self.order,
             R_base_flange=self.given[0],
             wrench=self.given[1],
-            effects=effects,
+            given_noise=given_noise,
+            covariance=covariance,
+            response=response,
         )
 
     def _deviation(self, c: Component, variance: float) -> float:
@@ -556,15 +544,16 @@ class _Problem:
         least = 0.0 if self.measured or c.kind != "white" else self.cov[0][np.argmax(c.share), np.argmax(c.share)]
         return float(np.sqrt(variance + least))
 
-    def _drift(self, best: Minimum, noise: Noise, effects: tuple[NDArray[np.intp], Array]) -> DriftEstimate:
+    def _drift(self, best: Minimum, noise: Noise, C: Array, found: Mapping[Component, float]) -> DriftEstimate:
         """Best linear prediction of the bias at every pose, and the error of its change."""
         J, r = jacobian(best.parameters, self.R), self.wrench - predict(best.parameters, self.R)
-        T = response_columns(best.parameters, self.R)[..., effects[0]]
+        T = response_columns(best.parameters, self.R)
+        variance = np.repeat([found.get(c, 0.0) for c in RESPONSE], [5, 6])[:, None]
 
         def not_drift(X: Array) -> Array:
             """Multiply by the covariance of all but the drift."""
             Y = noise.D @ X
-            return np.asarray(Y + T @ (effects[1][:, None] * summed_products(T, X)) if T.size else Y)
+            return np.asarray(Y + T @ (variance * summed_products(T, X)) if variance.any() else Y)
 
         sorted_bias = r - not_drift(noise.solve(r[..., None]))[..., 0]
         if not noise.kept.all():
@@ -575,8 +564,6 @@ class _Problem:
         ends = np.flatnonzero(noise.kept)[[0, -1]]
         select_ends = np.zeros((self.n, 6, 6))
         select_ends[ends] = [-np.eye(6), np.eye(6)]
-        Z = self.constraints.free(best.parameters)
-        C = Z @ _inverse(Z.T @ best.information @ Z) @ Z.T
         Y = not_drift(select_ends)
         WY = noise.solve(Y)
         E = summed_products(select_ends, J) - summed_products(WY, J)

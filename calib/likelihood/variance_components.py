@@ -24,6 +24,7 @@ SETTLED = 1e-4  # squared distance from the best variances, in their standard de
 NEGLIGIBLE = 1e-4  # of the white noise: where slope and curvature "at zero" are taken
 LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2}
 """Variances that no arm or sensor in working order exceeds. A larger one has another cause."""
+POSES_THAT_SHOW_THE_NOISE = 1000  # fewer leave its size uncertain enough to matter
 _AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
 
 Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk"]
@@ -330,6 +331,53 @@ def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
     components = [*(best.components[k] for k in rest), *slopes]
     trial = maximise(problem, components, np.append(best.theta[rest], start))
     return _pruned(problem, trial, needed) if trial.loglik > best.loglik else best
+
+
+def estimates(problem: Linearised, at: Point) -> tuple[Array, Array]:
+    """Estimate parameters, and gain and cross-talk of the sensor, under given variances.
+
+    Returns
+    -------
+    values : array, shape (m + 11,)
+        Step of the free parameters; best linear prediction of the coefficients, zero where none were found.
+    covariance : array, shape (m + 11, m + 11)
+    """
+    m, size = len(at.C), problem.response.shape[2]
+    found = dict(zip(at.components, at.theta, strict=True))
+    variance = np.repeat([found.get(c, 0.0) for c in RESPONSE], [5, 6])
+    values, covariance = np.zeros(m + size), np.zeros((m + size, m + size))
+    values[:m], covariance[:m, :m] = at.step, at.C
+    if variance.any():
+        T = problem.response
+        TWJ = summed_products(T, at.WJ)
+        TPT = summed_products(T, at.noise.solve(T)) - TWJ @ at.C @ TWJ.T
+        values[m:] = variance * np.tensordot(at.u, T, 2)
+        covariance[m:, :m] = -variance[:, None] * TWJ @ at.C
+        covariance[:m, m:] = covariance[m:, :m].T
+        covariance[m:, m:] = np.diag(variance) - variance[:, None] * TPT * variance
+    return values, covariance
+
+
+def estimates_of_unknown_variances(problem: Linearised, at: Point) -> tuple[Array, Array]:
+    """Give the `estimates` with a covariance for variances that were estimated too.
+
+    To first order in the uncertainty of the variances: estimates move with them, and the covariance at the best
+    variances is as much too small (Kenward, Roger 1997; Prasad, Rao 1990). The covariance itself is uncertain: as the
+    95 % interval of Student's distribution is wider by (z² + 1) / (4 nu), so is sigma, nu by Satterthwaite (1946).
+    """
+    x, C = estimates(problem, at)
+    if not at.components or int(problem.kept.sum()) >= POSES_THAT_SHOW_THE_NOISE:
+        return x, C
+    _, information = _score(problem, at, at.components, at.theta)
+    uncertainty = np.linalg.pinv(information, rcond=1e-6, hermitian=True)
+    k, h = len(at.theta), 1e-3
+    around = [estimates(problem, point(problem, at.components, at.theta * np.exp(h * row))) for row in np.eye(k)]
+    moves, changes = ([(part[i] - own) / h for part in around] for i, own in enumerate((x, C)))
+    scale = np.sqrt(np.diag(C))
+    scale[scale == 0] = 1.0
+    inverse = np.linalg.pinv(C / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
+    wider = (1.96**2 + 1) / 4 * np.einsum("ij,iab,bc,jcd->ad", uncertainty, changes, inverse, changes, optimize=True)
+    return x, C + 2 * np.transpose(moves) @ uncertainty @ np.array(moves) + wider
 
 
 def with_walks_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
