@@ -112,7 +112,7 @@ def _misfit(X: Array) -> float:
     scale = column_scale(gram[:-1, :-1])
     inverse = np.linalg.pinv(gram[:-1, :-1] / np.outer(scale, scale), rcond=1e-12, hermitian=True)
     moment = gram[:-1, -1] / scale
-    return float(gram[-1, -1] - moment @ inverse @ moment) / max(X.shape[0] * 6 - len(moment), 1)
+    return float((gram[-1, -1] - moment @ inverse @ moment) / max(6 * len(X) - len(moment), 1))
 
 
 def _best_change(parameters: Parameters, X: Array, positions: NDArray[np.intp]) -> Change:

@@ -366,7 +366,7 @@ def estimates_of_unknown_variances(problem: Linearised, at: Point) -> tuple[Arra
     95 % interval of Student's distribution is wider by (z² + 1) / (4 nu), so is sigma, nu by Satterthwaite (1946).
     """
     x, C = estimates(problem, at)
-    if not at.components or int(problem.kept.sum()) >= POSES_THAT_SHOW_THE_NOISE:
+    if not at.components or len(problem.r) >= POSES_THAT_SHOW_THE_NOISE:
         return x, C
     _, information = _score(problem, at, at.components, at.theta)
     uncertainty = np.linalg.pinv(information, rcond=1e-6, hermitian=True)

@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from calib import Parameters, read_csv
 from calib.known import Constraints, Known
 from calib.likelihood import fit as likelihood
+from calib.likelihood.explanation import Explanation, with_all_minima
 from calib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, Response, predicted_covariance
+from calib.likelihood.session import Session, inverses
 from calib.likelihood.variance_components import FORCE, RESPONSE, ROTATION, TORQUE, component
 from calib.model import STANDARD_GRAVITY_M_S2, Array, predict
 from calib.published.yu import lrom
@@ -156,15 +158,13 @@ def sensor_run(
 
 def informed(R: Array, wrench: Array, gain: float, cross_talk: float, drift_N: float) -> likelihood.Fit:
     """Fit with the true variances."""
-    problem = likelihood._Problem(
-        R, wrench, np.diag(NOISE**2), None, "auto", Constraints(Known(), STANDARD_GRAVITY_M_S2)
-    )
+    session = Session(R, wrench, np.diag(NOISE**2), None, "auto", Constraints(Known(), STANDARD_GRAVITY_M_S2))
     found = [ROTATION, *RESPONSE, component("walk", FORCE), component("walk", TORQUE)]
     theta = np.array([ORIENTATION_RAD, gain, cross_talk, drift_N, sim.LEVER_M * drift_N]) ** 2
-    minima = problem.descent.minima(likelihood._inverses(problem.cov))
+    minima = session.descent.minima(inverses(session.cov))
     used = [k for k in range(5) if theta[k] > 0]
-    e = likelihood._Explanation(minima[0].parameters, problem.everything, tuple(found[k] for k in used), theta[used])
-    return problem._fit(e, problem._with_all_minima(e, minima), np.nan)
+    e = Explanation(minima[0].parameters, session.everything, tuple(found[k] for k in used), theta[used])
+    return likelihood.fit_of(session, e, with_all_minima(session, e, minima), np.nan)
 
 
 def false_choice(lab: Lab) -> Iterator[Row]:

@@ -9,7 +9,8 @@ from calib import Parameters
 from calib.data.pooling import pooled_covariance
 from calib.known import Constraints, Known
 from calib.likelihood.descent import Descent
-from calib.likelihood.fit import Drift, Fit, fit
+from calib.likelihood.fit import Fit, fit
+from calib.likelihood.session import Drift
 from calib.likelihood.session_noise import CHUNK, inverse_blocks
 from calib.likelihood.sufficient_statistics import (
     Statistics,
