@@ -1,7 +1,10 @@
 """Noise of a session: O(n) algebra against dense matrices, restricted likelihood against its definition."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy import stats
 
 from calib.likelihood.session_noise import Noise, centred, walk_times
 from calib.likelihood.variance_components import (
@@ -13,6 +16,8 @@ from calib.likelihood.variance_components import (
     _pruned,
     _score,
     component,
+    estimates,
+    estimates_of_unknown_variances,
     maximise,
     point,
     select,
@@ -221,3 +226,21 @@ def test_a_linear_drift_is_preferred_where_it_fits_better() -> None:
     q = problem(rng, 30, (component("walk", FORCE),), np.array([0.2]))
     at = select(q, [], np.zeros(0), [component("walk", FORCE)])
     assert with_slopes_instead(q, at, 0) is at
+
+
+def test_unknown_noise_widens_sigma_like_students_distribution() -> None:
+    white = Component("white", "white", (1.0,) * 6)
+    p = problem(np.random.default_rng(8), 8, (white,), np.array([0.3]))
+    p = replace(p, D=1e-6 * p.D)
+    at = maximise(p, (white,), np.array([0.3]))
+    x, C = estimates_of_unknown_variances(p, at)
+    nu = 6 * 8 - 8
+    np.testing.assert_allclose(x[:8], at.step)
+    np.testing.assert_allclose(C[:8, :8], at.C * (1 + (1.96**2 + 1) / (2 * nu)), rtol=1e-3, atol=1e-9)
+    assert stats.t.ppf(0.975, nu) / 1.96 == pytest.approx(np.sqrt(C[0, 0] / at.C[0, 0]), rel=2e-3)
+
+
+def test_many_poses_show_their_noise() -> None:
+    p = problem(np.random.default_rng(9), 1000, ALL[:2], THETA[:2])
+    at = point(p, ALL[:2], THETA[:2])
+    np.testing.assert_array_equal(estimates_of_unknown_variances(p, at)[1], estimates(p, at)[1])
