@@ -12,6 +12,13 @@ from scipy.special import chdtr as chi2_cdf
 from scipy.special import chdtri as chi2_isf
 from scipy.special import fdtri as f_ppf
 
+from calib.likelihood.component_selection import (
+    WORTH_A_TRY,
+    predicted_gains,
+    select,
+    with_slopes_instead,
+    with_walks_instead,
+)
 from calib.likelihood.descent import Minimum
 from calib.likelihood.outliers import (
     FALSE_REJECTION,
@@ -23,20 +30,7 @@ from calib.likelihood.outliers import (
 )
 from calib.likelihood.session import LEVER_M, Session, inverses, white
 from calib.likelihood.session_noise import Noise
-from calib.likelihood.sufficient_statistics import Statistics, features
-from calib.likelihood.variance_components import (
-    WORTH_A_TRY,
-    Component,
-    Linearised,
-    Point,
-    maximise,
-    noise_of,
-    predicted_gains,
-    select,
-    squared_length,
-    with_slopes_instead,
-    with_walks_instead,
-)
+from calib.likelihood.variance_components import Component, Linearised, Point, maximise, noise_of, squared_length
 from calib.model import Array, Parameters, predict
 
 MANY_POSES = 20_000  # from here on single poses are looked at only when chi2 or `drift` asks for it
@@ -243,17 +237,12 @@ def _agreeing(
     session: Session, weights: Array, starts: list[Parameters], distances: Array, *, scaled: bool
 ) -> tuple[Parameters, Kept] | None:
     """Find poses that agree within the noise, or within one that fits half of all poses."""
-    phi = features(session.R)
-
-    def down(statistics: Statistics, p: Parameters, steps: int) -> Parameters:
-        return session.descent.down(statistics, p, steps).parameters
-
     if not scaled:
-        return agreeing_poses(phi, session.wrench, weights, starts, down) if session.measured else None
+        return agreeing_poses(session.descent, weights, starts) if session.measured else None
     scale = float(np.median(distances)) / MEDIAN_DISTANCE
     found = None
     for _ in range(4):
-        robust = agreeing_poses(phi, session.wrench, weights / scale, starts, down)
+        robust = agreeing_poses(session.descent, weights / scale, starts)
         if robust is None:
             break
         found = robust

@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, CalibrationResult, Parameters, solve
 from calib.known import Constraints, Known
+from calib.likelihood.component_selection import with_walks_instead
 from calib.likelihood.fit import Fit, fit
 from calib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, LEVER_M, Response, response_columns
 from calib.likelihood.session import Session
-from calib.likelihood.variance_components import FORCE, RESPONSE, component, maximise, with_walks_instead
+from calib.likelihood.variance_components import FORCE, RESPONSE, component, maximise
 from calib.model import Array, gravity_wrench, predict
 
 SIGMA = np.repeat([0.05, 0.00125], 3)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from calib.likelihood.component_selection import _pruned, select, with_slopes_instead
 from calib.likelihood.session_noise import Noise, centred, walk_times
 from calib.likelihood.variance_components import (
     FORCE,
@@ -13,15 +14,12 @@ from calib.likelihood.variance_components import (
     TORQUE,
     Component,
     Linearised,
-    _pruned,
-    _score,
     component,
     estimates,
     estimates_of_unknown_variances,
     maximise,
     point,
-    select,
-    with_slopes_instead,
+    score,
 )
 from calib.model import Array
 
@@ -129,7 +127,7 @@ def problem(rng: np.random.Generator, n: int, components: tuple[Component, ...],
 def test_slope_and_curvature_are_those_of_the_restricted_likelihood(components: tuple[Component, ...]) -> None:
     rng = np.random.default_rng(5)
     p = problem(rng, N, ALL, THETA)
-    slope, information = _score(p, point(p, components, THETA), components, THETA)
+    slope, information = score(p, point(p, components, THETA), components, THETA)
     h = 1e-4
     for k in range(len(components)):
         up, down = (point(p, components, THETA * np.exp(s * h * np.eye(len(components))[k])).loglik for s in (1, -1))
@@ -141,7 +139,7 @@ def test_the_score_of_a_walk_that_the_noise_lacks_is_that_at_zero() -> None:
     p = problem(np.random.default_rng(5), N, ALL, THETA)
     without = point(p, ALL[:3], THETA[:3])
     tiny = np.append(THETA[:3], 1e-7)
-    slope, _ = _score(p, without, ALL[:4], tiny)
+    slope, _ = score(p, without, ALL[:4], tiny)
     assert ALL[3].kind == "walk"
     assert slope[3] == pytest.approx(point(p, ALL[:4], tiny).loglik - without.loglik, rel=1e-2)
 
