@@ -7,6 +7,7 @@ after the device is gone. Every wait has a time-out. Stale data is an error and 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, fields
 from typing import Final, Literal, Self
 
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drivers.errors import DeviceFault
+from drivers.follow import Follow
 
 Array = NDArray[np.float64]
 
@@ -46,8 +48,32 @@ class DeviceInfo:
     `range`, (6,) the largest force in N and torque in N·m on each axis, in both directions; `sign`, 1 or -1."""
 
 
+class _Columns:
+    """n consecutive samples, one array for each quantity, one row for each sample."""
+
+    __slots__ = ()
+    t_host_ns: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        """Count the rows."""
+        return len(self.t_host_ns)
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence[Self]) -> Self:
+        """Join blocks in the order given."""
+        return cls(*(np.concatenate([getattr(block, name) for block in blocks]) for name in cls._names()))
+
+    def rows(self, which: slice | NDArray[np.bool_]) -> Self:
+        """Select samples."""
+        return type(self)(*(getattr(self, name)[which] for name in self._names()))
+
+    @classmethod
+    def _names(cls) -> list[str]:
+        return [column.name for column in fields(cls)]  # type: ignore[arg-type]  # every subclass is a dataclass
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class FtSamples:
+class FtSamples(_Columns):
     """n consecutive samples of one sensor, one row each, as measured: no bias, tare or filter applied.
 
     The wrench is exerted on the sensor by what hangs on it or pushes on it, in the sensor frame, about its origin.
@@ -65,10 +91,6 @@ class FtSamples:
     """(n, 6) force in N, then torque in N·m."""
     status: NDArray[np.uint32]
     """(n,) the vendor's status word."""
-
-    def __len__(self) -> int:
-        """Count the rows."""
-        return len(self.t_host_ns)
 
     @classmethod
     def of(
@@ -91,15 +113,6 @@ class FtSamples:
             wrench=wrench,
             status=np.full(n, status, np.uint32),
         )
-
-    @classmethod
-    def concatenate(cls, blocks: Sequence[Self]) -> Self:
-        """Join blocks in the order given."""
-        return cls(*(np.concatenate([getattr(block, column.name) for block in blocks]) for column in fields(cls)))
-
-    def rows(self, which: slice | NDArray[np.bool_]) -> Self:
-        """Select samples."""
-        return type(self)(*(getattr(self, column.name)[which] for column in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +157,29 @@ class ArmState:
     """(3, 3) maps flange coordinates to base coordinates."""
     p_base_flange_m: Array
     """(3,)"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmStates(_Columns):
+    """n consecutive samples of the arm, one row each. The flange is the mechanical flange, whatever TCP is active."""
+
+    t_host_ns: NDArray[np.int64]
+    """(n,) `Clock.now_ns()` of the driver at receipt."""
+    t_device_s: Array
+    """(n,) the controller's own clock, own epoch. Never subtract it from host time."""
+    q_rad: Array
+    """(n, 6) actual joint angles."""
+    qd_rad_s: Array
+    """(n, 6) actual joint speeds."""
+    R_base_flange: Array
+    """(n, 3, 3) maps flange coordinates to base coordinates."""
+    p_base_flange_m: Array
+    """(n, 3)"""
+
+    @classmethod
+    def of(cls, states: Sequence[ArmState]) -> Self:
+        """Join at least one state."""
+        return cls(*(np.array([getattr(state, name) for state in states]) for name in cls._names()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +248,13 @@ class ForceTorqueSensor(_Device):
         """
 
     @abstractmethod
+    def follow(self) -> AbstractContextManager[Follow[FtSamples]]:
+        """Read every sample from now on; see `Follow`. Any number of followers, each from any thread.
+
+        A lost sample is a gap in `seq`. After the stream has reconnected by itself, the same follower reads on.
+        """
+
+    @abstractmethod
     def latest(self, *, timeout_s: float) -> FtSamples:
         """Return the newest sample (one row); wait up to `timeout_s` for one that is not stale."""
 
@@ -247,6 +290,17 @@ class RobotArm(_Device):
 
         From any thread, also while `move_to` runs in another.
         """
+
+    def follow(self) -> AbstractContextManager[Follow[ArmStates]]:
+        """Read every state from now on; see `Follow`. Any number of followers, each from any thread.
+
+        The default calls `state()` once a read, so its rate is that of the reads.
+        """
+
+        def read(_: float) -> ArmStates:
+            return ArmStates.of([self.state()])
+
+        return nullcontext(Follow(read))
 
     @abstractmethod
     def status(self) -> ArmStatus:

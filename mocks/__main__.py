@@ -1,8 +1,10 @@
 """Command line: ``python -m mocks station``."""
 
 import argparse
+import math
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 from mocks.arrays import Array
 from mocks.kinematics import MODELS
@@ -41,6 +43,13 @@ def _positive(text: str) -> float:
     return value
 
 
+def _pace(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is negative or not finite")
+    return value
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m mocks", description="Emulated robot cells.", allow_abbrev=False)
     station = parser.add_subparsers(dest="what", required=True).add_parser(
@@ -55,6 +64,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--host", help="loopback address to listen on (default: a free 127.x.y.z)")
     add("--time-scale", type=_positive, default=1.0, metavar="K", help="the arm moves K times faster than real")
     add("--sensor", choices=CHOICES, default="can", metavar="NAME", help=f"{', '.join(CHOICES)} (default can)")
+    add("--sensor-delay-ms", type=float, metavar="D", help="time between the measurement of a sample and its sending")
+    add("--rtde-delay-ms", type=float, metavar="D", help="the same for the samples of the arm")
+    add("--recording", type=Path, metavar="FILE.csv", help="serve the raw wrench and the joints of a recording")
+    add("--pace", type=_pace, metavar="K", help="play it K times faster (default 1; 0: hold the first row)")
     add("--do", action="append", default=[], metavar="JSON", help="a request of the control channel to begin with")
 
     arm = station.add_argument_group("arm")
@@ -81,6 +94,15 @@ def _parser() -> argparse.ArgumentParser:
     add = truth.add_argument
     add("--mass", type=float, metavar="kg")
     add("--com", type=_vector(3), metavar="x,y,z", help="centre of mass in the sensor frame, m")
+    add(
+        "--inertia",
+        metavar="ixx,iyy,izz,ixy,ixz,iyz",
+        help="inertia tensor about the centre of mass, sensor axes, kg·m²; zeros for a point mass; "
+        "'none': the payload has weight, but no inertia",
+    )
+    add(
+        "--sensor-origin", type=_vector(3), metavar="x,y,z", help="of the sensor in the flange frame, m (default 0,0,0)"
+    )
     add("--sensor-rotvec-deg", type=_vector(3), metavar="x,y,z", help="R_flange_sensor as a rotation vector, degrees")
     add("--mount", choices=sorted(MOUNTS_RAD), default="floor")
     add("--tilt-deg", type=_vector(2), metavar="alpha,beta", help="tilt of the base; beta counts from the mount")

@@ -7,6 +7,7 @@ Standard DH, one row per joint: ``T_i = Rz(theta_i) Tz(d_i) Tx(a_i) Rx(alpha_i)`
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,24 @@ Vector6 = tuple[float, float, float, float, float, float]
 """Six joint values or a UR pose: plain floats, because the 500 Hz loop is scalar arithmetic."""
 
 ZERO6: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class JointState(NamedTuple):
+    """Joint angles (rad), speeds (rad/s) and accelerations (rad/s²) at one instant."""
+
+    q: Vector6
+    qd: Vector6 = ZERO6
+    qdd: Vector6 = ZERO6
+
+
+class FlangeMotion(NamedTuple):
+    """How the flange moves at one instant: orientation (3, 3) and the rest (3,) each, all in base axes, SI units."""
+
+    R_base_flange: Array
+    angular_velocity: Array
+    angular_acceleration: Array
+    acceleration: Array
+    """Of the flange's origin."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +151,29 @@ def jacobian(dh: Dh, q: Sequence[float]) -> Array:
         x, y, z = tip_x - frame[3], tip_y - frame[7], tip_z - frame[11]
         columns.append((ay * z - az * y, az * x - ax * z, ax * y - ay * x, ax, ay, az))
     return np.array(columns).T
+
+
+def flange_motion(dh: Dh, state: JointState) -> FlangeMotion:
+    """Orientation, rotation and acceleration of the flange: from joint to joint, as each link turns with those below.
+
+    Source: Craig, "Introduction to Robotics", section 6.5 (outward iterations), in base axes.
+    """
+    frames = _chain(dh, state.q)
+    wx = wy = wz = bx = by = bz = ax = ay = az = 0.0  # angular velocity, angular acceleration, acceleration
+    for below, above, v, c in zip(frames[:6], frames[1:], state.qd, state.qdd, strict=True):
+        x, y, z = below[2::4]
+        bx += x * c + (wy * z - wz * y) * v
+        by += y * c + (wz * x - wx * z) * v
+        bz += z * c + (wx * y - wy * x) * v
+        wx, wy, wz = wx + x * v, wy + y * v, wz + z * v
+        x, y, z = above[3] - below[3], above[7] - below[7], above[11] - below[11]
+        along, square = wx * x + wy * y + wz * z, wx * wx + wy * wy + wz * wz  # w x (w x r) = w (w.r) - r (w.w)
+        ax += by * z - bz * y + wx * along - x * square
+        ay += bz * x - bx * z + wy * along - y * square
+        az += bx * y - by * x + wz * along - z * square
+    m = frames[6]
+    R_base_flange = np.array([m[0:3], m[4:7], m[8:11]])
+    return FlangeMotion(R_base_flange, np.array([wx, wy, wz]), np.array([bx, by, bz]), np.array([ax, ay, az]))
 
 
 def closed_form(dh: Dh, target: Array, free_q6: float = 0.0) -> Iterator[Vector6]:

@@ -19,7 +19,9 @@ import numpy as np
 
 from mocks.arrays import Array
 from mocks.clock import CellClock
+from mocks.inertia import inertia_tensor
 from mocks.kinematics import MODELS, Vector6, rotation, vector3, vector6
+from mocks.recording import RecordedArm, RecordedWorld, Recording
 from mocks.sensors.catalogue import WRIST, Sensor
 from mocks.ur.operator import Operator
 from mocks.ur.robot import Robot, RobotSettings
@@ -29,6 +31,8 @@ from mocks.world import MOUNTS_RAD, Truth, World
 
 FORMAT = "mocks.station/1"
 HOST_TRIALS = 20
+LONGEST_DELAY_MS = 1000
+WITHOUT_EFFECT_ON_A_RECORDING = ("payload-shift", "push-joint", "hand-guide", "slider", "speed-scaling")
 
 START_Q_DEG = (45.0, -100.0, 60.0, -50.0, 90.0, 45.0)
 """Near the first pose of the tour: q4 = -90° - q2 - q3."""
@@ -37,35 +41,65 @@ START_SCATTER_DEG = 5.0
 """The wrist starts this far off at most, so that the arm moves to the first pose."""
 
 
+VECTORS = {
+    "com": "p_sensor_com_m",
+    "sensor_origin": "p_flange_sensor_m",
+    "force_bias": "force_bias_N",
+    "torque_bias": "torque_bias_Nm",
+    "force_drift": "force_drift_N_min",
+    "torque_drift": "torque_drift_Nm_min",
+}
+"""Options that give a vector of the truth, by its name."""
+
+
 def truth_from(options: Namespace) -> Truth:
     """Draw the truth from the seed, then replace every quantity given on the command line."""
     truth = Truth.drawn(options.seed, options.mount)
-    changes: dict[str, Any] = {}
+    if options.recording is not None:  # has its own bias and noise
+        nothing = np.zeros(3)
+        truth = replace(truth, force_bias_N=nothing, torque_bias_Nm=nothing, noise_force_N=0.0, noise_torque_Nm=0.0)
+    given = {name: getattr(options, option) for option, name in VECTORS.items()}
+    changes: dict[str, Any] = {name: np.array(vector) for name, vector in given.items() if vector is not None}
     if options.mass is not None:
         changes["mass_kg"] = options.mass
-    if options.com is not None:
-        changes["p_sensor_com_m"] = np.array(options.com)
     if options.sensor_rotvec_deg is not None:
         changes["R_flange_sensor"] = rotation(np.radians(options.sensor_rotvec_deg))
     if options.tilt_deg is not None:
         alpha, beta = np.radians(options.tilt_deg).tolist()
         changes["tilt_alpha_rad"] = alpha
         changes["tilt_beta_rad"] = math.remainder(MOUNTS_RAD[options.mount] + beta, 2 * math.pi)
-    if options.force_bias is not None:
-        changes["force_bias_N"] = np.array(options.force_bias)
-    if options.torque_bias is not None:
-        changes["torque_bias_Nm"] = np.array(options.torque_bias)
+    if options.inertia is not None:
+        changes["gyration_m2"] = _gyration(options.inertia, changes.get("mass_kg", truth.mass_kg))
     if options.noise is not None:
         changes["noise_force_N"], changes["noise_torque_Nm"] = options.noise
-    if options.force_drift is not None:
-        changes["force_drift_N_min"] = np.array(options.force_drift)
-    if options.torque_drift is not None:
-        changes["torque_drift_Nm_min"] = np.array(options.torque_drift)
     if options.sensor == WRIST:
         if options.sensor_rotvec_deg is not None:
             raise ValueError(f"the axes of {WRIST} are those of the flange: leave --sensor-rotvec-deg out")
         changes["R_flange_sensor"] = np.eye(3)
     return replace(truth, **changes)
+
+
+def _gyration(inertia: str, mass_kg: float) -> Array | None:
+    """Return the inertia tensor per mass of what --inertia gives; the payload has none for "none"."""
+    if inertia == "none":
+        return None
+    tensor = inertia_tensor(parse_vector(inertia, 6))
+    if tensor.any() and not mass_kg > 0.0:
+        raise ValueError(f"--inertia: a payload of {mass_kg} kg has no inertia tensor: set --mass too")
+    return tensor / (mass_kg or 1.0)
+
+
+def _recording(options: Namespace) -> Recording | None:
+    if options.recording is None:
+        if options.pace is not None:
+            raise ValueError("--pace is that of a --recording")
+        return None
+    if options.time_scale != 1.0 or options.start_q_deg is not None:
+        raise ValueError("--recording gives time and joints: leave --time-scale and --start-q-deg out")
+    try:
+        return Recording.read(options.recording)
+    except OSError as error:
+        raise ValueError(f"cannot read the recording: {error}") from None
 
 
 def start_posture(options: Namespace) -> Vector6:
@@ -102,7 +136,12 @@ class Station:
         options.model = options.model or ("UR5" if options.polyscope[0] <= 3 else "UR5e")
         nominal = MODELS[options.model]
         dh = nominal.disturbed(options.seed, 1e-3 * options.dh_noise, 3e-4 * options.dh_noise)
-        self.world = World(truth_from(options), dh, start_posture(options), options.seed, self._clock)
+        truth = truth_from(options)
+        self._recording = recording = _recording(options)
+        if recording is None:
+            self.world = World(truth, dh, start_posture(options), options.seed, self._clock)
+        else:
+            self.world = RecordedWorld(recording, truth, dh, options.seed, self._clock)
         self.robot = Robot(
             self.world,
             RobotSettings(
@@ -117,6 +156,7 @@ class Station:
                 unknown_outputs=frozenset({"tcp_offset"} if options.no_tcp_offset else ()),
                 time_scale=options.time_scale,
             ),
+            None if recording is None else RecordedArm(dh, recording),
         )
         self._selector = selectors.SelectSelector()  # the only one that waits for less than a millisecond
         self.server = self._listen()
@@ -125,9 +165,13 @@ class Station:
         self._line = bytearray()
         self._verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
             "state": self._state,
+            "delay": self._delay,
             **Workcell(self.world, self._sensors).verbs,
             **Operator(self.robot, self.server).verbs,
         }
+        if recording is not None:
+            self._verbs = {verb: do for verb, do in self._verbs.items() if verb not in WITHOUT_EFFECT_ON_A_RECORDING}
+            self._verbs["recording"] = lambda request: self._play(recording, request)
 
     def run(self) -> int:
         """Serve until standard input closes or SIGTERM arrives; return the exit code."""
@@ -136,10 +180,13 @@ class Station:
             signal.signal(number, self._on_signal)
         try:
             self._start_sensors()
-            for request in self._options.do:
+            for request in (*self._delays(), *self._options.do):
                 if "error" in (answer := self._answer(request.encode())):
                     sys.stderr.write(f"--do {request}: {answer['error']}\n")
                     return 2
+            if self._recording is not None:
+                pace = 1.0 if self._options.pace is None else self._options.pace
+                self._recording.play(self._clock.now_s(), 0.0, pace)
             self._selector.register(sys.stdin.fileno(), selectors.EVENT_READ, self._on_stdin)
             self._print(self._hello())
             self.server.run(lambda: self._ended)
@@ -164,10 +211,10 @@ class Station:
     def _start_sensors(self) -> None:
         wanted = {"both": ("can", "serial"), "none": ()}.get(self._options.sensor, (self._options.sensor,))
         if WRIST in wanted:
-            self.robot.wrist_sensor = self.world.measure
+            self.robot.wrist_sensor = lambda n: self.world.measure_at(np.full(n, self.robot.cycle_s))
         for name in wanted:
             self._sensors[name] = Sensor(
-                name, self.world.measure, seed=self._options.seed, host=self.server.host, clock=self._clock
+                name, self.world.measure_at, seed=self._options.seed, host=self.server.host, clock=self._clock
             )
 
     def _hello(self) -> dict[str, Any]:
@@ -181,8 +228,16 @@ class Station:
                 "serial_number": self._options.serial_number,
             },
             "sensors": sensors,
-            "truth": self.world.truth.to_json(),
+            **self._content(),
         }
+
+    def _content(self) -> dict[str, Any]:
+        """Return what is known about the cell: its truth, or the recording, whose truth is unknown."""
+        recording = self._recording
+        if recording is None:
+            return {"truth": self.world.truth.to_json()}
+        played = {"file": str(self._options.recording), "samples": len(recording), "duration_s": recording.duration_s}
+        return {"truth": None, "recording": played}
 
     def _print(self, message: dict[str, Any]) -> None:
         try:
@@ -214,6 +269,36 @@ class Station:
         except (ValueError, TypeError, KeyError, OSError) as error:
             return {"error": f"{request['do']}: {error!r}"}
 
+    def _delays(self) -> list[str]:
+        """Return the request that the options stand for."""
+        delays = {"sensor_ms": self._options.sensor_delay_ms, "rtde_ms": self._options.rtde_delay_ms}
+        given = {link: delay_ms for link, delay_ms in delays.items() if delay_ms is not None}
+        return [json.dumps({"do": "delay", **given})] if given else []
+
+    def _delay(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Set the time between measurement and sending."""
+        given = {link: float(request[link]) for link in ("sensor_ms", "rtde_ms") if link in request}
+        if not given:
+            raise KeyError("sensor_ms")
+        if not all(0.0 <= delay_ms <= LONGEST_DELAY_MS for delay_ms in given.values()):
+            raise ValueError(f"a delay is 0 to {LONGEST_DELAY_MS} ms, not {given}")
+        if "sensor_ms" in given:
+            emulators = [sensor.emulator for sensor in self._sensors.values()]
+            if not emulators:
+                raise ValueError("this station has no sensor")
+            for emulator in emulators:
+                emulator.faults.delay_s = 1e-3 * given["sensor_ms"]
+        self.server.delay_s = 1e-3 * given.get("rtde_ms", 1e3 * self.server.delay_s)
+        self.robot.note("network", "delay", why=json.dumps(given))
+        return {"done": "delay"}
+
+    def _play(self, recording: Recording, request: dict[str, Any]) -> dict[str, Any]:
+        """Continue the recording at another place, at another pace."""
+        now_s = self._clock.now_s()
+        at_s = float(request.get("at_s", recording.at_s(now_s)))
+        recording.play(now_s, at_s, float(request.get("pace", recording.pace)))
+        return {"done": "recording", "at_s": at_s, "pace": recording.pace}
+
     def _state(self, request: dict[str, Any]) -> dict[str, Any]:
         robot, arm = self.robot, self.robot.arm
         return {
@@ -232,6 +317,7 @@ class Station:
             "payload_cog_m": list(robot.payload_cog_m),
             "speed_fraction": arm.speed_fraction,
             "speed_scaling": arm.pace,
+            **({} if self._recording is None else {"recording_s": self._recording.at_s(self._clock.now_s())}),
             "true_wrench": self.world.true_wrench().tolist(),
             "bad_inputs": self.server.bad_inputs,
             "t_host_ns": self._clock.now_ns(),

@@ -7,19 +7,27 @@ by what hangs on it or pushes on it, about the sensor origin, force first. A sen
 
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mocks.arrays import Array
 from mocks.clock import CellClock
 from mocks.disturbances import Contact, Drift
-from mocks.kinematics import Dh, Vector6, cross, forward, rotation
+from mocks.inertia import drawn_gyration, moved_load
+from mocks.kinematics import Dh, JointState, Vector6, cross, flange_motion, forward, rotation
 
 MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
 """Tilt beta of the base for each mounting."""
 
+AHEAD_S = 0.02
+"""The arm of a controller that has run no cycle for so long stands still."""
+BURST_GAP_S = 0.001
+"""A burst begins so soon behind the last one, where it is measured from: half the work."""
+REMEMBERED = 8
+"""Control cycles whose motion is known: a sensor may be later than the controller."""
 _MINUTE_S = 60.0
 _NOTHING: Array = np.zeros(6)
 
@@ -44,6 +52,9 @@ class Truth:
     force_drift_N_min: Array = field(default_factory=_zero3)
     torque_drift_Nm_min: Array = field(default_factory=_zero3)
     g_m_s2: float = 9.80665
+    p_flange_sensor_m: Array = field(default_factory=_zero3)
+    gyration_m2: Array | None = None
+    """Inertia tensor per mass about the centre of mass, (3, 3), sensor axes; None for a payload without inertia."""
 
     @classmethod
     def drawn(cls, seed: int, mount: str = "floor") -> "Truth":
@@ -61,12 +72,18 @@ class Truth:
             tilt_beta_rad=math.remainder(MOUNTS_RAD[mount] + float(tilt[1]), 2 * math.pi),
             force_bias_N=rng.uniform(-15.0, 15.0, 3),
             torque_bias_Nm=rng.uniform(-1.0, 1.0, 3),
+            gyration_m2=drawn_gyration(np.random.default_rng([seed, 5]), reach),
         )
 
     @property
     def weight_N(self) -> float:
         """Weight of what hangs on the sensor."""
         return self.mass_kg * self.g_m_s2
+
+    @property
+    def inertia_kg_m2(self) -> Array | None:
+        """Inertia tensor about the centre of mass, (3, 3), sensor axes; None for a payload without inertia."""
+        return None if self.gyration_m2 is None else self.mass_kg * self.gyration_m2
 
     @property
     def gravity_m_s2(self) -> Array:
@@ -90,6 +107,8 @@ class Truth:
             "force_bias_N": self.force_bias_N.tolist(),
             "torque_bias_Nm": self.torque_bias_Nm.tolist(),
             "p_sensor_com_m": self.p_sensor_com_m.tolist(),
+            "inertia_kg_m2": None if self.inertia_kg_m2 is None else self.inertia_kg_m2.tolist(),
+            "p_flange_sensor_m": self.p_flange_sensor_m.tolist(),
             "tilt_alpha_rad": self.tilt_alpha_rad,
             "tilt_beta_rad": self.tilt_beta_rad,
             "noise_force_N": self.noise_force_N,
@@ -105,8 +124,18 @@ def _on_circle(rng: np.random.Generator) -> Array:
     return np.array([math.cos(angle), math.sin(angle)])
 
 
+class Cycle(NamedTuple):
+    """What the arm does from a control cycle on."""
+
+    t_s: float
+    """When, on the cell's clock."""
+    q: Vector6
+    motion: Callable[[float], JointState] | None
+    """Joints at a time of the cell's clock; None for an arm that stands at `q`."""
+
+
 class World:
-    """The cell at this instant. The arm emulator writes `q`; sensor emulators call `measure` from their own threads.
+    """The cell at this instant. The arm emulator moves it; sensor emulators call `measure` from their own threads.
 
     A change replaces a value as a whole, so that other threads read one instant.
 
@@ -129,7 +158,6 @@ class World:
         self.truth = truth
         self.dh = dh
         self.q = q
-        """Actual joint angles (rad)."""
         self.contacts: dict[str, Contact] = {}
         """What touches the tool, by name."""
         self.drifts: tuple[Drift, ...] = ()
@@ -140,53 +168,124 @@ class World:
         self._noise_sd = np.repeat([truth.noise_force_N, truth.noise_torque_Nm], 3)
         self._load: tuple[Vector6, Truth, Array] | None = None
         self._override: Array | None = None
+        self._known: tuple[float, Array] = (-math.inf, _NOTHING)
+        """The truth at the end of the last burst, where the next one begins."""
 
     @property
     def now_s(self) -> float:
         """The clock of pushes and drift."""
         return self.clock.now_s()
 
-    def true_wrench(self) -> Array:
-        """Return the wrench on the sensor without noise, (6,): N and N·m, sensor axes, bias and drift included."""
-        return self.load_wrench() + self.contact_wrench() + self._bias()
+    @property
+    def q(self) -> Vector6:
+        """Actual joint angles (rad) in the last control cycle; setting them lets the arm stand there."""
+        return self._cycles[-1].q
 
-    def _bias(self) -> Array:
-        truth, now_s = self.truth, self.now_s
-        minutes = (now_s - self._t0_s) / _MINUTE_S
+    @q.setter
+    def q(self, q: Vector6) -> None:
+        self._cycles: tuple[Cycle, ...] = (Cycle(-math.inf, q, None),)
+
+    def move(self, t_s: float, q: Vector6, motion: Callable[[float], JointState] | None) -> None:
+        """Set what the arm does from a control cycle on, see `Cycle`."""
+        last = self._cycles[-1]
+        if motion is not None or last.motion is not None or last.q is not q:
+            self._cycles = (*self._cycles[1 - REMEMBERED :], Cycle(t_s, q, motion))
+
+    def true_wrench(self, t_s: float | None = None) -> Array:
+        """Return the wrench on the sensor without noise, (6,): N and N·m, sensor axes, bias and drift included.
+
+        Parameters
+        ----------
+        t_s
+            On the cell's clock, near the present; None for now.
+        """
+        t_s = self.now_s if t_s is None else t_s
+        return self.load_wrench(t_s) + self.contact_wrench(t_s) + self._bias(t_s)
+
+    def _bias(self, t_s: float) -> Array:
+        truth = self.truth
+        minutes = (t_s - self._t0_s) / _MINUTE_S
         force_bias_N = truth.force_bias_N + minutes * truth.force_drift_N_min
         torque_bias_Nm = truth.torque_bias_Nm + minutes * truth.torque_drift_Nm_min
-        return np.concatenate((force_bias_N, torque_bias_Nm)) + sum((d.at(now_s) for d in self.drifts), _NOTHING)
+        return np.concatenate((force_bias_N, torque_bias_Nm)) + sum((d.at(t_s) for d in self.drifts), _NOTHING)
 
-    def load_wrench(self) -> Array:
-        """Return the wrench of gravity alone, (6,), sensor axes, about the sensor origin."""
-        q, truth, known = self.q, self.truth, self._load
+    def _joints(self, t_s: float) -> tuple[JointState, bool]:
+        """Return the joints at a time, and whether they move."""
+        cycles = self._cycles
+        cycle = next((cycle for cycle in reversed(cycles) if cycle.t_s <= t_s), cycles[0])
+        if cycle.motion is None or t_s > cycle.t_s + AHEAD_S:
+            return JointState(cycle.q), False
+        return cycle.motion(t_s), True
+
+    def load_wrench(self, t_s: float | None = None) -> Array:
+        """Return the wrench of gravity and inertia, (6,), sensor axes, about the sensor origin; time as above."""
+        joints, moves = self._joints(self.now_s if t_s is None else t_s)
+        if not moves:
+            return self._still_load(joints.q)
+        truth = self.truth
+        if truth.gyration_m2 is None:
+            return _weight(truth, forward(self.dh, joints.q)[:3, :3])
+        load: Array = truth.mass_kg * moved_load(
+            flange_motion(self.dh, joints),
+            truth.gravity_m_s2,
+            truth.R_flange_sensor,
+            truth.p_flange_sensor_m,
+            truth.p_sensor_com_m,
+            truth.gyration_m2,
+        )
+        return load
+
+    def _still_load(self, q: Vector6) -> Array:
+        truth, known = self.truth, self._load
         if known is not None and known[0] is q and known[1] is truth:
             return known[2]
-        R_base_sensor = forward(self.dh, q)[:3, :3] @ truth.R_flange_sensor
-        force_N = R_base_sensor.T @ truth.gravity_force_base_N
-        load = np.concatenate((force_N, cross(truth.p_sensor_com_m, force_N)))
+        load = _weight(truth, forward(self.dh, q)[:3, :3])
         self._load = (q, truth, load)
         return load
 
-    def contact_wrench(self) -> Array:
-        """Return the wrench of all contacts, (6,), sensor axes, about the sensor origin."""
+    def contact_wrench(self, t_s: float | None = None) -> Array:
+        """Return the wrench of all contacts, (6,), sensor axes, about the sensor origin; time as above."""
         contacts = self.contacts
         if not contacts:
             return _NOTHING
-        now_s, q = self.now_s, self.q
+        t_s = self.now_s if t_s is None else t_s
+        q = self._joints(t_s)[0].q
         R_base_sensor = forward(self.dh, q)[:3, :3] @ self.truth.R_flange_sensor
-        felt = {name: contact.wrench(now_s, q, R_base_sensor) for name, contact in contacts.items()}
+        felt = {name: contact.wrench(t_s, q, R_base_sensor) for name, contact in contacts.items()}
         return sum((wrench for wrench in felt.values() if wrench is not None), _NOTHING)
 
     def measure(self, n: int) -> Array:
         """Return `n` successive noisy readings at this instant, (n, 6): N and N·m, sensor axes. Thread-safe."""
+        return self.measure_at(np.full(n, self.now_s))
+
+    def measure_at(self, t_s: Array) -> Array:
+        """Return noisy readings at rising times near the present, (n, 6): N and N·m, sensor axes. Thread-safe.
+
+        Parameters
+        ----------
+        t_s
+            (n,) on the cell's clock. The truth is exact at the ends of a burst, and linear in between.
+        """
         override = self._override
         if override is not None:
-            return np.tile(override, (n, 1))
+            return np.tile(override, (len(t_s), 1))
         with self._lock:
-            noise = self._noise.standard_normal((n, 6))
-        readings: Array = self.true_wrench() + noise * self._noise_sd
+            noise = self._noise.standard_normal((len(t_s), 6))
+        readings: Array = self._true_wrenches(t_s) + noise * self._noise_sd
         return readings
+
+    def _true_wrenches(self, t_s: Array) -> Array:
+        """Return the wrench on the sensor at these times, (n, 6), or (6,) where it is the same."""
+        first_s, last_s = float(t_s[0]), float(t_s[-1])
+        last = self.true_wrench(last_s)
+        if first_s == last_s or not (self._joints(last_s)[1] or self.contacts):
+            return last
+        known_s, known = self._known
+        if not 0.0 <= first_s - known_s < BURST_GAP_S:
+            known_s, known = first_s, self.true_wrench(first_s)
+        self._known = (last_s, last)
+        wrenches: Array = known + np.outer((t_s - known_s) / (last_s - known_s), last - known)
+        return wrenches
 
     def touch(self, name: str, contact: Contact | None) -> None:
         """Set the contact of that name; None removes it."""
@@ -203,3 +302,10 @@ class World:
     def read_always(self, reading: Array | None) -> None:
         """Fix every reading to this one, (6,); None measures again."""
         self._override = reading
+
+
+def _weight(truth: Truth, R_base_flange: Array) -> Array:
+    """Return the wrench of gravity alone, (6,), sensor axes, about the sensor origin."""
+    R_base_sensor = R_base_flange @ truth.R_flange_sensor
+    force_N = R_base_sensor.T @ truth.gravity_force_base_N
+    return np.concatenate((force_N, cross(truth.p_sensor_com_m, force_N)))

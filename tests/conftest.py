@@ -15,7 +15,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # Before numpy is loaded: matrices are small, and the threads of two workers would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# The configuration of whoever runs the tests, and the plans they have run, are none of their business.
+# The tests ignore the configuration and the completed plans of the user who runs them.
 _state = TemporaryDirectory(prefix="ftdrive-state-")
 os.environ["XDG_CONFIG_HOME"] = _state.name + "/config"
 os.environ["XDG_STATE_HOME"] = _state.name
@@ -25,8 +25,9 @@ for _name in [name for name in os.environ if name.startswith("FTDRIVE_") and nam
 
 def pytest_configure(config: pytest.Config) -> None:
     """Keep the byte code of the processes that tests start, which would each compile numpy and scipy again."""
-    if os.environ.pop("PYTHONDONTWRITEBYTECODE", None) and config.cache is not None:
-        os.environ["PYTHONPYCACHEPREFIX"] = str(config.cache.mkdir("bytecode"))
+    cache = getattr(config, "cache", None)  # none with `-p no:cacheprovider`
+    if os.environ.pop("PYTHONDONTWRITEBYTECODE", None) and cache is not None:
+        os.environ["PYTHONPYCACHEPREFIX"] = str(cache.mkdir("bytecode"))
 
 
 def pytest_collection_finish() -> None:

@@ -44,7 +44,7 @@ class FakeClock(Clock):
         while self._due and self._due[0][0] <= end_ns:
             self._run_next()
             if not hasattr(waitable, "is_set"):
-                return True  # a condition: whoever waits looks again
+                return True  # a condition: the waiting thread looks again
             if self._is_set(waitable):
                 return True
         self.ns = max(self.ns, end_ns)

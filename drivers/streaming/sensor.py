@@ -6,13 +6,17 @@ import math
 import threading
 from abc import abstractmethod
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from drivers.clock import REAL, Clock, Follower
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from drivers.follow import Follow, Unread
 from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
 from drivers.streaming.plausibility import DeviceClock, Liveness, Rate
 
@@ -73,8 +77,8 @@ class StreamingSensor(ForceTorqueSensor):
         Stamps the samples; every limit holds on it.
     limits : StreamLimits
         Every time limit.
-    max_collect_samples : int
-        The most samples in one `collect`; more is an error, never a dropped sample.
+    max_unread_samples : int
+        The most samples in one `collect`, or waiting for a follower; more is an error, never a dropped sample.
     recover : bool
         Reconnect after an interruption or silence, for up to `recover_s`, instead of ending the stream. Calls made
         meanwhile still fail, and so does a `collect` with an interruption inside. May be set until `open`.
@@ -87,7 +91,7 @@ class StreamingSensor(ForceTorqueSensor):
         sign: int = 1,
         clock: Clock = REAL,
         limits: StreamLimits = StreamLimits(),
-        max_collect_samples: int = 1_000_000,
+        max_unread_samples: int = 1_000_000,
         recover: bool = False,
     ) -> None:
         if sign not in {1, -1}:
@@ -96,7 +100,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._sign = sign
         self._clock = clock
         self._limits = limits
-        self._max_collect_samples = max_collect_samples
+        self._max_unread_samples = max_unread_samples
         self.recover = recover
         self.configured: dict[str, Fact] = {}
         """`serial` and `range`, may be set until `open`. A device that reports another serial number is rejected; this
@@ -109,7 +113,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._failure: Exception | None = None
         self._interruption: tuple[DriverError, float] | None = None
         """While it reconnects: the first error, and when to give up."""
-        self._taps: list[deque[FtSamples]] = []
+        self._taps: list[Unread[FtSamples]] = []
         self._arrivals: deque[tuple[int, int]] = deque()
         self._reset()
 
@@ -197,37 +201,30 @@ class StreamingSensor(ForceTorqueSensor):
         """
         if not duration_s > 0:
             raise ValueError(f"a duration of {duration_s} s collects nothing; give a positive one")
-        blocks: deque[FtSamples] = deque()
-        with self._news:
-            self._check()
+        with self._news, self._tap() as unread:
             start_ns = self._clock.now_ns()
             end_ns = start_ns + round(duration_s * 1e9)
-            before, reconnects, pauses = self._received, self._reconnects, self._pauses
-            self._taps.append(blocks)
-            try:
-                while self._newest_ns < end_ns:
-                    self._clock.wait(self._news, max(0.0, self._limits.stale_s - self._age_s()) + 1e-3)
-                    self._check()
-                    if self._reconnects != reconnects:
-                        raise StreamBroken(f"{self.name}: the stream was interrupted and came back", "collect again")
-                    if self._pauses != pauses:
-                        raise DeviceTimeout(f"{self.name}: {self._pause}", "collect again")
-                    if self._received - before > self._max_collect_samples:
-                        raise StreamBroken(
-                            f"{self.name}: more than {self._max_collect_samples} samples in one collect of "
-                            f"{duration_s} s",
-                            "collect in shorter pieces",
-                        )
-            finally:
-                # by identity: blocks hold arrays, which do not compare
-                self._taps = [tap for tap in self._taps if tap is not blocks]
-            empty = self._newest.rows(slice(0, 0))
-        samples = FtSamples.concatenate([empty, *blocks])
+            reconnects, pauses = self._reconnects, self._pauses
+            while self._newest_ns < end_ns:
+                self._clock.wait(self._news, self._until_stale_s())
+                self._check()
+                if self._reconnects != reconnects:
+                    raise StreamBroken(f"{self.name}: the stream was interrupted and came back", "collect again")
+                if self._pauses != pauses:
+                    raise DeviceTimeout(f"{self.name}: {self._pause}", "collect again")
+                unread.check()
+            samples = self._joined(unread.take())
         samples = samples.rows((samples.t_host_ns >= start_ns) & (samples.t_host_ns < end_ns))
         silence_s = float(np.diff(samples.t_host_ns, prepend=start_ns, append=end_ns).max()) / 1e9
         if silence_s > self._limits.stale_s:
             raise self._stale(silence_s)
         return samples
+
+    @contextmanager
+    def follow(self) -> Iterator[Follow[FtSamples]]:
+        """Read every sample from now on; see `ForceTorqueSensor`. Raises at once what `check` raises."""
+        with self._tap() as unread:
+            yield Follow(partial(self._read_on, unread))
 
     def latest(self, *, timeout_s: float) -> FtSamples:
         """Return the newest sample (one row); wait up to `timeout_s` for one that is not stale."""
@@ -264,6 +261,34 @@ class StreamingSensor(ForceTorqueSensor):
                 nominal_rate_Hz=self._nominal_Hz,
                 events=tuple(self._events),
             )
+
+    @contextmanager
+    def _tap(self) -> Iterator[Unread[FtSamples]]:
+        """Queue every sample from now on."""
+        unread: Unread[FtSamples] = Unread(self.name, self._max_unread_samples)
+        with self._news:
+            self._check()
+            self._taps.append(unread)
+        try:
+            yield unread
+        finally:
+            with self._news:
+                self._taps = [tap for tap in self._taps if tap is not unread]
+
+    def _read_on(self, unread: Unread[FtSamples], timeout_s: float) -> FtSamples:
+        """Return what a follower has not read."""
+        with self._news:
+            for left_s in self._clock.looks(timeout_s):
+                if blocks := unread.take():
+                    return self._joined(blocks)
+                self._check()
+                if unread not in self._taps:
+                    raise StreamBroken(f"{self.name}: the sensor was reopened", "follow it again")
+                self._clock.wait(self._news, min(left_s, self._until_stale_s()))
+            return self._joined(unread.take())
+
+    def _joined(self, blocks: list[FtSamples]) -> FtSamples:
+        return FtSamples.concatenate([self._newest.rows(slice(0, 0)), *blocks])
 
     def _connect_and_identify(self) -> DeviceInfo:
         """Connect, and add the configured facts to those that the device reports."""
@@ -443,7 +468,7 @@ class StreamingSensor(ForceTorqueSensor):
                 self._reconnects += 1
                 self._note("reconnected")
             for tap in self._taps:
-                tap.append(block)
+                tap.put(block, len(block))
             self._news.notify_all()
 
     def _newer_rows(self, block: FtSamples) -> FtSamples:
@@ -507,6 +532,9 @@ class StreamingSensor(ForceTorqueSensor):
 
     def _age_s(self) -> float:
         return self._clock.awake_s() - self._heard_s
+
+    def _until_stale_s(self) -> float:
+        return max(0.0, self._limits.stale_s - self._age_s()) + 1e-3
 
     def _stale(self, age_s: float) -> DeviceTimeout:
         found = f"{self.name}: no new sample for {age_s:.3f} s (allowed: {self._limits.stale_s:g} s)"

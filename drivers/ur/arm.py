@@ -12,24 +12,27 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from math import radians
 from typing import Final
 
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
-from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, Finding, Guard, RobotArm
+from drivers.follow import Follow
+from drivers.interfaces import ArmState, ArmStates, ArmStatus, DeviceInfo, Finding, Guard, RobotArm
 from drivers.ur.control import ControlProcess
 from drivers.ur.control_child import DECELERATION_RAD_S2
 from drivers.ur.dashboard import Dashboard, T, ask_dashboard
 from drivers.ur.kinematics import MODELS, model_named
-from drivers.ur.reading import FREQUENCY_HZ, Reader
+from drivers.ur.reading import Reader
 from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
 from drivers.ur.sample import PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Sample
 from drivers.ur.timing import UrTiming
 
 log = logging.getLogger(__name__)
 
+_CONTROL_HZ: Final = 125.0
+"""Rate of ur_rtde's own connection: the full rate of the CB3 generation."""
 _ARRIVED_RAD: Final = 1e-3
 _STANDING_RAD_S: Final = 1e-6
 """Speed of the set-point, which is exactly zero at rest."""
@@ -157,7 +160,7 @@ class UrArm(RobotArm):
         self._ask_dashboard(prepare)
         self._require_no_program(reader)
         self._left_behind = self._starting = True
-        self._control = ControlProcess(self._host, FREQUENCY_HZ, clock=self._clock, timing=self._timing)
+        self._control = ControlProcess(self._host, _CONTROL_HZ, clock=self._clock, timing=self._timing)
         try:
             self._control.wait_until_ready(look_out)
             self._starting = False
@@ -240,8 +243,17 @@ class UrArm(RobotArm):
             )
         return reader.state(lambda: self._in_control().call("tcp_offset"))
 
+    def follow(self) -> AbstractContextManager[Follow[ArmStates]]:
+        """Read every sample from now on, 500 a second (CB3: 125), as flange poses; see `RobotArm`.
+
+        Samples that are late are included: compare `t_device_s`. Samples without power over the joints are left out;
+        a read that finds no others raises `DeviceFault`. A controller that is too old to report its TCP is polled.
+        """
+        reader = self._reading()
+        return reader.follow() if reader.reports_tcp else super().follow()
+
     def status(self) -> ArmStatus:
-        """Return the controller's modes and settings, updated 125 times a second; see `RobotArm`."""
+        """Return the controller's modes and settings, updated with every sample; see `RobotArm`."""
         return self._reading().status()
 
     def in_remote_control(self) -> bool | None:

@@ -9,14 +9,14 @@ TCP, and is never a source of flange poses.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import cos, pi, sin
+from math import asin, cos, pi, sin, sqrt
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from drivers.interfaces import Array
 
-__all__ = ["MODELS", "Array", "Geometry", "Pose", "forward", "model_named"]
+__all__ = ["MODELS", "Array", "Geometry", "Pose", "flange_poses", "forward", "model_named"]
 
 _ALPHA_RAD = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
 
@@ -60,23 +60,24 @@ class Pose:
     p_m: Array
     """(3,)"""
 
-    @classmethod
-    def from_ur(cls, pose: Sequence[float]) -> "Pose":
-        """Read a UR pose: x, y, z in metres, then a rotation vector in radians."""
-        return cls(
-            Rotation.from_rotvec(np.asarray(pose[3:6], dtype=float)).as_matrix(), np.array(pose[:3], dtype=float)
-        )
-
-    def inverse(self) -> "Pose":
-        """Return the pose of a in b."""
-        return Pose(self.R.T, -self.R.T @ self.p_m)
-
     def __matmul__(self, other: "Pose") -> "Pose":
         return Pose(self.R @ other.R, self.R @ other.p_m + self.p_m)
 
     def angle_to_rad(self, other: "Pose") -> float:
         """Return the angle between the two orientations."""
-        return float(Rotation.from_matrix(self.R.T @ other.R).magnitude())
+        chord = float(np.linalg.norm(self.R - other.R)) / sqrt(8.0)
+        return 2.0 * asin(min(1.0, chord))
+
+
+def flange_poses(tcp_poses: Array, tcp_offsets: Array) -> tuple[Array, Array]:
+    """Return n flanges in base, R (n, 3, 3) and p in metres (n, 3), from UR poses (n, 6).
+
+    `tcp_poses` are those of the active TCP in base, `tcp_offsets` those of the TCP in the flange.
+    """
+    R_base_tcp = Rotation.from_rotvec(tcp_poses[:, 3:]).as_matrix()
+    R_flange_tcp = Rotation.from_rotvec(tcp_offsets[:, 3:]).as_matrix()
+    R_base_flange = R_base_tcp @ R_flange_tcp.transpose(0, 2, 1)
+    return R_base_flange, tcp_poses[:, :3] - np.einsum("nij,nj->ni", R_base_flange, tcp_offsets[:, :3])
 
 
 def forward(geometry: Geometry, q_rad: Sequence[float] | Array) -> Pose:

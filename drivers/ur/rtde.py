@@ -12,11 +12,13 @@ import contextlib
 import logging
 import socket
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import accumulate, pairwise
-from typing import Final
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceTimeout, ProtocolError, StreamBroken, Unreachable
@@ -34,13 +36,16 @@ START: Final = ord("S")
 DATA: Final = ord("U")
 
 _HEADER: Final = struct.Struct(">HB")  # size of the whole package, type
-_FORMATS: Final = {
-    "UINT32": "I",
-    "INT32": "i",
-    "DOUBLE": "d",
-    "VECTOR3D": "3d",
-    "VECTOR6D": "6d",
+_FORMATS: Final[Mapping[str, tuple[str, tuple[int, ...]]]] = {
+    "UINT32": (">u4", ()),
+    "INT32": (">i4", ()),
+    "DOUBLE": (">f8", ()),
+    "VECTOR3D": (">f8", (3,)),
+    "VECTOR6D": (">f8", (6,)),
 }
+_RECEIVE_BYTES: Final = 65536
+_FULL_RATE_HZ: Final = (125.0, 500.0)
+"""Of the CB3 generation, and from the e-Series on."""
 
 
 def encode(kind: int, payload: bytes = b"") -> bytes:
@@ -100,25 +105,26 @@ class Recipe:
         except (IndexError, UnicodeDecodeError) as error:
             raise ProtocolError(f"RTDE recipe cannot be read: {payload.hex(' ')}") from error
 
-    def unpack(self, payload: bytes) -> list[tuple[float, ...]]:
-        """Unpack a data package into one tuple per output."""
-        whole, fields = _layout(self.types)
-        if len(payload) != whole.size or payload[0] != self.id:
+    def check(self, payload: bytes) -> None:
+        """Raise `ProtocolError` when a data package does not fit."""
+        size = _layout(self.types).itemsize
+        if len(payload) != size or payload[0] != self.id:
             raise ProtocolError(
-                f"RTDE data of {len(payload)} bytes, {whole.size} expected for recipe {self.id}: {payload.hex(' ')}"
+                f"RTDE data of {len(payload)} bytes, {size} expected for recipe {self.id}: {payload.hex(' ')}"
             )
-        values = whole.unpack(payload)
-        return [values[field] for field in fields]
+
+    def columns(self, payloads: Sequence[bytes]) -> list[NDArray[Any]]:
+        """Decode n checked data packages: one array for each output, (n,) or (n, length of the vector)."""
+        table = np.frombuffer(b"".join(payloads), _layout(self.types))
+        return [table[str(k)].astype(table[str(k)].dtype.newbyteorder("=")) for k in range(len(self.types))]
 
 
 @lru_cache(maxsize=16)
-def _layout(types: tuple[str, ...]) -> tuple[struct.Struct, list[slice]]:
-    """Return the layout of a data package, which begins with the recipe's number, and the place of each output."""
+def _layout(types: tuple[str, ...]) -> np.dtype[Any]:
+    """Return the layout of a data package, which begins with the recipe's number."""
     if unknown := [kind for kind in types if kind not in _FORMATS]:
         raise ProtocolError(f"RTDE outputs have unknown types: {', '.join(unknown)}")
-    formats = [_FORMATS[kind] for kind in types]
-    ends = list(accumulate((int(one[:-1] or 1) for one in formats), initial=1))
-    return struct.Struct(">B" + "".join(formats)), [slice(*pair) for pair in pairwise(ends)]
+    return np.dtype([("recipe", "u1"), *((str(k), *_FORMATS[kind]) for k, kind in enumerate(types))])
 
 
 class _Connection:
@@ -128,17 +134,32 @@ class _Connection:
         self._clock = clock
         self._deadline_s = clock.now_s() + timeout_s
         self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
+        self._timeout_s = timeout_s
         self._buffer = bytearray()
 
     def read(self, timeout_s: float) -> tuple[int, bytes]:
         """Read the next package as (type, payload)."""
-        self._socket.settimeout(timeout_s)
         while (package := take_package(self._buffer)) is None:
-            received = self._socket.recv(4096)
+            self._receive(timeout_s)
+        return package
+
+    def read_all(self, timeout_s: float) -> list[tuple[int, bytes]]:
+        """Read every package that has arrived, at least one; the socket is empty then."""
+        while not (packages := list(iter(lambda: take_package(self._buffer), None))):
+            self._receive(timeout_s)
+        return packages
+
+    def _receive(self, timeout_s: float) -> None:
+        """Wait for bytes, then empty the socket."""
+        if timeout_s != self._timeout_s:
+            self._socket.settimeout(timeout_s)  # a system call
+            self._timeout_s = timeout_s
+        received = b"\0" * _RECEIVE_BYTES
+        while len(received) == _RECEIVE_BYTES:
+            received = self._socket.recv(_RECEIVE_BYTES)
             if not received:
                 raise StreamBroken("the controller closed the connection")
             self._buffer += received
-        return package
 
     def ask(self, request: bytes) -> bytes:
         """Send a request and return the payload of its answer, which has the type of the request.
@@ -169,7 +190,7 @@ class Subscription:
     outputs : mapping of str to str
         Name and type of every output, such as ``{"timestamp": "DOUBLE"}``.
     frequency_Hz : float
-        At most the controller's own rate.
+        A higher one than the controller's own rate gives that rate: 500 Hz, 125 Hz of the CB3 generation.
     timeout_s : float
         Limit of the whole start-up.
     clock : Clock
@@ -189,6 +210,8 @@ class Subscription:
         where = f"{host}:{PORT}"
         self.version = (0, 0, 0, 0)
         """Of the controller: major, minor, bugfix, build."""
+        self.rate_Hz = frequency_Hz
+        """At which the controller sends."""
         self.missing: list[str] = []
         """Outputs that this controller does not know; samples lack them."""
         try:
@@ -196,7 +219,7 @@ class Subscription:
         except OSError as error:
             raise Unreachable(f"{where} cannot be reached ({error})", _fix_of(error, host)) from error
         try:
-            self._greet(outputs, frequency_Hz)
+            self._greet(outputs)
         except TimeoutError as error:
             self.close()
             raise ConnectError(
@@ -210,33 +233,40 @@ class Subscription:
                 "check that this is a robot controller and that RTDE is enabled under Settings, Security, Services",
             ) from error
 
-    def read(self, timeout_s: float) -> list[tuple[float, ...]]:
-        """Read the next sample: one tuple for each output.
+    def read(self, timeout_s: float) -> list[bytes]:
+        """Read every sample that has arrived, at least one, for `decode`. All arrived since the last call.
 
         Raises `TimeoutError` when none arrives, `OSError` or `StreamBroken` on a lost connection, `ProtocolError`.
         """
         while True:
-            kind, payload = self._connection.read(timeout_s)
-            if kind == DATA:
-                return self._recipe.unpack(payload)
+            if samples := [payload for kind, payload in self._connection.read_all(timeout_s) if kind == DATA]:
+                for sample in samples:
+                    self._recipe.check(sample)
+                return samples
+
+    def decode(self, samples: Sequence[bytes]) -> dict[str, NDArray[Any]]:
+        """Decode n samples: by the name of each known output, an array (n,) or (n, length of the vector)."""
+        return dict(zip(self._names, self._recipe.columns(samples), strict=True))
 
     def close(self) -> None:
         """Close the connection, and wake a thread that reads. Idempotent."""
         self._connection.close()
 
-    def _greet(self, outputs: Mapping[str, str], frequency_Hz: float) -> None:
+    def _greet(self, outputs: Mapping[str, str]) -> None:
         ask = self._connection.ask
         if ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02")) != b"\x01":
             raise ProtocolError("the controller refuses protocol version 2")
         self.version = decode_version(ask(encode(GET_CONTROLLER_VERSION)))
-        self._recipe = Recipe.decode(ask(encode_setup_outputs(frequency_Hz, tuple(outputs))))
+        self.rate_Hz = min(self.rate_Hz, _FULL_RATE_HZ[self.version[0] >= 5])
+        self._recipe = Recipe.decode(ask(encode_setup_outputs(self.rate_Hz, tuple(outputs))))
         if len(self._recipe.types) == len(outputs):
             self.missing = [name for name, kind in zip(outputs, self._recipe.types, strict=True) if kind == "NOT_FOUND"]
         known = {name: kind for name, kind in outputs.items() if name not in self.missing}
+        self._names = tuple(known)
         if not known:
             return
         if self.missing:
-            self._recipe = Recipe.decode(ask(encode_setup_outputs(frequency_Hz, tuple(known))))
+            self._recipe = Recipe.decode(ask(encode_setup_outputs(self.rate_Hz, self._names)))
         if self._recipe.types != tuple(known.values()):
             raise ProtocolError(f"{', '.join(known)} have the types {', '.join(self._recipe.types)}")
         if ask(encode(START)) != b"\x01":

@@ -7,11 +7,14 @@ Checked on hardware: no.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, Self
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmStatus
-from drivers.ur.kinematics import Pose
+from drivers.ur.kinematics import Pose, flange_poses
 
 OUTPUTS: Final = MappingProxyType(
     {
@@ -40,7 +43,8 @@ PROGRAM_STOPPED: Final = 1
 PROGRAM_PLAYING: Final = 2
 ROBOT_IDLE: Final = 5
 ROBOT_RUNNING: Final = 7
-_MEASURING: Final = (ROBOT_IDLE, 6, ROBOT_RUNNING)
+MEASURING: Final = (ROBOT_IDLE, ROBOT_RUNNING)
+"""First and last robot mode in which the controller measures the joints, which needs power."""
 _ROBOT_MODES: Final = {
     -1: "no controller",
     0: "disconnected",
@@ -99,31 +103,36 @@ class Sample:
     p_flange_payload_m: tuple[float, ...] | None
 
     @classmethod
-    def of(cls, t_host_ns: int, outputs: Mapping[str, tuple[float, ...]]) -> Self:
-        """Build a sample from outputs by their names; those of `OPTIONAL` may be missing."""
+    def of(cls, t_host_ns: int, outputs: Mapping[str, NDArray[Any]]) -> Self:
+        """Build the last of n samples from outputs by their names; those of `OPTIONAL` may be missing."""
+        last: dict[str, Any] = {name: column[-1].tolist() for name, column in outputs.items()}
+
+        def vector(name: str) -> tuple[float, ...]:
+            return tuple(last[name])
+
         return cls(
             t_host_ns,
-            outputs["timestamp"][0],
-            outputs["actual_q"],
-            outputs["actual_qd"],
-            outputs["target_q"],
-            outputs["target_qd"],
-            outputs["actual_TCP_pose"],
-            int(outputs["robot_mode"][0]),
-            int(outputs["safety_mode"][0]),
-            int(outputs["safety_status_bits"][0]),
-            int(outputs["runtime_state"][0]),
-            outputs["speed_scaling"][0],
-            outputs["target_speed_fraction"][0],
-            outputs.get("tcp_offset"),
-            outputs.get("payload", (None,))[0],
-            outputs.get("payload_cog"),
+            last["timestamp"],
+            vector("actual_q"),
+            vector("actual_qd"),
+            vector("target_q"),
+            vector("target_qd"),
+            vector("actual_TCP_pose"),
+            last["robot_mode"],
+            last["safety_mode"],
+            last["safety_status_bits"],
+            last["runtime_state"],
+            last["speed_scaling"],
+            last["target_speed_fraction"],
+            vector("tcp_offset") if "tcp_offset" in last else None,
+            last.get("payload"),
+            vector("payload_cog") if "payload_cog" in last else None,
         )
 
     @property
     def measures(self) -> bool:
-        """Whether the controller measures the joints, which needs power."""
-        return self.robot_mode in _MEASURING
+        """Whether the controller measures the joints."""
+        return MEASURING[0] <= self.robot_mode <= MEASURING[1]
 
     def safety_fault(self) -> DeviceFault | None:
         """Return why safety system or robot mode forbid motion."""
@@ -148,7 +157,8 @@ class Sample:
 
     def flange(self, tcp_offset: Sequence[float]) -> Pose:
         """Return the pose of the flange in base: `tcp_pose` without the TCP offset, (6,)."""
-        return Pose.from_ur(self.tcp_pose) @ Pose.from_ur(tcp_offset).inverse()
+        R, p_m = flange_poses(np.array([self.tcp_pose]), np.array([tcp_offset]))
+        return Pose(R[0], p_m[0])
 
     def status(self) -> ArmStatus:
         """Return modes and settings as text."""

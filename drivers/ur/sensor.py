@@ -10,7 +10,6 @@ Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": `ft_raw_wrench`, 
 Checked on hardware: no. Verified against: tests/unit/drivers/ur/test_wrist_sensor.py.
 """
 
-import math
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -92,7 +91,7 @@ class UrWristSensor(StreamingSensor):
         if stream is None:
             raise StreamBroken(f"{self.name}: the sensor is closed", "open it first")
         try:
-            (t_device_s,), raw = stream.read(self._clock.poll_s)
+            received = stream.read(self._clock.poll_s)
         except TimeoutError:
             return NOTHING
         except (OSError, StreamBroken) as exc:
@@ -100,17 +99,19 @@ class UrWristSensor(StreamingSensor):
                 f"{self.name}: the connection was lost ({exc})", "check the robot and the cable, then open it again"
             ) from exc
         t_host_ns = self._clock.now_ns()
-        if not (math.isfinite(t_device_s) and all(map(math.isfinite, raw))):
-            raise ProtocolError(f"{self.name}: the wrench at {t_device_s} s is not finite: {raw}")
-        seq = round(t_device_s * _RATE_Hz)
-        if self._seq is not None:
-            if seq <= self._seq:
-                raise StreamBroken(
-                    f"{self.name}: the controller's clock went back to {t_device_s:.3f} s", "open it again"
-                )
-            self._lost += seq - self._seq - 1
-        self._seq = seq
-        return FtSamples.of(t_host_ns, seq, [np.array(raw) / self._counts_per_unit], t_device_s=t_device_s)
+        outputs = stream.decode(received)
+        t_device_s, raw = outputs["timestamp"], outputs["ft_raw_wrench"]
+        if not (np.isfinite(t_device_s).all() and np.isfinite(raw).all()):
+            raise ProtocolError(f"{self.name}: the wrench at {t_device_s[-1]} s is not finite: {raw[-1].tolist()}")
+        seq = np.rint(t_device_s * _RATE_Hz).astype(np.int64)
+        steps = np.diff(seq, prepend=seq[0] - 1 if self._seq is None else self._seq)
+        if (steps <= 0).any():
+            raise StreamBroken(
+                f"{self.name}: the controller's clock went back to {t_device_s[steps <= 0][0]:.3f} s", "open it again"
+            )
+        self._lost += int((steps - 1).sum())
+        self._seq = int(seq[-1])
+        return FtSamples.of(t_host_ns, seq, raw / self._counts_per_unit, t_device_s=t_device_s)
 
     def _disconnect(self) -> None:
         stream, self._stream = self._stream, None

@@ -1,11 +1,13 @@
-"""Every time limit of a Universal Robots arm, and a wait that does not count a suspension of this process."""
+"""Every time limit of a Universal Robots arm; lateness; a wait that does not count a suspension of this process."""
 
+import math
 from dataclasses import dataclass
 from typing import Final, Self
 
 from drivers.clock import Clock, Waitable
 
 _TURN_NS: Final = 50_000_000
+_QUICKEST_OF_S: Final = 0.5
 
 
 @dataclass(frozen=True)
@@ -16,7 +18,9 @@ class UrTiming:
     stale_s: float = 0.2
     """The longest time without a sample."""
     status_s: float = 0.05
-    """The greatest age of a status."""
+    """The greatest age of a status, from its receipt."""
+    late_s: float = 0.05
+    """A sample that is later than this by the controller's clock is too old for a state or a status."""
     glance_s: float = 0.1
     """The wait of a stop for a sample, before it uses the dashboard server."""
     reason_s: float = 0.05
@@ -89,6 +93,25 @@ class UrTiming:
 
 STRICT: Final = UrTiming()
 """Limits of a real cell."""
+
+
+class Lateness:
+    """How late samples are by the controller's clock, compared with the quickest of the last 0.5 to 1 s with samples.
+
+    A clock that is up to 4 % slow, as that of a simulator, is not late. One that stood still is late for 1 s at most.
+    """
+
+    def __init__(self) -> None:
+        self._quickest_s, self._quickest_before_s = -math.inf, -math.inf
+        self._since_s: float | None = None
+
+    def late_s(self, t_device_s: float, heard_s: float) -> float:
+        """Return how late a sample is; `heard_s` is the time of its receipt. Only differences of both clocks count."""
+        lead_s = t_device_s - heard_s
+        if self._since_s is None or heard_s - self._since_s > _QUICKEST_OF_S:
+            self._quickest_before_s, self._quickest_s, self._since_s = self._quickest_s, lead_s, heard_s
+        self._quickest_s = max(self._quickest_s, lead_s)
+        return max(self._quickest_s, self._quickest_before_s) - lead_s
 
 
 class Patience:

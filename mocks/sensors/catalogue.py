@@ -8,8 +8,11 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
+from mocks.arrays import Array
 from mocks.clock import CellClock
-from mocks.wires.device import Device, Measure
+from mocks.wires.device import Device
+
+MeasureAt = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
@@ -77,15 +80,15 @@ class Sensor:
     ----------
     name
         One of `KINDS`, or `WRIST`.
-    measure
-        Readings (n, 6) in N and N·m.
+    measure_at
+        Readings (n, 6) in N and N·m at times (n,) of the cell's clock.
     host
         Loopback address of the station.
     clock
         Of the cell.
     """
 
-    def __init__(self, name: str, measure: Measure, *, seed: int, host: str, clock: CellClock) -> None:
+    def __init__(self, name: str, measure_at: MeasureAt, *, seed: int, host: str, clock: CellClock) -> None:
         self.name = name
         self._kind = KINDS.get(name)
         self._emulator: Device[Any] | None = None
@@ -95,8 +98,11 @@ class Sensor:
         module, _, class_name = self._kind.emulator.partition(":")
         options = self._kind.options | ({"host": host} if name == "netft" else {})
         make: Callable[..., Device[Any]] = getattr(import_module(module), class_name)
-        self._emulator = make(measure, seed=seed, clock=clock, **options)
-        self.endpoint = self._endpoint(self._kind, self._emulator.start())
+        emulator: Device[Any] = make(
+            lambda count: measure_at(emulator.sample_times_s(count)), seed=seed, clock=clock, **options
+        )
+        self._emulator = emulator
+        self.endpoint = self._endpoint(self._kind, emulator.start())
 
     def _endpoint(self, kind: Kind, where: Any) -> dict[str, Any]:
         """Return what the station reports about it, its address under "url"."""

@@ -210,6 +210,7 @@ class NetFtBox(Device[bytes]):
         first = self._pacer.made - count  # of this stream, from 0
         if self._left is not None:
             count = max(0, min(count, self._left - first))
+            self._pacer.made = first + count
         if count:
             counts, saturated = self._counts(count)
             ft = self._ft_start + ((first + np.arange(count)) * (INTERNAL_HZ / self._stream_hz)).astype(np.int64)

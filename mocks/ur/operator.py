@@ -11,6 +11,7 @@ from mocks.ur.modes import PERMITTED, RobotMode, SafetyMode
 from mocks.ur.robot import Robot
 from mocks.ur.script import Upload
 from mocks.ur.server import UrServer
+from mocks.ur.swing import Swing, SwingProgram
 
 Request = dict[str, Any]
 Verb = Callable[[Request], dict[str, Any]]
@@ -18,6 +19,7 @@ Verb = Callable[[Request], dict[str, Any]]
 FOREIGN_PROGRAM_S = 5.0
 FOREIGN_SPEED_RAD_S = 0.3
 HAND_SPEED_RAD_S = 0.3
+SWING_LIMITS = ("speed_rad_s", "acceleration_rad_s2", "acceleration_m_s2")
 
 
 class Operator:
@@ -47,6 +49,7 @@ class Operator:
             "hand-move": self._hand_move,
             "hand-guide": self._hand_guide,
             "pendant-program": self._pendant_program,
+            "swing": self._swing,
             "push-joint": self._push_joint,
             "slider": self._slider,
             "speed-scaling": self._speed_scaling,
@@ -154,6 +157,15 @@ class Operator:
     def _pendant_program(self, request: Request) -> dict[str, Any]:
         accepted = self._robot.upload(pendant_program(self._robot, _rest_s(request)), by="operator")
         return {"done": "pendant-program", "accepted": accepted}
+
+    def _swing(self, request: Request) -> dict[str, Any]:
+        robot = self._robot
+        limits = {name: float(request[name]) for name in SWING_LIMITS if name in request}
+        if not robot.arm.at_rest:
+            raise ValueError("the arm moves: let it stand first")
+        swing = Swing(robot.arm.dh, robot.arm.q, float(request["seconds"]), **limits)
+        accepted = robot.pendant_start(SwingProgram(robot, swing))
+        return {"done": "swing", "accepted": accepted, "seconds": swing.duration_s, "period_s": swing.period_s}
 
     def _dashboard_stop(self, _request: Request) -> dict[str, Any]:
         return {"done": "dashboard-stop", "reply": dashboard.answer(self._robot, "stop", by="another dashboard client")}

@@ -18,6 +18,7 @@ from mocks.ur.modes import PAUSING, PERMITTED, POWERED, POWERLESS, RobotMode, Ru
 from mocks.ur.motion import Arm, CannotFollow, HandMove, MotionError
 from mocks.ur.rtde import Value
 from mocks.ur.script import STOP_SCRIPT, ControlScript, Upload
+from mocks.ur.swing import SwingProgram
 from mocks.ur.urscript.library import ScriptError
 from mocks.ur.urscript.program import Program
 from mocks.ur.urscript.syntax import UrscriptSyntaxError
@@ -29,6 +30,8 @@ PROGRAM_START_S = 0.1
 POWER_STEP_S = 0.5
 COMMAND_REGISTERS = {"input_int_register_0", "input_int_register_24"}
 HAND_ACCELERATION_RAD_S2 = 1.5
+
+AnyProgram = ControlScript | Program | SwingProgram
 
 
 @dataclass(frozen=True)
@@ -98,17 +101,21 @@ class Robot:
     ----------
     world
         The shared truth; its `q` is written in every cycle. Its clock is the controller's.
+    arm
+        None makes one that stands where the world has it.
     """
 
-    def __init__(self, world: World, settings: RobotSettings) -> None:
+    def __init__(self, world: World, settings: RobotSettings, arm: Arm | None = None) -> None:
         self.world = world
         self.clock = world.clock
         self.settings = settings
-        self.arm = Arm(world.dh, world.q)
+        self.arm = arm or Arm(world.dh, world.q)
         self.limits = Limits(world.dh, settings.joint_limit_rad, settings.plane)
         self.frequency_hz = 125 if settings.polyscope[0] <= 3 else 500
         self.period_s = 1.0 / self.frequency_hz
         self.cycle = 0
+        self.cycle_s = world.now_s
+        """When the present cycle was due, on the cell's clock."""
         self.runtime = Runtime.STOPPED
         self.robot_mode = RobotMode.RUNNING
         self.safety_mode = SafetyMode.NORMAL
@@ -130,7 +137,7 @@ class Robot:
         """The operator who guides the arm by hand; one `next` per control cycle."""
         self._remote_control = True
         self._reduced = False
-        self._program: ControlScript | Program | None = None
+        self._program: AnyProgram | None = None
         self.popup: str | None = None
         """Text of the popup that a program shows, until the operator closes it."""
         self.wrist_sensor: Callable[[int], Array] | None = None
@@ -151,8 +158,9 @@ class Robot:
         scale = 1.0 if self.wrist_sensor else self.settings.time_scale
         return 100.0 + self.cycle * self.period_s * scale
 
-    def tick(self) -> None:
-        """One control cycle: program, then motion."""
+    def tick(self, t_s: float | None = None) -> None:
+        """One control cycle, due at `t_s` of the cell's clock (None: now): program, then motion."""
+        self.cycle_s = self.clock.now_s() if t_s is None else t_s
         self.cycle += 1
         dt = self.period_s * self.settings.time_scale
         self._physical_s += dt
@@ -171,14 +179,20 @@ class Robot:
                 self.stop_program(f"run-time error: {error}")
         before, stood = self.arm.q, self.arm.at_rest
         try:
-            self.arm.step(dt)
+            self.arm.step(dt, self.cycle_s)
         except CannotFollow as error:
             self.protective_stop(str(error))
         if self.arm.q is not before and self._leaves_limits(before):
             self.protective_stop("safety limit reached")
         if stood != self.arm.at_rest:
             self.note("arm", "moves" if stood else "stands", q_rad=list(self.arm.q))
-        self.world.q = self.arm.actual_q
+        self._move_world()
+
+    def _move_world(self) -> None:
+        """Let the world follow the arm, whose time runs `time_scale` times faster."""
+        begun_s, scale, motion = self.cycle_s, self.settings.time_scale, self.arm.motion
+        at = None if motion is None else lambda t_s: motion.at((t_s - begun_s) * scale)
+        self.world.move(begun_s, self.arm.actual_q, at)
 
     def note(self, by: str, what: str, *, accepted: bool = True, why: str = "", **detail: Any) -> None:
         """Add an entry to the event log."""
@@ -223,7 +237,7 @@ class Robot:
             return f"robot mode {self.robot_mode.name}"
         if self.safety_mode not in PERMITTED:
             return f"safety mode {self.safety_mode.name}"
-        return None
+        return self.arm.obstacle
 
     def upload(self, upload: Upload, *, by: str = "script port") -> bool:
         """Accept a program from the script port, which replaces the running one; return False when it is refused."""
@@ -239,16 +253,27 @@ class Robot:
         self.note(by, f"program {upload.name}", accepted=obstacle is None, why=obstacle or "")
         if obstacle or program is None:
             return False
+        self._start_soon(program)
+        return True
+
+    def pendant_start(self, program: SwingProgram) -> bool:
+        """Start a program of the operator, which replaces the running one; return False when it is refused."""
+        obstacle = self.obstacle
+        self.note("operator", f"program {program.name}", accepted=obstacle is None, why=obstacle or "")
+        if obstacle is None:
+            self._start_soon(program)
+        return obstacle is None
+
+    def _start_soon(self, program: AnyProgram) -> None:
         self.stop_program("replaced")
         self._after(PROGRAM_START_S, lambda: self._start(program))
-        return True
 
     def _program_of(self, upload: Upload) -> ControlScript | Program:
         if upload.is_control_script:
             return ControlScript(self, upload.register_offset("int"), upload.register_offset("float"))
         return Program(self, upload.name, upload.text)
 
-    def _start(self, program: ControlScript | Program) -> None:
+    def _start(self, program: AnyProgram) -> None:
         if self.obstacle is not None:
             self.note("program", f"started {program.name}", accepted=False, why=self.obstacle)
             return
@@ -475,9 +500,10 @@ class Robot:
 
     def flange_wrench(self) -> Array:
         """Return the wrench on the arm's own sensor, (6,): N and N·m, exerted on the flange, its axes and origin."""
-        R = self.world.truth.R_flange_sensor
-        felt = self.world.load_wrench() + self.world.contact_wrench()
-        return np.concatenate((R @ felt[:3], R @ felt[3:]))
+        truth = self.world.truth
+        felt = self.world.load_wrench(self.cycle_s) + self.world.contact_wrench(self.cycle_s)
+        force = truth.R_flange_sensor @ felt[:3]
+        return np.concatenate((force, truth.R_flange_sensor @ felt[3:] + cross(truth.p_flange_sensor_m, force)))
 
     def raw_wrench(self) -> Vector6:
         """ft_raw_wrench: a new reading in every cycle, flange axes."""
@@ -490,7 +516,7 @@ class Robot:
     def tcp_wrench(self) -> Vector6:
         """actual_TCP_force: payload-compensated and zeroed, base axes, at the TCP, exerted on the tool."""
         world = self.world
-        felt_now = (world.q, world.truth, world.contact_wrench())
+        felt_now = (world.q, world.load_wrench(self.cycle_s), world.contact_wrench(self.cycle_s))
         key = (*felt_now, self.payload_kg, self.payload_cog_m, self._tcp_offset, self._ft_zero)
         if self._wrench is None or any(a is not b for a, b in zip(self._wrench[0], key, strict=True)):
             felt = self._compensated() - self._ft_zero

@@ -8,6 +8,7 @@ import selectors
 import socket
 import struct
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable
 
 from mocks.clock import time_out_s
@@ -157,6 +158,9 @@ class RtdeClient(Client):
         self._every = 1
         self._inputs: list[rtde.Recipe] = []
         self._started = False
+        self._outbox: deque[tuple[float, bytes]] = deque()
+        """Samples on their way, and when each is sent, on the cell's clock."""
+        self._last = b""
 
     def on_bytes(self, buffer: bytearray) -> None:
         """Answer every complete package."""
@@ -167,11 +171,32 @@ class RtdeClient(Client):
             self.server.reject(str(error))
             self.close()
 
-    def sample(self, *, again: bool = False) -> None:
-        """Send the outputs if this cycle is due, or `again` to a client that commands; skip them when it lags."""
-        due = bool(self._inputs) if again else self.robot.cycle % self._every == 0
-        if self._started and due and not self.lagging and self._outputs is not None:
-            self.send(self._outputs.pack([read(self.robot) for read in self._readers]))
+    def sample(self) -> None:
+        """Take the outputs if this cycle is due; they are sent after the delay of the link."""
+        if self._started and self.robot.cycle % self._every == 0 and self._outputs is not None:
+            self._outbox.append((self.robot.cycle_s + self.server.delay_s, self._packed(self._outputs)))
+
+    def _packed(self, outputs: rtde.Recipe) -> bytes:
+        return outputs.pack([read(self.robot) for read in self._readers])
+
+    def deliver(self, now_s: float) -> float | None:
+        """Send the samples that are due, without those a lagging client has no room for.
+
+        Returns
+        -------
+        Seconds until the next one is due, None when there is none.
+        """
+        while self._outbox and self._outbox[0][0] <= now_s:
+            self._last = self._outbox.popleft()[1]
+            if not self.lagging:
+                self.send(self._last)
+        return self._outbox[0][0] - now_s if self._outbox else None
+
+    def repeat(self) -> None:
+        """Send the last sample again to a client that commands."""
+        if self._started and self._inputs and not self.lagging and self._outputs is not None:
+            self._last = self._last or self._packed(self._outputs)
+            self.send(self._last)
 
     def _on_package(self, kind: int, payload: bytes) -> None:
         if kind == rtde.VERSION:
@@ -187,6 +212,7 @@ class RtdeClient(Client):
             self._reply(kind, bytes([self._started]))
         elif kind == rtde.PAUSE:
             self._started = False
+            self._outbox.clear()
             self._reply(kind, b"\x01")
         elif kind == rtde.DATA:
             self._take_inputs(payload)
@@ -203,7 +229,7 @@ class RtdeClient(Client):
         (frequency_hz,) = struct.unpack_from(">d", payload)
         names = rtde.names_in(payload[8:])
         recipe = rtde.Recipe(1, names, [output_type(self.robot, name) for name in names])
-        self._outputs = recipe if recipe.valid else None
+        self._outputs, self._last = recipe if recipe.valid else None, b""
         self._readers = [OUTPUTS[name][1] for name in names] if recipe.valid else []
         base_hz = self.robot.frequency_hz
         self._every = max(1, int(base_hz / frequency_hz)) if frequency_hz > 1e-3 else 1
@@ -269,8 +295,10 @@ class UrServer:
         """While true no cycle runs and no byte is read or sent, but connections stay."""
         self.streaming = True
         """While false RTDE clients are answered, but get no samples."""
+        self.delay_s = 0.0
+        """Time between the cycle in which a sample is taken and its sending."""
         self._silent: set[str] = set()
-        self._sent_real_ns = 0
+        self._cycle_real_ns = robot.clock.real_ns()
         self._selector = selector
         self._clients: list[Client] = []
         self._listeners: dict[int, socket.socket] = {}
@@ -374,13 +402,15 @@ class UrServer:
             while not ended():
                 now_ns = clock.follow()
                 while due_ns <= now_ns:
-                    due_ns += period_ns
                     if not self.frozen:
-                        self.robot.tick()
-                        self._send_samples()
-                if not self.frozen and clock.real_ns() - self._sent_real_ns >= KEEP_ALIVE_NS:
-                    self._send_samples(again=True)
-                for key in self._ready(time_out_s(1e-9 * (due_ns - now_ns))):
+                        self.robot.tick(1e-9 * due_ns)
+                        self._take_samples()
+                    due_ns += period_ns
+                waits_s = [1e-9 * (due_ns - now_ns)]
+                if not self.frozen:
+                    waits_s += self._deliver(1e-9 * now_ns)
+                    self._keep_alive()
+                for key in self._ready(time_out_s(min(waits_s))):
                     key.data()
 
     def _ready(self, time_out_s: float) -> list[selectors.SelectorKey]:
@@ -391,11 +421,31 @@ class UrServer:
         others = {key.fd: key for key in keys if not isinstance(key.fileobj, (Client, socket.socket))}
         return [others[fd] for fd in select.select(list(others), [], [], time_out_s)[0]]
 
-    def _send_samples(self, *, again: bool = False) -> None:
-        self._sent_real_ns = self.robot.clock.real_ns()
-        for client in list(self._clients):
-            if client.kind in self._silent:
-                continue
+    @property
+    def _served(self) -> list[Client]:
+        return [client for client in self._clients if client.kind not in self._silent]
+
+    @property
+    def _rtde_clients(self) -> list[RtdeClient]:
+        return [client for client in self._served if isinstance(client, RtdeClient)]
+
+    def _take_samples(self) -> None:
+        self._cycle_real_ns = self.robot.clock.real_ns()
+        for client in self._served:
             client.flush()
-            if self.streaming and isinstance(client, RtdeClient):
-                client.sample(again=again)
+        if self.streaming:
+            for client in self._rtde_clients:
+                client.sample()
+
+    def _deliver(self, now_s: float) -> list[float]:
+        """Send the samples that are due; return the seconds until others are."""
+        waits_s = [client.deliver(now_s) for client in self._rtde_clients]
+        return [wait_s for wait_s in waits_s if wait_s is not None]
+
+    def _keep_alive(self) -> None:
+        """Repeat the last samples while the clock is held."""
+        real_ns = self.robot.clock.real_ns()
+        if self.streaming and real_ns - self._cycle_real_ns >= KEEP_ALIVE_NS:
+            self._cycle_real_ns = real_ns
+            for client in self._rtde_clients:
+                client.repeat()

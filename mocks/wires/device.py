@@ -57,6 +57,12 @@ class Pacer:
         self.made += count
         return count
 
+    def times_s(self, count: int) -> Array:
+        """Return when the last samples that were due had to be measured, (count,) on the cell's clock."""
+        if self._rate_hz is None:
+            return np.full(count, self._clock.now_s())
+        return self._start_s + np.arange(self.made - count, self.made) / self._rate_hz
+
     def wait_s(self, now_s: float) -> float | None:
         """Return the time until the next sample is due."""
         if self._rate_hz is None:
@@ -98,6 +104,10 @@ class Device(ABC, Generic[Frame]):
     def streaming(self) -> bool:
         """Whether the sensor sends samples by itself."""
         return self._pacer.running
+
+    def sample_times_s(self, count: int) -> Array:
+        """Return when the readings that the device asks for now are measured, (count,) on the cell's clock."""
+        return self._pacer.times_s(count)
 
     @abstractmethod
     def start(self) -> Any:

@@ -83,7 +83,9 @@ def rtde_packages(data: bytes) -> None:
 def rtde_data(data: bytes) -> object:
     """Decode a recipe, whose size comes first, and by it the data after it."""
     size = data[0] if data else 0
-    return rtde.Recipe.decode(data[1 : 1 + size]).unpack(data[1 + size :])
+    recipe = rtde.Recipe.decode(data[1 : 1 + size])
+    recipe.check(data[1 + size :])
+    return recipe.columns([data[1 + size :]])
 
 
 def robotous_halves() -> Callable[[bytes], None]:

@@ -21,7 +21,7 @@ from ftdrive.cell.emulated import Station
 Json = dict[str, Any]
 
 PAYLOAD_KG = 1.5
-"""What the controllers of all rows are told, where a row does not say otherwise."""
+"""The settings of the controller in all rows that set nothing else."""
 
 UNSEEN: Final[Mapping[str, str]] = {
     "1 cable, gently": "nothing stops the arm below the contact limit; the report names poses (test_disturbances.py)",
@@ -101,7 +101,7 @@ class Fault:
     row: str
     name: str
     inject: Deed
-    mend: Deed
+    repair: Deed
     hazards: frozenset[int]
     """The rows that may name it."""
     detect_s: float = 0.05
@@ -111,11 +111,11 @@ class Fault:
     resumed: bool = False
     """The process is gone, and --resume goes on."""
     restart: bool = False
-    """Its mending needs the cell to be switched off and on."""
+    """Its repair needs the cell to be switched off and on."""
     ends_its_move: bool = False
-    """Nobody can reach the arm: it ends the move it was given, and that is told."""
+    """The arm cannot be reached: it ends the commanded move, and the session reports that."""
     words: str = ""
-    """Part of what is told."""
+    """Part of the text that is shown."""
 
 
 # -- what happens ------------------------------------------------------------------------------------------------------
@@ -306,7 +306,7 @@ def _caged(cell: CellConfig) -> CellConfig:
 
 BEFOREHAND: Final[Sequence[Beforehand]] = (
     Beforehand("2, 3", "a tool longer than its cage", 7, "proven clear", change=_caged),
-    Beforehand("3", "nobody has measured", 7, "measured", change=_of_workcell(measured=False)),
+    Beforehand("3", "not measured", 7, "measured", change=_of_workcell(measured=False)),
     Beforehand("3", "a safety plane in the way", 7, "safety limits", ("--plane", "0,0,1,1.0")),
     Beforehand(
         "5",
@@ -316,7 +316,7 @@ BEFOREHAND: Final[Sequence[Beforehand]] = (
         change=_of_workcell(boxes_mm=((-400.0, -600.0, 300.0, 100.0, 0.0, 600.0),)),
     ),
     Beforehand("7", "payload 0 in the controller", 7, "payload", ("--payload", "0")),
-    Beforehand("8", "a turned TCP, not told", 0, options=("--tcp", "0,0,0.2,0.3,0,0", "--no-tcp-offset")),
+    Beforehand("8", "a turned TCP, not reported", 0, options=("--tcp", "0,0,0.2,0.3,0,0", "--no-tcp-offset")),
     Beforehand("9", "another model", 3, "UR10e", change=_of_model("UR10e")),
     Beforehand("10", "protective stop", 7, "protective", do={"do": "protective-stop"}),
     Beforehand("11", "emergency stop", 5, "emergency", do={"do": "emergency-stop"}),

@@ -1,4 +1,4 @@
-"""Sessions on an emulated cell at real speed, with faults: answered, disturbed, mended, resumed."""
+"""Sessions on an emulated cell at real speed, with faults: answered, disturbed, repaired, resumed."""
 
 import json
 import queue
@@ -52,7 +52,7 @@ class Observed:
 
 
 def conduct(scene: Scene, fault: Fault | None = None, seen: Observed | None = None) -> Json | None:
-    """Answer every question, let the fault happen, mend it; returns the result, or None when the process ended."""
+    """Answer every question, let the fault happen, repair it; returns the result, or None when the process ended."""
     injected, tries, deadline = seen is None or bool(seen.injected_ns), 0, time.monotonic() + PATIENCE_S
     hazards: list[int] = []
     while time.monotonic() < deadline:
@@ -94,7 +94,7 @@ def conduct(scene: Scene, fault: Fault | None = None, seen: Observed | None = No
                 if fault.restart:
                     scene.child.say("quit")
                     continue
-                fault.mend(scene)
+                fault.repair(scene)
             tries += 1
             time.sleep(0.0 if tries == 1 else 1.0)
             scene.child.say("resume" if tries < TRIES else "quit")
@@ -193,7 +193,7 @@ def undisturbed(folder: Path, options: Sequence[str], *arguments: str) -> Json:
 
 
 def disturb(folder: Path, plan: Path, fault: Fault) -> Observed:
-    """Run a session, let the fault happen, mend it, go on to the end."""
+    """Run a session, let the fault happen, repair it, go on to the end."""
     seen, options = Observed(), list(QUIET)
     if fault.at == "approach":
         q_deg = np.degrees(json.loads(plan.read_text())["steps"][0]["q_rad"])
@@ -208,7 +208,7 @@ def disturb(folder: Path, plan: Path, fault: Fault) -> Observed:
                 times = arm_events(scene.state()["events"], "stands", seen.injected_ns, time.monotonic_ns())
                 seen.stands_ns = max(times, default=None)
                 seen.kept = len(scene.poses())
-                fault.mend(scene)
+                fault.repair(scene)
             scene.child.end()
             seen.diary = scene.state()["events"]
             if fault.restart and seen.injected_ns and scene.run is not None:
@@ -227,7 +227,7 @@ def disturb(folder: Path, plan: Path, fault: Fault) -> Observed:
 
 
 def last_words(folder: Path) -> str:
-    """Read what the newest session in the folder said last: its error, if it told one."""
+    """Read the last text of the newest session in the folder: its error, if it reported one."""
     words = (folder / "stderr.txt").read_text().strip().splitlines()
     return next((line for line in words if line.startswith("error")), words[-1] if words else "")
 

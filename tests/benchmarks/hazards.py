@@ -6,7 +6,7 @@ uv run python tests/benchmarks/hazards.py --repeat 3     # each fault so often
 
 Every run that was stopped is resumed, and its calibration compared with that of an undisturbed run. Noise alone puts
 two runs of a noisy sensor 1.4 sigma of one run apart, which would hide what a fault leaves behind. So all runs but the
-first have a tenth of the usual noise, and differences are told in units of the standard deviation that the first run,
+first have a tenth of the usual noise, and differences are in units of the standard deviation that the first run,
 undisturbed and with the usual noise, states: the largest of any parameter must not exceed 1.
 """
 
@@ -48,9 +48,9 @@ GROUPS: Final = {
 class Known:
     """Parameters with the names of a result: the truth of a cell, or what another run found."""
 
-    def __init__(self, told: Mapping[str, Any]) -> None:
+    def __init__(self, reported: Mapping[str, Any]) -> None:
         for name in GROUPS.values():
-            setattr(self, name, np.array(told[name]))
+            setattr(self, name, np.array(reported[name]))
 
 
 def result_of(folder: Path, answer: Json) -> CalibrationResult:
@@ -144,11 +144,11 @@ class Table:
             differs = in_groups(groups)
             if max(groups.values()) > 1:
                 complaints.append("another calibration")
-        how = "told" if fault.ends_its_move else "held" if fault.at == "sample" else "stopped"
+        how = "reported" if fault.ends_its_move else "held" if fault.at == "sample" else "stopped"
         hazards = f", guard {seen.hazards[0]}" if seen.hazards else ""
         reaction = "none" if took_s is None else f"{how} after {took_s:.2f} s{hazards}"
         if complaints:
-            complaints.append(f"told: {(seen.words or seen.last_words)[:160]}")
+            complaints.append(f"reported: {(seen.words or seen.last_words)[:160]}")
         if seen.before or attempts > 1:
             differs += f"  (attempt {attempts}, held {seen.before} times before by something else)"
         return f"{reaction:30} {limit_s:5.2f} s {seen.kept:4}  {differs}", complaints

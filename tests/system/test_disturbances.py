@@ -35,15 +35,15 @@ NOTHING = [0.0] * 6
 
 
 @dataclass
-class Nobody:
+class Unattended:
     """Lets the session run, and makes things happen at its events."""
 
     happening: Happening
-    told: list[Event] = field(default_factory=list)
+    shown: list[Event] = field(default_factory=list)
     has_keys: bool = False
 
     def show(self, event: Event) -> None:
-        self.told.append(event)
+        self.shown.append(event)
         self.happening(event)
 
     def ask(self, question: Question) -> str:
@@ -53,7 +53,7 @@ class Nobody:
         return None
 
     def taken(self) -> dict[int, PoseTaken]:
-        return {event.stop: event for event in self.told if isinstance(event, PoseTaken)}
+        return {event.stop: event for event in self.shown if isinstance(event, PoseTaken)}
 
 
 @pytest.fixture
@@ -63,15 +63,15 @@ def station() -> Iterator[Station]:
 
 
 @pytest.fixture
-def tour(station: Station, tmp_path: Path) -> Callable[[Happening], tuple[Outcome, Nobody]]:
-    def run(happening: Happening) -> tuple[Outcome, Nobody]:
-        nobody = Nobody(happening)
+def tour(station: Station, tmp_path: Path) -> Callable[[Happening], tuple[Outcome, Unattended]]:
+    def run(happening: Happening) -> tuple[Outcome, Unattended]:
+        operator = Unattended(happening)
         cell = replace(station.cell, sampling=Sampling(average_s=0.3, noise_record_s=0.0))
-        outcome = calibrate(cell, nobody, Options(tmp_path, poses=POSES, real=False, questions=False))
+        outcome = calibrate(cell, operator, Options(tmp_path, poses=POSES, real=False, questions=False))
         assert outcome is not None
         assert len(outcome.run.stops()) == POSES + 1
-        assert CONTACT not in [event.hazard for event in nobody.told if isinstance(event, GuardTripped)]
-        return outcome, nobody
+        assert CONTACT not in [event.hazard for event in operator.shown if isinstance(event, GuardTripped)]
+        return outcome, operator
 
     return run
 
@@ -97,7 +97,7 @@ def begins(event: Event, state: State, stop: int) -> bool:
 
 def test_pushes_and_a_tap_while_poses_are_averaged(
     station: Station,
-    tour: Callable[[Happening], tuple[Outcome, Nobody]],
+    tour: Callable[[Happening], tuple[Outcome, Unattended]],
     words_of: Callable[[Outcome], str],
 ) -> None:
     pushed, tapped, last = 4, 7, POSES + 1
@@ -113,9 +113,9 @@ def test_pushes_and_a_tap_while_poses_are_averaged(
             taps += 1
             station.control(do="bump", wrench=PUSH, seconds=0.15)
 
-    outcome, nobody = tour(happening)
-    assert nobody.taken()[tapped].attempts == 2
-    assert nobody.taken()[tapped].steady
+    outcome, operator = tour(happening)
+    assert operator.taken()[tapped].attempts == 2
+    assert operator.taken()[tapped].steady
     text = words_of(outcome)
     first, bumped = names(outcome, 1, pushed)
     assert f"? {bumped} is off by 1.8 N and" in text
@@ -127,7 +127,7 @@ def test_pushes_and_a_tap_while_poses_are_averaged(
 
 def test_a_cable_that_pulls_in_three_poses(
     station: Station,
-    tour: Callable[[Happening], tuple[Outcome, Nobody]],
+    tour: Callable[[Happening], tuple[Outcome, Unattended]],
     words_of: Callable[[Outcome], str],
 ) -> None:
     taut_deg = -60
@@ -143,7 +143,7 @@ def test_a_cable_that_pulls_in_three_poses(
 
 def test_a_sensor_that_drifts_by_half_a_newton(
     station: Station,
-    tour: Callable[[Happening], tuple[Outcome, Nobody]],
+    tour: Callable[[Happening], tuple[Outcome, Unattended]],
     words_of: Callable[[Outcome], str],
 ) -> None:
     slope_N_s, began_ns = 0.06, 0
@@ -183,7 +183,7 @@ def test_a_payload_that_shifts_in_mid_run(
     shift: dict[str, Any],
     kind: str,
     station: Station,
-    tour: Callable[[Happening], tuple[Outcome, Nobody]],
+    tour: Callable[[Happening], tuple[Outcome, Unattended]],
     words_of: Callable[[Outcome], str],
 ) -> None:
     since = 7

@@ -1,4 +1,4 @@
-"""Every command of the tree works without any hardware, and tells what it has found in one JSON object."""
+"""Every command of the tree works without any hardware, and prints its findings as one JSON object."""
 
 import importlib
 import json
@@ -44,18 +44,20 @@ REHEARSED = ("replay", "solve")
 """They calibrate an emulated cell first, as do live, and demo, which is run and looked at in test_demo.py."""
 
 SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
-    "calibrate": lambda told: told["verdict"] != "rejected",
-    "config show": lambda told: told["config"]["robot"]["model"] == "UR5e" and told["config"]["workcell"]["measured"],
-    "devices": lambda told: len(told["serial"]) == 2,
-    "doctor": lambda told: all(check["state"] != "failed" for check in told["checks"]),
-    "export plan": lambda told: told["text"].startswith("# ftdrive.targets/1") and told["file"] is None,
-    "init": lambda told: told["config"]["tool"]["cylinders_mm"] == [[0, 60, 90]] and "UR5e" in told["robot"],
-    "live": lambda told: sum(f**2 for f in told["compensated"]["force_N"]) ** 0.5 < 0.2,
-    "plan": lambda told: told["description"]["model"] == "UR5e" and told["poses"] == 24,
-    "replay": lambda told: told["n_poses"] >= 6,
-    "solve": lambda told: told["n_poses"] >= 6,
-    "transcript play": lambda told: told["played"]["samples"] > 1000,
-    "transcript record": lambda told: told["recorded"]["error"] is None,
+    "calibrate": lambda answer: answer["verdict"] != "rejected",
+    "config show": lambda answer: (
+        answer["config"]["robot"]["model"] == "UR5e" and answer["config"]["workcell"]["measured"]
+    ),
+    "devices": lambda answer: len(answer["serial"]) == 2,
+    "doctor": lambda answer: all(check["state"] != "failed" for check in answer["checks"]),
+    "export plan": lambda answer: answer["text"].startswith("# ftdrive.targets/1") and answer["file"] is None,
+    "init": lambda answer: answer["config"]["tool"]["cylinders_mm"] == [[0, 60, 90]] and "UR5e" in answer["robot"],
+    "live": lambda answer: sum(f**2 for f in answer["compensated"]["force_N"]) ** 0.5 < 0.2,
+    "plan": lambda answer: answer["description"]["model"] == "UR5e" and answer["poses"] == 24,
+    "replay": lambda answer: answer["n_poses"] >= 6,
+    "solve": lambda answer: answer["n_poses"] >= 6,
+    "transcript play": lambda answer: answer["played"]["samples"] > 1000,
+    "transcript record": lambda answer: answer["recorded"]["error"] is None,
 }
 
 
@@ -71,9 +73,9 @@ def test_a_wrong_option_is_told_in_whole_words(
 ) -> None:
     monkeypatch.setattr("os.get_terminal_size", lambda *_: os.terminal_size((80, 24)))
     assert run(["solve", "--method", "x"]) == 2
-    told = capfd.readouterr().err
-    assert "'carlson-iterative'" in told
-    assert max(map(len, told.splitlines())) <= 80
+    answer = capfd.readouterr().err
+    assert "'carlson-iterative'" in answer
+    assert max(map(len, answer.splitlines())) <= 80
 
 
 @pytest.mark.parametrize(
@@ -152,7 +154,7 @@ def works_with_simulate_and_json(command: str, ftdrive: CommandLine, capfd: pyte
     assert outcome.returncode == 0, outcome.stderr
     assert "Exception" not in outcome.stderr + capfd.readouterr().err
     *events, answer = map(json.loads, outcome.stdout.splitlines())
-    assert bool(events) == (command == "calibrate")  # it tells what happens too, one object a line
+    assert bool(events) == (command == "calibrate")  # it prints its events too, one object a line
     assert answer["schema_version"] == 1
     assert SHOWN.get(command, bool)(answer)
 
@@ -160,9 +162,9 @@ def works_with_simulate_and_json(command: str, ftdrive: CommandLine, capfd: pyte
 @pytest.mark.parametrize(
     ("command", "url"),
     [
-        (("config", "show"), lambda told: told["config"]["sensor"]["url"]),
-        (("transcript", "record", "-o", "bota.jsonl", "--duration", "0.3"), lambda told: told["url"]),
-        (("transcript", "play"), lambda told: told["url"]),
+        (("config", "show"), lambda answer: answer["config"]["sensor"]["url"]),
+        (("transcript", "record", "-o", "bota.jsonl", "--duration", "0.3"), lambda answer: answer["url"]),
+        (("transcript", "play"), lambda answer: answer["url"]),
     ],
     ids=["config show", "record", "play"],
 )

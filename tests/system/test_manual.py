@@ -1,4 +1,4 @@
-"""Somebody else moves the emulated arm while the session only looks: over real wires, to a result within its sigmas."""
+"""Another client moves the emulated arm and the session only looks: over real wires, to a result within its sigmas."""
 
 import json
 import threading
@@ -195,7 +195,7 @@ def test_somebody_in_the_emulated_cell_brings_it_to_its_end(
     outcome = CliRunner().invoke(cli, arguments)
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)
     assert words in outcome.stderr
-    told = json.loads(outcome.stdout.splitlines()[-1])
-    assert told["verdict"] != "rejected"
-    truth = json.loads((Path(told["run"]) / "run.json").read_text())["station"]["truth"]
-    assert told["mass_kg"] == pytest.approx(truth["mass_kg"], rel=0.01)
+    answer = json.loads(outcome.stdout.splitlines()[-1])
+    assert answer["verdict"] != "rejected"
+    truth = json.loads((Path(answer["run"]) / "run.json").read_text())["station"]["truth"]
+    assert answer["mass_kg"] == pytest.approx(truth["mass_kg"], rel=0.01)

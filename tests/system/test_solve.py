@@ -114,9 +114,9 @@ def test_all_methods_side_by_side_each_with_a_result_or_a_reason(solve: Solve, t
         assert methods[name]["mass_kg"] == pytest.approx(1.2, abs=0.002)
         assert methods[name]["cross_validated"]["force_rms_N"] < 0.003
     assert methods["known-rotation"]["residual"]["force_rms_N"] > 1  # the sensor is turned by 40 degrees
-    told = solve(path, "--method", "carlson-cayley", "--mass-kg", "1.2", "--level-deg", "0", "--json")
-    assert told.returncode == 0, told.stderr
-    assert json.loads(told.stdout)["mass_kg"] == pytest.approx(1.2)
+    outcome = solve(path, "--method", "carlson-cayley", "--mass-kg", "1.2", "--level-deg", "0", "--json")
+    assert outcome.returncode == 0, outcome.stderr
+    assert json.loads(outcome.stdout)["mass_kg"] == pytest.approx(1.2)
 
 
 def test_a_rejected_result_is_saved_only_by_force_and_stays_marked(solve: Solve, tmp_path: Path) -> None:

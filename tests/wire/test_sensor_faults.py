@@ -8,7 +8,6 @@ import json
 import subprocess
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from drivers.clock import REAL, Clock
 from drivers.errors import DeviceTimeout, DriverError, StreamBroken
+from drivers.follow import Unread
 from drivers.interfaces import Array, FtSamples
 from drivers.registry import sensor_from_url
 from drivers.streaming.sensor import StreamingSensor
@@ -204,17 +204,19 @@ class Watched:
 
     sensor: StreamingSensor
     seconds: float = 0.0
-    blocks: deque[FtSamples] = field(default_factory=deque)
+    blocks: list[FtSamples] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        self.unread: Unread[FtSamples] = Unread(self.sensor.name, 10**9)
         with self.sensor._news:
-            self.sensor._taps.append(self.blocks)
+            self.sensor._taps.append(self.unread)
         if self.seconds:
             self.sensor.collect(self.seconds)
 
     def samples(self) -> FtSamples:
         with self.sensor._news:
-            return FtSamples.concatenate(list(self.blocks)) if self.blocks else self.sensor._newest
+            self.blocks += self.unread.take()
+            return FtSamples.concatenate(self.blocks) if self.blocks else self.sensor._newest
 
     def wrong(self) -> int:
         """Count the samples that no sensor has measured."""

@@ -2,14 +2,18 @@
 
 import json
 import math
+import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from mocks.sensors.netft import RECORD, NetFtBox
 from tests.wire.station_process import ROOT, StationProcess
 from tests.wire.waiting import LIMIT_S
 
@@ -75,6 +79,11 @@ def test_cables_drift_and_payload(station: StationProcess) -> None:
         ("set-payload", {"payload_kg": -1}, "payload -1"),
         ("set-payload", {"payload_kg": 1, "payload_cog_m": [0, 0]}, "not enough values"),
         ("slider", {"fraction": 2}, "not between"),
+        ("delay", {}, "sensor_ms"),
+        ("delay", {"sensor_ms": -1}, "0 to 1000 ms"),
+        ("swing", {}, "seconds"),
+        ("swing", {"seconds": 5, "speed_rad_s": 0}, "must be positive"),
+        ("recording", {"pace": 1}, "not understood"),
     ],
 )
 def test_a_wrong_request_is_an_error_and_changes_nothing(
@@ -132,7 +141,7 @@ def test_another_client_moves_the_arm(station: StationProcess) -> None:
     assert station.ask("foreign_program", q_rad=goal, speed_rad_s=0.5)["accepted"]
     station.wait_for(lambda s: s["runtime_state"] == "STOPPED" and s["q_rad"] == pytest.approx(goal, abs=1e-6))
     what = [event["what"] for event in station.ask("state", since=len(before["events"]))["events"]]
-    assert what == ["program other", "started other", "moves", "stopped other", "stands"]
+    assert what == ["program other", "started other", "moves", "stands", "stopped other"]
 
 
 def test_a_silent_arm_keeps_its_connections_and_answers_later(station: StationProcess) -> None:
@@ -158,6 +167,74 @@ def test_a_pendant_program_arrives_by_the_script_port(station: StationProcess) -
     assert [event["why"] for event in events if event["what"] == "textmsg"] == ["go"]
 
 
+def test_a_program_swings_the_arm_and_inertia_comes_and_goes() -> None:
+    with StationProcess("--seed", "3", "--force-bias", "0,0,0") as station:
+        mass_kg, weight_N = station.hello["truth"]["mass_kg"], station.hello["truth"]["weight_N"]
+
+        def inertia_N(state: dict[str, Any]) -> float:
+            """Change of the load's magnitude, which weight alone does not make."""
+            return abs(math.hypot(*state["true_wrench"][:3]) - float(weight_N))
+
+        assert inertia_N(station.ask("state")) < 1e-6
+        swing = station.ask("swing", seconds=3, acceleration_m_s2=3)
+        assert swing["accepted"]
+        assert swing["seconds"] >= 3
+        state = station.wait_for(lambda s: inertia_N(s) > 0.5 * mass_kg)
+        assert (state["program"], state["runtime_state"]) == ("swing", "PLAYING")
+        assert "the arm moves" in station.refusal("swing", seconds=3)
+        station.ask("dashboard-stop")
+        state = station.wait_for(lambda s: s["steady"] and s["runtime_state"] == "STOPPED")
+        assert inertia_N(state) < 1e-6
+
+
+def test_the_truth_names_the_inertia_and_the_sensor_origin(station: StationProcess) -> None:
+    drawn = station.hello["truth"]
+    assert (np.linalg.eigvalsh(drawn["inertia_kg_m2"]) > 1e-4).all()
+    assert drawn["p_flange_sensor_m"] == [0, 0, 0]
+    inertia = ("--mass", "2", "--inertia", "0.01,0.02,0.015,0.001,0,-0.002")
+    with StationProcess("--seed", "2", *inertia, "--sensor-origin", "0,0.01,0.04") as other:
+        given = other.hello["truth"]
+    np.testing.assert_allclose(
+        given["inertia_kg_m2"], [[0.01, 0.001, 0], [0.001, 0.02, -0.002], [0, -0.002, 0.015]], rtol=1e-12
+    )
+    assert given["p_flange_sensor_m"] == [0, 0.01, 0.04]
+    changed = {name for name in drawn if drawn[name] != given[name]}
+    assert changed == {"mass_kg", "weight_N", "gravity_force_base_N", "inertia_kg_m2", "p_flange_sensor_m"}
+
+
+def write_recording(path: Path) -> None:
+    """Row k of 4 s at 1 kHz has (k mN, 0, …) and turns joint 6 with 0.25 rad/s."""
+    lines = ["# ftdrive.recording/1", "t_s,raw_fx,raw_fy,raw_fz,raw_tx,raw_ty,raw_tz,q0,q1,q2,q3,q4,q5,note"]
+    for k in range(4001):
+        lines.append(f"{0.001 * k:.3f},{0.001 * k:.3f},0,0,0,0,0,0.5,-1.5,1,-0.5,1.5,{0.00025 * k},x")
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_a_recording_comes_over_the_wires(tmp_path: Path) -> None:
+    write_recording(tmp_path / "peg.csv")
+    options = ("--sensor", "netft", "--recording", str(tmp_path / "peg.csv"), "--pace", "0")
+    with StationProcess(*options) as station, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        assert station.hello["truth"] is None
+        assert station.hello["recording"] == {"file": str(tmp_path / "peg.csv"), "samples": 4001, "duration_s": 4.0}
+        where = station.hello["sensors"]["netft"]
+        client.settimeout(LIMIT_S)
+        client.connect((where["host"], where["rdt_port"]))
+        client.send(struct.pack(">HHI", 0x1234, 2, 1500))  # so many samples in real time
+        first = np.frombuffer(client.recv(36), RECORD)
+        assert station.ask("recording", at_s=1.0, pace=1.0) == {"done": "recording", "at_s": 1.0, "pace": 1.0}
+        records = np.concatenate([first, *(np.frombuffer(client.recv(36), RECORD) for _ in range(1499))])
+        counts_per_N = NetFtBox(lambda n: np.zeros((n, 6))).calibration.counts_per_SI[0]
+        rows = np.round(1e3 * records["counts"][:, 0] / counts_per_N).astype(int)
+        assert rows[0] == 0, "held at the first row"
+        played = rows[rows >= 1000]
+        np.testing.assert_array_equal(played, np.arange(1000, 1000 + len(played)))
+        assert len(played) > 500
+        state = station.wait_for(lambda s: s["recording_s"] == 4.0)
+        assert state["q_rad"] == pytest.approx([0.5, -1.5, 1, -0.5, 1.5, 1.0])
+        assert "follows a recording" in station.refusal("hand-move", q_rad=[0] * 6)
+        assert "not understood" in station.refusal("payload-shift", mass_kg=1)
+
+
 def test_requests_to_begin_with() -> None:
     drift = {"do": "drift", "force_N": [0, 0, 0.5], "seconds": 0}
     with StationProcess(*OPTIONS, "--do", json.dumps(drift), "--do", '{"do": "slider", "fraction": 0.5}') as station:
@@ -173,6 +250,10 @@ def test_requests_to_begin_with() -> None:
         (["--do", '{"do": "dance"}'], "not understood"),
         (["--sensor", "ur-ft", "--sensor-rotvec-deg", "0,0,30"], "leave --sensor-rotvec-deg out"),
         (["--sensor", "lab"], "invalid choice"),
+        (["--inertia", "1,1,3,0,0,0"], "no body has"),
+        (["--recording", "missing.csv"], "cannot read the recording"),
+        (["--recording", "README.md", "--time-scale", "2"], "leave --time-scale"),
+        (["--sensor", "ur-ft", "--sensor-delay-ms", "5"], "no wire of its own"),
     ],
 )
 def test_wrong_options_are_exit_code_2(options: list[str], why: str) -> None:

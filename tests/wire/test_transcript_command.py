@@ -61,7 +61,7 @@ def test_a_recording_may_be_longer_than_what_one_collect_holds(
     assert isinstance(sensor, StreamingSensor)
     with sensor:
         rate_Hz = len(sensor.collect(0.3)) / 0.3
-        sensor._max_collect_samples = round(0.4 * rate_Hz)
+        sensor._max_unread_samples = round(0.4 * rate_Hz)
         with pytest.raises(StreamBroken, match="in shorter pieces"):
             sensor.collect(0.9)
         monkeypatch.setattr(transcript, "_PIECE_S", 0.25)

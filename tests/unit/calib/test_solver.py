@@ -393,6 +393,23 @@ def test_what_is_known_to_be_down_depends_on_the_mounting() -> None:
     assert compared.force_rms_N < 1e-6
 
 
+def test_a_comparison_predicts_each_pose_from_the_others() -> None:
+    rng = np.random.default_rng(8)
+    R, wrench = R24[:12], predict(TRUTH, R24[:12]) + rng.normal(0, SIGMA, (12, 6))
+    (compared,) = [one for one in compare(dataset(R, wrench)) if one.method == "lrom"]
+    fitted = wrench - predict(solve(dataset(R, wrench), "lrom").parameters, R)
+    left_out = [
+        wrench[i] - predict(solve(dataset(np.delete(R, i, 0), np.delete(wrench, i, 0)), "lrom").parameters, R[i])
+        for i in range(12)
+    ]
+    for residuals, force_N, torque_Nm in (
+        (fitted, compared.force_rms_N, compared.torque_rms_Nm),
+        (np.array(left_out), compared.cv_force_rms_N, compared.cv_torque_rms_Nm),
+    ):
+        assert force_N == pytest.approx(np.sqrt((residuals[:, :3] ** 2).sum() / 12))
+        assert torque_Nm == pytest.approx(np.sqrt((residuals[:, 3:] ** 2).sum() / 12))
+
+
 def test_poses_of_one_tilt_are_rejected_because_up_and_down_look_alike() -> None:
     level = Parameters(
         TRUTH.R_flange_sensor, np.array([0, 0, -20.0]), TRUTH.force_bias_N, TRUTH.p_sensor_com_m, TRUTH.torque_bias_Nm

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +18,7 @@ from calib.model import Parameters
 from calib.routine import Sampling
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, DriverError
+from drivers.follow import Follow
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import Declined
@@ -68,12 +70,12 @@ class FakeArm(RobotArm):
         self.opened = 0
         self.control = False
         self.program = "stopped"
-        """Of somebody else, as long as nobody has taken control."""
+        """Of another client, until we take control."""
         self.remote: bool | None = True
         self.asked_limits = 0
         self.at_move: dict[int, Callable[[], None]] = {}
         self.at_look: Callable[[], None] = lambda: None
-        """Whenever somebody asks for the status."""
+        """Called whenever the status is read."""
         self.forbidden: Array | None = None
         self.halted = threading.Event()
         self.gone: DriverError | None = None
@@ -82,7 +84,7 @@ class FakeArm(RobotArm):
     def open(self, *, control: bool = False) -> None:
         self.opened += 1
         self.control |= control
-        assert not control or self.program == "stopped", "a program of somebody else was ended"
+        assert not control or self.program == "stopped", "a program of another client was ended"
 
     def close(self) -> None:
         self.control = False
@@ -110,7 +112,7 @@ class FakeArm(RobotArm):
         self._status = replace(STATUS, **different)
 
     def lose_power(self) -> None:
-        """An emergency stop, of which the joints tell before the status does."""
+        """An emergency stop that the joints show before the status does."""
         self.gone_status = {"fault": DeviceFault("emergency stop", "…"), "safety_mode": "robot emergency stop"}
         self.gone = DeviceFault("the joints are not measured")
 
@@ -144,7 +146,7 @@ class FakeArm(RobotArm):
         for step in range(1, steps + 1):
             guard()
             if self.halted.is_set():
-                raise DeviceFault("the arm was told to stop before it had arrived.")
+                raise DeviceFault("the arm was commanded to stop before it had arrived.")
             self.q = start + step / steps * (goal - start)
             if fault is not None and step == 2:
                 fault()
@@ -219,6 +221,9 @@ class FakeSensor(ForceTorqueSensor):
             np.zeros(n, np.uint32),
         )
 
+    def follow(self) -> AbstractContextManager[Follow[FtSamples]]:
+        raise NotImplementedError
+
     def latest(self, *, timeout_s: float) -> FtSamples:
         assert timeout_s == 0
         self.check()
@@ -250,11 +255,11 @@ class Scripted:
     """What happens while a question with these words waits for its answer."""
     keys: list[Key] = field(default_factory=list)
     has_keys: bool = True
-    told: list[Event] = field(default_factory=list)
+    shown: list[Event] = field(default_factory=list)
     asked: list[Question] = field(default_factory=list)
 
     def show(self, event: Event) -> None:
-        self.told.append(event)
+        self.shown.append(event)
         self.on_event(event)
 
     def ask(self, question: Question) -> str:
@@ -266,17 +271,17 @@ class Scripted:
             if word in question.text and answers:
                 return answers.pop(0)
         if "resume" in question.answers:
-            raise Declined("nobody")
+            raise Declined("unattended")
         return question.answers[0]
 
     def pressed(self) -> Key | None:
         return self.keys.pop(0) if self.keys else None
 
     def states(self) -> list[State]:
-        return [event.state for event in self.told if isinstance(event, StateChanged)]
+        return [event.state for event in self.shown if isinstance(event, StateChanged)]
 
     def of(self, kind: type[Any]) -> list[Any]:
-        return [event for event in self.told if isinstance(event, kind)]
+        return [event for event in self.shown if isinstance(event, kind)]
 
 
 class SteppedWatcher(Watcher):
@@ -408,7 +413,7 @@ class Lab:
         return [question.answers for question in self.operator.asked if "resume" in question.answers]
 
     def press(self, *presses: tuple[Key, type[Event], int]) -> None:
-        """Press each key once, when an event of its kind is told of its stop."""
+        """Press each key once, when an event of its kind is shown for its stop."""
         left = list(presses)
 
         def on_event(event: Event) -> None:

@@ -212,3 +212,20 @@ def test_pacer_is_on_schedule() -> None:
     pacer.stop()
     real.pass_s(10.0)
     assert pacer.due(clock.now_s()) == 0
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_samples_are_measured_when_they_are_due_however_late_the_thread_is(name: str) -> None:
+    bench = Bench(STREAMS[name][0])
+    times_s: list[float] = []
+
+    def measured(count: int) -> NDArray[np.float64]:
+        due_s = bench.device.sample_times_s(count)
+        assert due_s[-1] <= bench.clock.now_s()
+        times_s.extend(due_s)
+        return still(count)
+
+    bench.device.measure = measured
+    for step_s in (0.001, 0.007, 0.0003):
+        bench.run(0.2, step_s)
+    np.testing.assert_allclose(np.diff(times_s), 1 / STREAMS[name][2], rtol=1e-3 if name == "bota-fast" else 1e-6)

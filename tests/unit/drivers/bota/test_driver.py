@@ -62,6 +62,13 @@ def test_it_is_configured_when_asked(table: Table) -> None:
         assert len(sensor.collect(0.1)) == pytest.approx(10, abs=1)
 
 
+def test_a_reply_in_pieces_is_a_reply(table: Table) -> None:
+    run = b"R", Stream(frames(count(0, 10_000)), 0.01, b"r,0,R,0")
+    pieces = b"C", Stream([b"r", b",0,C", b",0"], 0.005)
+    with table.serial([pieces, *COMMANDS[1:], run]) as wire, Sensor(wire.clock, sinc=512):
+        assert wire.clock.now_s() < 1001
+
+
 def test_a_command_has_a_second_and_is_sent_three_times(table: Table) -> None:
     run = b"R", Stream(frames(count(0, 10_000)), 0.01, b"r,0,R,0")
     late = b"C", (990.0, b"r,0,C,0")

@@ -26,7 +26,7 @@ class Fed(StreamingSensor):
     """A sensor whose blocks the test puts into `feed`; an exception among them is raised in the reader."""
 
     def __init__(self, clock: Clock, *, sign: int = 1, limits: StreamLimits | None = None, most: int = 10**6) -> None:
-        super().__init__("fake", sign=sign, clock=clock, limits=limits or StreamLimits(), max_collect_samples=most)
+        super().__init__("fake", sign=sign, clock=clock, limits=limits or StreamLimits(), max_unread_samples=most)
         self.feed: deque[Feed] = deque()
         self.connect_error: Exception | None = None
         self.disconnect_error: Exception | None = None
@@ -231,7 +231,7 @@ def test_a_gap_that_no_wait_noticed_is_found_in_the_stamps(sensor: FakeSensor) -
 def test_more_samples_than_a_collect_may_hold_is_an_error() -> None:
     with FakeSensor(most=10) as fake:
         fake.stream(3)
-        with pytest.raises(StreamBroken, match="more than 10 samples"):
+        with pytest.raises(StreamBroken, match=r"12 samples .* 10 may wait; .* in shorter pieces"):
             fake.collect(1.0)
 
 
@@ -816,3 +816,113 @@ def test_a_consumer_that_comes_late_finds_what_came_in_time(
     sensor.time.advance(0.05)
     sensor.time.at(0.02, lambda: sensor.time.advance(0.2))  # the consumer itself gets no time, the reader does
     assert len(what(sensor))
+
+
+class TestFollow:
+    def test_every_sample_comes_once_and_in_order(self, sensor: FakeSensor) -> None:
+        sensor.stream(3, 0.004)
+        with sensor.follow() as follow:
+            pieces = []
+            for k in range(20):
+                sensor.time.advance(0.01 * (k % 4))
+                pieces.append(follow.read(0.1))
+        assert all(len(piece) for piece in pieces)
+        whole = FtSamples.concatenate(pieces)
+        assert whole.seq.tolist() == list(range(1, len(whole) + 1))
+        assert whole.wrench == pytest.approx(sensor.wrench(whole.seq))
+
+    def test_it_waits_for_the_first_sample_and_no_longer(self, sensor: FakeSensor) -> None:
+        sensor.at(0.05, 2)
+        with sensor.follow() as follow:
+            begin_s = sensor.time.now_s()
+            assert len(follow.read(0.02)) == 0
+            assert sensor.time.now_s() - begin_s == pytest.approx(0.02, abs=1e-3)
+            assert len(follow.read(0.1)) == 2
+            assert sensor.time.now_s() - begin_s == pytest.approx(0.05, abs=1e-3)
+            assert follow.read(0.0).counts.shape == (0, 6)
+
+    def test_followers_do_not_share_samples(self, sensor: FakeSensor) -> None:
+        sensor.stream(1, 0.01)
+        with sensor.follow() as one:
+            sensor.time.advance(0.1)
+            with sensor.follow() as other:
+                sensor.time.advance(0.1)
+                first, second = one.read(0.0).seq.tolist(), other.read(0.0).seq.tolist()
+            assert first[-len(second) :] == second
+            assert 0 < len(second) < len(first)
+        assert not sensor._taps
+
+    def test_a_lost_sample_is_a_gap_in_the_numbers(self, sensor: FakeSensor) -> None:
+        sensor.feed.extend([sensor.block([5, 6]), sensor.block([9])])
+        with sensor.follow() as follow:
+            sensor.settle()
+            assert follow.read(0.1).seq.tolist() == [5, 6, 9]
+
+    def test_what_came_before_silence_is_read_first(self, sensor: FakeSensor) -> None:
+        sensor.at(0.1, 4)
+        with sensor.follow() as follow:
+            sensor.time.advance(1.0)
+            assert len(follow.read(0.0)) == 4
+            with pytest.raises(DeviceTimeout, match=r"0\.9\d\d s"):
+                follow.read(0.0)
+
+    def test_silence_is_raised_after_three_tenths_of_a_second(self, sensor: FakeSensor) -> None:
+        with sensor.follow() as follow:
+            heard_s = sensor.latest(timeout_s=0.0).t_host_ns[0] / 1e9
+            with pytest.raises(DeviceTimeout):
+                follow.read(5.0)
+            assert sensor.time.now_s() - heard_s == pytest.approx(0.301, abs=1e-3)
+
+    @pytest.mark.parametrize("error", [StreamBroken("gone"), DeviceFault("hot"), Frozen("frozen")])
+    def test_a_failure_is_raised_after_what_came_before_it(self, sensor: FakeSensor, error: Exception) -> None:
+        with sensor.follow() as follow:
+            sensor.feed.extend([2, error])
+            sensor.settle()
+            assert len(follow.read(1.0)) == 2
+            for _ in range(2):
+                with pytest.raises(type(error), match=str(error)):
+                    follow.read(1.0)
+        with pytest.raises(type(error)), sensor.follow():
+            pytest.fail("a stream that has failed was followed")
+
+    def test_more_samples_than_may_wait_are_an_error_and_none_is_skipped(self) -> None:
+        with FakeSensor(most=10) as fake, fake.follow() as follow, fake.follow() as idle:
+            for _ in range(4):
+                fake.feed.append(5)
+                fake.settle()
+                assert len(follow.read(0.0)) == 5  # reads in time
+            for _ in range(2):
+                with pytest.raises(StreamBroken, match=r"20 samples .* 10 may wait; read more often"):
+                    idle.read(0.0)
+            assert not idle.read.__self__._read.args[0]._items  # type: ignore[attr-defined]
+
+    def test_an_old_follower_does_not_read_a_stream_that_was_opened_again(self, sensor: FakeSensor) -> None:
+        with sensor.follow() as follow:
+            sensor.close()
+            with pytest.raises(StreamBroken, match="not open"):
+                follow.read(0.0)
+            sensor.open()
+            with pytest.raises(StreamBroken, match="follow it again"):
+                follow.read(0.0)
+
+    def test_a_follower_outlives_a_reconnection(self) -> None:
+        with FakeSensor(recover=True) as fake, fake.follow() as follow:
+            fake._nominal_Hz = 1000.0
+            fake.connect_error = ConnectError("not plugged in")
+            fake.feed.extend([1, StreamBroken("gone")])
+            seen: list[int] = []
+
+            def plug_in() -> None:
+                seen.append(len(follow.read(0.0)))
+                with pytest.raises(StreamBroken, match="interrupted"):
+                    follow.read(0.0)
+                fake.connect_error, fake.first = None, 3
+                fake.seq = 0  # the device restarts its count
+
+            fake.time.at(0.1, plug_in)
+            fake.time.advance(0.3)
+            samples = follow.read(0.0)
+            assert seen == [1]
+            assert fake.health().reconnects == 1
+            assert samples.seq[0] > 100
+            assert len(samples) == 3

@@ -5,14 +5,17 @@ the control process and ur_rtde inside it. Everything else, `Calls` of the contr
 """
 
 import json
+import struct
 import subprocess
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drivers.clock import Clock
@@ -23,6 +26,7 @@ from drivers.ur.control import ControlProcess
 from drivers.ur.dashboard import Dashboard
 from drivers.ur.kinematics import MODELS, Pose, forward
 from drivers.ur.reading import Reader
+from drivers.ur.rtde import Recipe
 from drivers.ur.sample import OUTPUTS
 from drivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
@@ -31,9 +35,14 @@ CYCLE_S = 0.008
 HOST = "192.0.2.1"
 
 
+def pose_from_ur(pose: Sequence[float]) -> Pose:
+    """Read x, y, z in metres, then a rotation vector in radians."""
+    return Pose(Rotation.from_rotvec(pose[3:]).as_matrix(), np.array(pose[:3]))
+
+
 @lru_cache(maxsize=1)
 def tcp_pose(*q_and_tcp: float) -> tuple[float, ...]:
-    pose = forward(MODELS["UR5e"], q_and_tcp[:6]) @ Pose.from_ur(q_and_tcp[6:])
+    pose = forward(MODELS["UR5e"], q_and_tcp[:6]) @ pose_from_ur(q_and_tcp[6:])
     return (*pose.p_m, *Rotation.from_matrix(pose.R).as_rotvec())
 
 
@@ -43,6 +52,7 @@ class Controller:
     def __init__(self, clock: FakeClock) -> None:
         self.clock = clock
         self.t_s = 100.0
+        self._began_s: float | None = None
         self.q_rad = [0.1, -1.2, 1.5, -0.7, -1.4, 0.3]
         self.qd_rad_s = [0.0] * 6
         self.goal_rad: list[float] | None = None
@@ -69,7 +79,11 @@ class Controller:
         """What it was asked to do."""
         self.dashboard_limits_s: list[float] = []
         self.stopping_works = True
-        self._sent: deque[list[tuple[float, ...]]] = deque()
+        self.period_s = CYCLE_S
+        self.stood_still_s = 0.0
+        """For how long its clock has not run."""
+        self.stalled_until_s = self._arrives_s = 0.0
+        self._sent: deque[bytes] = deque()
         self._operation = 0
 
     # ------------------------------------------------------------------ RTDE
@@ -77,16 +91,27 @@ class Controller:
     version = (5, 15, 0, 1)
 
     @property
+    def rate_Hz(self) -> float:
+        return 1.0 / self.period_s
+
+    @property
     def missing(self) -> list[str]:
         return sorted(self.unknown)
 
-    def read(self, timeout_s: float) -> list[tuple[float, ...]]:
+    @property
+    def _known(self) -> dict[str, str]:
+        return {name: kind for name, kind in OUTPUTS.items() if name not in self.unknown}
+
+    def read(self, timeout_s: float) -> list[bytes]:
         assert timeout_s <= 0.05
         if self.failure:
             raise self.failure
         if not self._sent:
             raise TimeoutError
-        return self._sent.popleft()
+        return [self._sent.popleft() for _ in range(-(-len(self._sent) // 2))]  # a burst comes in pieces
+
+    def decode(self, samples: Sequence[bytes]) -> dict[str, NDArray[Any]]:
+        return dict(zip(self._known, Recipe(1, tuple(self._known.values())).columns(samples), strict=True))
 
     def close(self) -> None:
         pass
@@ -111,32 +136,54 @@ class Controller:
             "payload_cog": (0.0, 0.0, 0.05),
         }
 
+    def _packed(self) -> bytes:
+        """Pack the sample, after the number of the recipe."""
+        sample = self.sample()
+        letters = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "VECTOR3D": "3d", "VECTOR6D": "6d"}
+        layout = ">B" + "".join(letters[kind] for kind in self._known.values())
+        return struct.pack(layout, 1, *(number for name in self._known for number in sample[name]))
+
     def run(self, reader: Reader) -> None:
-        """Send a sample every 8 ms to a reader that has nothing else to do."""
+        """Send a sample every `period_s` to a reader that has nothing else to do."""
 
         def cycle() -> None:
-            self.t_s += CYCLE_S
+            if self._reader is not reader:
+                return
+            self.t_s = 100.0 + self.clock.now_s() - began_s - self.stood_still_s
             self._move()
             if not self.silent:
-                sample = self.sample()
-                self._sent.append([sample[name] for name in OUTPUTS if name not in self.unknown])
+                self._send(self._packed(), receive)
+            receive()
+            self.clock.at(self.period_s, cycle)
+
+        def receive() -> None:
             if not self.held_back:
-                receive(max(1, len(self._sent) // 2))
-                if self._sent:  # a backlog is read in no time, and a caller may look meanwhile
-                    self.clock.at(1e-4, lambda: receive(len(self._sent)))
-            self.clock.at(CYCLE_S, cycle)
-
-        def receive(n: int) -> None:
-            for _ in range(n):
                 reader._follow()
+                if self._sent:  # and a caller may look meanwhile
+                    self.clock.at(1e-4, receive)
 
-        self.clock.at(CYCLE_S, cycle)
+        self._reader = reader
+        began_s = self._began_s = self.clock.now_s() if self._began_s is None else self._began_s
+        self.clock.at(self.period_s, cycle)
+
+    def _send(self, sample: bytes, receive: Callable[[], None]) -> None:
+        """Send through a network that holds samples back until `stalled_until_s`, and is quicker than we are then."""
+        self._arrives_s = max(self.clock.now_s(), self.stalled_until_s, self._arrives_s + 0.6 * self.period_s)
+
+        def arrive() -> None:
+            self._sent.append(sample)
+            receive()
+
+        if self._arrives_s > self.clock.now_s():
+            self.clock.at(self._arrives_s - self.clock.now_s(), arrive)
+        else:
+            arrive()
 
     def _move(self) -> None:
         if self.goal_rad is None or self.program != 2 or self.safety_bits != 1:
             return
         left_rad = self.goal_rad[5] - self.q_rad[5]
-        step_rad = self.speed_rad_s * CYCLE_S
+        step_rad = self.speed_rad_s * self.period_s
         if abs(left_rad) <= step_rad:
             self.q_rad, self.goal_rad = self.goal_rad, None
         else:

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
-from drivers.ur.kinematics import MODELS, Pose, forward
+from drivers.interfaces import ArmStates
+from drivers.ur.kinematics import MODELS, forward
 from drivers.ur.reading import Reader
 from drivers.ur.sample import Sample
 from drivers.ur.timing import STRICT
 from tests.fake_clock import FakeClock
-from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, ReaderInMemory
+from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, ReaderInMemory, pose_from_ur
 
 
 @pytest.fixture
@@ -86,6 +87,70 @@ def test_a_status_is_at_most_fifty_milliseconds_old(controller: Controller, read
     reader.status()
     clock.advance(0.002)
     assert wait_s(clock, reader.status, DeviceTimeout) == pytest.approx(STRICT.stale_s, abs=1e-6)
+
+
+@pytest.fixture
+def full_rate(controller: Controller) -> Reader:
+    """A reader of an e-Series arm."""
+    controller.period_s = 0.002
+    return ReaderInMemory(controller, "UR5e")
+
+
+def test_a_busy_computer_at_the_full_rate_finds_new_samples(
+    controller: Controller, full_rate: Reader, clock: FakeClock
+) -> None:
+    """The reader gets a turn now and then, and finds samples without waiting for them."""
+    full_rate.look()
+    for pause_s in (0.02, 0.0005, 0.0005, 0.02, 0.09):
+        controller.held_back = True
+        clock.advance(pause_s)
+        controller.held_back = False
+        begin_s = clock.now_s()
+        full_rate.look()
+        assert clock.now_s() - begin_s < 0.0081
+
+
+@pytest.mark.parametrize("stalled_s", [0.06, 0.19, 5.0])
+def test_what_the_network_has_delayed_is_not_now(
+    controller: Controller, full_rate: Reader, clock: FakeClock, stalled_s: float
+) -> None:
+    """The reader waits for each sample, so only the controller's clock shows that it is old."""
+    clock.advance(0.7)
+    controller.stalled_until_s = clock.now_s() + stalled_s
+    late: list[float] = []
+    while clock.now_s() < controller.stalled_until_s + 0.3:
+        clock.advance(0.001)
+        t_s = full_rate._t_device_s
+        late.append(controller.t_s - t_s)
+        try:
+            status = full_rate.status()
+        except DeviceTimeout:
+            continue
+        assert controller.t_s - status.t_device_s <= STRICT.status_s + STRICT.late_s + 0.008
+    assert max(late) > 0.04
+
+
+def test_a_clock_that_stood_still_is_trusted_again_after_a_second(
+    controller: Controller, full_rate: Reader, clock: FakeClock
+) -> None:
+    clock.advance(2.0)
+    controller.stood_still_s = 0.4
+    with pytest.raises(DeviceTimeout, match=r"arrive 0\.40 s late"):
+        full_rate.look()
+    clock.advance(0.85)
+    full_rate.look()
+
+
+@pytest.mark.parametrize("slower", [0.04, -0.05, -9.0])  # simulators; the emulated arm lives ten times faster
+def test_a_clock_of_another_speed_is_not_late(
+    controller: Controller, full_rate: Reader, clock: FakeClock, slower: float
+) -> None:
+    begin_s = clock.now_s()
+    for _ in range(250):
+        controller.stood_still_s = slower * (clock.now_s() - begin_s)
+        before_s = clock.now_s()
+        full_rate.look()
+        assert clock.now_s() - before_s == pytest.approx(0.008, abs=1e-6)
 
 
 # ---------------------------------------------------------------------- silence
@@ -207,14 +272,125 @@ def test_joints_without_power_are_not_measured(controller: Controller, reader: R
 def test_a_flange_that_does_not_fit_the_joints_is_refused(
     reader: Reader, moved_mm: float, turned_deg: float, wrong: bool
 ) -> None:
-    nudge = Pose.from_ur([1e-3 * moved_mm, 0.0, 0.0, 0.0, math.radians(turned_deg), 0.0])
+    nudge = pose_from_ur([1e-3 * moved_mm, 0.0, 0.0, 0.0, math.radians(turned_deg), 0.0])
     sample = reader.look()
     flange = forward(MODELS["UR5e"], sample.q_rad) @ nudge
     if not wrong:
-        reader._check_model(sample, flange)
+        reader._check_model(sample.q_rad, flange)
         return
     with pytest.raises(DeviceFault, match=f"{moved_mm}.0 mm and {turned_deg:.2f} degrees .* UR5e"):
-        reader._check_model(sample, flange)
+        reader._check_model(sample.q_rad, flange)
+
+
+# ---------------------------------------------------------------------- following
+
+
+def test_a_follower_reads_every_sample_as_flange_poses(
+    controller: Controller, full_rate: Reader, clock: FakeClock
+) -> None:
+    tcps, joints, pieces = [], [], []
+    with full_rate.follow() as follow:
+        for k in range(30):
+            controller.tcp_offset = [0.01 * k, 0.0, 0.2, 0.05 * k, 0.0, 0.0]
+            controller.q_rad = [0.1, -1.2, 1.5, -0.7, -1.4, 0.01 * k]
+            tcps.append(controller.tcp_offset)
+            joints.append(controller.q_rad)
+            clock.advance(0.002)
+            if k % 7 == 6 or k == 29:
+                pieces.append(follow.read(0.0))
+        begin_s = clock.now_s()
+        assert len(follow.read(0.001)) == 0
+        assert clock.now_s() - begin_s == pytest.approx(0.001)
+    states = ArmStates.concatenate(pieces)
+    assert len(states) == 30
+    np.testing.assert_allclose(np.diff(states.t_device_s), 0.002, atol=1e-9)
+    np.testing.assert_allclose(np.diff(states.t_host_ns), 2_000_000, atol=1)
+    assert states.q_rad.tolist() == joints
+    nominal = [forward(MODELS["UR5e"], q) for q in joints]
+    np.testing.assert_allclose(states.R_base_flange, [pose.R for pose in nominal], atol=1e-9)
+    np.testing.assert_allclose(states.p_base_flange_m, [pose.p_m for pose in nominal], atol=1e-9)
+    assert not full_rate._followers
+
+
+def test_a_follower_loses_nothing_while_nobody_reads(
+    controller: Controller, full_rate: Reader, clock: FakeClock
+) -> None:
+    with full_rate.follow() as follow:
+        controller.held_back = True
+        clock.advance(3.0)
+        controller.held_back = False
+        clock.advance(0.01)
+        t_device_s = follow.read(0.0).t_device_s
+        assert len(t_device_s) == pytest.approx(3.01 / 0.002, abs=2)
+        np.testing.assert_allclose(np.diff(t_device_s), 0.002, atol=1e-9)
+
+
+def test_a_follower_finds_silence_as_quickly_as_a_look(
+    controller: Controller, full_rate: Reader, clock: FakeClock
+) -> None:
+    with full_rate.follow() as follow:
+        clock.advance(0.01)
+        controller.silent = True
+        heard_s = clock.now_s()
+        assert len(follow.read(0.05)) == 5
+        with pytest.raises(DeviceTimeout, match=r"stood still at 100\.\d{3} s for 0\.20 s"):  # noqa: PT012
+            for _ in range(100):
+                follow.read(0.01)
+        assert clock.now_s() - heard_s == pytest.approx(0.2, abs=0.003)
+        controller.silent = False
+        clock.advance(0.004)
+        assert len(follow.read(0.1)) == 2
+        controller.held_back = True
+        clock.stall(0.5)
+        with pytest.raises(DeviceTimeout, match="suspended or too busy"):
+            follow.read(0.0)
+
+
+def test_the_end_of_the_stream_is_raised_at_a_follower(
+    controller: Controller, full_rate: Reader, clock: FakeClock
+) -> None:
+    with full_rate.follow() as follow:
+        clock.advance(0.004)
+        controller.failure = ConnectionResetError("reset")
+        clock.advance(0.004)
+        assert len(follow.read(0.1)) == 2
+        for _ in range(2):
+            with pytest.raises(StreamBroken, match="reset"):
+                follow.read(0.1)
+    with pytest.raises(StreamBroken, match="reset"), full_rate.follow():
+        pytest.fail("a stream that has failed was followed")
+
+
+def test_a_follower_of_an_arm_that_was_closed_is_not_left_waiting(
+    controller: Controller, full_rate: Reader, clock: FakeClock
+) -> None:
+    with full_rate.follow() as follow:
+        clock.advance(0.004)
+        full_rate.close()
+        controller.failure = OSError("Bad file descriptor")
+        full_rate._follow()
+        assert len(follow.read(1.0)) == 2
+        with pytest.raises(StreamBroken, match="was closed; open it again"):
+            follow.read(1.0)
+
+
+def test_poses_without_power_over_the_joints_are_not_read(
+    controller: Controller, full_rate: Reader, clock: FakeClock
+) -> None:
+    with full_rate.follow() as follow:
+        clock.advance(0.01)
+        controller.robot_mode = 3
+        clock.advance(0.01)
+        assert len(follow.read(0.0)) == 5
+        with pytest.raises(DeviceFault, match="measure its joints"):
+            follow.read(0.1)
+
+
+def test_a_follower_refuses_another_arm(controller: Controller) -> None:
+    reader = ReaderInMemory(controller, "UR5e")
+    reader.info = replace(reader.info, model="UR10e")
+    with reader.follow() as follow, pytest.raises(DeviceFault, match="another model"):
+        follow.read(0.1)
 
 
 # ---------------------------------------------------------------------- who it is

@@ -4,7 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from drivers.ur.kinematics import MODELS, Pose, forward, model_named
+from drivers.ur.kinematics import MODELS, Pose, flange_poses, forward, model_named
+from tests.unit.drivers.ur.controller_in_memory import pose_from_ur
 
 # The constant tour: (number of the orientation, psi, q5, q6) in degrees, psi = q2 + q3 + q4.
 TOUR = [
@@ -57,18 +58,21 @@ def test_stretched_ur5e_by_hand() -> None:
     assert np.allclose(pose.R @ [0, 0, 1], [0, -1, 0], atol=1e-12)
 
 
-@given(pose_lists, pose_lists)
-def test_taking_the_tcp_off_again_gives_the_flange(flange: list[float], tcp: list[float]) -> None:
-    X_base_flange, X_flange_tcp = Pose.from_ur(flange), Pose.from_ur(tcp)
-    back = X_base_flange @ X_flange_tcp @ X_flange_tcp.inverse()
-    assert np.allclose(back.p_m, flange[:3], atol=1e-12)
-    assert np.allclose(Rotation.from_matrix(back.R).as_rotvec(), flange[3:], atol=1e-7)
+@given(st.lists(st.tuples(pose_lists, pose_lists), max_size=4))
+def test_taking_the_tcp_off_again_gives_the_flange(poses: list[tuple[list[float], list[float]]]) -> None:
+    tcps = [pose_from_ur(flange) @ pose_from_ur(tcp) for flange, tcp in poses]
+    tcp_poses = np.array([[*tcp.p_m, *Rotation.from_matrix(tcp.R).as_rotvec()] for tcp in tcps]).reshape(-1, 6)
+    R, p_m = flange_poses(tcp_poses, np.array([tcp for _, tcp in poses]).reshape(-1, 6))
+    assert (R.shape, p_m.shape) == ((len(poses), 3, 3), (len(poses), 3))
+    for k, (flange, _) in enumerate(poses):
+        assert np.allclose(p_m[k], flange[:3], atol=1e-12)
+        assert np.allclose(Rotation.from_matrix(R[k]).as_rotvec(), flange[3:], atol=1e-7)
 
 
 @given(pose_lists, st.tuples(*[st.floats(-1, 1)] * 3))
 def test_a_pose_moves_a_point_like_a_rotation_and_a_shift(pose: list[float], point: tuple[float, float, float]) -> None:
     p = np.array(point)
-    moved = (Pose.from_ur(pose) @ Pose(np.eye(3), p)).p_m
+    moved = (pose_from_ur(pose) @ Pose(np.eye(3), p)).p_m
     assert np.allclose(moved, Rotation.from_rotvec(pose[3:]).apply(p) + pose[:3], atol=1e-12)
 
 

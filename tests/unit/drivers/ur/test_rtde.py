@@ -1,9 +1,11 @@
+import math
 import os
 import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -47,7 +49,9 @@ def test_answers_are_read_from_the_documented_bytes() -> None:
     assert len(sample) == 84  # as documented for this recipe
     kind, data = rtde.take_package(bytearray(sample)) or (0, b"")
     assert kind == rtde.DATA
-    assert recipe.unpack(data) == [(12.5,), (3,), (1,), (2,), (1,), (-7,), (0,), *((float(k),) for k in range(6))]
+    recipe.check(data)
+    columns = recipe.columns([data, data])
+    assert [column.tolist() for column in columns] == [2 * [x] for x in (12.5, 3, 1, 2, 1, -7, 0, *range(6))]
 
 
 @given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=80)), max_size=6), st.integers(1, 40))
@@ -69,7 +73,8 @@ def test_decoding_is_total(data: bytes) -> None:
         while rtde.take_package(buffer) is not None:
             pass
         recipe = rtde.Recipe.decode(data)
-        recipe.unpack(data)
+        recipe.check(data)
+        recipe.columns([data])
     except ProtocolError:
         pass
     try:
@@ -145,6 +150,13 @@ def subscribe(server: Server) -> rtde.Subscription:
     return rtde.Subscription(server.host, OUTPUTS, 125.0, timeout_s=30.0)
 
 
+def values(stream: rtde.Subscription) -> list[dict[str, Any]]:
+    """Every sample that has arrived."""
+    columns = stream.decode(stream.read(30.0))
+    lists = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in lists]
+
+
 def test_samples_come_whole_and_in_order() -> None:
     with served() as server, closing(subscribe(server)) as stream:
         assert stream.version == (5, 15, 0, 1)
@@ -152,18 +164,49 @@ def test_samples_come_whole_and_in_order() -> None:
         text = rtde.encode(ord("M"), b"words of the controller")
         both = sample(1.0) + text + sample(2.0, 0.1, 0, 0.2, 0, 0, 1, safety_mode=3)
         server.send(both[:90])  # in the middle of the second
-        assert stream.read(30.0) == [(1.0,), (1,), (0.0,) * 6]
+        assert values(stream) == [{"timestamp": 1.0, "safety_mode": 1, "tcp_offset": [0.0] * 6}]
         with pytest.raises(TimeoutError):
             stream.read(0.01)
-        server.send(both[90:])
-        assert stream.read(30.0) == [(2.0,), (3,), (0.1, 0, 0.2, 0, 0, 1)]
+        server.send(both[90:] + sample(3.0))
+        second, third = values(stream)
+        assert second == {"timestamp": 2.0, "safety_mode": 3, "tcp_offset": [0.1, 0, 0.2, 0, 0, 1]}
+        assert third["timestamp"] == 3.0
+
+
+def test_a_read_empties_the_socket() -> None:
+    with served() as server, closing(subscribe(server)) as stream:
+        server.send(sample(1.0))
+        stream.read(30.0)
+        many = b"".join(sample(2.0 + k) for k in range(3000))  # more than three calls of recv
+        server.send(many)
+        received: list[bytes] = []
+        while len(received) < 3000:
+            received += stream.read(30.0)
+        assert stream.decode(received)["timestamp"].tolist() == [2.0 + k for k in range(3000)]
+
+
+@pytest.mark.parametrize(("major", "rate_Hz"), [(3, 125.0), (5, 500.0)])
+def test_no_controller_is_asked_for_more_than_its_own_rate(major: int, rate_Hz: float) -> None:
+    asked: list[float] = []
+
+    def answer(request: bytes) -> bytes:
+        if request[2] == rtde.SETUP_OUTPUTS:
+            asked.append(struct.unpack_from(">d", request, 3)[0])
+            return rtde.encode(rtde.SETUP_OUTPUTS, b"\x01" + b"DOUBLE")
+        version = rtde.encode(rtde.GET_CONTROLLER_VERSION, struct.pack(">4I", major, 10, 0, 0))
+        return {"V": ANSWER_PROTOCOL, "v": version, "S": ANSWER_START}[chr(request[2])]
+
+    with closing(Server(answer)) as server:
+        stream = rtde.Subscription(server.host, {"timestamp": "DOUBLE"}, math.inf, timeout_s=30.0)
+        assert asked == [stream.rate_Hz] == [rate_Hz]
+        stream.close()
 
 
 def test_outputs_that_a_controller_does_not_know_are_left_out() -> None:
     with served({"timestamp": "DOUBLE", "safety_mode": "INT32"}) as server, closing(subscribe(server)) as stream:
         assert stream.missing == ["tcp_offset"]
         server.send(rtde.encode(rtde.DATA, b"\x01" + struct.pack(">di", 7.0, 3)))
-        assert stream.read(30.0) == [(7.0,), (3,)]
+        assert values(stream) == [{"timestamp": 7.0, "safety_mode": 3}]
 
 
 def test_a_lost_connection_is_raised() -> None:

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from drivers.clock import Clock
 from drivers.errors import ConnectError, StreamBroken
@@ -47,13 +48,17 @@ class SubscriptionInMemory:
         self._t_s = 100.0
         return self
 
-    def read(self, timeout_s: float) -> list[tuple[float, ...]]:
+    def read(self, timeout_s: float) -> list[tuple[float, list[float]]]:
         assert timeout_s <= 0.05
         self._clock.advance(CYCLE_S)
         if self._clock.now_s() > self._ends_s:
             raise ConnectionResetError
         self._t_s = self.times.pop(0) if self.times else self._t_s + CYCLE_S
-        return [(self._t_s,), tuple(self.raw)]
+        return [(self._t_s, self.raw)]
+
+    def decode(self, samples: list[tuple[float, list[float]]]) -> dict[str, NDArray[np.float64]]:
+        times, raw = zip(*samples, strict=True)
+        return {"timestamp": np.array(times), "ft_raw_wrench": np.array(raw)}
 
     def close(self) -> None: ...
 

@@ -153,11 +153,11 @@ def test_the_final_report_says_both_unless_the_result_is_refused() -> None:
 def test_a_wrong_payload_is_told_once_when_the_fit_knows_and_at_the_end(lab: Lab) -> None:
     lab.arm.set_status(payload_kg=2.5)
     outcome = lab.calibrate()
-    words = [event for event in lab.operator.told if isinstance(event, Noted) and "PolyScope" in event.words]
+    words = [event for event in lab.operator.shown if isinstance(event, Noted) and "PolyScope" in event.words]
     assert len(words) == 1
     assert words[0].warning
     assert "2.50 kg, but 1.20 kg hang" in words[0].words
-    before = lab.operator.told[: lab.operator.told.index(words[0])]
+    before = lab.operator.shown[: lab.operator.shown.index(words[0])]
     assert [event.stop for event in before if isinstance(event, PoseTaken)] == [1, 2, 3, 4, 5, 6]
     (weighed,) = lab.operator.of(Weighed)
     assert weighed.mass_kg == pytest.approx(MEASURED_KG, abs=0.05)
@@ -183,7 +183,7 @@ def test_a_run_goes_on_with_the_mass_of_the_sensor_as_it_is_known_now(lab: Lab) 
     lab.arm.set_status(payload_kg=2.8)
     lab.calibrate()
     assert "PolyScope" in lab.said()
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     lab.cell = replace(lab.cell, sensor=SensorConfig("fake://", mass_kg=1.6))
     lab.calibrate(resume=lab.run().folder, redo=(4,))
     assert "PolyScope" not in lab.said()
@@ -205,7 +205,7 @@ def test_a_payload_that_was_corrected_before_the_run_goes_on_is_no_longer_report
     run = lab.run()
     with (run.folder / "events.ndjson").open("a") as file:
         file.write('{"event": "weigh')  # the power went
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     lab.arm.set_status(payload_kg=1.3)
     again = lab.calibrate(resume=run.folder, redo=(4,))
     assert "PolyScope" not in lab.said()

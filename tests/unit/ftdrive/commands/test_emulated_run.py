@@ -1,4 +1,4 @@
-"""What a calibration of an emulated cell tells: no folder that is gone afterwards, and commands that can be typed."""
+"""The events of an emulated calibration name no folder that is gone afterwards, and commands that can be typed."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -16,7 +16,7 @@ from ftdrive.session.events import Event, Noted, RunOpened
 STATION: Any = SimpleNamespace(sensor="can", options=(), truth={"mass_kg": 0.5}, cell=None)
 
 
-class Told:
+class Listener:
     def __init__(self) -> None:
         self.events: list[Event] = []
 
@@ -24,14 +24,14 @@ class Told:
         self.events.append(event)
 
 
-@pytest.mark.parametrize(("kept", "told"), [(True, [RunOpened, Noted, Noted]), (False, [Noted])])
+@pytest.mark.parametrize(("kept", "expected"), [(True, [RunOpened, Noted, Noted]), (False, [Noted])])
 def test_of_a_run_that_is_not_kept_nobody_is_told_where_it_is(
-    kept: bool, told: list[type[Event]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kept: bool, expected: list[type[Event]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, person = str(tmp_path / "2026-simulated"), Told()
+    folder, person = str(tmp_path / "2026-simulated"), Listener()
 
     @contextmanager
-    def open_operator() -> Iterator[Told]:
+    def open_operator() -> Iterator[Listener]:
         yield person
 
     def calibrate(_: object, operator: Any, options: Any) -> SimpleNamespace:
@@ -44,7 +44,7 @@ def test_of_a_run_that_is_not_kept_nobody_is_told_where_it_is(
     monkeypatch.setattr(emulated_run, "open_operator", open_operator)
     monkeypatch.setattr(emulated_run, "calibrate", calibrate)
     emulated_run.rehearse(STATION, tmp_path, "simulated", kept=kept)
-    assert [type(event) for event in person.events] == told
+    assert [type(event) for event in person.events] == expected
 
 
 @pytest.mark.parametrize(("environment", "command"), [("1", "   uv run ftdrive "), (None, "   ftdrive ")])
@@ -61,7 +61,7 @@ def test_the_demo_names_its_next_commands_as_they_can_be_typed(
     monkeypatch.setattr(demo, "rehearse", lambda *_: outcome)
     monkeypatch.setattr(demo, "print_result", lambda *_, **__: None)
     with capsys.disabled():
-        told = CliRunner().invoke(demo.demo, catch_exceptions=False).stderr
-    lines = [line for line in told.splitlines() if "runs/a" in line and "Saved" not in line]
+        shown = CliRunner().invoke(demo.demo, catch_exceptions=False).stderr
+    lines = [line for line in shown.splitlines() if "runs/a" in line and "Saved" not in line]
     assert len(lines) == 2
     assert all(line.startswith(command) for line in lines)

@@ -136,3 +136,26 @@ def test_a_cell_in_millimetres_becomes_what_judges_moves() -> None:
 def test_a_cell_that_cannot_be_is_refused(changed: CellConfig, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         certifier_for(changed, "ur5e")
+
+
+PILLAR = Box((-0.2, -0.39, 0.0), (-0.08, -0.26, 1.2))
+"""Where the flange stands in the usual posture."""
+
+
+def panned_deg(angle: float) -> Array:
+    return USUAL_POSTURE_RAD + np.radians([angle, 0, 0, 0, 0, 0])
+
+
+def test_a_pillar_in_the_way_is_passed_on_a_proven_path() -> None:
+    certifier = Certifier(ArmModel("UR5e", TOOL), Scene((BASE_PLANE,), (PILLAR,)))
+    now, first = panned_deg(-60), panned_deg(60)
+    approach = plan_approach(certifier, now, first, SLOW)
+    assert len(approach.q_rad) == 2
+    assert np.array_equal(approach.q_rad[-1], first)
+    assert sampled_clear(certifier, now, approach)
+
+
+def test_a_first_pose_that_is_not_clear_asks_for_a_new_plan() -> None:
+    certifier = Certifier(ArmModel("UR5e", TOOL), Scene((BASE_PLANE,), (PILLAR,)))
+    with pytest.raises(PlanRefused, match="first pose of the plan is not clear"):
+        plan_approach(certifier, panned_deg(-60), panned_deg(40), SLOW)

@@ -1,4 +1,4 @@
-"""Cells that cannot be: what is told to whom described one, and that nothing possible is refused."""
+"""Impossible cells are refused with a reason, and possible ones are not."""
 
 from collections.abc import Sequence
 

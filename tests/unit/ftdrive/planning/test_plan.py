@@ -194,6 +194,14 @@ def test_shortest_tour_is_the_best_of_all() -> None:
     assert shortest_tour(cost, group, allowed) is None
 
 
+def test_a_tour_has_three_groups_at_least() -> None:
+    everything = np.ones((3, 3), dtype=bool)
+    tour = shortest_tour(np.ones((3, 3)), np.arange(3), everything)
+    assert tour is not None
+    assert sorted(tour) == [0, 1, 2]
+    assert shortest_tour(np.ones((2, 2)), np.arange(2), everything[:2, :2]) is None
+
+
 @pytest.mark.slow
 def test_random_plans_sampled_at_half_a_degree_are_clear() -> None:
     rng = np.random.default_rng(7)

@@ -1,7 +1,8 @@
-"""Poses that somebody else moves the arm to: which are taken, what is told, when it ends. The clock is simulated."""
+"""Poses that another client moves the arm to: which are taken, what is shown, when it ends. The clock is simulated."""
 
 import re
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from calib.errors import TooFewSamples
 from calib.model import Array
 from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
 from drivers.errors import DeviceFault, DeviceTimeout, StreamBroken
+from drivers.follow import Follow
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
 from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.hand_guided import Recorder, collect_manually
@@ -52,7 +54,7 @@ def status(program: str = "playing", fault: DeviceFault | None = None) -> ArmSta
 
 
 class Cell(ForceTorqueSensor):
-    """An arm that somebody moves from dwell to dwell, and its sensor; both make time pass."""
+    """An arm that another client moves from dwell to dwell, and its sensor; both make time pass."""
 
     def __init__(self, dwells: Sequence[Dwell]) -> None:
         self.dwells = dwells
@@ -120,6 +122,9 @@ class Cell(ForceTorqueSensor):
     def identify(self) -> DeviceInfo:
         raise AssertionError
 
+    def follow(self) -> AbstractContextManager[Follow[FtSamples]]:
+        raise AssertionError
+
     def latest(self, *, timeout_s: float) -> FtSamples:
         raise AssertionError(timeout_s)
 
@@ -163,10 +168,10 @@ class Person:
         self.cell = cell
         self.has_keys = has_keys
         self.keys = keys | {cell.end_s + 20: Key.STOP}
-        self.told: list[Event] = []
+        self.shown: list[Event] = []
 
     def show(self, event: Event) -> None:
-        self.told.append(event)
+        self.shown.append(event)
 
     def ask(self, question: Question) -> str:
         raise AssertionError(question)
@@ -179,7 +184,7 @@ class Person:
         return self.keys.pop(due) if self.cell.now_s >= due else None
 
     def words(self) -> str:
-        return "\n".join(event.words for event in self.told if isinstance(event, Noted))
+        return "\n".join(event.words for event in self.shown if isinstance(event, Noted))
 
 
 @dataclass
@@ -252,7 +257,7 @@ class Outcome:
 
     def _commit(self, record: PoseRecord) -> None:
         self.kept.append(record)
-        self.person.told.append(Noted(words=f"committed {record.stop}"))
+        self.person.shown.append(Noted(words=f"committed {record.stop}"))
 
     @property
     def stops(self) -> list[int]:
@@ -278,19 +283,19 @@ def test_every_standstill_at_a_new_orientation_is_a_pose() -> None:
 
 
 def test_a_pose_is_on_disk_before_it_is_told() -> None:
-    told = Outcome(dwells(UP, DOWN)).person.told
+    shown = Outcome(dwells(UP, DOWN)).person.shown
     kinds = [
         event.words if isinstance(event, Noted) else event.state.value if isinstance(event, StateChanged) else "pose"
-        for event in told
+        for event in shown
         if not isinstance(event, Estimated)
     ]
     one = ["settle", "sample", "committed 1", "pose", "move"]
     assert kinds[1:-1] == ["move", *one, *(words.replace("1", "2") for words in one)]
-    taken = next(event for event in told if isinstance(event, PoseTaken))
+    taken = next(event for event in shown if isinstance(event, PoseTaken))
     np.testing.assert_allclose(taken.gravity_flange, [0, 0, -1])
     assert 1.0 <= taken.settle_s < 1.15
     assert taken.attempts == 1
-    estimates = [event for event in told if isinstance(event, Estimated)]
+    estimates = [event for event in shown if isinstance(event, Estimated)]
     assert [event.hint for event in estimates] == ["point it down"] * 2
 
 
@@ -318,10 +323,10 @@ def test_a_repeat_is_told_once_and_left_out(turn_deg: float) -> None:
 def test_a_repeat_once_the_poses_are_enough_names_the_key_that_finishes() -> None:
     near = Rotation.from_euler("y", 5.0, degrees=True)
     outcome = Outcome(dwells(UP, near, DOWN, LEFT, RIGHT, FRONT, BACK, near), keys={40.0: Key.KEEP})
-    told = [words for words in outcome.person.words().splitlines() if words.startswith("This is pose 1 again")]
+    repeats = [words for words in outcome.person.words().splitlines() if words.startswith("This is pose 1 again")]
     left_out = "This is pose 1 again, 5° from it: it is left out."
-    assert [words.startswith(left_out) for words in told] == [True, True]
-    assert ["Press k" in words for words in told] == [False, True]
+    assert [words.startswith(left_out) for words in repeats] == [True, True]
+    assert ["Press k" in words for words in repeats] == [False, True]
 
 
 def test_a_quarter_turn_about_gravity_is_no_repeat() -> None:
@@ -333,17 +338,17 @@ def test_keep_ends_it_when_the_poses_are_enough_and_not_before() -> None:
     words = outcome.person.words()
     assert "The light is amber" in words
     assert words.count("press k to finish") == 1
-    moves = [event.words for event in outcome.person.told if isinstance(event, StateChanged) and event.words]
+    moves = [event.words for event in outcome.person.shown if isinstance(event, StateChanged) and event.words]
     move_on = "move on to another orientation"
     assert moves[:5] == [move_on] * 5
     assert "press k" in moves[5]  # the screen says so all the time
-    assert outcome.person.told[-1].to_dict()["words"] == "Finished: 6 poses are kept."
+    assert outcome.person.shown[-1].to_dict()["words"] == "Finished: 6 poses are kept."
     assert outcome.cell.now_s == pytest.approx(32.0, abs=0.2)
 
 
 def test_stop_ends_it_at_any_time_and_says_what_is_missing() -> None:
     outcome = Outcome(dwells(UP, DOWN), keys={5.0: Key.STOP})
-    last = outcome.person.told[-1]
+    last = outcome.person.shown[-1]
     assert isinstance(last, Noted)
     assert last.warning
     assert last.words.startswith("Stopped: 1 pose is kept")
@@ -408,14 +413,14 @@ def test_keys_pressed_while_a_pose_is_averaged_mean_what_is_shown_then() -> None
 
 @pytest.mark.parametrize("listen", [False, True])
 def test_a_pose_that_is_done_with_is_no_longer_measured_on_the_screen(listen: bool) -> None:
-    told = Outcome(dwells(UP, DOWN, UP), listen=listen).person.told
+    shown = Outcome(dwells(UP, DOWN, UP), listen=listen).person.shown
     after = False
-    for event in told:
+    for event in shown:
         if isinstance(event, StateChanged):
             assert not after or (event.state is State.MOVE and event.words)
             after = False
         after |= isinstance(event, PoseTaken) or (isinstance(event, Noted) and "left out" in event.words)
-    words = [event.words for event in told if isinstance(event, StateChanged) and event.words]
+    words = [event.words for event in shown if isinstance(event, StateChanged) and event.words]
     assert words == (["the program goes on"] if listen else ["move on to another orientation"]) * 3
 
 
@@ -475,7 +480,7 @@ def test_a_hand_on_the_tool_is_named_and_the_pose_taken_again() -> None:
     words = outcome.person.words()
     assert re.search(r"fy scatters by 1\.\d N, .* 0\.0[45]", words)
     assert "Let go of" in words
-    assert [event.attempts for event in outcome.person.told if isinstance(event, PoseTaken)] == [1, 2, 1]
+    assert [event.attempts for event in outcome.person.shown if isinstance(event, PoseTaken)] == [1, 2, 1]
     assert np.abs(outcome.kept[1].mean.mean[1] - BIAS[1]) < 0.05  # without the hand
 
 
@@ -497,7 +502,7 @@ def test_a_mean_that_changes_is_seen_at_the_first_pose_too() -> None:
 def test_a_pose_that_the_others_contradict_is_asked_about(residual: tuple[float, float] | None, asked: bool) -> None:
     words = Outcome(dwells(*AROUND), fit=Fit(residual=residual)).person.words()
     assert ("Pose 6 is 3.2 N" in words) == asked
-    assert "Pose 5 is" not in words  # too few to tell
+    assert "Pose 5 is" not in words  # too few to judge
 
 
 def test_nothing_is_measured_while_the_controller_reports_a_fault() -> None:
@@ -533,7 +538,7 @@ def test_listening_ends_when_the_program_is_back_at_its_first_pose() -> None:
     assert "dwell 3.3 s" in words
     assert "first pose: 7 poses" in words
     assert not any(hint in words for hint in ("press k", "Turn the tool"))
-    assert {event.hint for event in outcome.person.told if isinstance(event, Estimated)} == {""}
+    assert {event.hint for event in outcome.person.shown if isinstance(event, Estimated)} == {""}
 
 
 def test_a_program_that_passes_its_first_pose_is_followed_to_its_end() -> None:
@@ -609,4 +614,4 @@ def test_a_disk_that_is_full_ends_it() -> None:
             down_base=FLOOR,
             listen=False,
         )
-    assert not any(isinstance(event, PoseTaken) for event in person.told)
+    assert not any(isinstance(event, PoseTaken) for event in person.shown)

@@ -97,7 +97,7 @@ def test_at_the_end_of_a_tour_the_running_fit_is_the_solvers() -> None:
         np.testing.assert_array_equal(last.sigma[name], sigma)
     assert last.light == "green"
     assert last.hint == ""
-    # The sigmas shrink as poses come in, and they tell the error.
+    # The sigmas shrink as poses come in, and they match the error.
     first = next(event for event in events if event.values)
     assert last.sigma["mass_kg"] < 0.8 * first.sigma["mass_kg"]
     assert (
@@ -243,12 +243,12 @@ def test_the_return_to_the_first_pose_changes_no_estimate_but_is_compared() -> N
 def test_the_prediction_waits_until_it_can_be_trusted_and_is_then_right() -> None:
     running, taken = Running(), tour()
     R = special([24])[0]
-    told = []
+    predictions = []
     for one in taken:
         running.add(one)
-        told.append(running.predict(R))
-    assert all(wrench is None for wrench in told[:5])
-    known = [wrench for wrench in told if wrench is not None]
+        predictions.append(running.predict(R))
+    assert all(wrench is None for wrench in predictions[:5])
+    known = [wrench for wrench in predictions if wrench is not None]
     assert len(known) >= 12
     for wrench in known:
         assert np.linalg.norm((wrench - predict(TRUTH, R))[:3]) < 0.1 * np.linalg.norm(TRUTH.gravity_force_base_N)
@@ -265,8 +265,8 @@ def test_an_arm_on_a_wall_is_seen_as_such_once_the_fit_knows() -> None:
     R = special(range(1, 25))
     event = run([record(stop, one, stop, truth=wall) for stop, one in enumerate(R, start=1)])
     assert event.faces == faces(-R[:, 1])
-    told = Running(down_base=(0, -1, 0)).add(record(1, R[0], 1, truth=wall))
-    assert told.faces == faces(-R[:1, 1])
+    estimate = Running(down_base=(0, -1, 0)).add(record(1, R[0], 1, truth=wall))
+    assert estimate.faces == faces(-R[:1, 1])
 
 
 def test_drift_is_told_with_the_estimates() -> None:

@@ -58,11 +58,19 @@ def test_a_tour_that_would_wind_up_the_cable_is_refused(lab: Lab, tmp_path: Path
     assert lab.calibrate(dry_run=True, output=made_there) is None
     assert "wrist 3 stands at -90°" in next(e.words for e in lab.operator.of(Checked) if e.name == "cable")
     lab.arm.q[5] = np.radians(160)
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     refuse_plan = pytest.raises(NotAccepted, match=r"160°.* -?\d+° and -?\d+°")
     with refuse_plan:
         lab.calibrate(plan=made_there)
     assert lab.arm.moves == []
+
+
+def test_a_plan_that_has_run_before_does_not_excuse_a_wound_cable(lab: Lab) -> None:
+    lab.calibrate()
+    lab.arm.q[5] -= 2 * np.pi
+    lab.operator.shown.clear()
+    with pytest.raises(NotAccepted, match="wrist 3 stands at"):
+        lab.calibrate(plan=lab.run().folder / "plan.json")
 
 
 def test_a_payload_that_is_not_that_of_the_tool_is_refused(lab: Lab) -> None:

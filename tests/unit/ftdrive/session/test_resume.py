@@ -158,7 +158,7 @@ def test_skip_of_the_first_pose_while_it_is_taken_again_keeps_it_and_names_the_r
     assert outcome is not None
     assert outcome.result.n_poses == 6
     assert outcome.drift is None
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     outcome = lab.calibrate(resume=lab.run().folder)
     assert lab.taken() == [7]
     assert outcome is not None
@@ -167,7 +167,7 @@ def test_skip_of_the_first_pose_while_it_is_taken_again_keeps_it_and_names_the_r
 
 def test_a_pose_of_a_run_that_redo_names_stays_when_it_is_skipped(lab: Lab) -> None:
     lab.calibrate()
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     lab.operator.answers["Pose 3 of 7"] = ["s"]
     outcome = lab.calibrate(resume=lab.run().folder, redo=(3,), mode="step")
     assert lab.taken() == []
@@ -237,14 +237,14 @@ def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None
     with pytest.raises(Declined):
         lab.calibrate()
     run = lab.run()
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     outcome = lab.calibrate(resume=run.folder)
     assert outcome is not None
     assert outcome.run.folder == run.folder
     assert [event.stop for event in lab.operator.of(PoseTaken)] == [4, 5, 6, 7]
-    assert len((run.folder / "events.ndjson").read_text().splitlines()) > len(lab.operator.told)
+    assert len((run.folder / "events.ndjson").read_text().splitlines()) > len(lab.operator.shown)
     first = run.calibration_path.read_bytes()
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     assert lab.calibrate(resume=run.folder, redo=(3,)) is not None
     assert [event.stop for event in lab.operator.of(PoseTaken)] == [3]
     assert run.calibration_path.name == "calibration-2.json"
@@ -270,12 +270,12 @@ def test_a_resumed_run_is_open_with_its_poses_before_anything_is_checked(lab: La
     with pytest.raises(Declined):
         lab.calibrate()
     run = lab.run()
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     assert lab.calibrate(resume=run.folder, dry_run=True) is None
-    kinds = [type(event) for event in lab.operator.told]
+    kinds = [type(event) for event in lab.operator.shown]
     assert kinds.count(RunOpened) == 1
     assert kinds.index(RunOpened) < kinds.index(Checked)
-    before = lab.operator.told[: kinds.index(Checked)]
+    before = lab.operator.shown[: kinds.index(Checked)]
     assert [event.poses for event in before if isinstance(event, Estimated)] == [1, 2, 3]
 
 
@@ -295,7 +295,7 @@ def test_a_run_is_not_gone_on_with_another_tool(lab: Lab) -> None:
 def broken_off(lab: Lab, url: str = "fake://", **facts: Any) -> Path:
     """Begin a run and stop it at its third move."""
     lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, url=url))
-    tells(lab, facts=facts)
+    reports(lab, facts=facts)
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
     with pytest.raises(Declined):
         lab.calibrate()
@@ -303,7 +303,7 @@ def broken_off(lab: Lab, url: str = "fake://", **facts: Any) -> Path:
     return lab.run().folder
 
 
-def tells(lab: Lab, model: str = "fake", serial: str = "S1", facts: dict[str, Any] | None = None) -> None:
+def reports(lab: Lab, model: str = "fake", serial: str = "S1", facts: dict[str, Any] | None = None) -> None:
     """Let the sensor say who it is."""
     known = {name: Fact(value, "device") for name, value in (facts or {}).items()}
     lab.sensor.identify = lambda: DeviceInfo(model, serial, "1", known)  # type: ignore[method-assign]
@@ -324,7 +324,7 @@ def test_a_sensor_without_a_serial_number_is_the_same_where_its_model_is(
     folder = broken_off(lab)
     header = folder / "run.json"
     header.write_text(header.read_text().replace('"fake"', f'"{then[0]}"').replace('"S1"', f'"{then[1]}"'))
-    tells(lab, *now)
+    reports(lab, *now)
     if not cure:
         assert lab.calibrate(resume=folder) is not None
         return
@@ -370,7 +370,7 @@ def test_a_run_is_not_gone_on_where_the_numbers_mean_something_else(
     begun = {"counts_per_N": 100.0, "counts_per_Nm": 1000.0, "range": (300.0,) * 6}
     folder = broken_off(lab, "ati-can://can0", **begun)
     lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, url=url))
-    tells(lab, facts=begun | facts)
+    reports(lab, facts=begun | facts)
     if not changed:
         assert lab.calibrate(resume=folder) is not None
         return
@@ -390,7 +390,7 @@ def test_a_run_by_hand_goes_on_by_hand(mode: str, lab: Lab) -> None:
     run = lab.run()
     assert not lab.arm.control
     for asked in ("auto", mode):
-        lab.operator.told.clear()
+        lab.operator.shown.clear()
         lab.operator.keys = [Key.STOP]
         with pytest.raises(Declined, match="ended before the first pose"):
             lab.calibrate(resume=run.folder, mode=asked)
@@ -404,7 +404,7 @@ def test_a_run_by_hand_goes_on_by_hand(mode: str, lab: Lab) -> None:
 
 
 def by_hand(lab: Lab, at_pose: Callable[[int], None] = lambda _: None) -> None:
-    """Let somebody take the arm on after each pose; nobody has keys."""
+    """Another client moves the arm on after each pose; there are no keys."""
     poses, clock_s, state = constant_tour(lab.arm.q), count(step=0.6), lab.arm.state
 
     def on_event(event: Event) -> None:
@@ -426,7 +426,7 @@ def test_by_hand_and_without_keys_the_session_ends_with_a_calibration(lab: Lab) 
 
 def test_by_hand_on_a_wall_a_pose_is_shown_on_the_face_where_it_counts(lab: Lab) -> None:
     def at_pose(stop: int) -> None:
-        if stop == 4:  # from here on the fit would tell how the base leans
+        if stop == 4:  # from here on the fit would show how the base leans
             raise KeyboardInterrupt
 
     lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting="wall"))
@@ -501,5 +501,5 @@ def test_a_run_of_another_sensor_is_not_gone_on_with(lab: Lab) -> None:
 def test_what_the_sensor_went_through_is_written_down(lab: Lab) -> None:
     lab.sensor.events = ((17, "connected again"),)
     lab.calibrate()
-    told = [event for event in lab.operator.of(Noted) if "connected again" in event.words]
-    assert len(told) == 1
+    reconnected = [event for event in lab.operator.of(Noted) if "connected again" in event.words]
+    assert len(reconnected) == 1

@@ -105,14 +105,14 @@ FAULTS: dict[str, tuple[int, Callable[[Lab], None], Callable[[Lab], None], type[
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_on_the_way_stops_the_arm_and_resume_goes_on(fault: str, lab: Lab) -> None:
-    hazard, inject, mend, _ = FAULTS[fault]
+    hazard, inject, repair, _ = FAULTS[fault]
     lab.arm.at_move[4] = lambda: inject(lab)
 
     def on_event(event: Event) -> None:
         if isinstance(event, StateChanged) and event.state is State.HOLD:
             assert lab.arm.halted.is_set()
             assert lab.stops() == [1, 2, 3]
-            mend(lab)
+            repair(lab)
 
     lab.operator.on_event = on_event
     lab.operator.answers["resume:"] = ["resume"]
@@ -419,15 +419,15 @@ def test_saturated_samples_discard_the_pose(lab: Lab, monkeypatch: pytest.Monkey
 QUESTIONS = ("Is the tool free", "Is the ball of", "Is the emergency stop in reach")
 
 
-def hold_and_resume(lab: Lab, fault: Callable[[], None], mend: Callable[[], None]) -> None:
+def hold_and_resume(lab: Lab, fault: Callable[[], None], repair: Callable[[], None]) -> None:
     """Let something stop the arm in its fourth move, and be gone when the operator is asked."""
 
     def on_event(event: Event) -> None:
         if isinstance(event, StateChanged) and event.state is State.HOLD:
             lab.operator.asked.clear()
-            lab.operator.told.clear()
+            lab.operator.shown.clear()
             lab.arm.asked_limits = 0
-            mend()
+            repair()
 
     lab.arm.at_move[4] = fault
     lab.operator.on_event = on_event
@@ -468,11 +468,11 @@ def test_the_controller_is_asked_for_every_pose_once_more_but_not_for_the_ways_b
 
 
 def test_what_became_wrong_while_the_arm_stood_is_found_before_it_goes_on(lab: Lab) -> None:
-    def mend() -> None:
+    def repair() -> None:
         lab.sensor.push = np.zeros(6)
-        lab.arm.remote = False  # and meanwhile somebody took the arm to the pendant
+        lab.arm.remote = False  # meanwhile the operator switched to local control
 
-    def told(event: Event) -> None:
+    def on_event(event: Event) -> None:
         if isinstance(event, Noted) and event.words.startswith("not yet"):
             lab.arm.remote = True
         held(event)
@@ -482,9 +482,9 @@ def test_what_became_wrong_while_the_arm_stood_is_found_before_it_goes_on(lab: L
 
     def held(event: Event) -> None:
         if isinstance(event, StateChanged) and event.state is State.HOLD:
-            mend()
+            repair()
 
-    lab.operator.on_event = told
+    lab.operator.on_event = on_event
     lab.calibrate()
     (refused,) = [event.words for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
     assert "remote: local control" in refused

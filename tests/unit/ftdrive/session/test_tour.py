@@ -51,7 +51,7 @@ def test_the_states_follow_one_another_and_all_is_written_down(lab: Lab) -> None
     assert [event.stop for event in lab.operator.of(PoseTaken)] == [1, 2, 3, 4, 5, 6, 7]
     run = lab.run()
     lines = (run.folder / "events.ndjson").read_text().splitlines()
-    assert len(lines) == len(lab.operator.told)
+    assert len(lines) == len(lab.operator.shown)
     assert outcome.drift is not None
     assert {path.name for path in run.folder.iterdir()} >= {"plan.json", "run.json", "dataset.json", "calibration.json"}
 
@@ -68,7 +68,7 @@ def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> 
 def test_the_diary_says_where_nobody_was_asked(lab: Lab) -> None:
     lab.calibrate(yes=True)  # a first run: --yes answers nothing
     assert {event.by for event in lab.operator.of(Asked)} == {"person"}
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     lab.operator.asked.clear()
     lab.operator.answers["tool free"] = ["no"]
     lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 0, 5.0])
@@ -128,7 +128,7 @@ def test_how_long_to_average_is_chosen_from_the_noise_of_the_sensor(lab: Lab) ->
     lab.cell = replace(lab.cell, sampling=Sampling())
     lab.calibrate()
     assert {pose.average_s for pose in lab.operator.of(PoseTaken)} == {1.0}
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     lab.sensor.rng = np.random.default_rng(0)
     lab.sensor.noise = np.repeat([0.8, 0.001], 3)  # of 100 samples a second: 2 s give 0.057 N
     lab.calibrate()
@@ -166,7 +166,7 @@ def test_a_run_that_was_ended_does_not_count_as_complete(lab: Lab) -> None:
 
 
 def has_run(lab: Lab) -> bool:
-    """Tell whether the plan of the run counts as run to its end."""
+    """Return whether the plan of the run counts as run to its end."""
     return has_completed("A1", str(Plan.load(lab.run().plan_path).to_dict()["sha256"]))
 
 
@@ -191,12 +191,12 @@ def test_a_skipped_pose_counts_against_the_plan_though_resume_takes_it(lab: Lab)
     lab.calibrate(mode="step")
     assert "slow again" in lab.said()
     assert "from poses 2 and 3 on" in lab.said()
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     lab.calibrate(resume=lab.run().folder, mode="auto")
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     assert not has_run(lab)
     assert "slow again" in lab.said()
-    lab.operator.told.clear()
+    lab.operator.shown.clear()
     lab.calibrate(resume=lab.run().folder)  # nothing is left to take: nothing to be said of moves
     assert "slow again" not in lab.said()
     lab.calibrate(resume=lab.run().folder, redo=(1, 2, 3, 4, 5, 6, 7), fast=True)
@@ -247,7 +247,7 @@ def test_an_arm_that_tells_no_serial_number_runs_slowly_each_time_and_the_reason
     lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
     for _ in range(2):
         lab.arm.moves.clear()
-        lab.operator.told.clear()
+        lab.operator.shown.clear()
         lab.operator.asked.clear()
         lab.calibrate(fast=True, yes=True)
         assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
@@ -280,15 +280,15 @@ def test_the_plan_is_shown_before_the_checks_and_kept_where_asked(lab: Lab) -> N
     with pytest.raises(NotAccepted):
         lab.calibrate(dry_run=True, output=path)
     (shown,) = lab.operator.of(Planned)
-    assert lab.operator.told.index(shown) < lab.operator.told.index(lab.operator.of(Checked)[0])
+    assert lab.operator.shown.index(shown) < lab.operator.shown.index(lab.operator.of(Checked)[0])
     words = in_words(shown)
     for figure in ("wrist 3", "Nearest", "ball of 0.3", "Predicted", "1 move (wrist 1 ", "proven clear by"):
         assert figure in words
     assert "whole arm" not in words
-    told = json.loads(json.dumps(shown.to_dict(), allow_nan=False))
-    assert told["event"] == "planned"
-    assert told["plan"] == json.loads(path.read_text())
-    np.testing.assert_allclose(told["way_rad"], [lab.arm.q, told["plan"]["steps"][0]["q_rad"]])
+    written = json.loads(json.dumps(shown.to_dict(), allow_nan=False))
+    assert written["event"] == "planned"
+    assert written["plan"] == json.loads(path.read_text())
+    np.testing.assert_allclose(written["way_rad"], [lab.arm.q, written["plan"]["steps"][0]["q_rad"]])
     assert not Plan.load(path).measured
     lab.cell = replace(lab.cell, workcell=WorkcellConfig(measured=True))
     with pytest.raises(FileExistsError):
@@ -329,7 +329,7 @@ def test_a_run_that_goes_on_from_elsewhere_is_confirmed_by_a_person(lab: Lab) ->
     lab.calibrate()  # trusted from here on
     for joint, assumed in ((5, True), (0, False)):
         lab.operator.asked.clear()
-        lab.operator.told.clear()
+        lab.operator.shown.clear()
         lab.arm.moves.clear()
         lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
         with pytest.raises(Declined):
@@ -370,7 +370,7 @@ def test_step_mode_waits_for_enter_before_each_move(lab: Lab) -> None:
     third = np.array(Plan.load(lab.run().plan_path).steps[2].q_rad)
     assert min(np.abs(goal - third).max() for goal, *_ in lab.arm.moves) > np.radians(5)  # never sent there
     (way,) = [question for question in lab.operator.asked if "the way to pose 4" in question.text]
-    assert way.text.startswith("The arm goes")  # certified anew, shown, and confirmed
+    assert way.text.startswith("The arm goes")  # certified again, shown, and confirmed
     assert lab.arm.moves[2][1] <= np.radians(15) + 1e-9
     asked = [question.text.split(",")[0] for question in lab.operator.asked if question.text.startswith("Pose")]
     assert asked == [f"Pose {stop} of 7" for stop in (1, 2, 3, 4, 5, 4, 5, 6, 7)]

@@ -306,18 +306,18 @@ def test_the_thread_looks_by_itself_and_ends_with_its_block() -> None:
 
 def test_the_thread_stops_an_arm_that_does_not_answer_the_stop() -> None:
     arm = real_arm()
-    answered, told = threading.Event(), threading.Event()
+    answered, reported = threading.Event(), threading.Event()
     stop = arm.stop
 
     def slow() -> None:
-        assert told.wait(60.0), "it is told meanwhile"
+        assert reported.wait(60.0), "the hazard is reported meanwhile"
         stop()
         answered.set()
 
     arm.stop = slow  # type: ignore[method-assign]  # this arm only
     with (
         trips(16),
-        Watcher(arm, FakeSensor(arm), [], lambda _: told.set(), clock=REAL, limits=Limits()) as watcher,
+        Watcher(arm, FakeSensor(arm), [], lambda _: reported.set(), clock=REAL, limits=Limits()) as watcher,
     ):
         watcher.begin()
         with watcher.watching(arm.q, arm.q, moving=False):

@@ -1,6 +1,7 @@
 """How the emulated arm moves: trapezoids on time, no jumps whatever is commanded, one owner at a time."""
 
 import math
+from collections.abc import Iterator
 from random import Random
 
 import numpy as np
@@ -41,7 +42,7 @@ def test_trapezoid_takes_length_over_speed_plus_one_ramp(
     profile = Trapezoid(length, speed, acceleration)
     assert profile.duration_s == pytest.approx(duration_s)
     times = np.linspace(0.0, duration_s, 2001) if duration_s else np.zeros(1)
-    way = np.array([profile.at(t) for t in times])
+    way = np.array([profile.at(t)[0] for t in times])
     assert way[0] == pytest.approx(0.0)
     assert way[-1] == pytest.approx(length)
     if duration_s:
@@ -213,3 +214,76 @@ def test_the_set_point_never_jumps_whatever_is_commanded(order: list[tuple[str, 
             arm.step(DT)
             assert max(abs(a - b) for a, b in zip(arm.q, before, strict=True)) <= 3.0 * DT
             assert max(abs(a - b) for a, b in zip(arm.qd, before_rate, strict=True)) <= 0.1
+
+
+def joint_move(arm: Arm) -> None:
+    arm.start(JointMove(DH, vector6(np.add(HOME, [0.3, -0.2, 0.4, 0.5, -0.6, 0.8])), 1.0, 2.0), "main")
+
+
+def line_move(arm: Arm) -> None:
+    X_flange_tcp = matrix_of([0.0, 0.02, 0.15, 0.1, 0.2, 0.3])
+    goal = (
+        matrix_of([0.05, -0.1, -0.05, 0, 0, 0]) @ forward(DH, arm.q) @ X_flange_tcp @ matrix_of([0, 0, 0, 0.2, 0.5, 0])
+    )
+    arm.start(LineMove(DH, X_flange_tcp, goal, 0.25, 1.2), "main")
+
+
+def scripted(order: str) -> Iterator[Arm]:
+    """An arm that starts, slows down, pauses, resumes and stops; every cycle of it."""
+    arm = Arm(DH, HOME)
+    (joint_move if order == "joints" else line_move)(arm)
+    for k in range(600):
+        arm.speed_fraction = 0.6 if 100 <= k < 200 else 1.0
+        arm.paused = 220 <= k < 320
+        if k == 450:
+            arm.stop_joints(3.0, "main")
+        arm.step(DT)
+        yield arm
+
+
+@pytest.mark.parametrize("order", ["joints", "line"])
+def test_speeds_and_accelerations_of_the_set_point_are_derivatives_of_its_angles(order: str) -> None:
+    states = [(arm.q, arm.qd, arm.qdd) for arm in scripted(order)]
+    q, qd, qdd = (np.array(column) for column in zip(*states, strict=True))
+    rate, change = (q[2:] - q[:-2]) / (2 * DT), (q[2:] - 2 * q[1:-1] + q[:-2]) / DT**2
+    even = np.abs(np.diff(qdd, axis=0)).max(axis=1) < 0.05  # not next to a jump of the acceleration
+    even = even[1:] & even[:-1]
+    assert even.mean() > 0.8
+    np.testing.assert_allclose(qd[1:-1][even], rate[even], atol=2e-4)
+    np.testing.assert_allclose(qdd[1:-1][even], change[even], atol=0.05)
+    assert np.abs(qdd).max() > 0.5
+
+
+@pytest.mark.parametrize("order", ["joints", "line"])
+def test_the_actual_joints_follow_as_a_first_order_lag_does(order: str) -> None:
+    """Against the lag of the set-point, integrated in steps of a hundredth of a cycle."""
+    targets, actual = [HOME], [HOME]
+    for arm in scripted(order):
+        targets.append(arm.q)
+        actual.append(arm.actual_q)
+    cycles = np.arange(len(targets))
+    fine = np.arange(0, len(targets) - 1, 0.01)
+    dense = np.array([np.interp(fine, cycles, column) for column in np.transpose(targets)]).T
+    lagged, share = np.array(HOME), 1 - math.exp(-0.01 * DT / 0.005)
+    for k, target in enumerate(dense):
+        if k % 100 == 0:
+            np.testing.assert_allclose(actual[k // 100], lagged, atol=1.5e-5)
+        lagged = lagged + share * (target - lagged)
+
+
+@pytest.mark.parametrize("order", ["joints", "line"])
+def test_motion_between_cycles_has_its_own_derivatives_and_meets_the_next_cycle(order: str) -> None:
+    guess, h, met = None, 1e-5, []
+    for arm in scripted(order):
+        if guess is not None:
+            met.append(np.abs(np.subtract(guess.q, arm.actual_q)).max())
+        motion = arm.motion
+        if motion is None:
+            continue
+        now, before, after = motion.at(0.001), motion.at(0.001 - h), motion.at(0.001 + h)
+        np.testing.assert_allclose(now.qd, np.subtract(after.q, before.q) / (2 * h), atol=1e-5)
+        np.testing.assert_allclose(now.qdd, np.subtract(after.qd, before.qd) / (2 * h), atol=1e-3)
+        np.testing.assert_allclose(motion.at(0.0).q, arm.actual_q, atol=1e-15)
+        guess = motion.at(DT)
+    assert np.median(met) < 1e-8
+    assert max(met) < 2e-5, "where the acceleration jumps"

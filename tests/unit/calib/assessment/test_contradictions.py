@@ -1,0 +1,65 @@
+"""Known values that the data contradict, from given estimates and sigmas."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib.assessment.contradictions import contradictions
+from calib.known import Known
+from calib.model import STANDARD_GRAVITY_M_S2, Parameters
+
+FOUND = Parameters(
+    R_flange_sensor=np.eye(3),
+    gravity_force_base_N=np.array([0.0, 0.0, -10.0]),
+    force_bias_N=np.zeros(3),
+    p_sensor_com_m=np.zeros(3),
+    torque_bias_Nm=np.zeros(3),
+)
+COVARIANCE = np.diag(np.square([*[0.002] * 3, *[0.01, 0.02, 0.05], *[0.1] * 9]))
+"""Sigmas: 2 mrad of the mounting, 1, 2 and 5 mrad of the direction of gravity or 0.5 % of the weight."""
+
+
+def contradicted(known: Known, sigmas: float, found: Parameters = FOUND) -> list[str]:
+    return contradictions(known, found, COVARIANCE, STANDARD_GRAVITY_M_S2, sigmas)
+
+
+@pytest.mark.parametrize("sigmas_off", [3.9, 4.1])
+def test_a_mass_is_compared_in_sigmas_of_the_weight(sigmas_off: float) -> None:
+    known = Known(mass_kg=(10 + sigmas_off * 0.05) / STANDARD_GRAVITY_M_S2)
+    assert len(contradicted(known, 4)) == (sigmas_off > 4)
+
+
+@pytest.mark.parametrize("sigmas_off", [3.9, 4.1])
+@pytest.mark.parametrize(("axis", "sigma_rad"), [(0, 0.002), (1, 0.001)])
+def test_a_direction_is_compared_in_sigmas_across_it(axis: int, sigma_rad: float, sigmas_off: float) -> None:
+    turn = Rotation.from_rotvec(sigmas_off * sigma_rad * np.eye(3)[axis])
+    known = Known(gravity_direction_base=turn.apply([0, 0, -1]))
+    words = contradicted(known, 4)
+    assert len(words) == (sigmas_off > 4)
+    if words:
+        assert f"{np.degrees(sigmas_off * sigma_rad):.2g}"[:3] in words[0]
+
+
+@pytest.mark.parametrize("yaw_only", [False, True])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_mounting_is_compared_but_for_a_free_yaw(axis: int, yaw_only: bool) -> None:
+    turn: NDArray[np.float64] = Rotation.from_rotvec(0.0082 * np.eye(3)[axis]).as_matrix()
+    known = Known(R_flange_sensor=turn, yaw_only=yaw_only)
+    assert len(contradicted(known, 4)) == (not (yaw_only and axis == 2))
+    assert not contradicted(known, 4.2)
+
+
+def test_a_unit_of_force_is_named() -> None:
+    (words,) = contradicted(Known(mass_kg=4.4482 / STANDARD_GRAVITY_M_S2 * 10), 4)
+    assert "lbf" in words
+
+
+def test_agreement_is_no_contradiction() -> None:
+    mass_kg = 10 / STANDARD_GRAVITY_M_S2
+    known = Known(mass_kg=mass_kg, gravity_direction_base=(0, 0, -1), R_flange_sensor=np.eye(3))
+    assert contradicted(known, 1e-6) == []
+    lighter = replace(FOUND, gravity_force_base_N=np.array([0.0, 0.0, -5.0]))
+    assert len(contradicted(known, 4, lighter)) == 1

@@ -1,0 +1,48 @@
+"""Pooled covariances: the common shape, the size of each, and what stays as it is."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.data.pooling import pooled_covariance
+
+Array = NDArray[np.float64]
+SHAPE = np.diag(np.square([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+
+
+def sampled(rng: np.random.Generator, n_samples: NDArray[np.int64], scale: Array) -> Array:
+    """Covariances of means of n samples of noise with SHAPE, times the scale of each pose."""
+    return np.array(
+        [
+            k * np.cov(rng.multivariate_normal(np.zeros(6), SHAPE, n).T) / n
+            for n, k in zip(n_samples, scale, strict=True)
+        ]
+    )
+
+
+def misfit(covariance: Array, truth: Array) -> float:
+    return float(np.linalg.norm(np.linalg.solve(truth, covariance) - np.eye(6)))
+
+
+def test_two_poses_are_pooled_and_one_alone_is_not() -> None:
+    cov = sampled(np.random.default_rng(1), np.array([20, 20, 20]), np.ones(3))
+    for known in ([20, 20, 0], [20, 20, 1]):
+        pooled = pooled_covariance(cov, np.array(known))
+        assert not np.allclose(pooled[:2], cov[:2])
+        np.testing.assert_array_equal(pooled[2], cov[2])
+    np.testing.assert_array_equal(pooled_covariance(cov, np.array([20, 0, 1])), cov)
+
+
+def test_pooling_comes_nearer_to_the_truth() -> None:
+    n_samples = np.full(12, 20)
+    cov = sampled(np.random.default_rng(2), n_samples, np.ones(12))
+    pooled = pooled_covariance(cov, n_samples)
+    assert np.mean([misfit(c, SHAPE / 20) for c in pooled]) < 0.6 * np.mean([misfit(c, SHAPE / 20) for c in cov])
+
+
+def test_a_noisy_pose_keeps_its_size() -> None:
+    n_samples, scale = np.full(12, 50), np.ones(12)
+    scale[4] = 25.0
+    cov = sampled(np.random.default_rng(3), n_samples, scale)
+    size = np.trace(np.linalg.solve(SHAPE / 50, pooled_covariance(cov, n_samples)), axis1=1, axis2=2) / 6
+    assert 15 < size[4] < 40
+    assert np.all(np.delete(size, 4) < 2)

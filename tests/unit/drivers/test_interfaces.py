@@ -1,0 +1,24 @@
+"""What the base classes of the devices do for every driver."""
+
+import numpy as np
+import pytest
+
+from drivers.errors import DeviceTimeout
+from drivers.interfaces import ArmStates
+from tests.fake_clock import FakeClock
+from tests.unit.ftdrive.fake_cell import FakeArm
+
+
+def test_an_arm_that_can_only_be_asked_is_followed_state_by_state() -> None:
+    clock = FakeClock()
+    arm = FakeArm(clock)
+    with arm.follow() as follow:
+        states = ArmStates.concatenate([follow.read(0.1) for _ in range(5)])
+        assert np.diff(states.t_host_ns).tolist() == [8_000_000] * 4
+        assert states.q_rad == pytest.approx(np.tile(arm.q, (5, 1)))
+        assert states.R_base_flange.shape == (5, 3, 3)
+        assert states.p_base_flange_m[3] == pytest.approx(arm.state().p_base_flange_m)
+        assert states.rows(slice(1, 3)).t_host_ns.tolist() == states.t_host_ns[1:3].tolist()
+        arm.gone = DeviceTimeout("its clock stands still")
+        with pytest.raises(DeviceTimeout, match="stands still"):
+            follow.read(0.1)

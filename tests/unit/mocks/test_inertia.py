@@ -1,0 +1,171 @@
+"""The wrench of a moved payload: against point masses whose accelerations are differences of their positions."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mocks.inertia import drawn_gyration, inertia_tensor
+from mocks.kinematics import MODELS, JointState, Vector6, flange_motion, forward, jacobian, rotation, vector6
+from mocks.world import AHEAD_S, Truth, World
+
+Array = NDArray[np.float64]
+
+DH = MODELS["UR5e"].disturbed(3)
+HOME = np.radians([45, -100, 60, -50, 90, 45])
+STEP_S = 1e-4
+MASSES_KG = np.array([0.3, 0.2, 0.4, 0.1, 0.25])
+
+
+def smooth(seed: int) -> Callable[[float], JointState]:
+    """All joints swing about home with speeds and accelerations of a few rad/s and rad/s²."""
+    rng = np.random.default_rng(seed)
+    reach, rate, phase = rng.uniform(0.2, 0.6, 6), rng.uniform(1.0, 4.0, 6), rng.uniform(-3, 3, 6)
+
+    def at(t: float) -> JointState:
+        turn = rate * t + phase
+        return JointState(
+            vector6(HOME + reach * np.sin(turn)),
+            vector6(reach * rate * np.cos(turn)),
+            vector6(-reach * rate**2 * np.sin(turn)),
+        )
+
+    return at
+
+
+def second_difference(of: Callable[[float], Array], t: float) -> Array:
+    weights = {-2: -1 / 12, -1: 4 / 3, 0: -5 / 2, 1: 4 / 3, 2: -1 / 12}
+    parts = [w * of(t + k * 10 * STEP_S) for k, w in weights.items()]
+    return np.asarray(np.sum(parts, axis=0)) / (10 * STEP_S) ** 2
+
+
+def point_masses(seed: int) -> tuple[Truth, Array]:
+    """A cell whose payload is five point masses, (5, 3) in the sensor frame."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.08, 0.12, (5, 3))
+    com = MASSES_KG @ points / MASSES_KG.sum()
+    arms = points - com
+    tensor = sum(m * (a @ a * np.eye(3) - np.outer(a, a)) for m, a in zip(MASSES_KG, arms, strict=True))
+    truth = replace(
+        Truth.drawn(seed),
+        mass_kg=float(MASSES_KG.sum()),
+        p_sensor_com_m=com,
+        gyration_m2=tensor / MASSES_KG.sum(),
+        p_flange_sensor_m=rng.uniform(-0.05, 0.05, 3),
+    )
+    return truth, points
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_moved_payload_exerts_what_its_points_do(seed: int) -> None:
+    truth, points = point_masses(seed)
+    at, t = smooth(seed), 0.7
+
+    def positions(t: float) -> Array:
+        X = forward(DH, at(t).q)
+        return (points @ truth.R_flange_sensor.T + truth.p_flange_sensor_m) @ X[:3, :3].T + X[:3, 3]
+
+    pulls = MASSES_KG[:, None] * (truth.gravity_m_s2 - second_difference(positions, t))
+    R_base_sensor = forward(DH, at(t).q)[:3, :3] @ truth.R_flange_sensor
+    forces = pulls @ R_base_sensor
+    expected = np.concatenate((forces.sum(axis=0), np.cross(points, forces).sum(axis=0)))
+
+    world = World(truth, DH, at(0.0).q)
+    world.move(t, at(t).q, at)
+    np.testing.assert_allclose(world.load_wrench(t), expected, atol=1e-6)
+    still = World(truth, DH, at(t).q).load_wrench()
+    assert np.linalg.norm(expected[:3] - still[:3]) > 1.0, "inertia is no trifle here"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_motion_of_the_flange_follows_from_its_poses(seed: int) -> None:
+    at, t = smooth(seed), -0.4
+    motion = flange_motion(DH, at(t))
+    X = forward(DH, at(t).q)
+    np.testing.assert_allclose(motion.R_base_flange, X[:3, :3], atol=1e-15)
+    np.testing.assert_allclose(jacobian(DH, at(t).q)[3:] @ at(t).qd, motion.angular_velocity, atol=1e-12)
+    np.testing.assert_allclose(
+        second_difference(lambda t: forward(DH, at(t).q)[:3, 3], t), motion.acceleration, atol=1e-6
+    )
+    rates = [flange_motion(DH, at(t + side * STEP_S)).angular_velocity for side in (-1, 1)]
+    np.testing.assert_allclose((rates[1] - rates[0]) / (2 * STEP_S), motion.angular_acceleration, atol=1e-6)
+
+
+def test_a_resting_arm_reads_bit_for_bit_what_it_read_without_inertia() -> None:
+    truth = Truth.drawn(4)
+    q = vector6(HOME)
+    alone = World(replace(truth, gyration_m2=None), DH, q).load_wrench()
+    np.testing.assert_array_equal(World(truth, DH, q).load_wrench(), alone)
+
+
+def test_a_payload_without_inertia_has_only_weight_while_it_moves() -> None:
+    truth, at = replace(Truth.drawn(4), gyration_m2=None), smooth(4)
+    world = World(truth, DH, at(0.0).q)
+    world.move(0.3, at(0.3).q, at)
+    still = World(truth, DH, at(0.3).q)
+    np.testing.assert_allclose(world.load_wrench(0.3), still.load_wrench(), atol=1e-12)
+
+
+def test_readings_of_a_burst_are_the_truth_at_their_times() -> None:
+    truth, at = replace(Truth.drawn(5), noise_force_N=0.0, noise_torque_Nm=0.0), smooth(5)
+    world = World(truth, DH, at(0.0).q)
+    start_s = world.now_s
+    world.move(start_s, at(0.0).q, lambda t_s: at(t_s - start_s))
+    times_s = start_s + np.arange(14) / 7000
+    expected = [world.true_wrench(t_s) for t_s in times_s]
+    np.testing.assert_allclose(world.measure_at(times_s), expected, atol=2e-4)
+    assert np.ptp(expected, axis=0).max() > 0.005, "it changes within a burst"
+
+
+def standing(q: Vector6) -> Callable[[float], JointState]:
+    return lambda _t_s: JointState(q)
+
+
+def test_a_late_sensor_reads_the_cycle_of_its_time_and_a_dead_controller_leaves_the_arm_at_rest() -> None:
+    at = smooth(6)
+    world = World(replace(Truth.drawn(6), gyration_m2=None), DH, at(0.0).q)
+    for k in range(20):
+        world.move(0.002 * k, at(0.002 * k).q, standing(at(0.002 * k).q))
+    for k in (13, 15, 19):
+        R = forward(DH, at(0.002 * k).q)[:3, :3] @ world.truth.R_flange_sensor
+        np.testing.assert_allclose(world.load_wrench(0.002 * k + 0.001)[:3], R.T @ world.truth.gravity_force_base_N)
+    world.move(0.04, at(0.04).q, at)
+    late_s = 0.04 + AHEAD_S + 1e-6
+    still = World(world.truth, DH, at(0.04).q).load_wrench()
+    np.testing.assert_allclose(world.load_wrench(late_s), still)
+
+
+def test_the_inertia_scales_with_a_mass_that_changes() -> None:
+    world = World(Truth.drawn(7), DH, vector6(HOME))
+    before = world.truth.inertia_kg_m2
+    world.shift_payload(2 * world.truth.mass_kg, None)
+    after = world.truth.inertia_kg_m2
+    assert before is not None
+    assert after is not None
+    np.testing.assert_allclose(after, 2 * before)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_seed_draws_a_plausible_body(seed: int) -> None:
+    reach_m = 0.03 + 0.0035 * seed
+    tensor = drawn_gyration(np.random.default_rng(seed), reach_m)
+    moments = np.linalg.eigvalsh(tensor)
+    np.testing.assert_allclose(tensor, tensor.T, atol=1e-15)
+    assert moments[2] <= moments[0] + moments[1]
+    assert 0.02 < math.sqrt(moments[0]) < math.sqrt(moments[2]) < 0.1, "radii of gyration, m"
+    np.testing.assert_allclose(
+        np.trace(tensor), np.trace(rotation([0.1, 0.2, 0.3]) @ tensor @ rotation([-0.1, -0.2, -0.3]))
+    )
+
+
+def test_elements_of_a_tensor_stand_where_the_readme_says() -> None:
+    np.testing.assert_array_equal(
+        inertia_tensor(np.array([1.0, 2, 2.5, 0.1, 0.2, 0.3])), [[1, 0.1, 0.2], [0.1, 2, 0.3], [0.2, 0.3, 2.5]]
+    )
+    assert not inertia_tensor(np.zeros(6)).any()
+    for wrong in ([1.0, 1, 3, 0, 0, 0], [-0.1, 1, 1, 0, 0, 0], [1, 1, 1, 2, 0, 0]):
+        with pytest.raises(ValueError, match="no body"):
+            inertia_tensor(np.array(wrong))

@@ -1,0 +1,147 @@
+"""A recording that is played back: which row when, what the arm has, and which files are refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mocks.clock import CellClock
+from mocks.disturbances import Push
+from mocks.kinematics import MODELS, forward
+from mocks.recording import COLUMNS, RecordedArm, RecordedWorld, Recording
+from mocks.ur.robot import Robot, RobotSettings
+from mocks.ur.script import Upload
+from mocks.world import Truth
+from tests.unit.mocks.real_time import RealTime
+
+DH = MODELS["UR5e"]
+HOME = np.radians([45, -100, 60, -50, 90, 45])
+RATE_HZ = 1000
+
+
+def made(rows: int = 2001) -> Recording:
+    """Row k holds the wrench (k, 2k, …, 6k) mN; joint 6 turns with 0.5 rad/s."""
+    k = np.arange(float(rows))
+    q_rad = HOME + np.outer(k / RATE_HZ, [0, 0, 0, 0, 0, 0.5])
+    return Recording(7.0 + k / RATE_HZ, 1e-3 * np.outer(k, range(1, 7)), q_rad)
+
+
+def row(wrench: np.ndarray) -> np.ndarray:
+    rows: np.ndarray = np.round(1e3 * wrench[:, 0]).astype(int)
+    return rows
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_a_sensor_of_the_same_rate_sends_every_row_once_at_any_phase() -> None:
+    recording = made()
+    recording.play(100.0, 0.0, 1.0)
+    for phase_s in (0.0, 1e-4, 5e-4, 9.9e-4):
+        times_s = 100.0 + phase_s + np.arange(1500) / RATE_HZ
+        np.testing.assert_array_equal(row(recording.wrench(times_s)), np.arange(1500))
+
+
+@pytest.mark.parametrize(("pace", "step"), [(2.0, 2.0), (0.25, 0.25), (10.0, 10.0)])
+def test_the_pace_scales_rows_and_speeds(pace: float, step: float) -> None:
+    recording = made()
+    recording.play(100.0, 0.0, pace)
+    times_s = 100.0 + np.arange(150) / RATE_HZ
+    np.testing.assert_array_equal(row(recording.wrench(times_s)), np.floor(step * np.arange(150) + 1e-6))
+    state = recording.joints(100.1)
+    assert state.q[5] - HOME[5] == pytest.approx(0.1 * pace * 0.5)
+    assert state.qd == pytest.approx([0, 0, 0, 0, 0, 0.5 * pace])
+
+
+def test_a_recording_holds_its_ends_and_continues_where_a_request_says() -> None:
+    recording = made()
+    assert row(recording.wrench(np.array([5.0, 500.0]))).tolist() == [0, 0], "not played yet"
+    recording.play(100.0, 0.5, 1.0)
+    assert recording.at_s(100.25) == pytest.approx(0.75)
+    assert row(recording.wrench(np.array([100.25, 1000.0]))).tolist() == [750, 2000]
+    assert recording.at_s(1000.0) == recording.duration_s == pytest.approx(2.0)
+    assert not any(recording.joints(1000.0).qd)
+    recording.play(1000.0, 0.25, 0.0)
+    assert recording.at_s(2000.0) == pytest.approx(0.25)
+    for at_s, pace in ((2.1, 1.0), (-0.1, 1.0), (0.0, -1.0), (0.0, np.inf)):
+        with pytest.raises(ValueError, match="at_s is 0 to 2"):
+            recording.play(0.0, at_s, pace)
+
+
+def test_the_arm_has_the_recorded_joints_and_takes_no_command() -> None:
+    recording, real = made(), RealTime()
+    clock = CellClock(real)
+    world = RecordedWorld(recording, Truth.drawn(1), DH, 0, clock)
+    robot = Robot(world, RobotSettings(), RecordedArm(DH, recording))
+    start_s = clock.now_s()
+    recording.play(start_s, 0.0, 1.0)
+    for k in range(100):
+        robot.tick(start_s + 0.002 * k)
+        assert robot.arm.actual_q[5] == pytest.approx(HOME[5] + 0.5 * 0.002 * k, abs=1e-12)
+        assert robot.arm.actual_qd[5] == pytest.approx(0.5)
+    np.testing.assert_allclose(robot.tcp_pose("actual")[:3], forward(DH, robot.arm.actual_q)[:3, 3])
+    assert not robot.upload(Upload("other", "def other():\n  sleep(1)\nend\n", secondary=False))
+    assert "follows a recording" in robot.events[-1].why
+    with pytest.raises(ValueError, match="follows a recording"):
+        robot.hand_move(robot.arm.q, 0.3)
+
+
+def test_the_controller_feels_the_recorded_wrench_while_the_arm_stands() -> None:
+    k = np.arange(3.0)
+    recording = Recording(k, np.outer(k, np.ones(6)), np.tile(HOME, (3, 1)))
+    world = RecordedWorld(recording, Truth.drawn(1), DH, 0, CellClock(RealTime()))
+    robot = Robot(world, RobotSettings(), RecordedArm(DH, recording))
+    recording.play(world.now_s, 0.0, 1.0)
+    felt = []
+    for at_s in (0.0, 1.0, 2.0):
+        robot.tick(robot.clock.now_s() + at_s)
+        felt.append(robot.tcp_wrench())
+    np.testing.assert_allclose(np.linalg.norm(np.diff(felt, axis=0)[:, :3], axis=1), np.sqrt(3))
+
+
+def test_a_push_comes_on_top_of_the_recorded_wrench() -> None:
+    recording = made()
+    truth = Truth.drawn(1)
+    nothing = np.zeros(3)
+    truth = Truth(truth.mass_kg, truth.p_sensor_com_m, np.eye(3), 0.0, 0.0, nothing, nothing, 0.0, 0.0)
+    world = RecordedWorld(recording, truth, DH, 0, CellClock(RealTime()))
+    recording.play(world.now_s, 1.0, 0.0)
+    np.testing.assert_allclose(world.measure(3), np.tile(np.arange(1.0, 7.0), (3, 1)), atol=1e-12)
+    np.testing.assert_allclose(world.true_wrench(), np.arange(1.0, 7.0), atol=1e-12)
+    world.touch("push", Push(np.array([0, 0, 5.0, 0, 0, 0]), in_sensor=True))
+    np.testing.assert_allclose(world.measure(1)[0], [1, 2, 8, 4, 5, 6], atol=1e-12)
+
+
+@pytest.mark.parametrize("units", [False, True])
+def test_columns_are_found_by_their_names(tmp_path: Path, units: bool) -> None:
+    unit = {"q": "_rad", "f": "_N", "t": "_Nm"} if units else {"q": "", "f": "", "t": ""}
+    named = [name + unit[name.removeprefix("raw_")[0]] if name != "t_s" else name for name in COLUMNS]
+    header = ["seq", *reversed(named), "status"]
+    rows = ["".join(["9,", ",".join(str(10 * r + c) for c in reversed(range(13))), ",7"]) for r in range(3)]
+    path = written(tmp_path / "peg.csv", "# ftdrive.recording/1\n" + ",".join(header) + "\n" + "\n".join(rows) + "\n")
+    recording = Recording.read(path)
+    assert (len(recording), recording.duration_s) == (3, 20.0)
+    recording.play(0.0, 10.0, 1.0)
+    np.testing.assert_array_equal(recording.wrench(np.zeros(1)), [[11, 12, 13, 14, 15, 16]])
+    np.testing.assert_allclose(recording.joints(0.0).q, [17, 18, 19, 20, 21, 22])
+
+
+HEADER = ",".join(COLUMNS)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("", "no column t_s, raw_fx"),
+        (HEADER.replace("raw_ty,", "") + "\n", "no column raw_ty$"),
+        (HEADER + "\n" + "0," * 12 + "0\n", "1 rows are no recording"),
+        (HEADER + "\n" + "0," * 12 + "0\n" + "0," * 12 + "0\n", "does not rise from row 1"),
+        (HEADER + "\n" + "0," * 12 + "0\n" + "1," * 12 + "nan\n", "row 2 holds"),
+        (HEADER + "\n" + "0," * 12 + "0\n" + "1," * 12 + "x\n", "'x'"),
+    ],
+)
+def test_a_file_that_is_no_recording_is_refused(tmp_path: Path, text: str, why: str) -> None:
+    with pytest.raises(ValueError, match=f"peg.csv.*{why}"):
+        Recording.read(written(tmp_path / "peg.csv", text))

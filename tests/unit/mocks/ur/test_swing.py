@@ -1,0 +1,101 @@
+"""The operator's program that swings the arm: what the flange reaches, and where it ends."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mocks.kinematics import MODELS, forward, rotvec, vector6
+from mocks.ur.modes import Runtime
+from mocks.ur.robot import Robot, RobotSettings
+from mocks.ur.swing import Swing, SwingProgram
+from mocks.world import Truth, World
+
+HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
+STEP_S = 0.004
+
+
+@pytest.mark.parametrize("model", ["UR3e", "UR5e", "UR20"])
+@pytest.mark.parametrize("limits", [(1.0, 2.0, 2.0), (0.5, 1.5, 0.7), (1.5, 4.0, 3.0)])
+def test_the_flange_reaches_the_speed_and_the_accelerations_of_the_request(
+    model: str, limits: tuple[float, float, float]
+) -> None:
+    """By differences of its poses along the path."""
+    speed, turning, moving = limits
+    dh = MODELS[model].disturbed(1)
+    swing = Swing(dh, HOME, 5.0, speed_rad_s=speed, acceleration_rad_s2=turning, acceleration_m_s2=moving)
+    times = np.arange(0.0, swing.period_s, STEP_S)
+    poses = np.array([forward(dh, swing.at(t).q) for t in times])
+    R, p = poses[:, :3, :3], poses[:, :3, 3]
+    rates = np.array([rotvec(b @ a.T) for a, b in pairwise(R)]) / STEP_S
+    reached = (
+        np.linalg.norm(rates, axis=1).max(),
+        np.linalg.norm(np.diff(rates, axis=0), axis=1).max() / STEP_S,
+        np.linalg.norm(np.diff(p, 2, axis=0), axis=1).max() / STEP_S**2,
+    )
+    np.testing.assert_allclose(reached, limits, rtol=0.01)
+
+
+def test_a_swing_starts_and_ends_at_rest_where_it_began_after_whole_periods() -> None:
+    swing = Swing(MODELS["UR5e"], HOME, 10.0)
+    assert 10.0 <= swing.duration_s < 10.0 + swing.period_s
+    assert swing.duration_s / swing.period_s == pytest.approx(round(swing.duration_s / swing.period_s))
+    for t in (0.0, swing.duration_s):
+        np.testing.assert_allclose(swing.at(t).q, HOME, atol=1e-9)
+        np.testing.assert_allclose(swing.at(t).qd, 0.0, atol=1e-9)
+
+
+def test_the_program_swings_the_arm_and_ends() -> None:
+    robot = Robot(World(Truth.drawn(0), MODELS["UR5e"], HOME), RobotSettings(time_scale=20.0))
+    swing = Swing(robot.arm.dh, HOME, 8.0)
+    assert robot.pendant_start(SwingProgram(robot, swing))
+    played_s = 0.0
+    for _ in range(1000):
+        robot.tick()
+        played_s += 20 * robot.period_s * (robot.runtime == Runtime.PLAYING)
+        if robot.runtime == Runtime.PLAYING:
+            assert robot.program_name == "swing"
+    assert played_s == pytest.approx(swing.duration_s, abs=4 * 20 * robot.period_s)
+    np.testing.assert_allclose(robot.arm.q, HOME, atol=1e-9)
+    assert [event.what for event in robot.events] == [
+        "program swing",
+        "started swing",
+        "moves",
+        "stands",
+        "stopped swing",
+    ]
+
+
+def test_a_stop_ends_the_swing_and_the_arm_comes_to_rest() -> None:
+    robot = Robot(World(Truth.drawn(0), MODELS["UR5e"], HOME), RobotSettings())
+    robot.pendant_start(SwingProgram(robot, Swing(robot.arm.dh, HOME, 30.0)))
+    for _ in range(500):
+        robot.tick()
+    assert not robot.arm.at_rest
+    robot.stop_program("another client")
+    for _ in range(200):
+        robot.tick()
+    assert robot.arm.at_rest
+    assert not robot.arm.busy
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"speed_rad_s": 0.0}, "positive"),
+        ({"acceleration_m_s2": math.nan}, "positive"),
+        ({"seconds": -1.0}, "positive"),
+        ({"speed_rad_s": 30.0, "acceleration_rad_s2": 100.0}, "joints|no swing"),
+    ],
+)
+def test_an_impossible_swing_is_refused(changes: dict[str, float], why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        Swing(MODELS["UR5e"], HOME, **{"seconds": 5.0, **changes})
+
+
+def test_no_swing_starts_without_power() -> None:
+    robot = Robot(World(Truth.drawn(0), MODELS["UR5e"], HOME), RobotSettings())
+    robot.power_off()
+    assert not robot.pendant_start(SwingProgram(robot, Swing(robot.arm.dh, HOME, 5.0)))
+    assert "POWER_OFF" in robot.events[-1].why
