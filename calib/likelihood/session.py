@@ -87,6 +87,8 @@ class Session:
 
     def start(self, problem: Linearised, components: Sequence[Component]) -> Array:
         """Give variances to start from: the mean square residual of the group, or its noise where that is more."""
+        if not components:
+            return np.zeros(0)
         noise = np.diagonal(problem.D, axis1=1, axis2=2)
         size = np.maximum(problem.r**2, noise)[problem.kept]
         scale = [np.mean(size[:, np.array(c.share) > 0]) for c in components]

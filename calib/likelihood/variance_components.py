@@ -174,7 +174,7 @@ def point(problem: Linearised, components: Sequence[Component], theta: Array) ->
 
 def noise_of(problem: Linearised, components: Sequence[Component], theta: Array) -> Noise:
     """Give the covariance with these variances."""
-    D, walk, slope = problem.D, np.zeros(6), problem.slope
+    D, walk, white, slope = problem.D, np.zeros(6), np.zeros(6), problem.slope
     effects = []
     for c, value in zip(components, theta, strict=True):
         columns = problem.columns(c)
@@ -185,8 +185,9 @@ def noise_of(problem: Linearised, components: Sequence[Component], theta: Array)
         elif c.kind == "rotation":
             D = D + value * problem.turn @ np.swapaxes(problem.turn, 1, 2)
         else:
-            white = value * np.diag(c.share)
-            D = D + white if D.strides[0] else np.broadcast_to(D[0] + white, D.shape)
+            white += value * np.array(c.share)
+    if white.any():
+        D = D + np.diag(white) if D.strides[0] else np.broadcast_to(D[0] + np.diag(white), D.shape)
     joined = [np.concatenate(parts, axis=-1) for parts in zip(*effects, strict=True)]
     together = (joined[0], joined[1]) if joined else None
     return Noise(D, problem.time, np.sqrt(walk), slope, together, problem.kept)
