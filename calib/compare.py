@@ -11,7 +11,7 @@ from calib.data.dataset import CalibrationDataset
 from calib.errors import BadDataset, NotObservable
 from calib.files import JSON
 from calib.known import Known
-from calib.likelihood.fit import Drift
+from calib.likelihood.session import Drift
 from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, predict
 from calib.published.methods import PUBLISHED
 from calib.result import CalibrationResult, Method

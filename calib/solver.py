@@ -17,7 +17,8 @@ from calib.data.pooling import pooled_covariance
 from calib.errors import NotObservable
 from calib.known import Known
 from calib.likelihood.descent import column_scale
-from calib.likelihood.fit import RANK_TOLERANCE, Drift, Fit, fit
+from calib.likelihood.fit import Fit, fit
+from calib.likelihood.session import RANK_TOLERANCE, Drift
 from calib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, predict
 from calib.published.methods import PUBLISHED, Estimator, published
 from calib.result import CalibrationResult, DriftResult, Method

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.likelihood.descent import column_scale
 from calib.likelihood.fit import Fit
-from calib.likelihood.session_noise import Noise, summed_products
+from calib.likelihood.session_noise import CHUNK, Noise, summed_products
 from calib.likelihood.variance_components import left_out
 from calib.model import Array, Parameters, jacobian, predict
 
@@ -80,4 +80,8 @@ AssessedFit = Fit | IndependentFit
 
 def standardized(residuals: Array, covariance: Array) -> Array:
     """Divide residuals (n, 6) by a root of their covariance (n, 6, 6): independent, of unit variance."""
-    return np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), residuals[..., None])[..., 0])
+    unit = np.empty_like(residuals)
+    for first in range(0, len(residuals), CHUNK):
+        part = slice(first, first + CHUNK)
+        unit[part] = np.linalg.solve(np.linalg.cholesky(covariance[part]), residuals[part, :, None])[..., 0]
+    return unit

@@ -12,7 +12,7 @@ from calib.likelihood.gain_and_cross_talk import response_columns
 from calib.likelihood.session_noise import summed_products
 from calib.model import Array, Parameters, jacobian
 
-MOST_POSITIONS = 1000
+MOST_POSITIONS = 200
 """Of a change that are tried at first; then all near the best one."""
 FEWEST_ON_A_SIDE = 3
 """Poses before and after."""
@@ -86,48 +86,46 @@ def lasting_change(
     n = len(residuals)
     if n < 2 * FEWEST_ON_A_SIDE + 2:
         return None
-    sigma = np.asarray(sigma, dtype=np.float64)
-    y = residuals / sigma
     # A fit may have taken a part of the change for gain and cross-talk: these are free too.
-    free = [jacobian(parameters, R_base_flange), response_columns(parameters, R_base_flange)]
-    J = np.concatenate(free, axis=2) / sigma[:, None]
-    ramp = ((t_s - t_s.mean()) / (np.ptp(t_s) or 1.0))[:, None, None] * (np.eye(6) / sigma[:, None])
-    others = [_misfit(J, y), _misfit(np.concatenate([J, ramp], axis=2), y)]
+    free = [jacobian(parameters, R_base_flange), response_columns(parameters, R_base_flange), residuals[..., None]]
+    X = np.concatenate(free, axis=2) / np.asarray(sigma, dtype=np.float64)[:, None]
+    ramp = ((t_s - t_s.mean()) / (np.ptp(t_s) or 1.0))[:, None, None] * np.eye(6)
+    others = [_misfit(X), _misfit(np.concatenate([ramp, X], axis=2))]
     used = np.ones(n, bool)
     used[list(suspect)] = False
     at_one_end = np.count_nonzero(np.diff(used)) == 1 and np.count_nonzero(~used) >= FEWEST_ON_A_SIDE
     if not at_one_end and not used.all() and used.sum() > FEWEST_ON_A_SIDE:
-        others.append(_misfit(J[used], y[used]))
+        others.append(_misfit(X[used]))
 
     positions = np.arange(FEWEST_ON_A_SIDE, n - FEWEST_ON_A_SIDE + 1)
     step = -(-len(positions) // MOST_POSITIONS)
-    best = _best_change(parameters, J, y, positions[::step])
+    best = _best_change(parameters, X, positions[::step])
     if step > 1:
         near = np.abs(positions - best.position) < step
-        best = _best_change(parameters, J, y, positions[near])
+        best = _best_change(parameters, X, positions[near])
     return best if max(best.misfit, 1.0) < CLEARLY * min(others) else None
 
 
-def _misfit(X: Array, y: Array) -> float:
-    """Mean square of what the columns (n, 6, m) leave of y (n, 6), per degree of freedom."""
-    X, y = X.reshape(-1, X.shape[2]), y.ravel()
-    scale = np.linalg.norm(X, axis=0)
-    scale[scale == 0] = 1.0
-    left = y - X / scale @ np.linalg.lstsq(X / scale, y, rcond=1e-10)[0]
-    return float(left @ left) / max(len(X) - X.shape[1], 1)
+def _misfit(X: Array) -> float:
+    """Mean square of what all columns but the last leave of the last, for X (n, 6, m), per degree of freedom."""
+    gram = summed_products(X, X)
+    scale = column_scale(gram[:-1, :-1])
+    inverse = np.linalg.pinv(gram[:-1, :-1] / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    moment = gram[:-1, -1] / scale
+    return float((gram[-1, -1] - moment @ inverse @ moment) / max(6 * len(X) - len(moment), 1))
 
 
-def _best_change(parameters: Parameters, J: Array, y: Array, positions: NDArray[np.intp]) -> Change:
+def _best_change(parameters: Parameters, X: Array, positions: NDArray[np.intp]) -> Change:
     """Find the likeliest change at one of these positions, ascending; all sums over poses are cumulative."""
-    n = len(y)
-    parts = [slice(first, last) for first, last in pairwise([0, *positions, n])]
-    information = np.array([summed_products(J[part], J[part]) for part in parts])
-    moment = np.array([summed_products(J[part], y[part][..., None])[:, 0] for part in parts])
+    n, columns = len(X), X.shape[2] - 1
+    parts = [X[first:last] for first, last in pairwise([0, *positions, n])]
+    gram = np.array([summed_products(part, part) for part in parts])
+    information, moment, square = gram[:, :-1, :-1], gram[:, :-1, -1], float(gram[:, -1, -1].sum())
     scale = column_scale(information.sum(axis=0))
     information, moment = information / np.outer(scale, scale), moment / scale
     after, moment_after = (np.cumsum(x[:0:-1], axis=0)[::-1] for x in (information, moment))
     inverse = np.linalg.pinv(information.sum(axis=0), rcond=1e-12, hermitian=True)
-    rest = float((y**2).sum() - moment.sum(axis=0) @ inverse @ moment.sum(axis=0))
+    rest = float(square - moment.sum(axis=0) @ inverse @ moment.sum(axis=0))
     # What a change can still explain beside the parameters.
     seen = (after - after @ inverse @ after)[:, :15, :15]
     asked = (moment_after - after @ (inverse @ moment.sum(axis=0)))[:, :15]
@@ -137,8 +135,8 @@ def _best_change(parameters: Parameters, J: Array, y: Array, positions: NDArray[
         gain = np.linalg.pinv(D.T @ seen @ D, rcond=1e-10, hermitian=True)
         x = (gain @ (asked @ D)[..., None])[..., 0]
         size = directions.shape[1]
-        misfit = (rest - np.sum(x * (asked @ D), axis=1)) / max(6 * n - J.shape[2] - size, 1)
-        misfit = np.maximum(misfit, 1e-12 * float((y**2).sum()) / n)
+        misfit = (rest - np.sum(x * (asked @ D), axis=1)) / max(6 * n - columns - size, 1)
+        misfit = np.maximum(misfit, 1e-12 * square / n)
         criterion = 6 * n * np.log(misfit) + size * np.log(6 * n)
         k = int(np.argmin(criterion))
         found.append(Change(what, int(positions[k]), x[k], float(misfit[k]), float(criterion[k])))

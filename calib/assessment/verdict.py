@@ -40,6 +40,8 @@ NOISELESS = 1e-6
 """Below this chi2 per degree of freedom the data are simulated without noise, and equal readings are no copies."""
 CORRELATED = 0.9
 FEW_LEFT_OUT = 0.1
+ENOUGH_FOR_FAULTS, SUCCESSIVE = 2000, 100
+"""Poses that show a fault as clearly as all of them, in runs long enough to show a wrong pairing."""
 SURE = 1e-3
 """Probability of a false reason."""
 
@@ -217,10 +219,13 @@ def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
 
 
 def _faults(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None, up_in_base: ArrayLike) -> list[str]:
-    """Look for faults in all poses, and if there are none, in the used poses."""
-    order = np.arange(len(used)) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
+    """Look for faults in all poses, or of many in evenly spread runs, and if there are none, in the used poses."""
+    n = len(used)
+    order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
+    order = order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0]
     found = faults(fit.R_base_flange[order], fit.wrench[order], up_in_base)
-    return found if found or used.all() else faults(fit.R_base_flange[used], fit.wrench[used], up_in_base)
+    order = order[used[order]]
+    return found if found or used.all() else faults(fit.R_base_flange[order], fit.wrench[order], up_in_base)
 
 
 def successive_correlation(standardized: Array, t_s: Array | None = None) -> tuple[float, float]:

@@ -1,6 +1,5 @@
 """Down to every minimum of the joint cost of forces and torques, for noise that is independent from pose to pose."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,16 +7,14 @@ from scipy.linalg.lapack import dposv
 
 from calib.known import Constraints
 from calib.likelihood import rotation_minima
-from calib.likelihood.sufficient_statistics import CHUNK, Statistics, coefficients, features, wrench_gram
+from calib.likelihood.session_noise import CHUNK
+from calib.likelihood.sufficient_statistics import Statistics, coefficients, features, wrench_gram
 from calib.model import Array, Parameters, angle_between
 
 MAX_STEPS = 100
 SMALL_STEP = 1e-4  # in standard deviations of the noise: a descent that ends with one is slow, not lost
 MOST_MINIMA = 6
 SAME_ROTATION_RAD = np.deg2rad(1.0)
-
-Equations = Callable[[Parameters], tuple[Array, Array, float]]
-"""Give information (15, 15), its right-hand side (15,) and the cost at a point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,11 +70,11 @@ class Descent:
         ends = []
         for R_flange_sensor in self.constraints.rotations([m.R.T for m in rotation_minima.minima(Q)[:MOST_MINIMA]], Q):
             start = self.constraints.satisfied(_linear_start(start_from, R_flange_sensor))
-            ends.append(self.down(statistics.normal_equations, start))
+            ends.append(self.down(statistics, start))
         found = self.distinct(ends)
         if n <= CHUNK:  # once more from close by: without noise every digit counts
             statistics = Statistics.of(phi, self.wrench, weights, coefficients(found[0].parameters))
-            found[0] = self.down(statistics.normal_equations, found[0].parameters)
+            found[0] = self.down(statistics, found[0].parameters)
         return found
 
     @staticmethod
@@ -94,17 +91,17 @@ class Descent:
         """Whether two points belong to one minimum."""
         return bool(angle_between(p.R_flange_sensor, q.R_flange_sensor) <= SAME_ROTATION_RAD)
 
-    def normal_equations(self, equations: Equations, p: Parameters) -> tuple[Array, Array, float]:
+    def normal_equations(self, statistics: Statistics, p: Parameters) -> tuple[Array, Array, float]:
         """Add what was known before."""
-        H, g, cost = equations(p)
+        H, g, cost = statistics.normal_equations(p)
         if self.constraints.any:
             A, residual = self.constraints.measurements(p)
             return H + A.T @ A, g + A.T @ residual, cost + float(residual @ residual)
         return H, g, cost
 
-    def down(self, equations: Equations, p: Parameters, steps: int = MAX_STEPS) -> Minimum:
+    def down(self, statistics: Statistics, p: Parameters, steps: int = MAX_STEPS) -> Minimum:
         """Levenberg-Marquardt with scaled columns."""
-        H, g, cost = self.normal_equations(equations, p)
+        H, g, cost = self.normal_equations(statistics, p)
         b, F0, T0 = p.gravity_force_base_N, p.force_bias_N, p.torque_bias_Nm
         prediction = np.concatenate([np.zeros(3), b, F0, np.zeros(3), T0])  # times the Jacobian is the predicted wrench
         rounding = 1e-14 * float(np.sqrt(max(prediction @ H @ prediction, 0.0)))
@@ -118,7 +115,7 @@ class Descent:
             trial = p.moved(step if Z is None else Z @ step)
             if Z is not None:
                 trial = self.constraints.satisfied(trial)
-            ahead = self.normal_equations(equations, trial)
+            ahead = self.normal_equations(statistics, trial)
             improved = ahead[2] < cost
             if improved:
                 p, (H, g, cost) = trial, ahead

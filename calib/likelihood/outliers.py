@@ -4,18 +4,17 @@ Graduated non-convexity with the Geman-McClure cost (Yang, Antonante, Tzoumas, C
 plain cost, then a plain fit of the poses that remain. The basin with the lowest truncated cost wins.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri as chi2_isf
 
-from calib.likelihood.sufficient_statistics import Statistics, coefficients
+from calib.likelihood.descent import Descent
+from calib.likelihood.sufficient_statistics import Statistics, coefficients, features
 from calib.model import Array, Parameters
 
 Kept = NDArray[np.bool_]
-Solver = Callable[[Statistics, Parameters, int], Parameters]
-"""Goes down from a start, at most so many steps."""
 
 FALSE_REJECTION = 1e-3
 """Share of good poses that are rejected."""
@@ -31,20 +30,16 @@ def fewest_kept(n: int) -> int:
     return n if n < FEWEST_TO_REJECT_FROM else max(FEWEST_TO_REJECT_FROM - 1, int(np.ceil(0.6 * n)))
 
 
-def agreeing_poses(
-    phi: Array, wrench: Array, weights: Array, starts: Sequence[Parameters], solver: Solver
-) -> tuple[Parameters, Kept] | None:
+def agreeing_poses(descent: Descent, weights: Array, starts: Sequence[Parameters]) -> tuple[Parameters, Kept] | None:
     """Find the largest set of poses that one calibration explains.
 
     Parameters
     ----------
-    phi : array, shape (n, 10)
-        Features of the orientations.
-    wrench : array, shape (n, 6)
+    descent : Descent
+        Of these poses.
     weights : array, shape (n, 6, 6)
         Inverse noise covariances.
     starts : sequence of Parameters
-    solver : callable
 
     Returns
     -------
@@ -52,22 +47,32 @@ def agreeing_poses(
     kept : bool array, shape (n,)
         Or None when fewer than `fewest_kept` agree, from every start.
     """
+    phi, wrench = features(descent.R), descent.wrench
+
+    def squared_distances(p: Parameters) -> Array:
+        e = wrench - phi @ coefficients(p).T
+        return np.asarray(((weights @ e[..., None])[..., 0] * e).sum(axis=1))
+
+    def down(w: Array, p: Parameters, steps: int) -> Parameters:
+        statistics = Statistics.of(phi, wrench, w[:, None, None] * weights, coefficients(p))
+        return descent.down(statistics, p, steps).parameters
+
     best: tuple[float, Parameters, Kept] | None = None
     for start in starts:
         p = start
-        d2 = _squared_distances(phi, wrench, weights, p)
+        d2 = squared_distances(p)
         softness = max(1.0, 2 * float(d2.max()) / FARTHEST)
         while softness > 1:
             soft = softness * FARTHEST
-            p = _weighted(phi, wrench, weights, (soft / (d2 + soft)) ** 2, p, solver, 1)
-            d2 = _squared_distances(phi, wrench, weights, p)
+            p = down((soft / (d2 + soft)) ** 2, p, 1)
+            d2 = squared_distances(p)
             softness /= ANNEALING
         kept = d2 < FARTHEST
         for _ in range(10):
             if kept.sum() < fewest_kept(len(kept)):
                 break
-            p = _weighted(phi, wrench, weights, kept.astype(np.float64), p, solver, 5)
-            d2 = _squared_distances(phi, wrench, weights, p)
+            p = down(kept.astype(np.float64), p, 5)
+            d2 = squared_distances(p)
             before, kept = kept, d2 < FARTHEST
             if (before == kept).all():
                 break
@@ -75,14 +80,3 @@ def agreeing_poses(
         if kept.sum() >= fewest_kept(len(kept)) and (best is None or cost < best[0]):
             best = cost, p, kept
     return best and best[1:]
-
-
-def _squared_distances(phi: Array, wrench: Array, weights: Array, p: Parameters) -> Array:
-    e = wrench - phi @ coefficients(p).T
-    return np.asarray(((weights @ e[..., None])[..., 0] * e).sum(axis=1))
-
-
-def _weighted(
-    phi: Array, wrench: Array, weights: Array, w: Array, p: Parameters, solver: Solver, steps: int
-) -> Parameters:
-    return solver(Statistics.of(phi, wrench, w[:, None, None] * weights, coefficients(p)), p, steps)

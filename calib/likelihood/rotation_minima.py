@@ -305,9 +305,12 @@ def _descend(quartic: Array, q: Array) -> tuple[Array, Array, Array]:
         reach = np.where(down, np.minimum(2 * reach, longest), reach / 4)
         done = (length < arrived) | (reach < arrived)
         here = tuple(np.where(down.reshape(-1, *[1] * (y.ndim - 1)), y, x) for x, y in zip(here, there, strict=True))
+        near = np.abs(here[0] @ here[0].T) > 1 - 1e-6
+        same = (near.argmax(axis=1) < np.arange(len(near))) & (curvature[:, 0] > 0)  # goes where another start goes
         if done.any():
             ends.append(tuple(x[done] for x in here[:4]))
-            here, reach = tuple(x[~done] for x in here), reach[~done]
+        if (gone := done | same).any():
+            here, reach = tuple(x[~gone] for x in here), reach[~gone]
         if not len(reach):
             break
     q, cost, gradient, hessian = (np.concatenate(parts) for parts in zip(*ends, here[:4], strict=True))

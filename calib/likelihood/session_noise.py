@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from calib.likelihood.sufficient_statistics import CHUNK
 from calib.model import Array
 
+CHUNK = 4096
+"""Rows per matrix product, so that a chunk stays in the cache."""
 SHORTEST_STEP = 1e-3  # in mean intervals: two poses at the same time have nearly the same bias
 FAINT = 1e-9  # weight of a rejected pose: too little to count, enough for the others to predict it
 
@@ -76,7 +77,7 @@ class Noise:
 
     def parts(self) -> Iterator[tuple[slice, "Noise"]]:
         """Split into poses that are independent of those of other parts, few enough for the caches."""
-        if self._low_rank or self.n <= CHUNK:
+        if not self.independent or self.n <= CHUNK:
             yield slice(None), self
             return
         for first in range(0, self.n, CHUNK):
@@ -147,6 +148,11 @@ class Noise:
         return np.asarray(W, dtype=np.float64)
 
     @property
+    def independent(self) -> bool:
+        """Whether the poses have nothing in common."""
+        return not self._low_rank
+
+    @property
     def walks(self) -> bool:
         """Whether the bias of some channel walks."""
         return self._walking.size > 0
@@ -155,7 +161,8 @@ class Noise:
         """Give tr(K (V^-1 + Q core Q')) for walks of these channels, where none walks yet."""
         trace = float(np.cumsum(steps(time)) @ self.W[:, channels, channels].sum(axis=1))
         for Q, core in (*self._low_rank, low_rank):
-            trace += sum(float(np.vdot(core, Q[:, c].T @ walk_times(time, Q[:, c]))) for c in channels)
+            F = _following(Q[:, channels])
+            trace += float(np.vdot(core, summed_products(steps(time)[:, None, None] * F, F)))
         return trace
 
 
@@ -200,11 +207,6 @@ def steps(time: Array) -> Array:
 def walk_times(time: Array, X: Array) -> Array:
     """Multiply X (n, k) by the covariance of a random walk of unit variance per unit time."""
     return np.asarray(np.cumsum(steps(time)[:, None] * _following(X), axis=0))
-
-
-def walk_square(time: Array, X: Array) -> Array:
-    """Give the diagonal (k,) of X' K X: the sum over steps of dt (sum of what follows)²."""
-    return np.asarray(steps(time) @ _following(X) ** 2)
 
 
 def _following(X: Array) -> Array:

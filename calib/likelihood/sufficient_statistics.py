@@ -13,12 +13,11 @@ from typing import Self
 
 import numpy as np
 
+from calib.likelihood.session_noise import CHUNK, Noise
 from calib.model import Array, Parameters, skew
 
-CHUNK = 4096
-"""Rows per matrix product, so that a chunk stays in the cache."""
 FEW = 256
-"""The same for rows of 100 products."""
+"""Rows of 100 products per matrix product, so that they stay in the cache."""
 
 _CROSS = skew(np.eye(3))
 _CONSTANT = np.zeros((15, 6, 10))
@@ -88,6 +87,20 @@ class Statistics:
             outer = (phi[part, :, None] * phi[part, None, :]).reshape(-1, 100)
             A += weights[part].reshape(-1, 36).T @ outer
         return cls(reference, _sixty(A), (We.T @ phi).ravel(), float(np.vdot(We, e)))
+
+    @classmethod
+    def of_noise(cls, phi: Array, wrench: Array, noise: Noise, reference: Array) -> Self:
+        """Sum up for noise that may be correlated between poses."""
+        if noise.independent:
+            return cls.of(phi, wrench, noise.W, reference)
+        e = wrench - phi @ reference.T
+        We = noise.solve(e[..., None])[..., 0]
+        A = np.empty((6, 10, 6, 10))
+        for channel in range(6):
+            X = np.zeros((len(phi), 6, 10))
+            X[:, channel] = phi
+            A[:, :, channel] = np.tensordot(noise.solve(X), phi, (0, 0)).transpose(0, 2, 1)
+        return cls(reference, A.reshape(60, 60), (We.T @ phi).ravel(), float(np.vdot(We, e)))
 
     @classmethod
     def of_gram(cls, gram: Array, weight: Array, reference: Array) -> Self:

@@ -11,18 +11,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.likelihood.session_noise import Noise, centred, summed_products, walk_square, walk_times
+from calib.likelihood.session_noise import Noise, centred, summed_products, walk_times
 from calib.model import Array
 
 GAIN = 2.0
 """A component stays when it raises the restricted log-likelihood by more than this: 2 % come in by chance."""
 GAIN_OF_RESPONSE = 3.0
 """The same for gain and cross-talk of the sensor, whose 5 and 6 numbers come in by chance in 0.4 %."""
-SURE = 20.0  # a gain or loss that no other component can regain
-WORTH_A_TRY = 1.0  # gain predicted from slope and curvature at zero
+SETTLED = 1e-4  # squared distance from the best variances, in their standard deviations
 NEGLIGIBLE = 1e-4  # of the white noise: where slope and curvature "at zero" are taken
 LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2}
 """Variances that no arm or sensor in working order exceeds. A larger one has another cause."""
+POSES_THAT_SHOW_THE_NOISE = 1000  # fewer leave its size uncertain enough to matter
 _AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
 
 Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk"]
@@ -108,6 +108,11 @@ class Point:
         """The log-likelihood less what each component must bring."""
         return self.loglik - sum(c.needed for c in self.components)
 
+    @property
+    def too_large(self) -> bool:
+        """Whether a variance is at the limit of what has this cause."""
+        return any(v >= LARGEST.get(c.kind, np.inf) for c, v in zip(self.components, self.theta, strict=True))
+
     def left_out(self) -> tuple[Array, Array]:
         """Residual (n, 6) of each pose when all others predict it, and its covariance (n, 6, 6)."""
         return left_out(self.noise, self.WJ, self.u, self.C)
@@ -169,7 +174,7 @@ def point(problem: Linearised, components: Sequence[Component], theta: Array) ->
 
 def noise_of(problem: Linearised, components: Sequence[Component], theta: Array) -> Noise:
     """Give the covariance with these variances."""
-    D, walk, slope = problem.D, np.zeros(6), problem.slope
+    D, walk, white, slope = problem.D, np.zeros(6), np.zeros(6), problem.slope
     effects = []
     for c, value in zip(components, theta, strict=True):
         columns = problem.columns(c)
@@ -180,14 +185,15 @@ def noise_of(problem: Linearised, components: Sequence[Component], theta: Array)
         elif c.kind == "rotation":
             D = D + value * problem.turn @ np.swapaxes(problem.turn, 1, 2)
         else:
-            white = value * np.diag(c.share)
-            D = D + white if D.strides[0] else np.broadcast_to(D[0] + white, D.shape)
+            white += value * np.array(c.share)
+    if white.any():
+        D = D + np.diag(white) if D.strides[0] else np.broadcast_to(D[0] + np.diag(white), D.shape)
     joined = [np.concatenate(parts, axis=-1) for parts in zip(*effects, strict=True)]
     together = (joined[0], joined[1]) if joined else None
     return Noise(D, problem.time, np.sqrt(walk), slope, together, problem.kept)
 
 
-def _score(problem: Linearised, at: Point, components: Sequence[Component], theta: Array) -> tuple[Array, Array]:
+def score(problem: Linearised, at: Point, components: Sequence[Component], theta: Array) -> tuple[Array, Array]:
     """Derivative (k,) of the restricted log-likelihood by the log variances, and average information (k, k).
 
     The noise at this point need not contain all of the components: for the others it is the derivative at zero, times
@@ -197,25 +203,28 @@ def _score(problem: Linearised, at: Point, components: Sequence[Component], thet
     WJC = WJ @ C
     P = noise.blocks - WJC @ np.swapaxes(WJ, 1, 2)
     of_all = {c: T for c in components if (T := problem.columns(c)) is not None}
-    PT = {c: noise.solve(T) - WJC @ summed_products(WJ, T) for c, T in of_all.items()}
+    WT = {c: (noise.solve(T), summed_products(WJ, T)) for c, T in of_all.items()}
+    Ku = walk_times(problem.time, u) if any(c.kind == "walk" for c in components) else u
+    white_square, white_trace, walk_square = (u**2).sum(axis=0), np.einsum("ncc->c", P), (u * Ku).sum(axis=0)
     kept = int(problem.kept.sum())
-    slope, Vu = [], []
-    for c, variance in zip(components, theta, strict=True):
+    slope, Vu = [], np.empty((*u.shape, len(components)))
+    for k, (c, variance) in enumerate(zip(components, theta, strict=True)):
         share = np.array(c.share)
         if c in of_all:
             T = of_all[c]
             along = np.tensordot(u, T, 2)
-            square, trace = float(along @ along), float(np.vdot(T, PT[c]))
-            Vu.append(variance * (T @ along))
+            solved, JWT = WT[c]
+            square, trace = float(along @ along), float(np.vdot(T, solved) - np.vdot(JWT, C @ JWT))
+            Vu[..., k] = variance * (T @ along)
         elif c.kind == "white":
-            square, trace = float((u**2).sum(axis=0) @ share), float(np.einsum("ncc,c->", P, share))
-            Vu.append(variance * share * u)
+            square, trace = float(white_square @ share), float(white_trace @ share)
+            Vu[..., k] = variance * share * u
         elif c.kind == "rotation":
             turned = (u[:, None] @ problem.turn)[:, 0]
             square, trace = float((turned**2).sum()), float(np.vdot(problem.turn, P @ problem.turn))
-            Vu.append(variance * (problem.turn @ turned[..., None])[..., 0])
+            Vu[..., k] = variance * (problem.turn @ turned[..., None])[..., 0]
         else:
-            square = float(walk_square(problem.time, u) @ share)
+            square = float(walk_square @ share)
             own = np.flatnonzero(share)
             if c in at.components:
                 # K P = (V - D - effects) P, and V P = 1 - J C J' W.
@@ -223,16 +232,15 @@ def _score(problem: Linearised, at: Point, components: Sequence[Component], thet
                 others += np.einsum("ncd,ndc->", noise.D[:, own], P[:, :, own])
                 for other, value in zip(components, theta, strict=True):
                     if other in of_all:
-                        others += value * np.vdot(of_all[other][:, own], PT[other][:, own])
+                        solved, JWT = WT[other]
+                        others += value * np.vdot(of_all[other][:, own], solved[:, own] - WJC[:, own] @ JWT)
                 trace = (kept * len(own) - float(others)) / variance
             else:
                 trace = noise.walk_trace(problem.time, own, (WJ, -C))
-            Vu.append(variance * share * walk_times(problem.time, u))
+            Vu[..., k] = variance * share * Ku
         slope.append(variance * (square - trace) / 2)
-    X = np.stack(Vu, axis=-1)
-    WX = noise.solve(X)
-    JWX = summed_products(WJ, X)
-    information = (summed_products(X, WX) - JWX.T @ C @ JWX) / 2
+    JWX = summed_products(WJ, Vu)
+    information = (summed_products(Vu, noise.solve(Vu)) - JWX.T @ C @ JWX) / 2
     return np.array(slope), np.asarray(information)
 
 
@@ -242,10 +250,12 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array)
         return point(problem, components, theta)
     most = np.array([LARGEST.get(c.kind, np.inf) for c in components])
     best = point(problem, components, np.minimum(theta, most))
-    least = np.minimum(1e-3 * NEGLIGIBLE * np.array([_unit(problem, best, c) for c in components]), most)
+    least = np.minimum(1e-3 * NEGLIGIBLE * units(problem, best, components), most)
     caution = 1e-3
     for _ in range(60):
-        slope, information = _score(problem, best, best.components, best.theta)
+        slope, information = score(problem, best, best.components, best.theta)
+        if float(slope @ np.linalg.lstsq(information, slope)[0]) < SETTLED:
+            break
         gained = 0.0
         while caution < 1e6:
             damped = information + np.diag(caution * (np.diag(information) + 1e-3))
@@ -265,102 +275,65 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array)
     return best
 
 
-def select(
-    problem: Linearised,
-    components: Sequence[Component],
-    theta: Array,
-    candidates: Sequence[Component],
-    needed: int | None = None,
-) -> Point:
-    """Add the candidates that raise the likelihood, one by one, then drop those that others make needless.
+def estimates(problem: Linearised, at: Point) -> tuple[Array, Array]:
+    """Estimate parameters, and gain and cross-talk of the sensor, under given variances.
 
-    Parameters
-    ----------
-    problem : Linearised
-    components : sequence of Component
-        To start from.
-    theta : array, shape (k,)
-        Their variances.
-    candidates : sequence of Component
-    needed : int, optional
-        How many of the components, the first, are part of the model; by default all.
+    Returns
+    -------
+    values : array, shape (m + 11,)
+        Step of the free parameters; best linear prediction of the coefficients, zero where none were found.
+    covariance : array, shape (m + 11, m + 11)
     """
-    needed = len(components) if needed is None else needed
-    best = _pruned(problem, maximise(problem, components, theta), needed)
-    waiting = [c for c in candidates if c not in best.components]
-    while waiting:
-        gains, start = predicted_gains(problem, best, waiting)
-        k = int(np.argmax(gains))
-        if gains[k] < WORTH_A_TRY:
-            break
-        # What is as good as certain comes in together with others of its kind: each acts on its own channels.
-        together = [i for i, c in enumerate(waiting) if i == k or (c.kind == waiting[k].kind and gains[i] > SURE)]
-        trial = maximise(
-            problem, [*best.components, *(waiting[i] for i in together)], np.append(best.theta, start[together])
-        )
-        too_large = any(v >= LARGEST.get(c.kind, np.inf) for c, v in zip(trial.components, trial.theta, strict=True))
-        if trial.loglik > best.loglik + waiting[k].needed and not too_large:
-            best = trial
-        waiting = [c for i, c in enumerate(waiting) if i not in together]
-    return _pruned(problem, best, needed)
+    m, size = len(at.C), problem.response.shape[2]
+    found = dict(zip(at.components, at.theta, strict=True))
+    variance = np.repeat([found.get(c, 0.0) for c in RESPONSE], [5, 6])
+    values, covariance = np.zeros(m + size), np.zeros((m + size, m + size))
+    values[:m], covariance[:m, :m] = at.step, at.C
+    if variance.any():
+        T = problem.response
+        TWJ = summed_products(T, at.WJ)
+        TPT = summed_products(T, at.noise.solve(T)) - TWJ @ at.C @ TWJ.T
+        values[m:] = variance * np.tensordot(at.u, T, 2)
+        covariance[m:, :m] = -variance[:, None] * TWJ @ at.C
+        covariance[:m, m:] = covariance[m:, :m].T
+        covariance[m:, m:] = np.diag(variance) - variance[:, None] * TPT * variance
+    return values, covariance
 
 
-def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
-    """Try a linear drift of the same groups in place of random walks; keep what is likelier."""
-    walks = [k for k, c in enumerate(best.components) if c.kind == "walk"]
-    if not walks:
-        return best
-    rest = [k for k in range(len(best.components)) if k not in walks]
-    groups = [g for g in (FORCE, TORQUE) if any(best.components[k].share[c] for k in walks for c in g)]
-    slopes = [component("slope", group) for group in groups]
-    start = [
-        len(problem.r) * max(best.theta[k] for k in walks if any(best.components[k].share[c] for c in g))
-        for g in groups
-    ]
-    components = [*(best.components[k] for k in rest), *slopes]
-    trial = maximise(problem, components, np.append(best.theta[rest], start))
-    return _pruned(problem, trial, needed) if trial.loglik > best.loglik else best
+def estimates_of_unknown_variances(problem: Linearised, at: Point) -> tuple[Array, Array]:
+    """Give the `estimates` with a covariance for variances that were estimated too.
+
+    To first order in the uncertainty of the variances: estimates move with them, and the covariance at the best
+    variances is as much too small (Kenward, Roger 1997; Prasad, Rao 1990). The covariance itself is uncertain: as the
+    95 % interval of Student's distribution is wider by (z² + 1) / (4 nu), so is sigma, nu by Satterthwaite (1946).
+    """
+    x, C = estimates(problem, at)
+    if not at.components or len(problem.r) >= POSES_THAT_SHOW_THE_NOISE:
+        return x, C
+    _, information = score(problem, at, at.components, at.theta)
+    uncertainty = np.linalg.pinv(information, rcond=1e-6, hermitian=True)
+    k, h = len(at.theta), 1e-3
+    around = [estimates(problem, point(problem, at.components, at.theta * np.exp(h * row))) for row in np.eye(k)]
+    moves, changes = ([(part[i] - own) / h for part in around] for i, own in enumerate((x, C)))
+    scale = np.sqrt(np.diag(C))
+    scale[scale == 0] = 1.0
+    inverse = np.linalg.pinv(C / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
+    wider = (1.96**2 + 1) / 4 * np.einsum("ij,iab,bc,jcd->ad", uncertainty, changes, inverse, changes, optimize=True)
+    return x, C + 2 * np.transpose(moves) @ uncertainty @ np.array(moves) + wider
 
 
-def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
-    """Drop components that raise the likelihood too little, one at a time."""
-    k = needed
-    while k < len(best.components):
-        rest = [i for i in range(len(best.components)) if i != k]
-        components, theta = [best.components[i] for i in rest], best.theta[rest]
-        without = point(problem, components, theta)  # the others can regain a part of what is lost
-        if best.loglik - without.loglik < SURE:
-            without = maximise(problem, components, theta)
-        if without.worth > best.worth:
-            best, k = without, needed
+def units(problem: Linearised, best: Point, components: Sequence[Component]) -> Array:
+    """Variances (k,) at which each component is about as large as the white noise."""
+    kept, n = problem.kept, int(problem.kept.sum())
+    variance = np.einsum("ncc,n->c", best.noise.D, kept) / n
+    units = []
+    for c in components:
+        columns = problem.columns(c) if c.kind != "slope" else None
+        if columns is not None or c.kind == "rotation":
+            columns = problem.turn if columns is None else np.sqrt(n) * columns
+            square = np.einsum("ncd,ncd,n->c", columns, columns, kept.astype(np.float64)) / (n * columns.shape[2])
+            units.append(float(1 / np.max(square / variance)))
         else:
-            k += 1
-    return best
-
-
-def predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Component]) -> tuple[Array, Array]:
-    """Gain in log-likelihood that each candidate alone promises, and where to start climbing."""
-    unit = np.array([_unit(problem, best, c) for c in waiting])
-    components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * unit])
-    at = point(problem, components, theta) if best.noise.walks else best
-    slope, information = _score(problem, at, components, theta)
-    k = len(best.components)
-    curvature, slope_k = np.diag(information)[k:], slope[k:]
-    if k:
-        known = np.linalg.lstsq(information[:k, :k], np.column_stack([information[:k, k:], slope[:k]]))[0]
-        curvature = curvature - np.einsum("ki,ki->i", information[:k, k:], known[:, :-1])
-        slope_k = slope_k - information[:k, k:].T @ known[:, -1]
-    gains = np.where(slope_k > 0, slope_k**2 / (2 * np.maximum(curvature, 1e-300)), 0.0)
-    return gains, unit
-
-
-def _unit(problem: Linearised, best: Point, c: Component) -> float:
-    """Variance at which a component is about as large as the white noise."""
-    variance = np.diagonal(best.noise.D[problem.kept], axis1=1, axis2=2).mean(axis=0)
-    n = int(problem.kept.sum())
-    columns = problem.columns(c) if c.kind != "slope" else None
-    if columns is not None or c.kind == "rotation":
-        columns = problem.turn if columns is None else np.sqrt(n) * columns
-        return float(1 / np.max((columns[problem.kept] ** 2).mean(axis=(0, 2)) / variance))
-    share = np.array(c.share)
-    return float((variance * share).sum() / share.sum()) / (n if c.kind == "walk" else 1)
+            share = np.array(c.share)
+            units.append(float((variance @ share) / share.sum()) / (n if c.kind == "walk" else 1))
+    return np.array(units)

@@ -15,7 +15,7 @@ from calib import CalibrationDataset, CalibrationResult, Known, read_csv
 from calib import solve as solve_dataset
 from calib.compare import compare
 from calib.errors import CalibError
-from calib.likelihood.fit import Drift
+from calib.likelihood.session import Drift
 from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE
 from calib.result import Method
 from calib.routine import drift_check

@@ -18,8 +18,11 @@ from numpy.typing import NDArray
 from calib import Parameters, read_csv
 from calib.known import Constraints, Known
 from calib.likelihood import fit as likelihood
+from calib.likelihood.explanation import Explanation, with_all_minima
 from calib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, Response, predicted_covariance
-from calib.likelihood.variance_components import FORCE, RESPONSE, ROTATION, TORQUE, component
+from calib.likelihood.session import Session, inverses
+from calib.likelihood.session_noise import centred
+from calib.likelihood.variance_components import FORCE, RESPONSE, ROTATION, TORQUE, Kind, component
 from calib.model import STANDARD_GRAVITY_M_S2, Array, predict
 from calib.published.yu import lrom
 from calib.result import COMMON_GAIN
@@ -84,9 +87,16 @@ def recordings(lab: Lab) -> Iterator[Row]:
                 f"{name}, left out, {method}, torque", 1e3 * torque, limits[1] if own else np.inf, len(R), " mN·m"
             )
         if name.startswith("agimus"):
+            whole = likelihood.fit(R, wrench)
             for split, halves in splits(len(R)).items():
-                distance, mass_z = disagreement(*(likelihood.fit(R[h], wrench[h], t_s=h.astype(float)) for h in halves))
-                yield most(f"{name}, {split}: chi2/dof of 15 parameters", distance, 1.5, 1)
+                one, two = (likelihood.fit(R[h], wrench[h], t_s=h.astype(float)) for h in halves)
+                biases = np.r_[6:9, 12:15]
+                every, mass_z = disagreement(one, two, np.zeros(6))
+                moved, _ = disagreement(one, two, drifted(whole, halves))
+                static, _ = disagreement(one, two, np.zeros(6), without=biases)
+                yield most(f"{name}, {split}: chi2/dof of 15 parameters, biases that drift", moved, 1.5, 1)
+                yield most("  without the biases", static, 1.5, 1)
+                yield most("  biases taken as constant", every, np.inf, 1)
                 yield most(f"{name}, {split}: z of the mass", abs(mass_z), 1.3 * 1.96, 1)
 
 
@@ -95,16 +105,37 @@ def splits(n: int) -> dict[str, tuple[Rows, Rows]]:
     return {"odd/even": (rows[::2], rows[1::2]), "first/second half": (rows[: n // 2], rows[n // 2 :])}
 
 
-def disagreement(one: likelihood.Fit, two: likelihood.Fit) -> tuple[float, float]:
-    """Squared difference of the parameters in units of its covariance, over 15, and z of the weight.
+def drifted(whole: likelihood.Fit, halves: tuple[Rows, Rows]) -> Array:
+    """Variance (6,) by which the mean biases of two halves differ, under the drift found in the whole run."""
+    n = len(whole.weights)
+    contrast = np.zeros(n)
+    contrast[halves[0]], contrast[halves[1]] = 1 / len(halves[0]), -1 / len(halves[1])
+    rows = np.arange(n, dtype=np.float64)
+    size: dict[Kind, float] = {
+        "walk": float(contrast @ np.minimum.outer(rows, rows) @ contrast),
+        "slope": float(contrast @ centred(rows)) ** 2,
+    }
+    variance = np.zeros(6)
+    for kind, unit in size.items():
+        for channels in (FORCE, TORQUE, *([c] for c in range(6))):
+            variance[list(channels)] += unit * whole.components.get(component(kind, channels).name, 0.0) ** 2
+    return variance
 
-    The biases are those of different times and not compared where they drift.
+
+def disagreement(
+    one: likelihood.Fit, two: likelihood.Fit, bias_variance: Array, without: Rows | None = None
+) -> tuple[float, float]:
+    """Squared difference of the parameters in units of its covariance, over their number, and z of the weight.
+
+    The bias of each fit is the mean over its poses: `bias_variance` is by how much these truly differ.
     """
     d, C = one.parameters.difference(two.parameters), one.covariance + two.covariance
-    keep = np.arange(15) if one.drift is None and two.drift is None else np.r_[0:6, 9:12]
-    d, C = d[keep], C[np.ix_(keep, keep)]
+    C[np.r_[6:9, 12:15], np.r_[6:9, 12:15]] += bias_variance
+    keep = np.delete(np.arange(15), [] if without is None else without)
     b = one.parameters.gravity_force_base_N / np.linalg.norm(one.parameters.gravity_force_base_N)
-    return float(d @ np.linalg.solve(C, d)) / len(keep), float(b @ d[3:6] / np.sqrt(b @ C[3:6, 3:6] @ b))
+    mass_z = float(b @ d[3:6] / np.sqrt(b @ C[3:6, 3:6] @ b))
+    d, C = d[keep], C[np.ix_(keep, keep)]
+    return float(d @ np.linalg.solve(C, d)) / len(keep), mass_z
 
 
 # Simulated sensors
@@ -144,9 +175,9 @@ def sensor_run(
         "mass": (weight_N - sim.WEIGHT_N) / np.hypot(own, COMMON_GAIN * fit.gain_sigma * weight_N),
         "rejected": np.mean(fit.weights == 0),
     }
-    for split, (a, b) in splits(n).items():
-        one, two = (likelihood.fit(reported[h], wrench[h], cov, t_s=h.astype(float)) for h in (a, b))
-        record[split] = disagreement(one, two)[0]
+    for split, halves in splits(n).items():
+        one, two = (likelihood.fit(reported[h], wrench[h], cov, t_s=h.astype(float)) for h in halves)
+        record[split] = disagreement(one, two, drifted(fit, halves))[0]
     if oracle:
         fit = informed(reported, wrench, gain, cross_talk, drift_N)
         e = predicted(fit, elsewhere) - right
@@ -156,15 +187,13 @@ def sensor_run(
 
 def informed(R: Array, wrench: Array, gain: float, cross_talk: float, drift_N: float) -> likelihood.Fit:
     """Fit with the true variances."""
-    problem = likelihood._Problem(
-        R, wrench, np.diag(NOISE**2), None, "auto", Constraints(Known(), STANDARD_GRAVITY_M_S2)
-    )
+    session = Session(R, wrench, np.diag(NOISE**2), None, "auto", Constraints(Known(), STANDARD_GRAVITY_M_S2))
     found = [ROTATION, *RESPONSE, component("walk", FORCE), component("walk", TORQUE)]
     theta = np.array([ORIENTATION_RAD, gain, cross_talk, drift_N, sim.LEVER_M * drift_N]) ** 2
-    minima = problem.descent.minima(likelihood._inverses(problem.cov))
+    minima = session.descent.minima(inverses(session.cov))
     used = [k for k in range(5) if theta[k] > 0]
-    e = likelihood._Explanation(minima[0].parameters, problem.everything, tuple(found[k] for k in used), theta[used])
-    return problem._fit(e, problem._with_all_minima(e, minima), np.nan)
+    e = Explanation(minima[0].parameters, session.everything, tuple(found[k] for k in used), theta[used])
+    return likelihood.fit_of(session, e, with_all_minima(session, e, minima), np.nan)
 
 
 def false_choice(lab: Lab) -> Iterator[Row]:

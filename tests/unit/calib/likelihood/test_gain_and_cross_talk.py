@@ -8,8 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, CalibrationResult, Parameters, solve
+from calib.known import Constraints, Known
+from calib.likelihood.component_selection import with_walks_instead
 from calib.likelihood.fit import Fit, fit
 from calib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, LEVER_M, Response, response_columns
+from calib.likelihood.session import Session
+from calib.likelihood.variance_components import FORCE, RESPONSE, component, maximise
 from calib.model import Array, gravity_wrench, predict
 
 SIGMA = np.repeat([0.05, 0.00125], 3)
@@ -93,6 +97,18 @@ def test_nothing_is_found_in_a_sensor_without_error() -> None:
         _, R, wrench, _, _ = session(np.random.default_rng(seed), 24, 0.0, 0.0)
         found += fit(R, wrench, WHITE).response is not None
     assert found <= 2
+
+
+def test_white_noise_hides_no_walk_and_gain() -> None:
+    rng = np.random.default_rng(1)
+    p, R, wrench, _, _ = session(rng, 24, 0.01, 0.01)
+    wrench += np.cumsum(rng.normal(size=(24, 6)), axis=0) * 0.07 * np.repeat([1, 0.025], 3)
+    data = Session(R, wrench, WHITE, None, "auto", Constraints(Known(), 9.8))
+    problem = data.linearised(p, data.everything)
+    hidden = maximise(problem, [component("white", FORCE), RESPONSE[1]], np.array([0.02, 1e-4]))
+    found = {c.name for c in with_walks_instead(problem, hidden, data.candidates(), 0).components}
+    assert {"gain", "walk_force_N"} <= found
+    assert "white_force_N" not in found
 
 
 def test_six_poses_are_too_few_to_look_for_it() -> None:

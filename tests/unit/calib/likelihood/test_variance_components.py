@@ -1,22 +1,25 @@
 """Noise of a session: O(n) algebra against dense matrices, restricted likelihood against its definition."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy import stats
 
-from calib.likelihood.session_noise import Noise, centred, walk_square, walk_times
+from calib.likelihood.component_selection import _pruned, select, with_slopes_instead
+from calib.likelihood.session_noise import Noise, centred, walk_times
 from calib.likelihood.variance_components import (
     FORCE,
     ROTATION,
     TORQUE,
     Component,
     Linearised,
-    _pruned,
-    _score,
     component,
+    estimates,
+    estimates_of_unknown_variances,
     maximise,
     point,
-    select,
-    with_slopes_instead,
+    score,
 )
 from calib.model import Array
 
@@ -86,7 +89,6 @@ def test_the_walk_multiplies_as_its_covariance() -> None:
     tau = np.cumsum(np.diff(time, prepend=time[0] - 1))
     K = np.minimum.outer(tau, tau)
     np.testing.assert_allclose(walk_times(time, X), K @ X)
-    np.testing.assert_allclose(walk_square(time, X), np.diag(X.T @ K @ X))
 
 
 ALL = (
@@ -125,7 +127,7 @@ def problem(rng: np.random.Generator, n: int, components: tuple[Component, ...],
 def test_slope_and_curvature_are_those_of_the_restricted_likelihood(components: tuple[Component, ...]) -> None:
     rng = np.random.default_rng(5)
     p = problem(rng, N, ALL, THETA)
-    slope, information = _score(p, point(p, components, THETA), components, THETA)
+    slope, information = score(p, point(p, components, THETA), components, THETA)
     h = 1e-4
     for k in range(len(components)):
         up, down = (point(p, components, THETA * np.exp(s * h * np.eye(len(components))[k])).loglik for s in (1, -1))
@@ -137,7 +139,7 @@ def test_the_score_of_a_walk_that_the_noise_lacks_is_that_at_zero() -> None:
     p = problem(np.random.default_rng(5), N, ALL, THETA)
     without = point(p, ALL[:3], THETA[:3])
     tiny = np.append(THETA[:3], 1e-7)
-    slope, _ = _score(p, without, ALL[:4], tiny)
+    slope, _ = score(p, without, ALL[:4], tiny)
     assert ALL[3].kind == "walk"
     assert slope[3] == pytest.approx(point(p, ALL[:4], tiny).loglik - without.loglik, rel=1e-2)
 
@@ -222,3 +224,21 @@ def test_a_linear_drift_is_preferred_where_it_fits_better() -> None:
     q = problem(rng, 30, (component("walk", FORCE),), np.array([0.2]))
     at = select(q, [], np.zeros(0), [component("walk", FORCE)])
     assert with_slopes_instead(q, at, 0) is at
+
+
+def test_unknown_noise_widens_sigma_like_students_distribution() -> None:
+    white = Component("white", "white", (1.0,) * 6)
+    p = problem(np.random.default_rng(8), 8, (white,), np.array([0.3]))
+    p = replace(p, D=1e-6 * p.D)
+    at = maximise(p, (white,), np.array([0.3]))
+    x, C = estimates_of_unknown_variances(p, at)
+    nu = 6 * 8 - 8
+    np.testing.assert_allclose(x[:8], at.step)
+    np.testing.assert_allclose(C[:8, :8], at.C * (1 + (1.96**2 + 1) / (2 * nu)), rtol=1e-3, atol=1e-9)
+    assert stats.t.ppf(0.975, nu) / 1.96 == pytest.approx(np.sqrt(C[0, 0] / at.C[0, 0]), rel=2e-3)
+
+
+def test_many_poses_show_their_noise() -> None:
+    p = problem(np.random.default_rng(9), 1000, ALL[:2], THETA[:2])
+    at = point(p, ALL[:2], THETA[:2])
+    np.testing.assert_array_equal(estimates_of_unknown_variances(p, at)[1], estimates(p, at)[1])
