@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.files import require_new
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import StreamEvent
-from ftdrive.recording.growing_file import partial_of
+from ftdrive.recording.growing_file import partial_of, publish
 from ftdrive.recording.recording import COLUMNS, NUMBERS, ROW, Header, Recording, Rows, event_of, event_text
 
 _PART_NS = 10_000_000_000
@@ -49,8 +48,7 @@ class ParquetFile:
         try:
             self._write_part()
             self._copy("read_parquet($parts)", self._folder / "whole", {"parts": f"{self._folder}/*.parquet"})
-            require_new(self._path)
-            (self._folder / "whole").rename(self._path)
+            publish(self._folder / "whole", self._path)
             shutil.rmtree(self._folder)
         finally:
             self._database.close()
