@@ -45,6 +45,7 @@ class GrowingFile:
 
     def complete(self) -> None:
         """Fsync the file and give it its name. Raises `OSError`."""
+        self._file.close()
         publish(self.partial, self.path)
 
     def discard(self) -> None:
@@ -61,7 +62,7 @@ class GrowingFile:
 
 def publish(written: Path, path: Path) -> None:
     """Fsync a file and give it its name. Raises `OSError`, also if the name is taken."""
-    with written.open("rb") as file:
+    with written.open("r+b") as file:
         os.fsync(file.fileno())
     require_new(path)
     written.rename(path)
