@@ -74,7 +74,7 @@ def read_recording(path: Path, columns: Collection[str] = ROW.names or ()) -> Re
     path : Path
         Its ending names the format: .mcap, .csv or .parquet.
     columns : collection of str
-        Fields of `Recording.rows` that are needed. Others may be 0, which makes reading Parquet faster.
+        Fields of `Recording.rows` that are needed. Others may be missing, which makes reading Parquet faster.
 
     Raises
     ------
