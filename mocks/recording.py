@@ -44,7 +44,7 @@ class Recording:
     def __init__(self, t_s: Array, wrench: Array, q_rad: Array) -> None:
         if len(t_s) < 2:
             raise ValueError(f"{len(t_s)} rows are no recording")
-        finite = np.isfinite(np.column_stack((t_s, wrench, q_rad))).all(axis=1)
+        finite = np.isfinite(t_s) & np.isfinite(wrench).all(axis=1) & np.isfinite(q_rad).all(axis=1)
         if not finite.all():
             raise ValueError(f"row {int(np.argmin(finite)) + 1} holds a value that is not finite")
         rising = np.diff(t_s) > 0.0

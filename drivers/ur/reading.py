@@ -289,6 +289,7 @@ class Reader:
         else:
             self._turn_s = self._read_s = self._clock.awake_s()
             t_host_ns = self._clock.now_ns()
+            before_s = self._t_device_s
             (self._t_device_s,) = _TIMESTAMP.unpack_from(samples[-1])
             self._late_s = self._lateness.late_s(self._t_device_s, self._read_s)
             with self._changed:
@@ -296,7 +297,9 @@ class Reader:
                 for unread in self._followers:
                     unread.put((t_host_ns, samples), len(samples))
                 self._since_live += len(samples)
-                if self._since_live >= self._stream.rate_Hz / _STATES_HZ and self._late_s <= self._timing.late_s:
+                due = self._since_live >= self._stream.rate_Hz / _STATES_HZ
+                advances = self._t_device_s != before_s  # a repeated sample is not a new one
+                if due and advances and self._late_s <= self._timing.late_s:
                     self._live, self._live_s, self._since_live = (t_host_ns, samples[-1]), self._read_s, 0
                 if self._followers or not self._since_live:
                     self._changed.notify_all()

@@ -20,7 +20,8 @@ from drivers.errors import DriverError
 from drivers.interfaces import Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import Station, sensor_name
-from ftdrive.checks.devices import AXES
+from ftdrive.checks.check import Check
+from ftdrive.checks.devices import AXES, check_weighed_payload
 from ftdrive.commands.common import (
     CELL,
     FOLDER,
@@ -97,12 +98,14 @@ def live(
         if calibration is None:
             raise ConfigError("no calibration: give --calibration PATH, or --simulate")
         stream: CompensatedStream | ReplayedStream
+        checks = list[Check]()
         if replay is not None:
             stream = replay_run(Run(replay), calibration, name, frame=frame, speed=1.0 if speed is None else speed)
         else:
             if not simulate:
                 cell = read_cell(config, robot, sensor)
             stream = stack.enter_context(CompensatedStream(cell, calibration, name=name, frame=frame))
+            checks = [check_weighed_payload(stream.payload_kg, calibration, cell.sensor.mass_kg)]
             for words in stream.warnings:
                 talk.print(f" {words}")
         if once or as_json:
@@ -110,7 +113,7 @@ def live(
         elif talk.is_terminal and sys.stdout.isatty() and sys.stdin.isatty() and not plain:
             from ftdrive.terminal.live_screen import run_live
 
-            run_live(stream)
+            run_live(stream, checks=checks)
         else:
             _show_table(stream)
 
@@ -142,15 +145,14 @@ def _emulated(
     calibration: CalibrationResult | None, sensor: str | None, stack: ExitStack
 ) -> tuple[CalibrationResult, CellConfig]:
     """Start the cell of a calibration, or calibrate a new one with six poses."""
-    if calibration is not None:
-        made_by = calibration.provenance.get("station") or {}
-        name = sensor_name(sensor) if sensor else made_by.get("sensor", "can")
-        return calibration, stack.enter_context(Station(name, made_by.get("options", ()))).cell
-    station = stack.enter_context(Station(sensor_name(sensor)))
-    with TemporaryDirectory(prefix="ftdrive-") as runs:
-        result = rehearse(station, Path(runs), "simulated", poses=6, kept=False).result
-    stop_unless_accepted(result)
-    return result, station.cell
+    if calibration is None:
+        with Station(sensor_name(sensor)) as quick, TemporaryDirectory(prefix="ftdrive-") as runs:
+            calibration = rehearse(quick, Path(runs), "simulated", poses=6, kept=False).result
+        stop_unless_accepted(calibration)
+    made_by = calibration.provenance.get("station") or {}
+    name = sensor_name(sensor) if sensor else made_by.get("sensor", "can")
+    options = (*made_by.get("options", ()), "--time-scale", "1")  # a stream pairs by the controller's clock
+    return calibration, stack.enter_context(Station(name, options)).cell
 
 
 @dataclass(frozen=True, slots=True, eq=False)

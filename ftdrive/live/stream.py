@@ -113,7 +113,10 @@ class CompensatedStream(ProcessedStream):
             sensor_rate_Hz = nominal_Hz if np.isfinite(nominal_Hz) else _rate(samples.t_host_ns)
             arm_rate_Hz = _rate(states.t_host_ns)
             self._arm_step_s = float(np.median(np.diff(states.t_device_s)))
-            self.info = self._described(arm, sensor, sensor_rate_Hz, arm_rate_Hz, self._arm.status())
+            status = self._arm.status()
+            self.payload_kg = status.payload_kg
+            """As configured in the controller; None where it is not reported."""
+            self.info = self._described(arm, sensor, sensor_rate_Hz, arm_rate_Hz, status)
             frame, stages, false_alarm_rate = self._begin
             self._processor = Processor(self.info, frame, stages, false_alarm_rate=false_alarm_rate)
             delay_ms = self._cell.sensor.delay_ms

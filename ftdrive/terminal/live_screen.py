@@ -62,7 +62,7 @@ _HELP = """\
  Any key returns."""
 
 
-def run_live(stream: Stream, *, recorder: Callable[[], Sink] | None = None, checks: Sequence[Check] = ()) -> None:
+def run_live(stream: Stream, *, recorder: Callable[[Path], Sink] | None = None, checks: Sequence[Check] = ()) -> None:
     """Show a stream until the user quits.
 
     Parameters
@@ -70,7 +70,7 @@ def run_live(stream: Stream, *, recorder: Callable[[], Sink] | None = None, chec
     stream : CompensatedStream or ReplayedStream
         Open; it is read here, and closed by the caller.
     recorder : callable, optional
-        Opens a recording; the key r starts and completes one.
+        Opens a recording in a new file; the key r starts and completes one.
     checks : sequence of Check
         Findings about the cell that the stream does not know, such as "robot.payload".
 
@@ -171,11 +171,12 @@ class LiveApp(App[None]):
             self.exit()
             return
         width, height = self.size
+        view = self._summary.view()
         if self._helping:
             lines = [Line(text).fit(width) for text in _HELP.split("\n")]
             self._canvas.show((lines + [Line().to(width)] * height)[:height])
         else:
-            self._canvas.show(frame(self._summary.view(), width, height))
+            self._canvas.show(frame(view, width, height))
 
     def on_key(self, event: events.Key) -> None:
         """Do what a key stands for."""

@@ -54,7 +54,11 @@ def with_dots(svg: str) -> str:
     """Replace Braille by one path a line, and the web fonts by those of the reader."""
     svg = re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)
     svg = svg.replace("Fira Code", "DejaVu Sans Mono, Menlo, Consolas")
-    return re.sub(r'<text class="([^"]*)" x="([\d.]+)" y="([\d.]+)"[^>]*>([^<]*)</text>', _dots, svg)
+    svg = re.sub(r'<text class="([^"]*)" x="([\d.]+)" y="([\d.]+)"[^>]*>([^<]*)</text>', _dots, svg)
+    colours = dict(re.findall(r"\.(\S+-r\d+) \{ fill: (#\w+)", svg))
+    strokes = "".join(f".{name}.dots {{ stroke: {colour} }}\n" for name, colour in colours.items())
+    dots = f".dots {{ stroke-width: 3.2; stroke-linecap: round }}\n{strokes}"
+    return svg.replace("</style>", f"{dots}</style>", 1)
 
 
 def _dots(text: re.Match[str]) -> str:
@@ -67,7 +71,8 @@ def _dots(text: re.Match[str]) -> str:
                 path += f"M{x + CELL_PX * (i + 0.27 + 0.5 * column):.1f} {y - 15 + ROW_PX * row / 4:.1f}h0"
     if not path:
         return text[0]
-    return f'<path class="{style} dots" d="{path}"/>'
+    rest = re.sub("[\u2800-\u28ff]", "\N{NO-BREAK SPACE}", text[0])
+    return f'{rest}<path class="{style} dots" d="{path}"/>'
 
 
 def main() -> None:
@@ -75,11 +80,8 @@ def main() -> None:
     FOLDER.mkdir(exist_ok=True)
     for scenario in get_args(Scenario):
         svg = with_dots(asyncio.run(picture(scenario)))
-        colours = dict(re.findall(r"\.(\S+-r\d+) \{ fill: (#\w+)", svg))
-        strokes = "".join(f".{name}.dots {{ stroke: {colour} }}\n" for name, colour in colours.items())
-        dots = f".dots {{ stroke-width: 3.2; stroke-linecap: round }}\n{strokes}"
         path = FOLDER / f"live-{scenario}.svg"
-        path.write_text(svg.replace("</style>", f"{dots}</style>", 1), encoding="utf-8")
+        path.write_text(svg, encoding="utf-8")
         print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")  # noqa: T201
 
 

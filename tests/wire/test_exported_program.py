@@ -60,10 +60,10 @@ def test_it_asks_and_then_visits_every_pose_at_rest(plan: Plan, start: Callable[
     diary = [event for event in state["events"] if event["what"] in ("moves", "stands") or ": pose " in event["why"]]
     steps = [*plan.steps, plan.steps[0]]
     assert [event["what"] for event in diary] == ["moves", "stands", "textmsg"] * len(steps)
-    for step, said, stands in zip(steps, diary[1::3], diary[2::3], strict=True):
+    for step, stands, said in zip(steps, diary[1::3], diary[2::3], strict=True):
         assert re.findall(r"R(\d\d)", said["why"])[0] == f"{step.number:02}"
         np.testing.assert_allclose(stands["q_rad"], step.q_rad, atol=2e-3)
-    for stands, moves in zip(diary[2:-1:3], diary[3::3], strict=True):
+    for stands, moves in zip(diary[1:-2:3], diary[3::3], strict=True):
         assert moves["t_robot_s"] - stands["t_robot_s"] == pytest.approx(DWELL_S, abs=0.1)
     assert "The tour is complete." in events(state, "popup")
 

@@ -3,7 +3,10 @@
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime
 from operator import methodcaller
+from pathlib import Path
 from queue import SimpleQueue
 from typing import Protocol
 
@@ -87,7 +90,7 @@ class Feed:
     ----------
     stream : Stream
     recorder : callable, optional
-        Opens a recording.
+        Opens a recording in a new file.
 
     Attributes
     ----------
@@ -106,7 +109,7 @@ class Feed:
         None without a recording.
     """
 
-    def __init__(self, stream: Stream, recorder: Callable[[], Sink] | None = None) -> None:
+    def __init__(self, stream: Stream, recorder: Callable[[Path], Sink] | None = None) -> None:
         self.stream = stream
         self.blocks: deque[Block] = deque(maxlen=_MOST_BLOCKS)
         self.notes: deque[Note] = deque()
@@ -172,8 +175,10 @@ class Feed:
         elif self._recorder is None:
             self.note("recording is not available here: use `ftdrive record -o FILE`")
         else:
-            self._sink, self.recording_since_ns = self._recorder(), self.newest_ns
-            self.note("recording started")
+            utc = datetime.fromtimestamp((self._now_ns + self.stream.info.utc_offset_ns) * 1e-9, UTC)
+            path = Path(f"live-{utc:%Y-%m-%dT%H%M%SZ}.mcap")
+            self._sink, self.recording_since_ns = self._recorder(path), self._now_ns
+            self.note(f"recording to {path.absolute()}")
 
     def _run(self) -> None:
         try:
@@ -181,6 +186,10 @@ class Feed:
                 self.step()
         except BaseException as error:  # the main thread raises it
             self.crash = error
+
+    @property
+    def _now_ns(self) -> int:
+        return self.newest_ns or 0
 
     def _read(self) -> None:
         try:
@@ -199,6 +208,8 @@ class Feed:
         try:
             act(self._sink)
         except (ConfigError, OSError) as error:
+            with suppress(ConfigError, OSError):
+                self._sink.close()
             self._sink = self.recording_since_ns = None
             self.note(f"recording ended: {error}", BAD)
 

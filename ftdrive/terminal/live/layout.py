@@ -30,7 +30,7 @@ def frame(view: View, width: int, height: int) -> list[Line]:
         panels.rule(view, width),
     ]
     foot = panels.keys(view, width)
-    rows = height - len(head) - 1
+    rows = max(0, height - len(head) - 1)
     body = _wide(view, width, rows) if width >= _WIDE else _narrow(view, width, rows)
     return [*head, *body, *[Line().to(width)] * (rows - len(body)), foot][:height]
 

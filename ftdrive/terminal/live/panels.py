@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +12,7 @@ from rich.cells import cell_len
 from drivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 from ftdrive.checks.check import Check
 from ftdrive.checks.controller_settings import axes_along
-from ftdrive.checks.devices import AXES
+from ftdrive.checks.devices import AXES, check_rate
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import LinkStatus, Stages, StreamInfo, WrenchFrame
@@ -51,7 +52,7 @@ _STATE = {"ok": ("✔", GOOD), "warning": ("!", WARNING), "failed": ("✘", BAD)
 def title(view: View, width: int) -> Line:
     """Name the devices, and whether the numbers are live."""
     line = Line(" ftdrive live", STRONG).add("  ")
-    line.add(" · ".join([view.info.arm.model, _named(view.info.sensor), view.info.tool]))
+    line.add(" · ".join(filter(None, [view.info.arm.model, _named(view.info.sensor), view.info.tool])))
     right = Line()
     if view.is_frozen:
         right.add(" FROZEN ", "reverse bold", "z").add(" ")
@@ -64,7 +65,8 @@ def title(view: View, width: int) -> Line:
 
 def _replay(replay: Replay) -> Line:
     state = "ended" if replay.has_ended else "paused" if replay.is_paused else f"x {replay.speed:g}"
-    return Line(f"REPLAY {_clock(replay.at_s)} of {_clock(replay.duration_s)}, {state}", STRONG, "space")
+    at, end = (f"{int(t_s // 60):02d}:{t_s % 60:04.1f}" for t_s in (replay.at_s, replay.duration_s))
+    return Line(f"REPLAY {at} of {end}, {state}", STRONG, "space")
 
 
 def provenance(view: View, width: int) -> Line:
@@ -128,9 +130,7 @@ def state(view: View, width: int) -> Line:
     else:
         force_N = float(np.linalg.norm(status.tare[:3]))
         line.add(f"{_time_of_day(view.info, status.tare_t_host_ns)[:5]} {force_N:.2f} N")
-    is_drifting = abs(status.drift_N_h) > _SIGNIFICANT * status.drift_sigma_N_h > 0
-    drift = f"{_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h"
-    line.add("   drift ").add(drift, WARNING if is_drifting else "")
+    line.add(f"   drift {_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h")
     return line.fit(width)
 
 
@@ -143,7 +143,7 @@ def _age(view: View) -> str:
     if not isinstance(created, str) or view.reading is None:
         return ""
     now_s = (view.reading.t_host_ns + view.info.utc_offset_ns) * 1e-9
-    hours = (now_s - datetime.fromisoformat(created).timestamp()) / 3600
+    hours = max(0.0, now_s - datetime.fromisoformat(created).timestamp()) / 3600
     return f" {hours * 60:.0f} min" if hours < 1 else f" {hours:.0f} h" if hours < 48 else f" {hours / 24:.0f} d"
 
 
@@ -283,13 +283,11 @@ def _contact(view: View) -> Line:
     reading, status = view.reading, view.status
     if reading is None or view.silent:
         return Line()
+    if np.isnan(reading.chi2):
+        return Line("noise not known yet", FAINT)
     rate = f"1 in {1 / status.false_alarm_rate:.0f}" if status.false_alarm_rate else ""
     sign = ">" if reading.chi2 > status.contact_limit else "<"
-    test = (
-        "noise not known yet"
-        if np.isnan(reading.chi2)
-        else f"χ² {reading.chi2:.0f} {sign} {status.contact_limit:.1f}, {rate}"
-    )
+    test = f"χ² {reading.chi2:.0f} {sign} {status.contact_limit:.1f}, {rate}"
     if reading.in_contact:
         return Line("▲ CONTACT ", f"bold {CONTACT}").add(f"{view.contact_s:.1f} s  ").add(test, FAINT)
     return Line("free  ", GOOD).add(test, FAINT)
@@ -367,9 +365,9 @@ def _range(view: View) -> Line:
 
 def _link(name: str, link: LinkStatus) -> Line:
     line = Line(f" {name:<10}", FAINT)
-    slow = link.nominal_rate_Hz > 0 and abs(link.rate_Hz / link.nominal_rate_Hz - 1) > 0.1
-    nominal = f" of {link.nominal_rate_Hz:.0f}" if link.nominal_rate_Hz > 0 else ""
-    line.add(f"{link.rate_Hz:.0f}{nominal} Hz", WARNING if slow else "")
+    nominal = "" if np.isnan(link.nominal_rate_Hz) else f" of {link.nominal_rate_Hz:.0f}"
+    is_usual = check_rate(link.rate_Hz, link.nominal_rate_Hz).state == "ok"
+    line.add(f"{link.rate_Hz:.0f}{nominal} Hz", "" if is_usual else WARNING)
     line.add("  ").add(f"lost {link.lost}", WARNING if link.lost else "")
     return line.add("  ").add(f"age {_short(link.age_s)}", BAD if link.error else "")
 
@@ -440,28 +438,34 @@ def sphere(view: View, width: int) -> list[Line]:
 
 def _half_sphere(known: Array, down: Array | None) -> list[Line]:
     """Draw one half of the sphere, seen along z; the distance from the middle is the angle."""
-    rows = _DISC // 2
-    angle = np.linspace(0, 2 * np.pi, 200)
-    dots = np.zeros((4 * rows, 2 * _DISC), np.bool_)
-    for radius in (0.5, 1.0):
-        y = np.round((2 * rows - 0.5) * (1 - radius * np.sin(angle)))
-        x = np.round((_DISC - 0.5) * (1 + radius * np.cos(angle)))
-        dots[y.astype(int), x.astype(int)] = True
-    rim = [list(braille.text(row)) for row in braille.characters(dots)]
-    styles = [[FAINT] * _DISC for _ in range(rows)]
+    disc = [list(row) for row in _rings()]
+    rows = len(disc)
+    styles = [[FAINT] * _DISC for _ in disc]
     for directions, sign, style in ((known, "∘", ""), (() if down is None else down[None], "●", BAD)):
         for x, y, z in directions:
             radius = np.arccos(min(abs(z), 1.0)) / (np.pi / 2) / max(np.hypot(x, y), 1e-9)
             row = min(rows - 1, int((1 - radius * y) * rows / 2))
             column = min(_DISC - 1, int((1 + radius * x) * _DISC / 2))
-            rim[row][column], styles[row][column] = sign, style
+            disc[row][column], styles[row][column] = sign, style
     lines = []
-    for signs, kinds in zip(rim, styles, strict=True):
+    for signs, kinds in zip(disc, styles, strict=True):
         line = Line()
         for sign, kind in zip(signs, kinds, strict=True):
             line.add(sign, kind)
         lines.append(line)
     return lines
+
+
+@cache
+def _rings() -> list[str]:
+    """Draw circles at 45° and 90°."""
+    rows, angle = _DISC // 2, np.linspace(0, 2 * np.pi, 200)
+    dots = np.zeros((4 * rows, 2 * _DISC), np.bool_)
+    for radius in (0.5, 1.0):
+        y = np.round((2 * rows - 0.5) * (1 - radius * np.sin(angle)))
+        x = np.round((_DISC - 0.5) * (1 + radius * np.cos(angle)))
+        dots[y.astype(int), x.astype(int)] = True
+    return [braille.text(row) for row in braille.characters(dots)]
 
 
 def _unit(vector: Array) -> Array:

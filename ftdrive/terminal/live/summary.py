@@ -23,6 +23,7 @@ T = TypeVar("T")
 
 _MEAN_NS = round(MEAN_S * 1e9)
 _REST_NS = 2_000_000_000
+_STILL_RAD = 5e-4
 _STALE_S = 0.3
 """An older number is not shown."""
 _MOST_NOTES = 200
@@ -55,7 +56,7 @@ class Summary:
         self._dataset = dataset
         self._resting: list[Array] | None = None if dataset is None else []
         """Samples of the free tool, until its noise has been compared."""
-        self._rested_since_ns = 0
+        self._rested_since_ns, self._rested_at = 0, np.eye(3)
         self._histories = {span_s: History(span_s) for span_s in SPANS_S}
         self._recent: deque[_Sum] = deque()
         self._newest: Block | None = None
@@ -152,7 +153,7 @@ class Summary:
                     history.clear()
         if has_gone_back:
             self._recent.clear()
-        self._follow_contact(t_ns, in_contact, anew=has_gone_back)
+        self._follow_contact(t_ns, in_contact, restarted=has_gone_back)
         self._newest = newest
         for block in blocks:
             end_ns = int(block.t_host_ns[-1])
@@ -164,19 +165,21 @@ class Summary:
             history.add(t_ns, wrench, in_contact)
         self._check_noise(blocks)
 
-    def _follow_contact(self, t_ns: NDArray[np.int64], in_contact: NDArray[np.bool_], *, anew: bool) -> None:
+    def _follow_contact(self, t_ns: NDArray[np.int64], in_contact: NDArray[np.bool_], *, restarted: bool) -> None:
         if not in_contact[-1]:
             return
         free = np.flatnonzero(~in_contact)
-        if len(free) or anew or self._newest is None or not self._newest.in_contact[-1]:
+        if len(free) or restarted or self._newest is None or not self._newest.in_contact[-1]:
             self._contact_since_ns = int(t_ns[free[-1] + 1 if len(free) else 0])
 
     def _check_noise(self, blocks: list[Block]) -> None:
         """Compare the noise of a free tool at rest with that of the calibration, once."""
         if self._resting is None or self._dataset is None:
             return
-        if not self._resting or any(block.in_contact.any() for block in blocks):
-            self._resting, self._rested_since_ns = [], self._now_ns
+        first, last = blocks[0], blocks[-1]
+        moves = np.abs(last.R_base_flange[-1] - self._rested_at).max() > _STILL_RAD
+        if not self._resting or moves or any(block.in_contact.any() for block in blocks):
+            self._resting, self._rested_since_ns, self._rested_at = [], self._now_ns, first.R_base_flange[0]
         self._resting += [block.raw for block in blocks]
         if self._now_ns - self._rested_since_ns < _REST_NS:
             return

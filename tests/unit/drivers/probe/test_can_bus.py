@@ -50,7 +50,7 @@ def test_a_silent_bus_is_asked_by_readings_only(probed: Probe, bitrate: int, sen
         ([STREAM[0], "002 0102030405400000"], [ATI_SERIAL], "Robotous"),
         (["301 AABBCCDDEEFF0011"], [ATI_SERIAL, ROBOTOUS_MODEL], None),
     ],
-    ids=["a PDO", "CANopen", "command", "short", "half", "no sample", "no overload", "reserved overload bit", "elsewhere"],
+    ids=["a PDO", "CANopen", "command", "short", "half", "no sample", "no overload", "reserved bit", "elsewhere"],
 )
 def test_identifiers_in_use_by_something_else_are_left_alone(
     probed: Probe, frames: list[str], sent: list[str], refused: str | None

@@ -17,6 +17,7 @@ from ftdrive.cli import cli, in_a_sentence
 from ftdrive.commands.doctor import _print
 from ftdrive.commands.live import _screen
 from ftdrive.errors import Declined
+from ftdrive.live.samples import WrenchFrame
 from ftdrive.session import session
 from ftdrive.session.events import Noted
 from ftdrive.session.operator import Question
@@ -50,10 +51,11 @@ def test_brackets_and_colons_are_no_markup(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_the_live_screen_shows_a_path_as_it_is() -> None:
     numbers = {"force_N": [1.0, -2.0, 3.0], "torque_Nm": [0.1, 0.2, 0.3]}
-    reading = {"axes": "base", "about": "sensor origin", "verdict": "good", "rate_Hz": 100.0, "lost": 0}
-    reading |= {"raw": numbers, "compensated": numbers, "sigma": numbers}
+    reading = {"verdict": "good", "rate_Hz": 100.0, "lost": 0, "contact": False, "stale": None}
+    reading |= {"delay_s": {"value": 0.0, "sigma": 0.0}, "raw": numbers, "compensated": numbers, "sigma": numbers}
+    reading |= {"contact": False, "stale": None, "delay_s": {"value": 0.0, "sigma": 0.0}}
     with talk.capture() as shown:
-        talk.print(_screen(reading, "my [old] runs/calibration.json"))
+        talk.print(_screen(reading, WrenchFrame("base"), "my [old] runs/calibration.json"))
     assert "my [old] runs/calibration.json" in shown.get()
     assert "[/]" not in shown.get()
 

@@ -1,8 +1,11 @@
 """The live screen as a user sees it: what it shows at which size, keys, mouse, colours."""
 
 import asyncio
+import threading
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,14 +14,16 @@ from rich.cells import cell_len
 from syrupy.assertion import SnapshotAssertion
 from textual.pilot import Pilot
 
+from calib import CalibrationDataset
+from drivers.errors import DeviceTimeout
 from ftdrive.checks.check import Check
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import STEP_S, ReplayedStream
-from ftdrive.live.samples import Paired, Stages, WrenchFrame
+from ftdrive.live.samples import Block, Paired, Stages, StreamInfo, WrenchFrame
 from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.layout import frame
 from ftdrive.terminal.live.summary import Summary
-from ftdrive.terminal.live_screen import LiveApp
+from ftdrive.terminal.live_screen import LiveApp, _dataset_of, run_live
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.terminal.fake_stream import FREE, INFO, R_BASE_FLANGE, SIGMA, START_NS, FakeStream, Scenario
 
@@ -91,8 +96,8 @@ def test_screen(scenario: Scenario, size: tuple[int, int], snapshot: SnapshotAss
 @pytest.mark.parametrize("scenario", ["contact", "stale"])
 def test_every_size_is_filled_exactly(scenario: Scenario) -> None:
     view = Screen(scenario).summary.view()
-    for width in (40, 60, 79, 81, 119, 121, 200):
-        for height in (8, 16, 23, 25, 40, 70):
+    for width in (1, 40, 60, 79, 81, 119, 121, 200):
+        for height in (1, 8, 16, 23, 25, 40, 70):
             lines = frame(view, width, height)
             assert {line.width for line in lines} == {width}
             assert len(lines) == height
@@ -196,7 +201,7 @@ def test_a_replay_pauses_steps_seeks_and_says_where_it_is() -> None:
         begin_s = replayed.at_s
         await screen.press(pilot, ".", ".")
         assert begin_s + STEP_S < replayed.at_s < begin_s + 5 * STEP_S
-        assert "REPLAY 00:00:00 of 00:00:19, paused" in (await screen.lines(pilot))[0]
+        assert "of 00:20.0, paused" in (await screen.lines(pilot))[0]
         await screen.press(pilot, "right", "right", "left", "right", "plus", "space")
         screen.step(40)
         assert replayed.at_s > 10
@@ -238,6 +243,52 @@ def test_stages_and_keys_can_be_clicked_and_q_ends() -> None:
     screen.run(act)
     assert not screen.stream.stages.gravity
     assert screen.stream.called == ["tare"]
+
+
+@pytest.fixture
+def no_app(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the app end as soon as its stream has failed."""
+
+    def run(app: LiveApp) -> None:
+        for _ in range(2000):
+            if app._feed.failure is not None or app._feed.crash is not None:
+                return
+            threading.Event().wait(0.005)
+
+    monkeypatch.setattr(LiveApp, "run", run)
+
+
+@pytest.mark.usefixtures("no_app")
+def test_a_stream_that_has_failed_is_the_end_of_the_command() -> None:
+    with pytest.raises(DeviceTimeout, match="sent no sample"):
+        run_live(FakeStream(silent_after=3))
+
+
+@pytest.mark.usefixtures("no_app")
+def test_an_error_of_the_reading_thread_is_raised() -> None:
+    class Other(FakeStream):
+        def read(self) -> Block:
+            raise ConfigError("another device answers: start again")
+
+    with pytest.raises(ConfigError, match="another device"):
+        run_live(Other())
+
+
+def test_the_poses_of_a_calibration_are_found_by_their_hash(tmp_path: Path) -> None:
+    poses = CalibrationDataset(
+        np.tile(R_BASE_FLANGE, (4, 1, 1)), np.zeros((4, 6)), None, np.zeros(4, np.int64), np.full(4, np.nan)
+    )
+    poses.save(tmp_path / "dataset-2.json")
+    (tmp_path / "dataset.json").write_text("damaged")
+
+    def info(digest: str) -> StreamInfo:
+        calibration = replace(INFO.calibration, provenance={"dataset_sha256": digest})
+        return replace(INFO, calibration=calibration, calibration_name=str(tmp_path / "calibration.json"))
+
+    found = _dataset_of(info(poses.sha256()))
+    assert found is not None
+    assert found.sha256() == poses.sha256()
+    assert _dataset_of(info("0" * 64)) is None
 
 
 def styles(screen: Screen) -> set[Any]:

@@ -35,7 +35,7 @@ class Tape:
 
 def test_a_recording_has_all_blocks_and_events_from_key_to_key() -> None:
     tape = Tape()
-    feed = Feed(FakeStream(), lambda: tape)
+    feed = Feed(FakeStream(), lambda path: tape if path.name == "live-2026-11-16T150000Z.mcap" else Tape(0))
     feed.step()
     feed.request(feed.switch_recording)
     feed.step()
@@ -44,16 +44,19 @@ def test_a_recording_has_all_blocks_and_events_from_key_to_key() -> None:
     assert feed.recording_since_ns is not None
     feed.request(feed.switch_recording)
     feed.step()
+    assert feed.notes[0].text.endswith("live-2026-11-16T150000Z.mcap")
     assert (len(tape.blocks), [event.kind for event in tape.events], tape.closed) == (2, ["mark"], 1)
     assert feed.recording_since_ns is None
 
 
 def test_a_full_disk_ends_the_recording_and_not_the_screen() -> None:
-    feed = Feed(FakeStream(), lambda: Tape(full_after=2))
+    tape = Tape(full_after=2)
+    feed = Feed(FakeStream(), lambda _: tape)
     feed.request(feed.switch_recording)
     for _ in range(5):
         feed.step()
     assert len(feed.blocks) == 5
+    assert tape.closed == 1
     assert feed.recording_since_ns is None
     assert "recording ended: [Errno 28] No space left on device" in [note.text for note in feed.notes]
 
@@ -99,7 +102,7 @@ def test_the_thread_reads_until_it_is_stopped_and_completes_the_recording() -> N
                 threading.Event().wait(0.001)
             return super().read()
 
-    feed = Feed(Counted(), lambda: tape)
+    feed = Feed(Counted(), lambda _: tape)
     feed.request(feed.switch_recording)
     feed.start()
     assert enough.wait(20)

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset
 from ftdrive.checks.check import Check
-from ftdrive.live.samples import WrenchFrame
+from ftdrive.live.samples import Block, WrenchFrame
 from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.summary import Summary
 from ftdrive.terminal.live.view import Reading, View
@@ -119,6 +120,19 @@ def test_the_noise_is_compared_once_with_that_of_the_calibration(noise: float, s
         view = rig.run(10)
     assert [(check.name, check.state) for check in view.checks] == [("noise.change", state)]
     assert len(view.notes) == (state == "warning")
+
+
+def test_noise_is_not_judged_while_the_arm_moves() -> None:
+    class Moving(FakeStream):
+        def read(self) -> Block:
+            turn = Rotation.from_rotvec([0.0, 0.0, 0.01 * self.blocks]).as_matrix()
+            block = super().read()
+            return replace(block, R_base_flange=block.R_base_flange @ turn, raw=block.raw * 10)
+
+    rig = Rig(Moving(), dataset(1.0))
+    for _ in range(30):
+        view = rig.run(10)
+    assert not view.checks
 
 
 def test_an_event_that_repeats_is_one_line() -> None:
