@@ -275,3 +275,16 @@ def test_compensate_imports_no_driver_of_a_device(recorded: Path) -> None:
     )
     outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert outcome.returncode == 0, outcome.stderr
+
+
+def test_live_replays_a_recording_with_its_calibration_or_another(
+    recorded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--speed", "1e9", "--once", "--json", "--axes", "base"]
+    assert cli.run(["live", "--replay", str(recorded), *options]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert np.linalg.norm(answer["compensated"]["force_N"]) < 0.1
+    assert cli.run(["live", "--replay", str(recorded), "--calibration", "c.json", *options]) == 0
+    assert json.loads(capsys.readouterr().out)["compensated"] == answer["compensated"]
+    Path("d.csv").write_text("t\n")
+    assert cli.run(["live", "--replay", "d.csv", "--once"]) == 6
