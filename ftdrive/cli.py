@@ -26,6 +26,7 @@ _COMMANDS = {
     "record": ("ftdrive.commands.record", "Record raw and compensated wrench with pose and events."),
     "convert": ("ftdrive.commands.convert", "Convert a recording between MCAP, CSV and Parquet."),
     "compensate": ("ftdrive.commands.compensate", "Compensate a recording. Needs no device."),
+    "stream": ("ftdrive.commands.stream", "Serve the wrench to Foxglove, Lichtblick and PlotJuggler."),
     "replay": ("ftdrive.commands.replay", "Repeat a recorded run through the same routine and solver."),
     "export": ("ftdrive.commands.export", "Write a plan as a program for the pendant or as a table."),
     "transcript": ("ftdrive.commands.transcript", "Record or play the bytes on a sensor's wire."),

@@ -1,4 +1,4 @@
-"""Blocks as ROS 2 messages: CDR bytes, `ros2msg` schemas and topics, shared by recordings and servers.
+"""Samples as ROS 2 messages: CDR bytes, `ros2msg` schemas and topics, shared by recordings and servers.
 
 CDR: 4 bytes that say "little endian", then the fields, each aligned to its size counted from there. All but the stamp
 and the numbers is the same in every message of a block, so that a block is packed as one array of records.
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drivers.interfaces import Array
-from ftdrive.live.samples import Block, WrenchFrame
+from ftdrive.live.samples import WrenchFrame
 
 RAW, COMPENSATED, POSE, JOINTS = "/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states"
 
@@ -88,17 +88,6 @@ def frame_id(frame: WrenchFrame) -> str:
     if isinstance(frame.about, str):
         return f"{frame.axes}_at_{frame.about}"
     return f"{frame.axes}_at_{'_'.join(f'{x:g}' for x in frame.about)}_m"
-
-
-def messages(block: Block, utc_offset_ns: int) -> dict[str, list[bytes]]:
-    """Pack a block: one message per sample and topic, stamped with UTC."""
-    t_ns = block.t_host_ns + utc_offset_ns
-    return {
-        RAW: pack_wrenches(t_ns, block.raw, "sensor"),
-        COMPENSATED: pack_wrenches(t_ns, block.wrench, frame_id(block.frame)),
-        POSE: pack_poses(t_ns, block.R_base_flange, block.p_base_flange_m),
-        JOINTS: pack_joints(t_ns, block.q_rad),
-    }
 
 
 def pack_wrenches(t_utc_ns: NDArray[np.int64], wrench: Array, frame: str) -> list[bytes]:

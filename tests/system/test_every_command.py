@@ -124,7 +124,7 @@ def test_a_full_disk_and_a_reader_that_is_gone_are_no_crash() -> None:
     [
         pytest.param(name, marks=pytest.mark.slow) if name == "calibrate" else name
         for name in names(cli)
-        if name not in ("demo", "live", "record", *REHEARSED, *OFFLINE)
+        if name not in ("demo", "live", "record", "stream", *REHEARSED, *OFFLINE)
     ],
 )
 def test_every_command_works_with_simulate_and_json(

@@ -1,9 +1,12 @@
 """Two other implementations of CDR read what we pack."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
 from ftdrive.live import ros2
@@ -23,23 +26,23 @@ PACKED = {
 
 
 @pytest.fixture(scope="module")
-def store():
+def store() -> Typestore:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
 @pytest.mark.parametrize("topic", PACKED)
-def test_rosbags_writes_the_same_bytes(store, topic: str) -> None:
+def test_rosbags_writes_the_same_bytes(store: Typestore, topic: str) -> None:
     name = ros2.SCHEMAS[topic].name
     for packed, t_ns in zip(PACKED[topic], T_NS.tolist(), strict=True):
-        message = store.deserialize_cdr(packed, name)
+        message: Any = store.deserialize_cdr(packed, name)
         assert message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec == t_ns
         assert bytes(store.serialize_cdr(message, name)) == packed
 
 
 @pytest.mark.parametrize("length", range(1, 10))
-def test_numbers_stay_aligned_after_a_frame_name_of_any_length(store, length: int) -> None:
+def test_numbers_stay_aligned_after_a_frame_name_of_any_length(store: Typestore, length: int) -> None:
     packed = ros2.pack_wrenches(T_NS, NUMBERS, "x" * length)[-1]
-    message = store.deserialize_cdr(packed, "geometry_msgs/msg/WrenchStamped")
+    message: Any = store.deserialize_cdr(packed, "geometry_msgs/msg/WrenchStamped")
     force, torque = message.wrench.force, message.wrench.torque
     assert message.header.frame_id == "x" * length
     assert [force.x, force.y, force.z, torque.x, torque.y, torque.z] == NUMBERS[-1].tolist()

@@ -1,0 +1,75 @@
+"""JSON over UDP, for PlotJuggler before 3.16."""
+
+import json
+import socket
+from math import isfinite
+
+from ftdrive.errors import ConfigError
+from ftdrive.live import ros2
+from ftdrive.live.samples import Block, StreamEvent, StreamInfo
+from ftdrive.servers.picked import Picked
+
+RATE_HZ = 200.0
+"""A plot of 5 s is about 1000 pixels wide: a higher rate is not visible. PlotJuggler parses datagrams in the thread of
+its window, and the system drops without a count what it does not read in time."""
+
+
+class UdpSender:
+    """Sends raw and compensated wrench at `RATE_HZ`, one sample a datagram, with the UTC in seconds as `timestamp`.
+
+    Parameters
+    ----------
+    host, port : str, int
+        PlotJuggler listens on port 9870.
+
+    Raises
+    ------
+    ConfigError
+        The host is unknown.
+    """
+
+    def __init__(self, info: StreamInfo, host: str, port: int) -> None:
+        try:
+            family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        except OSError as error:
+            raise ConfigError(f"--udp {host}:{port}: {error.strerror}: give the address of the viewer") from error
+        self._socket = socket.socket(family, kind, protocol)
+        self._socket.setblocking(False)
+        self._address = address
+        self._offset_ns = info.utc_offset_ns
+        self._picked = Picked(RATE_HZ)
+        self.sent = 0
+        self.dropped = 0
+        """Datagrams that the system did not take."""
+
+    def write(self, block: Block) -> None:
+        """Send what is due of a block; never waits."""
+        few = block.rows(self._picked.rows(block.t_host_ns))
+        compensated = f"compensated_{ros2.frame_id(block.frame)}"
+        for i, t_ns in enumerate((few.t_host_ns + self._offset_ns).tolist()):
+            values = {
+                "timestamp": t_ns * 1e-9,
+                "raw_sensor": _named(few.raw[i].tolist()),
+                compensated: _named(few.wrench[i].tolist()),
+                "chi2": chi2 if isfinite(chi2 := float(few.chi2[i])) else None,
+                "in_contact": int(few.in_contact[i]),
+            }
+            try:
+                self._socket.sendto(json.dumps(values).encode(), self._address)
+                self.sent += 1
+            except OSError:  # no room, or no way there at the moment: the next one is soon
+                self.dropped += 1
+
+    def event(self, event: StreamEvent) -> None:
+        """Send nothing: PlotJuggler plots numbers."""
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+def _named(wrench: list[float]) -> dict[str, dict[str, float]]:
+    return {
+        "force_N": dict(zip("xyz", wrench[:3], strict=True)),
+        "torque_Nm": dict(zip("xyz", wrench[3:], strict=True)),
+    }

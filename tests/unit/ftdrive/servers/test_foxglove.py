@@ -1,0 +1,351 @@
+"""A plain WebSocket client reads what the server sends, and decodes it with other implementations."""
+
+import base64
+import importlib
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
+
+from drivers.interfaces import Array
+from ftdrive.errors import ConfigError
+from ftdrive.live import ros2
+from ftdrive.live.samples import Stages, StreamEvent, WrenchFrame
+from ftdrive.servers import foxglove
+from ftdrive.servers.foxglove import ARROWS, EVENTS, STATUS, TRANSFORMS, FoxgloveServer
+from tests.unit.ftdrive.servers.fake_stream import INFO, UTC_OFFSET_NS, Client, FakeStream, block
+
+
+@pytest.fixture
+def stream() -> FakeStream:
+    return FakeStream()
+
+
+@pytest.fixture
+def server(stream: FakeStream) -> Iterator[FoxgloveServer]:
+    server = FoxgloveServer(cast(Any, stream), port=0)
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def client(server: FoxgloveServer) -> Iterator[Client]:
+    with Client.to(server.port) as client:
+        yield client
+
+
+def read_cdr(client: Client, topic: str, payload: bytes) -> Any:
+    """Decode by the schema that the server sent."""
+    channel = client.channels[topic]
+    assert (channel["encoding"], channel["schemaEncoding"]) == ("cdr", "ros2msg")
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(channel["schema"], channel["schemaName"]))
+    return store.deserialize_cdr(payload, channel["schemaName"])
+
+
+def read_protobuf(client: Client, topic: str, payload: bytes) -> Any:
+    """Decode by the descriptors that the server sent."""
+    channel = client.channels[topic]
+    assert (channel["encoding"], channel["schemaEncoding"]) == ("protobuf", "protobuf")
+    pool = descriptor_pool.DescriptorPool()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(base64.b64decode(channel["schema"])).file:
+        pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(channel["schemaName"])).FromString(payload)
+
+
+def stamp_ns(stamp: Any) -> int:
+    return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
+
+
+def numbers(*parts: Any) -> list[float]:
+    return [getattr(part, axis) for part in parts for axis in "xyz"]
+
+
+def test_the_server_is_what_viewers_expect(client: Client) -> None:
+    assert client.socket.subprotocol == "foxglove.sdk.v1"
+    assert client.info["name"] == "ftdrive: gripper, calibration.json"
+    assert {"parameters", "services"} <= set(client.info["capabilities"])
+    assert {topic: item["schemaName"] for topic, item in client.channels.items() if topic != STATUS} == {
+        ros2.RAW: "geometry_msgs/msg/WrenchStamped",
+        ros2.COMPENSATED: "geometry_msgs/msg/WrenchStamped",
+        ros2.POSE: "geometry_msgs/msg/PoseStamped",
+        ros2.JOINTS: "sensor_msgs/msg/JointState",
+        TRANSFORMS: "foxglove.FrameTransforms",
+        ARROWS: "foxglove.SceneUpdate",
+        EVENTS: "foxglove.Log",
+    }
+
+
+@pytest.mark.parametrize(("topic", "sign", "frame"), [(ros2.RAW, 1, "sensor"), (ros2.COMPENSATED, -1, "base_at_tcp")])
+def test_every_wrench_is_sent(server: FoxgloveServer, client: Client, topic: str, sign: int, frame: str) -> None:
+    client.subscribe(topic)
+    sent = block(start=5, frame=WrenchFrame("base", "tcp"))
+    server.write(sent)
+    for i in range(len(sent)):
+        received, log_time_ns, payload = client.message()
+        message = read_cdr(client, topic, payload) if i in (0, 69) else None
+        assert received == topic
+        assert log_time_ns == sent.t_host_ns[i] + UTC_OFFSET_NS
+        if message is not None:
+            assert stamp_ns(message.header.stamp) == log_time_ns
+            assert message.header.frame_id == frame
+            assert numbers(message.wrench.force, message.wrench.torque) == (sign * sent.raw[i]).tolist()
+
+
+def test_poses_and_joints_come_at_the_rate_of_the_arm(server: FoxgloveServer, client: Client) -> None:
+    client.subscribe(ros2.POSE, ros2.JOINTS)
+    sent = block(700)
+    server.write(sent)
+    received = [client.message() for _ in range(2 * 50)]
+    by_time = {int(t_ns): i for i, t_ns in enumerate(sent.t_host_ns + UTC_OFFSET_NS)}
+    assert {topic for topic, _, _ in received} == {ros2.POSE, ros2.JOINTS}
+    for topic, t_ns, payload in (received[0], received[-1]):
+        i = by_time[t_ns]
+        message = read_cdr(client, topic, payload)
+        if topic == ros2.JOINTS:
+            assert message.name == list(ros2.JOINT_NAMES)
+            assert message.position.tolist() == sent.q_rad[i].tolist()
+        else:
+            q = message.pose.orientation
+            assert numbers(message.pose.position) == sent.p_base_flange_m[i].tolist()
+            assert np.allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), sent.R_base_flange[i])
+
+
+def test_frames_lead_from_base_to_the_frame_of_the_wrench(server: FoxgloveServer, client: Client) -> None:
+    client.subscribe(TRANSFORMS)
+    sent = block(start=9, frame=WrenchFrame("base", (0.01, 0.02, 0.03)))
+    server.write(sent)
+    _, t_ns, payload = client.message()
+    poses = {"base": (np.eye(3), np.zeros(3))}
+    for item in read_protobuf(client, TRANSFORMS, payload).transforms:
+        R_base_parent, p_base_parent = poses[item.parent_frame_id]
+        q, p = item.rotation, item.translation
+        R = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+        poses[item.child_frame_id] = (R_base_parent @ R, p_base_parent + R_base_parent @ [p.x, p.y, p.z])
+        assert item.timestamp.seconds * 1_000_000_000 + item.timestamp.nanos == t_ns
+    R_base_flange, p_base_flange_m = sent.R_base_flange[-1], sent.p_base_flange_m[-1]
+    expected = {
+        "base": (np.eye(3), np.zeros(3)),
+        "flange": (R_base_flange, p_base_flange_m),
+        "sensor": (R_base_flange @ INFO.calibration.R_flange_sensor, p_base_flange_m + R_base_flange @ [0, 0, 0.04]),
+        "tcp": (R_base_flange @ INFO.R_flange_tcp, p_base_flange_m + R_base_flange @ [0, 0.1, 0.2]),
+        "base_at_0.01_0.02_0.03_m": (np.eye(3), p_base_flange_m + R_base_flange @ [0.01, 0.02, 0.03]),
+    }
+    assert poses.keys() == expected.keys()
+    for name, (R, p) in expected.items():
+        assert np.allclose(poses[name][0], R), name
+        assert np.allclose(poses[name][1], p), name
+
+
+def test_frames_that_are_not_configured_are_left_out_and_never_nan(stream: FakeStream) -> None:
+    unknown = np.full(3, np.nan)
+    stream.info = replace(INFO, p_flange_sensor_m=unknown, p_flange_tcp_m=unknown)
+    with closing(FoxgloveServer(cast(Any, stream), port=0)) as server, Client.to(server.port) as client:
+        client.subscribe(TRANSFORMS)
+        server.write(block())
+        found = {
+            item.child_frame_id: item for item in read_protobuf(client, TRANSFORMS, client.message()[2]).transforms
+        }
+    assert found.keys() == {"flange", "sensor"}
+    assert numbers(found["sensor"].translation) == [0, 0, 0]
+
+
+def test_a_block_without_samples_sends_nothing(server: FoxgloveServer, client: Client) -> None:
+    client.subscribe(*client.channels)
+    server.write(block(0))
+    server.event(StreamEvent(0, "mark", ""))
+    assert client.message()[0] == EVENTS
+
+
+@pytest.mark.parametrize("force_N", [(3.0, -4.0, 12.0), (-5.0, 0.0, 0.0), (0.0, 0.0, 0.0)])
+def test_arrows_show_force_and_torque(server: FoxgloveServer, client: Client, force_N: tuple[float, ...]) -> None:
+    client.subscribe(ARROWS)
+    sent = block(1, frame=WrenchFrame("base", "tcp"))
+    sent.wrench[-1] = [*force_N, 0.0, 0.6, 0.8]
+    server.write(sent)
+    (entity,) = read_protobuf(client, ARROWS, client.message()[2]).entities
+    assert entity.frame_id == "base_at_tcp"
+    vectors: list[Array] = []
+    for arrow in entity.arrows:
+        q = arrow.pose.orientation
+        along = Rotation.from_quat([q.x, q.y, q.z, q.w]).apply([arrow.shaft_length + arrow.head_length, 0, 0])
+        vectors.append(along + numbers(arrow.pose.position))
+    assert np.allclose(vectors, np.array([[0.01 * x for x in force_N], [0, 0.06, 0.08]]))  # 10 N and 1 N·m are 100 mm
+
+
+def test_arrows_and_frames_come_at_most_60_times_a_second(server: FoxgloveServer, client: Client) -> None:
+    client.subscribe(ARROWS, TRANSFORMS, STATUS)
+    for start in range(0, 7000, 35):
+        server.write(block(35, start))
+    server.event(StreamEvent(0, "mark", ""))
+    topics = [client.message()[0] for _ in range(122)]
+    assert (topics.count(ARROWS), topics.count(TRANSFORMS), topics.count(STATUS)) == (60, 60, 2)
+
+
+@pytest.mark.parametrize(("kind", "level"), [("mark", 2), ("tare-refused", 3)])
+def test_events_are_log_messages(server: FoxgloveServer, client: Client, kind: Any, level: int) -> None:
+    client.subscribe(EVENTS)
+    server.event(StreamEvent(5, kind, "peg in"))
+    _, t_ns, payload = client.message()
+    log = read_protobuf(client, EVENTS, payload)
+    assert (log.name, log.message, log.level, t_ns) == (kind, "peg in", level, 5 + UTC_OFFSET_NS)
+
+
+def test_the_status_says_what_is_shown_and_is_valid_json(server: FoxgloveServer, client: Client) -> None:
+    client.subscribe(STATUS)
+    server.write(block())
+
+    def refuse(word: str) -> None:
+        raise AssertionError(word)
+
+    status = json.loads(client.message()[2], parse_constant=refuse)
+    assert status["frame"] == "sensor axes, about the sensor origin"
+    assert status["stages"]["lowpass_Hz"] is None
+    assert status["calibration"] == "calibration.json"
+    assert status["status"]["arm"]["lost"] == 3
+    assert status["status"]["drift_N_h"] is None  # NaN there
+
+
+def test_tare_is_a_service(stream: FakeStream, client: Client) -> None:
+    client.call("tare")
+    assert client.answer() == {"success": True, "message": "bias +0.4 N"}
+    assert stream.tares == 1
+    client.call("undo_tare")
+    assert client.answer()["success"]
+    assert stream.tares == 0
+    stream.contact = True
+    client.call("tare")
+    assert client.answer() == {"success": False, "message": "3.4 N from the free tool"}
+
+
+def test_parameters_are_the_frame_and_the_stages(stream: FakeStream, client: Client) -> None:
+    at_first = {
+        "axes": "sensor",
+        "about": "sensor",
+        "bias": True,
+        "gravity": True,
+        "inertia": False,
+        "notch_Hz": 0.0,
+        "lowpass_Hz": 0.0,
+        "deadband_N": 0.0,
+        "deadband_Nm": 0.0,
+    }
+    assert client.parameters() == at_first
+    assert client.parameters("axes", "gravity") == {"axes": "sensor", "gravity": True}
+    wanted = {"axes": "base", "about": [0, 0.5, 1], "gravity": False, "lowpass_Hz": 40, "deadband_N": 0.5}
+    client.set(**wanted)
+    assert client.was_set() == at_first | wanted
+    assert stream.frame == WrenchFrame("base", (0.0, 0.5, 1.0))
+    assert stream.stages == Stages(gravity=False, lowpass_Hz=40.0, deadband_N=0.5)
+    client.set(about="flange", lowpass_Hz=0)
+    client.was_set()
+    assert stream.frame == WrenchFrame("base", "flange")
+    assert stream.stages == Stages(gravity=False, deadband_N=0.5)
+
+
+def test_other_clients_see_a_changed_parameter(server: FoxgloveServer, client: Client) -> None:
+    with Client.to(server.port) as other:
+        other.send("subscribeParameterUpdates", parameterNames=["axes"])
+        other.parameters()
+        client.set(axes="tcp")
+        (changed,) = other.read("parameterValues")["parameters"]
+        assert (changed["name"], changed["value"]) == ("axes", "tcp")
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"axes": "tool"}, "axes cannot be 'tool': set one of sensor, flange, base, tcp"),
+        ({"about": "base"}, "about cannot be 'base': set one of sensor, flange, tcp, or x, y, z in metres"),
+        ({"about": [1, 2]}, "about cannot be"),
+        ({"gravity": 1}, "gravity cannot be 1: set true or false"),
+        ({"deadband_N": True}, "deadband_N cannot be True"),
+        ({"lowpass_Hz": -1}, "lowpass_Hz cannot be -1: set a frequency; 0 switches"),
+        ({"gain": 1}, "gain cannot be 1: there is no such parameter"),
+        ({"about": "tcp"}, "the height of the sensor is not configured"),
+    ],
+)
+def test_a_wrong_parameter_changes_nothing(
+    stream: FakeStream, client: Client, values: dict[str, object], words: str
+) -> None:
+    before = client.parameters()
+    client.set(**values)
+    assert words in client.read("status")["message"]
+    assert client.was_set() == before
+    assert (stream.frame, stream.stages) == (WrenchFrame(), Stages())
+
+
+def test_a_client_that_never_reads_delays_nobody(
+    stream: FakeStream, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Every message reaches a client that reads, until the queue of another one overflows and beyond."""
+    monkeypatch.setattr(foxglove, "BACKLOG", 128)
+    with (
+        closing(FoxgloveServer(cast(Any, stream), port=0)) as server,
+        Client.to(server.port, reads=False) as slow,
+        Client.to(server.port) as client,
+    ):
+        slow.subscribe(ros2.RAW, EVENTS)
+        client.subscribe(ros2.RAW, EVENTS)
+        times_full = 0
+        while times_full < 10:
+            server.event(StreamEvent(0, "mark", "long" * 50_000))  # fills the buffers of the system
+            server.write(block(100))
+            assert [client.message()[0] for _ in range(101)] == [EVENTS, *[ros2.RAW] * 100]
+            times_full += "reads too slowly" in caplog.text
+        host, port = slow.socket.local_address[:2]
+        assert f"the client {host}:{port} reads too slowly: its oldest messages are dropped" in caplog.text
+
+
+def test_a_slow_client_can_count_what_it_lost(stream: FakeStream, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(foxglove, "BACKLOG", 128)
+    with (
+        closing(FoxgloveServer(cast(Any, stream), port=0)) as server,
+        Client.to(server.port, reads=False) as slow,
+    ):
+        slow.subscribe(ros2.RAW, STATUS, EVENTS)
+        for i in range(100):
+            server.write(block(100, 100 * i))
+            server.event(StreamEvent(0, "mark", "long" * 50_000))  # fills the buffers of the system
+        server.write(block(100, 20_000))
+        received, sent = [0], [0]
+        while sent[-1] < 101 * 100:
+            topic, _, payload = slow.message()
+            if topic == STATUS:
+                sent.append(json.loads(payload)["sent"][ros2.RAW])
+                received.append(received[-1])
+            received[-1] += topic == ros2.RAW
+        lost = np.diff(sent) - np.diff(received, prepend=0)[: len(sent) - 1]
+        assert (lost >= 0).all()
+        assert lost[-1] > 1000
+
+
+def test_without_a_client_nothing_is_packed(server: FoxgloveServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise AssertionError
+
+    for name in ("pack_wrenches", "pack_poses", "pack_joints"):
+        monkeypatch.setattr(ros2, name, fail)
+    server.write(block())
+
+
+def test_a_port_in_use_is_named(server: FoxgloveServer, stream: FakeStream) -> None:
+    with pytest.raises(
+        ConfigError, match=rf"cannot listen on 127\.0\.0\.1:{server.port}: Address already in use .*choose"
+    ):
+        FoxgloveServer(cast(Any, stream), port=server.port)
+
+
+def test_without_the_extra_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    monkeypatch.delitem(sys.modules, FoxgloveServer.__module__)
+    with pytest.raises(ConfigError, match="a server needs foxglove-sdk: install ftdrive with its extra stream"):
+        importlib.import_module(FoxgloveServer.__module__)
