@@ -32,6 +32,8 @@ _SCALED_S, _SCALED = 0.2, 0.05
 """A clock is no clock of seconds if it differs by so much over this time."""
 _PASSES = 4
 """A recording is paired so often until its delay has converged."""
+_STEP_BUCKETS, _STEP_NS = 8, 5e6
+"""If so many buckets in a row are later than this, and alike, the line before them is no longer true."""
 _LOST_S = 1.0
 """A device whose count is so far from the line has restarted."""
 
@@ -57,9 +59,10 @@ class Timeline:
         """Subtracted from every time; a change is followed slowly."""
         self._nominal_ns = period_s * 1e9
         self._tolerance = tolerance
-        self._restart()
+        self.restart()
 
-    def _restart(self) -> None:
+    def restart(self) -> None:
+        """Forget the line, after an interruption: a device may not have counted meanwhile."""
         self._points: deque[tuple[float, float]] = deque(maxlen=_BUCKETS)
         self._origin: tuple[float, int] | None = None
         self._slope, self._offset = self._nominal_ns, 0.0
@@ -78,7 +81,7 @@ class Timeline:
         if self._last is not None and (
             x[0] <= self._last[0] or abs(behind_ns[k] - self._offset) > _LOST_S * 1e9  # the device has restarted
         ):
-            self._restart()
+            self.restart()
             return self.stamp(count, t_host_ns)
         self._note(float(x[k]), float(y[k]))
         end = self._slope * x[-1] + self._offset - self.shift_s * 1e9
@@ -105,6 +108,10 @@ class Timeline:
         width = _BUCKET_S * 1e9 / self._slope
         if not self._points or x // width > self._points[-1][0] // width:
             self._points.append((x, y))
+            late = list(self._points)[-_STEP_BUCKETS - 1 : -1]
+            by_ns = [b - self._slope * a - self._offset for a, b in late]
+            if len(late) == _STEP_BUCKETS and min(by_ns) > max(_STEP_NS, 0.7 * max(by_ns)):
+                self._points = deque([*late, (x, y)], maxlen=_BUCKETS)  # samples were lost that nothing has counted
         elif y - self._slope * x < self._points[-1][1] - self._slope * self._points[-1][0]:
             self._points[-1] = x, y
         elif len(self._points) > 1:
@@ -294,6 +301,9 @@ class Pairing:
         """Drop what waits, after an interruption of either link."""
         self._waiting = []
         self._poses = PoseTrack(keep_s=2.0)
+        for line in (self._sensor, self._arm):
+            if line is not None:
+                line.restart()
 
 
 def _clock_of(states: ArmStates) -> Timeline:

@@ -184,3 +184,15 @@ def test_a_busy_computer_at_the_beginning_does_not_bend_the_line() -> None:
         [line.stamp(count[i : i + 8].astype(float), t_ns[i : i + 8]) for i in range(0, len(count), 8)]
     )
     assert np.abs((stamps - T0_NS) * 1e-9 - count * 1e-3).max() < 5e-3
+
+
+def test_lost_samples_that_nothing_counts_bend_the_line_for_some_seconds_only() -> None:
+    count, t_ns = received(12.0, 1000.0, 8)
+    t_ns[4000:] += 30_000_000  # 30 samples are missing
+    line = Timeline(1e-3, RATE_TOLERANCE)
+    stamps = np.concatenate(
+        [line.stamp(count[i : i + 8].astype(float), t_ns[i : i + 8]) for i in range(0, len(count), 8)]
+    )
+    error_s = (stamps - T0_NS) * 1e-9 - count * 1e-3 - 2e-4 - np.where(count < 4000, 0, 0.03)
+    assert np.abs(error_s[7000:]).max() < 5e-4
+    assert (np.diff(stamps) > 0).all()
