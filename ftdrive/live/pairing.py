@@ -18,8 +18,6 @@ from ftdrive.live.delay import DelayEstimator
 from ftdrive.live.samples import Ns, Paired
 
 _BUCKET_S, _BUCKETS = 0.25, 40
-_LEAST_SPAN_S = 2.0
-"""After this an unknown rate is learnt."""
 _LEAST_SCATTER_NS = 1e4
 CLOCK_TOLERANCE, RATE_TOLERANCE = 2e-4, 3e-3
 """Of a device's clock, and of the nominal rate of a sensor without one."""
@@ -47,8 +45,7 @@ class Timeline:
     Parameters
     ----------
     period_s : float
-        Nominal duration of one count: 1 for a clock in seconds, 1 / rate for a sample number. NaN is unknown; then the
-        first two seconds keep their times of receipt.
+        Nominal duration of one count: 1 for a clock in seconds, 1 / rate for a sample number.
     tolerance : float
         Relative error of that duration, one standard deviation. It counts as long as the times of receipt scatter too
         much to show the rate, as on a computer that is too busy.
@@ -73,9 +70,6 @@ class Timeline:
         if self._origin is None:
             self._origin = float(count[0]), int(t_host_ns[0])
         x, y = count - self._origin[0], (t_host_ns - self._origin[1]).astype(np.float64)
-        if math.isnan(self._slope):  # keep the times of receipt until they show the rate
-            self._learn_rate(x, y)
-            return t_host_ns
         behind_ns = y - self._slope * x
         k = int(np.argmin(behind_ns))
         if self._last is not None and (
@@ -95,13 +89,6 @@ class Timeline:
             times = y_0 + (x - x_0) * ((end - y_0) / (x[-1] - x_0))
         self._last = float(x[-1]), float(end)
         return np.asarray(self._origin[1] + np.rint(times).astype(np.int64))
-
-    def _learn_rate(self, x: Array, y: Array) -> None:
-        x_end, y_end = float(x[-1]), float(y[-1])
-        if y_end > _LEAST_SPAN_S * 1e9:
-            self._slope = self._nominal_ns = y_end / x_end
-            self._offset = float((y - self._slope * x).min())
-            self._last = x_end, y_end
 
     def _note(self, x: float, y: float) -> None:
         """Keep the least delayed sample of each bucket, and fit the line."""
@@ -228,7 +215,7 @@ class Pairing:
     Parameters
     ----------
     sensor_rate_Hz : float
-        Nominal; NaN where unknown. Used where the sensor has no clock of its own.
+        Nominal, for a sensor without a clock of its own; NaN where it is polled, which is not at a fixed rate.
     delay : DelayEstimator or float
         Finds the delay of the wrench after the pose, or is that delay in s.
     """
@@ -272,11 +259,16 @@ class Pairing:
         """Add what the sensor has sent."""
         if not len(samples):
             return
-        has_clock = bool(np.isfinite(samples.t_device_s).all())
+        has_clock, counts = bool(np.isfinite(samples.t_device_s).all()), math.isfinite(self._rate_Hz)
+        if has_clock:
+            count = samples.t_device_s
+        elif counts:
+            count = samples.seq.astype(np.float64)
+        else:  # polled: each time of receipt is its own
+            count = np.asarray(samples.t_host_ns * 1e-9)
         if self._sensor is None:
-            self._sensor = Timeline() if has_clock else Timeline(1 / self._rate_Hz, RATE_TOLERANCE)
+            self._sensor = Timeline(1 / self._rate_Hz, RATE_TOLERANCE) if counts and not has_clock else Timeline()
         self._sensor.shift_s = self.delay_s
-        count = samples.t_device_s if has_clock else samples.seq.astype(np.float64)
         self._waiting.append((samples, self._sensor.stamp(count, samples.t_host_ns)))
 
     def take(self) -> Paired | None:

@@ -125,7 +125,7 @@ class CompensatedStream(ProcessedStream):
             delay = (
                 DelayEstimator(self._calibration, self.info.p_flange_sensor_m) if delay_ms is None else delay_ms / 1e3
             )
-            self._pairing = Pairing(sensor_rate_Hz, delay)
+            self._pairing = Pairing(nominal_Hz, delay)
             self._pairing.add_states(states)
             self._pairing.add_samples(samples)
             self._stack = stack.pop_all()
