@@ -73,7 +73,7 @@ class Timeline:
         behind_ns = y - self._slope * x
         k = int(np.argmin(behind_ns))
         if self._last is not None and (
-            x[0] <= self._last[0] or abs(behind_ns[k] - self._offset) > _LOST_S * 1e9  # the device has restarted
+            x[0] < self._last[0] or abs(behind_ns[k] - self._offset) > _LOST_S * 1e9  # the device has restarted
         ):
             self.restart()
             return self.stamp(count, t_host_ns)
@@ -83,6 +83,8 @@ class Timeline:
             times = self._slope * (x - x[-1]) + end
         else:
             x_0, y_0 = self._last
+            if x[-1] <= x_0:  # the device's clock has coarse steps
+                return np.full(len(x), self._origin[1] + round(y_0), np.int64)
             due = self._slope * (x[-1] - x_0)
             slew = min(max(_SLEW, abs(end - y_0 - due) / _FAR_NS), _FASTEST_SLEW)
             end = min(max(end, y_0 + (1 - slew) * due), y_0 + (1 + slew) * due)

@@ -24,12 +24,16 @@ HEIGHT_M = 0.03
 OPTIONS = ("--time-scale", "1", "--sensor-origin", f"0,0,{HEIGHT_M}", "--inertia", "0,0,0,0,0,0")
 
 
+ages_ms: list[float] = []
+
+
 def read(stream: CompensatedStream, seconds: float) -> tuple[Array, Array]:
     """Wrenches (n, 6) and whether they are contact (n,), for so many seconds of the cell."""
     end_s = stream.clock.now_s() + seconds
     blocks = []
     while stream.clock.now_s() < end_s:
         blocks.append(stream.read())
+        ages_ms.append((stream.clock.now_ns() - int(blocks[-1].t_host_ns[-1])) / 1e6)
     return np.concatenate([block.wrench for block in blocks]), np.concatenate([block.in_contact for block in blocks])
 
 
@@ -53,6 +57,7 @@ def moving(
         cpu_s = (time.process_time() - cpu_s) / (stream.clock.now_s() - begin_s)
         status = stream.status()
         stream.stages = Stages()
+        ages_ms.clear()
         static, _ = read(stream, seconds / 4)
         kinds = [event.kind for event in stream.take_events()]
     expected_ms = sensor_ms - rtde_ms
@@ -62,7 +67,8 @@ def moving(
         f"{1e3 * status.delay_sigma_s:.2f} ms (links differ by {expected_ms:+g}), residual / noise "
         f"{ratio[:3].max():.2f} force {ratio[3:].max():.2f} torque, without inertia {beside[:3].max():.0f} and "
         f"{beside[3:].max():.0f}, CPU {100 * cpu_s:.0f} %, {status.sensor.rate_Hz:.0f} and "
-        f"{status.arm.rate_Hz:.0f} Hz, gaps {kinds.count('gap')}\n"
+        f"{status.arm.rate_Hz:.0f} Hz, gaps {kinds.count('gap')}, "
+        f"newest sample of a block {np.median(ages_ms):.1f} ms old (p95 {np.percentile(ages_ms, 95):.1f})\n"
     )
     sys.stdout.flush()
 

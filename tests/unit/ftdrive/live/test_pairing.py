@@ -205,3 +205,12 @@ def test_a_polled_sensor_keeps_its_times_of_receipt() -> None:
     seq = np.concatenate([paired.seq for paired in found])
     stamps = np.concatenate([paired.t_host_ns for paired in found])
     np.testing.assert_allclose(stamps, t_ns[seq] - 4_000_000, atol=100)
+
+
+def test_a_clock_of_coarse_steps_is_no_restart() -> None:
+    _, t_ns = received(6.0, 1000.0, 1)
+    coarse_s = np.floor(np.arange(len(t_ns)) / 4) * 4e-3
+    line = Timeline()
+    stamps = np.concatenate([line.stamp(coarse_s[i : i + 1], t_ns[i : i + 1]) for i in range(len(t_ns))])
+    assert (np.diff(stamps) >= 0).all()
+    assert np.abs((stamps - T0_NS)[3000:] * 1e-9 - coarse_s[3000:] - 2e-4).max() < 5e-4
