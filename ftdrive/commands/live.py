@@ -1,7 +1,7 @@
 """`ftdrive live`: raw and compensated wrench, ten times a second."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,7 +25,6 @@ from ftdrive.checks.check import Check
 from ftdrive.checks.devices import AXES, check_weighed_payload
 from ftdrive.commands.common import (
     CELL,
-    FOLDER,
     FRAME,
     JSON,
     Number,
@@ -41,8 +40,9 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.replay import ReplayedStream, replay_run
-from ftdrive.live.samples import Axes, Block, WrenchFrame
+from ftdrive.live.samples import Axes, Block, StreamInfo, WrenchFrame
 from ftdrive.live.stream import CompensatedStream, load_calibration
+from ftdrive.recording import Recorder, read_recording
 from ftdrive.runs.run import Run
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.keyboard import Keyboard
@@ -65,7 +65,12 @@ _RECOVER_S = 10.0
 )
 @CELL
 @simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
-@click.option("--replay", type=FOLDER, help="Show the samples of a recorded run.")
+@click.option(
+    "--replay",
+    metavar="RUN|RECORDING",
+    type=click.Path(exists=True, path_type=Path),
+    help="Show the samples of a run, or of a recording, which has a calibration.",
+)
 @click.option("--speed", type=Number(0, min_open=True), help="Of --replay; 1 is that of the recording.")
 @FRAME
 @click.option("--once", is_flag=True, help="Print one reading, then end.")
@@ -99,17 +104,19 @@ def live(
     with ExitStack() as stack:
         if simulate:
             calibration, cell = _emulated(calibration, sensor, stack)
-        if calibration is None:
-            raise ConfigError("no calibration: give --calibration PATH, or --simulate")
         stream: CompensatedStream | ReplayedStream
         checks = list[Check]()
+        recorder: Callable[[Path], Recorder] | None = None
         if replay is not None:
-            stream = replay_run(Run(replay), calibration, name, frame=frame, speed=1.0 if speed is None else speed)
+            stream = _replayed(replay, calibration, name, frame, speed=1.0 if speed is None else speed)
+        elif calibration is None:
+            raise ConfigError("no calibration: give --calibration PATH, or --simulate")
         else:
             if not simulate:
                 cell = read_cell(config, robot, sensor)
             stream = stack.enter_context(CompensatedStream(cell, calibration, name=name, frame=frame))
             checks = [check_weighed_payload(stream.payload_kg, calibration, cell.sensor.mass_kg)]
+            recorder = partial(_recorder, stream.info, cell.to_dict())
             for words in stream.warnings:
                 talk.print(f" {words}")
         if once or as_json:
@@ -117,16 +124,27 @@ def live(
         elif talk.is_terminal and sys.stdout.isatty() and sys.stdin.isatty() and not plain:
             from ftdrive.terminal.live_screen import run_live
 
-            recorder = None if replay is not None else partial(_record, stream, cell)
             run_live(stream, recorder=recorder, checks=checks)
         else:
             _show_table(stream)
 
 
-def _record(stream: ProcessedStream, cell: CellConfig, path: Path) -> "Recorder":
-    from ftdrive.recording import Recorder
+def _replayed(
+    path: Path, calibration: CalibrationResult | None, name: str, frame: WrenchFrame, speed: float
+) -> ReplayedStream:
+    """Replay a run folder, or a recording with its own calibration unless another one is given."""
+    if path.is_dir() and path.suffix != ".partial":
+        if calibration is None:
+            raise ConfigError("no calibration: give --calibration PATH")
+        return replay_run(Run(path), calibration, name, frame=frame, speed=speed)
+    recording = read_recording(path)
+    if calibration is not None:
+        recording = recording.with_calibration(calibration, name)
+    return ReplayedStream(recording.header.info, recording.paired(), frame=frame, speed=speed)
 
-    return Recorder([path], stream.info, cell.to_dict())
+
+def _recorder(info: StreamInfo, configuration: dict[str, Any], path: Path) -> Recorder:
+    return Recorder([path], info, configuration)
 
 
 def _print(stream: CompensatedStream | ReplayedStream, *, once: bool, as_json: bool) -> None:

@@ -86,14 +86,11 @@ def record(
     """
     from ftdrive.live.stream import CompensatedStream, load_calibration
     from ftdrive.recording import Recorder
-    from ftdrive.recording.files import format_of
+    from ftdrive.recording.files import require_new_recordings
     from ftdrive.terminal.console import talk
 
     check_simulate(simulate, real={"--config": config, "--robot": robot})
-    for path in paths:
-        format_of(path)
-    if len(set(paths)) < len(paths):
-        raise ConfigError("two -o name the same file: leave one out")
+    require_new_recordings(paths)
     frame = read_frame(axes, about)
     calibration = None if calibration_path is None else load_calibration(calibration_path)
     with ExitStack() as stack:
@@ -134,12 +131,13 @@ def record_stream(
     try:
         while True:
             block = stream.read()
-            for event in stream.take_events():
-                recorder.event(event)
             left = len(block) if count is None else count - recorder.samples
             if duration_s is not None and len(block):
                 end_ns = (recorder.first_ns or int(block.t_host_ns[0])) + round(duration_s * 1e9)
                 left = min(left, int(np.searchsorted(block.t_host_ns, end_ns)))
+            for event in stream.take_events():
+                if left >= len(block) or event.t_host_ns < block.t_host_ns[left]:
+                    recorder.event(event)
             recorder.write(block.rows(slice(left)))
             if left < len(block) or recorder.samples == count:
                 return
@@ -163,6 +161,6 @@ def _report(recorder: "Recorder", paths: Sequence[Path], frame: "WrenchFrame", n
     for path in saved:
         talk.print(f" Saved {path}: {words}")
     if as_json:
-        counts = {name: getattr(recorder, name) for name in ("samples", "duration_s", "gaps", "lost")}
+        counts = {key: getattr(recorder, key) for key in ("samples", "duration_s", "gaps", "lost")}
         about = {"axes": frame.axes, "about": frame.about, "calibration": name}
         write_json({"schema_version": 1, "files": [str(path) for path in saved], **counts, **about})

@@ -25,6 +25,8 @@ _SLOWEST_RAD_S = 0.02
 _PRIOR_S = 0.05
 _BIAS_N = 0.5
 """Change of the bias since the calibration, one standard deviation."""
+_HELD = 0.05
+"""Weight of what the tool may hold, relative to its own, one standard deviation."""
 _LEVER_M = 0.005
 """Error of the configured origin of the sensor; without one, `_ANY_LEVER_M`."""
 _ANY_LEVER_M = 0.1
@@ -59,7 +61,8 @@ class DelayEstimator:
         self._p_flange_sensor_m = p_flange_sensor_m if known else np.array([0.0, 0.0, 0.05])
         self._scale = np.zeros((13, 13))  # maps 13 numbers of sigma 1 to delay, errors of the calibration, lever
         self._scale[0, 0] = _PRIOR_S
-        errors = calibration.covariance[:9, :9] + np.diag(np.repeat([0, 0, _BIAS_N**2], 3))
+        change = np.repeat([0.0, _HELD * calibration.weight_N, _BIAS_N], 3)
+        errors = calibration.covariance[:9, :9] + np.diag(change**2)
         eigenvalues, V = np.linalg.eigh(errors)
         self._scale[1:10, 1:10] = V * np.sqrt(np.maximum(eigenvalues, 0.0))
         self._scale[10:, 10:] = (_LEVER_M if known else _ANY_LEVER_M) * np.eye(3)

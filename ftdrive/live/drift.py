@@ -1,7 +1,5 @@
 """Drift of the bias while nothing touches the tool."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from drivers.interfaces import Array
@@ -45,9 +43,7 @@ class DriftFilter:
         self._t_ns: int | None = None
         self._R: Array | None = None
 
-    def follow(
-        self, t_ns: Ns, residual: Array, R_base_flange: Array, noise: Noise, uncertainty: Callable[[Array], Array]
-    ) -> bool:
+    def follow(self, t_ns: Ns, residual: Array, R_base_flange: Array, noise: Noise, uncertainty: Array) -> bool:
         """Add the mean of each second in which the arm rests; return whether there was one.
 
         Parameters
@@ -57,8 +53,8 @@ class DriftFilter:
             Measured minus predicted wrench, N and N·m, sensor axes.
         R_base_flange : array, shape (n, 3, 3)
         noise : Noise
-        uncertainty : callable
-            Gives the covariance (6, 6) of the prediction at an orientation (3, 3).
+        uncertainty : array, shape (6,)
+            Variance of the prediction.
         """
         start, added = 0, False
         while start < len(t_ns):
@@ -74,7 +70,7 @@ class DriftFilter:
                 if not self._moved:
                     readings = max((t_ns[stop - 1] - begin_ns) * 1e-9 / READING_S, 1.0)
                     variance = np.diag(noise.reading) / readings
-                    pose = R, np.diag(uncertainty(R))
+                    pose = R, uncertainty
                     self._add(int(t_ns[stop - 1]), self._sum / self._n, variance, np.diag(noise.sample), pose)
                     added = True
                 self._begin = None

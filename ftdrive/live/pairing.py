@@ -18,8 +18,6 @@ from ftdrive.live.delay import DelayEstimator
 from ftdrive.live.samples import Ns, Paired
 
 _BUCKET_S, _BUCKETS = 0.25, 40
-_LEAST_SPAN_S = 2.0
-"""After this an unknown rate is learnt."""
 _LEAST_SCATTER_NS = 1e4
 CLOCK_TOLERANCE, RATE_TOLERANCE = 2e-4, 3e-3
 """Of a device's clock, and of the nominal rate of a sensor without one."""
@@ -32,6 +30,8 @@ _SCALED_S, _SCALED = 0.2, 0.05
 """A clock is no clock of seconds if it differs by so much over this time."""
 _PASSES = 4
 """A recording is paired so often until its delay has converged."""
+_STEP_BUCKETS, _STEP_NS = 8, 5e6
+"""If so many buckets in a row are later than this, and alike, the line before them is no longer true."""
 _LOST_S = 1.0
 """A device whose count is so far from the line has restarted."""
 
@@ -45,8 +45,7 @@ class Timeline:
     Parameters
     ----------
     period_s : float
-        Nominal duration of one count: 1 for a clock in seconds, 1 / rate for a sample number. NaN is unknown; then the
-        first two seconds keep their times of receipt.
+        Nominal duration of one count: 1 for a clock in seconds, 1 / rate for a sample number.
     tolerance : float
         Relative error of that duration, one standard deviation. It counts as long as the times of receipt scatter too
         much to show the rate, as on a computer that is too busy.
@@ -57,9 +56,10 @@ class Timeline:
         """Subtracted from every time; a change is followed slowly."""
         self._nominal_ns = period_s * 1e9
         self._tolerance = tolerance
-        self._restart()
+        self.restart()
 
-    def _restart(self) -> None:
+    def restart(self) -> None:
+        """Forget the line, after an interruption: a device may not have counted meanwhile."""
         self._points: deque[tuple[float, float]] = deque(maxlen=_BUCKETS)
         self._origin: tuple[float, int] | None = None
         self._slope, self._offset = self._nominal_ns, 0.0
@@ -70,15 +70,12 @@ class Timeline:
         if self._origin is None:
             self._origin = float(count[0]), int(t_host_ns[0])
         x, y = count - self._origin[0], (t_host_ns - self._origin[1]).astype(np.float64)
-        if math.isnan(self._slope):  # keep the times of receipt until they show the rate
-            self._learn_rate(x, y)
-            return t_host_ns
         behind_ns = y - self._slope * x
         k = int(np.argmin(behind_ns))
         if self._last is not None and (
-            x[0] <= self._last[0] or abs(behind_ns[k] - self._offset) > _LOST_S * 1e9  # the device has restarted
+            x[0] < self._last[0] or abs(behind_ns[k] - self._offset) > _LOST_S * 1e9  # the device has restarted
         ):
-            self._restart()
+            self.restart()
             return self.stamp(count, t_host_ns)
         self._note(float(x[k]), float(y[k]))
         end = self._slope * x[-1] + self._offset - self.shift_s * 1e9
@@ -86,6 +83,8 @@ class Timeline:
             times = self._slope * (x - x[-1]) + end
         else:
             x_0, y_0 = self._last
+            if x[-1] <= x_0:  # the device's clock has coarse steps
+                return np.full(len(x), self._origin[1] + round(y_0), np.int64)
             due = self._slope * (x[-1] - x_0)
             slew = min(max(_SLEW, abs(end - y_0 - due) / _FAR_NS), _FASTEST_SLEW)
             end = min(max(end, y_0 + (1 - slew) * due), y_0 + (1 + slew) * due)
@@ -93,18 +92,15 @@ class Timeline:
         self._last = float(x[-1]), float(end)
         return np.asarray(self._origin[1] + np.rint(times).astype(np.int64))
 
-    def _learn_rate(self, x: Array, y: Array) -> None:
-        x_end, y_end = float(x[-1]), float(y[-1])
-        if y_end > _LEAST_SPAN_S * 1e9:
-            self._slope = self._nominal_ns = y_end / x_end
-            self._offset = float((y - self._slope * x).min())
-            self._last = x_end, y_end
-
     def _note(self, x: float, y: float) -> None:
         """Keep the least delayed sample of each bucket, and fit the line."""
         width = _BUCKET_S * 1e9 / self._slope
         if not self._points or x // width > self._points[-1][0] // width:
             self._points.append((x, y))
+            late = list(self._points)[-_STEP_BUCKETS - 1 : -1]
+            by_ns = [b - self._slope * a - self._offset for a, b in late]
+            if len(late) == _STEP_BUCKETS and min(by_ns) > max(_STEP_NS, 0.7 * max(by_ns)):
+                self._points = deque([*late, (x, y)], maxlen=_BUCKETS)  # samples were lost that nothing has counted
         elif y - self._slope * x < self._points[-1][1] - self._slope * self._points[-1][0]:
             self._points[-1] = x, y
         elif len(self._points) > 1:
@@ -221,7 +217,7 @@ class Pairing:
     Parameters
     ----------
     sensor_rate_Hz : float
-        Nominal; NaN where unknown. Used where the sensor has no clock of its own.
+        Nominal, for a sensor without a clock of its own; NaN where it is polled, which is not at a fixed rate.
     delay : DelayEstimator or float
         Finds the delay of the wrench after the pose, or is that delay in s.
     """
@@ -265,11 +261,16 @@ class Pairing:
         """Add what the sensor has sent."""
         if not len(samples):
             return
-        has_clock = bool(np.isfinite(samples.t_device_s).all())
+        has_clock, counts = bool(np.isfinite(samples.t_device_s).all()), math.isfinite(self._rate_Hz)
+        if has_clock:
+            count = samples.t_device_s
+        elif counts:
+            count = samples.seq.astype(np.float64)
+        else:  # polled: each time of receipt is its own
+            count = np.asarray(samples.t_host_ns * 1e-9)
         if self._sensor is None:
-            self._sensor = Timeline() if has_clock else Timeline(1 / self._rate_Hz, RATE_TOLERANCE)
+            self._sensor = Timeline(1 / self._rate_Hz, RATE_TOLERANCE) if counts and not has_clock else Timeline()
         self._sensor.shift_s = self.delay_s
-        count = samples.t_device_s if has_clock else samples.seq.astype(np.float64)
         self._waiting.append((samples, self._sensor.stamp(count, samples.t_host_ns)))
 
     def take(self) -> Paired | None:
@@ -294,6 +295,9 @@ class Pairing:
         """Drop what waits, after an interruption of either link."""
         self._waiting = []
         self._poses = PoseTrack(keep_s=2.0)
+        for line in (self._sensor, self._arm):
+            if line is not None:
+                line.restart()
 
 
 def _clock_of(states: ArmStates) -> Timeline:

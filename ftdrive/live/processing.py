@@ -11,7 +11,6 @@ from calib.compensation import Compensator
 from calib.extras.inertia import REACH_S, inertial_wrench, motion_of_poses
 from calib.extras.update import Calibrated
 from calib.files import JSON
-from calib.likelihood.gain_and_cross_talk import predicted_covariance
 from drivers.clock import Clock
 from drivers.interfaces import Array
 from ftdrive.errors import ConfigError
@@ -79,11 +78,10 @@ class Processor:
         self._tares: list[tuple[Calibrated, int]] = [(calibration, 0)]
         likely_error = calibration.likely_error()
         self._usual_error_N = float(likely_error[0])
-        beyond = likely_error**2 - np.square(calibration.predicted_error())
-        self._beyond = np.repeat(beyond / 3, 3)
+        beyond = np.repeat((likely_error**2 - np.square(calibration.predicted_error())) / 3, 3)
         self._noise = NoiseEstimator(info.sensor_rate_Hz)
         self._noise_is_learnt = False
-        self._test = ContactTest(info.sensor_rate_Hz, false_alarm_rate, self._beyond)
+        self._test = ContactTest(info.sensor_rate_Hz, false_alarm_rate, beyond)
         self._tracker = ContactTracker()
         self._drift = DriftFilter()
         self._drift_warned = False
@@ -204,7 +202,7 @@ class Processor:
         motion = motion_of_poses(
             t_s[knots],
             buffer.R_base_flange[knots],
-            buffer.p_base_flange_m[knots],
+            np.nan_to_num(buffer.p_base_flange_m[knots]),  # an unknown position does not move
             R_flange_sensor=parameters.R_flange_sensor,
             p_flange_sensor_m=self.info.p_flange_sensor_m,
             reach=self._reach,
@@ -274,14 +272,6 @@ class Processor:
             covariance = covariance + self._test.uncertainty
         T = self._transform.matrix(R_base_flange)
         return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", T, covariance, T)))
-
-    def _uncertainty(self, R_base_flange: Array) -> Array:
-        """Covariance (6, 6) of the prediction of a free tool, sensor axes."""
-        current = self._tares[-1][0]
-        predicted = predicted_covariance(
-            current.parameters, current.covariance, self.info.calibration.response, R_base_flange
-        )
-        return np.asarray(predicted + np.diag(self._beyond))
 
     def restart(self, *, elsewhere: bool = False) -> None:
         """Forget the samples before an interruption; noise, tares and drift remain.
@@ -374,6 +364,7 @@ class Processor:
             if not self._recent:
                 return self.note("tare-refused", "tare refused: no sample has arrived yet; tare again", {})
             rows = Paired.concatenate(list(self._recent))
+            rows = rows.rows(rows.t_host_ns >= self._newest_ns - round(TARE_S * 1e9))
             update, text, values = try_tare(rows, self.info.calibration, self._tares[-1][0])
             if update is None:
                 return self.note("tare-refused", text, values)
@@ -399,7 +390,7 @@ class Processor:
     def _follow_drift(self, rows: Paired, residual: Array) -> None:
         noise = self._noise.noise
         if noise is None or not self._drift.follow(
-            rows.t_host_ns, residual, rows.R_base_flange, noise, self._uncertainty
+            rows.t_host_ns, residual, rows.R_base_flange, noise, np.diag(self._test.uncertainty)
         ):
             return
         rate, sigma = self._drift.force_rate_N_h

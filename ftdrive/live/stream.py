@@ -38,6 +38,8 @@ STALE_S = 0.3
 
 _BLOCK_S = 0.005
 """Samples are collected so long before they are processed, which costs the same for one as for many."""
+_RETRY_S = 0.2
+"""Between two attempts to reconnect."""
 _RATE_S = 0.5
 """At the beginning both rates are measured."""
 _RATE_WINDOW_NS = 1_000_000_000
@@ -123,7 +125,7 @@ class CompensatedStream(ProcessedStream):
             delay = (
                 DelayEstimator(self._calibration, self.info.p_flange_sensor_m) if delay_ms is None else delay_ms / 1e3
             )
-            self._pairing = Pairing(sensor_rate_Hz, delay)
+            self._pairing = Pairing(nominal_Hz, delay)
             self._pairing.add_states(states)
             self._pairing.add_samples(samples)
             self._stack = stack.pop_all()
@@ -223,16 +225,17 @@ class CompensatedStream(ProcessedStream):
         return found
 
     def _fail(self, role: str, error: DriverError) -> NoReturn:
-        if not self._failures:
-            if self._silent_since_ns is None:
-                self._silent_since_ns = self.clock.now_ns()
-            self._processor.note("stale", f"{role}: {error}", {"device": role}, self.clock.now_ns())
+        if self._silent_since_ns is None:
+            self._silent_since_ns = self.clock.now_ns()
+            self._processor.note("stale", f"{role}: {error}", {"device": role}, self._silent_since_ns)
         self._failures = {role: error}
         raise error
 
     def _reopen(self) -> None:
         """Open what has ended again; raises the failure that remains."""
         role, failure = next(iter(self._failures.items()))
+        self.clock.sleep((self._next_ns - self.clock.now_ns()) * 1e-9)
+        self._next_ns = self.clock.now_ns() + round(_RETRY_S * 1e9)
         self._unfollow()
         try:
             self._sensor.open()

@@ -121,9 +121,10 @@ def with_estimated_bias(recording: Recording) -> tuple[Recording, dict[str, list
     """
     calibration, rate_Hz = recording.header.info.calibration, recording.header.info.sensor_rate_Hz
     size = max(1, round(_READING_S * rate_Hz))
+    step = size * max(1, _PIECE_ROWS // size)
     readings, orientations = [np.empty((0, 6))], [np.empty((0, 3, 3))]
-    for start in range(0, len(recording.rows), size * (_PIECE_ROWS // size)):
-        paired = recording.paired(slice(start, start + size * (_PIECE_ROWS // size)))
+    for start in range(0, len(recording.rows), step):
+        paired = recording.paired(slice(start, start + step))
         whole = len(paired) // size * size
         left = calibration.compensate(paired.raw[:whole], paired.R_base_flange[:whole])
         readings.append(left.reshape(-1, size, 6).mean(axis=1))
@@ -152,6 +153,14 @@ def with_estimated_bias(recording: Recording) -> tuple[Recording, dict[str, list
     name = f"{recording.header.info.calibration_name}, bias estimated"
     sigma = np.sqrt(np.diag(covariance)[BIASES])
     return recording.with_calibration(estimated, name), {"value": change.tolist(), "sigma": sigma.tolist()}
+
+
+def free_samples(left: Array, rate_Hz: float) -> NDArray[np.bool_]:
+    """Return which samples (n,) belong to readings of a free tool; `left` (n, 6) is what the calibration leaves."""
+    size = max(1, round(_READING_S * rate_Hz))
+    whole = len(left) // size * size
+    free = np.repeat(_free(left[:whole].reshape(-1, size, 6).mean(axis=1)), size)
+    return np.concatenate([free, np.zeros(len(left) - whole, bool)])
 
 
 def _free(reading: Array) -> NDArray[np.bool_]:

@@ -16,6 +16,7 @@ from drivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtSam
 from ftdrive.live.delay import DelayEstimator
 from ftdrive.live.pairing import pair_recording
 from ftdrive.live.samples import Stages, StreamInfo, WrenchFrame
+from ftdrive.recording.compensation import free_samples
 from ftdrive.recording.recording import Header, Recording, rows_of
 from ftdrive.runs.run import versions
 
@@ -52,9 +53,15 @@ def read_pair(
         A file cannot be used, or the two have no time in common.
     """
     samples, states = read_wrench(wrench), read_orientation(orientation)
-    unknown = np.full(3, np.nan)
-    estimator = DelayEstimator(calibration, unknown, window=_WHOLE)
-    paired = pair_recording(samples, states, estimator if delay_s is None else delay_s)
+    unknown, sigma_s = np.full(3, np.nan), 0.0
+    sensor_rate_Hz = _rate_Hz(samples.t_host_ns)
+    if delay_s is None:  # from the samples without contact, which would be taken for a delay
+        first = pair_recording(samples, states, 0.0)
+        free = free_samples(calibration.compensate(first.raw, first.R_base_flange), sensor_rate_Hz)
+        estimator = DelayEstimator(calibration, unknown, window=_WHOLE)
+        pair_recording(samples.rows(np.isin(samples.seq, first.seq[free])), states, estimator)
+        delay_s, sigma_s = estimator.delay_s, estimator.sigma_s
+    paired = pair_recording(samples, states, delay_s)
     info = StreamInfo(
         calibration=calibration,
         calibration_name=name,
@@ -62,7 +69,7 @@ def read_pair(
         sensor=DeviceInfo("unknown", NOT_REPORTED, NOT_REPORTED),
         tool="",
         utc_offset_ns=0,
-        sensor_rate_Hz=_rate_Hz(samples.t_host_ns),
+        sensor_rate_Hz=sensor_rate_Hz,
         arm_rate_Hz=_rate_Hz(states.t_host_ns),
         p_flange_sensor_m=unknown,
         R_flange_tcp=np.eye(3),
@@ -70,9 +77,7 @@ def read_pair(
         versions=versions(),
     )
     recording = Recording(Header(info, WrenchFrame(), Stages()), rows_of(paired), [])
-    if delay_s is None:
-        return recording, {"value": estimator.delay_s, "sigma": estimator.sigma_s}
-    return recording, {"value": delay_s, "sigma": 0.0}
+    return recording, {"value": delay_s, "sigma": sigma_s}
 
 
 def _rate_Hz(t_ns: NDArray[np.int64]) -> float:

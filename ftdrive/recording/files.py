@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording.csv_file import CsvFile, read_csv
+from ftdrive.recording.growing_file import partial_of
 from ftdrive.recording.mcap_file import McapFile, read_mcap
 from ftdrive.recording.parquet_file import ParquetFile, read_parquet
 from ftdrive.recording.recording import ROW, Header, Recording, Rows
@@ -56,6 +57,15 @@ def format_of(path: Path) -> Format:
     return _FORMATS[ending]
 
 
+def require_new_recordings(paths: Sequence[Path]) -> None:
+    """Raise `ConfigError` or `OSError` unless a recording can be written to all of these files."""
+    for path in paths:
+        format_of(path)
+        partial_of(path)
+    if len({path.absolute() for path in paths}) < len(paths):
+        raise ConfigError("two outputs name the same file: leave one out")
+
+
 def read_recording(path: Path, columns: Collection[str] = ROW.names or ()) -> Recording:
     """Read a recording, also the `.partial` of one that was interrupted.
 
@@ -64,7 +74,7 @@ def read_recording(path: Path, columns: Collection[str] = ROW.names or ()) -> Re
     path : Path
         Its ending names the format: .mcap, .csv or .parquet.
     columns : collection of str
-        Fields of `Recording.rows` that are needed. Others may be 0, which makes reading Parquet faster.
+        Fields of `Recording.rows` that are needed. Others may be missing, which makes reading Parquet faster.
 
     Raises
     ------

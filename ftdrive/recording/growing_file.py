@@ -44,10 +44,9 @@ class GrowingFile:
         return start
 
     def complete(self) -> None:
-        """Fsync the file and give it its name."""
-        os.fsync(self._file.fileno())
-        require_new(self.path)
-        self.partial.rename(self.path)
+        """Fsync the file and give it its name. Raises `OSError`."""
+        self._file.close()
+        publish(self.partial, self.path)
 
     def discard(self) -> None:
         """Delete the file."""
@@ -59,6 +58,14 @@ class GrowingFile:
 
     def __exit__(self, *_: object) -> None:
         self._file.close()
+
+
+def publish(written: Path, path: Path) -> None:
+    """Fsync a file and give it its name. Raises `OSError`, also if the name is taken."""
+    with written.open("r+b") as file:
+        os.fsync(file.fileno())
+    require_new(path)
+    written.rename(path)
 
 
 def partial_of(path: Path) -> Path:

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.files import require_new
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import StreamEvent
-from ftdrive.recording.growing_file import partial_of
+from ftdrive.recording.growing_file import partial_of, publish
 from ftdrive.recording.recording import COLUMNS, NUMBERS, ROW, Header, Recording, Rows, event_of, event_text
 
 _PART_NS = 10_000_000_000
@@ -49,8 +48,7 @@ class ParquetFile:
         try:
             self._write_part()
             self._copy("read_parquet($parts)", self._folder / "whole", {"parts": f"{self._folder}/*.parquet"})
-            require_new(self._path)
-            (self._folder / "whole").rename(self._path)
+            publish(self._folder / "whole", self._path)
             shutil.rmtree(self._folder)
         finally:
             self._database.close()
@@ -93,7 +91,8 @@ def read_parquet(path: Path, columns: Collection[str]) -> Recording:
     parts = sorted(map(str, path.glob("*.parquet"))) if path.is_dir() else [str(path)]
     if not parts:
         raise BadRecording("the folder contains no complete part")
-    names = [one for name in ROW.names or () if name in columns for one in NUMBERS[name]]
+    groups = [name for name in ROW.names or () if name in columns]
+    names = [one for name in groups for one in NUMBERS[name]]
     with duckdb.connect() as database:
         try:
             pairs = database.execute("SELECT key, value FROM parquet_kv_metadata($1)", [parts[-1]]).fetchall()
@@ -107,10 +106,11 @@ def read_parquet(path: Path, columns: Collection[str]) -> Recording:
             raise BadRecording(
                 f"{error}: the file is damaged or was cut; a Parquet file cannot be read then"
             ) from error
-    rows = np.zeros(len(found[names[0]]), COLUMNS)
+    rows = np.empty(len(found[names[0]]), [(name, COLUMNS[name]) for name in names])
     for name in names:
         rows[name] = np.ma.filled(found[name], np.nan) if np.ma.isMaskedArray(found[name]) else found[name]
-    return Recording(header, rows.view(ROW), events, "the recording was interrupted" if path.is_dir() else "")
+    grouped = rows.view([(name, ROW[name]) for name in groups])
+    return Recording(header, grouped, events, "the recording was interrupted" if path.is_dir() else "")
 
 
 def _quoted(text: str) -> str:

@@ -9,8 +9,7 @@ import numpy as np
 
 from calib.files import JSON
 from ftdrive.live.samples import Block, StreamEvent, StreamInfo
-from ftdrive.recording.files import RecordingFile, format_of
-from ftdrive.recording.growing_file import partial_of
+from ftdrive.recording.files import RecordingFile, format_of, require_new_recordings
 from ftdrive.recording.recording import ROW, Header, frame_values, rows_of
 
 _FLUSH_NS = 1_000_000_000
@@ -40,9 +39,7 @@ class Recorder:
     def __init__(self, paths: Sequence[Path], info: StreamInfo, configuration: Mapping[str, JSON]) -> None:
         self.samples, self.gaps, self.lost = 0, 0, 0
         self.first_ns = self.last_ns = 0
-        for path in paths:
-            format_of(path)
-            partial_of(path)
+        require_new_recordings(paths)
         self._paths, self._info, self._configuration = paths, info, configuration
         self._files: list[RecordingFile] = []
         self._header: Header | None = None

@@ -170,11 +170,13 @@ class Recording:
         return int(np.count_nonzero(np.diff(self.rows["seq"]) != 1))
 
     def paired(self, which: slice = slice(None)) -> Paired:
-        """Return samples as measured, each with its pose."""
+        """Return samples as measured, each with its pose; columns that were not read are 0."""
         rows = self.rows[which]
-        names = ("t_host_ns", "t_device_s", "seq", "status", "raw", "q_rad", "p_base_flange_m")
         R_base_flange = Rotation.from_quat(rows["quaternion_base_flange"]).as_matrix()
-        return Paired(R_base_flange=R_base_flange, **{name: rows[name] for name in names})
+        read = rows.dtype.names or ()
+        names = [item.name for item in fields(Paired) if item.name != "R_base_flange"]
+        columns = {name: rows[name] if name in read else np.zeros(len(rows), ROW[name]) for name in names}
+        return Paired(R_base_flange=R_base_flange, **columns)
 
     def with_calibration(self, calibration: CalibrationResult, name: str) -> Self:
         """Return the recording with another calibration in its header."""

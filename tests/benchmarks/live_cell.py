@@ -11,30 +11,20 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, Parameters, solve
-from calib.model import Array, predict
+from calib import CalibrationResult
+from calib.model import Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import Station
 from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
+from tests.unit.ftdrive.live.simulated import calibrated_from
 
-NAMES = ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")
 HEIGHT_M = 0.03
 OPTIONS = ("--time-scale", "1", "--sensor-origin", f"0,0,{HEIGHT_M}", "--inertia", "0,0,0,0,0,0")
 
 
-def calibrated(station: Station) -> CalibrationResult:
-    """A calibration with 24 poses, simulated from the truth: a tour at the arm's own speed takes minutes."""
-    truth = station.truth
-    parameters = Parameters(**{name: np.array(truth[name]) for name in NAMES})
-    sigma = np.repeat([truth["noise_force_N"], truth["noise_torque_Nm"]], 3) / 30
-    rng = np.random.default_rng(1)
-    R = Rotation.random(24, rng=rng).as_matrix()
-    wrench = predict(parameters, R) + sigma * rng.normal(size=(24, 6))
-    covariance = np.tile(np.diag(sigma**2), (24, 1, 1))
-    return solve(CalibrationDataset(R, wrench, covariance, np.zeros(24, np.int64), np.full(24, np.nan)))
+ages_ms: list[float] = []
 
 
 def read(stream: CompensatedStream, seconds: float) -> tuple[Array, Array]:
@@ -43,6 +33,7 @@ def read(stream: CompensatedStream, seconds: float) -> tuple[Array, Array]:
     blocks = []
     while stream.clock.now_s() < end_s:
         blocks.append(stream.read())
+        ages_ms.append((stream.clock.now_ns() - int(blocks[-1].t_host_ns[-1])) / 1e6)
     return np.concatenate([block.wrench for block in blocks]), np.concatenate([block.in_contact for block in blocks])
 
 
@@ -56,6 +47,7 @@ def moving(
     sensor_ms, rtde_ms = delays_ms
     station.control(do="delay", sensor_ms=sensor_ms, rtde_ms=rtde_ms)
     with CompensatedStream(cell, calibration, stages=Stages(inertia=True)) as stream:
+        read(stream, 1.0)
         still = rms(read(stream, 2.0)[0])
         while "error" in station.control(do="swing", seconds=1.5 * seconds):  # until the last swing has ended
             read(stream, 1.0)
@@ -65,6 +57,7 @@ def moving(
         cpu_s = (time.process_time() - cpu_s) / (stream.clock.now_s() - begin_s)
         status = stream.status()
         stream.stages = Stages()
+        ages_ms.clear()
         static, _ = read(stream, seconds / 4)
         kinds = [event.kind for event in stream.take_events()]
     expected_ms = sensor_ms - rtde_ms
@@ -74,7 +67,8 @@ def moving(
         f"{1e3 * status.delay_sigma_s:.2f} ms (links differ by {expected_ms:+g}), residual / noise "
         f"{ratio[:3].max():.2f} force {ratio[3:].max():.2f} torque, without inertia {beside[:3].max():.0f} and "
         f"{beside[3:].max():.0f}, CPU {100 * cpu_s:.0f} %, {status.sensor.rate_Hz:.0f} and "
-        f"{status.arm.rate_Hz:.0f} Hz, gaps {kinds.count('gap')}\n"
+        f"{status.arm.rate_Hz:.0f} Hz, gaps {kinds.count('gap')}, "
+        f"newest sample of a block {np.median(ages_ms):.1f} ms old (p95 {np.percentile(ages_ms, 95):.1f})\n"
     )
     sys.stdout.flush()
 
@@ -103,7 +97,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20.0)
     options = parser.parse_args()
     with Station(options.sensor, OPTIONS) as station:
-        calibration = calibrated(station)
+        calibration = calibrated_from(station.truth)
         cell = replace(station.cell, sensor=replace(station.cell.sensor, height_mm=1e3 * HEIGHT_M))
         push(station, cell, calibration)
         for delays_ms in ((0.0, 0.0), (8.0, 0.0), (20.0, 0.0), (0.0, 10.0)):

@@ -76,13 +76,13 @@ def blocks(n: int, size: int = 100) -> list[Block]:
 
 
 def test_count_ends_exactly_and_files_are_equal(run_record: Run) -> None:
-    code, told, err = run_record(FakeStream(blocks(30)), "-o", "a.mcap", "-o", "a.csv", "--count", "1234")
+    code, answer, err = run_record(FakeStream(blocks(30)), "-o", "a.mcap", "-o", "a.csv", "--count", "1234")
     assert code == 0
-    assert told is not None
-    assert (told["files"], told["samples"], told["gaps"], told["lost"]) == (["a.mcap", "a.csv"], 1234, 0, 0)
-    assert (told["axes"], told["about"], told["calibration"]) == ("sensor", "sensor", "c.json")
+    assert answer is not None
+    assert (answer["files"], answer["samples"], answer["gaps"], answer["lost"]) == (["a.mcap", "a.csv"], 1234, 0, 0)
+    assert (answer["axes"], answer["about"], answer["calibration"]) == ("sensor", "sensor", "c.json")
     assert "the serial number is unknown" in err
-    one, other = (read_recording(Path(name)) for name in told["files"])
+    one, other = (read_recording(Path(name)) for name in answer["files"])
     assert one.rows.tobytes() == other.rows.tobytes()
     assert len(one.rows) == 1234
     assert one.header.configuration["robot"]["host"] == "10.0.0.2"
@@ -92,18 +92,18 @@ def test_count_ends_exactly_and_files_are_equal(run_record: Run) -> None:
 
 
 def test_duration_ends_by_the_times_of_the_samples(run_record: Run) -> None:
-    code, told, _ = run_record(FakeStream(blocks(30)), "-o", "a.csv", "--duration", "0.5s")
+    code, answer, _ = run_record(FakeStream(blocks(30)), "-o", "a.csv", "--duration", "0.5s")
     assert code == 0
-    assert told is not None
-    assert told["samples"] in (500, 501)
-    assert told["duration_s"] < 0.5
+    assert answer is not None
+    assert answer["samples"] in (500, 501)
+    assert answer["duration_s"] < 0.5
 
 
 def test_control_c_keeps_the_data(run_record: Run) -> None:
-    code, told, err = run_record(FakeStream(blocks(3)), "-o", "a.mcap")
+    code, answer, err = run_record(FakeStream(blocks(3)), "-o", "a.mcap")
     assert code == 130
-    assert told is not None
-    assert told["samples"] == 300
+    assert answer is not None
+    assert answer["samples"] == 300
     assert "Saved a.mcap: 300 samples" in err
     assert read_recording(Path("a.mcap")).cut == ""
 
@@ -111,26 +111,34 @@ def test_control_c_keeps_the_data(run_record: Run) -> None:
 def test_a_lost_link_keeps_the_data(run_record: Run) -> None:
     stale = StreamEvent(5_300_000_000, "stale", "sensor: silent")
     stream = FakeStream(blocks(3), DeviceTimeout("sensor silent for 0.3 s", "check its cable"), {3: stale})
-    code, told, err = run_record(stream, "-o", "a.csv")
+    code, answer, err = run_record(stream, "-o", "a.csv")
     assert code == 4
     assert "error: sensor silent for 0.3 s; check its cable" in err
-    assert told is not None
+    assert answer is not None
     assert [event.kind for event in read_recording(Path("a.csv")).events] == ["stale", "delay"]
 
 
 def test_a_stream_without_a_sample_leaves_no_file(run_record: Run, tmp_path: Path) -> None:
-    code, told, _ = run_record(FakeStream([], DeviceTimeout("sensor silent")), "-o", "a.csv")
-    assert (code, told) == (4, None)
+    code, answer, _ = run_record(FakeStream([], DeviceTimeout("sensor silent")), "-o", "a.csv")
+    assert (code, answer) == (4, None)
     assert [path.name for path in tmp_path.iterdir()] == ["c.json"]
 
 
 def test_a_gap_is_exit_code_8(run_record: Run) -> None:
     gap = StreamEvent(5_100_000_000, "gap", "7 samples lost", {"lost": 7, "seq": 1})
-    code, told, err = run_record(FakeStream(blocks(3), events={2: gap}), "-o", "a.csv", "--count", "300")
+    code, answer, err = run_record(FakeStream(blocks(3), events={2: gap}), "-o", "a.csv", "--count", "300")
     assert code == 8
-    assert told is not None
-    assert (told["gaps"], told["lost"]) == (1, 7)
+    assert answer is not None
+    assert (answer["gaps"], answer["lost"]) == (1, 7)
     assert "error: gaps: 1, samples lost: 7" in err
+
+
+def test_a_gap_after_the_end_does_not_count(run_record: Run) -> None:
+    gap = StreamEvent(5_150_000_000, "gap", "7 samples lost", {"lost": 7, "seq": 1})
+    code, answer, _ = run_record(FakeStream(blocks(3), events={2: gap}), "-o", "a.csv", "--count", "120")
+    assert code == 0
+    assert answer is not None
+    assert (answer["samples"], answer["gaps"]) == (120, 0)
 
 
 @pytest.mark.parametrize(
@@ -144,8 +152,8 @@ def test_a_gap_is_exit_code_8(run_record: Run) -> None:
     ],
 )
 def test_what_cannot_be_done_is_refused_before_any_work(run_record: Run, options: list[str], words: str) -> None:
-    code, told, err = run_record(FakeStream([], AssertionError("the stream was read")), *options)
-    assert (code, told) == (2, None)
+    code, answer, err = run_record(FakeStream([], AssertionError("the stream was read")), *options)
+    assert (code, answer) == (2, None)
     assert words in " ".join(err.split())
 
 
@@ -203,14 +211,19 @@ KEYS = {"force_rms_N", "force_max_N", "torque_rms_Nm", "torque_max_Nm"}
 def test_compensate_answers_as_documented(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--calibration", "c.json", "--axes", "base", "--json", "-o", "b.parquet"]
     assert cli.run(["compensate", str(recorded), *options]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["schema_version"] == 1
-    assert (told["samples"], told["gaps"], told["contacts"]) == (3000, 0, [])
-    assert told["delay_s"] == {"value": 0.0031, "sigma": 0.0002}
-    assert told["raw"].keys() == told["compensated"].keys() == KEYS
-    assert told["compensated"]["force_rms_N"] == pytest.approx(np.sqrt(3) * 0.05, rel=0.1)
-    assert told["raw"]["force_rms_N"] > 10
-    assert (told["axes"], told["about"], told["calibration"], told["file"]) == ("base", "sensor", "c.json", "b.parquet")
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["schema_version"] == 1
+    assert (answer["samples"], answer["gaps"], answer["contacts"]) == (3000, 0, [])
+    assert answer["delay_s"] == {"value": 0.0031, "sigma": 0.0002}
+    assert answer["raw"].keys() == answer["compensated"].keys() == KEYS
+    assert answer["compensated"]["force_rms_N"] == pytest.approx(np.sqrt(3) * 0.05, rel=0.1)
+    assert answer["raw"]["force_rms_N"] > 10
+    assert (answer["axes"], answer["about"], answer["calibration"], answer["file"]) == (
+        "base",
+        "sensor",
+        "c.json",
+        "b.parquet",
+    )
     assert str(read_recording(Path("b.parquet")).header.frame) == "base axes, about the sensor origin"
 
 
@@ -262,3 +275,16 @@ def test_compensate_imports_no_driver_of_a_device(recorded: Path) -> None:
     )
     outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert outcome.returncode == 0, outcome.stderr
+
+
+def test_live_replays_a_recording_with_its_calibration_or_another(
+    recorded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--speed", "1e9", "--once", "--json", "--axes", "base"]
+    assert cli.run(["live", "--replay", str(recorded), *options]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert np.linalg.norm(answer["compensated"]["force_N"]) < 0.1
+    assert cli.run(["live", "--replay", str(recorded), "--calibration", "c.json", *options]) == 0
+    assert json.loads(capsys.readouterr().out)["compensated"] == answer["compensated"]
+    Path("d.csv").write_text("t\n")
+    assert cli.run(["live", "--replay", "d.csv", "--once"]) == 6

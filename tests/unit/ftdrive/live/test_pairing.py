@@ -46,13 +46,6 @@ def test_a_shift_is_followed_slowly_and_time_never_runs_backwards() -> None:
     assert all_ns[-1] - T0_NS == pytest.approx(count[-1] * 1e6 + 0.2e6 - 20e6, abs=0.2e6)
 
 
-def test_without_a_nominal_rate_it_is_learnt() -> None:
-    count, t_ns = received(10.0, 70.0, 1)
-    line = Timeline(float("nan"))
-    stamps = np.concatenate([line.stamp(count[i : i + 1].astype(float), t_ns[i : i + 1]) for i in range(len(count))])
-    assert np.abs((stamps - T0_NS)[400:] * 1e-9 - count[400:] / 70 - 2e-4).max() < 1e-3
-
-
 def test_a_restarted_device_begins_a_new_line() -> None:
     line = Timeline(1.0)
     first = line.stamp(np.array([5000.0, 5000.1]), T0_NS + np.array([0, 100_000_000]))
@@ -184,3 +177,40 @@ def test_a_busy_computer_at_the_beginning_does_not_bend_the_line() -> None:
         [line.stamp(count[i : i + 8].astype(float), t_ns[i : i + 8]) for i in range(0, len(count), 8)]
     )
     assert np.abs((stamps - T0_NS) * 1e-9 - count * 1e-3).max() < 5e-3
+
+
+def test_lost_samples_that_nothing_counts_bend_the_line_for_some_seconds_only() -> None:
+    count, t_ns = received(12.0, 1000.0, 8)
+    t_ns[4000:] += 30_000_000  # 30 samples are missing
+    line = Timeline(1e-3, RATE_TOLERANCE)
+    stamps = np.concatenate(
+        [line.stamp(count[i : i + 8].astype(float), t_ns[i : i + 8]) for i in range(0, len(count), 8)]
+    )
+    error_s = (stamps - T0_NS) * 1e-9 - count * 1e-3 - 2e-4 - np.where(count < 4000, 0, 0.03)
+    assert np.abs(error_s[7000:]).max() < 5e-4
+    assert (np.diff(stamps) > 0).all()
+
+
+def test_a_polled_sensor_keeps_its_times_of_receipt() -> None:
+    _, states = Motion().links(2.0, 0.0)
+    rng = np.random.default_rng(1)
+    t_ns = T0_NS + np.cumsum(rng.integers(1_000_000, 9_000_000, 300))
+    pairing, found = Pairing(float("nan"), 0.004), []
+    pairing.add_states(states)
+    for i in range(0, 300, 3):
+        rows = slice(i, i + 3)
+        pairing.add_samples(FtSamples.of(t_ns[rows], np.arange(i, i + 3), np.zeros((3, 6))))
+        if (paired := pairing.take()) is not None:
+            found.append(paired)
+    seq = np.concatenate([paired.seq for paired in found])
+    stamps = np.concatenate([paired.t_host_ns for paired in found])
+    np.testing.assert_allclose(stamps, t_ns[seq] - 4_000_000, atol=100)
+
+
+def test_a_clock_of_coarse_steps_is_no_restart() -> None:
+    _, t_ns = received(6.0, 1000.0, 1)
+    coarse_s = np.floor(np.arange(len(t_ns)) / 4) * 4e-3
+    line = Timeline()
+    stamps = np.concatenate([line.stamp(coarse_s[i : i + 1], t_ns[i : i + 1]) for i in range(len(t_ns))])
+    assert (np.diff(stamps) >= 0).all()
+    assert np.abs((stamps - T0_NS)[3000:] * 1e-9 - coarse_s[3000:] - 2e-4).max() < 5e-4

@@ -36,12 +36,12 @@ def turning(t_s: Array) -> Array:
     return Rotation.from_rotvec(angles).as_matrix()
 
 
-def recording(parameters: Parameters = TRUTH, seconds: float = 8.0, push_N: float = 6.0) -> Recording:
+def recording(parameters: Parameters = TRUTH, seconds: float = 8.0) -> Recording:
     """A free tool, but for a push of 6 N along x of the sensor from 4 to 5 s."""
     rng, n = np.random.default_rng(0), round(seconds * RATE_HZ)
     t_s = np.arange(n) / RATE_HZ
     R = turning(t_s)
-    push = np.where((t_s >= 4) & (t_s < 5), push_N, 0.0)[:, None] * np.eye(6)[0]
+    push = np.where((t_s >= 4) & (t_s < 5), 6.0, 0.0)[:, None] * np.eye(6)[0]
     nothing, t_ns = np.zeros((n, 6)), np.rint(t_s * 1e9).astype(np.int64) + 10**12
     samples = Block(
         t_host_ns=t_ns,
@@ -115,7 +115,7 @@ def test_a_short_recording_shows_no_bias() -> None:
 
 def write_pair(folder: Path, delay_s: float, orientation: str) -> tuple[Path, Path]:
     """The recording as two files: wrench at 500 Hz, late by the delay, orientation at 125 Hz."""
-    source = recording(seconds=15.0, push_N=0.0)
+    source = recording(seconds=15.0)
     wrench, poses = folder / "wrench.csv", folder / "poses.csv"
     t_s = np.arange(len(source.rows)) / RATE_HZ + 100.0
     table = np.c_[t_s + delay_s, source.rows["raw"]]
@@ -132,7 +132,7 @@ def write_pair(folder: Path, delay_s: float, orientation: str) -> tuple[Path, Pa
 
 
 @pytest.mark.parametrize("orientation", ["r11,r12,r13,r21,r22,r23,r31,r32,r33", "qx,qy,qz,qw", "rx,ry,rz"])
-def test_a_pair_of_files_is_paired_with_its_delay(orientation: str, tmp_path: Path) -> None:
+def test_a_pair_of_files_is_paired_with_its_delay_despite_a_push(orientation: str, tmp_path: Path) -> None:
     files = write_pair(tmp_path, 0.012, orientation)
     found, delay = read_pair(*files, calibration(), "c", None)
     assert delay["value"] == pytest.approx(0.012, abs=1e-3)
