@@ -139,7 +139,7 @@ def settings(host: str) -> dict[str, Any]:
     """TCP, payload, force sensor, speed slider."""
     r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
     io = import_module("rtde_io").RTDEIOInterface(host)
-    c.getActualToolFlangePose()
+    wait_for(lambda: any(c.getActualToolFlangePose()))  # zeros until the controller's first answer is read
     some_cycles(r)
     flange, bare = c.getActualToolFlangePose(), r.getActualTCPPose()
     out: dict[str, Any] = {"offset_before": c.getTCPOffset(), "setTcp": c.setTcp([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])}
