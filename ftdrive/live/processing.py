@@ -194,10 +194,10 @@ class Processor:
     def _inertial(self, buffer: Paired) -> tuple[Array, int]:
         """Return the inertial wrench of all rows, and the number of those with neighbours on both sides."""
         knots = np.arange(0, len(buffer), self._stride)
+        t_s = (buffer.t_host_ns - buffer.t_host_ns[0]) * 1e-9
+        knots = knots[np.diff(t_s[knots], prepend=-1.0) > 0]  # a coarse clock repeats times
         if len(knots) < 2 * self._reach + 2:
             return np.zeros((len(buffer), 6)), 0
-        t_s = (buffer.t_host_ns - buffer.t_host_ns[0]) * 1e-9
-        knots = knots[np.diff(t_s[knots], prepend=-1.0) > 0]
         parameters = self.info.calibration.parameters
         motion = motion_of_poses(
             t_s[knots],

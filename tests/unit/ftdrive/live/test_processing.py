@@ -207,6 +207,14 @@ def test_inertia_leaves_only_noise_of_a_moving_tool() -> None:
     assert len(static.seq) - len(dynamic.seq) <= 13  # milliseconds
 
 
+def test_repeated_times_delay_the_inertia_stage_only() -> None:
+    rows = moving(0.4)
+    coarse = replace(rows, t_host_ns=rows.t_host_ns // 20_000_000 * 20_000_000)
+    _, block = processed(coarse, stages=Stages(inertia=True))
+    assert len(block.seq) > 100
+    assert np.isfinite(block.wrench).all()
+
+
 def test_a_known_inertia_tensor_is_subtracted_too() -> None:
     tensor = np.diag([0.01, 0.02, 0.03])
     rows = moving(3.0)
