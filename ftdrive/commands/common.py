@@ -29,6 +29,13 @@ def runs(words: str = "Parent folder of the new run folder.") -> Callable[[F], F
     return click.option("--runs", type=folder, default=Path("runs"), show_default=True, help=words)
 
 
+CALIBRATION = click.option(
+    "--calibration",
+    "path",
+    metavar="PATH",
+    type=click.Path(exists=True, path_type=Path),
+    help="A calibration.json or its run folder. With --simulate the default is a new one.",
+)
 CONFIG = click.option("--config", type=FILE, help="TOML file that describes the cell, instead of ./ftdrive.toml.")
 
 

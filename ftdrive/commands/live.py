@@ -6,7 +6,6 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -16,26 +15,22 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from calib import CalibrationResult
 from drivers.errors import DriverError
 from drivers.interfaces import Array
-from ftdrive.cell.config import CellConfig
-from ftdrive.cell.emulated import Station, sensor_name
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import AXES, check_weighed_payload
 from ftdrive.commands.common import (
+    CALIBRATION,
     CELL,
     FRAME,
     JSON,
     Number,
     check_simulate,
-    read_cell,
     read_frame,
     simulate,
-    stop_unless_accepted,
     write_json,
 )
-from ftdrive.commands.emulated_run import rehearse
+from ftdrive.commands.live_source import open_source
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.processing import ProcessedStream
@@ -56,13 +51,7 @@ _RECOVER_S = 10.0
 
 
 @click.command()
-@click.option(
-    "--calibration",
-    "path",
-    metavar="PATH",
-    type=click.Path(exists=True, path_type=Path),
-    help="A calibration.json or its run folder. With --simulate the default is a new one.",
-)
+@CALIBRATION
 @CELL
 @simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
 @click.option(
@@ -99,26 +88,16 @@ def live(
     if speed is not None and replay is None:
         raise ConfigError("--speed goes only with --replay: add it, or leave --speed out")
     frame = read_frame(axes, about)
-    calibration = None if path is None else load_calibration(path)
-    name = "temporary calibration" if path is None else str(path)
     with ExitStack() as stack:
-        if simulate:
-            calibration, cell = _emulated(calibration, sensor, stack)
         stream: CompensatedStream | ReplayedStream
         checks = list[Check]()
         recorder: Callable[[Path], Recorder] | None = None
         if replay is not None:
-            stream = _replayed(replay, calibration, name, frame, speed=1.0 if speed is None else speed)
-        elif calibration is None:
-            raise ConfigError("no calibration: give --calibration PATH, or --simulate")
+            stream = _replayed(replay, path, frame, speed=1.0 if speed is None else speed)
         else:
-            if not simulate:
-                cell = read_cell(config, robot, sensor)
-            stream = stack.enter_context(CompensatedStream(cell, calibration, name=name, frame=frame))
-            checks = [check_weighed_payload(stream.payload_kg, calibration, cell.sensor.mass_kg)]
+            stream, cell = open_source(path, config, robot, sensor, simulate=simulate, frame=frame, stack=stack)
+            checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, cell.sensor.mass_kg)]
             recorder = partial(_recorder, stream.info, cell.to_dict())
-            for words in stream.warnings:
-                talk.print(f" {words}")
         if once or as_json:
             _print(stream, once=once, as_json=as_json)
         elif talk.is_terminal and sys.stdout.isatty() and sys.stdin.isatty() and not plain:
@@ -129,17 +108,15 @@ def live(
             _show_table(stream)
 
 
-def _replayed(
-    path: Path, calibration: CalibrationResult | None, name: str, frame: WrenchFrame, speed: float
-) -> ReplayedStream:
+def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, speed: float) -> ReplayedStream:
     """Replay a run folder, or a recording with its own calibration unless another one is given."""
     if path.is_dir() and path.suffix != ".partial":
         if calibration is None:
             raise ConfigError("no calibration: give --calibration PATH")
-        return replay_run(Run(path), calibration, name, frame=frame, speed=speed)
+        return replay_run(Run(path), load_calibration(calibration), str(calibration), frame=frame, speed=speed)
     recording = read_recording(path)
     if calibration is not None:
-        recording = recording.with_calibration(calibration, name)
+        recording = recording.with_calibration(load_calibration(calibration), str(calibration))
     return ReplayedStream(recording.header.info, recording.paired(), frame=frame, speed=speed)
 
 
@@ -168,20 +145,6 @@ def _show_table(stream: CompensatedStream | ReplayedStream) -> None:
             shown = _screen(_reading(look, stream), stream.frame, stream.info.calibration_name)
             screen.update(Group(shown, "Ctrl-C ends"))
         screen.update(Group(shown, "The recording has ended."))
-
-
-def _emulated(
-    calibration: CalibrationResult | None, sensor: str | None, stack: ExitStack
-) -> tuple[CalibrationResult, CellConfig]:
-    """Start the cell of a calibration, or calibrate a new one with six poses."""
-    if calibration is None:
-        with Station(sensor_name(sensor)) as quick, TemporaryDirectory(prefix="ftdrive-") as runs:
-            calibration = rehearse(quick, Path(runs), "simulated", poses=6, kept=False).result
-        stop_unless_accepted(calibration)
-    made_by = calibration.provenance.get("station") or {}
-    name = sensor_name(sensor) if sensor else made_by.get("sensor", "can")
-    options = (*made_by.get("options", ()), "--time-scale", "1")  # a stream pairs by the controller's clock
-    return calibration, stack.enter_context(Station(name, options)).cell
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ftdrive.commands.common import (
+    CALIBRATION,
     CELL,
     FRAME,
     JSON,
     NewFile,
     check_simulate,
-    read_cell,
     read_frame,
     simulate,
     write_json,
 )
-from ftdrive.errors import ConfigError, RecordingHasGaps
+from ftdrive.errors import RecordingHasGaps
 
 if TYPE_CHECKING:
     from ftdrive.live.samples import Axes, WrenchFrame
@@ -55,13 +55,7 @@ class Duration(click.ParamType[float]):
 )
 @click.option("--duration", "duration_s", type=Duration(), help="Such as 60s, 10min or 1h; otherwise Ctrl-C ends.")
 @click.option("--count", type=click.IntRange(1), help="Number of samples.")
-@click.option(
-    "--calibration",
-    "calibration_path",
-    metavar="PATH",
-    type=click.Path(exists=True, path_type=Path),
-    help="A calibration.json or its run folder. With --simulate the default is a new one.",
-)
+@CALIBRATION
 @CELL
 @simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
 @FRAME
@@ -70,7 +64,7 @@ def record(
     paths: Sequence[Path],
     duration_s: float | None,
     count: int | None,
-    calibration_path: Path | None,
+    path: Path | None,
     config: Path | None,
     robot: str | None,
     sensor: str | None,
@@ -84,7 +78,7 @@ def record(
     Foxglove, Lichtblick, PlotJuggler and ROS 2 open .mcap. The arm is only read, never moved. However the recording
     ends, the files hold what was received until then. Exit code 8 if samples are missing.
     """
-    from ftdrive.live.stream import CompensatedStream, load_calibration
+    from ftdrive.commands.live_source import open_source
     from ftdrive.recording import Recorder
     from ftdrive.recording.files import require_new_recordings
     from ftdrive.terminal.console import talk
@@ -92,27 +86,15 @@ def record(
     check_simulate(simulate, real={"--config": config, "--robot": robot})
     require_new_recordings(paths)
     frame = read_frame(axes, about)
-    calibration = None if calibration_path is None else load_calibration(calibration_path)
     with ExitStack() as stack:
-        if simulate:
-            from ftdrive.commands.live import _emulated as emulated
-
-            calibration, cell = emulated(calibration, sensor, stack)
-        elif calibration is None:
-            raise ConfigError("no calibration: give --calibration PATH, or --simulate")
-        else:
-            cell = read_cell(config, robot, sensor)
-        name = "temporary calibration" if calibration_path is None else str(calibration_path)
-        stream = stack.enter_context(CompensatedStream(cell, calibration, name=name, frame=frame))
-        for words in stream.warnings:
-            talk.print(f" {words}")
+        stream, cell = open_source(path, config, robot, sensor, simulate=simulate, frame=frame, stack=stack)
         recorder = Recorder(paths, stream.info, cell.to_dict())
         talk.print(f" Recording at {stream.info.sensor_rate_Hz:.0f} Hz, {frame}. Ctrl-C ends.")
         try:
             record_stream(stream, recorder, duration_s, count)
         finally:
             if recorder.samples:
-                _report(recorder, paths, frame, name, as_json=as_json)
+                _report(recorder, paths, frame, stream.info.calibration_name, as_json=as_json)
     if recorder.gaps:
         raise RecordingHasGaps(
             f"gaps: {recorder.gaps}, samples lost: {recorder.lost}; check cable, supply and load of the computer, then "

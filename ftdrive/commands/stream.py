@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import click
 
 from drivers.errors import DriverError
-from ftdrive.commands.common import CELL, FRAME, check_simulate, read_cell, read_frame, simulate
-from ftdrive.commands.live import _emulated as emulated
+from ftdrive.commands.common import CALIBRATION, CELL, FRAME, check_simulate, read_frame, simulate
+from ftdrive.commands.live_source import open_source
 from ftdrive.errors import ConfigError
 from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.samples import Axes
-from ftdrive.live.stream import CompensatedStream, load_calibration
+from ftdrive.live.stream import CompensatedStream
 from ftdrive.servers.udp import UdpSender
 from ftdrive.terminal.console import talk
 
@@ -27,13 +27,7 @@ RECOVER_S = 10.0
 
 
 @click.command()
-@click.option(
-    "--calibration",
-    "path",
-    metavar="PATH",
-    type=click.Path(exists=True, path_type=Path),
-    help="A calibration.json or its run folder. With --simulate the default is a new one.",
-)
+@CALIBRATION
 @CELL
 @simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
 @FRAME
@@ -63,18 +57,8 @@ def stream(
     check_simulate(simulate, real={"--config": config, "--robot": robot})
     frame = read_frame(axes, about)
     udp_address = None if udp is None else _address(udp)
-    calibration = None if path is None else load_calibration(path)
-    name = "temporary calibration" if path is None else str(path)
     with ExitStack() as stack:
-        if simulate:
-            calibration, cell = emulated(calibration, sensor, stack)
-        elif calibration is None:
-            raise ConfigError("no calibration: give --calibration PATH, or --simulate")
-        else:
-            cell = read_cell(config, robot, sensor)
-        source = stack.enter_context(CompensatedStream(cell, calibration, name=name, frame=frame))
-        for words in source.warnings:
-            talk.print(f" {words}")
+        source, _ = open_source(path, config, robot, sensor, simulate=simulate, frame=frame, stack=stack)
         server = stack.enter_context(closing(FoxgloveServer(source, host, port)))
         sinks: list[FoxgloveServer | UdpSender] = [server]
         if udp_address is not None:

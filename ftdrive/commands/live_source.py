@@ -1,0 +1,62 @@
+"""The compensated stream of the cell that the options name, for `live`, `record` and `stream`."""
+
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from calib import CalibrationResult
+from ftdrive.cell.config import CellConfig
+from ftdrive.cell.emulated import Station, sensor_name
+from ftdrive.commands.common import read_cell, stop_unless_accepted
+from ftdrive.commands.emulated_run import rehearse
+from ftdrive.errors import ConfigError
+from ftdrive.live.samples import WrenchFrame
+from ftdrive.live.stream import CompensatedStream, load_calibration
+from ftdrive.terminal.console import talk
+
+
+def open_source(
+    path: Path | None,
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    *,
+    simulate: bool,
+    frame: WrenchFrame,
+    stack: ExitStack,
+) -> tuple[CompensatedStream, CellConfig]:
+    """Open the stream of a real or an emulated cell and print its warnings; `stack` closes it.
+
+    Parameters
+    ----------
+    path : Path, optional
+        A calibration.json or its run folder. Only an emulated cell needs none: it is calibrated first.
+    config, robot, sensor
+        As `read_cell` takes them.
+    """
+    calibration = None if path is None else load_calibration(path)
+    if simulate:
+        calibration, cell = _emulated(calibration, sensor, stack)
+    elif calibration is None:
+        raise ConfigError("no calibration: give --calibration PATH, or --simulate")
+    else:
+        cell = read_cell(config, robot, sensor)
+    name = "temporary calibration" if path is None else str(path)
+    stream = stack.enter_context(CompensatedStream(cell, calibration, name=name, frame=frame))
+    for words in stream.warnings:
+        talk.print(f" {words}")
+    return stream, cell
+
+
+def _emulated(
+    calibration: CalibrationResult | None, sensor: str | None, stack: ExitStack
+) -> tuple[CalibrationResult, CellConfig]:
+    """Start the cell of a calibration, or calibrate a new one with six poses."""
+    if calibration is None:
+        with Station(sensor_name(sensor)) as quick, TemporaryDirectory(prefix="ftdrive-") as runs:
+            calibration = rehearse(quick, Path(runs), "simulated", poses=6, kept=False).result
+        stop_unless_accepted(calibration)
+    made_by = calibration.provenance.get("station") or {}
+    name = sensor_name(sensor) if sensor else made_by.get("sensor", "can")
+    options = (*made_by.get("options", ()), "--time-scale", "1")  # a stream pairs by the controller's clock
+    return calibration, stack.enter_context(Station(name, options)).cell
