@@ -211,7 +211,7 @@ def test_robotous_of_unknown_model_is_refused(start: Start) -> None:
 
 def test_robotous_rate(start: Start) -> None:
     with start("robotous-can").sensor("rate=1000") as sensor:
-        assert 75 < len(sensor.collect(0.3)) < 330  # more than the 60 of the factory
+        assert 75 < len(sensor.collect(0.3)) < 400  # the factory gives 60; late ones come in bursts
     slow = start("robotous-serial")
     with slow.sensor("rate=50") as sensor:
         assert 8 < len(sensor.collect(0.4)) < 24
@@ -223,7 +223,7 @@ def test_robotous_uart_carries_a_kilohertz_at_921600_only(start: Start) -> None:
     with pytest.raises(BadUrl, match="choose at most 500 Hz"):
         sensor_from_url("robotous-serial:///dev/x?rate=1000")
     with start("robotous-serial", baud_code=1).sensor("baud=921600&rate=1000") as sensor:
-        assert 75 < len(sensor.collect(0.3)) < 330  # more than the 60 of the factory
+        assert 75 < len(sensor.collect(0.3)) < 400  # the factory gives 60; late ones come in bursts
 
 
 def test_robotiq_saturation_is_a_fault(start: Start) -> None:
