@@ -26,11 +26,11 @@ def read(stream: CompensatedStream, seconds: float) -> Array:
 
 @pytest.mark.slow
 def test_a_push_a_swing_and_an_interruption() -> None:
-    with Station("can", OPTIONS) as station:
+    with Station("serial", OPTIONS) as station:
         config = replace(station.cell, sensor=replace(station.cell.sensor, height_mm=30.0))
         calibration = calibrated_from(station.truth)
         with CompensatedStream(config, calibration, frame=WrenchFrame("base", "flange")) as stream:
-            noise = read(stream, 2.0)[300:].std(axis=0)
+            noise = read(stream, 2.0)[7000:].std(axis=0)
             assert stream.read().sigma == pytest.approx(noise, rel=0.5)
             station.control(do="push", wrench=[10.0, 0, 0, 0, 0, 0], axes="base")
             R_axes_base = {
@@ -47,9 +47,12 @@ def test_a_push_a_swing_and_an_interruption() -> None:
             read(stream, 0.5)
             assert "contact" in [event.kind for event in stream.take_events()]
 
-            station.control(do="swing", seconds=12)
+            station.control(do="swing", seconds=60)
             stream.stages = Stages(inertia=True)
-            read(stream, 6.0)
+            for _ in range(50):  # a starved cell shows less of the motion
+                if stream.status().delay_sigma_s < 1e-3:
+                    break
+                read(stream, 1.0)
             assert 0 < stream.status().delay_sigma_s < 1e-3
             dynamic = read(stream, 2.0).std(axis=0)
             stream.stages = Stages()
