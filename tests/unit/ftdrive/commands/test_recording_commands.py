@@ -62,7 +62,7 @@ def run_record(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.C
     calibration().save(tmp_path / "c.json")
 
     def run(stream: FakeStream, *options: str) -> tuple[int, dict[str, Any] | None, str]:
-        monkeypatch.setattr("ftdrive.live.stream.CompensatedStream", lambda *_, **__: stream)
+        monkeypatch.setattr("ftdrive.commands.live_source.CompensatedStream", lambda *_, **__: stream)
         given = ["--calibration", "c.json", "--robot", "10.0.0.2", "--sensor", "ati-can://can0", "--json", *options]
         code = cli.run(["record", *given])
         out, err = capsys.readouterr()
@@ -76,11 +76,12 @@ def blocks(n: int, size: int = 100) -> list[Block]:
 
 
 def test_count_ends_exactly_and_files_are_equal(run_record: Run) -> None:
-    code, answer, err = run_record(FakeStream(blocks(30)), "-o", "a.mcap", "-o", "a.csv", "--count", "1234")
+    stream = FakeStream(blocks(30))
+    code, answer, err = run_record(stream, "-o", "a.mcap", "-o", "a.csv", "--count", "1234")
     assert code == 0
     assert answer is not None
     assert (answer["files"], answer["samples"], answer["gaps"], answer["lost"]) == (["a.mcap", "a.csv"], 1234, 0, 0)
-    assert (answer["axes"], answer["about"], answer["calibration"]) == ("sensor", "sensor", "c.json")
+    assert (answer["axes"], answer["about"], answer["calibration"]) == ("sensor", "sensor", stream.info.calibration_name)
     assert "the serial number is unknown" in err
     one, other = (read_recording(Path(name)) for name in answer["files"])
     assert one.rows.tobytes() == other.rows.tobytes()

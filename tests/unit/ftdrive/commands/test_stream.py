@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from drivers.errors import DeviceTimeout
 from ftdrive.cli import exit_code
-from ftdrive.commands import stream
+from ftdrive.commands import live_source, stream
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, StreamEvent, WrenchFrame
 from tests.fake_clock import FakeClock
@@ -102,9 +102,9 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *arguments: str) -> tup
         opened.update(options)
         return Source()
 
-    monkeypatch.setattr(stream, "CompensatedStream", open_)
-    monkeypatch.setattr(stream, "load_calibration", lambda _: SimpleNamespace())
-    monkeypatch.setattr(stream, "read_cell", lambda *_: SimpleNamespace())
+    monkeypatch.setattr(live_source, "CompensatedStream", open_)
+    monkeypatch.setattr(live_source, "load_calibration", lambda _: SimpleNamespace())
+    monkeypatch.setattr(live_source, "read_cell", lambda *_: SimpleNamespace())
     calibration = tmp_path / "calibration.json"
     calibration.touch()
     outcome = CliRunner().invoke(stream.stream, ["--calibration", str(calibration), "--port", "0", *arguments])
