@@ -81,7 +81,8 @@ def test_count_ends_exactly_and_files_are_equal(run_record: Run) -> None:
     assert code == 0
     assert answer is not None
     assert (answer["files"], answer["samples"], answer["gaps"], answer["lost"]) == (["a.mcap", "a.csv"], 1234, 0, 0)
-    assert (answer["axes"], answer["about"], answer["calibration"]) == ("sensor", "sensor", stream.info.calibration_name)
+    assert (answer["axes"], answer["about"]) == ("sensor", "sensor")
+    assert answer["calibration"] == stream.info.calibration_name
     assert "the serial number is unknown" in err
     one, other = (read_recording(Path(name)) for name in answer["files"])
     assert one.rows.tobytes() == other.rows.tobytes()
