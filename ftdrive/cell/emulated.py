@@ -115,9 +115,10 @@ class Station:
         """Configuration that reaches this station as it would reach a real cell."""
         arm = self.endpoints["arm"]
         url = next(iter(self.endpoints["sensors"].values()))["url"]
+        height_m = self.truth["p_flange_sensor_m"][2]
         return CellConfig(
             robot=RobotConfig(arm["host"], arm["model"], speed_deg_s=60.0, acceleration_deg_s2=80.0),
-            sensor=SensorConfig(url),
+            sensor=SensorConfig(url, height_mm=1e3 * height_m),
             tool=ToolConfig("emulated", (TOOL_MM,)),
             workcell=WorkcellConfig(self.mounting, measured=True),
             sampling=Sampling(average_s=0.4, noise_record_s=0.0),
