@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ftdrive.recording import Recorder
 
 
-class Duration(click.ParamType[float]):
+class Duration(click.ParamType):  # type: ignore[type-arg]  # a generic type in newer versions of click only
     """A time such as 90, 60s, 10min or 1h, in s."""
 
     name = "duration"
