@@ -87,6 +87,7 @@ def test_contact_through_the_gain_comes_out_true() -> None:
     np.testing.assert_allclose(one, compensated[0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_the_force_gain_is_worth() -> None:
     """2 % gains, 24 poses, noise 0.05 N: compensation rms 0.301 N without, 0.022 N with it, in simulation."""
     without, with_gain, misfit, distance = [], [], [], []

@@ -421,6 +421,7 @@ def test_impossible_knowledge_is_refused(fields: dict[str, object], words: str) 
 # Covariances from few samples
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("samples", "spread"), [(10, 0.5), (200, 0.5)])
 def test_covariances_from_few_samples_do_no_harm(samples: int, spread: float) -> None:
     n = 24

@@ -145,6 +145,7 @@ def test_it_is_kept_in_the_file(tmp_path: Path) -> None:
     assert CalibrationResult.from_dict(document).response is None
 
 
+@pytest.mark.slow
 def test_the_mass_is_uncertain_by_the_gain_common_to_all_axes() -> None:
     z = []
     for seed in range(12):
