@@ -246,11 +246,19 @@ class UrArm(RobotArm):
     def follow(self) -> AbstractContextManager[Follow[ArmStates]]:
         """Read every sample from now on, 500 a second (CB3: 125), as flange poses; see `RobotArm`.
 
+        Before the first call, the arm is read 125 times a second, which is enough for a session and costs a quarter.
         Samples that are late are included: compare `t_device_s`. Samples without power over the joints are left out;
         a read that finds no others raises `DeviceFault`. A controller that is too old to report its TCP is polled.
         """
         reader = self._reading()
-        return reader.follow() if reader.reports_tcp else super().follow()
+        if not reader.reports_tcp:
+            return super().follow()
+        if not reader.reads_all:
+            quick = Reader(self._host, self._model, clock=self._clock, timing=self._timing, rate_Hz=math.inf)
+            self._reader = quick
+            reader.close()
+            reader = quick
+        return reader.follow()
 
     def status(self) -> ArmStatus:
         """Return the controller's modes and settings, updated with every sample; see `RobotArm`."""

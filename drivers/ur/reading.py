@@ -34,8 +34,8 @@ from drivers.ur.timing import Lateness, Patience, UrTiming
 
 log = logging.getLogger(__name__)
 
-_STATES_HZ: Final = 125.0
-"""The full rate of the CB3 generation, and every fourth sample of the e-Series."""
+STATES_HZ: Final = 125.0
+"""Rate of states and status: the full rate of the CB3 generation, a quarter of that of the e-Series."""
 _MOST_UNREAD: Final = 1_000_000
 """Samples that may wait for one follower: 33 minutes at 500 Hz."""
 Received = tuple[int, list[bytes]]
@@ -54,7 +54,9 @@ class Reader:
     Raises `ConnectError` when the arm cannot be reached, or is not the `model` (a key of `MODELS`) it should be.
     """
 
-    def __init__(self, host: str, model: str | None, *, clock: Clock, timing: UrTiming) -> None:
+    def __init__(
+        self, host: str, model: str | None, *, clock: Clock, timing: UrTiming, rate_Hz: float = STATES_HZ
+    ) -> None:
         self._host = host
         self._clock = clock
         self._timing = timing
@@ -71,7 +73,7 @@ class Reader:
         self._failure: DriverError | None = None
         self.silent = False
         """Whether no sample has arrived since `DeviceTimeout` was raised."""
-        self._stream = Subscription(host, OUTPUTS, math.inf, timeout_s=timing.connect_s, clock=clock)
+        self._stream = Subscription(host, OUTPUTS, rate_Hz, timeout_s=timing.connect_s, clock=clock)
         self.version = self._stream.version
         """Of the controller: major, minor, bugfix, build."""
         missing = set(self._stream.missing)
@@ -84,6 +86,11 @@ class Reader:
         except BaseException:
             self.close()
             raise
+
+    @property
+    def reads_all(self) -> bool:
+        """Whether it reads at the full rate of the controller."""
+        return self._stream.is_full_rate
 
     def close(self) -> None:
         """Close the connection. Idempotent."""
@@ -297,7 +304,7 @@ class Reader:
                 for unread in self._followers:
                     unread.put((t_host_ns, samples), len(samples))
                 self._since_live += len(samples)
-                due = self._since_live >= self._stream.rate_Hz / _STATES_HZ
+                due = self._since_live >= self._stream.rate_Hz / STATES_HZ
                 advances = self._t_device_s != before_s  # a repeated sample is not a new one
                 if due and advances and self._late_s <= self._timing.late_s:
                     self._live, self._live_s, self._since_live = (t_host_ns, samples[-1]), self._read_s, 0

@@ -212,6 +212,7 @@ class Subscription:
         """Of the controller: major, minor, bugfix, build."""
         self.rate_Hz = frequency_Hz
         """At which the controller sends."""
+        self.is_full_rate = False
         self.missing: list[str] = []
         """Outputs that this controller does not know; samples lack them."""
         try:
@@ -257,7 +258,8 @@ class Subscription:
         if ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02")) != b"\x01":
             raise ProtocolError("the controller refuses protocol version 2")
         self.version = decode_version(ask(encode(GET_CONTROLLER_VERSION)))
-        self.rate_Hz = min(self.rate_Hz, _FULL_RATE_HZ[self.version[0] >= 5])
+        full_Hz = _FULL_RATE_HZ[self.version[0] >= 5]
+        self.rate_Hz, self.is_full_rate = min(self.rate_Hz, full_Hz), self.rate_Hz >= full_Hz
         self._recipe = Recipe.decode(ask(encode_setup_outputs(self.rate_Hz, tuple(outputs))))
         if len(self._recipe.types) == len(outputs):
             self.missing = [name for name, kind in zip(outputs, self._recipe.types, strict=True) if kind == "NOT_FOUND"]

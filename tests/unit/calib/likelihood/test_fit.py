@@ -214,6 +214,7 @@ def test_seven_poses_are_never_split_into_right_and_wrong() -> None:
     assert best.measured_chi2 > stats.chi2.isf(1e-6, best.dof)
 
 
+@pytest.mark.slow
 def test_inexact_orientations_are_found_and_weighed() -> None:
     sigma, turn = SIGMA / 10, np.deg2rad(0.3)
     error, least, found = np.zeros(5), np.zeros(5), []

@@ -240,6 +240,7 @@ def test_the_return_to_the_first_pose_changes_no_estimate_but_is_compared() -> N
     assert after.residual_sigma < 5
 
 
+@pytest.mark.slow
 def test_the_prediction_waits_until_it_can_be_trusted_and_is_then_right() -> None:
     running, taken = Running(), tour()
     R = special([24])[0]
