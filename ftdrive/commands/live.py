@@ -6,7 +6,7 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 import numpy as np
@@ -41,9 +41,6 @@ from ftdrive.recording import Recorder, read_recording
 from ftdrive.runs.run import Run
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.keyboard import Keyboard
-
-if TYPE_CHECKING:
-    from ftdrive.recording import Recorder
 
 _PERIOD_S = 0.1
 _RECOVER_S = 10.0
