@@ -61,8 +61,7 @@ def compensate(
         **compensated(recording, frame, output),
         "delay_s": found,
         "bias_change": change,
-        "axes": frame.axes,
-        "about": frame.about,
+        **frame.to_dict(),
         "calibration": recording.header.info.calibration_name,
         "file": None if output is None else str(output),
     }

@@ -144,5 +144,5 @@ def _report(recorder: "Recorder", paths: Sequence[Path], frame: "WrenchFrame", n
         talk.print(f" Saved {path}: {words}")
     if as_json:
         counts = {key: getattr(recorder, key) for key in ("samples", "duration_s", "gaps", "lost")}
-        about = {"axes": frame.axes, "about": frame.about, "calibration": name}
+        about = {**frame.to_dict(), "calibration": name}
         write_json({"schema_version": 1, "files": [str(path) for path in saved], **counts, **about})

@@ -113,7 +113,7 @@ class Processor:
         with self._lock:
             self._report_contacts(self._tracker.end())
             self._frame, self._transform = frame, transform
-            self.note("frame", str(frame), {"axes": frame.axes, "about": _listed(frame.about)})
+            self.note("frame", str(frame), frame.to_dict())
 
     @property
     def stages(self) -> Stages:
@@ -342,8 +342,7 @@ class Processor:
                 "direction": contact.direction.tolist(),
                 "line_point_m": contact.line_m.tolist(),
                 "line_distance_m": float(np.linalg.norm(contact.line_m)),
-                "axes": self._frame.axes,
-                "about": _listed(self._frame.about),
+                **self._frame.to_dict(),
             }
             words = f"contact {contact.peak_N:.1f} N, {contact.duration_s:.1f} s"
             self.note("contact", words, values, contact.begin_ns)
@@ -464,7 +463,3 @@ def stages_in_words(stages: Stages) -> str:
     if stages.deadband_N or stages.deadband_Nm:
         words.append(f"deadband {stages.deadband_N:g} N, {stages.deadband_Nm:g} N·m")
     return ", ".join(words)
-
-
-def _listed(about: str | tuple[float, float, float]) -> JSON:
-    return about if isinstance(about, str) else list(about)

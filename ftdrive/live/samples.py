@@ -31,6 +31,10 @@ class WrenchFrame:
             point = "({:g}, {:g}, {:g}) mm from the flange".format(*(1e3 * x for x in self.about))
         return f"{self.axes} axes, about {point}"
 
+    def to_dict(self) -> dict[str, JSON]:
+        """Return the fields as JSON; a point is a list."""
+        return {"axes": self.axes, "about": self.about if isinstance(self.about, str) else list(self.about)}
+
 
 @dataclass(frozen=True, slots=True)
 class Stages:

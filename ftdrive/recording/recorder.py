@@ -10,7 +10,7 @@ import numpy as np
 from calib.files import JSON
 from ftdrive.live.samples import Block, StreamEvent, StreamInfo
 from ftdrive.recording.files import RecordingFile, format_of, require_new_recordings
-from ftdrive.recording.recording import ROW, Header, frame_values, rows_of
+from ftdrive.recording.recording import ROW, Header, rows_of
 
 _FLUSH_NS = 1_000_000_000
 
@@ -100,7 +100,7 @@ class Recorder:
         changes = []
         if block.frame != self._header.frame:
             text = f"The compensated wrench is in {block.frame}"
-            changes.append(StreamEvent(t_ns, "frame", text, frame_values(block.frame)))
+            changes.append(StreamEvent(t_ns, "frame", text, block.frame.to_dict()))
         if block.stages != self._header.stages:
             changes.append(StreamEvent(t_ns, "stages", f"The stages are {block.stages}", asdict(block.stages)))
         if changes:

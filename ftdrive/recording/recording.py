@@ -85,7 +85,7 @@ class Header:
         values |= {name: _finite(values[name]) for name in _ARRAYS}
         values |= {"arm": asdict(info.arm), "sensor": asdict(info.sensor), "versions": dict(info.versions)}
         values["calibration"] = info.calibration.to_dict()
-        frame, stages = frame_values(self.frame), asdict(self.stages)
+        frame, stages = self.frame.to_dict(), asdict(self.stages)
         return {"format": FORMAT, **values, "frame": frame, "stages": stages, "configuration": dict(self.configuration)}
 
     @classmethod
@@ -120,13 +120,8 @@ def _device(document: Mapping[str, Any]) -> DeviceInfo:
     return DeviceInfo(document["model"], document["serial"], document["firmware"], facts)
 
 
-def frame_values(frame: WrenchFrame) -> dict[str, JSON]:
-    """Return a frame as JSON."""
-    return {"axes": frame.axes, "about": frame.about if isinstance(frame.about, str) else list(frame.about)}
-
-
 def frame_of(values: Mapping[str, Any]) -> WrenchFrame:
-    """Build a frame from `frame_values`."""
+    """Build a frame from `WrenchFrame.to_dict`."""
     about: Any = values["about"]
     return WrenchFrame(values["axes"], tuple(about) if isinstance(about, list) else about)
 

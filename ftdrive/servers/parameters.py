@@ -42,8 +42,7 @@ class Parameters(ServerListener):
         """Return those named; all if there are no names."""
         frame, stages = self._stream.frame, asdict(self._stream.stages)
         values: dict[str, JSON] = {
-            "axes": frame.axes,
-            "about": frame.about if isinstance(frame.about, str) else list(frame.about),
+            **frame.to_dict(),
             # A parameter cannot be None: a filter that is off has 0 Hz.
             **{name: 0.0 if value is None else value for name, value in stages.items()},
         }
