@@ -21,6 +21,7 @@ from ftdrive.live.samples import (
     StreamInfo,
     StreamStatus,
     WrenchFrame,
+    sensor_origin_m,
 )
 from ftdrive.runs.run import Run
 
@@ -213,7 +214,6 @@ def replay_run(run: Run, calibration: CalibrationResult, name: str = "", **optio
     begin_ns = int(records[0].samples.t_host_ns[0])
     rows = replace(rows, t_host_ns=begin_ns + np.rint(rows.seq * 1e9 / rate_Hz).astype(np.int64))
     config: Mapping[str, Any] = header["config"]
-    height_mm = config["sensor"].get("height_mm")
     info = StreamInfo(
         calibration=calibration,
         calibration_name=name,
@@ -223,7 +223,7 @@ def replay_run(run: Run, calibration: CalibrationResult, name: str = "", **optio
         utc_offset_ns=records[0].clock_offset_ns,
         sensor_rate_Hz=rate_Hz,
         arm_rate_Hz=rate_Hz,
-        p_flange_sensor_m=np.full(3, np.nan) if height_mm is None else np.array([0.0, 0.0, height_mm / 1e3]),
+        p_flange_sensor_m=sensor_origin_m(config["sensor"].get("height_mm")),
         R_flange_tcp=np.eye(3),
         p_flange_tcp_m=np.full(3, np.nan),
         versions=header.get("versions", {}),

@@ -177,6 +177,16 @@ class Sample:
     frame: WrenchFrame
 
 
+def mean_rate_Hz(t_ns: NDArray[np.int64]) -> float:
+    """Return the mean rate of samples at these times (n,), n >= 2."""
+    return (len(t_ns) - 1) / max(float(t_ns[-1] - t_ns[0]) * 1e-9, 1e-9)
+
+
+def sensor_origin_m(height_mm: float | None) -> Array:
+    """Return `p_flange_sensor_m` (3,) of a sensor whose origin is so high above the flange face; NaN where unknown."""
+    return np.full(3, np.nan) if height_mm is None else np.array([0.0, 0.0, height_mm / 1e3])
+
+
 EventKind = Literal[
     "contact",
     "tare",

@@ -15,7 +15,7 @@ from calib.errors import BadDataset
 from drivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtSamples
 from ftdrive.live.delay import DelayEstimator
 from ftdrive.live.pairing import pair_recording
-from ftdrive.live.samples import Stages, StreamInfo, WrenchFrame
+from ftdrive.live.samples import Stages, StreamInfo, WrenchFrame, mean_rate_Hz
 from ftdrive.recording.compensation import free_samples
 from ftdrive.recording.recording import Header, Recording, rows_of
 from ftdrive.runs.run import versions
@@ -54,7 +54,7 @@ def read_pair(
     """
     samples, states = read_wrench(wrench), read_orientation(orientation)
     unknown, sigma_s = np.full(3, np.nan), 0.0
-    sensor_rate_Hz = _rate_Hz(samples.t_host_ns)
+    sensor_rate_Hz = mean_rate_Hz(samples.t_host_ns)
     if delay_s is None:  # from the samples without contact, which would be taken for a delay
         first = pair_recording(samples, states, 0.0)
         free = free_samples(calibration.compensate(first.raw, first.R_base_flange), sensor_rate_Hz)
@@ -70,7 +70,7 @@ def read_pair(
         tool="",
         utc_offset_ns=0,
         sensor_rate_Hz=sensor_rate_Hz,
-        arm_rate_Hz=_rate_Hz(states.t_host_ns),
+        arm_rate_Hz=mean_rate_Hz(states.t_host_ns),
         p_flange_sensor_m=unknown,
         R_flange_tcp=np.eye(3),
         p_flange_tcp_m=unknown,
@@ -78,10 +78,6 @@ def read_pair(
     )
     recording = Recording(Header(info, WrenchFrame(), Stages()), rows_of(paired), [])
     return recording, {"value": delay_s, "sigma": sigma_s}
-
-
-def _rate_Hz(t_ns: NDArray[np.int64]) -> float:
-    return (len(t_ns) - 1) / max(float(t_ns[-1] - t_ns[0]) * 1e-9, 1e-9)
 
 
 def read_wrench(path: Path) -> FtSamples:

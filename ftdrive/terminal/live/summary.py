@@ -15,6 +15,7 @@ from ftdrive.checks.check import Check
 from ftdrive.checks.devices import check_noise_change
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Block
+from ftdrive.live.stream import STALE_S
 from ftdrive.terminal.live.feed import MEAN_S, Feed, Stream
 from ftdrive.terminal.live.history import SPANS_S, Columns, History
 from ftdrive.terminal.live.view import WARNING, Note, Peaks, Reading, Replay, View
@@ -24,8 +25,6 @@ T = TypeVar("T")
 _MEAN_NS = round(MEAN_S * 1e9)
 _REST_NS = 2_000_000_000
 _STILL_RAD = 5e-4
-_STALE_S = 0.3
-"""An older number is not shown."""
 _MOST_NOTES = 200
 
 
@@ -117,7 +116,7 @@ class Summary:
     def _silent(self) -> str:
         feed = self._feed
         for device, link in ((feed.stream.info.sensor, feed.status.sensor), (feed.stream.info.arm, feed.status.arm)):
-            if link.error or link.age_s > _STALE_S:
+            if link.error or link.age_s > STALE_S:
                 return f"{device.model}: {link.error or f'no sample for {link.age_s:.1f} s'}"
         return "" if feed.failure is None else str(feed.failure)
 
