@@ -14,7 +14,7 @@ from calib import CalibrationResult
 from drivers.clock import Clock
 from drivers.errors import DeviceTimeout, DriverError
 from drivers.follow import Follow
-from drivers.interfaces import ArmStates, ArmStatus, Array, DeviceInfo, FtSamples
+from drivers.interfaces import ArmStates, ArmStatus, DeviceInfo, FtSamples
 from ftdrive.cell.config import CellConfig, load
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.checks.devices import belonging
@@ -30,6 +30,8 @@ from ftdrive.live.samples import (
     StreamInfo,
     StreamStatus,
     WrenchFrame,
+    mean_rate_Hz,
+    sensor_origin_m,
 )
 from ftdrive.runs.run import Run, versions
 
@@ -90,7 +92,8 @@ class CompensatedStream(ProcessedStream):
         self._begin = frame, stages, false_alarm_rate
         self._stack = ExitStack()
         self._follows: ExitStack | None = None
-        self._failures: dict[str, DriverError] = {}
+        self._failure: tuple[str, DriverError] | None = None
+        """The device that has failed, "sensor" or "arm", and why."""
         self._silent_since_ns: int | None = None
         self._arrivals: deque[tuple[int, int]] = deque()
         self._arm_lost = 0
@@ -112,8 +115,8 @@ class CompensatedStream(ProcessedStream):
             self._follow()
             samples, states = self._first_samples()
             nominal_Hz = self._sensor.health().nominal_rate_Hz
-            sensor_rate_Hz = nominal_Hz if np.isfinite(nominal_Hz) else _rate(samples.t_host_ns)
-            arm_rate_Hz = _rate(states.t_host_ns)
+            sensor_rate_Hz = nominal_Hz if np.isfinite(nominal_Hz) else mean_rate_Hz(samples.t_host_ns)
+            arm_rate_Hz = mean_rate_Hz(states.t_host_ns)
             self._arm_step_s = float(np.median(np.diff(states.t_device_s)))
             status = self._arm.status()
             self.payload_kg = status.payload_kg
@@ -137,7 +140,6 @@ class CompensatedStream(ProcessedStream):
     def _described(
         self, arm: DeviceInfo, sensor: DeviceInfo, sensor_rate_Hz: float, arm_rate_Hz: float, status: ArmStatus
     ) -> StreamInfo:
-        height_mm = self._cell.sensor.height_mm
         tcp = np.full(6, np.nan) if status.tcp_offset is None else np.array(status.tcp_offset)
         return StreamInfo(
             calibration=self._calibration,
@@ -148,7 +150,7 @@ class CompensatedStream(ProcessedStream):
             utc_offset_ns=time.time_ns() - self.clock.now_ns(),  # the anchor of all times in files
             sensor_rate_Hz=sensor_rate_Hz,
             arm_rate_Hz=arm_rate_Hz,
-            p_flange_sensor_m=np.full(3, np.nan) if height_mm is None else np.array([0.0, 0.0, height_mm / 1e3]),
+            p_flange_sensor_m=sensor_origin_m(self._cell.sensor.height_mm),
             R_flange_tcp=np.eye(3) if status.tcp_offset is None else Rotation.from_rotvec(tcp[3:]).as_matrix(),
             p_flange_tcp_m=tcp[:3],
             versions=versions(),
@@ -166,8 +168,8 @@ class CompensatedStream(ProcessedStream):
         StreamBroken, DeviceFault, ConnectError
             A device has failed. The next call reconnects.
         """
-        if self._failures:
-            self._reopen()
+        if self._failure is not None:
+            self._reopen(*self._failure)
         self.clock.sleep((self._next_ns - self.clock.now_ns()) * 1e-9)
         for left_s in self.clock.looks(timeout_s):
             if (block := self._next_block(left_s)) is not None:
@@ -228,12 +230,11 @@ class CompensatedStream(ProcessedStream):
         if self._silent_since_ns is None:
             self._silent_since_ns = self.clock.now_ns()
             self._processor.note("stale", f"{role}: {error}", {"device": role}, self._silent_since_ns)
-        self._failures = {role: error}
+        self._failure = role, error
         raise error
 
-    def _reopen(self) -> None:
+    def _reopen(self, role: str, failure: DriverError) -> None:
         """Open what has ended again; raises the failure that remains."""
-        role, failure = next(iter(self._failures.items()))
         self.clock.sleep((self._next_ns - self.clock.now_ns()) * 1e-9)
         self._next_ns = self.clock.now_ns() + round(_RETRY_S * 1e9)
         self._unfollow()
@@ -243,13 +244,13 @@ class CompensatedStream(ProcessedStream):
             self._sensor.check()
             self._follow()
         except DriverError as error:
-            self._failures = {role: error}
+            self._failure = role, error
             raise
         if (arm := self._arm.identify()) != self.info.arm or self._sensor.identify() != self.info.sensor:
             raise ConfigError(f"another device answers ({arm.model} {arm.serial}): start again") from failure
         self._pairing.forget()
         self._processor.restart()
-        self._failures = {}
+        self._failure = None
         self._arm_newest = None
 
     def _report_recovery(self) -> None:
@@ -262,7 +263,7 @@ class CompensatedStream(ProcessedStream):
     def status(self) -> StreamStatus:
         """Return rates, losses, ages, delay, tare and drift."""
         health = self._sensor.health()
-        texts = {role: str(error) for role, error in self._failures.items()}
+        texts = {} if self._failure is None else {self._failure[0]: str(self._failure[1])}
         now_ns = self.clock.now_ns()
         newest_ns = self._arm_newest[0] if self._arm_newest else 0
         sensor = LinkStatus(
@@ -331,7 +332,3 @@ def open_stream(
 def load_calibration(path: Path) -> CalibrationResult:
     """Read a calibration.json, or the newest one of a run folder. Raises `BadCalibration` or `OSError`."""
     return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path)
-
-
-def _rate(t_ns: Array | np.ndarray[tuple[int], np.dtype[np.int64]]) -> float:
-    return float((len(t_ns) - 1) / max((t_ns[-1] - t_ns[0]) * 1e-9, 1e-9))
