@@ -247,6 +247,7 @@ class UrArm(RobotArm):
         """Read every sample from now on, 500 a second (CB3: 125), as flange poses; see `RobotArm`.
 
         Before the first call, the arm is read 125 times a second, which is enough for a session and costs a quarter.
+        That call replaces the reader; a `state` or `status` that waits in another thread then raises `StreamBroken`.
         Samples that are late are included: compare `t_device_s`. Samples without power over the joints are left out;
         a read that finds no others raises `DeviceFault`. A controller that is too old to report its TCP is polled.
         """

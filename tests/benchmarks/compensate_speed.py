@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -32,6 +33,10 @@ def timed(work: Callable[[], object]) -> tuple[float, float]:
     return time.process_time() - cpu_s, time.perf_counter() - wall_s
 
 
+def compensate(path: Path, frame: WrenchFrame) -> None:
+    compensated(read_recording(path, NEEDED), frame)
+
+
 def show(name: str, count: int, what: str, seconds: tuple[float, float], end: str = "") -> None:
     cpu_s, wall_s = seconds
     sys.stdout.write(f"{name:42} {count / wall_s:9.3g} {what}/s   {count / cpu_s:9.3g} {what}/CPU s {end}\n")
@@ -45,15 +50,15 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         for ending, count in ((".parquet", n), (".mcap", n), (".csv", n // 10)):
             path, part = Path(folder) / f"a{ending}", replace(recording, rows=recording.rows[:count])
-            written = timed(lambda p=path, r=part: write_recording(p, r))  # type: ignore[misc]
+            written = timed(partial(write_recording, path, part))
             size = f"{path.stat().st_size / count:.0f} bytes/sample"
             show(f"write {ending}", count, "samples", written, size)
-            show(f"read {ending}", count, "samples", timed(lambda p=path: read_recording(p)))  # type: ignore[misc]
+            show(f"read {ending}", count, "samples", timed(partial(read_recording, path)))
             if ending == ".mcap":
                 show("write .mcap", 5 * count, "messages", written)
         path = Path(folder) / "a.parquet"
         for frame in (WrenchFrame(), WrenchFrame("base")):
-            results = [timed(lambda f=frame: compensated(read_recording(path, NEEDED), f)) for _ in range(5)]  # type: ignore[misc]
+            results = [timed(partial(compensate, path, frame)) for _ in range(5)]
             found = min(cpu_s for cpu_s, _ in results), min(wall_s for _, wall_s in results)
             verdict = "pass" if n / found[0] >= TARGET_PER_S else "FAIL"
             name = f"compensate from .parquet, {frame.axes} axes"

@@ -5,15 +5,10 @@ counted. The cost of devices, pairing and processing is not in these figures.
 """
 
 import argparse
-import fcntl
 import json
 import os
-import pty
 import resource
-import struct
-import subprocess
 import sys
-import termios
 import threading
 import time
 from pathlib import Path
@@ -24,6 +19,7 @@ from ftdrive.live.samples import Block
 from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.summary import Summary
 from ftdrive.terminal.live_screen import LiveApp
+from tests.benchmarks.on_terminal import on_terminal
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream
 
 SIZES = ((80, 24), (160, 50))
@@ -89,27 +85,6 @@ def run(rate_Hz: float, duration_s: float, with_screen: bool) -> dict[str, float
     return {"cpu": (used[1] - used[0]) / duration_s, "grown_MB": grown_MB, "late_ms": 1e3 * late_s}
 
 
-def on_terminal(width: int, height: int, arguments: list[str]) -> tuple[dict[str, float], float]:
-    """Run this script on a terminal of a size; return its figures and how many kilobytes it wrote."""
-    main, side = pty.openpty()
-    fcntl.ioctl(side, termios.TIOCSWINSZ, struct.pack("HHHH", height, width, 0, 0))
-    report, written = os.pipe()
-    environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": str(width), "LINES": str(height)}
-    command = [sys.executable, __file__, "--report", str(written), *arguments]
-    with subprocess.Popen(command, stdin=side, stdout=side, stderr=side, pass_fds=[written], env=environment) as child:
-        os.close(side)
-        os.close(written)
-        size = 0
-        while True:
-            try:
-                size += len(os.read(main, 1 << 16))
-            except OSError:  # the child has ended
-                break
-        child.wait()
-    with os.fdopen(report) as file:
-        return json.loads(file.read()), size / 1e3
-
-
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("--seconds", type=float, default=10.0)
@@ -121,11 +96,11 @@ if __name__ == "__main__":
         os.write(options.report, json.dumps(figures).encode())
         sys.exit()
     reading = run(options.rate, options.seconds, with_screen=False)
-    print(f"stream alone          {100 * reading['cpu']:5.1f} % of a core")  # noqa: T201
+    sys.stdout.write(f"stream alone          {100 * reading['cpu']:5.1f} % of a core\n")
     for width, height in SIZES:
-        figures, size_kB = on_terminal(width, height, sys.argv[1:])
-        print(  # noqa: T201
+        figures, size_kB = on_terminal(__file__, width, height, sys.argv[1:])
+        sys.stdout.write(
             f"{width:3d}x{height:<3d}               {100 * figures['cpu']:5.1f} % of a core, "
             f"{size_kB / (options.seconds + 3):5.1f} kB/s, memory grown by {figures['grown_MB']:.1f} MB, "
-            f"block to terminal {figures['late_ms']:.0f} ms p95"
+            f"block to terminal {figures['late_ms']:.0f} ms p95\n"
         )

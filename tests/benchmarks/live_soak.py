@@ -8,14 +8,10 @@ block is read from the stream and when the terminal has it, and the time from th
 """
 
 import argparse
-import fcntl
 import json
 import os
-import pty
-import struct
 import subprocess
 import sys
-import termios
 import threading
 import time
 from contextlib import closing
@@ -35,6 +31,7 @@ from ftdrive.servers.foxglove import FoxgloveServer
 from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.summary import Summary
 from ftdrive.terminal.live_screen import LiveApp
+from tests.benchmarks.on_terminal import on_terminal
 from tests.unit.ftdrive.live.simulated import calibrated_from
 
 WARM_UP_S = 60.0
@@ -130,27 +127,6 @@ def run(duration_s: float) -> dict[str, object]:
         }
 
 
-def on_terminal(width: int, height: int, arguments: list[str]) -> dict[str, object]:
-    """Run this script on a terminal of a size; return its figures."""
-    main, side = pty.openpty()
-    fcntl.ioctl(side, termios.TIOCSWINSZ, struct.pack("HHHH", height, width, 0, 0))
-    report, written = os.pipe()
-    environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": str(width), "LINES": str(height)}
-    command = [sys.executable, __file__, "--report", str(written), *arguments]
-    with subprocess.Popen(command, stdin=side, stdout=side, stderr=side, pass_fds=[written], env=environment) as child:
-        os.close(side)
-        os.close(written)
-        while True:
-            try:
-                os.read(main, 1 << 16)
-            except OSError:  # the child has ended
-                break
-        child.wait()
-    with os.fdopen(report) as file:
-        figures: dict[str, object] = json.loads(file.read())
-    return figures
-
-
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=600.0)
@@ -161,5 +137,6 @@ if __name__ == "__main__":
         os.write(options.report, json.dumps(run(options.seconds)).encode())
         sys.exit()
     columns, lines = map(int, options.size.split("x"))
-    for name, figure in on_terminal(columns, lines, ["--seconds", str(options.seconds)]).items():
-        print(f"{name:16} {figure}")  # noqa: T201
+    figures, _ = on_terminal(__file__, columns, lines, ["--seconds", str(options.seconds)])
+    for name, figure in figures.items():
+        sys.stdout.write(f"{name:16} {figure}\n")
