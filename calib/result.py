@@ -1,5 +1,6 @@
 """The result of a calibration: estimates, their uncertainty, provenance and verdict."""
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -146,6 +147,18 @@ class CalibrationResult:
             except (TypeError, ValueError) as exc:
                 raise ValueError(f"{name} cannot be written as JSON ({exc})") from exc
             object.__setattr__(self, name, MappingProxyType(value))
+
+    @property
+    def id(self) -> str:
+        """Name of the result: 12 hex digits of the SHA-256 of all that `compensate` and its uncertainty depend on.
+
+        Two files with the same id compensate alike, whatever their provenance.
+        """
+        numbers = [getattr(self.parameters, each.name).tolist() for each in fields(Parameters)]
+        numbers += [self.covariance.tolist(), self.gain_sigma, self.g_m_s2]
+        if self.response is not None:
+            numbers.append(self.response.to_dict())
+        return hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:12]
 
     @property
     def n_poses(self) -> int:
@@ -310,6 +323,7 @@ class CalibrationResult:
         return {
             "format": FORMAT,
             "schema_version": 1,
+            "id": self.id,
             "method": self.method,
             "verdict": self.verdict,
             "reasons": list(self.reasons),

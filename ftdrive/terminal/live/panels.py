@@ -120,8 +120,7 @@ def state(view: View, width: int) -> Line:
     """Name the calibration, the tare and the drift of the bias."""
     calibration, status = view.info.calibration, view.status
     line = Line(" cal ")
-    digest = calibration.provenance.get("dataset_sha256")
-    line.add(digest[:6] if isinstance(digest, str) else view.info.calibration_name).add(" ")
+    line.add(calibration.id[:6]).add(" ")
     line.add(calibration.verdict.upper(), GOOD if calibration.verdict == "good" else WARNING)
     line.add(_age(view)).add(f", {calibration.n_poses} poses")
     line.add("   tare ")

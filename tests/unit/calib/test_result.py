@@ -127,6 +127,14 @@ def test_a_file_gives_back_the_same_result(tmp_path: Path) -> None:
     assert CalibrationResult.from_dict({**RESULT.to_dict(), "new": 1}).to_dict() == RESULT.to_dict()
 
 
+def test_the_id_names_the_numbers_and_not_their_history(tmp_path: Path) -> None:
+    RESULT.save(tmp_path / "c.json")
+    assert CalibrationResult.load(tmp_path / "c.json").id == RESULT.id
+    assert replace(RESULT, provenance={}).id == RESULT.id
+    moved = replace(RESULT.parameters, force_bias_N=RESULT.force_bias_N + 1e-12)
+    assert replace(RESULT, parameters=moved).id != RESULT.id
+
+
 def without(name: str) -> str:
     return json.dumps({k: v for k, v in RESULT.to_dict().items() if k != name})
 
