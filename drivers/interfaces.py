@@ -61,6 +61,8 @@ class _Columns:
     @classmethod
     def concatenate(cls, blocks: Sequence[Self]) -> Self:
         """Join blocks in the order given."""
+        if len(blocks) == 1:
+            return blocks[0]
         return cls(*(np.concatenate([getattr(block, name) for block in blocks]) for name in cls._names()))
 
     def rows(self, which: slice | NDArray[np.bool_]) -> Self:

@@ -33,15 +33,15 @@ _READ_S = 0.02
 """The longest wait of one read, and the silence that proves that a stream has stopped."""
 _REPLY_S = 0.1
 _SILENCE_S = 0.2
-_BATCH_BYTES = 32 * modbus.RECORD_SIZE
-"""4.6 ms of stream, less where FF bytes are doubled: few wake-ups, and far less than a port buffers."""
+_BATCH_BYTES = 28 * modbus.RECORD_SIZE
+"""The least that one read waits for, 4 ms of stream: few wake-ups, and far less than a port buffers."""
 _MAX_RESTARTS = 3
 
 
 class AtiSerialSensor(StreamingSensor):
     """An ATI Digital F/T (or the RS-485 port of a NETCANOEM) on a serial port, 7 kHz.
 
-    Records carry no time and no number. `t_host_ns` is the receipt of their batch of about 32, `t_device_s` is NaN.
+    Records carry no time and no number. `t_host_ns` is the receipt of their batch of at least 28, `t_device_s` is NaN.
     `seq` counts records, including damaged ones (wrong sum, or a byte with wrong parity) and an estimate from the clock
     for those lost in a restart. `counts` are the six gauges. `status` is the status word as last read. A record has
     only an error bit; when it is set, the driver stops the stream and reads the word again. If the word explains the

@@ -288,7 +288,7 @@ class StreamingSensor(ForceTorqueSensor):
             return self._joined(unread.take())
 
     def _joined(self, blocks: list[FtSamples]) -> FtSamples:
-        return FtSamples.concatenate([self._newest.rows(slice(0, 0)), *blocks])
+        return FtSamples.concatenate(blocks or [self._newest.rows(slice(0, 0))])
 
     def _connect_and_identify(self) -> DeviceInfo:
         """Connect, and add the configured facts to those that the device reports."""

@@ -74,8 +74,8 @@ def flange_poses(tcp_poses: Array, tcp_offsets: Array) -> tuple[Array, Array]:
 
     `tcp_poses` are those of the active TCP in base, `tcp_offsets` those of the TCP in the flange.
     """
-    R_base_tcp = Rotation.from_rotvec(tcp_poses[:, 3:]).as_matrix()
-    R_flange_tcp = Rotation.from_rotvec(tcp_offsets[:, 3:]).as_matrix()
+    rotvec_rad = np.concatenate([tcp_poses[:, 3:], tcp_offsets[:, 3:]])
+    R_base_tcp, R_flange_tcp = Rotation.from_rotvec(rotvec_rad).as_matrix().reshape(2, -1, 3, 3)
     R_base_flange = R_base_tcp @ R_flange_tcp.transpose(0, 2, 1)
     return R_base_flange, tcp_poses[:, :3] - np.einsum("nij,nj->ni", R_base_flange, tcp_offsets[:, :3])
 

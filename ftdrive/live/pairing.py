@@ -15,6 +15,7 @@ import numpy as np
 from calib.errors import BadDataset
 from drivers.interfaces import ArmStates, Array, FtSamples
 from ftdrive.live.delay import DelayEstimator
+from ftdrive.live.quaternions import matrices, quaternions
 from ftdrive.live.samples import Ns, Paired
 
 _BUCKET_S, _BUCKETS = 0.25, 40
@@ -32,6 +33,8 @@ _PASSES = 4
 """A recording is paired so often until its delay has converged."""
 _STEP_BUCKETS, _STEP_NS = 8, 5e6
 """If so many buckets in a row are later than this, and alike, the line before them is no longer true."""
+_MOST_AHEAD_NS = 10_000_000
+"""A pose is extrapolated at most so far: one interval of a CB3 controller, with some delay."""
 _LOST_S = 1.0
 """A device whose count is so far from the line has restarted."""
 
@@ -141,12 +144,19 @@ class PoseTrack:
     def __init__(self, keep_s: float = math.inf) -> None:
         self._keep_s = keep_s
         self._t_ns = np.empty(0, np.int64)
+        self._room = np.empty(0, np.int64), np.empty((0, 14))
+        """Both, with room for more."""
         self._columns = np.empty((0, 14))  # unit quaternion x y z w, position, joint angles, half the angle to the next
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
         """First and last time; None while there is no pose."""
         return (int(self._t_ns[0]), int(self._t_ns[-1])) if len(self._t_ns) else None
+
+    @property
+    def ahead_ns(self) -> int:
+        """How long after the last pose the next one is due; so long, the motion is taken to continue."""
+        return min(int(self._t_ns[-1] - self._t_ns[-2]), _MOST_AHEAD_NS) if len(self._t_ns) > 1 else 0
 
     def add(self, t_host_ns: Ns, q_rad: Array, R_base_flange: Array, p_base_flange_m: Array) -> None:
         """Append n poses; one that is not later than the pose before it is dropped."""
@@ -155,11 +165,13 @@ class PoseTrack:
         if not later.any():
             return
         new = np.zeros((int(later.sum()), 14))
-        new[:, :4] = _quaternions(R_base_flange[later])
+        new[:, :4] = quaternions(R_base_flange[later])
         new[:, 4:7], new[:, 7:13] = p_base_flange_m[later], q_rad[later]
-        t_ns = np.concatenate([self._t_ns, t_host_ns[later]])
-        columns = np.concatenate([self._columns, new])
-        start = max(0, len(self._t_ns) - 1)
+        start, end = max(0, len(self._t_ns) - 1), len(self._t_ns) + len(new)
+        if end > len(self._room[0]):
+            self._make_room(end)
+        t_ns, columns = self._room[0][:end], self._room[1][:end]
+        t_ns[end - len(new) :], columns[end - len(new) :] = t_host_ns[later], new
         quat = columns[start:, :4]
         # q and -q are one orientation: take the one on the side of its predecessor
         side = np.where((quat[1:] * quat[:-1]).sum(axis=1) < 0, -1.0, 1.0)
@@ -169,10 +181,20 @@ class PoseTrack:
         keep = 0
         if math.isfinite(self._keep_s):
             keep = int(np.searchsorted(t_ns, t_ns[-1] - round(self._keep_s * 1e9)))
+        self._room = self._room[0][keep:], self._room[1][keep:]
         self._t_ns, self._columns = t_ns[keep:], columns[keep:]
 
+    def _make_room(self, rows: int) -> None:
+        """Move the poses to the beginning of arrays with room for as many again."""
+        t_ns, columns = np.empty(2 * rows, np.int64), np.empty((2 * rows, 14))
+        t_ns[: len(self._t_ns)], columns[: len(self._t_ns)] = self._t_ns, self._columns
+        self._room = t_ns, columns
+
     def at(self, t_ns: Ns) -> tuple[Array, Array, Array]:
-        """Return joint angles (n, 6), R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) at times inside `span_ns`."""
+        """Return joint angles (n, 6), R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) at times (n,).
+
+        Times are inside `span_ns`, or after it by `ahead_ns` at most: the velocity between the last two poses lasts.
+        """
         if len(self._t_ns) == 1:
             i = np.zeros(len(t_ns), np.intp)
             before = after = self._columns[i]
@@ -184,31 +206,7 @@ class PoseTrack:
         linear = before[:, 4:13] + f * (after[:, 4:13] - before[:, 4:13])
         angle = np.maximum(before[:, 13:], 1e-9)
         quat = (np.sin((1 - f) * angle) * before[:, :4] + np.sin(f * angle) * after[:, :4]) / np.sin(angle)
-        return linear[:, 3:], _matrices(quat), linear[:, :3]
-
-
-def _quaternions(R: Array) -> Array:
-    """Unit quaternions x y z w (n, 4) of rotation matrices (n, 3, 3), by the largest component (Shepperd 1978)."""
-    x, y, z = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
-    squares = np.stack([1 + x - y - z, 1 - x + y - z, 1 - x - y + z, 1 + x + y + z], axis=1)  # 4 times
-    largest = squares.argmax(axis=1)
-    outer = np.empty((len(R), 4, 4))  # 4 q q^T
-    outer[:, :3, :3] = R + np.swapaxes(R, 1, 2)
-    for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0))):
-        outer[:, i, 3] = outer[:, 3, i] = R[:, j, k] - R[:, k, j]
-    outer[:, range(4), range(4)] = squares
-    row = outer[np.arange(len(R)), largest]
-    return np.asarray(row / np.sqrt(np.square(row).sum(axis=1, keepdims=True)))
-
-
-def _matrices(quat: Array) -> Array:
-    """Rotation matrices (n, 3, 3) of unit quaternions x y z w (n, 4)."""
-    x, y, z, w = quat.T
-    x2, y2, z2 = x + x, y + y, z + z
-    xx, yy, zz = x * x2, y * y2, z * z2
-    xy, xz, yz, wx, wy, wz = x * y2, x * z2, y * z2, w * x2, w * y2, w * z2
-    columns = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
-    return np.stack(columns, axis=1).reshape(-1, 3, 3)
+        return linear[:, 3:], matrices(quat), linear[:, :3]
 
 
 class Pairing:
@@ -243,7 +241,7 @@ class Pairing:
 
     @property
     def waits_for_pose(self) -> bool:
-        """Whether there are samples without a pose."""
+        """Whether there are samples without a pose, which are too new to extrapolate it."""
         return bool(self._waiting)
 
     def add_states(self, states: ArmStates) -> None:
@@ -282,7 +280,7 @@ class Pairing:
             return None
         samples = FtSamples.concatenate([block for block, _ in self._waiting])
         t_ns = np.concatenate([times for _, times in self._waiting])
-        first, end = np.searchsorted(t_ns, span_ns[0]), np.searchsorted(t_ns, span_ns[1], "right")
+        first, end = np.searchsorted(t_ns, [span_ns[0], span_ns[1] + self._poses.ahead_ns + 1]).tolist()
         self._waiting = [(samples.rows(slice(end, None)), t_ns[end:])] if end < len(t_ns) else []
         if first >= end:
             return None

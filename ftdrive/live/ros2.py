@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from drivers.interfaces import Array
+from ftdrive.live.quaternions import quaternions
 from ftdrive.live.samples import WrenchFrame
 
 RAW, COMPENSATED, POSE, JOINTS = "/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states"
@@ -97,8 +97,7 @@ def pack_wrenches(t_utc_ns: NDArray[np.int64], wrench: Array, frame: str) -> lis
 
 def pack_poses(t_utc_ns: NDArray[np.int64], R_base_flange: Array, p_base_flange_m: Array) -> list[bytes]:
     """Pack poses (n, 3, 3) and (n, 3) of the flange in base as PoseStamped."""
-    xyzw = Rotation.from_matrix(R_base_flange).as_quat()
-    return pack_pose_numbers(t_utc_ns, np.hstack([p_base_flange_m, xyzw]))
+    return pack_pose_numbers(t_utc_ns, np.concatenate([p_base_flange_m, quaternions(R_base_flange)], axis=1))
 
 
 def pack_pose_numbers(t_utc_ns: NDArray[np.int64], pose: Array) -> list[bytes]:

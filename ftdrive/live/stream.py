@@ -38,8 +38,8 @@ from ftdrive.runs.run import Run, versions
 STALE_S = 0.3
 """Without a new sample of either device for so long, `CompensatedStream.read` raises."""
 
-_BLOCK_S = 0.005
-"""Samples are collected so long before they are processed, which costs the same for one as for many."""
+_BLOCK_S = 0.003
+"""A block has the samples of so long, because it costs about the same with one sample as with many."""
 _RETRY_S = 0.2
 """Between two attempts to reconnect."""
 _RATE_S = 0.5
@@ -117,6 +117,7 @@ class CompensatedStream(ProcessedStream):
             nominal_Hz = self._sensor.health().nominal_rate_Hz
             sensor_rate_Hz = nominal_Hz if np.isfinite(nominal_Hz) else mean_rate_Hz(samples.t_host_ns)
             arm_rate_Hz = mean_rate_Hz(states.t_host_ns)
+            self._block_rows = int(_BLOCK_S * sensor_rate_Hz)
             self._arm_step_s = float(np.median(np.diff(states.t_device_s)))
             status = self._arm.status()
             self.payload_kg = status.payload_kg
@@ -170,10 +171,8 @@ class CompensatedStream(ProcessedStream):
         """
         if self._failure is not None:
             self._reopen(*self._failure)
-        self.clock.sleep((self._next_ns - self.clock.now_ns()) * 1e-9)
         for left_s in self.clock.looks(timeout_s):
             if (block := self._next_block(left_s)) is not None:
-                self._next_ns = self.clock.now_ns() + round(_BLOCK_S * 1e9)
                 self._report_recovery()
                 return block
         role = "arm" if self._pairing.waits_for_pose else "sensor"
@@ -183,7 +182,7 @@ class CompensatedStream(ProcessedStream):
         waits_for_pose = self._pairing.waits_for_pose
         role = "sensor"
         try:
-            samples = self._sensor_follow.read(0.0 if waits_for_pose else wait_s)
+            samples = self._sensor_follow.read(0.0) if waits_for_pose else self._read_sensor(wait_s)
             role = "arm"
             states = self._arm_follow.read(wait_s if waits_for_pose else 0.0)
         except DriverError as error:
@@ -196,6 +195,15 @@ class CompensatedStream(ProcessedStream):
             return None
         block = self._processor.process(paired)
         return block if len(block) else None
+
+    def _read_sensor(self, wait_s: float) -> FtSamples:
+        """Wait for the first samples, then for those of one block; the last of them have just arrived."""
+        blocks = [self._sensor_follow.read(wait_s)]
+        rows = len(blocks[0])
+        while 0 < rows < self._block_rows and len(more := self._sensor_follow.read(_BLOCK_S)):
+            blocks.append(more)
+            rows += len(more)
+        return FtSamples.concatenate(blocks)
 
     def __iter__(self) -> Iterator[Sample]:
         while True:

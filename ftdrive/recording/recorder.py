@@ -12,7 +12,8 @@ from ftdrive.live.samples import Block, StreamEvent, StreamInfo
 from ftdrive.recording.files import RecordingFile, format_of, require_new_recordings
 from ftdrive.recording.recording import ROW, Header, rows_of
 
-_FLUSH_NS = 1_000_000_000
+_FLUSH_NS = 200_000_000
+"""Writing takes a few ms, in which the stream waits."""
 
 
 class Recorder:

@@ -17,7 +17,9 @@ class Picked:
     def rows(self, t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which samples (n,) to send, by their times in the order of measurement."""
         period = t_ns // self._period_ns
-        chosen: NDArray[np.bool_] = np.diff(period, prepend=self._last) != 0
+        chosen = np.empty(len(period), bool)
         if len(period):
+            chosen[0] = period[0] != self._last
+            chosen[1:] = period[1:] != period[:-1]
             self._last = int(period[-1])
         return chosen

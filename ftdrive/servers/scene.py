@@ -13,10 +13,10 @@ from foxglove.messages import (
     Timestamp,
     Vector3,
 )
-from scipy.spatial.transform import Rotation
 
 from drivers.interfaces import Array
 from ftdrive.live import ros2
+from ftdrive.live.quaternions import quaternions
 from ftdrive.live.samples import Block, StreamInfo, WrenchFrame
 
 FORCE_M_N, TORQUE_M_NM = 0.01, 0.1
@@ -53,7 +53,7 @@ def _transform(parent: str, child: str, R: Array, p_m: Array, t_utc_ns: int) -> 
         parent_frame_id=parent,
         child_frame_id=child,
         translation=Vector3(x=x, y=y, z=z),
-        rotation=Quaternion(**dict(zip("xyzw", Rotation.from_matrix(R).as_quat().tolist(), strict=True))),
+        rotation=Quaternion(**dict(zip("xyzw", quaternions(R[None])[0].tolist(), strict=True))),
     )
 
 

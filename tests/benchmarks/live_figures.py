@@ -78,11 +78,11 @@ def false_alarms(calibrations: int) -> None:
 def streamed(
     stages: Stages, delay: DelayEstimator | float, motion: Motion, delay_s: float, duration_s: float
 ) -> Iterator[Block]:
-    """Blocks of 10 ms from links of 7 kHz and 500 Hz."""
+    """Blocks of 4 ms from links of 7 kHz and 500 Hz."""
     samples, states = motion.links(duration_s, delay_s)
     pairing, processor = Pairing(7000.0, delay), Processor(info(calibrated(), 7000.0), WrenchFrame(), stages)
     i = j = 0
-    for end_ns in range(T0_NS, T0_NS + round((duration_s + 0.03) * 1e9), 10_000_000):
+    for end_ns in range(T0_NS, T0_NS + round((duration_s + 0.03) * 1e9), 4_000_000):
         i_end, j_end = (int(np.searchsorted(rows.t_host_ns, end_ns, "right")) for rows in (samples, states))
         pairing.add_states(states.rows(slice(j, j_end)))
         pairing.add_samples(samples.rows(slice(i, i_end)))

@@ -3,26 +3,32 @@
     uv run python tests/benchmarks/live_soak.py [--seconds 600] [--size 160x50]
 
 An ATI sensor at 7 kHz and the arm at 500 Hz, in another process and in real time. Printed: samples that are missing in
-the file, CPU and growth of memory of the whole program, the age of the newest sample (by the clock of the cell) when a
-block is read from the stream and when the terminal has it, and the time from there to the client.
+the file, CPU and growth of memory of the whole program, and latencies (median, 95 %) of every sample in ms by the clock
+of the cell: from its measurement to its receipt, which is mostly the batch of the emulated adapter; from there to the
+block that is read from the stream; and from the measurement to client and terminal. Last, the age of the newest sample
+when a line of `ftdrive live --json` is read from a pipe, in a program of its own.
 """
 
 import argparse
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
 import time
 from contextlib import closing
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from drivers.interfaces import FtSamples
 from ftdrive.cell.emulated import Station
 from ftdrive.live.samples import Block, StreamEvent
 from ftdrive.live.stream import CompensatedStream
@@ -35,21 +41,30 @@ from tests.benchmarks.on_terminal import on_terminal
 from tests.unit.ftdrive.live.simulated import calibrated_from
 
 WARM_UP_S = 60.0
+SKIPPED = 14_000
+"""Samples at the beginning that do not count in latencies: 2 s."""
 CLIENT = Path(__file__).with_name("stream_latency.py")
 
 
 class Both:
-    """A recorder and a server as one consumer; notes how old the newest sample of each block is."""
+    """A server and a recorder as one consumer; notes when each sample was received and read."""
 
     def __init__(self, recorder: Recorder, server: FoxgloveServer, stream: CompensatedStream) -> None:
         self.recorder, self._server, self._clock = recorder, server, stream.clock
-        self.read_ms = list[float]()
+        self._received, self._read = list[tuple[NDArray[np.int64], ...]](), list[tuple[NDArray[np.int64], ...]]()
+        add = stream._pairing.add_samples
+
+        def noted(samples: FtSamples) -> None:
+            self._received.append((samples.seq, samples.t_host_ns))
+            add(samples)
+
+        stream._pairing.add_samples = noted  # type: ignore[method-assign]
 
     def write(self, block: Block) -> None:
-        self.read_ms.append((self._clock.now_ns() - int(block.t_host_ns[-1])) * 1e-6)
+        now_ns = np.full(len(block), self._clock.now_ns())
+        self._read.append((block.seq, block.t_host_ns, now_ns))
+        self._server.write(block)
         self.recorder.write(block)
-        now_ns = time.monotonic_ns()  # the client subtracts the stamp of a message from this clock
-        self._server.write(replace(block, t_host_ns=np.arange(now_ns - len(block) + 1, now_ns + 1)))
 
     def event(self, event: StreamEvent) -> None:
         self.recorder.event(event)
@@ -57,20 +72,32 @@ class Both:
     def close(self) -> None:
         self.recorder.close()
 
+    def stages(self) -> dict[str, list[float]]:
+        """From measurement to receipt, and from there to the block."""
+        seq, measured, read = (np.concatenate(column)[SKIPPED:] for column in zip(*self._read, strict=True))
+        seqs, received = (np.concatenate(column) for column in zip(*self._received, strict=True))
+        received = received[np.searchsorted(seqs, seq)]
+        return {"received_ms": percentiles(received - measured), "block_ms": percentiles(read - received)}
+
+
+def percentiles(age_ns: NDArray[np.int64] | list[int] | list[float]) -> list[float]:
+    """Median and 95 %, ms."""
+    return [round(float(age_ms), 2) for age_ms in np.percentile(np.asarray(age_ns), [50, 95]) * 1e-6]
+
 
 class Timed(LiveApp):
     """Notes how old the newest sample is once the terminal has it."""
 
     stream: CompensatedStream
     feed: Feed
-    drawn_ms: list[float]
+    drawn_ns: list[int]
 
     def draw(self) -> None:
         newest_ns = self.feed.newest_ns
         super().draw()
         if newest_ns is not None:
             self.call_after_refresh(
-                lambda: self.drawn_ms.append((self.stream.clock.now_ns() - newest_ns) * 1e-6),
+                lambda: self.drawn_ns.append(self.stream.clock.now_ns() - newest_ns),
             )
 
 
@@ -89,13 +116,15 @@ def run(duration_s: float) -> dict[str, object]:
         both = Both(Recorder([path := Path(folder, "soak.mcap")], stream.info, {}), server, stream)
         feed = Feed(stream, lambda _: both)
         client = subprocess.Popen(
-            [sys.executable, CLIENT, "client", str(server.port)], stdout=subprocess.PIPE, text=True
+            [sys.executable, CLIENT, "client", str(server.port), station.endpoints["clock"]],
+            stdout=subprocess.PIPE,
+            text=True,
         )
         assert client.stdout is not None
         client.stdout.readline()
         feed.request(feed.switch_recording)
         app = Timed(feed, Summary(feed))
-        app.stream, app.feed, app.drawn_ms = stream, feed, []
+        app.stream, app.feed, app.drawn_ns = stream, feed, []
         cpu_s, grown_MB = 0.0, 0.0
 
         def watch() -> None:
@@ -120,11 +149,31 @@ def run(duration_s: float) -> dict[str, object]:
             "missing": int(seq[-1] - seq[0]) + 1 - len(seq),
             "cpu": cpu_s,
             "grown_MB": grown_MB,
-            "read_ms": np.percentile(both.read_ms, [50, 95]).tolist(),
-            "drawn_ms": np.percentile(app.drawn_ms, [50, 95]).tolist(),
+            **both.stages(),
             "client_ms": [received["p50"], received["p95"]],
             "client_wrenches": received["wrenches"],
+            "screen_ms": percentiles(app.drawn_ns),
         }
+
+
+def piped(lines: int) -> list[float]:
+    """Age of the newest sample when a line of `ftdrive live --json` is read from a pipe."""
+    with TemporaryDirectory() as folder, Station("serial", ("--time-scale", "1")) as station:
+        calibrated_from(station.truth).save(calibration := Path(folder, "calibration.json"))
+        arm, sensor = station.endpoints["arm"], station.cell.sensor.url
+        config = Path(folder, "ftdrive.toml")
+        config.write_text(
+            f'format = "ftdrive.config/1"\n[robot]\nhost = "{arm["host"]}"\nmodel = "{arm["model"]}"\n'
+            f'[sensor]\nurl = "{sensor}"\n'
+        )
+        command = [sys.executable, "-m", "ftdrive", "live", "--json", "--config", str(config)]
+        command += ["--calibration", str(calibration)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as live:
+            assert live.stdout is not None
+            age_ns = [time.monotonic_ns() - 1e9 * json.loads(line)["t_s"] for line in islice(live.stdout, lines)]
+            live.send_signal(signal.SIGINT)
+            live.stdout.read()
+    return percentiles(age_ns[10:])
 
 
 if __name__ == "__main__":
@@ -138,5 +187,6 @@ if __name__ == "__main__":
         sys.exit()
     columns, lines = map(int, options.size.split("x"))
     figures, _ = on_terminal(__file__, columns, lines, ["--seconds", str(options.seconds)])
+    figures["stdout_ms"] = piped(round(10 * min(options.seconds, 30)))
     for name, figure in figures.items():
         sys.stdout.write(f"{name:16} {figure}\n")

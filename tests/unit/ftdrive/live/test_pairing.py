@@ -84,7 +84,7 @@ def test_positions_and_joints_are_interpolated_between_neighbours() -> None:
     assert poses.span_ns == (t_ns[-501], t_ns[-1])  # the rest was dropped
 
 
-def test_a_sample_waits_for_the_pose_after_it() -> None:
+def test_a_sample_waits_for_the_pose_unless_the_next_one_is_due() -> None:
     pairing = Pairing(1000.0, 0.0)
     samples, states = Motion().links(0.2, 0.0, rate_Hz=1000.0, batch_s=0.001)
     pairing.add_samples(samples)
@@ -93,7 +93,7 @@ def test_a_sample_waits_for_the_pose_after_it() -> None:
     pairing.add_states(states.rows(half))
     first = pairing.take()
     assert first is not None
-    assert first.t_host_ns[-1] <= states.t_host_ns[49]
+    assert states.t_host_ns[49] < first.t_host_ns[-1] <= states.t_host_ns[49] + 2_000_000  # by one interval
     assert pairing.waits_for_pose
     pairing.add_states(states.rows(slice(50, None)))
     second = pairing.take()
@@ -101,6 +101,18 @@ def test_a_sample_waits_for_the_pose_after_it() -> None:
     seq = np.concatenate([first.seq, second.seq])
     assert (np.diff(seq) == 1).all()
     assert len(seq) > 190
+
+
+def test_an_extrapolated_pose_continues_the_last_motion_but_not_over_a_gap() -> None:
+    poses, turn = PoseTrack(), Rotation.from_rotvec(np.outer([0.0, 0.002, 0.004], [0.6, 0.0, 0.8]))
+    for i, t_ns in enumerate((T0_NS, T0_NS + 2_000_000)):
+        poses.add(np.array([t_ns]), np.full((1, 6), i), turn[[i]].as_matrix(), np.full((1, 3), 2.0 * i))
+    assert poses.ahead_ns == 2_000_000
+    q, R, p = poses.at(np.array([T0_NS + 4_000_000]))
+    np.testing.assert_allclose(R[0], turn[2].as_matrix(), atol=1e-12)
+    np.testing.assert_allclose([q[0, 0], p[0, 0]], [2.0, 4.0])
+    poses.add(np.array([T0_NS + 10**9]), np.zeros((1, 6)), turn[[2]].as_matrix(), np.zeros((1, 3)))
+    assert poses.ahead_ns == 10_000_000
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.013])
