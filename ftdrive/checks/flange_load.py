@@ -75,8 +75,8 @@ def margin_in_words(mass_kg: float, model: str) -> str:
     """Compare a load with the rated payload of an arm."""
     rated_kg = RATED_KG.get(model)
     if rated_kg is None:
-        return f"the rated payload of a {model} is unknown here: compare {mass_kg:.2f} kg with its data sheet"
-    curve = "the payload curve over the offset of the centre is in UR's user manual only"
+        return f"{mass_kg:.2f} kg, and the rated payload of a {model} is unknown: compare with its data sheet"
+    curve = "compare with the payload curve in its user manual, too"
     if mass_kg > rated_kg:
         over_kg = mass_kg - rated_kg
         return (

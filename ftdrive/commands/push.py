@@ -98,6 +98,7 @@ def push(
             write_json({"schema_version": 1, **json.loads(saved.read_text(encoding="utf-8")), "file": str(saved)})
             return
     talk.print(f" ✔ Read back: {settings_in_words(read_back)}")
+    talk.print(" Programs made at the pendant set the values of their installation: enter them there too.")
     if saved.exists():  # not of a temporary run
         talk.print(f" Receipt {saved}; undo: ftdrive push --restore {shlex.quote(str(saved))}")
 

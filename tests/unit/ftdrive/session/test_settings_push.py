@@ -379,11 +379,13 @@ def test_a_run_without_a_receipt_says_so(tmp_path: Path) -> None:
 
 def test_old_new_and_change_stand_beside_one_another(cell: Cell) -> None:
     lines = proposal_in_lines(cell.propose())
-    assert lines[1].split() == ["mass", "0.600", "kg", "1.500", "kg", "0.0000", "kg", "+0.900", "kg"]
-    assert "(0.0, 0.0, 30.0) mm" in lines[2]
-    assert "(8.0, 0.0, 84.0) mm" in lines[2]
-    assert "(+8.0, +0.0, +54.0) mm" in lines[2]
+    assert [line.split() for line in lines[:3]] == [
+        ["controller", "new", "change"],
+        ["mass,", "kg", "0.600", "1.500", "+0.900"],
+        ["centre,", "mm", "(0.0,", "0.0,", "30.0)", "(8.0,", "0.0,", "84.0)", "(+8.0,", "+0.0,", "+54.0)"],
+    ]
     text = "\n".join(lines)
     assert "3.50 kg below the rated payload of a UR5e, 5 kg" in text
     assert "sensor and adapter, 0.3 kg" in text
+    assert "The inertia is kept" in text
     assert "At the calibration, the payload in the controller was 0.900 kg." in text
