@@ -209,7 +209,7 @@ class ArmStatus:
 
 
 @dataclass(frozen=True, slots=True)
-class LoadSettings:
+class ControllerSettings:
     """What a controller assumes about its load and about gravity. None where it does not report a value."""
 
     mass_kg: float | None = None
@@ -322,26 +322,26 @@ class RobotArm(_Device):
         Never older than 0.1 s; otherwise raises `DeviceTimeout` or `StreamBroken`. Raises `ConnectError` while closed.
         """
 
-    def load_settings(self) -> LoadSettings:
+    def controller_settings(self) -> ControllerSettings:
         """Read the load and the gravity that the controller assumes. Needs no control.
 
         The default knows what `status` reports.
         """
         status = self.status()
-        return LoadSettings(status.payload_kg, status.p_flange_payload_m)
+        return ControllerSettings(status.payload_kg, status.p_flange_payload_m)
 
     def set_payload(
         self, mass_kg: float, p_flange_com_m: Sequence[float], inertia_kg_m2: Sequence[float] = (0.0,) * 6
     ) -> None:
-        """Set the payload in the controller; read it back with `load_settings`. Needs control and an arm at rest.
+        """Set the payload in the controller; read it back with `controller_settings`. Needs control and an arm at rest.
 
-        Parameters as in `LoadSettings`; an inertia of zeros is a point mass. The default raises `DeviceFault`.
+        Parameters as in `ControllerSettings`; an inertia of zeros is a point mass. The default raises `DeviceFault`.
         """
         payload = f"a payload of {mass_kg:g} kg at {[*p_flange_com_m]} m with the inertia {[*inertia_kg_m2]} kg·m²"
         raise DeviceFault(f"the driver of this arm cannot set {payload}", "set it at the controller")
 
     def set_gravity(self, up_base_m_s2: Sequence[float]) -> None:
-        """Set the direction of gravity in the controller, as in `LoadSettings`; otherwise as `set_payload`."""
+        """Set the direction of gravity in the controller, as in `ControllerSettings`; otherwise as `set_payload`."""
         gravity = f"a gravity of {[*up_base_m_s2]} m/s²"
         raise DeviceFault(f"the driver of this arm cannot set {gravity}", "set the mounting at the controller")
 

@@ -19,12 +19,12 @@ from typing import Final
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
 from drivers.follow import Follow
-from drivers.interfaces import ArmState, ArmStates, ArmStatus, DeviceInfo, Finding, Guard, LoadSettings, RobotArm
+from drivers.interfaces import ArmState, ArmStates, ArmStatus, ControllerSettings, DeviceInfo, Finding, Guard, RobotArm
 from drivers.ur.control import ControlProcess
 from drivers.ur.control_child import DECELERATION_RAD_S2
+from drivers.ur.controller_settings import checked_gravity, checked_payload, read_controller_settings
 from drivers.ur.dashboard import Dashboard, T, ask_dashboard
 from drivers.ur.kinematics import MODELS, model_named
-from drivers.ur.load_settings import checked_gravity, checked_payload, read_load_settings
 from drivers.ur.reading import Reader
 from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
 from drivers.ur.sample import PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Sample
@@ -266,13 +266,13 @@ class UrArm(RobotArm):
         """Return the controller's modes and settings, updated with every sample; see `RobotArm`."""
         return self._reading().status()
 
-    def load_settings(self) -> LoadSettings:
+    def controller_settings(self) -> ControllerSettings:
         """Read payload, inertia and gravity over a connection of their own, which takes some milliseconds.
 
         Payload from PolyScope 5.6 and 3.11 on, inertia from 5.11 and 3.15 on, gravity only on recent versions.
         """
         self._reading()
-        return read_load_settings(self._host, timeout_s=self._timing.connect_s, clock=self._clock)
+        return read_controller_settings(self._host, timeout_s=self._timing.connect_s, clock=self._clock)
 
     def in_remote_control(self) -> bool | None:
         """Ask the dashboard server, which takes some milliseconds. Raises `NoDashboard`.

@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.errors import BadDataset
 from calib.files import check_format, read_object, write_new
-from drivers.interfaces import DeviceInfo, LoadSettings
+from drivers.interfaces import ControllerSettings, DeviceInfo
 from ftdrive.runs.run import Run, versions
 
 FORMAT: Final = "ftdrive.push/1"
@@ -26,7 +26,7 @@ def write_receipt(
     folder: Path,
     devices: Mapping[str, DeviceInfo],
     reason: Mapping[str, Any],
-    values: Mapping[str, LoadSettings | None],
+    values: Mapping[str, ControllerSettings | None],
     error: str,
 ) -> Path:
     """Write a new receipt; return its path.
@@ -64,8 +64,8 @@ class Receipt:
     """A receipt on disk."""
 
     path: Path
-    old: LoadSettings
-    new: LoadSettings
+    old: ControllerSettings
+    new: ControllerSettings
     devices: Mapping[str, Mapping[str, Any]]
     restores: str | None
     """The receipt whose old values were sent back; None for a push."""
@@ -96,7 +96,7 @@ class Receipt:
         raise BadDataset(f"{run} has no receipt of a push: give the run, or the {NAME}.json, of an earlier push")
 
 
-def _settings(values: Mapping[str, Any]) -> LoadSettings:
+def _settings(values: Mapping[str, Any]) -> ControllerSettings:
     shapes = {"mass_kg": (), "p_flange_com_m": (3,), "inertia_kg_m2": (6,), "up_base_m_s2": (3,)}
     found: dict[str, Any] = {}
     for name, shape in shapes.items():
@@ -105,4 +105,4 @@ def _settings(values: Mapping[str, Any]) -> LoadSettings:
             if array.shape != shape or not np.isfinite(array).all():
                 raise ValueError(f"{name} is {value}")
             found[name] = tuple(array.tolist()) if shape else float(array)
-    return LoadSettings(**found)
+    return ControllerSettings(**found)

@@ -13,7 +13,7 @@ import numpy as np
 
 from calib import CalibrationResult
 from calib.model import Array
-from drivers.interfaces import DeviceInfo, ForceTorqueSensor, LoadSettings, RobotArm
+from drivers.interfaces import ControllerSettings, DeviceInfo, ForceTorqueSensor, RobotArm
 from ftdrive.cell.config import CellConfig
 from ftdrive.checks import computer, devices
 from ftdrive.checks.controller_settings import Lean, lean_from
@@ -42,8 +42,8 @@ Ask = Callable[[str], None]
 class Push:
     """What is to be set, beside what is set."""
 
-    old: LoadSettings
-    new: LoadSettings
+    old: ControllerSettings
+    new: ControllerSettings
     """None where nothing is to be set."""
     devices: Mapping[str, DeviceInfo]
     reason: Mapping[str, Any]
@@ -98,12 +98,12 @@ def propose(
     if others := devices.belonging(result, connected).others:
         raise NotAccepted(f"{others[0]}: push the calibration of this cell")
     require_ready(cell, arm)
-    load, old = flange_load(result, mass_kg, height_m), arm.load_settings()
+    load, old = flange_load(result, mass_kg, height_m), arm.controller_settings()
     down = down_of(cell.workcell.mounting) if old.up_base_m_s2 is None else -_unit(old.up_base_m_s2)
     lean = lean_from(down, result.gravity_force_base_N, result.covariance[3:6, 3:6])
     return Push(
         old,
-        LoadSettings(
+        ControllerSettings(
             load.mass_kg if payload else None,
             tuple(load.p_flange_com_m.tolist()) if payload else None,
             (old.inertia_kg_m2 or (0.0,) * 6) if payload else None,
@@ -170,7 +170,7 @@ def _contact(arm: RobotArm, sensor: ForceTorqueSensor, result: CalibrationResult
     return np.asarray(result.compensate(wrench.mean(axis=0), arm.state().R_base_flange))
 
 
-def _gravity(result: CalibrationResult, lean: Lean, old: LoadSettings) -> tuple[float, ...] | None:
+def _gravity(result: CalibrationResult, lean: Lean, old: ControllerSettings) -> tuple[float, ...] | None:
     """Return the gravity to be set, as large as the controller has it; None if it agrees."""
     if old.up_base_m_s2 is None:
         raise NotAccepted(
@@ -195,14 +195,14 @@ def _unit(vector: Any) -> Array:
 # ------------------------------------------------------------------------------------------------------------- sending
 
 
-def send(arm: RobotArm, push: Push, folder: Path, ask: Ask) -> tuple[Path, LoadSettings]:
+def send(arm: RobotArm, push: Push, folder: Path, ask: Ask) -> tuple[Path, ControllerSettings]:
     """Ask for a word for each setting, send them, read them back, and write the receipt.
 
     Returns
     -------
     path : Path
         Of the receipt, a new file in `folder`.
-    read_back : LoadSettings
+    read_back : ControllerSettings
         What the controller keeps.
 
     Raises
@@ -221,14 +221,14 @@ def send(arm: RobotArm, push: Push, folder: Path, ask: Ask) -> tuple[Path, LoadS
         ask(name)
     arm.open(control=True)
     _wait_until_still(arm)
-    if arm.load_settings() != push.old:
+    if arm.controller_settings() != push.old:
         raise NotAccepted("the settings of the controller have changed meanwhile: start again; nothing was sent")
     read_back, failure = None, ""
     try:
         _set(arm, push.new)
         arm.close()  # what the controller keeps without our program
         arm.open()
-        read_back = arm.load_settings()
+        read_back = arm.controller_settings()
     except BaseException as error:  # also Ctrl-C
         failure = str(error) or "interrupted"
         raise
@@ -254,16 +254,16 @@ EFFECTS: Final = {
 """What each setting does, with the question."""
 
 
-def _set(arm: RobotArm, new: LoadSettings) -> None:
+def _set(arm: RobotArm, new: ControllerSettings) -> None:
     if new.mass_kg is not None and new.p_flange_com_m is not None:
         arm.set_payload(new.mass_kg, new.p_flange_com_m, new.inertia_kg_m2 or (0.0,) * 6)
     if new.up_base_m_s2 is not None:
         arm.set_gravity(new.up_base_m_s2)
 
 
-def differences(sent: LoadSettings, read_back: LoadSettings | None) -> list[str]:
+def differences(sent: ControllerSettings, read_back: ControllerSettings | None) -> list[str]:
     """Return which settings were read back with another value; what is not reported does not count."""
-    back = read_back or LoadSettings()
+    back = read_back or ControllerSettings()
     pairs = {
         "mass": (sent.mass_kg, back.mass_kg),
         "centre of mass": (sent.p_flange_com_m, back.p_flange_com_m),
@@ -288,10 +288,10 @@ def restore(cell: CellConfig, arm: RobotArm, receipt: Receipt) -> Push:
     payload = changed.mass_kg is not None
     if payload and (old.mass_kg is None or old.p_flange_com_m is None):
         raise NotAccepted(f"{receipt.path} has no old payload, the controller did not report it: set it at the pendant")
-    back = LoadSettings(
+    back = ControllerSettings(
         old.mass_kg if payload else None,
         old.p_flange_com_m if payload else None,
         old.inertia_kg_m2 if payload else None,
         old.up_base_m_s2 if changed.up_base_m_s2 is not None else None,
     )
-    return Push(arm.load_settings(), back, {"arm": info}, {"restores": str(receipt.path)})
+    return Push(arm.controller_settings(), back, {"arm": info}, {"restores": str(receipt.path)})

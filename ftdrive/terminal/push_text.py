@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drivers.interfaces import LoadSettings
+from drivers.interfaces import ControllerSettings
 from ftdrive.checks.flange_load import FlangeLoad, margin_in_words
 from ftdrive.session.settings_push import Push
 
@@ -55,7 +55,7 @@ def _payload(push: Push, load: FlangeLoad) -> list[str]:
     ]
 
 
-def settings_in_words(settings: LoadSettings | None) -> str:
+def settings_in_words(settings: ControllerSettings | None) -> str:
     """Return what a controller reports."""
     if settings is None or settings.mass_kg is None:
         return "the controller does not report its payload: compare it at the pendant"

@@ -12,7 +12,7 @@ from calib import CalibrationResult, Parameters
 from calib.errors import BadDataset
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, DeviceTimeout
-from drivers.interfaces import DeviceInfo, Guard, LoadSettings
+from drivers.interfaces import ControllerSettings, DeviceInfo, Guard
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted
 from ftdrive.runs.push_receipt import Receipt
@@ -24,7 +24,7 @@ from tests.unit.ftdrive.fake_cell import FakeArm, FakeSensor
 SENSOR_KG, HEIGHT_MM = 0.3, 40.0
 LEVEL = (0.0, 0.0, 9.82)
 INERTIA = (0.01, 0.01, 0.002, 0.0, 0.0, 0.0)
-OLD = LoadSettings(0.6, (0.0, 0.0, 0.03), INERTIA, LEVEL)
+OLD = ControllerSettings(0.6, (0.0, 0.0, 0.03), INERTIA, LEVEL)
 NEW_KG = 1.5
 NEW_M = (1.2 * 0.01 / 1.5, 0.0, (1.2 * 0.1 + 0.3 * 0.02) / 1.5)
 """By hand: 1.2 kg at (10, 0, 40 + 60) mm, 0.3 kg at (0, 0, 20) mm."""
@@ -41,7 +41,7 @@ class SettableArm(FakeArm):
         self.ignores = False
         self.moves_by_itself = False
 
-    def load_settings(self) -> LoadSettings:
+    def controller_settings(self) -> ControllerSettings:
         return self.settings
 
     def set_payload(self, mass_kg: float, p_flange_com_m: Any, inertia_kg_m2: Any = (0.0,) * 6) -> None:
@@ -111,7 +111,7 @@ class Cell:
         self.typed.append(name)
         self.at_question()
 
-    def send(self, push: Push) -> tuple[Path, LoadSettings]:
+    def send(self, push: Push) -> tuple[Path, ControllerSettings]:
         return send(self.arm, push, self.folder, self.ask)
 
     def receipts(self) -> list[dict[str, Any]]:
@@ -153,7 +153,7 @@ def test_a_receipt_restores_the_old_values_as_often_as_wanted(cell: Cell) -> Non
     cell.send(cell.propose())
     for count in (2, 3):
         push = restore(cell.config, cell.arm, Receipt.load(cell.folder))
-        assert push.new == LoadSettings(0.6, (0.0, 0.0, 0.03), INERTIA)
+        assert push.new == ControllerSettings(0.6, (0.0, 0.0, 0.03), INERTIA)
         path, _ = cell.send(push)
         assert cell.arm.settings == OLD
         assert path.name == f"push-{count}.json"
@@ -163,9 +163,9 @@ def test_a_receipt_restores_the_old_values_as_often_as_wanted(cell: Cell) -> Non
 
 
 def test_an_old_controller_is_set_blindly_and_cannot_be_restored(cell: Cell) -> None:
-    cell.arm.settings = LoadSettings()
+    cell.arm.settings = ControllerSettings()
     path, read_back = cell.send(cell.propose())
-    assert read_back == LoadSettings()
+    assert read_back == ControllerSettings()
     assert "does not report" in settings_in_words(read_back)
     with pytest.raises(NotAccepted, match="no old payload"):
         restore(cell.config, cell.arm, Receipt.load(path))

@@ -15,7 +15,7 @@ from typing import Final
 
 from drivers.clock import Clock
 from drivers.errors import DeviceTimeout, StreamBroken
-from drivers.interfaces import LoadSettings
+from drivers.interfaces import ControllerSettings
 from drivers.ur.rtde import Subscription
 
 OUTPUTS: Final = MappingProxyType(
@@ -34,7 +34,7 @@ _RATE_HZ: Final = 125.0
 _G_M_S2: Final = (8.0, 12.0)
 
 
-def read_load_settings(host: str, *, timeout_s: float, clock: Clock) -> LoadSettings:
+def read_controller_settings(host: str, *, timeout_s: float, clock: Clock) -> ControllerSettings:
     """Read them once. Raises `ConnectError`, `DeviceTimeout`, `StreamBroken` or `ProtocolError`."""
     stream = Subscription(host, OUTPUTS, _RATE_HZ, timeout_s=timeout_s, clock=clock)
     try:
@@ -49,7 +49,7 @@ def read_load_settings(host: str, *, timeout_s: float, clock: Clock) -> LoadSett
     def vector(name: str) -> tuple[float, ...] | None:
         return tuple(outputs[name][-1].tolist()) if name in outputs else None
 
-    return LoadSettings(
+    return ControllerSettings(
         mass_kg=float(outputs["payload"][-1]) if "payload" in outputs else None,
         p_flange_com_m=vector("payload_cog"),
         inertia_kg_m2=vector("payload_inertia"),

@@ -8,10 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from drivers.interfaces import LoadSettings
-from drivers.ur import load_settings
+from drivers.interfaces import ControllerSettings
+from drivers.ur import controller_settings
 from drivers.ur.arm import UrArm
-from drivers.ur.load_settings import read_load_settings
+from drivers.ur.controller_settings import read_controller_settings
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import HOST, Controller
 
@@ -157,9 +157,9 @@ class Stream:
         self.closed = True
 
 
-def read(stream: Stream, monkeypatch: pytest.MonkeyPatch) -> LoadSettings:
-    monkeypatch.setattr(load_settings, "Subscription", lambda *_, **__: stream)
-    return read_load_settings(HOST, timeout_s=2.0, clock=FakeClock())
+def read(stream: Stream, monkeypatch: pytest.MonkeyPatch) -> ControllerSettings:
+    monkeypatch.setattr(controller_settings, "Subscription", lambda *_, **__: stream)
+    return read_controller_settings(HOST, timeout_s=2.0, clock=FakeClock())
 
 
 def test_everything_that_a_controller_reports_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -171,12 +171,12 @@ def test_everything_that_a_controller_reports_is_read(monkeypatch: pytest.Monkey
         "target_gravity": (0.0, 0.3, 9.81),
     }
     stream = Stream(outputs)
-    assert read(stream, monkeypatch) == LoadSettings(1.442, (0.01, 0.0, 0.08), INERTIA, (0.0, 0.3, 9.81))
+    assert read(stream, monkeypatch) == ControllerSettings(1.442, (0.01, 0.0, 0.08), INERTIA, (0.0, 0.3, 9.81))
     assert stream.closed
 
 
 def test_what_an_old_controller_does_not_report_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert read(Stream({"timestamp": 7.0}), monkeypatch) == LoadSettings()
+    assert read(Stream({"timestamp": 7.0}), monkeypatch) == ControllerSettings()
 
 
 @pytest.mark.parametrize(("failure", "kind"), [(TimeoutError(), DeviceTimeout), (ConnectionResetError(), StreamBroken)])
@@ -191,4 +191,4 @@ def test_a_link_that_fails_is_an_error_of_the_device(
 
 def test_a_closed_arm_reads_nothing() -> None:
     with pytest.raises(ConnectError, match="not open"):
-        UrArm(HOST).load_settings()
+        UrArm(HOST).controller_settings()

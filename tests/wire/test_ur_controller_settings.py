@@ -6,7 +6,7 @@ from contextlib import closing
 import pytest
 
 from drivers.errors import DeviceFault
-from drivers.interfaces import LoadSettings
+from drivers.interfaces import ControllerSettings
 from drivers.ur.arm import UrArm
 from tests.wire.conftest import Station
 
@@ -26,7 +26,7 @@ def test_a_payload_is_kept_when_our_program_has_ended(station: Station, arm: UrA
     arm.set_gravity((0.0, 0.3, 9.81))
     arm.close()
     arm.open()
-    found = arm.load_settings()
+    found = arm.controller_settings()
     assert (found.mass_kg, found.p_flange_com_m, found.inertia_kg_m2) == (1.442, COM_M, INERTIA)
     assert found.up_base_m_s2 in {None, (0.0, 0.3, 9.81)}  # only recent controllers report it
     assert station.ask("state")["payload_kg"] == 1.442
@@ -38,14 +38,14 @@ def test_a_payload_is_kept_when_our_program_has_ended(station: Station, arm: UrA
 @pytest.mark.parametrize(
     ("polyscope", "call", "reported"),
     [
-        ("3.15", "setPayload", LoadSettings(1.2, COM_M, (0.0,) * 6)),
-        ("5.4", "setPayload", LoadSettings()),
-        ("5.9", "setPayload", LoadSettings(1.2, COM_M)),
-        ("5.10", "setTargetPayload", LoadSettings(1.2, COM_M)),
+        ("3.15", "setPayload", ControllerSettings(1.2, COM_M, (0.0,) * 6)),
+        ("5.4", "setPayload", ControllerSettings()),
+        ("5.9", "setPayload", ControllerSettings(1.2, COM_M)),
+        ("5.10", "setTargetPayload", ControllerSettings(1.2, COM_M)),
     ],
 )
 def test_every_generation_takes_a_payload(
-    start_station: Callable[..., Station], polyscope: str, call: str, reported: LoadSettings
+    start_station: Callable[..., Station], polyscope: str, call: str, reported: ControllerSettings
 ) -> None:
     station = start_station("--polyscope", polyscope)
     with closing(station.arm(model="UR5" if polyscope == "3.15" else "UR5e")) as arm:
@@ -54,7 +54,7 @@ def test_every_generation_takes_a_payload(
         if call == "setPayload":
             with pytest.raises(DeviceFault, match="takes no inertia"):
                 arm.set_payload(1.2, COM_M, INERTIA)
-        assert arm.load_settings() == reported
+        assert arm.controller_settings() == reported
     assert taken(station) == [call]
     state = station.ask("state")
     assert (state["payload_kg"], state["payload_cog_m"]) == (1.2, [*COM_M])
