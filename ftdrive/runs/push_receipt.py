@@ -4,6 +4,7 @@ push.json         ftdrive.push/1: devices, reason, old and new values, values re
 """
 
 import json
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -89,8 +90,9 @@ class Receipt:
 
     @classmethod
     def _newest(cls, run: Path) -> Self:
-        paths = sorted(run.glob(f"{NAME}*.json"), key=lambda path: int(path.stem.removeprefix(NAME)[1:] or 1))
-        for path in reversed(paths):
+        found = {path: re.fullmatch(rf"{NAME}-?(\d*)\.json", path.name) for path in run.iterdir()}
+        paths = sorted((int(match[1] or 1), path) for path, match in found.items() if match)
+        for _, path in reversed(paths):
             if (receipt := cls.load(path)).restores is None:
                 return receipt
         raise BadDataset(f"{run} has no receipt of a push: give the run, or the {NAME}.json, of an earlier push")

@@ -129,7 +129,8 @@ def _sensor_of(cell: CellConfig) -> tuple[float, float]:
     mass_kg, height_mm = cell.sensor.mass_kg, cell.sensor.height_mm
     if mass_kg is None:
         raise ConfigError(
-            "[sensor] mass_kg is not set, and the sensor cannot weigh itself: set it to the mass of sensor and adapter"
+            "[sensor] mass_kg is not set, and the sensor cannot weigh itself: set it to the mass of sensor and "
+            "adapter, or to 0 for the sensor inside the wrist"
         )
     if height_mm is None:
         raise ConfigError(
