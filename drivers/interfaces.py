@@ -211,6 +211,19 @@ class ArmStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class ControllerSettings:
+    """What a controller assumes about its load and about gravity. None where it does not report a value."""
+
+    mass_kg: float | None = None
+    p_flange_com_m: tuple[float, ...] | None = None
+    """(3,) centre of mass of everything below the flange."""
+    inertia_kg_m2: tuple[float, ...] | None = None
+    """(6,) Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of mass, along the flange axes."""
+    up_base_m_s2: tuple[float, ...] | None = None
+    """(3,) acceleration away from the earth, in base axes: (0, 0, 9.82) on a level floor."""
+
+
+@dataclass(frozen=True, slots=True)
 class Finding:
     """A check that a driver makes of its own device, beyond what every device of its kind reports."""
 
@@ -310,6 +323,29 @@ class RobotArm(_Device):
 
         Never older than 0.1 s; otherwise raises `DeviceTimeout` or `StreamBroken`. Raises `ConnectError` while closed.
         """
+
+    def controller_settings(self) -> ControllerSettings:
+        """Read the load and the gravity that the controller assumes. Needs no control.
+
+        The default knows what `status` reports.
+        """
+        status = self.status()
+        return ControllerSettings(status.payload_kg, status.p_flange_payload_m)
+
+    def set_payload(
+        self, mass_kg: float, p_flange_com_m: Sequence[float], inertia_kg_m2: Sequence[float] = (0.0,) * 6
+    ) -> None:
+        """Set the payload in the controller; read it back with `controller_settings`. Needs control and an arm at rest.
+
+        Parameters as in `ControllerSettings`; an inertia of zeros is a point mass. The default raises `DeviceFault`.
+        """
+        payload = f"a payload of {mass_kg:g} kg at {[*p_flange_com_m]} m with the inertia {[*inertia_kg_m2]} kg·m²"
+        raise DeviceFault(f"the driver of this arm cannot set {payload}", "set it at the controller")
+
+    def set_gravity(self, up_base_m_s2: Sequence[float]) -> None:
+        """Set the direction of gravity in the controller, as in `ControllerSettings`; otherwise as `set_payload`."""
+        gravity = f"a gravity of {[*up_base_m_s2]} m/s²"
+        raise DeviceFault(f"the driver of this arm cannot set {gravity}", "set the mounting at the controller")
 
     def in_remote_control(self) -> bool | None:
         """Return whether the controller accepts programs from the network; None where it has no such switch."""

@@ -23,6 +23,7 @@ _COMMANDS = {
     "devices": ("ftdrive.commands.devices", "List serial ports and CAN interfaces."),
     "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
     "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
+    "push": ("ftdrive.commands.push", "Set payload or gravity in the controller as calibrated."),
     "record": ("ftdrive.commands.record", "Record raw and compensated wrench with pose and events."),
     "convert": ("ftdrive.commands.convert", "Convert a recording between MCAP, CSV and Parquet."),
     "compensate": ("ftdrive.commands.compensate", "Compensate a recording. Needs no device."),

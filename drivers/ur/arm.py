@@ -19,9 +19,10 @@ from typing import Final
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
 from drivers.follow import Follow
-from drivers.interfaces import ArmState, ArmStates, ArmStatus, DeviceInfo, Finding, Guard, RobotArm
+from drivers.interfaces import ArmState, ArmStates, ArmStatus, ControllerSettings, DeviceInfo, Finding, Guard, RobotArm
 from drivers.ur.control import ControlProcess
 from drivers.ur.control_child import DECELERATION_RAD_S2
+from drivers.ur.controller_settings import checked_gravity, checked_payload, read_controller_settings
 from drivers.ur.dashboard import Dashboard, T, ask_dashboard
 from drivers.ur.kinematics import MODELS, model_named
 from drivers.ur.reading import Reader
@@ -265,6 +266,14 @@ class UrArm(RobotArm):
         """Return the controller's modes and settings, updated with every sample; see `RobotArm`."""
         return self._reading().status()
 
+    def controller_settings(self) -> ControllerSettings:
+        """Read payload, inertia and gravity over a connection of their own, which takes some milliseconds.
+
+        Payload from PolyScope 5.6 and 3.11 on, inertia from 5.11 and 3.15 on, gravity only on recent versions.
+        """
+        self._reading()
+        return read_controller_settings(self._host, timeout_s=self._timing.connect_s, clock=self._clock)
+
     def in_remote_control(self) -> bool | None:
         """Ask the dashboard server, which takes some milliseconds. Raises `NoDashboard`.
 
@@ -324,6 +333,44 @@ class UrArm(RobotArm):
             if fault := self._fault():
                 raise fault from error
             raise
+
+    def set_payload(
+        self, mass_kg: float, p_flange_com_m: Sequence[float], inertia_kg_m2: Sequence[float] = (0.0,) * 6
+    ) -> None:
+        """Set the payload; see `RobotArm`. The controller also zeroes the sensor in an e-Series wrist.
+
+        The change is instantaneous, so the arm may make a small jump. Raises `DeviceFault` or `StreamBroken` when it
+        cannot be confirmed, and `ValueError` for values that no payload has. PolyScope before 5.10 takes no inertia.
+        """
+        mass, com, inertia = checked_payload(mass_kg, p_flange_com_m, inertia_kg_m2)
+        version = self._reading().version[:2]
+        takes_inertia = version >= (5, 10)
+        if any(inertia) and not takes_inertia:
+            raise DeviceFault(
+                "PolyScope {}.{} takes no inertia of the payload from a program".format(*version),
+                "set the payload at the pendant",
+            )
+        self._set("payload", mass, com, inertia if takes_inertia else None)
+
+    def set_gravity(self, up_base_m_s2: Sequence[float]) -> None:
+        """Set the direction of gravity; see `RobotArm`. Errors as `set_payload`."""
+        self._set("gravity", checked_gravity(up_base_m_s2))
+
+    def _set(self, what: str, *values: object) -> None:
+        """Have our program set what a controller assumes; another program is left as it is."""
+        control = self._in_control()
+        self._look_out()
+        self._check_ours(control)
+        try:
+            taken = control.call(f"set_{what}", *values, look_out=self._look_out)
+        except DriverError as error:
+            if fault := self._fault():
+                raise fault from error
+            raise
+        if not taken:
+            raise self._fault() or DeviceFault(
+                f"the controller did not confirm the {what} that was sent", "read the pendant's log"
+            )
 
     def move_to(
         self,

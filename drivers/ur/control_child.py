@@ -45,6 +45,12 @@ class _Control(Protocol):
 
     def getTCPOffset(self) -> list[float]: ...
 
+    def setPayload(self, mass: float, cog: list[float], /) -> bool: ...
+
+    def setTargetPayload(self, mass: float, cog: list[float], inertia: list[float], /) -> bool: ...
+
+    def setGravity(self, direction: list[float], /) -> bool: ...
+
     def isProgramRunning(self) -> bool: ...
 
     def isConnected(self) -> bool: ...
@@ -103,6 +109,16 @@ class Calls:
     def tcp_offset(self) -> list[float]:
         """Return the active TCP in the flange."""
         return self._control.getTCPOffset()
+
+    def set_payload(self, mass_kg: float, com_m: list[float], inertia_kg_m2: list[float] | None) -> bool:
+        """Set the payload; return whether the program did. Without an inertia by the older command, which resets it."""
+        if inertia_kg_m2 is None:
+            return self._control.setPayload(mass_kg, com_m)
+        return self._control.setTargetPayload(mass_kg, com_m, inertia_kg_m2)
+
+    def set_gravity(self, up_base_m_s2: list[float]) -> bool:
+        """Set the direction of gravity; return whether the program did."""
+        return self._control.setGravity(up_base_m_s2)
 
     def quit(self) -> None:
         """Stop the arm and end the script, which would otherwise stay on the controller."""

@@ -1,5 +1,6 @@
 """Differences between settings of the controller and identified values: the payload and the mounting of the base."""
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -81,27 +82,58 @@ def lean_in_words(gravity_force_base_N: Array, covariance: Array, mounting: str)
     mounting : str
         As in [workcell]; assumed to be set in the controller too.
     """
-    down = down_of(mounting)
+    lean = lean_from(down_of(mounting), gravity_force_base_N, covariance)
+    name = mounting if mounting.isalpha() else f"{float(mounting):g}°"
+    mounted = f"[workcell] mounting ({name})"
+    if lean.is_other_mounting:
+        return (
+            f"gravity is {lean.deg:.0f}° off the direction of {mounted}: correct the mounting, here and in PolyScope; "
+            "near 180°, check the sensor's sign first"
+        )
+    if not lean.is_significant:
+        return ""
+    return (
+        f"the base {lean}, compared with {mounted} and "
+        "assuming PolyScope has the same mounting: level the base, or set its mounting in PolyScope"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Lean:
+    """How far the measured direction of gravity in the base is from an expected one."""
+
+    deg: float
+    sigma_deg: float
+    side: str
+    """The low side of the base, such as "+y"."""
+
+    @property
+    def is_other_mounting(self) -> bool:
+        """Whether it is too large for a lean."""
+        return self.deg > _OTHER_MOUNTING_DEG
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether it is larger than its uncertainty and than the accuracy of an arm's own orientation."""
+        return self.deg >= max(LEAN_DEG, _SIGNIFICANT * self.sigma_deg)
+
+    def __str__(self) -> str:
+        return f"leans {self.deg:.2f}° (sigma {self.sigma_deg:.2f}°) towards its {self.side}"
+
+
+def lean_from(down: Array, gravity_force_base_N: Array, covariance: Array) -> Lean:
+    """Compare measured gravity (3,), with its covariance (3, 3), with the expected direction `down` (3,), unit length.
+
+    All in base axes.
+    """
     along_N = float(gravity_force_base_N @ down)
     aside_N = gravity_force_base_N - along_N * down
     size_N = float(np.linalg.norm(aside_N))
-    lean_deg = float(np.degrees(np.arctan2(size_N, along_N)))
-    name = mounting if mounting.isalpha() else f"{float(mounting):g}°"
-    mounted = f"[workcell] mounting ({name})"
-    if lean_deg > _OTHER_MOUNTING_DEG:
-        return (
-            f"gravity is {lean_deg:.0f}° off the direction of {mounted}: correct the mounting, here and in PolyScope; "
-            "near 180°, check the sensor's sign first"
-        )
     low = aside_N / max(size_N, 1e-12)
-    sigma_deg = float(np.degrees(np.sqrt(low @ covariance @ low) / along_N))
-    if lean_deg < max(LEAN_DEG, _SIGNIFICANT * sigma_deg):
-        return ""
-    side = " and ".join(axes_along(low))
-    return (
-        f"the base leans {lean_deg:.2f}° (sigma {sigma_deg:.2f}°) towards its {side}, compared with {mounted} and "
-        "assuming PolyScope has the same mounting: level the base, or set its mounting in PolyScope"
-    )
+    deg = float(np.degrees(np.arctan2(size_N, along_N)))
+    weight_N = float(np.linalg.norm(gravity_force_base_N))
+    sigma_deg = float(np.degrees(np.sqrt(max(float(low @ covariance @ low), 0.0)) / weight_N))
+    return Lean(deg, sigma_deg, " and ".join(axes_along(low)))
 
 
 def axes_along(direction: Array) -> list[str]:

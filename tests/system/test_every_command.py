@@ -45,7 +45,7 @@ OFFLINE = ("convert", "compensate")
 """They read files and know no cell."""
 
 REHEARSED = ("replay", "solve")
-"""They calibrate an emulated cell first, as do live, and demo, which is run and looked at in test_demo.py."""
+"""They calibrate an emulated cell first, as do live, push (test_push.py) and demo (test_demo.py)."""
 
 SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     "calibrate": lambda answer: answer["verdict"] != "rejected",
@@ -124,7 +124,7 @@ def test_a_full_disk_and_a_reader_that_is_gone_are_no_crash() -> None:
     [
         pytest.param(name, marks=pytest.mark.slow) if name == "calibrate" else name
         for name in names(cli)
-        if name not in ("demo", "live", "record", "stream", *REHEARSED, *OFFLINE)
+        if name not in ("demo", "live", "push", "record", "stream", *REHEARSED, *OFFLINE)
     ],
 )
 def test_every_command_works_with_simulate_and_json(
@@ -192,7 +192,8 @@ def test_the_sensor_that_is_named_is_emulated(
         (("doctor", "--simulate", "--robot", "10.0.0.2"), "--robot does not go with --simulate"),
         (("solve", "--simulate", "."), "DATASET does not go with --simulate"),
         (("solve", "--sensor", "emulated://bota", "."), "--sensor goes only with --simulate"),
-        *(((command,), "--simulate") for command in ("solve", "replay", "live")),
+        *(((command,), "--simulate") for command in ("solve", "replay", "live", "push")),
+        (("push", ".", "--restore", "."), "--restore takes everything"),
         (("record", "-o", "a.csv"), "--simulate"),
         (("transcript", "play"), "--simulate"),
         (("export", "plan", "--format", "csv"), "--simulate"),

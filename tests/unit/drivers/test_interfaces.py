@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drivers.errors import DeviceTimeout
-from drivers.interfaces import ArmStates
+from drivers.errors import DeviceFault, DeviceTimeout
+from drivers.interfaces import ArmStates, ControllerSettings
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import FakeArm
 
@@ -22,3 +22,12 @@ def test_an_arm_that_can_only_be_asked_is_followed_state_by_state() -> None:
         arm.gone = DeviceTimeout("its clock stands still")
         with pytest.raises(DeviceTimeout, match="stands still"):
             follow.read(0.1)
+
+
+def test_an_arm_whose_driver_sets_nothing_says_what_it_was_to_set() -> None:
+    arm = FakeArm(FakeClock())
+    assert arm.controller_settings() == ControllerSettings(1.5, (0.0, 0.0, 0.05))  # of its status
+    with pytest.raises(DeviceFault, match=r"payload of 1.2 kg at \[0.0, 0.0, 0.08\] m"):
+        arm.set_payload(1.2, (0.0, 0.0, 0.08))
+    with pytest.raises(DeviceFault, match=r"gravity of \[0.0, 0.0, 9.82\]"):
+        arm.set_gravity((0.0, 0.0, 9.82))

@@ -78,7 +78,7 @@ class Controller:
         self.did: list[str] = []
         """What it was asked to do."""
         self.dashboard_limits_s: list[float] = []
-        self.stopping_works = True
+        self.stopping_works = self.takes_settings = True
         self.period_s = CYCLE_S
         self.stood_still_s = 0.0
         """For how long its clock has not run."""
@@ -261,6 +261,18 @@ class Controller:
 
     def getTCPOffset(self) -> list[float]:
         return self.tcp_offset
+
+    def setPayload(self, mass: float, cog: list[float], /) -> bool:
+        self.did.append(f"payload {mass:g} {cog}")
+        return self.takes_settings
+
+    def setTargetPayload(self, mass: float, cog: list[float], inertia: list[float], /) -> bool:
+        self.did.append(f"payload {mass:g} {cog} {inertia}")
+        return self.takes_settings
+
+    def setGravity(self, direction: list[float], /) -> bool:
+        self.did.append(f"gravity {direction}")
+        return self.takes_settings
 
     def isProgramRunning(self) -> bool:
         return self.program == 2

@@ -1,0 +1,61 @@
+"""Payload and gravity of the emulated controller, through the unmodified ur_rtde."""
+
+from collections.abc import Callable
+from contextlib import closing
+
+import pytest
+
+from drivers.errors import DeviceFault
+from drivers.interfaces import ControllerSettings
+from drivers.ur.arm import UrArm
+from tests.wire.conftest import Station
+
+pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
+
+COM_M = (0.0095, 0.0048, 0.0809)
+INERTIA = (0.01, 0.02, 0.03, 0.0, -0.001, 0.0)
+SETTINGS_CALLS = ("setPayload", "setTargetPayload", "setGravity")
+
+
+def taken(station: Station) -> list[str]:
+    return [event["why"] for event in station.ask("state")["events"] if event["why"] in SETTINGS_CALLS]
+
+
+def test_a_payload_is_kept_when_our_program_has_ended(station: Station, arm: UrArm) -> None:
+    arm.set_payload(1.442, COM_M, INERTIA)
+    arm.set_gravity((0.0, 0.3, 9.81))
+    arm.close()
+    arm.open()
+    found = arm.controller_settings()
+    assert (found.mass_kg, found.p_flange_com_m, found.inertia_kg_m2) == (1.442, COM_M, INERTIA)
+    assert found.up_base_m_s2 in {None, (0.0, 0.3, 9.81)}  # only recent controllers report it
+    assert station.ask("state")["payload_kg"] == 1.442
+    assert taken(station) == ["setTargetPayload", "setGravity"]
+    assert (arm.status().payload_kg, arm.status().program) == (1.442, "stopped")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("polyscope", "call", "reported"),
+    [
+        ("3.15", "setPayload", ControllerSettings(1.2, COM_M, (0.0,) * 6)),
+        ("5.4", "setPayload", ControllerSettings()),
+        ("5.9", "setPayload", ControllerSettings(1.2, COM_M)),
+        ("5.10", "setTargetPayload", ControllerSettings(1.2, COM_M)),
+    ],
+)
+def test_every_generation_takes_a_payload(
+    start_station: Callable[..., Station], polyscope: str, call: str, reported: ControllerSettings
+) -> None:
+    station = start_station("--polyscope", polyscope)
+    with closing(station.arm(model="UR5" if polyscope == "3.15" else "UR5e")) as arm:
+        arm.open(control=True)
+        arm.set_payload(1.2, COM_M)
+        if call == "setPayload":
+            with pytest.raises(DeviceFault, match="takes no inertia"):
+                arm.set_payload(1.2, COM_M, INERTIA)
+        assert arm.controller_settings() == reported
+    assert taken(station) == [call]
+    state = station.ask("state")
+    assert (state["payload_kg"], state["payload_cog_m"]) == (1.2, [*COM_M])
+    assert state["bad_inputs"] == []
