@@ -1,7 +1,7 @@
 """What the store keeps of a run folder, read from its files."""
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -93,12 +93,27 @@ def mass_sigma_kg(parameters: Parameters, covariance: Array, g_m_s2: float) -> f
     return float(np.sqrt(np.maximum(down @ covariance[3:6, 3:6] @ down, 0.0))) / g_m_s2
 
 
-def run_folders(folder: Path) -> Iterator[Path]:
-    """Yield the folder itself if it is a run, else the runs in it, by name."""
-    if _is_run(folder):
-        yield folder
-    elif folder.is_dir():
-        yield from filter(_is_run, sorted(folder.iterdir()))
+def record_paths(folders: Iterable[Path]) -> list[Path]:
+    """Return the files that become records, of runs or of the runs in folders, each once and by name."""
+    runs = set[Path]()
+    for folder in (one.resolve() for one in folders):
+        if _is_run(folder):
+            runs.add(folder)
+        elif folder.is_dir():
+            runs.update(filter(_is_run, folder.iterdir()))
+    names = ("calibration*.json", "verification*.json")
+    return [path for run in sorted(runs) for name in names for path in sorted(run.glob(name))]
+
+
+def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
+    """Read files; the second list names those that were left out, each with the reason."""
+    records, unreadable = list[Record](), list[str]()
+    for path in paths:
+        try:
+            records.append(read_record(path))
+        except (CalibError, OSError) as error:
+            unreadable.append(f"{path}: {error}")
+    return records, tuple(unreadable)
 
 
 def _is_run(folder: Path) -> bool:
@@ -106,11 +121,6 @@ def _is_run(folder: Path) -> bool:
         return (folder / "run.json").is_file()
     except OSError:  # a folder of another user
         return False
-
-
-def record_paths(run: Path) -> list[Path]:
-    """Return the files of a run folder that become records."""
-    return sorted([*run.glob("calibration*.json"), *run.glob("verification*.json")])
 
 
 def read_record(path: Path) -> Record:

@@ -31,15 +31,13 @@ from sqlalchemy import (
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
-from calib.errors import CalibError
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.store.records import (
     Record,
     StoredResult,
     StoredVerification,
-    read_record,
+    read_records,
     record_paths,
-    run_folders,
 )
 
 SCHEMA = 1
@@ -142,7 +140,7 @@ class Store:
         A file that is known by its path is not read again, because no file of a run is ever overwritten.
         """
         known = self._known_paths()
-        return self._add(path for path in _paths(folders) if str(path) not in known)
+        return self._add(path for path in record_paths(folders) if str(path) not in known)
 
     def rebuild(self, *folders: Path) -> Indexed:
         """Read these folders and all that were indexed before again, and forget runs that were deleted.
@@ -152,22 +150,17 @@ class Store:
         known = self._known_paths()
         parents = {Path(path).parent.parent for path in known}
         gone = [path for path in known if not Path(path).exists() and Path(path).parent.parent.is_dir()]
-        return self._add(_paths([*folders, *parents]), forget=gone)
+        return self._add(record_paths([*folders, *parents]), forget=gone)
 
     def _add(self, paths: Iterable[Path], forget: Sequence[str] = ()) -> Indexed:
-        records, unreadable = list[Record](), []
-        for path in paths:
-            try:
-                records.append(read_record(path))
-            except (CalibError, OSError) as error:
-                unreadable.append(f"{path}: {error}")
+        records, unreadable = read_records(paths)
         if records or forget:
             with self._writing() as connection:
                 for kind, table in _TABLES.items():
                     rows = [asdict(one) for one in records if isinstance(one, kind)]
                     self._write(connection, table, rows, forget)
         results = sum(isinstance(one, StoredResult) for one in records)
-        return Indexed(results, len(records) - results, tuple(unreadable))
+        return Indexed(results, len(records) - results, unreadable)
 
     def _write(self, connection: Connection, table: Table, rows: list[dict[str, Any]], forget: Sequence[str]) -> None:
         """Insert rows; of two files with the same content the first by path counts, whatever the order."""
@@ -262,10 +255,3 @@ class Store:
             raise BadStore(
                 f"the store {self.name} cannot be {verb} ({reason}): check [store] url, and who may use it"
             ) from error
-
-
-def _paths(folders: Iterable[Path]) -> Iterator[Path]:
-    """Yield the files of all runs, once each."""
-    runs = {run for folder in folders for run in run_folders(folder.resolve())}
-    for run in sorted(runs):
-        yield from record_paths(run)
