@@ -291,3 +291,18 @@ def test_a_run_that_names_nothing_still_counts(tmp_path: Path) -> None:
     assert (one.arm_serial, one.sensor_serial, one.mount) == ("arm-9", "ft-9", "left")
     assert one.created_utc == "2026-05-01T08:00:00.000000+00:00"
     assert (one.parent, one.update, one.temperature_C, one.dataset_sha256) == (None, None, None, None)
+
+
+@pytest.mark.slow
+def test_a_csv_is_solved_without_the_database(tmp_path: Path) -> None:
+    """And so is everything else imported that does not look up or index a result."""
+    rows = "".join(f"0.{k},0.{k}{7 * k % 10},-0.{9 - k},{k},{-k},9.8,0.1,0.{k},0\n" for k in range(1, 10))
+    (tmp_path / "poses.csv").write_text("rx,ry,rz,fx,fy,fz,tx,ty,tz\n" + rows)
+    code = (
+        "import sys, ftdrive.live.stream, ftdrive.commands.live, ftdrive.commands.history\n"
+        "from ftdrive.cli import run\n"
+        "code = run(['solve', 'poses.csv'])\n"
+        "sys.exit('sqlalchemy is imported' if 'sqlalchemy' in sys.modules else code not in (0, 7))\n"
+    )
+    outcome = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert outcome.returncode == 0, outcome.stderr
