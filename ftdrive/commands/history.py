@@ -63,7 +63,7 @@ def history(folders: Sequence[Path], tool: str | None, index: Sequence[Path], re
     for line in _table([_row(one, last.get(one.id), now) for one in results]):
         click.echo(line)
     for drift in found:
-        talk.print(hanging(" trend: ", str(drift)), style="yellow" if drift.is_significant else None)
+        click.echo(f"trend: {drift}")
     for words in advice:
         talk.print(hanging(" ! ", words), style="yellow")
 

@@ -46,7 +46,7 @@ WAIT_S = 5.0
 """For another writer."""
 
 _metadata = MetaData()
-_schema = Table("ftdrive_schema", _metadata, Column("version", Integer, primary_key=True))
+_schema = Table("ftdrive_schema", _metadata, Column("version", Integer, primary_key=True, autoincrement=False))
 _results = Table(
     "ftdrive_results",
     _metadata,

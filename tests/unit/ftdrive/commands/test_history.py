@@ -55,14 +55,14 @@ def test_the_list_names_results_trends_and_what_to_do(run: Callable[..., Ran], r
     assert "No results. `ftdrive calibrate`" in run("history")[2]
     code, out, err = run("history", "--index", runs)
     lines = out.splitlines()
-    assert (code, len(lines)) == (0, 6)
+    assert (code, len(lines)) == (0, 6 + 4)
     assert lines[0].split()[:3] == ["id", "date,", "UTC"]
     assert "2026-03-01 00:00" in lines[1]
     assert "drill" in lines[2]
     assert "FAILED" in lines[5]
     assert "ago, bias" in lines[5]
-    assert "gripper, force bias: +" in err
-    assert "N per 30 days (1 sigma, 4 results), significant (p =" in err
+    assert lines[6].startswith("trend: gripper, force bias: +")
+    assert "N per 30 days (1 sigma, 4 results), significant (p =" in lines[6]
     assert "gripper: the newest calibration" in err
     assert "failed its last verification (the force bias has changed by 0.5 N): calibrate again" in err
     assert run("history")[:2] == run("history", runs)[:2]  # the same from the store and from the folders
@@ -88,7 +88,10 @@ def test_rebuilt_a_deleted_run_is_gone_and_a_damaged_one_is_named(run: Callable[
     (runs / "gripper-0" / "calibration.json").write_text("{")
     (runs / "drill" / "calibration.json").unlink()
     code, out, err = run("history", "--rebuild")
-    assert (code, len(out.splitlines())) == (0, 5)  # the damaged one is still there, and no reason to forget its result
+    assert (code, len(out.splitlines())) == (
+        0,
+        5 + 4,
+    )  # the damaged one is still there, and no reason to forget its result
     assert "left out: " in err
     assert "gripper-0/calibration.json" in err
     assert run("history", runs, "--rebuild")[0] == 2
