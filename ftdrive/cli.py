@@ -25,6 +25,8 @@ _COMMANDS = {
     "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
     "push": ("ftdrive.commands.push", "Set payload or gravity in the controller as calibrated."),
     "record": ("ftdrive.commands.record", "Record raw and compensated wrench with pose and events."),
+    "history": ("ftdrive.commands.history", "List results and verifications, with their trends."),
+    "diff": ("ftdrive.commands.diff", "Compare two calibrations, in sigmas."),
     "convert": ("ftdrive.commands.convert", "Convert a recording between MCAP, CSV and Parquet."),
     "compensate": ("ftdrive.commands.compensate", "Compensate a recording. Needs no device."),
     "stream": ("ftdrive.commands.stream", "Serve the wrench to Foxglove, Lichtblick and PlotJuggler."),
@@ -86,14 +88,14 @@ def exit_code(error: BaseException) -> int | None:
     from calib.errors import BadCalibration, BadDataset, CalibError, TooFewSamples
     from drivers.errors import ConnectError, DeviceFault, DriverError
     from drivers.transcript.recorder import BadTranscript
-    from ftdrive.errors import BadPlan, BadRecording, ConfigError, NotAccepted, RecordingHasGaps
+    from ftdrive.errors import BadPlan, BadRecording, BadStore, ConfigError, NotAccepted, RecordingHasGaps
 
     codes: list[tuple[int, tuple[type[BaseException], ...]]] = [
         (2, (ConfigError,)),
         (3, (ConnectError,)),
         (5, (DeviceFault,)),
         (4, (DriverError, TooFewSamples)),
-        (6, (BadDataset, BadCalibration, BadTranscript, BadPlan, BadRecording)),
+        (6, (BadDataset, BadCalibration, BadTranscript, BadPlan, BadRecording, BadStore)),
         (7, (CalibError, NotAccepted)),
         (8, (RecordingHasGaps,)),
         (6, (OSError,)),

@@ -17,6 +17,10 @@ class BadRecording(Exception):
     """A file does not contain a recording that this version can read."""
 
 
+class BadStore(Exception):
+    """The store of results cannot be read or written."""
+
+
 class RecordingHasGaps(Exception):
     """Samples are missing in a recording that is otherwise complete."""
 

@@ -19,6 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 _state = TemporaryDirectory(prefix="ftdrive-state-")
 os.environ["XDG_CONFIG_HOME"] = _state.name + "/config"
 os.environ["XDG_STATE_HOME"] = _state.name
+os.environ["XDG_DATA_HOME"] = _state.name + "/data"
 for _name in [name for name in os.environ if name.startswith("FTDRIVE_") and name != "FTDRIVE_REAL_DATA"]:
     del os.environ[_name]
 

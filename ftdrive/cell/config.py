@@ -9,6 +9,7 @@ is chosen from a record of the sensor at rest, unless `average_s` is set and `no
 
 import json
 import os
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields
@@ -79,13 +80,24 @@ class SensorConfig:
     delay_ms: float | None = entry(
         "delay of the wrench after the pose; estimated from motion if it is not set", None, "ms", (-100, 100)
     )
+    mount: str | None = entry(
+        "label of the mounting, such as adapter-a; a calibration is valid for one label: change it when the sensor is "
+        "mounted again",
+        None,
+        reject=rules.reject_empty,
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class ToolConfig:
     """Everything mounted on the flange, the sensor included. What is not described here may collide."""
 
-    name: str = entry("of the tool", "tool", option="--tool-name", reject=rules.reject_empty)
+    name: str = entry(
+        "of the tool; `live --tool NAME` takes its newest calibration",
+        "tool",
+        option="--tool-name",
+        reject=rules.reject_empty,
+    )
     cylinders_mm: Rows = entry(
         "[from, to, diameter] along the flange z axis from the flange face; [from, to, diameter, x, y] puts the axis "
         "aside; measure cables, cameras and screws too",
@@ -159,6 +171,17 @@ class SiteConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class StoreConfig:
+    """The store of results and verifications, an index of run folders."""
+
+    url: str | None = entry(
+        "of the database, such as sqlite:////data/store.sqlite; a file in the user's data folder if it is not set",
+        None,
+        reject=rules.reject_store,
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class CellConfig:
     """Everything that is configured."""
 
@@ -168,12 +191,16 @@ class CellConfig:
     workcell: WorkcellConfig = field(default_factory=WorkcellConfig)
     sampling: Sampling = field(default_factory=SamplingConfig)
     site: SiteConfig = field(default_factory=SiteConfig)
+    store: StoreConfig = field(default_factory=StoreConfig)
     clock: Clock = field(default=REAL, compare=False, repr=False)
     """Times everything in the cell; an emulated cell has its own. It is in no file."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the sections as files have them."""
-        return {name: asdict(getattr(self, name)) for name in SECTIONS}
+        """Return the sections as files have them; a password in the store's address is left out."""
+        found = {name: asdict(getattr(self, name)) for name in SECTIONS}
+        if self.store.url is not None:
+            found["store"]["url"] = re.sub(r"(://[^:/@]*):[^/]*@", r"\1@", self.store.url)
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +223,7 @@ SECTIONS: Mapping[str, Any] = {
     "workcell": WorkcellConfig,
     "sampling": SamplingConfig,
     "site": SiteConfig,
+    "store": StoreConfig,
 }
 _KEYS = {f"{name}.{item.name}": item for name, kind in SECTIONS.items() for item in fields(kind)}
 

@@ -112,6 +112,7 @@ def unless(fits: Callable[[Any], bool], fix: str) -> Reject:
 reject_empty = unless(lambda text: bool(text.strip()), "it is empty, give one or leave it out")
 reject_sign = unless({-1, 1}.__contains__, "give 1, or -1 for a sensor that reports the reaction")
 reject_height = unless(lambda mm: not 0 < mm < 1, "is it mm? Give the height in mm, such as 33, or 0")
+reject_store = unless(lambda url: "://" in url, "it is no address, give one such as sqlite:////data/store.sqlite")
 reject_record = unless(lambda s: s == 0 or s >= 3, "give 3 or more, or 0 for none: a shorter record is of no use")
 
 

@@ -4,7 +4,7 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
+from types import EllipsisType, MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -451,10 +451,13 @@ class Belonging:
     """Devices of the same model where a serial number is unknown."""
 
 
-def belonging(result: CalibrationResult, connected: Mapping[str, DeviceInfo]) -> Belonging:
+def belonging(
+    result: CalibrationResult, connected: Mapping[str, DeviceInfo], mount: str | EllipsisType | None = ...
+) -> Belonging:
     """Compare the devices of a calibration with the connected ones, by role.
 
-    Serial numbers decide where both sides have one; elsewhere another model is another device.
+    Serial numbers decide where both sides have one; elsewhere another model is another device. The label `mount` of the
+    mounting, None without one, must be the same; it is not compared if it is left out, or if the file is older.
     """
     made_with = result.provenance.get("devices")
     others, unknown = [], []
@@ -471,13 +474,19 @@ def belonging(result: CalibrationResult, connected: Mapping[str, DeviceInfo]) ->
             which = "it was made with" if serial == NOT_REPORTED else "connected"
             why = f"the {role} {which} reports no serial number"
             unknown.append(f"whether the calibration is of this {role} cannot be checked: {why}")
+    setup = result.provenance.get("setup")
+    if mount is not ... and isinstance(setup, Mapping) and setup.get("mount", mount) != mount:
+        made_as, now = (f"[sensor] mount = {one!r}" if one else "no [sensor] mount" for one in (setup["mount"], mount))
+        others.append(f"the calibration was made with {made_as}, but {now} is configured")
     return Belonging(tuple(others), tuple(unknown))
 
 
-def check_calibration(result: CalibrationResult, connected: Mapping[str, DeviceInfo]) -> Check:
-    """Check that a calibration belongs to the connected devices."""
+def check_calibration(
+    result: CalibrationResult, connected: Mapping[str, DeviceInfo], mount: str | EllipsisType | None = ...
+) -> Check:
+    """Check that a calibration belongs to the connected devices, and as `belonging` does to the mounting."""
     name = "calibration.devices"
-    belongs = belonging(result, connected)
+    belongs = belonging(result, connected, mount)
     if belongs.others:
         return Check(name, "failed", "; ".join(belongs.others), "ftdrive calibrate")
     created = result.provenance.get("created_utc")

@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import CELL, FILE, FOLDER, NewFile, rows, runs, simulate, stop_unless_accepted, write_json
+from ftdrive.commands.common import (
+    CELL,
+    FILE,
+    FOLDER,
+    NewFile,
+    index_run,
+    rows,
+    runs,
+    simulate,
+    stop_unless_accepted,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from ftdrive.cell.config import CellConfig
@@ -140,6 +151,7 @@ def calibrate(
     if outcome is None:
         talk.print("Dry run: nothing has moved.")
         return
+    index_run(outcome.run.folder, None if simulate else cell)
     if as_json:
         write_json(_as_json(outcome))
     else:

@@ -29,13 +29,6 @@ def runs(words: str = "Parent folder of the new run folder.") -> Callable[[F], F
     return click.option("--runs", type=folder, default=Path("runs"), show_default=True, help=words)
 
 
-CALIBRATION = click.option(
-    "--calibration",
-    "path",
-    metavar="PATH",
-    type=click.Path(exists=True, path_type=Path),
-    help="A calibration.json or its run folder. With --simulate the default is a new one.",
-)
 CONFIG = click.option("--config", type=FILE, help="TOML file that describes the cell, instead of ./ftdrive.toml.")
 
 
@@ -44,6 +37,20 @@ def CELL(command: F) -> F:
     sensor_help = "Address, such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0."
     command = click.option("--sensor", metavar="URL", help=sensor_help)(command)
     return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller.")(command))
+
+
+def CALIBRATION(command: F) -> F:
+    """Add the options --calibration, --tool and --force, which `open_source` takes."""
+    path = click.option(
+        "--calibration",
+        "path",
+        metavar="PATH",
+        type=click.Path(exists=True, path_type=Path),
+        help="A calibration.json or its run folder. With --simulate the default is a new one.",
+    )
+    tool = click.option("--tool", metavar="NAME", help="Newest accepted calibration of this tool on this cell.")
+    force = click.option("--force", is_flag=True, help="Apply a calibration of another arm, sensor or mount.")
+    return path(tool(force(command)))
 
 
 class Number(click.FloatRange):
@@ -152,6 +159,30 @@ def read_frame(axes: "Axes", about: str) -> "WrenchFrame":
 def write_json(value: Mapping[str, Any]) -> None:
     """Write one JSON object to stdout, on one line."""
     click.echo(json.dumps(value))
+
+
+def index_run(folder: Path, cell: "CellConfig | None" = None) -> None:
+    """Add a run to the store, and the runs beside it that it lacks; if that fails, print one sentence.
+
+    The run folder is complete without the store, and the next call adds it. Without a real cell the store is that of
+    environment and files.
+    """
+    from ftdrive.errors import BadStore, ConfigError
+    from ftdrive.store.store import Store
+    from ftdrive.terminal.console import talk
+
+    try:
+        Store(store_url() if cell is None else cell.store.url).index(folder.resolve().parent)
+    except (BadStore, ConfigError, OSError) as error:
+        talk.print(f" The run is saved but not in the history yet, because {error}.")
+
+
+def store_url(config: Path | None = None) -> str | None:
+    """Return [store] url from environment and files; None is the user's store."""
+    from ftdrive.cell.config import settings
+
+    url: str | None = settings(config)["store.url"].value
+    return url
 
 
 def read_cell(config: Path | None, robot: str | None, sensor: str | None, *, model: str | None = None) -> "CellConfig":

@@ -98,7 +98,7 @@ def doctor(
             connected = {"sensor": device.identify()} if alive else {}
             if arm is not None:
                 connected["arm"] = arm.identify()
-            found.append(devices.check_calibration(calibration, connected))
+            found.append(devices.check_calibration(calibration, connected, cell.sensor.mount))
         if push:
             R_flange_sensor = None if calibration is None else calibration.R_flange_sensor
             if station is not None and calibration is None:

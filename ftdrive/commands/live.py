@@ -64,6 +64,8 @@ _RECOVER_S = 10.0
 @JSON
 def live(
     path: Path | None,
+    tool: str | None,
+    force: bool,
     config: Path | None,
     robot: str | None,
     sensor: str | None,
@@ -84,6 +86,8 @@ def live(
     check_simulate(simulate, real={"--config": config, "--robot": robot, "--replay": replay})
     if speed is not None and replay is None:
         raise ConfigError("--speed goes only with --replay: add it, or leave --speed out")
+    if replay is not None and (tool or force):
+        raise ConfigError(f"{'--tool' if tool else '--force'} does not go with --replay: leave one of the two out")
     frame = read_frame(axes, about)
     with ExitStack() as stack:
         stream: CompensatedStream | ReplayedStream
@@ -92,7 +96,9 @@ def live(
         if replay is not None:
             stream = _replayed(replay, path, frame, speed=1.0 if speed is None else speed)
         else:
-            stream, cell = open_source(path, config, robot, sensor, simulate=simulate, frame=frame, stack=stack)
+            stream, cell = open_source(
+                path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
+            )
             checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, cell.sensor.mass_kg)]
             recorder = partial(_recorder, stream.info, cell.to_dict())
         if once or as_json:

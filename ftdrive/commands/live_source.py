@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 from calib import CalibrationResult
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import Station, sensor_name
-from ftdrive.commands.common import read_cell, stop_unless_accepted
+from ftdrive.commands.common import check_simulate, read_cell, stop_unless_accepted
 from ftdrive.commands.emulated_run import rehearse
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import WrenchFrame
@@ -17,10 +17,12 @@ from ftdrive.terminal.console import talk
 
 def open_source(
     path: Path | None,
+    tool: str | None,
     config: Path | None,
     robot: str | None,
     sensor: str | None,
     *,
+    force: bool,
     simulate: bool,
     frame: WrenchFrame,
     stack: ExitStack,
@@ -31,18 +33,28 @@ def open_source(
     ----------
     path : Path, optional
         A calibration.json or its run folder. Only an emulated cell needs none: it is calibrated first.
+    tool : str, optional
+        Instead of `path`, on a real cell: the newest accepted calibration of this tool.
     config, robot, sensor
         As `read_cell` takes them.
+    force : bool
+        Apply a calibration of another arm, sensor or mount.
     """
+    check_simulate(simulate, real={"--tool": tool})
+    if path is not None and tool is not None:
+        raise ConfigError("--calibration and --tool exclude one another: leave one of them out")
     calibration = None if path is None else load_calibration(path)
     if simulate:
         calibration, cell = _emulated(calibration, sensor, stack)
-    elif calibration is None:
-        raise ConfigError("no calibration: give --calibration PATH, or --simulate")
+    elif calibration is None and tool is None:
+        raise ConfigError("no calibration: give --calibration PATH or --tool NAME, or --simulate")
     else:
         cell = read_cell(config, robot, sensor)
+    chosen = calibration if calibration is not None else str(tool)
     name = "temporary calibration" if path is None else str(path)
-    stream = stack.enter_context(CompensatedStream(cell, calibration, name=name, frame=frame))
+    stream = stack.enter_context(CompensatedStream(cell, chosen, name=name, frame=frame, force=force))
+    if tool is not None:
+        talk.print(f" {tool}: {stream.info.calibration_name}")
     for words in stream.warnings:
         talk.print(f" {words}")
     return stream, cell

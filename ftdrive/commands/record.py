@@ -65,6 +65,8 @@ def record(
     duration_s: float | None,
     count: int | None,
     path: Path | None,
+    tool: str | None,
+    force: bool,
     config: Path | None,
     robot: str | None,
     sensor: str | None,
@@ -87,7 +89,9 @@ def record(
     require_new_recordings(paths)
     frame = read_frame(axes, about)
     with ExitStack() as stack:
-        stream, cell = open_source(path, config, robot, sensor, simulate=simulate, frame=frame, stack=stack)
+        stream, cell = open_source(
+            path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
+        )
         recorder = Recorder(paths, stream.info, cell.to_dict())
         talk.print(f" Recording at {stream.info.sensor_rate_Hz:.0f} Hz, {frame}. Ctrl-C ends.")
         try:

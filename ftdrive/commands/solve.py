@@ -26,6 +26,7 @@ from ftdrive.commands.common import (
     NewFile,
     Number,
     check_simulate,
+    index_run,
     numbers,
     simulate,
     stop_unless_accepted,
@@ -109,6 +110,8 @@ def solve(
     options = {"drift": drift, "known": _known(mass_kg, level_deg, mounting_deg)}
     with rehearsed_run(sensor) if simulate else nullcontext() as run:
         _solve_each(sources if run is None else [run], method, orientation, options, output, force, as_json)
+    if output is not None and sources and sources[0].is_dir():
+        index_run(sources[0])  # the result, if it was saved in the run
 
 
 def _solve_each(

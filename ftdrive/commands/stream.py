@@ -36,6 +36,8 @@ RECOVER_S = 10.0
 @click.option("--udp", metavar="HOST:PORT", help="Also send JSON to a PlotJuggler before 3.16, which listens on 9870.")
 def stream(
     path: Path | None,
+    tool: str | None,
+    force: bool,
     config: Path | None,
     robot: str | None,
     sensor: str | None,
@@ -58,7 +60,9 @@ def stream(
     frame = read_frame(axes, about)
     udp_address = None if udp is None else _address(udp)
     with ExitStack() as stack:
-        source, _ = open_source(path, config, robot, sensor, simulate=simulate, frame=frame, stack=stack)
+        source, _ = open_source(
+            path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
+        )
         server = stack.enter_context(closing(FoxgloveServer(source, host, port)))
         sinks: list[FoxgloveServer | UdpSender] = [server]
         if udp_address is not None:

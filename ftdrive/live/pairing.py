@@ -239,6 +239,12 @@ class Pairing:
         """One standard deviation; 0 if the delay is configured."""
         return self._estimator.sigma_s if self._estimator else 0.0
 
+    def use(self, estimator: DelayEstimator) -> None:
+        """Estimate with another calibration from now on, and keep the delay; a configured delay stays."""
+        if self._estimator is not None:
+            estimator.delay_s, estimator.sigma_s = self._estimator.delay_s, self._estimator.sigma_s
+            self._estimator = estimator
+
     @property
     def waits_for_pose(self) -> bool:
         """Whether there are samples without a pose, which are too new to extrapolate it."""

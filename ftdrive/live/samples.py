@@ -199,6 +199,7 @@ EventKind = Literal[
     "delay",
     "stale",
     "recovered",
+    "tool",
     "mark",
 ]
 
@@ -216,7 +217,7 @@ class StreamEvent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreamInfo:
-    """What does not change while a stream runs; every file and every client gets it."""
+    """What does not change while a stream runs with one calibration; every file and every client gets it."""
 
     calibration: CalibrationResult
     calibration_name: str

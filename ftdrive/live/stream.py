@@ -4,6 +4,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn, Self
 
@@ -27,6 +28,7 @@ from ftdrive.live.samples import (
     LinkStatus,
     Sample,
     Stages,
+    StreamEvent,
     StreamInfo,
     StreamStatus,
     WrenchFrame,
@@ -56,10 +58,12 @@ class CompensatedStream(ProcessedStream):
     Parameters
     ----------
     cell : CellConfig
-    calibration : CalibrationResult
-        Of these devices.
+    calibration : CalibrationResult or str
+        Of these devices, or the name of a tool: its newest accepted calibration is looked up on entry.
     name : str
         Of the calibration, such as its path.
+    force : bool
+        Warn instead of raising an error if the calibration is of another arm, sensor or mount.
     frame : WrenchFrame
         Axes and reference point; may be set at any time.
     stages : Stages
@@ -70,7 +74,8 @@ class CompensatedStream(ProcessedStream):
     Raises
     ------
     ConfigError
-        On entry: the calibration is of another arm or sensor, or the frame needs what is not configured.
+        On entry: the calibration is of another arm, sensor or mount, the tool has none, or the frame needs what is
+        not configured.
     ConnectError
         On entry: a device does not answer.
     """
@@ -78,17 +83,19 @@ class CompensatedStream(ProcessedStream):
     def __init__(
         self,
         cell: CellConfig,
-        calibration: CalibrationResult,
+        calibration: CalibrationResult | str,
         *,
         name: str = "",
+        force: bool = False,
         frame: WrenchFrame = SENSOR_FRAME,
         stages: Stages = STANDARD,
         false_alarm_rate: float = FALSE_ALARM_RATE,
     ) -> None:
         self._cell = cell
         self.clock: Clock = cell.clock
-        self._calibration = calibration
+        self._wanted = calibration
         self._name = name
+        self._force = force
         self._begin = frame, stages, false_alarm_rate
         self._stack = ExitStack()
         self._follows: ExitStack | None = None
@@ -106,11 +113,8 @@ class CompensatedStream(ProcessedStream):
             self._arm = stack.enter_context(closing(build_arm(self._cell)))
             self._arm.open()
             arm, sensor = self._arm.identify(), self._sensor.identify()
-            belongs = belonging(self._calibration, {"arm": arm, "sensor": sensor})
-            if belongs.others:
-                raise ConfigError(f"{belongs.others[0]}: calibrate this cell")
-            self.warnings = belongs.unknown
-            """What could not be checked about the calibration."""
+            self._calibration, self._name, self.warnings = self._chosen(arm, sensor)
+            """What is doubtful about the calibration, and what could not be checked."""
             stack.callback(self._unfollow)
             self._follow()
             samples, states = self._first_samples()
@@ -138,6 +142,21 @@ class CompensatedStream(ProcessedStream):
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
+    def _chosen(self, arm: DeviceInfo, sensor: DeviceInfo) -> tuple[CalibrationResult, str, tuple[str, ...]]:
+        """Return the calibration, its name and warnings; it belongs to the devices and their mounting."""
+        calibration, name, warnings = self._wanted, self._name, tuple[str, ...]()
+        mount = self._cell.sensor.mount
+        if isinstance(calibration, str):
+            from ftdrive.store.tools import calibration_of_tool
+
+            url = self._cell.store.url
+            tool = calibration_of_tool(calibration, arm, sensor, mount, url=url, force=self._force)
+            calibration, name, warnings = tool.calibration, str(tool.path), tool.warnings
+        belongs = belonging(calibration, {"arm": arm, "sensor": sensor}, mount)
+        if belongs.others and not self._force:
+            raise ConfigError(f"{belongs.others[0]}: calibrate this cell, or apply it all the same with --force")
+        return calibration, name, (*warnings, *belongs.others, *belongs.unknown)
+
     def _described(
         self, arm: DeviceInfo, sensor: DeviceInfo, sensor_rate_Hz: float, arm_rate_Hz: float, status: ArmStatus
     ) -> StreamInfo:
@@ -147,7 +166,7 @@ class CompensatedStream(ProcessedStream):
             calibration_name=self._name,
             arm=arm,
             sensor=sensor,
-            tool=self._cell.tool.name,
+            tool=self._wanted if isinstance(self._wanted, str) else self._cell.tool.name,
             utc_offset_ns=time.time_ns() - self.clock.now_ns(),  # the anchor of all times in files
             sensor_rate_Hz=sensor_rate_Hz,
             arm_rate_Hz=arm_rate_Hz,
@@ -156,6 +175,34 @@ class CompensatedStream(ProcessedStream):
             p_flange_tcp_m=tcp[:3],
             versions=versions(),
         )
+
+    def use_tool(self, name: str) -> StreamEvent:
+        """Continue with the newest accepted calibration of another tool, after a change of tools.
+
+        The devices stay open. Noise, contact, tares and drift begin again; the delay is kept. Call it between two
+        reads, and open new recorders and servers: each keeps the calibration with which it was opened.
+
+        Raises
+        ------
+        ConfigError
+            There is no such calibration. The stream continues with the one it has.
+        """
+        before, self._wanted = self._wanted, name
+        try:
+            self._calibration, self._name, self.warnings = self._chosen(self.info.arm, self.info.sensor)
+        except ConfigError:
+            self._wanted = before
+            raise
+        old, self.info = (
+            self._processor,
+            replace(self.info, calibration=self._calibration, calibration_name=self._name, tool=name),
+        )
+        self._processor = Processor(self.info, old.frame, old.stages, false_alarm_rate=self._begin[2])
+        for event in old.take_events():
+            self._processor.note(event.kind, event.text, event.values, event.t_host_ns)
+        self._pairing.use(DelayEstimator(self._calibration, self.info.p_flange_sensor_m))
+        values = {"tool": name, "calibration": self._calibration.id}
+        return self._processor.note("tool", f"tool {name}, calibration {self._name}", values, self.clock.now_ns())
 
     # -------------------------------------------------------------------------------------------------------- reading
 
@@ -300,8 +347,10 @@ def open_stream(
     config: Path | CellConfig | None = None,
     calibration: Path | str | CalibrationResult | None = None,
     *,
+    tool: str | None = None,
     frame: WrenchFrame = SENSOR_FRAME,
     stages: Stages = STANDARD,
+    force: bool = False,
 ) -> CompensatedStream:
     """Return the stream of a cell, for use with `with`.
 
@@ -311,13 +360,18 @@ def open_stream(
         A configuration file instead of ./ftdrive.toml, or the cell itself.
     calibration : Path, str or CalibrationResult
         A calibration.json or its run folder.
+    tool : str
+        Instead of `calibration`: the newest accepted one of this tool on the devices and mount of the cell, from the
+        store and from the run folders in ./runs. `CompensatedStream.use_tool` switches to another one.
     frame : WrenchFrame
     stages : Stages
+    force : bool
+        Apply a calibration of another arm, sensor or mount, with a warning in `CompensatedStream.warnings`.
 
     Raises
     ------
     ConfigError
-        The configuration cannot be used, or there is no calibration.
+        The configuration cannot be used, or there is not one of calibration and tool.
     BadCalibration, OSError
         The calibration cannot be read.
 
@@ -327,14 +381,16 @@ def open_stream(
     ...     for sample in stream:
     ...         print(sample.t_s, sample.force_N, sample.torque_Nm, sample.frame)
     """
-    if calibration is None:
-        raise ConfigError("no calibration: give the path of a calibration.json or of its run folder")
+    if (calibration is None) == (tool is None):
+        found = "no calibration" if tool is None else "both a calibration and a tool"
+        raise ConfigError(f"{found}: give the path of a calibration.json or of its run folder, or the name of a tool")
     cell = config if isinstance(config, CellConfig) else load(config)
+    if tool is not None:
+        return CompensatedStream(cell, tool, frame=frame, stages=stages, force=force)
     if isinstance(calibration, CalibrationResult):
-        return CompensatedStream(cell, calibration, frame=frame, stages=stages)
-    return CompensatedStream(
-        cell, load_calibration(Path(calibration)), name=str(calibration), frame=frame, stages=stages
-    )
+        return CompensatedStream(cell, calibration, frame=frame, stages=stages, force=force)
+    path = Path(str(calibration))
+    return CompensatedStream(cell, load_calibration(path), name=str(path), frame=frame, stages=stages, force=force)
 
 
 def load_calibration(path: Path) -> CalibrationResult:

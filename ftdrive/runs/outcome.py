@@ -63,7 +63,7 @@ def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationData
 
 
 def _setup(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what `checks.controller_settings` compares a result with, among it the payload last reported."""
+    """Return what a result is bound to or compared with: payload last reported, tool, mount label and mounting."""
     payload_kg = None
     for event in run.events():
         if event.get("event") == "weighed":
@@ -72,4 +72,6 @@ def _setup(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
         "payload_kg": payload_kg,
         "sensor_mass_kg": config.get("sensor", {}).get("mass_kg"),
         "mounting": config.get("workcell", {}).get("mounting"),
+        "tool": config.get("tool", {}).get("name"),
+        "mount": config.get("sensor", {}).get("mount"),
     }

@@ -64,7 +64,7 @@ def test_help_imports_nothing_heavy_and_opens_nothing() -> None:
         "sys.argv = ['ftdrive', '--help']\n"
         "from ftdrive.cli import main\n"
         "main()\n"
-        "heavy = {'numpy', 'scipy', 'rich', 'can', 'serial', 'rtde_control'} & sys.modules.keys()\n"
+        "heavy = {'numpy', 'scipy', 'rich', 'can', 'serial', 'rtde_control', 'sqlalchemy'} & sys.modules.keys()\n"
         "sys.exit(f'help imports {heavy}' if heavy else 0)\n"
     )
     outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

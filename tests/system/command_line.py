@@ -28,7 +28,11 @@ class CommandLine:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._environment = {"COLUMNS": "200", "XDG_STATE_HOME": str(folder / "state")}
+        self._environment = {
+            "COLUMNS": "200",
+            "XDG_STATE_HOME": str(folder / "state"),
+            "XDG_DATA_HOME": str(folder / "data"),
+        }
         self._started: list[subprocess.Popen[str]] = []
 
     def connect(self, station: Station) -> Path:

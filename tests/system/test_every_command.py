@@ -41,7 +41,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
 }
 """What a command cannot do without; any other must work with --simulate and --json alone."""
 
-OFFLINE = ("convert", "compensate")
+OFFLINE = ("convert", "compensate", "history", "diff")
 """They read files and know no cell."""
 
 REHEARSED = ("replay", "solve")

@@ -279,3 +279,14 @@ def test_a_relative_folder_of_the_user_does_not_count(monkeypatch: pytest.Monkey
     monkeypatch.setenv("XDG_CONFIG_HOME", "relative")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert user_file() == tmp_path / ".config" / "ftdrive" / "ftdrive.toml"
+
+
+def test_a_password_of_the_store_reaches_no_file() -> None:
+    """What runs and recordings keep of the configuration."""
+    Path("ftdrive.toml").write_text(GOOD + '[store]\nurl = "postgresql+psycopg://lab:p@ss:w@host:5432/cells"\n')
+    found = load()
+    assert found.store.url == "postgresql+psycopg://lab:p@ss:w@host:5432/cells"
+    assert found.to_dict()["store"] == {"url": "postgresql+psycopg://lab@host:5432/cells"}
+    Path("ftdrive.toml").write_text(GOOD + '[store]\nurl = "store.sqlite"\n')
+    with pytest.raises(ConfigError, match=r"\[store\] url = 'store.sqlite' cannot be used"):
+        load()

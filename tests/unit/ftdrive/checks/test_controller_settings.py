@@ -228,4 +228,5 @@ def test_a_payload_that_was_corrected_before_the_run_goes_on_is_no_longer_report
     assert again is not None
     assert not any("payload" in one for one in hints(again.result, again.run.records()))
     saved = json.loads(run.calibration_path.read_text())
-    assert saved["provenance"]["setup"] == {"payload_kg": 1.3, "sensor_mass_kg": None, "mounting": "floor"}
+    expected = {"payload_kg": 1.3, "sensor_mass_kg": None, "mounting": "floor"}
+    assert expected.items() <= saved["provenance"]["setup"].items()

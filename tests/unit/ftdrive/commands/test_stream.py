@@ -145,4 +145,4 @@ def test_a_wrong_udp_address_is_refused_before_any_work(
 def test_a_calibration_is_needed() -> None:
     outcome = CliRunner().invoke(stream.stream, [])
     assert isinstance(outcome.exception, ConfigError)
-    assert "give --calibration PATH, or --simulate" in str(outcome.exception)
+    assert "give --calibration PATH or --tool NAME, or --simulate" in str(outcome.exception)

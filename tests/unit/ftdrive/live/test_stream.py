@@ -4,6 +4,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -193,6 +194,70 @@ def test_a_calibration_of_another_sensor_is_refused(cell: Cell) -> None:
     cell.calibration = replace(cell.calibration, provenance=made_with)
     with pytest.raises(ConfigError, match="S2"), cell.stream():
         pass
+
+
+def test_a_calibration_of_another_sensor_or_mount_is_applied_if_forced(cell: Cell) -> None:
+    made_with = {"devices": {"sensor": {"model": "model", "serial": "S2"}}, "setup": {"mount": "adapter-a"}}
+    cell.calibration = replace(cell.calibration, provenance=made_with)
+    with cell.stream(force=True) as stream:
+        assert len(stream.read())
+    assert "the sensor S2" in stream.warnings[0]
+    assert "[sensor] mount = 'adapter-a', but no [sensor] mount is configured" in stream.warnings[1]
+    cell.calibration = replace(cell.calibration, provenance={"setup": {"mount": "adapter-a"}})
+    with pytest.raises(ConfigError, match=r"adapter-a.*--force"), cell.stream():
+        pass
+    cell.config = replace(cell.config, sensor=replace(cell.config.sensor, mount="adapter-a"))
+    with cell.stream():
+        pass
+
+
+@pytest.fixture
+def tools(cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cell:
+    """A cell with the tool that hangs on it, and an empty flange with another bias."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    devices = {role: {"model": "model", "serial": "serial"} for role in ("arm", "sensor")}
+    for day, (tool, bias_N) in enumerate({"gripper": 0.0, "drill": 7.0}.items()):
+        parameters = cell.calibration.parameters.moved(np.eye(15)[6] * bias_N)
+        provenance = {"devices": devices, "setup": {"tool": tool}, "created_utc": f"2026-01-0{day + 1}T00:00:00+00:00"}
+        folder = tmp_path / "runs" / tool
+        folder.mkdir(parents=True)
+        (folder / "run.json").write_text("{}")
+        replace(cell.calibration, parameters=parameters, provenance=provenance).save(folder / "calibration.json")
+    return cell
+
+
+def test_a_stream_is_opened_by_the_name_of_a_tool(tools: Cell) -> None:
+    with open_stream(tools.config, tool="drill") as stream:
+        assert stream.info.tool == "drill"
+        assert stream.info.calibration_name.endswith("runs/drill/calibration.json")
+        assert stream.read().wrench[:, 0].mean() == pytest.approx(-7.0, abs=1.0)
+    with pytest.raises(ConfigError, match=r"'welder'.*drill, gripper"), open_stream(tools.config, tool="welder"):
+        pass
+    with pytest.raises(ConfigError, match="both a calibration and a tool"):
+        open_stream(tools.config, tools.calibration, tool="drill")
+
+
+def test_the_tool_is_switched_while_the_devices_stay_open(tools: Cell) -> None:
+    tools.sensor.motion = tools.arm.motion = Motion()
+    with open_stream(tools.config, tool="drill", frame=WrenchFrame("base"), stages=Stages(lowpass_Hz=200.0)) as stream:
+        until(stream, lambda: stream.status().delay_sigma_s < 1e-3)
+        before, sigma_s = stream.read(), stream.status().delay_sigma_s
+        stream.mark("tool changed")
+        event = stream.use_tool("gripper")
+        after = stream.read()
+        assert stream.status().delay_sigma_s == sigma_s
+        assert [one.kind for one in stream.take_events() if one.kind != "contact"] == ["mark", "tool"]
+        with pytest.raises(ConfigError, match="'welder'"):
+            stream.use_tool("welder")
+        assert stream.info.tool == "gripper"
+        assert len(stream.read())
+    assert event.values == {"tool": "gripper", "calibration": tools.calibration.id}
+    assert after.seq[0] == before.seq[-1] + 1
+    assert (after.frame, after.stages) == (before.frame, before.stages)
+    change = after.wrench[0, :3] - before.wrench[-1, :3]  # the tool moves on, but not far
+    assert np.linalg.norm(change) == pytest.approx(7.0, abs=0.5)
+    assert (tools.sensor.opened, tools.arm.opened) == (1, 1)
 
 
 def test_a_device_that_sends_nothing_is_named(cell: Cell) -> None:

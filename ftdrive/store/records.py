@@ -1,0 +1,214 @@
+"""What the store keeps of a run folder, read from its files."""
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib import CalibrationResult
+from calib.errors import BadDataset, CalibError
+from calib.files import JSON, read_object
+from calib.model import Array, Parameters
+from ftdrive.runs.run import Run
+
+VERIFICATION = "ftdrive.verification/1"
+
+_NUMBERS = tuple(field.name for field in fields(Parameters))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredResult:
+    """One calibration; what its file does not say is None."""
+
+    id: str
+    """`CalibrationResult.id`."""
+    path: str
+    """The calibration file."""
+    run: str
+    """Name of its run folder."""
+    created_utc: str | None
+    """As ISO 8601 with microseconds, so that texts sort as times."""
+    tool: str | None
+    arm_serial: str | None
+    sensor_serial: str | None
+    mount: str | None
+    verdict: str
+    n_poses: int
+    mass_kg: float
+    g_m_s2: float
+    numbers: dict[str, JSON]
+    """The fields of `Parameters` and `covariance`, as in the file."""
+    dataset_sha256: str | None
+    parent: str | None
+    """Id of the calibration that this one updates."""
+    update: str | None
+    """What was updated, such as "bias"."""
+    temperature_C: float | None
+    """Of the sensor, where a device reports it."""
+
+    @property
+    def parameters(self) -> Parameters:
+        """Estimates; with `covariance` they make a `calib.extras.update.Calibrated`."""
+        return Parameters(**{name: np.array(self.numbers[name]) for name in _NUMBERS})
+
+    @property
+    def covariance(self) -> Array:
+        """(15, 15) of the error coordinates `calib.model.PARAMETER_NAMES`."""
+        return np.array(self.numbers["covariance"], dtype=np.float64)
+
+    @property
+    def mass_sigma_kg(self) -> float:
+        """One standard deviation of the mass, without the sensor's gain, which all results of a sensor share."""
+        return mass_sigma_kg(self.parameters, self.covariance, self.g_m_s2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredVerification:
+    """One verification of a calibration."""
+
+    id: str
+    """12 hex digits of the SHA-256 of its file."""
+    path: str
+    run: str
+    calibration_id: str
+    created_utc: str | None
+    passed: bool
+    change: str | None
+    """What has changed since the calibration, such as "bias"."""
+    reason: str | None
+    temperature_C: float | None
+
+
+Record = StoredResult | StoredVerification
+
+
+def mass_sigma_kg(parameters: Parameters, covariance: Array, g_m_s2: float) -> float:
+    """Return one standard deviation of the mass from the covariance (15, 15) alone."""
+    force = parameters.gravity_force_base_N
+    down = force / (np.linalg.norm(force) or 1.0)
+    return float(np.sqrt(np.maximum(down @ covariance[3:6, 3:6] @ down, 0.0))) / g_m_s2
+
+
+def record_paths(folders: Iterable[Path]) -> list[Path]:
+    """Return the files that become records, of runs or of the runs in folders, each once and by name."""
+    runs = set[Path]()
+    for folder in (one.resolve() for one in folders):
+        if _is_run(folder):
+            runs.add(folder)
+        elif folder.is_dir():
+            runs.update(filter(_is_run, folder.iterdir()))
+    names = ("calibration*.json", "verification*.json")
+    return [path for run in sorted(runs) for name in names for path in sorted(run.glob(name))]
+
+
+def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
+    """Read files; the second list names those that were left out, each with the reason."""
+    records, unreadable = list[Record](), list[str]()
+    for path in paths:
+        try:
+            records.append(read_record(path))
+        except (CalibError, OSError) as error:
+            unreadable.append(f"{path}: {error}")
+    return records, tuple(unreadable)
+
+
+def _is_run(folder: Path) -> bool:
+    try:
+        return (folder / "run.json").is_file()
+    except OSError:  # a folder of another user
+        return False
+
+
+def read_record(path: Path) -> Record:
+    """Read one file of a run folder; fields that this version does not know are ignored.
+
+    Raises
+    ------
+    BadCalibration, BadDataset
+        The file is damaged or of another format.
+    OSError
+    """
+    return _verification(path) if path.name.startswith("verification") else _result(path)
+
+
+def _result(path: Path) -> StoredResult:
+    result = CalibrationResult.load(path)
+    header = _header(path.parent)
+    config = header.get("config", {})
+    provenance, run_devices = result.provenance, header.get("devices", {})
+    setup, devices = _object(provenance.get("setup")), _object(provenance.get("devices")) or run_devices
+    parent = provenance.get("parent")
+    return StoredResult(
+        id=result.id,
+        path=str(path),
+        run=path.parent.name,
+        created_utc=_utc(provenance.get("created_utc") or header.get("created_utc")),
+        tool=_text(setup.get("tool")) or _text(_object(config.get("tool")).get("name")),
+        arm_serial=_text(_object(devices.get("arm")).get("serial")),
+        sensor_serial=_text(_object(devices.get("sensor")).get("serial")),
+        mount=_text(setup["mount"] if "mount" in setup else _object(config.get("sensor")).get("mount")),
+        verdict=result.verdict,
+        n_poses=result.n_poses,
+        mass_kg=result.mass_kg,
+        g_m_s2=result.g_m_s2,
+        numbers={
+            **{name: getattr(result.parameters, name).tolist() for name in _NUMBERS},
+            "covariance": result.covariance.tolist(),
+        },
+        dataset_sha256=_text(provenance.get("dataset_sha256")),
+        parent=_text(_object(parent).get("id")) or _text(parent),
+        update=_text(provenance.get("update")),
+        temperature_C=_number(provenance.get("temperature_C")),
+    )
+
+
+def _verification(path: Path) -> StoredVerification:
+    document = read_object(path, BadDataset)
+    if document.get("format") != VERIFICATION:
+        raise BadDataset(f"{path.name} has format {document.get('format')!r}: this version reads {VERIFICATION}")
+    calibration_id, passed = _text(_object(document.get("calibration")).get("id")), document.get("passed")
+    if calibration_id is None or not isinstance(passed, bool):
+        raise BadDataset(f"{path.name} lacks the id of its calibration or the outcome: the file is damaged")
+    return StoredVerification(
+        id=hashlib.sha256(path.read_bytes()).hexdigest()[:12],
+        path=str(path),
+        run=path.parent.name,
+        calibration_id=calibration_id,
+        created_utc=_utc(document.get("created_utc")),
+        passed=passed,
+        change=_text(document.get("change")),
+        reason=_text(document.get("reason")),
+        temperature_C=_number(document.get("temperature_C")),
+    )
+
+
+def _header(run: Path) -> Mapping[str, Any]:
+    """Return run.json, or nothing if it is damaged: the calibration file alone suffices."""
+    try:
+        return dict(Run(run).header())
+    except (CalibError, OSError):
+        return {}
+
+
+def _object(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _text(value: Any) -> str | None:
+    return value if isinstance(value, str) and value else None
+
+
+def _number(value: Any) -> float | None:
+    usable = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+    return float(value) if usable else None
+
+
+def _utc(value: Any) -> str | None:
+    try:
+        return datetime.fromisoformat(value).astimezone(UTC).isoformat(timespec="microseconds")
+    except (TypeError, ValueError):
+        return None

@@ -1,0 +1,238 @@
+"""`history` and `diff` as commands, and the call with which other commands add their runs to the store."""
+
+import json
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib import CalibrationResult
+from ftdrive import cli
+from ftdrive.commands.common import index_run
+from ftdrive.runs.run import Run
+from ftdrive.session import session
+from ftdrive.store.store import Store, default_file
+from tests.unit.ftdrive.live.simulated import calibrated
+from tests.unit.ftdrive.store.run_folders import new_run, result, verified
+
+Ran = tuple[int, str, str]
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
+    """Run a command in an empty folder; return its exit code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+
+    def call(*arguments: str | Path) -> Ran:
+        code = cli.run([*map(str, arguments)])
+        out, err = capsys.readouterr()
+        return code, out, " ".join(err.split())
+
+    return call
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """Four results of one tool whose force bias drifts, one of another, and a failed verification."""
+    runs = tmp_path / "runs"
+    sigma = np.sqrt(np.diag(calibrated().covariance))
+    rng = np.random.default_rng(1)
+    for month in range(4):
+        step = rng.normal(size=15) * sigma + np.eye(15)[6] * 40 * month * sigma[6]
+        new_run(runs, f"gripper-{month}", result(30 * month, step))
+    new_run(runs, "drill", result(5, tool="drill"))
+    newest = CalibrationResult.load(runs / "gripper-3" / "calibration.json")
+    verified(new_run(runs, "verify"), newest.id, 91, passed=False)
+    return runs
+
+
+def test_the_list_names_results_trends_and_what_to_do(run: Callable[..., Ran], runs: Path) -> None:
+    assert "No results. `ftdrive calibrate`" in run("history")[2]
+    code, out, err = run("history", "--index", runs)
+    lines = out.splitlines()
+    assert (code, len(lines)) == (0, 6 + 4)
+    assert lines[0].split()[:3] == ["id", "date,", "UTC"]
+    assert "2026-03-01 00:00" in lines[1]
+    assert "drill" in lines[2]
+    assert "FAILED" in lines[5]
+    assert "ago, bias" in lines[5]
+    assert lines[6].startswith("trend: gripper, force bias: +")
+    assert "N per 30 days (1 sigma, 4 results), significant (p =" in lines[6]
+    assert "gripper: the newest calibration" in err
+    assert "failed its last verification (the force bias has changed by 0.5 N): calibrate again" in err
+    assert run("history")[:2] == run("history", runs)[:2]  # the same from the store and from the folders
+    assert len(run("history", "--tool", "drill")[1].splitlines()) == 2
+
+
+def test_as_json_it_is_one_object(run: Callable[..., Ran], runs: Path) -> None:
+    found = json.loads(run("history", "--index", runs, "--json")[1])
+    assert found["store"] == str(default_file())
+    assert [one["run"] for one in found["results"]] == ["gripper-0", "drill", "gripper-1", "gripper-2", "gripper-3"]
+    last = found["results"][-1]
+    truth = CalibrationResult.load(Path(last["path"]))
+    assert last["force_bias_N"] == truth.force_bias_N.tolist()
+    assert last["bias_sigma"]["torque_Nm"] == truth.sigma["torque_bias_Nm"].tolist()  # type: ignore[union-attr]
+    assert last["last_verification"]["change"] == "bias"
+    assert found["results"][0]["last_verification"] is None
+    assert {trend["quantity"]: trend["significant"] for trend in found["trends"]}["force bias"]
+    assert json.loads(run("history", runs, "--json")[1])["store"] is None
+
+
+def test_rebuilt_a_deleted_run_is_gone_and_a_damaged_one_is_named(run: Callable[..., Ran], runs: Path) -> None:
+    run("history", "--index", runs)
+    (runs / "gripper-0" / "calibration.json").write_text("{")
+    (runs / "drill" / "calibration.json").unlink()
+    code, out, err = run("history", "--rebuild")
+    assert (code, len(out.splitlines())) == (
+        0,
+        5 + 4,
+    )  # the damaged one is still there, and no reason to forget its result
+    assert "left out: " in err
+    assert "gripper-0/calibration.json" in err
+    assert run("history", runs, "--rebuild")[0] == 2
+
+
+def test_a_store_that_cannot_be_used_is_one_sentence(
+    run: Callable[..., Ran], runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Store().index(runs)
+    with sqlite3.connect(default_file()) as connection:
+        connection.execute("UPDATE ftdrive_schema SET version = 2")
+    connection.close()
+    for arguments in (["history"], ["history", "--index", runs], ["diff", "abcd", "abcd"]):
+        code, out, err = run(*arguments)
+        assert (code, out) == (6, "")
+        assert "has version 2, this ftdrive uses version 1: install a newer ftdrive" in err
+    monkeypatch.setenv("FTDRIVE_STORE_URL", "mysql://host/db")
+    code, _, err = run("history")
+    assert (code, "begins with mysql" in err) == (2, True)
+
+
+def test_two_calibrations_are_compared_by_file_run_and_id(run: Callable[..., Ran], runs: Path) -> None:
+    Store().index(runs)
+    first, second = (CalibrationResult.load(runs / f"gripper-{n}" / "calibration.json") for n in (0, 3))
+    by_id = json.loads(run("diff", first.id, second.id[:5], "--json")[1])
+    by_path = json.loads(run("diff", runs / "gripper-0", runs / "gripper-3" / "calibration.json", "--json")[1])
+    assert by_id["joint"] == by_path["joint"]
+    assert by_id["joint"]["dof"] == 15
+    assert by_id["significant"] is True
+    assert by_id["groups"]["force_bias_N"]["p_value"] < 1e-6
+    (bias_x,) = (one for one in by_id["parameters"] if one["name"] == "force_bias_N.x")
+    assert bias_x["change"] == second.force_bias_N[0] - first.force_bias_N[0]
+    assert bias_x["in_sigmas"] == pytest.approx(120 / np.sqrt(2), rel=0.05)
+    code, out, _ = run("diff", first.id, second.id)
+    assert code == 0
+    assert out.splitlines()[-1].startswith("They differ significantly (chi2 ")
+    assert out.splitlines()[-1].endswith("): force bias.")
+    assert run("diff", first.id, first.id)[1].splitlines()[-1] == "The calibrations are the same."
+
+
+def test_a_result_whose_run_is_gone_is_compared_from_the_store(run: Callable[..., Ran], runs: Path) -> None:
+    Store().index(runs)
+    first, second = Store().results("gripper")[:2]
+    before = run("diff", first.id, second.id)
+    (runs / "gripper-0" / "calibration.json").unlink()
+    assert run("diff", first.id, second.id) == before
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "words"),
+    [
+        ("nothing", 2, "neither a file nor an id"),
+        ("abc", 2, "4 digits or more"),
+        ("0000", 2, "has no result 0000"),
+        ("notes.txt", 6, "not valid JSON"),
+    ],
+)
+def test_what_is_no_calibration_is_named(run: Callable[..., Ran], text: str, code: int, words: str) -> None:
+    Path("notes.txt").write_text("notes")
+    found, out, err = run("diff", text, "abcd")
+    assert (found, out) == (code, "")
+    assert words in err
+
+
+def calibrate_with(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    """Have `ftdrive calibrate` end with this run."""
+    loaded = CalibrationResult.load(folder / "calibration.json")
+    outcome = SimpleNamespace(run=Run(folder), result=loaded, drift=None)
+    monkeypatch.setattr(session, "calibrate", lambda *_: outcome)
+
+
+def test_a_calibration_never_fails_for_the_store_and_is_caught_up(
+    run: Callable[..., Ran], runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The store is locked during one calibration, and comes back before the next."""
+    cell = '[robot]\nhost = "h"\n[sensor]\nurl = "ati-can://can0"\n'
+    (tmp_path / "ftdrive.toml").write_text(f'format = "ftdrive.config/1"\n{cell}[store]\nurl = "sqlite:///s.sqlite"\n')
+    monkeypatch.setattr(Store.__init__, "__kwdefaults__", {"wait_s": 0.05})
+    store = Store("sqlite:///s.sqlite")
+    store.index(runs / "gripper-0")
+    other = sqlite3.connect("s.sqlite")
+    other.execute("BEGIN EXCLUSIVE")
+    calibrate_with(monkeypatch, runs / "gripper-1")
+    code, out, err = run("calibrate")
+    assert (code, out) == (0, "")
+    assert err.endswith("calibration.json")
+    assert "The run is saved but not in the history yet, because the store s.sqlite cannot be" in err
+    assert "(database is locked)" in err
+    other.close()
+    calibrate_with(monkeypatch, runs / "gripper-2")
+    code, _, err = run("calibrate")
+    assert (code, "history" in err) == (0, False)
+    assert len(store.results()) == 5  # everything in the folder of the run
+    assert not default_file().exists()
+
+
+@pytest.mark.parametrize("url", ["mysql://host/db", "sqlite:////dev/null/store.sqlite", "store"])
+def test_a_bad_address_is_a_warning_after_a_calibration(
+    url: str, runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("FTDRIVE_STORE_URL", url)
+    index_run(runs / "gripper-0")
+    assert capsys.readouterr().err.startswith(" The run is saved but not in the history yet, because ")
+
+
+def test_a_result_that_solve_saves_in_its_run_is_indexed(
+    run: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = new_run(tmp_path / "runs", "a", result())
+    monkeypatch.setattr("ftdrive.commands.solve._solve_each", lambda *_: result(1).save(folder / "calibration-2.json"))
+    assert run("solve", folder)[0] == 0
+    assert not default_file().exists()
+    (folder / "calibration-2.json").unlink()
+    assert run("solve", folder, "-o", folder / "calibration-2.json")[0] == 0
+    assert len(Store().results()) == 2
+
+
+@pytest.mark.parametrize("command", [["live"], ["stream"], ["record", "-o", "a.csv"]])
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--tool", "gripper", "--calibration", "."], "--calibration and --tool exclude one another"),
+        (["--tool", "gripper", "--simulate"], "--tool does not go with --simulate"),
+    ],
+)
+def test_a_tool_excludes_what_names_another_calibration(
+    run: Callable[..., Ran], command: list[str], more: list[str], words: str
+) -> None:
+    code, _, err = run(*command, *more)
+    assert (code, words in err) == (2, True)
+
+
+def test_a_tool_reaches_the_stream(run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[tuple[Any, Any]] = []
+
+    def stream(_cell: object, wanted: object, **options: Any) -> object:
+        opened.append((wanted, options["force"]))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ftdrive.commands.live_source.CompensatedStream", stream)
+    for more in ([], ["--force"]):
+        run("live", "--tool", "gripper", "--robot", "10.0.0.2", "--sensor", "ati-can://can0", *more)
+    assert opened == [("gripper", False), ("gripper", True)]
+    assert "--tool does not go with --replay" in run("live", "--tool", "gripper", "--replay", ".")[2]

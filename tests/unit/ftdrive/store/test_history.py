@@ -1,0 +1,127 @@
+"""What the history says of simulated months: drifts with their significance, ages, failures and temperatures."""
+
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.model import Array
+from ftdrive.store.history import Drift, age_days, drifts, warnings
+from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
+from tests.unit.ftdrive.live.simulated import calibrated
+from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
+
+
+def records(folder: Path) -> tuple[list[StoredResult], list[StoredVerification]]:
+    found, unreadable = read_records(record_paths([folder]))
+    assert unreadable == ()
+    return [one for one in found if isinstance(one, StoredResult)], [
+        one for one in found if isinstance(one, StoredVerification)
+    ]
+
+
+def months(folder: Path, rate: Array, n: int = 6, scatter: float = 0.0, **about: Any) -> list[StoredResult]:
+    """Monthly results of a sensor whose numbers change by `rate` (15,) sigmas a month; noise as stated, and scatter."""
+    sigma = np.sqrt(np.diag(calibrated().covariance))
+    rng = np.random.default_rng(3)
+    for month in range(n):
+        noise = rng.multivariate_normal(np.zeros(15), calibrated().covariance)
+        step = noise + sigma * (month * rate + scatter * rng.normal(size=15))
+        new_run(folder, f"{month:02d}", result(30 * month, step, **about))
+    return records(folder)[0]
+
+
+def significant(found: list[Drift]) -> dict[str, bool]:
+    return {drift.quantity: drift.is_significant for drift in found}
+
+
+def test_a_stable_sensor_has_no_trend(tmp_path: Path) -> None:
+    found = drifts(months(tmp_path, np.zeros(15)))
+    assert significant(found) == dict.fromkeys(("force bias", "torque bias", "centre of mass", "mass"), False)
+    assert all("not significant (p = " in str(drift) for drift in found)
+
+
+def test_scatter_that_no_covariance_knows_is_no_trend(tmp_path: Path) -> None:
+    """As of a sensor that is tared by hand each time: every result is far from the others, in no direction."""
+    assert not any(significant(drifts(months(tmp_path, np.zeros(15), scatter=50.0))).values())
+
+
+def test_a_drift_of_the_bias_is_found_and_only_that(tmp_path: Path) -> None:
+    sigma = np.sqrt(np.diag(calibrated().covariance))
+    rate = np.zeros(15)
+    rate[6] = 5.0
+    found = drifts(months(tmp_path, rate))
+    assert significant(found) == {"force bias": True, "torque bias": False, "centre of mass": False, "mass": False}
+    force = found[0].trend
+    assert (force.slope - [5 * sigma[6], 0, 0]) / force.sigma == pytest.approx(np.zeros(3), abs=6)
+    assert "gripper, force bias: +" in str(found[0])
+    assert "N per 30 days (1 sigma, 6 results), significant (p = " in str(found[0])
+    assert found[0].to_dict()["significant"] is True
+
+
+def test_a_load_that_grows_is_found(tmp_path: Path) -> None:
+    rate = np.zeros(15)
+    rate[5] = -8.0  # gravity points along -z of the base
+    found = significant(drifts(months(tmp_path, rate)))
+    assert (found["mass"], found["force bias"]) == (True, False)
+
+
+def test_tools_sensors_and_mounts_are_not_mixed(tmp_path: Path) -> None:
+    """Two results of each are too few, although eight are there."""
+    abouts: tuple[dict[str, Any], ...] = ({}, {"tool": "drill"}, {"mount": "b"}, {"serials": ("arm-1", "ft-2")})
+    results = [one for i, about in enumerate(abouts) for one in months(tmp_path / str(i), np.zeros(15), 2, **about)]
+    assert drifts(results) == []
+
+
+def test_a_copied_or_known_value_is_no_point_of_a_trend(tmp_path: Path) -> None:
+    """Updates of the bias keep mass and centre of mass: only three results have estimated these."""
+    results = months(tmp_path, np.zeros(15), 5)
+    for later in (3, 4):
+        numbers = {**results[later].numbers, "p_sensor_com_m": results[2].numbers["p_sensor_com_m"]}
+        results[later] = StoredResult(
+            **{
+                **{name: getattr(results[later], name) for name in StoredResult.__slots__},
+                "numbers": numbers,
+                "mass_kg": results[2].mass_kg,
+            }
+        )
+    assert {drift.quantity: drift.trend.n for drift in drifts(results)} == {
+        "force bias": 5,
+        "torque bias": 5,
+        "centre of mass": 3,
+        "mass": 3,
+    }
+
+
+def test_an_old_calibration_should_be_verified_unless_it_was(tmp_path: Path) -> None:
+    new_run(tmp_path, "a", result(0))
+    results, _ = records(tmp_path)
+    assert list(warnings(results, [], FIRST + timedelta(days=29))) == []
+    (words,) = warnings(results, [], FIRST + timedelta(days=45))
+    assert "neither made nor verified in the last 45 days: verify it" in words
+    verified(tmp_path / "a", results[0].id, 40)
+    assert list(warnings(*records(tmp_path), FIRST + timedelta(days=45))) == []
+
+
+def test_a_failed_verification_counts_until_the_next_calibration(tmp_path: Path) -> None:
+    new_run(tmp_path, "a", result(0))
+    verified(tmp_path / "a", result(0).id, 1, passed=False)
+    (words,) = warnings(*records(tmp_path), FIRST + timedelta(days=2))
+    assert "failed its last verification (the force bias has changed by 0.5 N): calibrate again" in words
+    new_run(tmp_path, "b", result(1.5))
+    assert list(warnings(*records(tmp_path), FIRST + timedelta(days=2))) == []
+
+
+@pytest.mark.parametrize(("now_C", "words"), [(35.0, "14 K warmer"), (12.0, "9 K"), (8.0, "13 K colder")])
+def test_another_temperature_is_named(tmp_path: Path, now_C: float, words: str) -> None:
+    new_run(tmp_path, "a", result(0, temperature_C=21.0))
+    verified(tmp_path / "a", result(0).id, 1, temperature_C=now_C)
+    found = list(warnings(*records(tmp_path), FIRST + timedelta(days=2)))
+    assert [words in one for one in found] == ([True] if abs(now_C - 21) > 10 else [])
+
+
+def test_an_unknown_time_has_no_age() -> None:
+    assert age_days(None, FIRST) is None
+    assert age_days("2026-02-28T00:00:00.000000+00:00", FIRST) == 1.0
