@@ -13,6 +13,7 @@ from tests.house import commands_page
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.mark.timeout(600)  # mypy without a cache takes 45 s of computing time
 @pytest.mark.parametrize(
     "command",
     [
