@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 import click
+from click.core import ParameterSource
 
 from calib.files import require_new, write_new
 from calib.likelihood.session import Drift
@@ -101,10 +102,10 @@ def report(
 
 
 def _typed(context: click.Context) -> tuple[str, ...]:
-    """Return the options of solve that differ from their defaults, as words for a shell."""
+    """Return the options of solve that were given, as words for a shell."""
     return tuple(
         word
         for one in context.command.params
-        if one.name in _SOLVING and context.params[one.name] != one.default
+        if one.name in _SOLVING and context.get_parameter_source(one.name) is not ParameterSource.DEFAULT
         for word in (one.opts[0], shlex.quote(str(context.params[one.name])))
     )
