@@ -36,6 +36,8 @@ LONG_S = 200
 """Longer times are shown in minutes."""
 MOST_DOTS = 400
 """Of many poses every second, third, … is drawn, because each dot has its size in the file."""
+INVISIBLE = 0.02
+"""Weaker correlations are not drawn."""
 _MARKERS = "osD"
 _STYLE: Mapping[Any, Any] = {
     "svg.fonttype": "none",
@@ -174,7 +176,7 @@ def _correlation(figure: Any, facts: Facts) -> None:
     n = len(matrix)
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
-    for i, j in np.ndindex(n, n):
+    for i, j in np.argwhere(matrix > INVISIBLE):
         # the strength is opacity, so that 0 is the page itself
         axes.fill([j, j + 1, j + 1, j], [i, i, i + 1, i + 1], color=SERIES[0], alpha=float(matrix[i, j]), linewidth=0)
     for edge in range(0, n + 1, 3):

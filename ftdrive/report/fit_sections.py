@@ -36,7 +36,8 @@ def estimates(facts: Facts) -> Section:
     )
     tables = [Table("", ("quantity", "estimate", "± 1 sigma"), list(_estimate_rows(result)))]
     if result["response"] is not None:
-        tables.append(Table("Gain and cross-talk of the sensor", ("entry", "value", "± 1 sigma"), _response(result)))
+        columns = ("entry", "value", "± 1 sigma")
+        tables.append(Table("Gain and cross-talk of the sensor", columns, _response(result), folded=True))
     return Section("estimates", "Estimates", text, [figure], tables)
 
 
