@@ -4,7 +4,7 @@ import json
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, CalibrationResult, Parameters, solve
-from calib.errors import BadCalibration
+from calib.errors import BadCalibration, BadDataset
 from calib.model import predict
 from calib.routine import PoseRecord, TourPose
 from drivers.interfaces import FtSamples
@@ -332,6 +332,30 @@ def test_a_result_without_its_data_is_reported_as_far_as_it_goes(tmp_path: Path)
     assert "report its run folder" in text
     assert "Methods are not compared." in text
     assert "does not" not in command(path, "--format", "json").output
+
+
+def test_a_damaged_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "half.json"
+    path.write_text('{"format": "ftd')
+    with pytest.raises(BadDataset, match=r"half\.json"):
+        read_subject(path, SolveOptions())
+
+
+@pytest.mark.usefixtures("no_other_methods")
+@pytest.mark.parametrize(
+    ("name", "verdicts", "words"),
+    [
+        ("agimus_mini45_b", ("good", "usable"), "The bias drifted by 0.17 N"),
+        ("foamcutting_2013_06_12", ("rejected",), "The force residual is 22.4 % of the weight"),
+    ],
+)
+def test_real_recordings_are_judged_and_explained(
+    name: str, verdicts: Sequence[str], words: str, real_data: Path
+) -> None:
+    outcome = command(real_data / name / "poses.csv", "--orientation", "R_flange_base", "--format", "md")
+    assert outcome.exit_code == 0
+    assert outcome.stdout.splitlines()[0].rpartition(" ")[2].lower() in verdicts
+    assert words in outcome.stdout
 
 
 def test_no_report_is_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
