@@ -246,6 +246,8 @@ def _time_residuals(figure: Any, facts: Facts) -> None:
         axes.set_ylabel(label)
         axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), borderaxespad=0.1)
     unit = "min" if long else "s"
+    if not timed:
+        axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_xlabel(f"time since the first pose, {unit}" if timed else "pose, in the order of the rows")
 
 

@@ -31,7 +31,7 @@ def estimates(facts: Facts) -> Section:
     figure = Figure(
         "correlation",
         f"Matrix of the correlations of the 15 estimated parameters. {text[1]}",
-        "Correlation of the estimates. Good: pale everywhere beside the diagonal. A dark field means that the poses "
+        "Correlation of the estimates. Good: faint everywhere beside the diagonal. A strong field means that the poses "
         "hardly separate two parameters: add other orientations.",
     )
     tables = [Table("", ("quantity", "estimate", "± 1 sigma"), list(_estimate_rows(result)))]
@@ -275,7 +275,7 @@ def coverage(facts: Facts) -> Section:
         f"{found['words'][0].upper()}{found['words'][1:]}",
         f"{found['orientations']} different orientations (24 or more count as 24) determine {found['rank']} of 15 "
         "parameters.",
-        f"Largest gap: no direction of gravity within {gap_deg:.0f}° of {found['gap_words'].removeprefix('along ')}.",
+        f"Largest gap: {gap_deg:.0f}° around the direction {found['gap_words']}.",
     ]
     figure = Figure(
         "coverage",

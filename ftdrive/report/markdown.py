@@ -14,7 +14,7 @@ def markdown(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
 
 def _lines(facts: Mapping[str, Any], sections: Sequence[Section]) -> Iterator[str]:
     yield f"# Calibration {facts['id']}: {facts['verdict'].upper()}\n"
-    yield f"{_escaped(facts['error']['words'])}\n"
+    yield f"Compensation error {_escaped(facts['error']['words'])}.\n"
     yield from (f"* {_escaped(one[:1].upper() + one[1:])}" for one in [*facts["reasons"], *facts["hints"]])
     yield f"\n**Next:** {_escaped(facts['next_step'])}\n"
     for section in sections:
