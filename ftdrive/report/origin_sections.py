@@ -80,7 +80,7 @@ def comparison(facts: Facts) -> Section:
     if found["same_data"]:
         text.append("Both rest on the same data: the test below does not apply, because it assumes independent noise.")
     else:
-        changed = [one["name"] for one in found["groups"][:-2] if one["p_value"] < CHANGED_P]
+        changed = [one["name"] for one in found["groups"][:-1] if one["p_value"] < CHANGED_P]
         text.append(
             f"Changed by more than chance explains: {', '.join(changed)}."
             if changed
