@@ -1,5 +1,7 @@
 """Poses for a verification: far from the fit, few, and informative about every cause."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -22,8 +24,11 @@ def distance_rad(R: Array, fitted: Array, down: Array = DOWN) -> Array:
 
 
 def information(R: Array) -> float:
+    """About each pair of mounting, gravity, centre of mass and bias."""
     J = (whitened_jacobian(R, TOOL) / TOOL.scale * USUAL_CHANGE).reshape(-1, 15)
-    return float(np.linalg.slogdet(np.eye(15) + J.T @ J)[1])
+    causes = ([0, 1, 2], [3, 4, 5], [9, 10, 11], [6, 7, 8, 12, 13, 14])
+    pairs = [J[:, [*a, *b]] for a, b in combinations(causes, 2)]
+    return float(sum(np.linalg.slogdet(np.eye(pair.shape[1]) + pair.T @ pair)[1] for pair in pairs))
 
 
 @pytest.mark.parametrize("n", [2, 6])
