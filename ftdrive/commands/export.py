@@ -185,9 +185,8 @@ def calibration(
 
 
 @export.command()
-@simulate("The same list: it needs no cell.")
 @JSON
-def formats(simulate: bool, as_json: bool) -> None:  # noqa: ARG001 - every command accepts --simulate
+def formats(as_json: bool) -> None:
     """List the formats of `ftdrive export calibration`."""
     if as_json:
         found = [
