@@ -179,7 +179,8 @@ def test_urdf_is_a_tree_with_the_mount_and_an_inertia_marked_as_not_identified()
     ends = [one.get("link") for joint in (mount, tool) for one in (*joint.iter("parent"), *joint.iter("child"))]
     assert ends == ["tool0", "ft_sensor", "ft_sensor", "tool"]
     origins = [[list(map(float, one.attrib[key].split())) for key in ("xyz", "rpy")] for one in robot.iter("origin")]
-    assert np.allclose(origins, [[COM, [0] * 3], [[0, 0, 0.033], [0, 0, pi / 2]], [[0] * 3, [0] * 3]], atol=1e-15)
+    expected: list[list[list[float]]] = [[COM, [0] * 3], [[0, 0, 0.033], [0, 0, pi / 2]], [[0] * 3, [0] * 3]]
+    assert np.allclose(origins, expected, atol=1e-15)
     assert float(robot.find(".//mass").get("value")) == pytest.approx(2.0)  # type: ignore[union-attr, arg-type]
     assert set(robot.find(".//inertia").attrib.values()) == {"0.0"}  # type: ignore[union-attr]
     assert "not identified" in text.partition("<inertia ")[0].rpartition("<mass")[2]
