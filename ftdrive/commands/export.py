@@ -152,13 +152,13 @@ def calibration(
         result = load_calibration(path)
         recorded_height_mm, recorded_mass_kg = recorded_sensor(path, result)
     settings = Settings(
-        base_frame,
-        flange_frame,
-        sensor_frame,
-        tool_frame,
-        recorded_height_mm if height_mm is None else height_mm,
-        recorded_mass_kg if sensor_mass_kg is None else sensor_mass_kg,
-        None if sensor_com is None else tuple(numbers("--sensor-com", sensor_com, ",", [3])),
+        base_frame=base_frame,
+        flange_frame=flange_frame,
+        sensor_frame=sensor_frame,
+        tool_frame=tool_frame,
+        height_mm=recorded_height_mm if height_mm is None else height_mm,
+        sensor_mass_kg=recorded_mass_kg if sensor_mass_kg is None else sensor_mass_kg,
+        sensor_com_mm=None if sensor_com is None else tuple(numbers("--sensor-com", sensor_com, ",", [3])),
     )
     made = registry.export(result, target, settings, max_force_error_N=max_force_error_N)
     for note in made.notes:

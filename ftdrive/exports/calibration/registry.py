@@ -88,10 +88,10 @@ def export(
             if force_N > max_force_error_N:
                 raise NotAccepted(
                     f"{words}, and the limit is {max_force_error_N:g} N. Choose another format "
-                    f"({', '.join(_able(calibration, target))}), or raise --max-force-error"
+                    f"({', '.join(_lossless(calibration, target))}), or raise --max-force-error"
                 )
             notes.insert(0, f"{words}.")
-    notes += [f"Also set {place} = {_short(value)}." for place, value in exported.elsewhere.items()]
+    notes += [f"Also set {place} = {_in_words(value)}." for place, value in exported.elsewhere.items()]
     text = with_header(exported.text, target.comment, [made_by(calibration), target.description, *notes])
     return Export(text, tuple(notes), exported.elsewhere, force_N, torque_Nm)
 
@@ -110,17 +110,17 @@ def _lost(calibration: CalibrationResult, target: Format) -> Iterator[str]:
         yield "gain and cross-talk of the sensor"
 
 
-def _able(calibration: CalibrationResult, target: Format) -> Iterator[str]:
+def _lossless(calibration: CalibrationResult, target: Format) -> Iterator[str]:
     """Name the formats that lose nothing and subtract as much."""
     for name, other in FORMATS.items():
         if set(other.subtracts) >= set(target.subtracts) and not list(_lost(calibration, other)):
             yield name
 
 
-def _short(value: JSON) -> str:
+def _in_words(value: JSON) -> str:
     """Write a value of `elsewhere` for people."""
     if isinstance(value, Mapping):
-        return f"({', '.join(f'{name} {_short(one)}' for name, one in value.items())})"
+        return f"({', '.join(f'{name} {_in_words(one)}' for name, one in value.items())})"
     if isinstance(value, list):
-        return f"[{', '.join(map(_short, value))}]"
+        return f"[{', '.join(map(_in_words, value))}]"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
