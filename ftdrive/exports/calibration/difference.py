@@ -15,17 +15,20 @@ _CONVERGED = 1e-12
 """Relative gain of a step, at the start that gains most."""
 
 
-def as_target(calibration: CalibrationResult, target: Format) -> Compensator:
-    """Return the compensation of a target that expresses all but what its `expresses` lacks.
+def compensations(calibration: CalibrationResult, target: Format) -> tuple[Compensator, Compensator]:
+    """Return our compensation, and that of a target that expresses all but what its `expresses` lacks.
 
     Without tilt, gravity points along -z of the base. Without rotation, the sensor's axes are those of the flange.
+    Where the target has another sensor, or none, neither has the response of ours.
     """
     parameters = calibration.parameters
+    response = None if target.has_own_reading else calibration.response
+    ours = Compensator(parameters, response=response)
     if "tilt" not in target.expresses:
         parameters = replace(parameters, gravity_force_base_N=np.array([0.0, 0.0, -calibration.weight_N]))
     if "rotation" not in target.expresses:
         parameters = replace(parameters, R_flange_sensor=np.eye(3))
-    return Compensator(parameters, response=calibration.response if "response" in target.expresses else None)
+    return ours, Compensator(parameters, response=response if "response" in target.expresses else None)
 
 
 def largest_difference(one: Compensator, other: Compensator) -> tuple[float, float]:

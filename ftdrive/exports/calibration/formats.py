@@ -19,9 +19,14 @@ class Format:
     subtracts: tuple[Literal["bias", "weight"], ...] = ("bias", "weight")
     """Of the reading, by the target."""
     expresses: tuple[Property, ...] = ("tilt", "rotation")
-    """Of the calibration: in the file, where the target reads it instead, or without need because it has no reading."""
+    """Of the calibration: in the file, or where the target reads it instead. Response: or see `has_own_reading`."""
     comment: Comment = "#"
     """How the header is written."""
+
+    @property
+    def has_own_reading(self) -> bool:
+        """Whether the target reads another sensor, or none, so that neither bias nor response of ours matter."""
+        return "bias" not in self.subtracts and "response" in self.expresses
 
 
 FORMATS: Mapping[str, Format] = {
@@ -73,10 +78,11 @@ FORMATS: Mapping[str, Format] = {
         comment="<!-- -->",
     ),
     "mujoco": Format(
-        "mujoco_ros2_control, parameters of its plugin FtsGravCompPlugin",
-        "mujoco_plugins.yaml",
+        "MuJoCo body of tool and sensor, with parameters for mujoco_ros2_control",
+        "tool.xml",
         subtracts=("weight",),
         expresses=("tilt", "rotation", "response"),
+        comment="<!-- -->",
     ),
     "static-transform": Format("ROS 2 static_transform_publisher, flange to sensor", "transform.sh", subtracts=()),
     "json": Format(

@@ -11,7 +11,7 @@ from calib.files import JSON
 from calib.model import angle_between
 from ftdrive.errors import NotAccepted
 from ftdrive.exports.calibration import complete, models, robots, ros1, ros2
-from ftdrive.exports.calibration.difference import as_target, largest_difference
+from ftdrive.exports.calibration.difference import compensations, largest_difference
 from ftdrive.exports.calibration.formats import FORMATS, Format
 from ftdrive.exports.calibration.settings import Settings
 from ftdrive.exports.calibration.text import Exported, made_by, with_header
@@ -79,7 +79,7 @@ def export(
     force_N, torque_Nm = 0.0, 0.0
     notes = list(exported.notes)
     if target.subtracts:
-        force_N, torque_Nm = largest_difference(calibration.compensator, as_target(calibration, target))
+        force_N, torque_Nm = largest_difference(*compensations(calibration, target))
         if lost := list(_lost(calibration, target)):
             words = (
                 f"{name} cannot express {' and '.join(lost)}: its result differs from that of ftdrive by up to "

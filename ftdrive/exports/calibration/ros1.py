@@ -2,7 +2,7 @@
 
 from calib import CalibrationResult
 from ftdrive.exports.calibration.settings import Settings
-from ftdrive.exports.calibration.shared import frame_note, gravity_m_s2
+from ftdrive.exports.calibration.shared import frame_note, gravity_in_frame_m_s2
 from ftdrive.exports.calibration.text import Exported, numbers, xyz, yaml_text
 
 
@@ -30,7 +30,7 @@ def kth(calibration: CalibrationResult, settings: Settings) -> Exported:
     )
     elsewhere = {
         "imu header.frame_id": settings.base_frame,
-        "imu linear_acceleration": numbers(-gravity_m_s2(calibration)),
+        "imu linear_acceleration": numbers(-gravity_in_frame_m_s2(calibration, settings)),
     }
     return Exported(yaml_text(document), notes, elsewhere)
 
@@ -98,6 +98,6 @@ def code_iai(calibration: CalibrationResult, settings: Settings) -> Exported:
     elsewhere = {
         "gravity_publisher fixed_frame": settings.base_frame,
         "gravity_publisher sensor_frame": settings.sensor_frame,
-        "gravity_publisher gravity_vector": numbers(gravity_m_s2(calibration)),
+        "gravity_publisher gravity_vector": numbers(gravity_in_frame_m_s2(calibration, settings)),
     }
     return Exported(yaml_text(document), notes, elsewhere)

@@ -4,8 +4,9 @@ import shlex
 from typing import Any
 
 from calib import CalibrationResult
+from calib.files import JSON
 from ftdrive.exports.calibration.settings import Settings
-from ftdrive.exports.calibration.shared import frame_note, gravity_m_s2, quaternion_xyzw
+from ftdrive.exports.calibration.shared import R_frame_sensor, frame_note, gravity_in_frame_m_s2, quaternion_xyzw
 from ftdrive.exports.calibration.text import Exported, numbers, xyz, yaml_text
 
 CALAW_G_M_S2 = 9.81
@@ -27,19 +28,14 @@ def ft_tools(calibration: CalibrationResult, settings: Settings) -> Exported:
         "force_offset": numbers(calibration.force_bias_N),
         "torque_offset": numbers(calibration.torque_bias_Nm),
     }
-    elsewhere = {
-        "calibration.reference_frame.id": settings.base_frame,
-        "calibration.sensor_frame.id": settings.sensor_frame,
-        "calibration.gravity_in_reference_frame": numbers(gravity_m_s2(calibration)),
-    }
-    return Exported(yaml_text(document), (frame_note(calibration, settings),), elsewhere)
+    return Exported(yaml_text(document), (frame_note(calibration, settings),), _ft_estimation(calibration, settings))
 
 
 def ros2_message(calibration: CalibrationResult, settings: Settings) -> Exported:
     """Write a message ft_msgs/msg/FtCalibration, as `ros2 service call` and `ros2 topic pub` take it.
 
-    Reader: ICube-Robotics/ft_tools_ros2, ft_msgs/msg/FtCalibration.msg, main. The formula is that of `ft_tools`.
-    `elsewhere` has the other fields of ft_msgs/srv/SetCalibration.
+    Reader: ICube-Robotics/ft_tools_ros2, ft_msgs/msg/FtCalibration.msg, main; the only field of a request of
+    ft_msgs/srv/SetCalibration. The formula is that of `ft_tools`, and gravity is the same parameter of the node.
     """
     document = {
         "mass": calibration.mass_kg,
@@ -47,8 +43,20 @@ def ros2_message(calibration: CalibrationResult, settings: Settings) -> Exported
         "force_offset": xyz(calibration.force_bias_N),
         "torque_offset": xyz(calibration.torque_bias_Nm),
     }
-    elsewhere = {"reference_frame": settings.base_frame, "gravity": xyz(gravity_m_s2(calibration))}
-    return Exported(yaml_text(document), (frame_note(calibration, settings),), elsewhere)
+    notes = (
+        "The request of the service ft_estimation_node/set_calibration has it in the field ft_calibration.",
+        frame_note(calibration, settings),
+    )
+    return Exported(yaml_text(document), notes, _ft_estimation(calibration, settings))
+
+
+def _ft_estimation(calibration: CalibrationResult, settings: Settings) -> dict[str, JSON]:
+    """Return the parameters of ft_estimation_node, ft_tools/src/ft_estimation_node_parameters.yaml."""
+    return {
+        "calibration.reference_frame.id": settings.base_frame,
+        "calibration.sensor_frame.id": settings.sensor_frame,
+        "calibration.gravity_in_reference_frame": numbers(gravity_in_frame_m_s2(calibration, settings)),
+    }
 
 
 def calaw(calibration: CalibrationResult, settings: Settings) -> Exported:
@@ -72,8 +80,8 @@ def calaw(calibration: CalibrationResult, settings: Settings) -> Exported:
         "mass is negative on purpose, and cog is minus mass times position: the formula of CalaW is for sensors that "
         "report the reaction.",
         f"mass is weight / {CALAW_G_M_S2:g} m/s2, because the node multiplies it by {CALAW_G_M_S2:g}.",
-        "The node does not read the file. Copy the ten numbers below into ft_compensation_node.py. The frames world "
-        "and ati_measuring_face are fixed there too.",
+        "The node does not read the file. Copy the ten numbers below into ft_compensation_node.py. The frames of "
+        "gravity (world) and sensor are fixed there too.",
         frame_note(calibration, settings),
     )
     ten = [-mass_kg, *(value for vector in vectors.values() for value in vector)]
@@ -101,7 +109,7 @@ def ros2_control(calibration: CalibrationResult, settings: Settings) -> Exported
             "tool": {
                 "CoG": numbers(calibration.p_sensor_com_m),
                 "mass": calibration.mass_kg,
-                "gravity_field": numbers(gravity_m_s2(calibration)),
+                "gravity_field": numbers(gravity_in_frame_m_s2(calibration, settings)),
             },
         },
     }
@@ -151,10 +159,10 @@ def static_transform(calibration: CalibrationResult, settings: Settings) -> Expo
     """Write the command that publishes the sensor frame.
 
     Reader: ros2/geometry2, tf2_ros static_transform_publisher, Humble or newer. Position (m) and quaternion map sensor
-    coordinates to flange coordinates: p_flange = R(q) p_sensor + (x, y, z).
+    coordinates to those of the frame-id: p = R(q) p_sensor + (x, y, z).
     """
-    x, y, z = settings.p_flange_sensor_m("static-transform").tolist()
-    qx, qy, qz, qw = quaternion_xyzw(calibration)
+    x, y, z = numbers(settings.p_frame_sensor_m("static-transform"))
+    qx, qy, qz, qw = quaternion_xyzw(R_frame_sensor(calibration, settings))
     values = {"x": x, "y": y, "z": z, "qx": qx, "qy": qy, "qz": qz, "qw": qw}
     frames = {"frame-id": settings.flange_frame, "child-frame-id": settings.sensor_frame}
     words = ["ros2", "run", "tf2_ros", "static_transform_publisher"]

@@ -13,7 +13,12 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.samples import sensor_origin_m
 from ftdrive.runs.run import Run
 
-_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
+_NAME = re.compile(r"[A-Za-z_](-?[A-Za-z0-9_./])*")
+"""Also inside a comment of XML, where `--` is an error."""
+_R_BASE_LINK_BASE = np.diag([-1.0, -1.0, 1.0])
+"""ur_description/urdf/ur_macro.xacro, joint base_link-base_fixed_joint: 180° about z."""
+_R_FLANGE_TOOL0 = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""ur_description/urdf/ur_macro.xacro, joint flange-tool0: rpy = (π/2, 0, π/2). x of `flange` points out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,8 +26,9 @@ class Settings:
     """Names and measured values; None where not measured. Raises `ConfigError` for a name that files cannot take."""
 
     base_frame: str = "base"
-    """Axes of the controller's base."""
+    """The controller's base, or the `base_link` of a UR in ROS, with any prefix."""
     flange_frame: str = "tool0"
+    """With z out of the flange, or the `flange` of ROS-Industrial with x out, with any prefix."""
     sensor_frame: str = "ft_sensor"
     """Also the name of the sensor, where a target has one."""
     tool_frame: str = "tool"
@@ -37,10 +43,32 @@ class Settings:
         for field in ("base_frame", "flange_frame", "sensor_frame", "tool_frame"):
             if not _NAME.fullmatch(name := getattr(self, field)):
                 option = field.replace("_", "-")
-                raise ConfigError(f"--{option} is {name!r}: use letters, digits and _ . / -, a letter or _ first")
+                raise ConfigError(
+                    f"--{option} is {name!r}: use letters, digits and _ . / -, a letter or _ first, no --"
+                )
         frames = self.flange_frame, self.sensor_frame, self.tool_frame
         if len(set(frames)) < len(frames):
             raise ConfigError(f"the frames of flange, sensor and tool are {', '.join(frames)}: give each its own name")
+
+    @property
+    def R_frame_base(self) -> Array:
+        """Orientation (3, 3) of the controller's base in `base_frame`."""
+        return _R_BASE_LINK_BASE if self.base_frame.endswith("base_link") else np.eye(3)
+
+    @property
+    def base_axes(self) -> str:
+        """The axes that `base_frame` must have, in words."""
+        turned = ", turned by 180° about z" if self.base_frame.endswith("base_link") else ""
+        return f"the base of the controller{turned}"
+
+    @property
+    def R_frame_flange(self) -> Array:
+        """Orientation (3, 3) of the flange, z out, in `flange_frame`."""
+        return _R_FLANGE_TOOL0 if self.flange_frame.endswith("flange") else np.eye(3)
+
+    def p_frame_sensor_m(self, target: str) -> Array:
+        """Return the sensor's origin (3,) in `flange_frame`, m; raises `ConfigError` if it was not measured."""
+        return self.R_frame_flange @ self.p_flange_sensor_m(target)
 
     def p_flange_sensor_m(self, target: str) -> Array:
         """Return the sensor's origin (3,) in the flange, m; raises `ConfigError` if it was not measured."""

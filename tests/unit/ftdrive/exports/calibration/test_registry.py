@@ -97,7 +97,7 @@ def test_a_rejected_calibration_is_not_exported() -> None:
         export(rejected(), "json", MEASURED)
 
 
-@pytest.mark.parametrize("name", ["urdf", "static-transform", "mc-rtc", "franka", "ur-payload"])
+@pytest.mark.parametrize("name", ["urdf", "mujoco", "static-transform", "mc-rtc", "franka", "ur-payload"])
 def test_the_place_of_the_sensor_is_never_invented(name: str) -> None:
     with pytest.raises(ConfigError, match="--height MM"):
         export(calibration(), name, replace(MEASURED, height_mm=None))
@@ -119,7 +119,7 @@ def test_what_needs_no_place_takes_none(name: str) -> None:
         export(calibration(R_flange_sensor=np.eye(3)), name, Settings())
 
 
-@pytest.mark.parametrize("frame", ["", "a b", "a\nb: 1", "-x", '"', "a#", "ö"])
+@pytest.mark.parametrize("frame", ["", "a b", "a\nb: 1", "-x", "a--b", "a-", '"', "a#", "ö"])
 def test_a_name_that_could_break_a_file_is_refused(frame: str) -> None:
     with pytest.raises(ConfigError, match=r"--sensor-frame is .*letters, digits"):
         Settings(sensor_frame=frame)

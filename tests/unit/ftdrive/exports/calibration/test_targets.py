@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from math import pi, sqrt
 from typing import Any
 
@@ -74,7 +75,7 @@ def test_the_ros2_message_has_the_same_as_vectors() -> None:
     assert equal(found["mass"], 2.0)
     assert equal(xyz(found["sensor_frame_to_com"]), COM)
     assert equal(xyz(found["force_offset"]) + xyz(found["torque_offset"]), FORCE + TORQUE)
-    assert xyz(made("ros2-message").elsewhere["gravity"]) == pytest.approx([0, 0, -G_M_S2], abs=1e-15)
+    assert made("ros2-message").elsewhere == made("ft-tools").elsewhere  # both are read by ft_estimation_node
 
 
 def test_calaw_has_minus_the_mass_and_minus_the_moment_for_its_fixed_gravity() -> None:
@@ -186,14 +187,49 @@ def test_urdf_is_a_tree_with_the_mount_and_an_inertia_marked_as_not_identified()
     assert "not identified" in text.partition("<inertia ")[0].rpartition("<mass")[2]
 
 
-def test_mujoco_has_the_plugin_with_a_site_and_gravity_of_the_model() -> None:
-    plugin = document("mujoco")["/**"]["ros__parameters"]["mujoco_plugins"]["fts_grav_comp_plugin"]
+def test_mujoco_has_the_tool_at_the_site_of_the_sensor_and_the_parameters_of_the_plugin() -> None:
+    text = made("mujoco").text
+    (body,) = ET.fromstring(text).iter("body")
+    inertial, site = body
+    values = {name: list(map(float, body.attrib[name].split())) for name in ("pos", "quat")}
+    assert values["pos"] == pytest.approx([0, 0, 0.033], abs=1e-15)
+    assert values["quat"] == pytest.approx([sqrt(0.5), 0, 0, sqrt(0.5)], abs=1e-15)
+    assert (site.tag, site.attrib) == ("site", {"name": "ft_sensor"})
+    assert equal([float(x) for x in inertial.attrib["pos"].split()], COM)
+    assert float(inertial.attrib["mass"]) == pytest.approx(2.0)
+    assert inertial.attrib["diaginertia"] == "0 0 0"
+    assert "not identified" in text.partition("<inertial ")[0].rpartition("<body")[2]
+    sensors = [(one.tag, one.get("name"), one.get("site")) for one in ET.fromstring(text).find("sensor") or ()]
+    assert sensors == [("force", "ft_sensor_force", "ft_sensor"), ("torque", "ft_sensor_torque", "ft_sensor")]
+    parameters = yaml.safe_load("/**:" + text.partition("/**:")[2].partition("-->")[0])
+    plugin = parameters["/**"]["ros__parameters"]["mujoco_plugins"]["fts_grav_comp_plugin"]
     assert plugin["type"] == "mujoco_ros2_control_plugins/FtsGravCompPlugin"
     assert plugin["ft_sensor"]["frame_id"] == "ft_sensor"
     assert equal([plugin["ft_sensor"]["CoG"]["mass"], *plugin["ft_sensor"]["CoG"]["pos"]], [2.0, *COM])
-    elsewhere = made("mujoco").elsewhere
-    assert elsewhere["option gravity"] == pytest.approx([0, 0, -G_M_S2], abs=1e-15)
-    assert elsewhere["site quat (w x y z) in the flange"] == pytest.approx([sqrt(0.5), 0, 0, sqrt(0.5)], abs=1e-15)
+    assert made("mujoco").elsewhere["option gravity"] == pytest.approx([0, 0, -G_M_S2], abs=1e-15)
+
+
+ROS = replace(MEASURED, base_frame="base_link", flange_frame="flange")
+
+
+def test_base_link_is_turned_by_half_a_turn_against_the_base_of_the_controller() -> None:
+    down = [G_M_S2 / 2, 0, -G_M_S2 * sqrt(3) / 2]
+    found = yaml.safe_load(export(tilted(30), "ros2-control", ROS).text)["force_torque_sensor_broadcaster"]
+    tool = found["ros__parameters"]["sensor_filter_chain"]["filter1"]["params"]["tool"]
+    assert tool["gravity_field"] == pytest.approx(down, rel=1e-14)
+    assert export(tilted(30), "kth", ROS).elsewhere["imu linear_acceleration"] == pytest.approx([-x for x in down])
+    assert export(tilted(30), "ur-payload", ROS).elsewhere["set_gravity"] == pytest.approx([down[0], 0, -down[2]])
+
+
+def test_the_flange_of_ros_industrial_has_x_out_of_it() -> None:
+    """The sensor's x is tool0's y, and so its z; y is tool0's -x, and so its -y; z is tool0's z, and so its x."""
+    words = shlex.split(made("static-transform", ROS).text, comments=True)
+    found = dict(zip(words[4::2], words[5::2], strict=True))
+    assert [float(found[f"--{axis}"]) for axis in "xyz"] == pytest.approx([0.033, 0, 0], abs=1e-15)
+    half = sqrt(0.5)
+    assert [float(found[f"--q{axis}"]) for axis in "xyzw"] == pytest.approx([half, 0, half, 0], abs=1e-15)
+    lines = made("mc-rtc", ROS).text.splitlines()
+    assert [float(line) for line in lines[4:7]] == pytest.approx([0.083, 0.02, 0.01], abs=1e-15)
 
 
 def test_static_transform_is_one_command_with_the_scalar_last() -> None:
@@ -223,7 +259,7 @@ def test_two_yaml_readers_agree_and_a_small_number_is_a_number_to_both(name: str
     text = made(name).text
     one, other = yaml.safe_load(text), YAML(typ="safe").load(text)
     assert one == other
-    assert len(IN_YAML) == 12
+    assert len(IN_YAML) == 11
 
     def leaves(value: Any) -> list[Any]:
         if isinstance(value, dict):
