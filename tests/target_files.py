@@ -45,22 +45,22 @@ def force_at(point: Array, force: Array) -> Array:
 
 
 def world_from_base(world_frame: str) -> Array:
-    """(3, 3) `base_link` is UR's base turned by 180 deg about z; any other name is UR's base."""
-    return np.diag([-1.0, -1.0, 1.0]) if world_frame == "base_link" else np.eye(3)
+    """(3, 3) `base_link` is UR's base turned by 180 deg about z; any other name is UR's base.
+
+    ur_description/urdf/ur_macro.xacro, joint base_link-base_fixed_joint; names may have a prefix.
+    """
+    return np.diag([-1.0, -1.0, 1.0]) if world_frame.endswith("base_link") else np.eye(3)
+
+
+def tool0_from(flange_frame: str) -> Array:
+    """(3, 3) `flange` is ROS-Industrial's, x out of the flange; any other name is tool0. Names may have a prefix."""
+    return R_TOOL0_FLANGE if flange_frame.endswith("flange") else np.eye(3)
 
 
 def mapping(node: Any) -> Mapping[str, Any]:
     if not isinstance(node, Mapping):
         raise ValueError(f"expected a mapping, got {node!r}")  # noqa: TRY004 - what evaluate promises
     return node
-
-
-def find(node: Any, key: str) -> Mapping[str, Any] | None:
-    """Return the first mapping that has `key`, in documents, mappings and their values."""
-    if isinstance(node, Mapping) and key in node:
-        return node
-    children = node.values() if isinstance(node, Mapping) else node if isinstance(node, list) else ()
-    return next((found for child in children if (found := find(child, key)) is not None), None)
 
 
 def numbers(values: Any, count: int) -> Array:

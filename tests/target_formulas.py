@@ -9,12 +9,13 @@ the result with our compensated wrench.
 | key | meaning |
 |---|---|
 | `R_flange_sensor` (3, 3), `p_flange_sensor_m` (3,) | mounting of the sensor, as in the target's robot model |
-| `g_m_s2` | gravity for targets that have it as a setting; CalaW and mc_rtc have 9.81 in their source |
+| `g_m_s2` | gravity for targets that have it as a setting; CalaW and mc_rtc have it in their source |
 | `gravity_m_s2` (3,), optional | the same as a vector in base, for targets whose setting is a vector; default down |
 | `force_bias_N`, `torque_bias_Nm` (3,) | for targets that carry no bias |
 | `sensor_mass_kg`, `p_flange_sensor_com_m` (3,) | sensor and adapter, for targets whose payload includes them |
 | `p_sensor_com_m`, `gravity_force_base_N` (3,) | the load, for a target that carries only the mounting |
-| `R_flange_model_sensor` (3, 3), optional | mc_rtc: the sensor in the robot module; default the flange axes |
+| `R_flange_parent` (3, 3), optional | mc_rtc: axes of the sensor's parent body at the flange; default the flange |
+| `R_flange_model_sensor` (3, 3), optional | mc_rtc: the sensor in the robot module; default as the parent body |
 
 World axes are those of the robot base, unless a file names `base_link`: UR's base turned by 180 deg about z.
 Frames named `tool0` are our flange; `flange` is ROS-Industrial's, with x out of the flange.
@@ -31,13 +32,11 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from tests.target_files import (
-    R_TOOL0_FLANGE,
     Array,
     Context,
     Data,
     context_bias,
     doubles,
-    find,
     force_at,
     gravity_base,
     in_sensor_axes,
@@ -48,6 +47,7 @@ from tests.target_files import (
     numbers,
     six,
     split,
+    tool0_from,
     transform_arguments,
     world_from_base,
     xyz,
@@ -100,18 +100,12 @@ def kth(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Arr
 def ft_tools(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
     """ICube ft_tools_ros2 (tpoignonec), ft_tools/src/ft_estimation.cpp `remove_weight`, 080098e; ft_parameters.cpp.
 
-    `f_g = m R_ref_sensor^T g; raw - (f_g, com x f_g) - (force_offset, torque_offset)`. yaml-cpp reads the first
-    document only. g is the node's parameter `calibration.gravity_in_reference_frame`; it is taken from a later
-    document if there is one. The formulas of the README have the opposite sign.
+    `f_g = m R_ref_sensor^T g; raw - (f_g, com x f_g) - (force_offset, torque_offset)`. g is the parameter
+    `calibration.gravity_in_reference_frame` of ft_estimation_node, default (0, 0, -9.81), which the file does not have.
+    The formulas of the README have the opposite sign.
     """
-    first, *later = yaml.safe_load_all(text)
-    node = find(later, "gravity_in_reference_frame")
-    return _ft_calibration(
-        mapping(first),
-        lambda value: numbers(value, 3),
-        gravity_base(context) if node is None else numbers(node["gravity_in_reference_frame"], 3),
-        (R_base_flange, wrench, context),
-    )
+    file = mapping(yaml.safe_load(text))
+    return _ft_calibration(file, lambda value: numbers(value, 3), (R_base_flange, wrench, context))
 
 
 def ros2_message(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
@@ -122,7 +116,7 @@ def ros2_message(text: str, R_base_flange: Array, wrench: Array, context: Contex
     """
     fields = message(text)
     file = mapping(fields.get("ft_calibration", fields))
-    return _ft_calibration(file, xyz, gravity_base(context), (R_base_flange, wrench, context))
+    return _ft_calibration(file, xyz, (R_base_flange, wrench, context))
 
 
 def calaw(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
@@ -176,10 +170,11 @@ def admittance(text: str, R_base_flange: Array, wrench: Array, context: Context)
     (p,) = _ros_parameters(text, "gravity_compensation")
     gravity = p["gravity_compensation"]
     R_flange_sensor, _ = mounting(context)
-    frames = {p["ft_sensor"]["frame"]["id"]: R_flange_sensor, "tool0": np.eye(3), "flange": R_TOOL0_FLANGE}
+    frame = gravity["frame"]["id"]
+    R_flange_frame = R_flange_sensor if frame == p["ft_sensor"]["frame"]["id"] else tool0_from(frame)
     R_world_flange = world_from_base(p["fixed_world_frame"]["frame"]["id"]) @ R_base_flange
     R_world_sensor = R_world_flange @ R_flange_sensor
-    com_world = R_world_flange @ frames[gravity["frame"]["id"]] @ doubles(gravity["CoG"]["pos"], 3)
+    com_world = R_world_flange @ R_flange_frame @ doubles(gravity["CoG"]["pos"], 3)
     weight = np.array([0.0, 0.0, -doubles([gravity["CoG"]["force"]], 1)[0]])
     unbiased = (wrench - context_bias(context)).reshape(-1, 2, 3) @ R_world_sensor.transpose(0, 2, 1)
     left = unbiased - np.stack([np.broadcast_to(weight, com_world.shape), np.cross(com_world, weight)], axis=1)
@@ -192,16 +187,16 @@ def kit(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Arr
     handle: `raw - offset`. include/iirob_filters/gravity_compensation.h, in world axes: `f_z += force;
     t_x += force cog_y; t_y -= force cog_x` with cog turned to world from the axes of the data. `force` is positive
     newtons. The offset counts only with `Calibration/Offset/isStatic: true`, otherwise the node tares at start.
-    Its key `force` is also the filter's, so the two parts are two documents or stand in their namespaces.
+    Both parts stand under the node's name: in one file, since both have a key `force`. `recalibrate` is not evaluated.
     """
-    documents = list(yaml.safe_load_all(text))
-    offset, tool = find(documents, "torque"), find(documents, "CoG_x")
-    if offset is None or tool is None:
-        raise ValueError("no offset with `torque`, or no tool with `CoG_x`")
-    if offset.get("isStatic") is False:
-        raise ValueError("isStatic is false: the node would not use the offset")
+    file = mapping(yaml.safe_load(text))
+    offset, tool = mapping(file["Calibration"]["Offset"]), mapping(file["GravityCompensation"]["params"])
+    if tool["force_frame"] != tool["sensor_frame"]:
+        raise ValueError(f"force_frame {tool['force_frame']} is not the sensor_frame, and is not evaluated here")
+    if offset["isStatic"] is not True:
+        raise ValueError("isStatic is not true: the node would not use the offset")
     force = numbers([tool["force"]], 1)[0]
-    R_world_sensor = R_base_flange @ mounting(context)[0]
+    R_world_sensor = world_from_base(tool["world_frame"]) @ R_base_flange @ mounting(context)[0]
     unbiased = wrench - np.concatenate([xyz(offset["force"]), xyz(offset["torque"])], dtype=np.float64)
     data = unbiased.reshape(-1, 2, 3) @ R_world_sensor.transpose(0, 2, 1)
     cog = R_world_sensor @ numbers([tool["CoG_x"], tool["CoG_y"], tool["CoG_z"]], 3)
@@ -227,19 +222,21 @@ def code_iai(text: str, R_base_flange: Array, wrench: Array, context: Context) -
 def mc_rtc(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
     """jrl-umi3218/mc_rtc, src/mc_rbdyn/ForceSensor.cpp `loadData`, `wfToSensor`, 0a4d7c8; rpy_utils.h.
 
-    `f_ext = f_mes - offset - X_0_vb^T (0; -mass gravity)`, gravity = (0, 0, +9.81) of the robot's configuration.
+    `f_ext = f_mes - offset - X_0_vb^T (0; -mass gravity)`, gravity = (0, 0, +9.80665): Robot.cpp, 01d64da, loads the
+    file with `mc_rtc::constants::gravity` of mc_rtc/constants.h, 3cca220. (Old versions of Robot.cpp have 9.81.)
     13 numbers: mass; rpy of X_f_ds, from the model's sensor axes to the real ones (E = RotX RotY RotZ of
     SpaceVecAlg, the transpose of Rz Ry Rx); centre of mass in the *parent body*; offset as couple, then force.
-    The parent body is our flange. The stream must not end with the last number: a newline follows, no comment.
+    The stream must be good after the last number: white space follows. What follows that is not read.
     """
     words = text.split()
     if len(words) < 13 or (len(words) == 13 and not text[-1].isspace()):
         raise ValueError("calib_data needs 13 numbers and white space after the last one")
     x = np.array([float(word) for word in words[:13]])
-    R_flange_model = np.asarray(context.get("R_flange_model_sensor", np.eye(3)))
+    R_flange_parent = np.asarray(context.get("R_flange_parent", np.eye(3)))
+    R_flange_model = np.asarray(context.get("R_flange_model_sensor", R_flange_parent))
     R_flange_real = R_flange_model @ Rotation.from_euler("xyz", x[1:4]).as_matrix()
-    com = R_flange_real.T @ (x[4:7] - mounting(context)[1])
-    force = np.array([0.0, 0.0, -x[0] * 9.81]) @ (R_base_flange @ R_flange_real)
+    com = R_flange_real.T @ (R_flange_parent @ x[4:7] - mounting(context)[1])
+    force = np.array([0.0, 0.0, -x[0] * 9.80665]) @ (R_base_flange @ R_flange_real)
     return wrench - np.concatenate([x[10:13], x[7:10]], dtype=np.float64) - force_at(com, force)
 
 
@@ -265,7 +262,7 @@ def static_transform(text: str, R_base_flange: Array, wrench: Array, context: Co
     """
     (command,) = re.findall(r"^[^#\n]*static_transform_publisher (.*)", text.replace("\\\n", " "), re.MULTILINE)
     parent, position, rotation = transform_arguments(shlex.split(command, comments=True))
-    R_flange_parent = R_TOOL0_FLANGE if parent == "flange" else np.eye(3)
+    R_flange_parent = tool0_from(parent)
     R_flange_text, p_flange_text = R_flange_parent @ rotation.as_matrix(), R_flange_parent @ position
     R_flange_sensor, p_flange_sensor = mounting(context)
     p_flange_com = R_flange_sensor @ np.asarray(context["p_sensor_com_m"]) + p_flange_sensor
@@ -274,17 +271,18 @@ def static_transform(text: str, R_base_flange: Array, wrench: Array, context: Co
     return wrench - context_bias(context) - force_at(com, force)
 
 
-def plain_json(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
-    """`ftdrive.calibration/1`, the model in calib/README.md without the sensor's `response`.
+def plain_json(text: str, R_base_flange: Array, wrench: Array, _: Context) -> Array:
+    """`ftdrive.export/1`, ftdrive/exports/README.md; the fields are those of a calibration, calib/README.md.
 
-    `F = R_flange_sensor^T R_base_flange^T gravity_force_base_N; raw - (force_bias_N, torque_bias_Nm) - (F, p x F)`.
+    `u = R_flange_sensor^T R_base_flange^T gravity_force_base_N;
+    raw - (force_bias_N, torque_bias_Nm) - (u, p x u) - (force_gain u, cross_talk_m u)`.
     """
-    return _calibration(json.loads(text), R_base_flange, wrench, context)
+    return _plain(json.loads(text), R_base_flange, wrench)
 
 
-def plain_yaml(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
+def plain_yaml(text: str, R_base_flange: Array, wrench: Array, _: Context) -> Array:
     """As `plain_json`, in YAML 1.1."""
-    return _calibration(yaml.safe_load(text), R_base_flange, wrench, context)
+    return _plain(yaml.safe_load(text), R_base_flange, wrench)
 
 
 TARGETS: dict[str, Callable[[str, Array, Array, Context], Array]] = {
@@ -314,28 +312,31 @@ def _ros_parameters(text: str, key: str) -> list[Mapping[str, Any]]:
     return [mapping(parameters) for parameters in nodes if key in parameters]
 
 
-def _ft_calibration(file: Mapping[str, Any], vector: Callable[[Any], Array], gravity: Array, data: Data) -> Array:
+def _ft_calibration(file: Mapping[str, Any], vector: Callable[[Any], Array], data: Data) -> Array:
     R_base_flange, wrench, context = data
     com, force_offset, torque_offset = (
         vector(file[name]) for name in ("sensor_frame_to_com", "force_offset", "torque_offset")
     )
-    f_g = mass_kg(file["mass"]) * in_sensor_axes(gravity, R_base_flange, context)
+    f_g = mass_kg(file["mass"]) * in_sensor_axes(gravity_base(context), R_base_flange, context)
     return wrench - force_at(com, f_g) - np.concatenate([force_offset, torque_offset], dtype=np.float64)
 
 
-def _calibration(file: Any, R_base_flange: Array, wrench: Array, _: Context) -> Array:
-    if file["format"] != "ftdrive.calibration/1":
-        raise ValueError(f"not a calibration: {file['format']}")
+def _plain(file: Any, R_base_flange: Array, wrench: Array) -> Array:
+    if file["format"] != "ftdrive.export/1":
+        raise ValueError(f"not an export: {file['format']}")
     R_flange_sensor = np.array([numbers(row, 3) for row in file["R_flange_sensor"]])
-    force = numbers(file["gravity_force_base_N"], 3) @ (R_base_flange @ R_flange_sensor)
+    u = numbers(file["gravity_force_base_N"], 3) @ (R_base_flange @ R_flange_sensor)
     bias = np.concatenate([numbers(file["force_bias_N"], 3), numbers(file["torque_bias_Nm"], 3)], dtype=np.float64)
-    return wrench - bias - force_at(numbers(file["p_sensor_com_m"], 3), force)
+    load = force_at(numbers(file["p_sensor_com_m"], 3), u)
+    if file["response"] is not None:
+        rows = [*file["response"]["force_gain"], *file["response"]["cross_talk_m"]]
+        load += u @ np.array([numbers(row, 3) for row in rows]).T
+    return wrench - bias - load
 
 
 def _in_sensor(frame: str, point: Array, context: Context) -> Array:
     """(3,) a point of `frame` in the sensor frame; any other name than tool0 and flange is the sensor."""
-    if frame not in {"tool0", "flange"}:
+    if not frame.endswith(("tool0", "flange")):
         return point
     R_flange_sensor, p_flange_sensor = mounting(context)
-    p_flange_point = R_TOOL0_FLANGE @ point if frame == "flange" else point
-    return np.asarray(R_flange_sensor.T @ (p_flange_point - p_flange_sensor))
+    return np.asarray(R_flange_sensor.T @ (tool0_from(frame) @ point - p_flange_sensor))

@@ -1,25 +1,32 @@
-"""Targets that carry a payload, not a bias: calls of robot controllers, and robot models."""
+"""Targets that carry a payload, not a bias: calls of robot controllers, and robot models.
+
+The firmware of Franka and UR is not public: their formula is taken from the manuals' words on the payload.
+"""
 
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+import yaml
 from scipy.spatial.transform import Rotation
 
 from tests.target_files import (
-    R_TOOL0_FLANGE,
     Array,
     Context,
     Data,
     context_bias,
+    doubles,
     force_at,
     gravity_base,
+    in_sensor_axes,
+    mapping,
     mass_kg,
     message,
     mounting,
     numbers,
     split,
+    tool0_from,
 )
 
 Pose = tuple[Array, Array]
@@ -90,6 +97,28 @@ def mujoco(text: str, R_base_flange: Array, wrench: Array, context: Context) -> 
     return _payload(*_sum(bodies), (R_base_flange, wrench, context), with_sensor=with_sensor)
 
 
+def mujoco_plugin(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
+    """mujoco_ros2_control_plugins/src/fts_grav_comp_plugin.cpp, 145426f, ros-controls/mujoco_ros2_control PR #308.
+
+    In MuJoCo's sign, in the site of the sensor: `F + mass g; T + pos x (mass g)`, pos moved from the site `frame_id`.
+    The hardware interface then negates both. The parameters stand in a comment of the model, which must have a site
+    `frame_id`, and the sensors NAME_force and NAME_torque; here both are at one site.
+    """
+    (parameters,) = re.findall(r"<!--[^\n]*\n(/\*\*:.*?)-->", text, re.DOTALL)
+    plugins = yaml.safe_load(parameters)["/**"]["ros__parameters"]["mujoco_plugins"]
+    plugin = mapping(plugins["fts_grav_comp_plugin"])
+    if plugin["type"] != "mujoco_ros2_control_plugins/FtsGravCompPlugin":
+        raise ValueError(f"a plugin {plugin['type']}")
+    ((name, sensor),) = ((name, mapping(value)) for name, value in plugin.items() if name != "type")
+    model = _parse(text)
+    for kind in ("force", "torque"):
+        if [one.get("site") for one in model.iter(kind) if one.get("name") == f"{name}_{kind}"] != [sensor["frame_id"]]:
+            raise ValueError(f"no sensor {name}_{kind} at the site {sensor['frame_id']}")
+    mass, pos = doubles([sensor["CoG"]["mass"]], 1)[0], doubles(sensor["CoG"]["pos"], 3)
+    weight = mass * in_sensor_axes(gravity_base(context), R_base_flange, context)
+    return -(-(wrench - context_bias(context)) + force_at(pos, weight))
+
+
 def _payload(mass: float, p_flange_com: Array, data: Data, *, with_sensor: bool = True) -> Array:
     """Subtract bias and payload, less sensor and adapter if it includes them, from a wrench about the sensor origin."""
     R_base_flange, wrench, context = data
@@ -129,7 +158,7 @@ def _urdf_load(text: str, R_flange_sensor: Array, p_flange_sensor: Array) -> tup
 
     def pose(link: str) -> Pose:
         if link not in joints:
-            return (R_TOOL0_FLANGE if link == "flange" else np.eye(3)), np.zeros(3)
+            return tool0_from(link), np.zeros(3)
         parent, origin = joints[link]
         return _compose(pose(parent), origin)
 
@@ -153,8 +182,8 @@ def _mujoco_load(text: str, R_flange_sensor: Array, p_flange_sensor: Array) -> t
 
     mujoco.readthedocs.io/en/stable/XMLreference.html: `pos` and orientation of a body are in its parent, those of
     `inertial` and `site` in the body. `quat` is w x y z; `euler` and `axisangle` are degrees unless
-    `<compiler angle="radian">`; `eulerseq` is xyz, turning axes. The outermost body hangs on the flange, or is the
-    flange if its name is tool0 or flange. The sensor's site belongs to the child: its whole body counts as load.
+    `<compiler angle="radian">`; `eulerseq` is xyz, turning axes. The outermost body hangs on tool0, or is what its name
+    says: tool0, or ROS-Industrial's flange. The sensor's site belongs to the child: its whole body counts as load.
     """
     model = _parse(text)
     compiler = next(model.iter("compiler"), ET.Element("compiler")).attrib
@@ -165,8 +194,9 @@ def _mujoco_load(text: str, R_flange_sensor: Array, p_flange_sensor: Array) -> t
 
     def visit(parent: ET.Element, pose: Pose) -> None:
         for body in parent.findall("body"):
-            is_flange = parent.tag != "body" and body.get("name") in {"tool0", "flange"}
-            here = flange if is_flange else _compose(pose, _mujoco_pose(body, compiler))
+            name = body.get("name", "")
+            is_flange = parent.tag != "body" and name.endswith(("tool0", "flange"))
+            here = (tool0_from(name), np.zeros(3)) if is_flange else _compose(pose, _mujoco_pose(body, compiler))
             bodies.append((body, here))
             visit(body, here)
 

@@ -87,7 +87,7 @@ admittance_controller:
     fixed_world_frame: {frame: {id: base_link}}
     gravity_compensation: {frame: {id: ft_sensor}, CoG: {pos: [0.02, 0.0, 0.1], force: 10.0}}
 """,
-    "mc-rtc": f"{KG_AT_9_81}\n0 0 {math.pi / 2}\n0 0.02 0.13\n0.1 0.2 0.3\n1 2 3\n",
+    "mc-rtc": f"{10 / 9.80665}\n0 0 {math.pi / 2}\n0 0.02 0.13\n0.1 0.2 0.3\n1 2 3\n",
     "xarm": "arm.ft_sensor_cali_load([1.0, 20.0, 0.0, 100.0, 1.0, 2.0, 3.0, 0.1, 0.2, 0.3])  # kg, mm, N, N·m [SDK]\n",
     "franka": f"""
 // kg, m, kg·m2
@@ -100,7 +100,7 @@ Calibration:
     force: {x: 1.0, y: 2.0, z: 3.0}
     torque: {x: 0.1, y: 0.2, z: 0.3}
 GravityCompensation:
-  params: {world_frame: base_link, CoG_x: 0.02, CoG_y: 0.0, CoG_z: 0.1, force: 10.0}
+  params: {world_frame: base_link, sensor_frame: s, force_frame: s, CoG_x: 0.02, CoG_y: 0.0, CoG_z: 0.1, force: 10.0}
 """,
     "code-iai": """
 center_of_mass:
@@ -144,19 +144,20 @@ force_offset: {x: 1.0, y: 2.0, z: 3.0}
 torque_offset: {x: 0.1, y: 0.2, z: 0.3}
 """,
     "json": """{
- "format": "ftdrive.calibration/1",
+ "format": "ftdrive.export/1",
  "R_flange_sensor": [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
  "gravity_force_base_N": [0.0, 0.0, -10.0],
  "p_sensor_com_m": [0.02, 0.0, 0.1],
- "force_bias_N": [1.0, 2.0, 3.0], "torque_bias_Nm": [0.1, 0.2, 0.3]
+ "force_bias_N": [1.0, 2.0, 3.0], "torque_bias_Nm": [0.1, 0.2, 0.3], "response": null
 }""",
     "yaml": """
-format: ftdrive.calibration/1
+format: ftdrive.export/1
 R_flange_sensor: [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
 gravity_force_base_N: [0.0, 0.0, -10.0]
 p_sensor_com_m: [0.02, 0.0, 0.1]
 force_bias_N: [1.0, 2.0, 3.0]
 torque_bias_Nm: [0.1, 0.2, 0.3]
+response: null
 """,
 }
 SAME_TOOL = {
@@ -181,11 +182,6 @@ SAME_TOOL = {
         f"mass: 1.5\ncenter_of_mass: [{COG_FLANGE[0]}, {COG_FLANGE[1]}, {COG_FLANGE[2]}]\n"
         "load_inertia: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n",
     ),
-    "kit, two files": (
-        "kit",
-        "CoG_x: 0.02\nCoG_y: 0.0\nCoG_z: 0.1\nforce: 10.0\n---\n"
-        "force: {x: 1.0, y: 2.0, z: 3.0}\ntorque: {x: 0.1, y: 0.2, z: 0.3}\n",
-    ),
     "urdf, payload at the flange": (
         "urdf",
         '<joint name="j" type="fixed"><parent link="tool0"/><child link="payload"/></joint>'
@@ -202,7 +198,7 @@ SAME_TOOL = {
     ),
     "mujoco, payload at the flange": (
         "mujoco",
-        '<mujoco><compiler angle="radian"/><worldbody><body name="flange" pos="1 2 3" euler="1 2 3">'
+        '<mujoco><compiler angle="radian"/><worldbody><body name="tool0" pos="1 2 3" euler="1 2 3">'
         f'<body name="payload" pos="0 {COG_FLANGE[1]} {COG_FLANGE[2]}"><inertial pos="0 0 0" mass="1.5"/></body>'
         "</body></worldbody></mujoco>",
     ),
@@ -255,7 +251,7 @@ TURNED_CONTEXT = CONTEXT | {"R_flange_sensor": [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
 TURNED_RAW = np.array([[1.5, 12.0, 3.0, -0.9, 0.2, 0.75], [1.5, 2.0, 13.0, 0.1, 0.0, 0.55]])
 """Free tool: (0, 10, 0) N, (-1, 0, 0.2) N·m and (0, 0, 10) N, (0, -0.2, 0) N·m."""
 TURNED = {
-    "mc-rtc": f"{KG_AT_9_81} {math.pi / 2} 0 {math.pi / 2} 0.1 0.02 0.03 0.1 0.2 0.3 1 2 3\n",
+    "mc-rtc": f"{10 / 9.80665} {math.pi / 2} 0 {math.pi / 2} 0.1 0.02 0.03 0.1 0.2 0.3 1 2 3\n",
     "urdf": TEXTS["urdf"].replace('rpy="0 0 1', f'rpy="{math.pi / 2} 0 1'),
     "mujoco": TEXTS["mujoco"].replace(f"{QUARTER} 0 0 {QUARTER}", "0.5 0.5 0.5 0.5"),
     "mujoco, turning axes": '<compiler eulerseq="zxy"/>'
@@ -293,8 +289,6 @@ TILTED = {
     "ros2-control, base_link": TEXTS["ros2-control"]
     .replace("world_frame: base", "world_frame: base_link")
     .replace("[0.0, 0.0, -10.0]", "[-6.0, 0.0, -8.0]"),
-    "ft-tools": TEXTS["ft-tools"]
-    + "---\nft_estimation_node:\n  ros__parameters:\n    calibration: {gravity_in_reference_frame: [6.0, 0.0, -8.0]}\n",
     "json": TEXTS["json"].replace("[0.0, 0.0, -10.0]", "[6.0, 0.0, -8.0]"),
 }
 
@@ -305,7 +299,9 @@ def test_a_tilt_in_the_file_counts(name: str, text: str) -> None:
     np.testing.assert_allclose(left, [CONTACT], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["kth", "ros2-message", "code-iai", "xarm", "franka", "urdf", "mujoco", "ur-payload"])
+@pytest.mark.parametrize(
+    "name", ["kth", "ft-tools", "ros2-message", "code-iai", "xarm", "franka", "urdf", "mujoco", "ur-payload"]
+)
 def test_a_tilt_among_the_settings_of_the_target_counts(name: str) -> None:
     left = evaluate(name, TEXTS[name], DOWN[None], TILTED_RAW, CONTEXT | {"gravity_m_s2": TILTED_GRAVITY})
     np.testing.assert_allclose(left, [CONTACT], atol=1e-12)
