@@ -104,8 +104,18 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     metavar="X,Y,Z",
     help="Centre of mass of sensor and adapter, mm from the flange face along its axes.",
 )
-@click.option("--base-frame", default="base", show_default=True, help="Name of the controller's base frame.")
-@click.option("--flange-frame", default="tool0", show_default=True, help="Name of the flange frame.")
+@click.option(
+    "--base-frame",
+    default="base",
+    show_default=True,
+    help="Name of the controller's base frame; with base_link, vectors are turned by 180° about z, as in ROS.",
+)
+@click.option(
+    "--flange-frame",
+    default="tool0",
+    show_default=True,
+    help="Name of the flange frame, z out; with flange, x points out, as in ROS-Industrial.",
+)
 @click.option("--sensor-frame", default="ft_sensor", show_default=True, help="Name of the sensor and its frame.")
 @click.option("--tool-frame", default="tool", show_default=True, help="Name of the tool and its frame.")
 @click.option(
@@ -151,6 +161,8 @@ def calibration(
     with _calibrated(source, sensor, simulate=simulate) as path:
         result = load_calibration(path)
         recorded_height_mm, recorded_mass_kg = recorded_sensor(path, result)
+    if simulate:
+        recorded_mass_kg = 0.0  # an emulated sensor weighs nothing
     settings = Settings(
         base_frame=base_frame,
         flange_frame=flange_frame,

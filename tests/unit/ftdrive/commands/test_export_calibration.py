@@ -1,6 +1,7 @@
 """`ftdrive export calibration` and `ftdrive export formats`: options, the run's configuration, JSON, files."""
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import yaml
 from click.testing import CliRunner, Result
 
 from ftdrive.cli import cli, exit_code
+from ftdrive.commands import emulated_run
 from ftdrive.errors import ConfigError
 from ftdrive.exports.calibration.formats import FORMATS
 from ftdrive.runs.run import Run
@@ -52,6 +54,14 @@ def test_text_goes_to_stdout_and_notes_to_stderr(saved: Path) -> None:
     assert outcome.exit_code == 0
     assert yaml.safe_load(outcome.stdout)["mass"] == pytest.approx(2.0)
     assert "gravity_in_reference_frame = [0, 0, -9.80665]" in " ".join(outcome.stderr.split())
+
+
+def test_an_emulated_sensor_weighs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Run.create(tmp_path, "simulated", {"config": {"sensor": {"url": "x", "height_mm": 0.0}}}).folder
+    calibration().save(folder / "calibration.json")
+    monkeypatch.setattr(emulated_run, "rehearsed_run", lambda _: nullcontext(folder))
+    outcome = export("calibration", "--simulate", "--format", "franka")
+    assert yaml.safe_load(outcome.stdout)["mass"] == pytest.approx(2.0)
 
 
 def test_json_has_text_notes_and_what_is_set_elsewhere(saved: Path) -> None:
