@@ -111,9 +111,10 @@ def _lost(calibration: CalibrationResult, target: Format) -> Iterator[str]:
 
 
 def _lossless(calibration: CalibrationResult, target: Format) -> Iterator[str]:
-    """Name the formats that lose nothing and subtract as much."""
+    """Name the formats that lose nothing, subtract as much, and read our sensor if the target does."""
     for name, other in FORMATS.items():
-        if set(other.subtracts) >= set(target.subtracts) and not list(_lost(calibration, other)):
+        as_much = set(other.subtracts) >= set(target.subtracts) and other.has_own_reading <= target.has_own_reading
+        if as_much and not list(_lost(calibration, other)):
             yield name
 
 

@@ -58,6 +58,13 @@ def test_a_tilt_that_is_expressed_costs_nothing(name: str) -> None:
     assert export(result, name, MEASURED, max_force_error_N=0).max_force_error_N == 0
 
 
+def test_no_model_is_proposed_in_place_of_a_target_that_reads_the_sensor() -> None:
+    with pytest.raises(NotAccepted, match="Choose another format") as error:
+        export(tilted(1.8), "admittance", MEASURED)
+    assert "ros2-control" in str(error.value)
+    assert not [name for name in ("urdf", "mujoco", "ur-payload") if name in str(error.value)]
+
+
 def test_a_turned_sensor_is_an_error_where_the_target_has_the_axes_of_the_flange() -> None:
     with pytest.raises(NotAccepted, match=rf"turned by 90°.*{WEIGHT_N * sqrt(2):.3g} N"):
         export(calibration(), "xarm", MEASURED)
