@@ -32,7 +32,7 @@ _COMMANDS = {
     "compensate": ("ftdrive.commands.compensate", "Compensate a recording. Needs no device."),
     "stream": ("ftdrive.commands.stream", "Serve the wrench to Foxglove, Lichtblick and PlotJuggler."),
     "replay": ("ftdrive.commands.replay", "Repeat a recorded run through the same routine and solver."),
-    "export": ("ftdrive.commands.export", "Write a plan as a program for the pendant or as a table."),
+    "export": ("ftdrive.commands.export", "Write a plan or a calibration for another program."),
     "transcript": ("ftdrive.commands.transcript", "Record or play the bytes on a sensor's wire."),
 }
 

@@ -6,7 +6,7 @@ from ftdrive.errors import PlanRefused
 from ftdrive.planning.plan import Plan
 
 _FASTEST_RAD_S, _FASTEST_RAD_S2 = pi + 1e-9, radians(300) + 1e-9
-_SPELLED = {"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u"}
+_SPELLED = {"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u", "²": "2"}
 
 
 def require_usable(plan: Plan) -> None:

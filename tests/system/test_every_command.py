@@ -35,6 +35,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
     "init": ("--yes", "--height", "33", "--tool", "0:60:90"),
     "calibrate": ("--minimal", "--yes"),
     "live": ("--once",),
+    "export calibration": ("--format", "json"),
     "export plan": ("--format", "csv"),
     "report": ("--format", "md"),
     "record": ("--output", "a.csv", "--count", "500"),
@@ -42,10 +43,10 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
 }
 """What a command cannot do without; any other must work with --simulate and --json alone."""
 
-OFFLINE = ("convert", "compensate", "history", "diff")
-"""They read files and know no cell."""
+OFFLINE = ("convert", "compensate", "history", "diff", "export formats")
+"""They know no cell."""
 
-REHEARSED = ("replay", "report", "solve")
+REHEARSED = ("replay", "report", "solve", "export calibration")
 """They calibrate an emulated cell first, as do live, push (test_push.py) and demo (test_demo.py)."""
 
 SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
@@ -55,6 +56,7 @@ SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     ),
     "devices": lambda answer: len(answer["serial"]) == 2,
     "doctor": lambda answer: all(check["state"] != "failed" for check in answer["checks"]),
+    "export calibration": lambda answer: json.loads(answer["text"])["id"] == answer["calibration"],
     "export plan": lambda answer: answer["text"].startswith("# ftdrive.targets/1") and answer["file"] is None,
     "init": lambda answer: answer["config"]["tool"]["cylinders_mm"] == [[0, 60, 90]] and "UR5e" in answer["robot"],
     "live": lambda answer: sum(f**2 for f in answer["compensated"]["force_N"]) ** 0.5 < 0.2,
@@ -143,7 +145,7 @@ def test_a_command_that_needs_a_run_works_with_simulate_and_json(
     capfd: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    module = importlib.import_module(f"ftdrive.commands.{command}")
+    module = importlib.import_module(f"ftdrive.commands.{'emulated_run' if ' ' in command else command}")
     monkeypatch.setattr(module, "rehearsed_run", lambda _: nullcontext(Path(demo["run"])))
     works_with_simulate_and_json(command, ftdrive, capfd)
 
@@ -199,6 +201,7 @@ def test_the_sensor_that_is_named_is_emulated(
         (("record", "-o", "a.csv"), "--simulate"),
         (("transcript", "play"), "--simulate"),
         (("export", "plan", "--format", "csv"), "--simulate"),
+        (("export", "calibration", "--format", "json"), "--simulate"),
     ],
 )
 def test_what_would_be_ignored_or_is_missing_is_refused(arguments: tuple[str, ...], words: str) -> None:

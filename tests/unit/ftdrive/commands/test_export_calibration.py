@@ -1,0 +1,150 @@
+"""`ftdrive export calibration` and `ftdrive export formats`: options, the run's configuration, JSON, files."""
+
+import json
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner, Result
+
+from ftdrive.cli import cli, exit_code
+from ftdrive.commands import emulated_run
+from ftdrive.errors import ConfigError
+from ftdrive.exports.calibration.formats import FORMATS
+from ftdrive.runs.run import Run
+from tests.unit.ftdrive.exports.calibration.example import calibration, tilted
+
+
+def export(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, ["export", *map(str, arguments)])
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    calibration().save(tmp_path / "calibration.json")
+    return tmp_path / "calibration.json"
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    config = {"sensor": {"url": "x", "height_mm": 40.0, "mass_kg": 0.0}}
+    folder = Run.create(tmp_path, "tool", {"config": config}).folder
+    calibration().save(folder / "calibration.json")
+    return folder
+
+
+def height_m(outcome: Result) -> float:
+    words = outcome.stdout.split()
+    return float(words[words.index("--z") + 1])
+
+
+def test_formats_are_listed_for_people_and_programs() -> None:
+    answer = json.loads(export("formats", "--json").stdout)
+    assert answer["schema_version"] == 1
+    assert [one["name"] for one in answer["formats"]] == list(FORMATS)
+    assert answer["formats"][0].keys() >= {"name", "description", "file"}
+    assert len(export("formats").stdout.splitlines()) == len(FORMATS)
+
+
+def test_text_goes_to_stdout_and_notes_to_stderr(saved: Path) -> None:
+    outcome = export("calibration", saved, "--format", "ft-tools")
+    assert outcome.exit_code == 0
+    assert yaml.safe_load(outcome.stdout)["mass"] == pytest.approx(2.0)
+    assert "gravity_in_reference_frame = [0, 0, -9.80665]" in " ".join(outcome.stderr.split())
+
+
+def test_an_emulated_sensor_weighs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Run.create(tmp_path, "simulated", {"config": {"sensor": {"url": "x", "height_mm": 0.0}}}).folder
+    calibration().save(folder / "calibration.json")
+    monkeypatch.setattr(emulated_run, "rehearsed_run", lambda _: nullcontext(folder))
+    outcome = export("calibration", "--simulate", "--format", "franka")
+    assert yaml.safe_load(outcome.stdout)["mass"] == pytest.approx(2.0)
+
+
+def test_json_has_text_notes_and_what_is_set_elsewhere(saved: Path) -> None:
+    answer = json.loads(export("calibration", saved, "--format", "ft-tools", "--json").stdout)
+    assert (answer["schema_version"], answer["format"], answer["file"]) == (1, "ft-tools", None)
+    assert answer["calibration"] == calibration().id
+    assert answer["elsewhere"]["calibration.reference_frame.id"] == "base"
+    assert answer["max_force_error_N"] == 0
+    assert len(answer["notes"]) == 4
+    assert yaml.safe_load(answer["text"])["mass"] == pytest.approx(2.0)
+
+
+def test_a_file_is_new_and_complete_or_absent(saved: Path, tmp_path: Path) -> None:
+    path = tmp_path / "ft.yaml"
+    first = export("calibration", saved, "--format", "kit", "-o", path)
+    assert (first.exit_code, first.stdout) == (0, "")
+    text = path.read_text()
+    again = export("calibration", saved, "--format", "kit", "-o", path)
+    assert isinstance(again.exception, ConfigError)
+    assert path.read_text() == text
+    tilted(3).save(tmp_path / "tilted.json")
+    refused = export("calibration", tmp_path / "tilted.json", "--format", "kit", "-o", tmp_path / "new.yaml")
+    assert refused.exception is not None
+    assert exit_code(refused.exception) == 7
+    assert not list(tmp_path.glob("new*"))
+    limit = ("--max-force-error", "1.1", "-o", tmp_path / "new.yaml")
+    assert export("calibration", tmp_path / "tilted.json", "--format", "kit", *limit).exit_code == 0
+
+
+def test_height_and_mass_come_from_the_run_unless_an_option_has_them(run: Path, saved: Path) -> None:
+    arguments = "calibration", run, "--format", "static-transform"
+    assert height_m(export(*arguments)) == pytest.approx(0.04)
+    assert height_m(export(*arguments, "--height", "33")) == pytest.approx(0.033)
+    payload = yaml.safe_load(export("calibration", run, "--format", "franka").stdout)
+    assert payload["mass"] == pytest.approx(2.0)
+    assert payload["F_x_Cload"][2] == pytest.approx(0.09)
+    alone = export("calibration", saved, "--format", "static-transform")
+    assert isinstance(alone.exception, ConfigError)
+
+
+def test_a_calibration_file_that_still_lies_in_its_run_has_its_configuration(run: Path) -> None:
+    def named(name: str) -> dict[str, Any]:
+        document = calibration().to_dict()
+        document["provenance"] = {"run": name, "setup": {"sensor_mass_kg": 0.25}}
+        return document
+
+    (run / "mine.json").write_text(json.dumps(named(run.name)))
+    assert height_m(export("calibration", run / "mine.json", "--format", "static-transform")) == pytest.approx(0.04)
+    (run / "other.json").write_text(json.dumps(named("another")))
+    other = export("calibration", run / "other.json", "--format", "static-transform")
+    assert isinstance(other.exception, ConfigError)
+    options = "--height", "0", "--sensor-com", "0,0,20"
+    payload = export("calibration", run / "other.json", "--format", "franka", *options)
+    assert yaml.safe_load(payload.stdout)["mass"] == pytest.approx(2.25)  # the result names the mass itself
+
+
+def test_names_of_frames_are_options(saved: Path) -> None:
+    frames = "--base-frame", "world", "--sensor-frame", "ft", "--tool-frame", "gripper"
+    found = yaml.safe_load(export("calibration", saved, "--format", "kth", *frames).stdout)
+    assert (found["gripper_com_frame_id"], found["gripper_com_child_frame_id"]) == ("ft", "gripper")
+
+
+def test_three_numbers_are_wanted_for_a_place(saved: Path) -> None:
+    outcome = export("calibration", saved, "--format", "franka", "--height", "1", "--sensor-com", "0,0")
+    assert isinstance(outcome.exception, ConfigError)
+    assert "--sensor-com is '0,0'" in str(outcome.exception)
+
+
+def test_an_unknown_format_is_a_usage_error_that_lists_the_known(saved: Path) -> None:
+    outcome = export("calibration", saved, "--format", "kht")
+    assert outcome.exit_code == 2
+    assert all(name in outcome.stderr for name in FORMATS)
+
+
+def test_the_text_compensates_as_the_result_does(saved: Path) -> None:
+    """The formula of `complete.as_json`, on random poses."""
+    found = json.loads(export("calibration", saved, "--format", "json").stdout)
+    value = {key: np.array(item) for key, item in found.items() if key.endswith(("_N", "_Nm", "_m", "sensor"))}
+    rng = np.random.default_rng(4)
+    wrench = rng.normal(size=(50, 6))
+    R = np.linalg.qr(rng.normal(size=(50, 3, 3)))[0]
+    R *= np.linalg.det(R)[:, None, None]
+    u = value["gravity_force_base_N"] @ R @ value["R_flange_sensor"]
+    force = wrench[:, :3] - value["force_bias_N"] - u
+    torque = wrench[:, 3:] - value["torque_bias_Nm"] - np.cross(value["p_sensor_com_m"], u)
+    np.testing.assert_allclose(np.hstack([force, torque]), calibration().compensate(wrench, R), atol=1e-12)
