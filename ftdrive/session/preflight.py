@@ -60,8 +60,6 @@ class Row:
 
     name: str
     """In the event."""
-    hazards: tuple[int, ...]
-    """The rows of the hazard table that it covers."""
     judge: Callable[[Before], Check]
 
     def __call__(self, before: Before) -> Checked:
@@ -182,26 +180,26 @@ def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
         clock.sleep(0.02)
 
 
-_APPROACH: Final = Row("approach", (5,), check_approach)
+_APPROACH: Final = Row("approach", check_approach)
 
 CHECKS: Final[Sequence[Row]] = (
-    Row("safety", (10, 11, 12), lambda before: devices.check_safety(before.arm.status())),
-    Row("remote", (21,), lambda before: devices.check_remote(before.arm)),
-    Row("model", (8, 9), check_model),
-    Row("payload", (7,), check_payload),
-    Row("slider", (22,), lambda before: devices.check_speed(before.arm.status())),
-    Row("link", (16,), check_link),
-    Row("sensor", (14, 15), check_sensor),
-    Row("load", (13,), lambda before: devices.check_load(before.sensor_range, before.cell)),
-    Row("workcell", (3,), check_workcell),
-    Row("plan", (2, 25), check_plan),
+    Row("safety", lambda before: devices.check_safety(before.arm.status())),
+    Row("remote", lambda before: devices.check_remote(before.arm)),
+    Row("model", check_model),
+    Row("payload", check_payload),
+    Row("slider", lambda before: devices.check_speed(before.arm.status())),
+    Row("link", check_link),
+    Row("sensor", check_sensor),
+    Row("load", lambda before: devices.check_load(before.sensor_range, before.cell)),
+    Row("workcell", check_workcell),
+    Row("plan", check_plan),
     _APPROACH,
-    Row("cable", (1,), check_cable),
-    Row("disk", (26,), lambda before: computer.check_disk(before.runs)),
+    Row("cable", check_cable),
+    Row("disk", lambda before: computer.check_disk(before.runs)),
 )
 """In the order of their events. None of them takes control of the arm."""
 
-IN_CONTROL: Final[Sequence[Row]] = (Row("limits", (3,), check_safety_limits),)
+IN_CONTROL: Final[Sequence[Row]] = (Row("limits", check_safety_limits),)
 """Checks that need a program on the controller, made when all others have passed."""
 
 AGAIN: Final[Sequence[Row]] = (*(row for row in CHECKS if row is not _APPROACH), *IN_CONTROL)

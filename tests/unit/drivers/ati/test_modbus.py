@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from drivers.ati import modbus
 from drivers.errors import ProtocolError
 from drivers.wires.crc import crc16_modbus
+from drivers.wires.status_word import describe_status
 
 V1 = bytes.fromhex("00 64 01 2C 01 F4 FF 38 FE 70 FD A8 50")
 V2 = bytes.fromhex("00 DD 00 45 09 26 FC 62 FB C2 04 F2 62")
@@ -213,3 +214,10 @@ def test_judging_in_batches_settles_like_judging_at_once(seen: str, batch: int) 
         slipped = False
     assert slipped == slipped_whole
     assert kept == whole.tolist()
+
+
+@pytest.mark.parametrize(
+    ("bit", "words"), [(1, "voltage too high"), (7, "EEPROM"), (11, "thermistor too high"), (12, "thermistor too low")]
+)
+def test_status_bits_have_the_numbers_of_the_manual(bit: int, words: str) -> None:
+    assert words in describe_status(1 << bit, modbus.STATUS_BITS)
