@@ -5,6 +5,7 @@ rest come first. If some orientations are out of reach, the most informative rea
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +20,7 @@ from ftdrive.planning.geometry.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan, make_plan
 from ftdrive.planning.search import constant_tour
-from ftdrive.planning.search.chosen import Chosen, chosen_tour
+from ftdrive.planning.search.chosen import Chosen, chosen_tour, verification_tour
 from ftdrive.planning.search.nodes import WRIST_6_RAD, box_nodes, wrist_nodes
 from ftdrive.planning.search.postures import with_room
 from ftdrive.planning.search.tours import clear_tour
@@ -29,6 +30,7 @@ USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 NUMBERS = {24: tuple(range(1, 25)), 12: T12, 6: SUBSET_6}
 BOX_HALF_SIZE_M = 0.1
 FEWEST_CHOSEN = 6
+FEWEST_TO_VERIFY = 2
 
 Found = tuple[Sequence[int], Array]
 """Numbers of the orientations and joint vectors (n, 6), in the order of travel."""
@@ -181,6 +183,42 @@ def plan_box(
         "reach, or no tour of them is proven clear: give a larger box, or another centre"
     )
     return _first_found([("box", [_box_words(centre, half_size_m)], found)], refusal, certifier, speeds, guess)
+
+
+def plan_verification(
+    certifier: Certifier, q_rad: ArrayLike, poses: int, R_fitted: Array, *, speeds: Speeds, guess: Guess
+) -> Plan:
+    """Plan a tour of poses that are far from those of a calibration.
+
+    Parameters
+    ----------
+    q_rad : array_like, shape (6,)
+        Present joint angles.
+    poses : int
+        2 or more.
+    R_fitted : array, shape (k, 3, 3)
+        Orientations R_base_flange of the calibration.
+    guess : Guess
+        As of `plan_tour`.
+
+    Raises
+    ------
+    PlanRefused
+        Too few poses are reachable by moves that are proven clear.
+    """
+    q_now = checked_joints(q_rad)
+    if poses < FEWEST_TO_VERIFY:
+        raise ConfigError(f"{poses} poses cannot verify a calibration: give {FEWEST_TO_VERIFY} or more")
+    found = verification_tour(certifier, q_now, poses, R_fitted, speeds)
+    if found is None:
+        raise PlanRefused(
+            f"no tour of {poses} fresh poses is reachable and proven clear: jog the arm to another posture, or clear "
+            "the surroundings"
+        )
+    why = f"{poses} poses that were not used in the calibration, far from its {len(R_fitted)} poses."
+    elsewhere = [] if np.array_equal(found[1][0, :3], q_now[:3]) else [_elsewhere_words(found[1][0])]
+    plan = make_plan("verification", [why, *elsewhere], certifier, *found, speeds, guess)
+    return replace(plan, why=(why, *elsewhere))  # without the accuracy of a calibration from these poses
 
 
 def _numbers(poses: int) -> tuple[int, ...]:

@@ -1,0 +1,235 @@
+"""From the poses of a verification on disk to its outcome, and to an updated calibration.
+
+verification.json   ftdrive.verification/1, in the run folder of the poses: calibration, limits, poses, outcome
+calibration.json    in the same folder, if the operator accepted an update: its provenance names the parent
+"""
+
+import json
+import sys
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from scipy.special import chdtrc as chi2_sf
+
+from calib import CalibrationDataset, CalibrationResult
+from calib.extras.verification import Verification, verify
+from calib.errors import BadCalibration, BadDataset
+from calib.extras.update import Update
+from calib.files import JSON, write_new
+from calib.model import Array
+from calib.routine import DriftCheck, PoseRecord, dataset_from, drift_check, is_return
+from ftdrive.runs.run import Run, versions
+from ftdrive.runs.verification import FORMAT
+
+FALSE_ALARMS: Final = 0.01
+"""Share of verifications of an unchanged cell that fail."""
+_SAME: Final = 1e-9
+_COPIED: Final = ("devices", "station", "setup")
+"""Parts of a calibration's provenance that an update keeps."""
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptanceLimits:
+    """Largest differences that pass. If either is given, it decides instead of the predicted uncertainty."""
+
+    force_N: float | None = None
+    torque_Nm: float | None = None
+
+    @property
+    def given(self) -> bool:
+        """Whether either limit is given."""
+        return self.force_N is not None or self.torque_Nm is not None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verified:
+    """A verification run, compared with the calibration."""
+
+    run: Run
+    calibration: CalibrationResult
+    calibration_path: Path
+    limits: AcceptanceLimits
+    dataset: CalibrationDataset
+    records: tuple[PoseRecord, ...]
+    """One for each row of the dataset."""
+    verification: Verification
+    drift: DriftCheck | None
+    path: Path
+    """verification.json"""
+
+    @property
+    def force_N(self) -> Array:
+        """(n,) norm of the difference at each pose."""
+        return np.asarray(np.linalg.norm(self.verification.residual[:, :3], axis=1))
+
+    @property
+    def torque_Nm(self) -> Array:
+        """(n,) norm of the difference at each pose."""
+        return np.asarray(np.linalg.norm(self.verification.residual[:, 3:], axis=1))
+
+    @property
+    def passed(self) -> bool:
+        """Whether the calibration holds, by the limits given or by its predicted uncertainty."""
+        if not self.limits.given:
+            return bool(self.verification.passed)
+        return not self.exceeded
+
+    @property
+    def exceeded(self) -> tuple[str, ...]:
+        """AcceptanceLimits that a pose exceeds, in words with the values."""
+        pairs = (
+            (self.force_N, self.limits.force_N, "--max-force", "N"),
+            (self.torque_Nm, self.limits.torque_Nm, "--max-torque", "N·m"),
+        )
+        return tuple(
+            f"{found.max():.3g} {unit} is above {option} {limit:g} {unit}"
+            for found, limit, option, unit in pairs
+            if limit is not None and found.max() > limit
+        )
+
+    @property
+    def update(self) -> Update | None:
+        """The smallest sufficient update; None if the calibration holds, or if only a new calibration helps."""
+        return self.verification.update
+
+    @property
+    def update_name(self) -> str | None:
+        """What the update estimates: "bias", "payload" (with the bias, if it has changed) or "all"."""
+        if self.update is None:
+            return None
+        old, new = self.calibration.parameters, self.update.parameters
+        turned = np.abs(new.R_flange_sensor - old.R_flange_sensor).max() > _SAME
+        leans = np.linalg.norm(np.cross(new.gravity_force_base_N, old.gravity_force_base_N)) > _SAME
+        if turned or leans:
+            return "all"
+        weight_N = np.linalg.norm(new.gravity_force_base_N) - np.linalg.norm(old.gravity_force_base_N)
+        moved_m = np.abs(new.p_sensor_com_m - old.p_sensor_com_m).max()
+        return "payload" if abs(weight_N) > _SAME or moved_m > _SAME else "bias"
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return the content of verification.json."""
+        found, header = self.verification, self.run.header()
+        numbers = found.to_dict()
+        return {
+            "format": FORMAT,
+            "schema_version": 1,
+            "created_utc": datetime.now(UTC).isoformat(),
+            "run": self.run.folder.name,
+            "calibration": {
+                "id": self.calibration.id,
+                "path": str(self.calibration_path.absolute()),
+                "created_utc": self.calibration.provenance.get("created_utc"),
+            },
+            "devices": header.get("devices", {}),
+            "passed": self.passed,
+            "change": found.change,
+            "reason": found.reason,
+            "update": self.update_name,
+            "limits": {
+                "force_N": self.limits.force_N,
+                "torque_Nm": self.limits.torque_Nm,
+                "false_alarms": None if self.limits.given else FALSE_ALARMS,
+            },
+            "force_max_N": float(self.force_N.max()),
+            "torque_max_Nm": float(self.torque_Nm.max()),
+            "chi2": numbers["chi2"],
+            "dof": numbers["dof"],
+            "p_value": numbers["p_value"],
+            "poses": [self._pose(row) for row in range(len(self.records))],
+            "drift_check": None
+            if self.drift is None
+            else {
+                "change": self.drift.change.tolist(),
+                "sigma": self.drift.sigma.tolist(),
+                "elapsed_s": self.drift.elapsed_s,
+            },
+            "dataset_sha256": self.dataset.sha256(),
+            "argv": sys.argv,
+            "versions": versions(),
+        }
+
+    def _pose(self, row: int) -> dict[str, JSON]:
+        record, measured = self.records[row], self.dataset.wrench[row]
+        residual = self.verification.residual[row]
+        return {
+            "stop": record.stop,
+            "number": record.pose.number,
+            "q_rad": np.asarray(record.before.q_rad).tolist(),
+            "R_base_flange": self.dataset.R_base_flange[row].tolist(),
+            "measured": measured.tolist(),
+            "predicted": (measured - residual).tolist(),
+            "residual": residual.tolist(),
+            "sigma": self.verification.predicted_sigma[row].tolist(),
+            "steady": record.steady,
+        }
+
+
+def verify_run(run: Run, calibration: CalibrationResult, path: Path, limits: AcceptanceLimits) -> Verified:
+    """Compare the poses of a run, read from its files, with a calibration; write dataset.json and verification.json.
+
+    Parameters
+    ----------
+    path : Path
+        File of the calibration.
+    """
+    records = run.records()
+    dataset = dataset_from(records, {"run": run.folder.name, "devices": run.header().get("devices", {})})
+    if dataset.wrench_cov is None:
+        raise BadDataset(f"{run.folder} has no noise of its poses: repeat the verification")
+    found = verify(calibration, dataset.R_base_flange, dataset.wrench, dataset.wrench_cov, false_alarms=FALSE_ALARMS)
+    kept = tuple(record for record in records if not is_return(record, records))
+    file = run.new_path("verification")
+    verified = Verified(run, calibration, path, limits, dataset, kept, found, drift_check(records), file)
+    dataset.save(run.new_path("dataset"))
+    write_new(file, json.dumps(verified.to_dict(), allow_nan=False, indent=1) + "\n")
+    return verified
+
+
+def save_update(verified: Verified) -> Path:
+    """Save the update as a new calibration in the run folder of the verification; its provenance names the parent."""
+    update = verified.update
+    if update is None:
+        raise BadCalibration("the verification has no update to save: calibrate again")
+    updated = updated_calibration(verified, update)
+    path = verified.run.new_path("calibration")
+    updated.save(path)
+    return path
+
+
+def updated_calibration(verified: Verified, update: Update) -> CalibrationResult:
+    """Return the calibration with the parameters of an update."""
+    old, dataset, name = verified.calibration, verified.dataset, verified.update_name
+    now = datetime.now(UTC).isoformat()
+    cov = np.asarray(dataset.wrench_cov)
+    note = f"{name} updated from {len(dataset)} poses of a verification, parent {old.id}"
+    new = replace(
+        old,
+        parameters=update.parameters,
+        covariance=update.covariance,
+        residuals=np.zeros((len(dataset), 6)),
+        chi2=update.chi2,
+        dof=max(update.dof, 1),
+        noise_source="measured",
+        reasons=(*old.reasons, note),
+        p_value=float(chi2_sf(max(update.dof, 1), update.chi2)),
+        measured_sigma=np.sqrt(np.einsum("nii->ni", cov).mean(axis=0)),
+        weights=None,
+        drift=None,
+        quality={},
+        provenance={
+            "created_utc": now,
+            "argv": sys.argv,
+            "versions": versions(),
+            **{key: old.provenance[key] for key in _COPIED if key in old.provenance},
+            "run": verified.run.folder.name,
+            "dataset_sha256": dataset.sha256(),
+            "parent": {"id": old.id, "path": str(verified.calibration_path.absolute())},
+            "update": name,
+            "verification": verified.path.name,
+        },
+    )
+    residuals = new.compensate(dataset.wrench, dataset.R_base_flange)
+    return replace(new, residuals=residuals)
