@@ -1,28 +1,48 @@
-"""Update a calibration after a change of payload or bias.
+"""Update a calibration after a change of bias, payload, mounting or base, from a few new poses.
 
 Parameters that are not estimated keep their values and their uncertainty. The uncertainty counts as an error common to
 all readings, both in the weights (generalised least squares) and in the covariance of the result.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.special import chdtrc as chi2_sf
 from scipy.special import chdtri as chi2_isf
 
+from calib.compensation import Compensator
 from calib.data.dataset import finite
 from calib.data.dwell_mean import is_stationary, mean_and_covariance
 from calib.errors import BadDataset, NotObservable
-from calib.model import Array, Parameters, jacobian, predict, read_only, skew
+from calib.likelihood.gain_and_cross_talk import Response, predicted_covariance, response_columns
+from calib.model import Array, Parameters, jacobian, read_only, skew
+from calib.result import CalibrationResult
 
 LEAST_SPREAD = 0.025  # of the gravity directions in the sensor frame, rms; two poses 3° apart have it
 SIGNIFICANT_SIGMAS = 5.0
 FALSE_ALARMS = 1e-3  # share of good tares that are rejected
 USUAL_DRIFT_N, USUAL_DRIFT_NM = 1.0, 0.03  # a wrist sensor over hours: temperature, mounting, wear
+SETTLED = 1e-20  # squared step in standard deviations at which the iteration ends
+MOST_STEPS = 30
+UNDETERMINED = 1e-6  # smallest singular value of the scaled equations over the largest
 
 BIASES = np.r_[6:9, 12:15]  # where force and torque bias stand in `PARAMETER_NAMES`
+
+Block = Literal["weight", "centre of mass", "bias", "gravity direction", "mounting"]
+BLOCKS: Mapping[str, tuple[Block, ...]] = {
+    "bias": ("bias",),
+    "weight": ("weight",),
+    "centre of mass": ("centre of mass",),
+    "payload": ("weight", "centre of mass"),
+    "mounting": ("mounting",),
+    "base": ("gravity direction",),
+    "bias and payload": ("weight", "centre of mass", "bias"),
+    "all": ("weight", "centre of mass", "bias", "gravity direction", "mounting"),
+}
+"""Kinds of update, and what each estimates."""
 
 
 class Calibrated(Protocol):
@@ -36,6 +56,10 @@ class Calibrated(Protocol):
     def covariance(self) -> Array:
         """(15, 15) of the error coordinates `calib.model.PARAMETER_NAMES`."""
 
+    @property
+    def response(self) -> Response | None:
+        """Gain and cross-talk of the sensor."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Update:
@@ -48,18 +72,92 @@ class Update:
     """Misfit of the new readings; about `dof` if only noise and the old uncertainty act."""
     dof: int
     """0 if no reading is left for a check."""
+    kind: str = ""
+    """One of `BLOCKS`."""
+    residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    """(n, 6) of the new readings, N and N·m, in the sensor frame."""
+    response: Response | None = None
+    """Gain and cross-talk of the sensor are kept; their covariance with the parameters is that after the update."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", read_only(self.covariance))
+        object.__setattr__(self, "residuals", read_only(self.residuals))
+
+
+def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noise: Array, kind: str) -> Update:
+    """Estimate some of the parameters again by generalised least squares; keep the others.
+
+    With x the parameters of `kind` and e the errors of the old calibration, a reading is h(x) + K e + noise. The
+    weights are the inverse of noise + K C K'. The error of the new parameters is G (noise - K e) + kept e, with G the
+    matrix of the estimate.
+
+    Parameters
+    ----------
+    calibration : CalibrationResult or Update
+    R_base_flange : array, shape (n, 3, 3)
+    wrench : array, shape (n, 6)
+        Mean readings as measured, N and N·m, in the sensor frame.
+    noise : array, shape (6n, 6n)
+        Covariance of all readings, pose by pose.
+    kind : str
+        One of `BLOCKS`.
+
+    Raises
+    ------
+    BadDataset
+        Shapes that do not fit each other.
+    NotObservable
+        The poses do not determine these parameters, or the weight is not significant.
+    """
+    n, old, response = len(wrench), calibration.parameters, calibration.response
+    R_base_flange, wrench = finite("R_base_flange", R_base_flange, (n, 3, 3)), finite("wrench", wrench, (n, 6))
+    C = calibration.covariance if response is None else response.covariance
+    if not old.gravity_force_base_N.any() and kind != "bias":
+        raise NotObservable("the calibration has no weight, so the direction of gravity is unknown: calibrate first.")
+    new = old
+    for _ in range(MOST_STEPS):
+        estimated, kept = _directions(new, BLOCKS[kind]), _kept(old, new, BLOCKS[kind], len(C))
+        J = jacobian(new, R_base_flange)
+        if response is not None:
+            J = np.concatenate([J, response_columns(new, R_base_flange)], axis=2)
+        K = J.reshape(6 * n, -1) @ kept
+        H = J[..., :15].reshape(6 * n, 15) @ estimated
+        S = noise + K @ C @ K.T
+        weighted = np.linalg.solve(S, H).T
+        information = weighted @ H
+        _require_determined(information, kind, n)
+        G = np.linalg.solve(information, weighted)
+        left = _residuals(new, response, R_base_flange, wrench).ravel()
+        x = G @ left
+        if "weight" in BLOCKS[kind]:
+            weight_N = float(np.linalg.norm(new.gravity_force_base_N) + x[0])
+            _require_significant(weight_N, float(np.sqrt(np.linalg.inv(information)[0, 0])))
+        if float(x @ information @ x) < SETTLED * max(1.0, float(left @ np.linalg.solve(S, left))):
+            break
+        new = _moved(new, estimated, x, BLOCKS[kind])
+    else:
+        raise NotObservable(f"the new {kind} has not settled in {MOST_STEPS} steps: calibrate again.")
+    estimated_15 = np.zeros((len(C), len(x)))
+    estimated_15[:15] = estimated
+    gain = estimated_15 @ G
+    mixed = kept - gain @ K
+    covariance = gain @ noise @ gain.T + mixed @ C @ mixed.T
+    covariance = (covariance + covariance.T) / 2
+    return Update(
+        new,
+        covariance[:15, :15],
+        float(left @ np.linalg.solve(S, left)),
+        6 * n - len(x),
+        kind,
+        left.reshape(n, 6),
+        None if response is None else Response(response.coefficients, covariance),
+    )
 
 
 def update_payload(
     calibration: Calibrated, R_base_flange: Array, wrench: Array, wrench_cov: Array, *, retare: bool = False
 ) -> Update:
     """Estimate weight and centre of mass of another payload; keep mounting, tilt and (unless `retare`) biases.
-
-    With u_i the unit vector of gravity in the sensor frame, the readings are linear in the weight w and in w P:
-    F_i = w u_i + F0, T_i = (w P) x u_i + T0.
 
     Parameters
     ----------
@@ -81,52 +179,44 @@ def update_payload(
         Too few poses, gravity along one line in all of them, or a weight that is not significant.
     """
     old, n = calibration.parameters, len(wrench)
-    R_base_flange, wrench = finite("R_base_flange", R_base_flange, (n, 3, 3)), finite("wrench", wrench, (n, 6))
+    R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
     wrench_cov = finite("wrench_cov", wrench_cov, (n, 6, 6))
-    old_weight_N = float(np.linalg.norm(old.gravity_force_base_N))
-    if old_weight_N == 0:
-        raise NotObservable("the calibration has no weight, so the direction of gravity is unknown: calibrate first.")
-    direction = old.gravity_force_base_N / old_weight_N
-    u = direction @ (R_base_flange @ old.R_flange_sensor)
-    _require_tilt(u, retare)
+    weight_N = float(np.linalg.norm(old.gravity_force_base_N))
+    if weight_N > 0:
+        _require_tilt(old.gravity_force_base_N / weight_N @ (R_base_flange @ old.R_flange_sensor), retare)
+    kind = "bias and payload" if retare else "payload"
+    return reestimate(calibration, R_base_flange, wrench, block_diag(*wrench_cov), kind)
 
-    size = 10 if retare else 4
-    derivative = np.zeros((n, 6, 10))  # by weight, weight times centre of mass, biases
-    derivative[:, :3, 0] = u
-    derivative[:, 3:, 1:4] = -skew(u)
-    derivative[:, :, 4:] = np.eye(6)
-    H = derivative[:, :, :size].reshape(6 * n, size)
-    bias = np.concatenate([old.force_bias_N, old.torque_bias_Nm])
-    y = (wrench if retare else wrench - bias).ravel()
 
-    kept = np.zeros((15, 15))  # derivative of the new errors by the old ones
-    kept[:3, :3] = np.eye(3)
-    if not retare:
-        kept[BIASES, BIASES] = 1.0
-    noise = block_diag(*wrench_cov)
-    S = noise
-    for _ in range(3):  # the weights depend on the payload, weakly
-        G = _gain(H, S)
-        x = G @ y
-        weight_N, sigma_N = float(x[0]), float(np.sqrt((G @ S @ G.T)[0, 0]))
-        if not weight_N > SIGNIFICANT_SIGMAS * sigma_N:
-            raise NotObservable(
-                f"the weight of the payload, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty of "
-                f"{sigma_N:.2g} N: hang something heavier on the sensor, or check the sign and the tare."
-            )
-        new_bias = x[4:] if retare else bias
-        new = Parameters(old.R_flange_sensor, weight_N * direction, new_bias[:3], x[1:4] / weight_N, new_bias[3:])
-        kept[3:6, 3:6] = weight_N / old_weight_N * (np.eye(3) - np.outer(direction, direction))
-        K = jacobian(new, R_base_flange).reshape(6 * n, 15) @ kept
-        S = noise + K @ calibration.covariance @ K.T
+def bias_change(
+    calibration: Calibrated, R_base_flange: Array, wrench: Array, wrench_cov: Array, drift_N: float, drift_Nm: float
+) -> tuple[Array, Array]:
+    """Compare readings of a free tool with the prediction.
 
-    estimated = np.zeros((15, size))  # derivative of the new errors by those of the estimates
-    estimated[3:6, 0] = direction
-    estimated[9:12, 0] = -new.p_sensor_com_m / weight_N
-    estimated[9:12, 1:4] = np.eye(3) / weight_N
-    if retare:
-        estimated[BIASES, np.arange(4, 10)] = 1.0
-    return _update(new, calibration.covariance, estimated @ _gain(H, S), kept, K, noise, y - H @ x, 6 * n - size)
+    Parameters
+    ----------
+    calibration : CalibrationResult or Update
+    R_base_flange : array, shape (n, 3, 3)
+    wrench : array, shape (n, 6)
+        Means, N and N·m, in the sensor frame.
+    wrench_cov : array, shape (n, 6, 6)
+        Of those means.
+    drift_N, drift_Nm : float
+        Expected drift of the biases, one standard deviation an axis.
+
+    Returns
+    -------
+    change : array, shape (n, 6)
+        Measured minus predicted.
+    sigmas : array, shape (n,)
+        Mahalanobis distance, with noise, drift and the uncertainty of the calibration.
+    """
+    change = _residuals(calibration.parameters, calibration.response, R_base_flange, wrench)
+    drift = np.diag(np.repeat([drift_N**2, drift_Nm**2], 3))
+    S = wrench_cov + drift + predicted_covariance(
+        calibration.parameters, calibration.covariance, calibration.response, R_base_flange
+    )
+    return change, np.sqrt(np.einsum("ni,ni->n", change, np.linalg.solve(S, change[..., None])[..., 0]))
 
 
 def tare(
@@ -168,62 +258,148 @@ def tare(
             raise BadDataset(f"pose {i + 1}: the reading changes during the dwell: keep arm and tool still.")
     means = [mean_and_covariance(dwell) for dwell in dwells]
     wrench, wrench_cov = np.array([m.mean for m in means]), np.array([m.covariance for m in means])
-    old, n = calibration.parameters, len(means)
-    R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
-    residual = wrench - predict(old, R_base_flange)
-    J = jacobian(old, R_base_flange)
-    drift = np.diag(np.repeat([drift_N**2, drift_Nm**2], 3))
+    R_base_flange = finite("R_base_flange", R_base_flange, (len(means), 3, 3))
+    change, sigmas = bias_change(calibration, R_base_flange, wrench, wrench_cov, drift_N, drift_Nm)
     limit = float(chi2_isf(6, FALSE_ALARMS))
-    for i in range(n):
-        innovation = wrench_cov[i] + J[i] @ calibration.covariance @ J[i].T + drift
-        distance = float(residual[i] @ np.linalg.solve(innovation, residual[i]))
-        if distance > limit:
-            raise BadDataset(
-                f"pose {i + 1}: the reading is {np.linalg.norm(residual[i, :3]):.2g} N and "
-                f"{np.linalg.norm(residual[i, 3:]):.2g} N·m from the prediction, more than drift explains "
-                f"(d² {distance:.0f}, limit {limit:.1f}): free the tool, or calibrate again if the payload has changed."
-            )
-
-    kept = np.eye(15)
-    kept[BIASES, BIASES] = 0.0
-    K = J.reshape(6 * n, 15) @ kept
-    H = np.tile(np.eye(6), (n, 1))
-    noise = block_diag(*wrench_cov)
-    S = noise + K @ calibration.covariance @ K.T
-    G = _gain(H, S)
-    change = G @ residual.ravel()
-    new = Parameters(
-        old.R_flange_sensor,
-        old.gravity_force_base_N,
-        old.force_bias_N + change[:3],
-        old.p_sensor_com_m,
-        old.torque_bias_Nm + change[3:],
-    )
-    estimated = np.zeros((15, 6))
-    estimated[BIASES, np.arange(6)] = 1.0
-    left = (residual - change).ravel()
-    update = _update(new, calibration.covariance, estimated @ G, kept, K, noise, left, 6 * n - 6)
+    for i in np.flatnonzero(sigmas**2 > limit):
+        raise BadDataset(
+            f"pose {i + 1}: the reading is {np.linalg.norm(change[i, :3]):.2g} N and "
+            f"{np.linalg.norm(change[i, 3:]):.2g} N·m from the prediction, more than drift explains "
+            f"(d² {sigmas[i] ** 2:.0f}, limit {limit:.1f}): free the tool, or calibrate again if the payload has changed."
+        )
+    update = reestimate(calibration, R_base_flange, wrench, block_diag(*wrench_cov), "bias")
     if update.dof and update.chi2 > chi2_isf(update.dof, FALSE_ALARMS):
         raise BadDataset(
-            f"the {n} poses do not agree on one bias (chi2 {update.chi2:.0f} for {update.dof} degrees of freedom): "
-            "free the tool, or calibrate again if the payload has changed."
+            f"the {len(means)} poses do not agree on one bias (chi2 {update.chi2:.0f} for {update.dof} degrees of "
+            "freedom): free the tool, or calibrate again if the payload has changed."
         )
     return update
 
 
-def _gain(H: Array, S: Array) -> Array:
-    """Generalised least squares: the matrix that maps readings of covariance S to the estimates."""
-    weighted = np.linalg.solve(S, H).T
-    return np.asarray(np.linalg.solve(weighted @ H, weighted))
+def updated(
+    calibration: CalibrationResult, update: Update, provenance: Mapping[str, Any] | None = None
+) -> CalibrationResult:
+    """Make a new calibration of an update.
+
+    `residuals`, `chi2`, `dof` and `p_value` are those of the new readings. Noise beyond the measured one
+    (`components`) and the verdict are those of the old calibration, because new readings are too few for them.
+
+    Parameters
+    ----------
+    calibration : CalibrationResult
+        That the update was made from.
+    update : Update
+    provenance : mapping, optional
+        Of the new readings. The id of the old calibration is added to its `parent`, and the kind of update as `update`.
+
+    Raises
+    ------
+    NotObservable
+        No reading is left for a check.
+    """
+    if update.dof == 0:
+        raise NotObservable("one pose leaves no reading for a check of the new bias: use 2 poses or more.")
+    given = dict(provenance or {})
+    note = f"{update.kind} updated from {len(update.residuals)} poses; the verdict is that of {calibration.id}"
+    return CalibrationResult(
+        parameters=update.parameters,
+        covariance=update.covariance,
+        residuals=update.residuals,
+        chi2=update.chi2,
+        dof=update.dof,
+        noise_source="measured",
+        g_m_s2=calibration.g_m_s2,
+        method=calibration.method,
+        verdict=calibration.verdict,
+        reasons=(*calibration.reasons, note),
+        provenance={
+            **given,
+            "parent": {**given.get("parent", {}), "id": calibration.id},
+            "update": update.kind,
+        },
+        p_value=float(chi2_sf(update.dof, update.chi2)),
+        components=calibration.components,
+        response=update.response,
+        gain_sigma=calibration.gain_sigma,
+        second_basin_chi2=calibration.second_basin_chi2,
+    )
 
 
-def _update(
-    new: Parameters, old_cov: Array, G: Array, kept: Array, K: Array, noise: Array, left: Array, dof: int
-) -> Update:
-    """Propagate: error of the new parameters = G (noise - K old error) + kept old error."""
-    S, mixed = noise + K @ old_cov @ K.T, kept - G @ K
-    covariance = G @ noise @ G.T + mixed @ old_cov @ mixed.T
-    return Update(new, (covariance + covariance.T) / 2, float(left @ np.linalg.solve(S, left)), dof)
+def _residuals(p: Parameters, response: Response | None, R_base_flange: Array, wrench: Array) -> Array:
+    return np.asarray(Compensator(p, response=response).batch(wrench, R_base_flange), dtype=np.float64)
+
+
+def _directions(p: Parameters, blocks: Sequence[Block]) -> Array:
+    """Error coordinates (15, k) of what is estimated: weight first, biases force first.
+
+    With a new weight the centre of mass is estimated as their product, in which the readings are linear.
+    """
+    weight_N = float(np.linalg.norm(p.gravity_force_base_N))
+    columns = []
+    if "weight" in blocks:
+        weight = np.zeros((15, 1))
+        weight[3:6, 0] = p.gravity_force_base_N / weight_N
+        if "centre of mass" in blocks:
+            weight[9:12, 0] = -p.p_sensor_com_m / weight_N
+        columns.append(weight)
+    if "centre of mass" in blocks:
+        columns.append(np.eye(15)[:, 9:12] / weight_N)
+    if "bias" in blocks:
+        columns.append(np.eye(15)[:, BIASES])
+    if "gravity direction" in blocks:
+        direction = np.zeros((15, 2))
+        direction[3:6] = weight_N * np.linalg.svd(skew(p.gravity_force_base_N))[0][:, :2]
+        columns.append(direction)
+    if "mounting" in blocks:
+        columns.append(np.eye(15)[:, :3])
+    return np.concatenate(columns, axis=1)
+
+
+def _kept(old: Parameters, new: Parameters, blocks: Sequence[Block], size: int) -> Array:
+    """Derivative (size, size) of the new errors by the old ones, where they are kept."""
+    kept = np.eye(size)
+    if "mounting" in blocks:
+        kept[:3, :3] = 0.0
+    if "bias" in blocks:
+        kept[BIASES, BIASES] = 0.0
+    if "centre of mass" in blocks:
+        kept[9:12, 9:12] = 0.0
+    before, after = old.gravity_force_base_N, new.gravity_force_base_N
+    if "weight" in blocks:
+        across = np.eye(3) - np.outer(after, after) / (after @ after)
+        kept[3:6, 3:6] = np.linalg.norm(after) / np.linalg.norm(before) * across
+    if "gravity direction" in blocks:
+        along = np.outer(after, before) / (before @ before)
+        kept[3:6, 3:6] = 0.0 if "weight" in blocks else along
+    return kept
+
+
+def _moved(p: Parameters, estimated: Array, x: Array, blocks: Sequence[Block]) -> Parameters:
+    step = estimated @ x
+    weight_N = float(np.linalg.norm(p.gravity_force_base_N))
+    if "weight" in blocks:
+        step[9:12] *= weight_N / (weight_N + x[0])
+    elif "gravity direction" in blocks:  # along the sphere
+        moved = p.gravity_force_base_N + step[3:6]
+        step[3:6] = moved * weight_N / np.linalg.norm(moved) - p.gravity_force_base_N
+    return p.moved(step)
+
+
+def _require_significant(weight_N: float, sigma_N: float) -> None:
+    if not weight_N > SIGNIFICANT_SIGMAS * sigma_N:
+        raise NotObservable(
+            f"the weight of the payload, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty of "
+            f"{sigma_N:.2g} N: hang something heavier on the sensor, or check the sign and the tare."
+        )
+
+
+def _require_determined(information: Array, kind: str, n: int) -> None:
+    scale = np.sqrt(np.diag(information))
+    value = np.linalg.eigvalsh(information / np.outer(scale, scale)) if (scale > 0).all() else np.zeros(1)
+    if value[0] <= UNDETERMINED**2 * value[-1] or len(scale) > 6 * n:
+        raise NotObservable(
+            f"{n} {'pose does' if n == 1 else 'poses do'} not determine {kind}: add poses with other tilts of the tool."
+        )
 
 
 def _require_tilt(u: Array, retare: bool) -> None:
