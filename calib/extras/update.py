@@ -213,8 +213,10 @@ def bias_change(
     """
     change = _residuals(calibration.parameters, calibration.response, R_base_flange, wrench)
     drift = np.diag(np.repeat([drift_N**2, drift_Nm**2], 3))
-    S = wrench_cov + drift + predicted_covariance(
-        calibration.parameters, calibration.covariance, calibration.response, R_base_flange
+    S = (
+        wrench_cov
+        + drift
+        + predicted_covariance(calibration.parameters, calibration.covariance, calibration.response, R_base_flange)
     )
     return change, np.sqrt(np.einsum("ni,ni->n", change, np.linalg.solve(S, change[..., None])[..., 0]))
 

@@ -1,18 +1,21 @@
 """Stand-in with the interface of the verification."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc as chi2_sf
 
-from calib.model import Array
+from calib.errors import NotObservable
+from calib.extras.update import Update, reestimate
+from calib.files import JSON
+from calib.model import Array, jacobian
+from calib.result import CalibrationResult
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Verification:
-    """Result."""
+    """Result of a verification."""
 
     residual: Array
     predicted_sigma: Array
@@ -22,78 +25,51 @@ class Verification:
     passed: bool
     change: str | None
     reason: str
-    update: Any
+    update: Update | None = None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON."""
+    def to_dict(self) -> dict[str, JSON]:
+        """Return the content as JSON."""
         return {
-            "residual": self.residual.tolist(),
-            "predicted_sigma": self.predicted_sigma.tolist(),
-            "chi2": self.chi2,
-            "dof": self.dof,
-            "p_value": self.p_value,
             "passed": self.passed,
             "change": self.change,
             "reason": self.reason,
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "p_value": self.p_value,
         }
 
 
 def verify(
-    calibration: Any, R_base_flange: Array, wrench: Array, wrench_cov: Array, *, false_alarms: float = 0.01
+    calibration: CalibrationResult,
+    R_base_flange: Array,
+    wrench: Array,
+    wrench_cov: Array,
+    *,
+    false_alarms: float = 0.01,
 ) -> Verification:
     """Compare."""
-    from calib.extras.update import NotObservable, Update, _gain, _update, update_payload  # type: ignore[attr-defined]
-    from calib.model import Parameters, jacobian
-
     n = len(wrench)
     residual = calibration.compensate(wrench, R_base_flange)
-    J = jacobian(calibration.parameters, R_base_flange)
-    predicted = np.einsum("nij,jk,nlk->nil", J, calibration.covariance, J)
-    sigma = np.sqrt(np.einsum("nii->ni", wrench_cov + predicted))
+    J = jacobian(calibration.parameters, R_base_flange).reshape(6 * n, 15)
     noise = block_diag(*wrench_cov)
-
-    def misfit(x: Array, covariance: Array) -> float:
-        return float(x.ravel() @ np.linalg.solve(covariance, x.ravel()))
-
-    K = J.reshape(6 * n, 15)
-    chi2 = misfit(residual, noise + K @ calibration.covariance @ K.T)
-    p = float(chi2_distribution.sf(chi2, 6 * n))
+    S = noise + J @ calibration.covariance @ J.T
+    chi2 = float(residual.ravel() @ np.linalg.solve(S, residual.ravel()))
+    p = float(chi2_sf(6 * n, chi2))
+    sigma = np.sqrt(np.diag(S)).reshape(n, 6)
     if p >= false_alarms:
-        return Verification(residual, sigma, chi2, 6 * n, p, True, None, "the calibration still holds", None)
-    kept = np.eye(15)
-    biases = np.r_[6:9, 12:15]
-    kept[biases, biases] = 0
-    K = K @ kept
-    H = np.tile(np.eye(6), (n, 1))
-    G = _gain(H, noise + K @ calibration.covariance @ K.T)
-    change = G @ residual.ravel()
-    old = calibration.parameters
-    new = Parameters(
-        old.R_flange_sensor,
-        old.gravity_force_base_N,
-        old.force_bias_N + change[:3],
-        old.p_sensor_com_m,
-        old.torque_bias_Nm + change[3:],
-    )
-    estimated = np.zeros((15, 6))
-    estimated[biases, np.arange(6)] = 1
-    found: Update | None = _update(
-        new, calibration.covariance, estimated @ G, kept, K, noise, (residual - change).ravel(), 6 * n - 6
-    )
-    if found is not None and chi2_distribution.sf(found.chi2, found.dof) >= false_alarms:
-        words = f"the bias has changed by {np.linalg.norm(change[:3]):.2f} N"
-        return Verification(residual, sigma, chi2, 6 * n, p, False, "bias", words, found)
-    try:
-        found = update_payload(calibration, R_base_flange, wrench, wrench_cov, retare=n > 2)
-    except NotObservable:
-        found = None
-    if found is not None and chi2_distribution.sf(found.chi2, max(found.dof, 1)) < false_alarms:
-        found = None
-    words = "the payload has changed" if found else "several quantities have changed"
-    return Verification(residual, sigma, chi2, 6 * n, p, False, "payload" if found else "several", words, found)
+        return Verification(residual, sigma, chi2, 6 * n, p, True, None, "the calibration holds")
+    for kind in ("bias", "payload", "bias and payload", "all"):
+        try:
+            update = reestimate(calibration, R_base_flange, wrench, noise, kind)
+        except NotObservable:
+            continue
+        if update.dof and chi2_sf(update.dof, update.chi2) > 1e-3:
+            change = kind if kind in ("bias", "payload") else "several"
+            return Verification(residual, sigma, chi2, 6 * n, p, False, change, f"{change} has changed", update)
+    return Verification(residual, sigma, chi2, 6 * n, p, False, None, "no change explains the readings")
 
 
-def choose_verification_poses(candidates: Array, fitted: Array, n: int) -> Any:
+def choose_verification_poses(candidates: Array, fitted: Array, n: int) -> Array:
     """Farthest first."""
     near = np.full(len(candidates), np.inf)
     if len(fitted):

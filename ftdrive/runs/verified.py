@@ -6,18 +6,17 @@ calibration.json    in the same folder, if the operator accepted an update: its 
 
 import json
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from scipy.special import chdtrc as chi2_sf
 
 from calib import CalibrationDataset, CalibrationResult
+from calib.errors import BadDataset, NotObservable
+from calib.extras.update import Update, updated
 from calib.extras.verification import Verification, verify
-from calib.errors import BadCalibration, BadDataset
-from calib.extras.update import Update
 from calib.files import JSON, write_new
 from calib.model import Array
 from calib.routine import DriftCheck, PoseRecord, dataset_from, drift_check, is_return
@@ -26,7 +25,6 @@ from ftdrive.runs.verification import FORMAT
 
 FALSE_ALARMS: Final = 0.01
 """Share of verifications of an unchanged cell that fail."""
-_SAME: Final = 1e-9
 _COPIED: Final = ("devices", "station", "setup")
 """Parts of a calibration's provenance that an update keeps."""
 
@@ -97,17 +95,8 @@ class Verified:
 
     @property
     def update_name(self) -> str | None:
-        """What the update estimates: "bias", "payload" (with the bias, if it has changed) or "all"."""
-        if self.update is None:
-            return None
-        old, new = self.calibration.parameters, self.update.parameters
-        turned = np.abs(new.R_flange_sensor - old.R_flange_sensor).max() > _SAME
-        leans = np.linalg.norm(np.cross(new.gravity_force_base_N, old.gravity_force_base_N)) > _SAME
-        if turned or leans:
-            return "all"
-        weight_N = np.linalg.norm(new.gravity_force_base_N) - np.linalg.norm(old.gravity_force_base_N)
-        moved_m = np.abs(new.p_sensor_com_m - old.p_sensor_com_m).max()
-        return "payload" if abs(weight_N) > _SAME or moved_m > _SAME else "bias"
+        """What the update estimates, such as "bias", "payload" or "all"."""
+        return None if self.update is None else self.update.kind
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the content of verification.json."""
@@ -189,47 +178,26 @@ def verify_run(run: Run, calibration: CalibrationResult, path: Path, limits: Acc
 
 
 def save_update(verified: Verified) -> Path:
-    """Save the update as a new calibration in the run folder of the verification; its provenance names the parent."""
-    update = verified.update
-    if update is None:
-        raise BadCalibration("the verification has no update to save: calibrate again")
-    updated = updated_calibration(verified, update)
-    path = verified.run.new_path("calibration")
-    updated.save(path)
+    """Save the update as a new calibration in the run folder of the verification; its provenance names the parent.
+
+    Raises
+    ------
+    NotObservable
+        The verification has no update.
+    """
+    if verified.update is None:
+        raise NotObservable("no update makes up for the change: calibrate again")
+    old, run = verified.calibration, verified.run
+    provenance = {
+        "created_utc": datetime.now(UTC).isoformat(),
+        "argv": sys.argv,
+        "versions": versions(),
+        **{key: old.provenance[key] for key in _COPIED if key in old.provenance},
+        "run": run.folder.name,
+        "dataset_sha256": verified.dataset.sha256(),
+        "verification": verified.path.name,
+        "parent": {"path": str(verified.calibration_path.absolute())},
+    }
+    path = run.new_path("calibration")
+    updated(old, verified.update, provenance).save(path)
     return path
-
-
-def updated_calibration(verified: Verified, update: Update) -> CalibrationResult:
-    """Return the calibration with the parameters of an update."""
-    old, dataset, name = verified.calibration, verified.dataset, verified.update_name
-    now = datetime.now(UTC).isoformat()
-    cov = np.asarray(dataset.wrench_cov)
-    note = f"{name} updated from {len(dataset)} poses of a verification, parent {old.id}"
-    new = replace(
-        old,
-        parameters=update.parameters,
-        covariance=update.covariance,
-        residuals=np.zeros((len(dataset), 6)),
-        chi2=update.chi2,
-        dof=max(update.dof, 1),
-        noise_source="measured",
-        reasons=(*old.reasons, note),
-        p_value=float(chi2_sf(max(update.dof, 1), update.chi2)),
-        measured_sigma=np.sqrt(np.einsum("nii->ni", cov).mean(axis=0)),
-        weights=None,
-        drift=None,
-        quality={},
-        provenance={
-            "created_utc": now,
-            "argv": sys.argv,
-            "versions": versions(),
-            **{key: old.provenance[key] for key in _COPIED if key in old.provenance},
-            "run": verified.run.folder.name,
-            "dataset_sha256": dataset.sha256(),
-            "parent": {"id": old.id, "path": str(verified.calibration_path.absolute())},
-            "update": name,
-            "verification": verified.path.name,
-        },
-    )
-    residuals = new.compensate(dataset.wrench, dataset.R_base_flange)
-    return replace(new, residuals=residuals)
