@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
@@ -69,7 +70,7 @@ def verify(
     return Verification(residual, sigma, chi2, 6 * n, p, False, None, "no change explains the readings")
 
 
-def choose_verification_poses(candidates: Array, fitted: Array, n: int) -> Array:
+def choose_verification_poses(candidates: Array, fitted: Array, n: int) -> NDArray[np.intp]:
     """Farthest first."""
     near = np.full(len(candidates), np.inf)
     if len(fitted):
@@ -81,4 +82,4 @@ def choose_verification_poses(candidates: Array, fitted: Array, n: int) -> Array
         chosen.append(best)
         trace = np.einsum("mij,ij->m", candidates, candidates[best])
         near = np.minimum(near, np.arccos(np.clip((trace - 1) / 2, -1, 1)))
-    return np.array(chosen)
+    return np.array(chosen, dtype=np.intp)

@@ -12,6 +12,7 @@ from ftdrive.commands.emulated_run import rehearse
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import WrenchFrame
 from ftdrive.live.stream import CompensatedStream, load_calibration
+from ftdrive.runs.verification import last_verification
 from ftdrive.terminal.console import talk
 
 
@@ -25,7 +26,9 @@ def open_source(
     frame: WrenchFrame,
     stack: ExitStack,
 ) -> tuple[CompensatedStream, CellConfig]:
-    """Open the stream of a real or an emulated cell and print its warnings; `stack` closes it.
+    """Open the stream of a real or an emulated cell; `stack` closes it.
+
+    The state of the calibration and warnings are printed.
 
     Parameters
     ----------
@@ -42,7 +45,11 @@ def open_source(
     else:
         cell = read_cell(config, robot, sensor)
     name = "temporary calibration" if path is None else str(path)
-    stream = stack.enter_context(CompensatedStream(cell, calibration, name=name, frame=frame))
+    verification = None if path is None else last_verification(path)
+    stream = stack.enter_context(
+        CompensatedStream(cell, calibration, name=name, frame=frame, verification=verification)
+    )
+    talk.print(f" {stream.info.calibration_state}")
     for words in stream.warnings:
         talk.print(f" {words}")
     return stream, cell

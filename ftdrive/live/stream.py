@@ -4,6 +4,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NoReturn, Self
 
@@ -34,6 +35,7 @@ from ftdrive.live.samples import (
     sensor_origin_m,
 )
 from ftdrive.runs.run import Run, versions
+from ftdrive.runs.verification import VerificationRecord, calibration_in_words, last_verification
 
 STALE_S = 0.3
 """Without a new sample of either device for so long, `CompensatedStream.read` raises."""
@@ -66,6 +68,8 @@ class CompensatedStream(ProcessedStream):
         May be set at any time.
     false_alarm_rate : float
         Share of readings of a free tool that count as contact.
+    verification : VerificationRecord, optional
+        The last one of the calibration.
 
     Raises
     ------
@@ -84,8 +88,10 @@ class CompensatedStream(ProcessedStream):
         frame: WrenchFrame = SENSOR_FRAME,
         stages: Stages = STANDARD,
         false_alarm_rate: float = FALSE_ALARM_RATE,
+        verification: VerificationRecord | None = None,
     ) -> None:
         self._cell = cell
+        self._verification = verification
         self.clock: Clock = cell.clock
         self._calibration = calibration
         self._name = name
@@ -154,6 +160,8 @@ class CompensatedStream(ProcessedStream):
             R_flange_tcp=np.eye(3) if status.tcp_offset is None else Rotation.from_rotvec(tcp[3:]).as_matrix(),
             p_flange_tcp_m=tcp[:3],
             versions=versions(),
+            verification=self._verification,
+            calibration_state=calibration_in_words(self._calibration, self._verification, datetime.now(UTC)),
         )
 
     # -------------------------------------------------------------------------------------------------------- reading
@@ -324,8 +332,14 @@ def open_stream(
     cell = config if isinstance(config, CellConfig) else load(config)
     if isinstance(calibration, CalibrationResult):
         return CompensatedStream(cell, calibration, frame=frame, stages=stages)
+    path = Path(calibration)
     return CompensatedStream(
-        cell, load_calibration(Path(calibration)), name=str(calibration), frame=frame, stages=stages
+        cell,
+        load_calibration(path),
+        name=str(calibration),
+        frame=frame,
+        stages=stages,
+        verification=last_verification(path),
     )
 
 

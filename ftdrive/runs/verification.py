@@ -6,7 +6,7 @@ in the run folders beside that of the calibration, in those in `runs` beside the
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, Final, Self
@@ -28,6 +28,7 @@ class VerificationRecord:
     created_utc: datetime
     passed: bool
     change: str | None
+    """What has changed; None if nothing, or if no change explains the readings."""
     reason: str
     force_max_N: float
     torque_max_Nm: float
@@ -36,18 +37,21 @@ class VerificationRecord:
     def load(cls, path: Path) -> Self:
         """Read a verification.json; unknown fields are ignored. Raises `BadCalibration` or `OSError`."""
         try:
-            return cls.from_dict(read_object(path, BadCalibration), path)
+            document = read_object(path, BadCalibration)
+            check_format(document, FORMAT, BadCalibration)
+            found = document.get("calibration")
+            identity = found.get("id") if isinstance(found, Mapping) else None
+            return cls.from_dict({**document, "path": str(path), "calibration_id": identity})
         except BadCalibration as error:
             raise BadCalibration(f"{path}: {error}") from error
 
     @classmethod
-    def from_dict(cls, document: Mapping[str, Any], path: Path) -> Self:
-        """Build from the content of a file. Raises `BadCalibration`."""
-        check_format(document, FORMAT, BadCalibration)
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Build from `to_dict`; unknown fields are ignored. Raises `BadCalibration`."""
         try:
             return cls(
-                path,
-                str(document["calibration"]["id"]),
+                Path(document["path"]),
+                str(document["calibration_id"]),
                 datetime.fromisoformat(document["created_utc"]),
                 bool(document["passed"]),
                 document["change"],
@@ -60,15 +64,7 @@ class VerificationRecord:
 
     def to_dict(self) -> dict[str, JSON]:
         """Return what streams and recordings keep of it."""
-        return {
-            "path": str(self.path),
-            "created_utc": self.created_utc.isoformat(),
-            "passed": self.passed,
-            "change": self.change,
-            "reason": self.reason,
-            "force_max_N": self.force_max_N,
-            "torque_max_Nm": self.torque_max_Nm,
-        }
+        return asdict(self) | {"path": str(self.path), "created_utc": self.created_utc.isoformat()}
 
     def in_words(self, now: datetime) -> str:
         """Return the result and its age, such as "verified 2 h ago"."""
@@ -137,4 +133,4 @@ def calibration_in_words(calibration: CalibrationResult, verification: Verificat
     created = calibration.provenance.get("created_utc")
     if isinstance(created, str):
         words += f", {age_in_words(now - datetime.fromisoformat(created))} old"
-    return f"{words}, {'never verified' if verification is None else verification.in_words(now)}"
+    return f"{words}, {'not verified' if verification is None else verification.in_words(now)}"

@@ -229,13 +229,7 @@ class _Session:
     def new_run(self) -> Run:
         """Create the run folder."""
         options = self.options
-        description = {
-            "command": self.task.command,
-            "config": self.cell.to_dict(),
-            "devices": dict(self.devices),
-            "mode": options.mode,
-            **options.description,
-        }
+        description = {"command": self.task.command, **_description(self.cell, self.devices, options)}
         return Run.create(options.runs, options.name, description, self.cell.clock)
 
     def listen(self, duration_s: float) -> FtSamples:
@@ -559,3 +553,7 @@ def _by_hand(session: _Session) -> Run:
             listen=session.options.mode == "listen",
         )
     return run
+
+
+def _description(cell: CellConfig, devices: Mapping[str, Any], options: Options) -> dict[str, Any]:
+    return {"config": cell.to_dict(), "devices": dict(devices), "mode": options.mode, **options.description}
