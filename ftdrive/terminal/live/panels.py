@@ -124,13 +124,13 @@ def state(view: View, width: int) -> Line:
     line.add(calibration.id[:6]).add(" ")
     line.add(calibration.verdict.upper(), GOOD if calibration.verdict == "good" else WARNING)
     line.add(_age(view)).add(", ").add(*_verified(view))
-    line.add("   tare ")
+    line.add("  tare ")
     if status.tare is None or status.tare_t_host_ns is None:
         line.add("none", FAINT)
     else:
         force_N = float(np.linalg.norm(status.tare[:3]))
         line.add(f"{_time_of_day(view.info, status.tare_t_host_ns)[:5]} {force_N:.2f} N")
-    line.add(f"   drift {_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h")
+    line.add(f"  drift {_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h")
     return line.fit(width)
 
 
