@@ -1,29 +1,39 @@
 """`ftdrive verify`: fresh poses against the prediction of a calibration."""
 
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 
-from ftdrive.commands.common import CELL, FOLDER, Number, check_simulate, runs, simulate, write_json
+from ftdrive.commands.common import (
+    CALIBRATION,
+    CELL,
+    FOLDER,
+    Number,
+    check_simulate,
+    read_cell,
+    runs,
+    simulate,
+    stop_unless_accepted,
+    write_json,
+)
+from ftdrive.errors import ConfigError
 
 if TYPE_CHECKING:
+    from calib import CalibrationResult
     from ftdrive.cell.config import CellConfig
-    from ftdrive.runs.verified import Verified
+    from ftdrive.cell.emulated import Station
+    from ftdrive.runs.run import Run
+    from ftdrive.runs.verified import AcceptanceLimits, Verified
+    from ftdrive.session.session import Options
 
-_QUESTION = "Save it as a new calibration"
+Answer = Literal["ask", "no", "yes"]
 
 
 @click.command()
-@click.option(
-    "--calibration",
-    "path",
-    metavar="PATH",
-    type=click.Path(exists=True, path_type=Path),
-    help="A calibration.json or its run folder. With --simulate the default is a new one.",
-)
+@CALIBRATION
 @CELL
 @simulate(
     "Use the emulated cell of the calibration, or calibrate one first; --sensor emulated://NAME chooses its sensor."
@@ -61,7 +71,7 @@ def verify(
     force_N: float | None,
     torque_Nm: float | None,
     manual: bool,
-    update: Literal["ask", "no", "yes"],
+    update: Answer,
     resume: Path | None,
     yes: bool,
     runs: Path,
@@ -73,126 +83,143 @@ def verify(
     --max-torque, 1 % of unchanged cells fail. If it fails, it names what has changed, offers the smallest sufficient
     update, and ends with exit code 7.
     """
-    from ftdrive.errors import ConfigError, Declined, NotAccepted
-    from ftdrive.live.stream import load_calibration
-    from ftdrive.runs.run import Run
-    from ftdrive.runs.verified import AcceptanceLimits, save_update, verify_run
-    from ftdrive.session.session import Options, take_poses
-    from ftdrive.session.verification import POSES, QUICK_POSES, Verifying
-    from ftdrive.terminal.console import talk
-    from ftdrive.terminal.screen import open_operator
-    from ftdrive.terminal.verification_text import print_verification
+    from ftdrive.errors import NotAccepted
+    from ftdrive.runs.verified import AcceptanceLimits, verify_run
+    from ftdrive.session.session import Options
 
     check_simulate(simulate, real={"--config": config, "--robot": robot})
+    wanted = _wanted(path, quick, poses, AcceptanceLimits(force_N, torque_Nm), resume)
+    options = Options(
+        runs,
+        "verify",
+        poses=wanted.poses,
+        mode="manual" if manual else "auto",
+        fast=wanted.quick,
+        resume=resume,
+        real=not simulate,
+        yes=yes,
+    )
+    with ExitStack() as stack:
+        station, path = None, wanted.path
+        if simulate:
+            station, path = _emulated(stack, path, sensor, runs)
+        elif path is None:
+            raise ConfigError("no calibration: give --calibration PATH, or --simulate")
+        cell = read_cell(config, robot, sensor) if station is None else station.cell
+        run, calibration, path = _take_poses(cell, station, path, wanted, options, as_json=as_json)
+    verified = verify_run(run, calibration, path, wanted.limits)
+    _report(verified, update, as_json=as_json)
+    if not verified.passed:
+        words = verified.exceeded if verified.limits.given else (verified.verification.reason,)
+        raise NotAccepted(f"the verification failed: {'; '.join(words)}")
+
+
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """What is verified, and how; the run keeps it, so that --resume continues alike."""
+
+    path: Path | None
+    poses: int
+    quick: bool
+    limits: "AcceptanceLimits"
+
+
+def _wanted(
+    path: Path | None, quick: bool, poses: int | None, limits: "AcceptanceLimits", resume: Path | None
+) -> _Wanted:
+    from ftdrive.runs.run import Run
+    from ftdrive.runs.verified import AcceptanceLimits
+    from ftdrive.session.verification import POSES, QUICK_POSES
+
     if quick and poses is not None:
         raise ConfigError("--quick and --poses exclude one another: leave one of them out")
-    limits = AcceptanceLimits(force_N, torque_Nm)
-    if resume is not None:
-        if given := [name for name, value in _of_a_new_one(path, quick, poses, limits).items() if value]:
-            raise ConfigError(f"--resume continues with the options of its run: leave out {' and '.join(given)}")
-        begun = _begun(resume)
-        path, poses, quick = Path(begun["path"]), begun["poses"], begun["quick"]
-        limits = AcceptanceLimits(**begun["limits"])
-    wanted = poses or (QUICK_POSES if quick else POSES)
-    with ExitStack() as stack:
-        cell, path, description = _cell(stack, path, config, robot, sensor, runs, simulate=simulate)
-        calibration = load_calibration(path)
-        if path.is_dir():
-            path = Run(path).calibration_path
-        description["verification"] = {
-            "id": calibration.id,
-            "path": str(path.absolute()),
-            "poses": wanted,
-            "quick": quick,
-            "limits": asdict(limits),
-        }
-        options = Options(
-            runs,
-            "verify",
-            poses=wanted,
-            mode="manual" if manual else "auto",
-            fast=quick,
-            resume=resume,
-            real=not simulate,
-            yes=yes,
-            description=description,
-        )
-        task = Verifying(calibration, path, wanted, runs)
-        try:
-            with open_operator(as_json=as_json, command="verify") as operator:
-                run = take_poses(cell, operator, options, task)
-        except Declined as error:
-            talk.print(str(error))
-            raise click.Abort from error
+    if resume is None:
+        return _Wanted(path, poses or (QUICK_POSES if quick else POSES), quick, limits)
+    given = {"--calibration": path, "--quick": quick, "--poses": poses, "--max-force or --max-torque": limits.given}
+    if wrong := [option for option, value in given.items() if value]:
+        raise ConfigError(f"--resume continues with the options of its run: leave out {' and '.join(wrong)}")
+    run = Run(resume)
+    if run.command != "verify":
+        raise ConfigError(f"{resume} is not a verification: continue it with {run.resume_command}")
+    begun = run.header()["verification"]
+    return _Wanted(Path(begun["path"]), begun["poses"], begun["quick"], AcceptanceLimits(**begun["limits"]))
+
+
+def _take_poses(
+    cell: "CellConfig",
+    station: "Station | None",
+    path: Path,
+    wanted: _Wanted,
+    options: "Options",
+    *,
+    as_json: bool,
+) -> tuple["Run", "CalibrationResult", Path]:
+    """Guide the operator through the poses; return the run, and the calibration with its file."""
+    from ftdrive.cell.emulated import MOVED_BY
+    from ftdrive.commands.emulated_run import described
+    from ftdrive.errors import Declined
+    from ftdrive.live.stream import load_calibration
+    from ftdrive.runs.run import Run
+    from ftdrive.session.session import take_poses, with_recorded_mode
+    from ftdrive.session.verification import Verifying
+    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.screen import open_operator
+
+    calibration = load_calibration(path)
+    path = Run(path).calibration_path if path.is_dir() else path
+    about = {**asdict(wanted), "id": calibration.id, "path": str(path.absolute())}
+    description = {"verification": about}
+    if station is not None:
+        description |= described(station)
+        if mover := MOVED_BY.get(with_recorded_mode(options).mode):
+            request, words = mover
+            station.control(**request)
+            talk.print(f"The cell is emulated: {words}.")
+    task = Verifying(calibration, path, wanted.poses, options.runs)
+    try:
+        with open_operator(as_json=as_json, command=task.command) as operator:
+            run = take_poses(cell, operator, replace(options, description=description), task)
+    except Declined as error:
+        talk.print(str(error))
+        raise click.Abort from error
     if run is None:
         raise RuntimeError("a verification is never a dry run")
-    verified = verify_run(run, calibration, path, limits)
+    return run, calibration, path
+
+
+def _report(verified: "Verified", update: Answer, *, as_json: bool) -> None:
+    """Print the outcome; save the update if it is wanted."""
+    from ftdrive.runs.verified import save_update
+    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.verification_text import print_verification
+
     if not as_json:
         print_verification(verified)
     saved = save_update(verified) if _wants_update(verified, update, as_json=as_json) else None
     if as_json:
         write_json({**verified.to_dict(), "file": str(verified.path), "saved": None if saved is None else str(saved)})
     elif saved is not None:
-        talk.print(f" Saved {saved}: {verified.update_name} updated, parent {calibration.id[:6]}")
-    if not verified.passed:
-        raise NotAccepted(_failure(verified))
+        talk.print(f" Saved {saved}: {verified.update_name} updated, parent {verified.calibration.id[:6]}")
 
 
-def _of_a_new_one(path: Path | None, quick: bool, poses: int | None, limits: Any) -> dict[str, Any]:
-    return {
-        "--calibration": path,
-        "--quick": quick,
-        "--poses": poses,
-        "--max-force": limits.force_N,
-        "--max-torque": limits.torque_Nm,
-    }
-
-
-def _begun(folder: Path) -> dict[str, Any]:
-    """Return what a verification was started with."""
-    from ftdrive.errors import ConfigError
-    from ftdrive.runs.run import Run
-
-    run = Run(folder)
-    header = run.header()
-    if header.get("command") != "verify":
-        raise ConfigError(f"{folder} is not a verification: continue it with {run.resume_command}")
-    return dict(header["verification"])
-
-
-def _cell(
-    stack: ExitStack,
-    path: Path | None,
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
-    runs: Path,
-    *,
-    simulate: bool,
-) -> tuple["CellConfig", Path, dict[str, Any]]:
-    """Return the cell, the calibration's path and the description of an emulated cell, which is calibrated first."""
+def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Path) -> tuple["Station", Path]:
+    """Start the cell of a calibration, or calibrate a new one; return it with the path of its calibration."""
     from ftdrive.cell.emulated import Station, sensor_name
-    from ftdrive.commands.common import read_cell, stop_unless_accepted
-    from ftdrive.commands.emulated_run import described, rehearse
-    from ftdrive.errors import ConfigError
+    from ftdrive.commands.emulated_run import rehearse
     from ftdrive.live.stream import load_calibration
 
-    if not simulate:
-        if path is None:
-            raise ConfigError("no calibration: give --calibration PATH, or --simulate")
-        return read_cell(config, robot, sensor), path, {}
     made_by = {} if path is None else load_calibration(path).provenance.get("station") or {}
     name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
     station = stack.enter_context(Station(name, made_by.get("options", ())))
     if path is None:
-        outcome = rehearse(station, runs, "simulated", poses=12)
+        outcome = rehearse(station, runs, "simulated", poses=6)
         stop_unless_accepted(outcome.result, to_be_saved=True)
         path = outcome.run.calibration_path
-    return station.cell, path, described(station)
+    return station, path
 
 
-def _wants_update(verified: "Verified", update: Literal["ask", "no", "yes"], *, as_json: bool) -> bool:
-    """Whether to save the update; nobody who answers means no."""
+def _wants_update(verified: "Verified", update: Answer, *, as_json: bool) -> bool:
+    """Whether to save the update; without an answer, no."""
     from ftdrive.errors import Declined
     from ftdrive.session.operator import Question
     from ftdrive.terminal.console import talk
@@ -203,13 +230,8 @@ def _wants_update(verified: "Verified", update: Literal["ask", "no", "yes"], *, 
     if update == "yes":
         return True
     operator = JsonOperator() if as_json else PlainOperator(quiet=talk.quiet)
-    text = f"An update of the {verified.update_name} is sufficient. {_QUESTION}?"
+    text = f"An update of the {verified.update_name} is sufficient. Save it as a new calibration?"
     try:
         return operator.ask(Question(text)) == "yes"
     except Declined:
         return False
-
-
-def _failure(verified: "Verified") -> str:
-    words = "; ".join(verified.exceeded) if verified.limits.given else verified.verification.reason
-    return f"the verification failed: {words}"

@@ -14,7 +14,7 @@ from ftdrive.terminal.report import drift_in_words
 def print_verification(verified: Verified) -> None:
     """Print measured and predicted wrench of each pose, the verdict with its limits, and what has changed."""
     found, n = verified.verification, len(verified.records)
-    count = f"{n} fresh poses" if n > 1 else "1 fresh pose"
+    count = f"{n} poses" if n > 1 else "1 pose"
     talk.print(Text.assemble(("Verification", "bold cyan"), f"  {count}, calibration {verified.calibration.id[:6]}"))
     talk.print(_table(verified))
     verdict = ("PASS", "bold green") if verified.passed else ("FAILED", "bold red")

@@ -1,0 +1,97 @@
+"""Verifications on an emulated cell: an unchanged cell passes, a change is named, an update names its parent."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import CalibrationResult
+from ftdrive.cell.emulated import Station
+from ftdrive.commands.emulated_run import rehearse
+from ftdrive.runs.outcome import Outcome
+from ftdrive.runs.run import Run
+from ftdrive.terminal.report import compensation_error
+from tests.system.command_line import CommandLine
+
+ANSWERS = "yes\nyes\nyes\nMOVE\nyes\n"
+"""Three safety questions, the word for the first motion, the beginning of the tour."""
+
+
+@pytest.fixture
+def station() -> Iterator[Station]:
+    with Station("can", ["--seed", "5"]) as station:
+        yield station
+
+
+@pytest.fixture
+def calibrated(station: Station, ftdrive: CommandLine) -> Outcome:
+    return rehearse(station, ftdrive.folder / "runs", "calibrate", poses=12)
+
+
+def verification_in(folder: Path) -> Run:
+    (found,) = (folder / "runs").glob("*-verify")
+    return Run(found)
+
+
+def test_a_bias_step_is_named_and_the_update_is_saved(
+    station: Station, calibrated: Outcome, ftdrive: CommandLine
+) -> None:
+    config, parent = ftdrive.connect(station), calibrated.run.calibration_path
+    station.control(do="drift", force_N=[0.3, 0.4, 0.0], seconds=0.01)
+    outcome = ftdrive.run(
+        "verify", "--quick", "--calibration", parent, "--config", config, "--json", typed=f"{ANSWERS}yes\n"
+    )
+    assert outcome.returncode == 7, outcome.stderr
+    answer = json.loads(outcome.stdout.splitlines()[-1])
+    assert (answer["passed"], answer["change"], answer["update"]) == (False, "bias", "bias")
+    assert "bias" in outcome.stderr
+    saved = CalibrationResult.load(ftdrive.folder / answer["saved"])
+    assert saved.provenance["parent"] == {"id": calibrated.result.id, "path": str(parent)}
+    step, sigma = saved.force_bias_N - calibrated.result.force_bias_N, np.asarray(saved.sigma["force_bias_N"])
+    assert np.abs((step - [0.3, 0.4, 0.0]) / sigma).max() < 6
+    truth = dict(station.truth, force_bias_N=np.add(station.truth["force_bias_N"], [0.3, 0.4, 0.0]))
+    assert compensation_error(saved, truth)["force_rms_N"] < 0.05
+    reading = ftdrive.run("live", "--once", "--json", "--calibration", parent, "--config", config)
+    assert reading.returncode == 0, reading.stderr
+    assert "VERIFICATION FAILED" in reading.stderr
+    assert json.loads(reading.stdout)["verification"]["change"] == "bias"
+
+
+@pytest.mark.slow
+def test_an_unchanged_cell_passes_and_keeps_its_plan(
+    station: Station, calibrated: Outcome, ftdrive: CommandLine
+) -> None:
+    config = ftdrive.connect(station)
+    arguments = ("verify", "--calibration", calibrated.run.folder, "--config", config)
+    outcome = ftdrive.run(*arguments, typed=ANSWERS)
+    assert outcome.returncode == 0, outcome.stderr
+    assert " PASS  largest difference" in outcome.stderr
+    first = verification_in(ftdrive.folder)
+    again = ftdrive.run(*arguments, "--yes")  # the plan was completed: no word is typed
+    assert again.returncode == 0, again.stderr
+    second = max((ftdrive.folder / "runs").glob("*-verify*"))
+    assert second != first.folder
+    assert (second / "plan.json").read_bytes() == first.plan_path.read_bytes()
+
+
+@pytest.mark.slow
+def test_another_payload_is_named_and_nothing_is_saved_unasked(
+    station: Station, calibrated: Outcome, ftdrive: CommandLine
+) -> None:
+    config = ftdrive.connect(station)
+    station.control(do="payload-shift", mass_kg=station.truth["mass_kg"] + 0.03)
+    outcome = ftdrive.run("verify", "--calibration", calibrated.run.folder, "--config", config, typed=ANSWERS)
+    assert outcome.returncode == 7, outcome.stderr
+    run = verification_in(ftdrive.folder)
+    document = json.loads((run.folder / "verification.json").read_text())
+    assert document["change"] in {"payload", "several"}
+    assert not run.calibration_path.exists()
+
+
+@pytest.mark.slow
+def test_by_hand_it_ends_with_the_last_fresh_pose(ftdrive: CommandLine) -> None:
+    answer = ftdrive.json("verify", "--simulate", "--manual", "--poses", "3")
+    assert answer["passed"]
+    assert len(answer["poses"]) >= 3
