@@ -213,15 +213,14 @@ class Processor:
         return wrench, int(knots[-1 - self._reach]) + 1
 
     def _processed(self, rows: Paired, inertial: Array | None) -> Block:
-        stages, calibration = self._stages, self.info.calibration
-        n = len(rows)
+        stages, n = self._stages, len(rows)
         residual, gravity, bias = self._free(rows)  # chi2 is that of a free tool, whatever is switched off
         if inertial is not None:
             residual -= inertial
         if n and not self._noise_is_learnt:
             self._noise.add(residual, rows.R_base_flange, rows.p_base_flange_m)
         current = self._tares[-1][0]
-        uncertain = (current.parameters, current.covariance, calibration.response)
+        uncertain = (current.parameters, current.covariance, current.response)
         self._test.expect(self._noise.noise, uncertain)
         if n:
             readings, chi2 = self._test.judge(residual, rows.R_base_flange)
@@ -364,7 +363,7 @@ class Processor:
                 return self.note("tare-refused", "tare refused: no sample has arrived yet; tare again", {})
             rows = Paired.concatenate(list(self._recent))
             rows = rows.rows(rows.t_host_ns >= self._newest_ns - round(TARE_S * 1e9))
-            update, text, values = try_tare(rows, self.info.calibration, self._tares[-1][0])
+            update, text, values = try_tare(rows, self._tares[-1][0])
             if update is None:
                 return self.note("tare-refused", text, values)
             self._set_tare([*self._tares, (update, self._newest_ns)])

@@ -4,13 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib import CalibrationResult
-from calib.compensation import Compensator
 from calib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
 from calib.errors import BadDataset
-from calib.extras.update import Calibrated, Update, tare
+from calib.extras.tare import bias_change, tare
+from calib.extras.update import Calibrated, Update
 from calib.files import JSON
-from calib.likelihood.gain_and_cross_talk import predicted_covariance
 from ftdrive.live.samples import Paired
 
 TARE_S = 0.5
@@ -21,9 +19,7 @@ _STILL_RAD, _STILL_M = 5e-4, 5e-4
 """Largest motion of the flange during a tare."""
 
 
-def try_tare(
-    rows: Paired, calibration: CalibrationResult, current: Calibrated
-) -> tuple[Update | None, str, Mapping[str, JSON]]:
+def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Mapping[str, JSON]]:
     """Estimate the bias again, or refuse.
 
     It is refused when arm or reading are not still, and when the reading differs from the prediction of a free tool by
@@ -33,7 +29,6 @@ def try_tare(
     ----------
     rows : Paired
         The last `TARE_S` seconds.
-    calibration : CalibrationResult
     current : CalibrationResult or Update
         The calibration after earlier tares.
 
@@ -49,32 +44,26 @@ def try_tare(
     again = "tare again when arm and tool have rested for half a second"
     if len(rows) < LEAST_SAMPLES or rows.t_host_ns[-1] - rows.t_host_ns[0] < 0.5e9 * TARE_S:
         return None, f"tare refused: only {len(rows)} samples; {again}", {}
-    R, p = rows.R_base_flange[-1], rows.p_base_flange_m[-1]
+    R, p = rows.R_base_flange[-1:], rows.p_base_flange_m[-1]
     # as `not <=`, so that an unknown position is still
     if np.abs(rows.R_base_flange - R).max() > _STILL_RAD or (np.abs(rows.p_base_flange_m - p) > _STILL_M).any():
         return None, f"tare refused: the arm moves; {again}", {}
-    old = current.parameters
-    # gain and cross-talk of the sensor act on the weight, but `tare` of calib does not know them
-    response = (calibration.compensator.matrix - Compensator(calibration.parameters).matrix) @ R.ravel()
-    dwell = rows.raw - response
-    bias = np.concatenate([old.force_bias_N, old.torque_bias_Nm])
-    change = dwell.mean(axis=0) - Compensator(old).matrix @ R.ravel() - bias
-    drift = np.diag(np.repeat([TARE_DRIFT_N**2, TARE_DRIFT_NM**2], 3))
-    predicted = predicted_covariance(old, current.covariance, calibration.response, R)
-    total = mean_and_covariance(dwell).covariance + predicted + drift
-    sigmas = float(np.sqrt(change @ np.linalg.solve(total, change)))
+    dwell = mean_and_covariance(rows.raw)
+    (change,), (sigmas,) = bias_change(
+        current, R, dwell.mean[None], dwell.covariance[None], TARE_DRIFT_N, TARE_DRIFT_NM
+    )
     force_N, torque_Nm = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
     values: dict[str, JSON] = {
         "change": change.tolist(),
         "force_N": force_N,
         "torque_Nm": torque_Nm,
-        "sigmas": sigmas,
+        "sigmas": float(sigmas),
     }
     found = f"{force_N:.2f} N and {torque_Nm:.3f} N·m ({sigmas:.1f} sigma)"
-    if not is_stationary(dwell):
+    if not is_stationary(rows.raw):
         return None, f"tare refused: the reading changes; {again}", values
     try:
-        update = tare(current, R[None], [dwell], drift_N=TARE_DRIFT_N, drift_Nm=TARE_DRIFT_NM)
+        update = tare(current, R, [rows.raw], drift_N=TARE_DRIFT_N, drift_Nm=TARE_DRIFT_NM)
     except BadDataset:
         why = f"{found} from the free tool, more than drift explains"
         return None, f"tare refused: {why}; take hand or contact away, or calibrate again", values

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.extras.verification import choose_verification_poses
 from calib.poses.information import Guess, predicted_sigma
 from calib.poses.selection import choose, cone_candidates
+from calib.poses.verification import choose_verification_poses
 from drivers.ur.kinematics import Array
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import wrist_inverse

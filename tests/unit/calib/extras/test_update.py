@@ -1,11 +1,15 @@
 """Another payload and a new tare on an old calibration: exact without noise, honest with it, refused when needed."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import BadDataset, CalibrationDataset, NotObservable, Parameters, solve
-from calib.extras.update import Update, tare, update_payload
+from calib import BadDataset, CalibrationDataset, CalibrationResult, NotObservable, Parameters, solve
+from calib.extras.tare import tare
+from calib.extras.update import BLOCKS, Update, reestimate, update_payload, updated
+from calib.likelihood.gain_and_cross_talk import Response, response_columns
 from calib.model import Array, jacobian, predict
 
 NOISE = np.diag(np.repeat([0.05**2, (0.025 * 0.05) ** 2], 3))
@@ -47,6 +51,11 @@ def loaded(parameters: Parameters) -> Parameters:
 
 def noise_of(n: int) -> Array:
     return np.tile(NOISE, (n, 1, 1))
+
+
+def joint(n: int) -> Array:
+    """Covariance of n poses together."""
+    return np.asarray(np.kron(np.eye(n), NOISE))
 
 
 def dwell(parameters: Parameters, R_base_flange: Array, rng: np.random.Generator, n: int = 200) -> Array:
@@ -213,6 +222,101 @@ def test_good_tares_pass() -> None:
     for seed in range(40):
         now = drifted(truth(), rng.normal(size=3), rng.normal(size=3) * 0.03)
         tare(calibration(truth(), seed=seed), R[:1], [dwell(now, R[0], rng, 400)])
+
+
+def with_response(start: Update, seed: int = 12) -> tuple[Update, Array]:
+    """The same for a sensor with 1 % gain and cross-talk, known to 0.1 %, and the true coefficients."""
+    estimated = np.random.default_rng(seed).normal(size=11) * 0.01
+    covariance = np.zeros((26, 26))
+    covariance[:15, :15] = start.covariance
+    covariance[15:, 15:] = 1e-6 * np.eye(11)
+    error = np.random.default_rng(seed + 1).normal(size=11) * 1e-3
+    response = Response(estimated, covariance)
+    return Update(start.parameters, start.covariance, 0.0, 0, response=response), estimated + error
+
+
+def test_a_tare_knows_the_gain_and_cross_talk_of_the_sensor() -> None:
+    rng = np.random.default_rng(17)
+    R = tilted(70)
+    distances = []
+    for seed in range(40):
+        start, coefficients = with_response(calibration(truth(), seed=seed), 2 * seed)
+        reading = dwell(truth(), R[0], rng) + response_columns(truth(), R[0]) @ coefficients
+        update = tare(start, R, [reading])
+        error = truth().difference(update.parameters)[[6, 7, 8, 12, 13, 14]]
+        block = update.covariance[np.ix_([6, 7, 8, 12, 13, 14], [6, 7, 8, 12, 13, 14])]
+        distances.append(error @ np.linalg.solve(block, error))
+        assert update.response is not None
+        assert start.response is not None
+        np.testing.assert_array_equal(update.response.coefficients, start.response.coefficients)
+        np.testing.assert_allclose(update.response.covariance[:15, :15], update.covariance)
+    assert np.mean(distances) == pytest.approx(6, rel=0.35)  # 5 sigma of the mean of 40
+
+
+@pytest.mark.parametrize("kind", BLOCKS)
+def test_every_kind_of_update_is_exact_without_noise(kind: str) -> None:
+    old, rng = truth(), np.random.default_rng(14)
+    R = Rotation.random(6, rng=rng).as_matrix()
+    turned = Rotation.from_euler("xyz", [5, -8, 12], degrees=True)
+    heavier = 1.3 if "weight" in BLOCKS[kind] else 1.0
+    gravity = heavier * old.gravity_force_base_N
+    now = Parameters(
+        turned.as_matrix() @ old.R_flange_sensor if "mounting" in BLOCKS[kind] else old.R_flange_sensor,
+        turned.apply(gravity) if "gravity direction" in BLOCKS[kind] else gravity,
+        old.force_bias_N + 3.0 * ("bias" in BLOCKS[kind]),
+        old.p_sensor_com_m + 0.02 * ("centre of mass" in BLOCKS[kind]),
+        old.torque_bias_Nm - 0.1 * ("bias" in BLOCKS[kind]),
+    )
+    update = reestimate(exact(old), R, predict(now, R), joint(6), kind)
+    np.testing.assert_allclose(now.difference(update.parameters), 0, atol=1e-9)
+    assert update.chi2 < 1e-12
+
+
+@pytest.mark.parametrize("kind", ["mounting", "base", "all", "centre of mass", "weight"])
+def test_the_covariance_of_every_kind_covers_noise_and_the_old_errors(kind: str) -> None:
+    rng = np.random.default_rng(15)
+    R = Rotation.random(5, rng=rng).as_matrix()
+    distances, misfits = [], []
+    for seed in range(30):
+        wrench = predict(truth(), R) + rng.multivariate_normal(np.zeros(6), NOISE, size=5)
+        update = reestimate(calibration(truth(), seed=seed), R, wrench, joint(5), kind)
+        error = truth().difference(update.parameters)
+        distances.append(error @ np.linalg.solve(update.covariance, error))
+        misfits.append(update.chi2 / update.dof)
+    assert np.mean(distances) == pytest.approx(15, rel=0.3)  # 5 sigma of the mean of 30
+    assert np.mean(misfits) == pytest.approx(1, rel=0.2)
+
+
+def test_poses_that_do_not_determine_the_parameters_are_rejected() -> None:
+    R = tilted(0, 60)
+    with pytest.raises(NotObservable, match="2 poses do not determine all: add poses"):
+        reestimate(calibration(truth()), R, predict(truth(), R), joint(2), "all")
+    R = tilted(0, 0)
+    with pytest.raises(NotObservable, match="do not determine mounting"):
+        reestimate(calibration(truth()), R, predict(truth(), R), joint(2), "mounting")
+
+
+def test_an_update_makes_a_calibration_that_names_its_parent_and_survives_a_file(tmp_path: Path) -> None:
+    rng = np.random.default_rng(16)
+    R = Rotation.random(12, rng=rng).as_matrix()
+    wrench = predict(truth(), R) + rng.multivariate_normal(np.zeros(6), NOISE, size=12)
+    parent = solve(CalibrationDataset(R, wrench, noise_of(12), np.zeros(12, np.int64), np.full(12, np.nan)))
+    new = loaded(truth())
+    readings = predict(new, tilted(0, 60)) + rng.multivariate_normal(np.zeros(6), NOISE, size=2)
+    update = update_payload(parent, tilted(0, 60), readings, noise_of(2))
+    child = updated(parent, update, {"parent": {"path": "old.json"}, "command": "verify"})
+    assert child.provenance["parent"] == {"path": "old.json", "id": parent.id}
+    assert (child.provenance["update"], child.provenance["command"]) == ("payload", "verify")
+    assert child.id != parent.id
+    assert any(parent.id in reason for reason in child.reasons)
+    np.testing.assert_allclose(child.residuals, readings - predict(update.parameters, tilted(0, 60)), atol=1e-12)
+    assert (child.chi2, child.dof, child.n_poses) == (update.chi2, 8, 2)
+    child.save(tmp_path / "child.json")
+    again = CalibrationResult.load(tmp_path / "child.json")
+    assert again.id == child.id
+    one = tare(parent, R[:1], [dwell(truth(), R[0], rng)])
+    with pytest.raises(NotObservable, match="use 2 poses or more"):
+        updated(parent, one)
 
 
 def test_shapes_that_do_not_fit_are_rejected() -> None:

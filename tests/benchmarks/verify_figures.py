@@ -1,0 +1,203 @@
+"""False alarms of a verification, and the changes that it names, in simulation.
+
+    uv run python tests/benchmarks/verify_figures.py [--quick] [--only PART]
+
+Prints one row per figure: name, figure, target, pass or FAIL, runs; then the names given to each change. The exit code
+is the number of rows that failed.
+
+The cell: a tool of 1.2 kg, 70 mm from a sensor with 0.05 N and 0.002 N·m of noise a sample, a pose the mean of 200
+samples. The new poses are chosen from 200 random orientations.
+"""
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationDataset, Parameters, solve
+from calib.data.dwell_mean import mean_and_covariance
+from calib.data.pooling import pooled_covariance
+from calib.extras.update import BLOCKS
+from calib.extras.verification import SINGLE, verify
+from calib.likelihood.gain_and_cross_talk import response_columns
+from calib.model import STANDARD_GRAVITY_M_S2, Array, predict
+from calib.poses.information import SUBSET_6, T12, special
+from calib.poses.verification import choose_verification_poses
+from tests.benchmarks.accuracy import Lab, Row, band, laboratory
+from tests.benchmarks.scenarios import Rng, direction
+
+SAMPLES, NOISE = 200, np.repeat([0.05, 0.002], 3)
+MASS_KG, COM_M = 1.2, 0.07
+FITTED = {24: special(range(1, 25)), 12: special(T12), 6: special(SUBSET_6)}
+CHANGES = tuple(dict.fromkeys(SINGLE.values()))
+NAMES = (*CHANGES, "several", None)
+KINDS = (*BLOCKS, None)
+CANDIDATES = 200
+MORE = {"exact": (0.0, 0.0, 0.0), "gain 1 %": (0.01, 0.0, 0.0), "0.2°": (0.0, np.deg2rad(0.2), 0.0)}
+MORE |= {"walk 0.02 N": (0.0, 0.0, 0.02)}
+"""Gain and cross-talk, error of each orientation in rad, random walk of the bias in N from pose to pose."""
+
+
+class Cell:
+    """A sensor and its tool, drawn at random."""
+
+    def __init__(self, rng: Rng, more: str) -> None:
+        gain, self.rotation_rad, self.walk_N = MORE[more]
+        self.rng = rng
+        self.coefficients = gain * rng.normal(size=11)
+        self.bias = np.zeros(6)
+        self.parameters = Parameters(
+            Rotation.from_rotvec(0.5 * rng.normal(size=3)).as_matrix(),
+            MASS_KG
+            * STANDARD_GRAVITY_M_S2
+            * Rotation.from_rotvec([*(0.03 * rng.normal(size=2)), 0.0]).apply([0.0, 0.0, -1.0]),
+            5 * rng.normal(size=3),
+            np.array([0.01, 0.01, 0.0]) * rng.normal(size=3) + np.array([0.0, 0.0, COM_M]),
+            0.3 * rng.normal(size=3),
+        )
+
+    def measure(self, R_base_flange: Array) -> CalibrationDataset:
+        """Measure poses one after the other."""
+        n, rng = len(R_base_flange), self.rng
+        there = R_base_flange @ Rotation.from_rotvec(self.rotation_rad * rng.normal(size=(n, 3))).as_matrix()
+        exact = predict(self.parameters, there) + response_columns(self.parameters, there) @ self.coefficients
+        walk = self.walk_N * np.repeat([1.0, 0.03], 3)
+        means = []
+        for wrench in exact:
+            self.bias = self.bias + walk * rng.normal(size=6)
+            means.append(mean_and_covariance(wrench + self.bias + NOISE * rng.normal(size=(SAMPLES, 6))))
+        wrench, cov = np.array([m.mean for m in means]), np.array([m.covariance for m in means])
+        return CalibrationDataset(R_base_flange, wrench, cov, np.full(n, SAMPLES), np.arange(n, dtype=np.float64))
+
+    def change(self, what: str) -> None:
+        """Change one quantity, in a random direction."""
+        p, away = self.parameters, direction(self.rng)
+        com, gravity = np.array(p.p_sensor_com_m), np.array(p.gravity_force_base_N)
+        if what == "bias":
+            self.parameters = replace(p, force_bias_N=p.force_bias_N + 0.5 * away)
+        elif what == "payload":  # 30 g somewhere 50 mm from the centre of mass
+            self.parameters = replace(
+                p,
+                gravity_force_base_N=gravity * (MASS_KG + 0.03) / MASS_KG,
+                p_sensor_com_m=com + 0.03 / (MASS_KG + 0.03) * 0.05 * away,
+            )
+        elif what == "centre of mass":
+            self.parameters = replace(p, p_sensor_com_m=com + 0.003 * away)
+        elif what == "mounting":
+            turned = Rotation.from_rotvec(np.deg2rad(1.0) * away).as_matrix()
+            self.parameters = replace(p, R_flange_sensor=turned @ p.R_flange_sensor)
+        else:
+            level = np.cross(gravity, away)
+            tilt = Rotation.from_rotvec(np.deg2rad(0.5) * level / np.linalg.norm(level))
+            self.parameters = replace(p, gravity_force_base_N=tilt.apply(gravity))
+
+
+def new_poses(rng: Rng, fitted: int, n: int) -> Array:
+    """Choose new poses."""
+    candidates = Rotation.random(CANDIDATES, rng=rng).as_matrix()
+    return np.asarray(candidates[choose_verification_poses(candidates, FITTED[fitted], n)])
+
+
+def unchanged_run(seed: int, fitted: int, more: str) -> dict[str, object]:
+    """Verify an unchanged cell with 6 and with 2 poses."""
+    cell = Cell(np.random.default_rng([seed, fitted]), more)
+    calibration = solve(cell.measure(FITTED[fitted]))
+    record: dict[str, object] = {}
+    for n in (6, 2):
+        new = cell.measure(new_poses(cell.rng, fitted, n))
+        found = verify(calibration, new.R_base_flange, new.wrench, pooled(new))
+        record[f"p{n}"] = found.p_value
+    return record
+
+
+def changed_run(seed: int, n: int, more: str, what: str) -> dict[str, object]:
+    """Name a change since a calibration from 24 poses."""
+    cell = Cell(np.random.default_rng([seed, n]), more)
+    calibration = solve(cell.measure(FITTED[24]))
+    cell.change(what)
+    new = cell.measure(new_poses(cell.rng, 24, n))
+    found = verify(calibration, new.R_base_flange, new.wrench, pooled(new))
+    share, square = 0.0, np.nan
+    if found.update is not None:
+        error, cov = found.update.parameters.difference(cell.parameters), found.update.covariance
+        share = float(np.mean(np.abs(error) < 3 * np.sqrt(np.diag(cov))))
+        square = float(error @ np.linalg.solve(cov, error)) / 15
+    return {
+        "change": NAMES.index(found.change),
+        "kind": KINDS.index(None if found.update is None else found.update.kind),
+        "ambiguous": bool(found.alternatives),
+        "share": share,
+        "square": square,
+    }
+
+
+def pooled(dataset: CalibrationDataset) -> Array:
+    """Give the pooled covariances of a dataset."""
+    assert dataset.wrench_cov is not None
+    return pooled_covariance(dataset.wrench_cov, dataset.n_samples)
+
+
+def false_alarms(lab: Lab) -> Iterator[Row]:
+    """Alarms at nominal 1 % where nothing has changed."""
+    for more in MORE:
+        for fitted in FITTED:
+            runs = lab.count(600 if more in ("exact", "gain 1 %") else 300, 60)
+            p = lab.simulate(partial(unchanged_run, fitted=fitted, more=more), runs)
+            required = more in ("exact", "gain 1 %") and not lab.quick
+            low, high = (0.5, 2.0) if required else (0.0, 100.0)
+            for n in (6, 2):
+                rate = 100 * float(np.mean(p[f"p{n}"] < 0.01))
+                yield band(f"false alarms, {fitted} poses, {more}, {n} new poses", rate, low, high, runs, " %", 2)
+
+
+def names(lab: Lab) -> Iterator[Row]:
+    """Names given to each change, and the error of the update."""
+    for n, more in ((6, "exact"), (6, "gain 1 %"), (2, "exact")):
+        for what in CHANGES:
+            runs = lab.count(200, 20)
+            found = lab.simulate(partial(changed_run, n=n, more=more, what=what), runs)
+            right = 100 * float(np.mean(found["change"] == NAMES.index(what)))
+            counts, kinds = (
+                ", ".join(f"{all_of[int(k)]} {count}" for k, count in Counter(found[key].tolist()).most_common())
+                for key, all_of in (("change", NAMES), ("kind", KINDS))
+            )
+            yield band(
+                f"{what}, {more}, {n} new poses: named correctly", right, 95.0 if n > 2 else 0.0, 100, runs, " %"
+            )
+            sure = ~np.isnan(found["square"])
+            yield band(
+                "  updated parameters within 3 sigma", 100 * float(found["share"][sure].mean()), 99, 100, runs, " %"
+            )
+            yield band("  mean square error over the stated one", float(found["square"][sure].mean()), 0.7, 1.3, runs)
+            ambiguous = int(found["ambiguous"].sum())
+            yield Row(f"  named {counts}; updates {kinds}; ambiguous {ambiguous}", "", "", True, runs)
+
+
+PARTS: dict[str, Callable[[Lab], Iterator[Row]]] = {"false-alarms": false_alarms, "names": names}
+
+
+def main() -> int:
+    """Print all rows."""
+    parser = argparse.ArgumentParser(description="Verification of a calibration.")
+    parser.add_argument("--quick", action="store_true", help="few runs")
+    parser.add_argument("--only", choices=PARTS, action="append", help="one part; may be repeated")
+    options = parser.parse_args()
+    failed = 0
+    write = partial(print, flush=True)
+    pool, lab = laboratory(quick=options.quick)
+    with pool:
+        for name in options.only or PARTS:
+            for row in PARTS[name](lab):
+                failed += not row.passed
+                mark = "pass" if row.passed else "FAIL"
+                write(f"{row.name:62} {row.figure:>10}   {row.target:16} {mark} {row.runs:6}")
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())
