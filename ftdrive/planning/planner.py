@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from calib.poses.information import SUBSET_6, T12, Guess, special
+from calib.poses.verification import FEWEST
 from drivers.ur.kinematics import Array
 from ftdrive.cell.config import USUAL_KG
 from ftdrive.errors import ConfigError, PlanRefused
@@ -30,7 +31,6 @@ USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 NUMBERS = {24: tuple(range(1, 25)), 12: T12, 6: SUBSET_6}
 BOX_HALF_SIZE_M = 0.1
 FEWEST_CHOSEN = 6
-FEWEST_TO_VERIFY = 2
 
 Found = tuple[Sequence[int], Array]
 """Numbers of the orientations and joint vectors (n, 6), in the order of travel."""
@@ -207,8 +207,8 @@ def plan_verification(
         Too few poses are reachable by moves that are proven clear.
     """
     q_now = checked_joints(q_rad)
-    if poses < FEWEST_TO_VERIFY:
-        raise ConfigError(f"{poses} poses cannot verify a calibration: give {FEWEST_TO_VERIFY} or more")
+    if poses < FEWEST:
+        raise ConfigError(f"{poses} poses cannot verify a calibration: give {FEWEST} or more")
     found = verification_tour(certifier, q_now, poses, R_fitted, speeds)
     if found is None:
         raise PlanRefused(

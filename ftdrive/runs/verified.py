@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from calib import CalibrationDataset, CalibrationResult
+from calib.data.pooling import pooled_covariance
 from calib.errors import BadDataset, NotObservable
 from calib.extras.update import Update, updated
 from calib.extras.verification import Verification, verify
@@ -101,7 +102,6 @@ class Verified:
     def to_dict(self) -> dict[str, JSON]:
         """Return the content of verification.json."""
         found, header = self.verification, self.run.header()
-        numbers = found.to_dict()
         return {
             "format": FORMAT,
             "schema_version": 1,
@@ -115,6 +115,7 @@ class Verified:
             "devices": header.get("devices", {}),
             "passed": self.passed,
             "change": found.change,
+            "alternatives": list(found.alternatives),
             "reason": found.reason,
             "update": self.update_name,
             "limits": {
@@ -124,9 +125,9 @@ class Verified:
             },
             "force_max_N": float(self.force_N.max()),
             "torque_max_Nm": float(self.torque_Nm.max()),
-            "chi2": numbers["chi2"],
-            "dof": numbers["dof"],
-            "p_value": numbers["p_value"],
+            "chi2": found.chi2,
+            "dof": found.dof,
+            "p_value": found.p_value,
             "poses": [self._pose(row) for row in range(len(self.records))],
             "drift_check": None
             if self.drift is None
@@ -168,7 +169,8 @@ def verify_run(run: Run, calibration: CalibrationResult, path: Path, limits: Acc
     dataset = dataset_from(records, {"run": run.folder.name, "devices": run.header().get("devices", {})})
     if dataset.wrench_cov is None:
         raise BadDataset(f"{run.folder} has no noise of its poses: repeat the verification")
-    found = verify(calibration, dataset.R_base_flange, dataset.wrench, dataset.wrench_cov, false_alarms=FALSE_ALARMS)
+    wrench_cov = pooled_covariance(dataset.wrench_cov, dataset.n_samples)
+    found = verify(calibration, dataset.R_base_flange, dataset.wrench, wrench_cov, false_alarms=FALSE_ALARMS)
     kept = tuple(record for record in records if not is_return(record, records))
     file = run.new_path("verification")
     verified = Verified(run, calibration, path, limits, dataset, kept, found, drift_check(records), file)

@@ -37,6 +37,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
     "live": ("--once",),
     "export plan": ("--format", "csv"),
     "record": ("--output", "a.csv", "--count", "500"),
+    "verify": ("--yes", "--quick", "--max-force", "0.5"),
     "transcript record": ("--output", "sensor.jsonl", "--duration", "0.5"),
 }
 """What a command cannot do without; any other must work with --simulate and --json alone."""
@@ -46,6 +47,9 @@ OFFLINE = ("convert", "compensate")
 
 REHEARSED = ("replay", "solve")
 """They calibrate an emulated cell first, as do live, and demo, which is run and looked at in test_demo.py."""
+
+GUIDED = ("calibrate", "verify")
+"""They print their events too, one object a line."""
 
 SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     "calibrate": lambda answer: answer["verdict"] != "rejected",
@@ -62,6 +66,7 @@ SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     "replay": lambda answer: answer["n_poses"] >= 6,
     "solve": lambda answer: answer["n_poses"] >= 6,
     "transcript play": lambda answer: answer["played"]["samples"] > 1000,
+    "verify": lambda answer: answer["passed"] and len(answer["poses"]) == 2,
     "transcript record": lambda answer: answer["recorded"]["error"] is None,
 }
 
@@ -122,7 +127,7 @@ def test_a_full_disk_and_a_reader_that_is_gone_are_no_crash() -> None:
 @pytest.mark.parametrize(
     "command",
     [
-        pytest.param(name, marks=pytest.mark.slow) if name == "calibrate" else name
+        pytest.param(name, marks=pytest.mark.slow) if name in GUIDED else name
         for name in names(cli)
         if name not in ("demo", "live", "record", "stream", *REHEARSED, *OFFLINE)
     ],
@@ -159,7 +164,7 @@ def works_with_simulate_and_json(command: str, ftdrive: CommandLine, capfd: pyte
     assert outcome.returncode == 0, outcome.stderr
     assert "Exception" not in outcome.stderr + capfd.readouterr().err
     *events, answer = map(json.loads, outcome.stdout.splitlines())
-    assert bool(events) == (command == "calibrate")  # it prints its events too, one object a line
+    assert bool(events) == (command in GUIDED)
     assert answer["schema_version"] == 1
     assert SHOWN.get(command, bool)(answer)
 

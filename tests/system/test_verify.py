@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,9 @@ from tests.system.command_line import CommandLine
 ANSWERS = "yes\nyes\nyes\nMOVE\nyes\n"
 """Three safety questions, the word for the first motion, the beginning of the tour."""
 
+LIMITS = ("--max-force", "0.2", "--max-torque", "0.02")
+"""Far above the noise: the prediction itself fails one unchanged cell in a hundred."""
+
 
 @pytest.fixture
 def station() -> Iterator[Station]:
@@ -27,7 +31,7 @@ def station() -> Iterator[Station]:
 
 @pytest.fixture
 def calibrated(station: Station, ftdrive: CommandLine) -> Outcome:
-    return rehearse(station, ftdrive.folder / "runs", "calibrate", poses=12)
+    return rehearse(station, ftdrive.folder / "runs", "calibrate", poses=6)
 
 
 def verification_in(folder: Path) -> Run:
@@ -35,6 +39,15 @@ def verification_in(folder: Path) -> Run:
     return Run(found)
 
 
+def test_the_cell_of_a_calibration_passes(demo: dict[str, Any], ftdrive: CommandLine) -> None:
+    arguments = ("--calibration", demo["run"], "--simulate", "--quick", "--yes")
+    answer = ftdrive.json("verify", *arguments, *LIMITS)
+    assert answer["passed"]
+    assert answer["calibration"]["id"] == demo["result"]["id"]
+    assert [len(pose["residual"]) for pose in answer["poses"]] == [6, 6]
+
+
+@pytest.mark.slow
 def test_a_bias_step_is_named_and_the_update_is_saved(
     station: Station, calibrated: Outcome, ftdrive: CommandLine
 ) -> None:
@@ -60,38 +73,28 @@ def test_a_bias_step_is_named_and_the_update_is_saved(
 
 
 @pytest.mark.slow
-def test_an_unchanged_cell_passes_and_keeps_its_plan(
+def test_an_unchanged_cell_passes_then_another_payload_is_named(
     station: Station, calibrated: Outcome, ftdrive: CommandLine
 ) -> None:
     config = ftdrive.connect(station)
-    arguments = ("verify", "--calibration", calibrated.run.folder, "--config", config)
-    outcome = ftdrive.run(*arguments, typed=ANSWERS)
+    arguments = ("verify", "--quick", "--calibration", calibrated.run.folder, "--config", config)
+    outcome = ftdrive.run(*arguments, *LIMITS, typed=ANSWERS)
     assert outcome.returncode == 0, outcome.stderr
     assert " PASS  largest difference" in outcome.stderr
     first = verification_in(ftdrive.folder)
-    again = ftdrive.run(*arguments, "--yes")  # the plan was completed: no word is typed
-    assert again.returncode == 0, again.stderr
-    second = max((ftdrive.folder / "runs").glob("*-verify*"))
-    assert second != first.folder
+    station.control(do="payload-shift", mass_kg=station.truth["mass_kg"] + 0.05)
+    again = ftdrive.run(*arguments, "--yes", "--update", "no", "--json")  # the plan was completed: no word is typed
+    assert again.returncode == 7, again.stderr
+    answer = json.loads(again.stdout.splitlines()[-1])
+    assert "payload" in (answer["change"], *answer["alternatives"])
+    assert answer["saved"] is None
+    second = Path(ftdrive.folder / answer["file"]).parent
     assert (second / "plan.json").read_bytes() == first.plan_path.read_bytes()
-
-
-@pytest.mark.slow
-def test_another_payload_is_named_and_nothing_is_saved_unasked(
-    station: Station, calibrated: Outcome, ftdrive: CommandLine
-) -> None:
-    config = ftdrive.connect(station)
-    station.control(do="payload-shift", mass_kg=station.truth["mass_kg"] + 0.03)
-    outcome = ftdrive.run("verify", "--calibration", calibrated.run.folder, "--config", config, typed=ANSWERS)
-    assert outcome.returncode == 7, outcome.stderr
-    run = verification_in(ftdrive.folder)
-    document = json.loads((run.folder / "verification.json").read_text())
-    assert document["change"] in {"payload", "several"}
-    assert not run.calibration_path.exists()
+    assert not Run(second).calibration_path.exists()
 
 
 @pytest.mark.slow
 def test_by_hand_it_ends_with_the_last_fresh_pose(ftdrive: CommandLine) -> None:
-    answer = ftdrive.json("verify", "--simulate", "--manual", "--poses", "3")
+    answer = ftdrive.json("verify", "--simulate", "--manual", "--poses", "2", *LIMITS)
     assert answer["passed"]
-    assert len(answer["poses"]) >= 3
+    assert len(answer["poses"]) >= 2

@@ -135,7 +135,7 @@ def verification_tour(
     candidates = cone_candidates(np.pi, SPINS_OF_A_LUMP, DIRECTIONS_OF_A_LUMP, certifier.scene.down_base)
 
     def far_from_fitted(reached: Array) -> Nodes:
-        return choose_verification_poses(reached, R_fitted, poses)
+        return choose_verification_poses(reached, R_fitted, poses, gravity_direction_base=certifier.scene.down_base)
 
     def tours(q: Array) -> Iterator[tuple[tuple[int, ...], Array]]:
         return _tours_at(certifier, q, candidates, SPINS_OF_A_LUMP, poses, far_from_fitted, speeds)

@@ -13,11 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from calib import CalibrationResult
 from calib.errors import NotObservable
+from calib.model import Array
 from calib.routine import PoseRecord
 from drivers.interfaces import DeviceInfo
 from ftdrive.errors import ConfigError, Declined
 from ftdrive.planning.plan import Plan
-from ftdrive.runs.run import Run
+from ftdrive.runs.run import Reading, Run
 from ftdrive.runs.verification import last_verification
 from ftdrive.runs.verified import AcceptanceLimits, Verified, save_update, verify_run
 from ftdrive.session.completed_plans import has_completed
@@ -71,6 +72,12 @@ def verified(run: Run, calibration: CalibrationResult, limits: AcceptanceLimits 
 
 def records_of(lab: Lab, calibration: CalibrationResult) -> list[PoseRecord]:
     return Run(lab.folder / "runs" / str(calibration.provenance["run"])).records()
+
+
+def turned(record: PoseRecord, R: Array) -> PoseRecord:
+    """Return a record at another orientation."""
+    before = record.before
+    return replace(record, before=Reading(before.t_host_ns, before.q_rad, before.R_base_flange @ R))
 
 
 def turn_deg(R: Any, others: Any) -> float:
@@ -210,12 +217,10 @@ def test_only_fresh_poses_count_by_hand(lab: Lab, calibration: CalibrationResult
     comparison = Comparison(calibration, used, wanted=1)
     assert comparison.add(records[0]).light == "amber"
     assert comparison.add(records[0]).poses == 1
-    reading = replace(records[1].before, R_base_flange=records[1].before.R_base_flange @ TURNED)
-    near = comparison.add(replace(records[1], before=reading))
+    near = comparison.add(turned(records[1], TURNED))
     assert (near.light, bool(near.hint)) == ("amber", True)
     tilted = Rotation.from_euler("x", 40, degrees=True).as_matrix()
-    reading = replace(records[2].before, R_base_flange=records[2].before.R_base_flange @ tilted)
-    assert comparison.add(replace(records[2], before=reading)).light == "green"
+    assert comparison.add(turned(records[2], tilted)).light == "green"
 
 
 def test_the_contact_guard_trusts_the_calibration_once_it_holds(lab: Lab, calibration: CalibrationResult) -> None:
