@@ -309,7 +309,8 @@ def _drift(view: View) -> Text:
         words, bad = drift_in_words(view.drift)
         return Text(f"drift  {words}", "bold yellow" if bad else "")
     if fit is None or not fit.values:
-        return Text("drift  not known before the fit", "dim")
+        when = "the fit" if view.command == "calibrate" else "the first pose is measured again"
+        return Text(f"drift  not known before {when}", "dim")
     if "drift" not in fit.values:
         return Text("drift  none seen so far")
     change, sigma = fit.values["drift"], fit.sigma["drift"]

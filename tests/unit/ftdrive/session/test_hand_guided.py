@@ -241,7 +241,7 @@ class Outcome:
         keys: dict[float, Key] | None = None,
         earlier: Sequence[PoseRecord] = (),
         says: Callable[[float], ArmStatus] | None = None,
-        fit: Fit | Verification | None = None,
+        fit: Any = None,
         has_keys: bool = True,
         raises: Any = None,
         **cell: Any,
