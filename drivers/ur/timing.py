@@ -78,9 +78,9 @@ class UrTiming:
             starting_s=30.0,
             call_s=30.0,
             progress_s=30.0,
-            ours_s=5.0,  # the same for another program
-            ours_again_s=5.0,
-            ours_closing_s=5.0,
+            ours_s=30.0,
+            ours_again_s=30.0,
+            ours_closing_s=30.0,
             quit_s=30.0,
             braking_s=30.0,
             stop_s=30.0,

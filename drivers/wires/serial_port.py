@@ -104,20 +104,20 @@ class SerialPort:
 
     def read(self, size: int) -> bytes:
         """Read `size` bytes, fewer after `read_s` or with marks among them. Raises `StreamBroken`."""
-        return self.read_marked(size)[0]
-
-    def read_marked(self, size: int) -> tuple[bytes, list[int]]:
-        """Read like `read`; also return the places of bytes received with wrong parity or framing."""
         with self._in_use() as port:
             data = port.read(size)
-        return self._undo(data)
+        return self._undo(data)[0]
 
     def read_all(self, at_least: int) -> bytes:
         """Read `at_least` bytes, or fewer as in `read`, and all others that have arrived. Raises `StreamBroken`."""
+        return self.read_marked(at_least)[0]
+
+    def read_marked(self, at_least: int) -> tuple[bytes, list[int]]:
+        """Read like `read_all`; also return the places of bytes received with wrong parity or framing."""
         with self._in_use() as port:
             data = port.read(at_least)
             data += port.read(port.in_waiting)
-        return self._undo(data)[0]
+        return self._undo(data)
 
     def drain(self, silence_s: float, at_most_s: float) -> None:
         """Drop what arrives until a silence of `silence_s`, for `at_most_s`. Raises `StreamBroken`."""

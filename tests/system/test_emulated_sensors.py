@@ -21,6 +21,7 @@ def test_the_application_knows_all_sensors_of_a_station() -> None:
     assert set(SENSORS) == set(CHOICES) - {"both", "none"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_driver_reads_the_truth_of_the_cell_and_refuses_what_is_none(name: str) -> None:
     """On the emulated wrist: bias, weight, mounting and a push arrive; frozen, saturated and no number are errors."""

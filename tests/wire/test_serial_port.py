@@ -1,6 +1,7 @@
 """The serial port of a driver on a pseudo-terminal; the far side, played by the test, checks parity and makes marks."""
 
 import errno
+import fcntl
 import os
 import select
 import sys
@@ -44,6 +45,11 @@ class FarSide:
     def send(self, data: bytes) -> None:
         assert os.write(self.master, data) == len(data)
 
+    def await_arrival(self, size: int) -> None:
+        deadline = time.monotonic() + 5
+        while int.from_bytes(fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)), sys.byteorder) < size:
+            assert time.monotonic() < deadline
+
     def close(self) -> None:
         os.close(self._slave)
         os.close(self.master)
@@ -64,14 +70,26 @@ def port(far_side: FarSide) -> Iterator[SerialPort]:
     port.close()
 
 
-def read_until(port: SerialPort, size: int, at_once: int = 416) -> tuple[bytes, list[int]]:
-    data, damaged, deadline = b"", list[int](), time.monotonic() + 5
+def read_until(port: SerialPort, size: int, data: bytes = b"") -> tuple[bytes, list[int]]:
+    damaged, deadline = list[int](), time.monotonic() + 5
     while len(data) < size:
         assert time.monotonic() < deadline
-        more, places = port.read_marked(min(at_once, size - len(data)))
+        more, places = port.read_marked(size - len(data))
         damaged += [len(data) + place for place in places]
         data += more
     return data, damaged
+
+
+def send_and_read(far_side: FarSide, port: SerialPort, sent: bytes, size: int, at_once: int) -> tuple[bytes, list[int]]:
+    """Read after every few bytes that are sent, so that marks are cut."""
+    data, damaged = b"", list[int]()
+    for start in range(0, len(sent), at_once):
+        far_side.send(sent[start : start + at_once])
+        more, places = port.read_marked(0)
+        damaged += [len(data) + place for place in places]
+        data += more
+    data, rest = read_until(port, size, data)
+    return data, damaged + rest
 
 
 def test_marks_are_asked_for_once_opened_and_stay(far_side: FarSide, port: SerialPort) -> None:
@@ -86,7 +104,6 @@ def test_marks_are_asked_for_once_opened_and_stay(far_side: FarSide, port: Seria
 
 
 def test_asking_for_marks_keeps_an_unusual_bit_rate(far_side: FarSide, port: SerialPort) -> None:
-    fcntl = pytest.importorskip("fcntl")
     TCGETS2 = 0x802C542A
     port.read(1)
     settings = bytearray(64)
@@ -107,15 +124,25 @@ def test_marks_are_not_asked_for_without_parity(far_side: FarSide) -> None:
 
 @pytest.mark.parametrize("at_once", [1, 2, 416])
 def test_what_the_system_doubles_is_undone(far_side: FarSide, port: SerialPort, at_once: int) -> None:
-    far_side.send(ALL)
-    assert read_until(port, len(ALL), at_once) == (ALL, [])
+    assert send_and_read(far_side, port, ALL, len(ALL), at_once) == (ALL, [])
 
 
 @pytest.mark.parametrize("at_once", [1, 2, 416])
 def test_damaged_bytes_are_told(far_side: FarSide, port: SerialPort, at_once: int) -> None:
     far_side.make_marks_itself()
-    far_side.send(b"ab" + b"\xff\x00c" + b"\xff\xff" + b"\xff\x00\xff" + b"\x00" + b"\xff\x00\x00" + b"z")
-    assert read_until(port, 8, at_once) == (b"abc\xff\xff\x00\x00z", [2, 4, 6])
+    sent = b"ab" + b"\xff\x00c" + b"\xff\xff" + b"\xff\x00\xff" + b"\x00" + b"\xff\x00\x00" + b"z"
+    assert send_and_read(far_side, port, sent, 8, at_once) == (b"abc\xff\xff\x00\x00z", [2, 4, 6])
+
+
+def test_a_read_returns_all_that_has_arrived(far_side: FarSide) -> None:
+    port = SerialPort("sensor", far_side.path, 115_200)
+    port.open()
+    try:
+        far_side.send(ALL)
+        far_side.await_arrival(len(ALL))
+        assert port.read_marked(13) == (ALL, [])
+    finally:
+        port.close()
 
 
 def test_all_that_has_arrived_is_undone_too(far_side: FarSide, port: SerialPort) -> None:

@@ -181,7 +181,7 @@ def test_the_odds_of_the_second_basin_are_those_of_being_wrong() -> None:
 
 
 @pytest.mark.parametrize(("n", "bumped"), [(24, 6), (12, 3)])
-@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_bumped_poses_are_rejected_and_no_others(n: int, bumped: int, measured: bool) -> None:
     error, least, missed, false = np.zeros(5), np.zeros(5), 0, 0
     for seed in range(2):

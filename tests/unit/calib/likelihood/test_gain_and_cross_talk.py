@@ -61,7 +61,7 @@ def test_columns_are_the_derivative_of_the_response() -> None:
     np.testing.assert_allclose(response_columns(p, R) @ x, read(p, R, M, L) - predict(p, R), atol=1e-12)
 
 
-@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_sensor_of_wrong_gain_is_predicted_as_well_as_by_an_oracle(measured: bool) -> None:
     ours, plain = [], []
     for seed in range(8):
@@ -79,6 +79,7 @@ def test_a_sensor_of_wrong_gain_is_predicted_as_well_as_by_an_oracle(measured: b
     assert np.sqrt(np.mean(plain)) > 3 * np.sqrt(np.mean(ours))
 
 
+@pytest.mark.slow
 def test_the_error_of_the_prediction_is_as_stated() -> None:
     distances = []
     for seed in range(15):

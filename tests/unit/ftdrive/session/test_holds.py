@@ -110,7 +110,7 @@ def test_a_no_before_the_first_motion_ends_the_session(words: str, lab: Lab) -> 
 
 
 @pytest.mark.parametrize("mode", ["robot emergency stop", "system emergency stop", "safeguard stop", "protective stop"])
-@pytest.mark.parametrize("held", ["by a pause", "for a contact"])
+@pytest.mark.parametrize("held", ["by a pause", pytest.param("for a contact", marks=pytest.mark.slow)])
 def test_an_emergency_stop_that_is_pressed_in_a_hold_brings_the_questions_again(mode: str, held: str, lab: Lab) -> None:
     if held == "by a pause":
         pause_on_the_way(lab, 4)

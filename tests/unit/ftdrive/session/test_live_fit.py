@@ -86,6 +86,7 @@ def run(taken: list[PoseRecord], running: Running | None = None) -> Estimated:
     return running.add(taken[-1])
 
 
+@pytest.mark.slow
 def test_at_the_end_of_a_tour_the_running_fit_is_the_solvers() -> None:
     running, taken = Running(), tour()
     events = [running.add(one) for one in taken]

@@ -78,7 +78,7 @@ def test_a_method_with_wrong_known_values_is_named_as_the_cause() -> None:
 LEVEL = Known(gravity_direction_base=(0, 0, -1), mass_kg=0.5)
 
 
-@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("known", "words"),
     [
@@ -218,6 +218,7 @@ def test_what_was_taken_as_known_is_called_fixed(
     assert not any(" 0.0000000" in line for line in lines)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mass_kg", np.linspace(0.4995, 0.5005, 5))
 def test_a_weight_known_exactly_has_an_uncertainty_of_zero(mass_kg: float) -> None:
     rng = np.random.default_rng(1)

@@ -54,7 +54,7 @@ def test_constant_tour_takes_24_moves_of_90_degrees_and_leaves_cables_alone() ->
 
 
 @pytest.mark.parametrize(("model", "q6_deg"), [("UR5e", -170), ("UR5e", 90), ("UR3e", 80), ("UR10e", 180)])
-@pytest.mark.parametrize("poses", [24, 12])
+@pytest.mark.parametrize("poses", [pytest.param(24, marks=pytest.mark.slow), 12])
 def test_wrist_3_stays_within_200_degrees_of_where_it_stands(model: str, q6_deg: float, poses: int) -> None:
     certifier = certifier_of(model)
     stands = np.radians([45, -100, 60, -50, 90, q6_deg])
