@@ -27,6 +27,8 @@ PARAMETER_NAMES = tuple(
     for axis in "xyz"
 )
 """The 15 error coordinates, in the order of the Jacobian and of every covariance."""
+BIASES = np.r_[6:9, 12:15]
+"""Where force and torque bias stand in `PARAMETER_NAMES`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

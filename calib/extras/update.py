@@ -16,7 +16,7 @@ from calib.compensation import Compensator
 from calib.data.dataset import finite
 from calib.errors import NotObservable
 from calib.likelihood.gain_and_cross_talk import Response, response_columns
-from calib.model import Array, Parameters, jacobian, read_only, skew
+from calib.model import BIASES, Array, Parameters, jacobian, read_only, skew
 from calib.result import CalibrationResult
 
 LEAST_SPREAD = 0.025  # of the gravity directions in the sensor frame, rms; two poses 3° apart have it
@@ -24,8 +24,6 @@ SIGNIFICANT_SIGMAS = 5.0
 SETTLED = 1e-20  # squared step in standard deviations at which the iteration ends
 MOST_STEPS = 30
 UNDETERMINED = 1e-6  # smallest singular value of the scaled equations over the largest
-
-BIASES = np.r_[6:9, 12:15]  # where force and torque bias stand in `PARAMETER_NAMES`
 
 Block = Literal["weight", "centre of mass", "bias", "gravity direction", "mounting"]
 BLOCKS: Mapping[str, tuple[Block, ...]] = {

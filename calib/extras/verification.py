@@ -17,10 +17,10 @@ from scipy.special import fdtrc as f_sf
 from calib.compensation import Compensator
 from calib.data.dataset import finite
 from calib.errors import BadDataset, NotObservable
-from calib.extras.update import BIASES, BLOCKS, Update, reestimate
+from calib.extras.update import BLOCKS, Update, reestimate
 from calib.files import JSON
 from calib.likelihood.gain_and_cross_talk import response_columns
-from calib.model import Array, jacobian, read_only
+from calib.model import BIASES, Array, jacobian, read_only
 from calib.result import CalibrationResult
 
 Change = Literal["bias", "payload", "centre of mass", "mounting", "base", "several"]

@@ -1,11 +1,13 @@
 """Selection of poses that verify a calibration: far from those of the fit, and able to name what has changed."""
 
+from itertools import combinations
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.model import Array
+from calib.model import BIASES, Array
 from calib.poses.information import Guess, whitened_jacobian
-from calib.poses.selection import Indices
+from calib.poses.selection import LEAST_GAIN, Indices
 
 FEWEST = 2
 FARTHER_SHARE = 0.5
@@ -15,6 +17,9 @@ TOOL = Guess(mass_kg=1.0, sigma_force_N=0.02, sigma_torque_Nm=0.001)
 USUAL_CHANGE = np.repeat([np.deg2rad(1.0), TOOL.weight_N * np.deg2rad(0.5), 0.5, 3e-3, 0.02], 3)
 """(15,) of mounting, gravity force, force bias, centre of mass and torque bias."""
 
+CAUSES = (range(3), range(3, 6), range(9, 12), BIASES)
+"""Error coordinates of mounting, gravity force (base or payload), centre of mass, and bias."""
+
 
 def choose_verification_poses(
     candidates: Array, fitted: Array, n: int, *, gravity_direction_base: ArrayLike = (0.0, 0.0, -1.0)
@@ -22,8 +27,8 @@ def choose_verification_poses(
     """Choose poses for a verification: greedily, then exchanging one at a time as long as it helps.
 
     They are chosen among the half of the candidates in which gravity pulls on the tool from directions farthest from
-    those of the fit. They maximise the determinant of the information about all parameters, with a prior of the usual
-    size of a change: changes of bias, payload, mounting and base then look as different as possible.
+    those of the fit. They maximise the determinants of the information about each pair of causes of a change, with a
+    prior of the usual size of a change. Two poses then differ in tilt, and no two causes look alike.
 
     Parameters
     ----------
@@ -53,15 +58,18 @@ def choose_verification_poses(
 
 
 def _most_informative(rows: Array, n: int) -> Indices:
-    """Choose n of the rows (m, 6, 15) that maximise log det(1 + sum of J'J)."""
+    """Choose n of the rows (m, 6, 15) that maximise log det(1 + sum of J'J), summed over the pairs of causes."""
+    pairs = [rows[..., [*a, *b]] for a, b in combinations(CAUSES, 2)]
     chosen: list[int] = []
 
     def gains() -> Array:
-        J = rows[chosen].reshape(-1, 15)
-        covariance = np.linalg.inv(np.eye(15) + J.T @ J)
-        gain = np.linalg.slogdet(np.eye(6) + rows @ covariance @ np.swapaxes(rows, 1, 2))[1]
-        gain[chosen] = -np.inf
-        return np.asarray(gain)
+        total = np.zeros(len(rows))
+        for J in pairs:
+            done = J[chosen].reshape(-1, J.shape[2])
+            covariance = np.linalg.inv(np.eye(J.shape[2]) + done.T @ done)
+            total += np.linalg.slogdet(np.eye(6) + J @ covariance @ np.swapaxes(J, 1, 2))[1]
+        total[chosen] = -np.inf
+        return total
 
     while len(chosen) < n:
         chosen.append(int(gains().argmax()))
@@ -72,7 +80,7 @@ def _most_informative(rows: Array, n: int) -> Indices:
             old = chosen.pop(i)
             gain = gains()
             best = int(gain.argmax())
-            better = bool(gain[best] > gain[old] + 1e-9)
+            better = bool(gain[best] > gain[old] + LEAST_GAIN)
             chosen.insert(i, best if better else old)
             improved |= better
     return np.array(chosen)

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import BadDataset
-from calib.extras.update import BIASES
-from calib.model import jacobian
+from calib.model import BIASES, jacobian
 from drivers.interfaces import Array
 from ftdrive.live.processing import Processor
 from ftdrive.live.samples import StreamEvent, WrenchFrame

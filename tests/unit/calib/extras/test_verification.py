@@ -1,0 +1,214 @@
+"""Verification: unchanged cells pass, each change is named with its update, contact is not explained away."""
+
+import json
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib import BadDataset, CalibrationDataset, CalibrationResult, Parameters, solve
+from calib.extras.update import updated
+from calib.extras.verification import Verification, verify
+from calib.likelihood.gain_and_cross_talk import response_columns
+from calib.model import Array, predict
+from calib.poses.information import SUBSET_6, special
+from calib.result import DriftResult
+
+SIGMA = np.repeat([0.05, 0.002], 3) / np.sqrt(200)
+TRUTH = Parameters(
+    Rotation.from_euler("zx", [20, 3], degrees=True).as_matrix(),
+    np.array([0.2, -0.1, -11.76]),
+    np.array([3.0, -2.0, 5.0]),
+    np.array([0.01, -0.005, 0.07]),
+    np.array([0.1, 0.2, -0.1]),
+)
+COEFFICIENTS = 0.01 * np.random.default_rng(0).normal(size=11)
+TURN = Rotation.from_rotvec(np.deg2rad(1.0) * np.array([0.6, 0.0, 0.8]))
+CHANGED = {
+    "bias": replace(TRUTH, force_bias_N=TRUTH.force_bias_N + np.array([0.3, 0.0, 0.4])),
+    "payload": replace(
+        TRUTH, gravity_force_base_N=TRUTH.gravity_force_base_N * 1.025, p_sensor_com_m=TRUTH.p_sensor_com_m + 0.001
+    ),
+    "centre of mass": replace(TRUTH, p_sensor_com_m=TRUTH.p_sensor_com_m + np.array([0.0, 0.003, 0.0])),
+    "mounting": replace(TRUTH, R_flange_sensor=TURN.as_matrix() @ TRUTH.R_flange_sensor),
+    "base": replace(
+        TRUTH,
+        gravity_force_base_N=Rotation.from_euler("x", 0.5, degrees=True).apply(np.array(TRUTH.gravity_force_base_N)),
+    ),
+}
+
+
+def readings(parameters: Parameters, R: Array, seed: int, coefficients: Array | None = None) -> Array:
+    noise = np.random.default_rng(seed).normal(size=(len(R), 6)) * SIGMA
+    added = 0.0 if coefficients is None else response_columns(parameters, R) @ coefficients
+    return np.asarray(predict(parameters, R) + added + noise)
+
+
+def noise_of(n: int) -> Array:
+    return np.tile(np.diag(SIGMA**2), (n, 1, 1))
+
+
+@lru_cache(maxsize=64)
+def calibrated(seed: int = 1, *, poses: int = 24, gain: bool = False) -> CalibrationResult:
+    R = special(range(1, 25)) if poses == 24 else special(SUBSET_6)
+    wrench = readings(TRUTH, R, seed, COEFFICIENTS if gain else None)
+    return solve(CalibrationDataset(R, wrench, noise_of(poses), np.zeros(poses, np.int64), np.full(poses, np.nan)))
+
+
+def orientations(n: int, seed: int = 2) -> Array:
+    return np.asarray(Rotation.random(n, rng=np.random.default_rng(seed)).as_matrix())
+
+
+def verified(parameters: Parameters, n: int = 6, seed: int = 3, *, gain: bool = False) -> Verification:
+    wrench = readings(parameters, orientations(n), seed, COEFFICIENTS if gain else None)
+    return verify(calibrated(gain=gain), orientations(n), wrench, noise_of(n))
+
+
+@pytest.mark.parametrize("gain", [False, True])
+@pytest.mark.parametrize("n", [2, 6])
+def test_an_unchanged_cell_passes(n: int, gain: bool) -> None:
+    found = verified(TRUTH, n, gain=gain)
+    assert found.passed
+    assert (found.change, found.update, found.dof) == (None, None, 6 * n)
+    assert "agree with the calibration" in found.reason
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+@pytest.mark.parametrize("gain", [False, True])
+@pytest.mark.parametrize("what", CHANGED)
+def test_a_change_is_named_and_the_smallest_update_makes_up_for_it(what: str, gain: bool) -> None:
+    found = verified(CHANGED[what], gain=gain)
+    assert not found.passed
+    assert (found.change, found.alternatives) == (what, ())
+    assert found.update is not None
+    assert found.update.kind == what
+    error = CHANGED[what].difference(found.update.parameters)
+    assert error @ np.linalg.solve(found.update.covariance, error) < 45  # chi-square, 15 dof: one in 10 000
+    child = updated(calibrated(gain=gain), found.update)
+    wrench = readings(CHANGED[what], orientations(6, 9), 9, COEFFICIENTS if gain else None)
+    assert verify(child, orientations(6, 9), wrench, noise_of(6)).passed
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_the_reason_states_the_change_with_its_size() -> None:
+    assert "the bias has changed by 0.5 N" in verified(CHANGED["bias"]).reason
+    assert "the payload has changed by +30 g" in verified(CHANGED["payload"]).reason
+    assert "the centre of mass has moved by 3.0 mm" in verified(CHANGED["centre of mass"]).reason
+    assert "turned on the flange by 1°" in verified(CHANGED["mounting"]).reason
+    assert "gravity has turned in the base by 0.5°" in verified(CHANGED["base"]).reason
+
+
+def test_bias_and_payload_together_are_several() -> None:
+    both = replace(CHANGED["payload"], force_bias_N=CHANGED["bias"].force_bias_N)
+    found = verified(both)
+    assert found.change == "several"
+    assert found.update is not None
+    assert found.update.kind == "bias and payload"
+    error = both.difference(found.update.parameters)
+    assert error @ np.linalg.solve(found.update.covariance, error) < 45
+
+
+def test_everything_changed_needs_all() -> None:
+    everything = replace(CHANGED["base"], R_flange_sensor=CHANGED["mounting"].R_flange_sensor)
+    everything = replace(everything, force_bias_N=CHANGED["bias"].force_bias_N)
+    found = verified(everything, 8)
+    assert found.change == "several"
+    assert found.update is not None
+    assert found.update.kind == "all"
+
+
+def test_a_hand_on_the_tool_in_one_pose_is_no_change_of_the_calibration() -> None:
+    wrench = readings(TRUTH, orientations(6), 3)
+    wrench[3] += [2.0, 1.0, 0.0, 0.1, 0.0, 0.05]
+    found = verify(calibrated(), orientations(6), wrench, noise_of(6))
+    assert not found.passed
+    assert (found.change, found.update) == (None, None)
+    assert "the farthest is pose 4" in found.reason
+    assert "free tool and cables" in found.reason
+
+
+def test_two_poses_that_do_not_separate_mounting_from_base_say_so() -> None:
+    """Without a turn between them, the poses show a turned sensor and a tilted base alike."""
+    R = np.array([Rotation.from_euler("x", 180 + d, degrees=True).as_matrix() for d in (-2.0, 2.0)])
+    turned = Rotation.from_euler("y", 1.0, degrees=True).as_matrix() @ TRUTH.R_flange_sensor
+    found = verify(calibrated(), R, readings(replace(TRUTH, R_flange_sensor=turned), R, 4), noise_of(2))
+    assert not found.passed
+    assert {found.change, *found.alternatives} >= {"mounting", "base"}
+    assert "do not distinguish it from a change of" in found.reason
+
+
+def test_sigma_holds_noise_and_the_uncertainty_of_the_calibration() -> None:
+    new = orientations(6)
+    for gain in (False, True):
+        found, calibration = verified(TRUTH, gain=gain), calibrated(gain=gain)
+        variance = SIGMA**2 + np.diagonal(calibration.wrench_covariance(new), axis1=1, axis2=2)
+        np.testing.assert_allclose(found.predicted_sigma**2, variance, rtol=1e-9)
+
+
+def test_the_uncertainty_of_the_calibration_is_common_to_all_poses() -> None:
+    """Six calibration poses: as independent errors of each pose, chi2 would scatter far more than 6n degrees do."""
+    calibration, rng = calibrated(poses=6), np.random.default_rng(11)
+    chi2 = []
+    for seed in range(40):
+        error = rng.multivariate_normal(np.zeros(15), calibration.covariance)
+        drawn = replace(calibration, parameters=TRUTH.moved(error))
+        wrench = readings(TRUTH, orientations(12), seed)
+        chi2.append(verify(drawn, orientations(12), wrench, noise_of(12)).chi2)
+    assert np.mean(chi2) == pytest.approx(72, abs=6 * np.sqrt(2 * 72 / 40))
+    assert np.std(chi2) < 20  # 12 expected
+
+
+def test_errors_of_each_pose_that_the_fit_found_are_expected_again() -> None:
+    calibration = calibrated()
+    inexact = Rotation.from_rotvec(0.003 * np.random.default_rng(5).normal(size=(6, 3))).as_matrix()
+    wrench = readings(TRUTH, orientations(6) @ inexact, 6)
+    assert not verify(calibration, orientations(6), wrench, noise_of(6)).passed
+    aware = replace(calibration, components={"rotation_rad": 0.003})
+    assert verify(aware, orientations(6), wrench, noise_of(6)).passed
+    noisy = replace(calibration, components={"white_force_N": 0.05, "white_torque_Nm": 0.004})
+    assert verify(noisy, orientations(6), wrench, noise_of(6)).passed
+
+
+def test_a_bias_that_walked_in_the_tour_may_walk_on() -> None:
+    calibration = calibrated()
+    walk = np.cumsum(np.random.default_rng(7).normal(size=(6, 6)) * np.repeat([0.05, 0.001], 3), axis=0)
+    wrench = readings(TRUTH, orientations(6), 8) + 1.5 * walk[-1] + walk
+    assert not verify(calibration, orientations(6), wrench, noise_of(6)).passed
+    walking = replace(calibration, components={"walk_force_N": 0.05, "walk_torque_Nm": 0.001})
+    found = verify(walking, orientations(6), wrench, noise_of(6))
+    assert found.passed
+    jumped = verify(walking, orientations(6), wrench + np.array([2.0, 0, 0, 0, 0, 0]), noise_of(6))
+    assert (jumped.passed, jumped.change) == (False, "bias")
+    drift = DriftResult(np.repeat([0.4, 0.005], 3), np.full(6, 0.01))
+    linear = replace(calibration, drift=drift)
+    ramp = readings(TRUTH, orientations(6), 8) + np.outer(0.5 + np.arange(6) / 24, drift.change)
+    assert not verify(calibration, orientations(6), ramp, noise_of(6)).passed
+    assert verify(linear, orientations(6), ramp, noise_of(6)).passed
+
+
+def test_noise_estimated_from_few_residuals_raises_the_limit() -> None:
+    """Chi-square would give false alarms: six poses leave few degrees of freedom for the noise."""
+    wrench = readings(TRUTH, orientations(6), 3) + 0.09 * np.random.default_rng(10).normal(size=(6, 6)) * [
+        1, 1, 1, 0.04, 0.04, 0.04,
+    ]  # fmt: skip
+    found = [
+        verify(
+            replace(calibrated(poses=n), components={"white_force_N": 0.05, "white_torque_Nm": 0.002}),
+            orientations(6),
+            wrench,
+            noise_of(6),
+        )
+        for n in (24, 6)
+    ]
+    assert found[1].p_value > 10 * found[0].p_value
+
+
+def test_what_cannot_be_verified_is_refused() -> None:
+    with pytest.raises(BadDataset, match="1 pose is too few for a verification: record 2 or more"):
+        verify(calibrated(), orientations(1), readings(TRUTH, orientations(1), 0), noise_of(1))
+    with pytest.raises(BadDataset, match="wrench_cov"):
+        verify(calibrated(), orientations(2), readings(TRUTH, orientations(2), 0), noise_of(3))
+    with pytest.raises(ValueError, match="false_alarms is 0"):
+        verify(calibrated(), orientations(2), readings(TRUTH, orientations(2), 0), noise_of(2), false_alarms=0)
