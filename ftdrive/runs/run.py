@@ -237,6 +237,7 @@ _KINDS: Mapping[str, _Kind] = {
     "station": _OBJECT,
     "station.sensor": _TEXT,
     "station.options": _TEXTS,
+    "verification": _OBJECT,
 }
 """Types of the fields of run.json; `recorded` checks those of config."""
 

@@ -9,6 +9,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from calib import CalibrationResult
+from calib.errors import BadDataset
 from calib.model import Array
 from calib.routine import PoseRecord
 from drivers.interfaces import DeviceInfo
@@ -89,7 +90,7 @@ class Verifying(Task):
     def _earlier(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan | None:
         """Find a plan that was driven before: it may have been completed, so that it may run fast."""
         for path in sorted(self.runs.glob("*/plan.json"), reverse=True):
-            with suppress(BadPlan, PlanRefused, OSError, KeyError, TypeError):
+            with suppress(BadPlan, BadDataset, PlanRefused, OSError, KeyError, TypeError):
                 plan = Plan.load(path)
                 turns = np.array([step.q_rad[5] for step in plan.steps]) - q_rad[5]
                 near = turns.min() <= 0 <= turns.max() or np.abs(turns).max() <= WRIST_6_RAD  # else the cable winds up

@@ -27,8 +27,11 @@ def print_verification(verified: Verified) -> None:
         words, bad = drift_in_words(verified.drift)
         if bad or talk.verbose:
             talk.print(hanging(" drift: ", words), style="yellow" if bad else None)
-    if not verified.passed and verified.update is None:
-        talk.print(hanging(" → ", "No update makes up for it: calibrate again."))
+    if not verified.passed and found.passed:
+        words = "Nothing has changed: the differences agree with their sigma. Average longer, or raise the limit."
+        talk.print(hanging("   ", words), style="yellow")
+    elif not verified.passed and verified.update is None:
+        talk.print(hanging("   ", "No update makes up for the change: calibrate again."), style="yellow")
     talk.print(f" Saved {verified.path}")
 
 

@@ -159,6 +159,9 @@ def test_a_completed_plan_is_driven_again_and_fast(lab: Lab, take: Callable[...,
     slowest = max(speed for _, speed, _ in lab.arm.moves)
     assert has_completed("A1", first.sha256)
     lab.arm.moves.clear()
+    for name in ("2999-damaged", "2999-other"):  # newer folders that are of no use
+        (lab.folder / "runs" / name).mkdir()
+        (lab.folder / "runs" / name / "plan.json").write_text("{" if "damaged" in name else json.dumps(first.to_dict()))
     again = Plan.load(take(fast=True, yes=True).plan_path)
     assert again.sha256 == first.sha256
     assert max(speed for _, speed, _ in lab.arm.moves) > slowest
