@@ -19,6 +19,7 @@ _COMMANDS = {
     "config": ("ftdrive.commands.config", "Show the configuration and the source of each value."),
     "plan": ("ftdrive.commands.plan", "Plan a tour proven clear of collisions. Needs no robot."),
     "calibrate": ("ftdrive.commands.calibrate", "Drive the tour, average the sensor at each pose, solve."),
+    "verify": ("ftdrive.commands.verify", "Compare fresh poses with a calibration's prediction."),
     "doctor": ("ftdrive.commands.doctor", "Check robot, sensor and computer. Moves nothing."),
     "devices": ("ftdrive.commands.devices", "List serial ports and CAN interfaces."),
     "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
-from calib.extras.update import Calibrated
 from calib.model import Array, Parameters, read_only
 
 KNOWN = 1e-9
@@ -17,6 +17,18 @@ _SINGULAR = 1e-10
 """Likewise an eigenvalue of a correlation matrix."""
 _ROUNDING_SIGMAS = 1e-3
 """A difference in a direction that both calibrations take as known counts from here on."""
+
+
+class Estimated(Protocol):
+    """A calibration, an update of it, or a row of a store."""
+
+    @property
+    def parameters(self) -> Parameters:
+        """Estimates."""
+
+    @property
+    def covariance(self) -> Array:
+        """(15, 15) of the error coordinates `calib.model.PARAMETER_NAMES`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +61,7 @@ class Difference:
             return np.asarray(np.where(self.change == 0, 0.0, self.change / self.sigma))
 
 
-def difference(first: Calibrated, second: Calibrated) -> Difference:
+def difference(first: Estimated, second: Estimated) -> Difference:
     """Compare two calibrations whose errors are independent.
 
     A field that is identical in both was copied, as by an update of the bias. It is left out of the joint test, because
@@ -57,7 +69,7 @@ def difference(first: Calibrated, second: Calibrated) -> Difference:
 
     Parameters
     ----------
-    first, second : CalibrationResult or Update
+    first, second : Estimated
 
     Returns
     -------

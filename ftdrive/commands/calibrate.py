@@ -99,6 +99,7 @@ def calibrate(
     continues.
     """
     from ftdrive.cell.emulated import MOVED_BY, Station, sensor_name
+    from ftdrive.commands.emulated_run import described
     from ftdrive.errors import Declined
     from ftdrive.runs.run import Run
     from ftdrive.session.session import Options, with_recorded_mode
@@ -117,7 +118,7 @@ def calibrate(
             name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
             station = stack.enter_context(Station(name, made_by.get("options", ())))
             cell = station.cell
-            description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
+            description = described(station)
         else:
             said = Said(str(config.absolute()) if config else None, robot, sensor, tool)
             description = {"said": asdict(said)}

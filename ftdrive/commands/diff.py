@@ -10,8 +10,7 @@ import click
 from ftdrive.commands.common import JSON, store_url, write_json
 
 if TYPE_CHECKING:
-    from calib.extras.difference import ChiSquare, Difference
-    from calib.extras.update import Calibrated
+    from calib.extras.difference import ChiSquare, Difference, Estimated
 
 _SIGNIFICANT = 0.01
 _ROWS = (
@@ -27,7 +26,7 @@ _ROWS = (
 class Side:
     """One of the two calibrations."""
 
-    calibrated: "Calibrated"
+    calibrated: "Estimated"
     id: str
     path: str
     created_utc: str | None

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from ftdrive.cell.emulated import Station, sensor_name
 from ftdrive.runs.outcome import Outcome
@@ -34,10 +35,14 @@ class _Unkept:
         return self._operator.pressed()
 
 
+def described(station: Station) -> dict[str, Any]:
+    """Return what run.json says about an emulated cell."""
+    return {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
+
+
 def rehearse(station: Station, runs: Path, name: str, *, poses: int = 24, kept: bool = True) -> Outcome:
     """Calibrate an emulated cell without questions; `kept` says whether the folder `runs` outlives the command."""
-    description = {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
-    options = Options(runs, name, poses=poses, real=False, questions=False, description=description)
+    options = Options(runs, name, poses=poses, real=False, questions=False, description=described(station))
     with open_operator() as operator:
         outcome = calibrate(station.cell, operator if kept else _Unkept(operator, runs), options)
     if outcome is None:

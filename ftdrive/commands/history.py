@@ -105,7 +105,7 @@ def _as_json(one: "StoredResult", check: "StoredVerification | None", now: datet
 
     import numpy as np
 
-    from calib.extras.update import BIASES
+    from calib.model import BIASES
     from ftdrive.store.history import age_days
 
     kept = {name: value for name, value in asdict(one).items() if name != "numbers"}

@@ -145,7 +145,8 @@ def _show_table(stream: CompensatedStream | ReplayedStream) -> None:
         Live(console=talk, refresh_per_second=10) as screen,
     ):
         for look in _looks(stream):
-            shown = _screen(_reading(look, stream), stream.frame, stream.info.calibration_name)
+            made = f"{stream.info.calibration_name}: {stream.info.calibration_state or stream.info.calibration.verdict}"
+            shown = _screen(_reading(look, stream), stream.frame, made)
             screen.update(Group(shown, "Ctrl-C ends"))
         screen.update(Group(shown, "The recording has ended."))
 
@@ -214,6 +215,7 @@ def _look(blocks: Sequence[Block], stream: ProcessedStream, span_s: float) -> Lo
 
 def _reading(look: Look, stream: ProcessedStream) -> dict[str, Any]:
     status, frame, calibration = stream.status(), stream.frame, stream.info.calibration
+    verification = stream.info.verification
 
     def wrench(values: Array) -> dict[str, Any] | None:
         if look.stale:
@@ -235,7 +237,9 @@ def _reading(look: Look, stream: ProcessedStream) -> dict[str, Any]:
         "rate_Hz": status.sensor.rate_Hz,
         "lost": status.sensor.lost,
         "calibration": calibration.provenance.get("created_utc"),
+        "calibration_id": calibration.id,
         "verdict": calibration.verdict,
+        "verification": None if verification is None else verification.to_dict(),
     }
 
 
@@ -264,7 +268,8 @@ def _screen(reading: dict[str, Any], frame: WrenchFrame, made: str) -> Group:
     delay, state = reading["delay_s"], "CONTACT" if reading["contact"] else "free"
     return Group(
         Text.assemble((str(frame), "bold"), "   contact: raw minus bias and gravity"),
-        f"{made}, {reading['verdict']}   mean of {_PERIOD_S} s   {reading['rate_Hz']:.0f} Hz, lost {reading['lost']}",
+        made,
+        f"mean of {_PERIOD_S} s   {reading['rate_Hz']:.0f} Hz, lost {reading['lost']}",
         Text(f"{reading['stale']}", "red")
         if reading["stale"]
         else f"{state}   delay {1e3 * delay['value']:.1f} ± {1e3 * delay['sigma']:.1f} ms (1 sigma)",

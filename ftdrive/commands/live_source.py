@@ -27,7 +27,9 @@ def open_source(
     frame: WrenchFrame,
     stack: ExitStack,
 ) -> tuple[CompensatedStream, CellConfig]:
-    """Open the stream of a real or an emulated cell and print its warnings; `stack` closes it.
+    """Open the stream of a real or an emulated cell; `stack` closes it.
+
+    The state of the calibration and warnings are printed.
 
     Parameters
     ----------
@@ -55,6 +57,7 @@ def open_source(
     stream = stack.enter_context(CompensatedStream(cell, chosen, name=name, frame=frame, force=force))
     if tool is not None:
         talk.print(f" {tool}: {stream.info.calibration_name}")
+    talk.print(f" {stream.info.calibration_state}")
     for words in stream.warnings:
         talk.print(f" {words}")
     return stream, cell

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from calib import CalibrationResult
 from calib.files import JSON
 from drivers.interfaces import Array, DeviceInfo
+from ftdrive.runs.verification import VerificationRecord
 
 Axes = Literal["sensor", "flange", "base", "tcp"]
 Point = Literal["sensor", "flange", "tcp"]
@@ -236,6 +237,10 @@ class StreamInfo:
     p_flange_tcp_m: Array
     """(3,)"""
     versions: Mapping[str, str]
+    verification: VerificationRecord | None = None
+    """The last one of the calibration, when the stream was opened."""
+    calibration_state: str = ""
+    """Id, verdict, age and last verification of the calibration, when the stream was opened; for people."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NoReturn, Self
 
@@ -36,6 +37,7 @@ from ftdrive.live.samples import (
     sensor_origin_m,
 )
 from ftdrive.runs.run import Run, versions
+from ftdrive.runs.verification import VerificationRecord, calibration_in_words, last_verification
 
 STALE_S = 0.3
 """Without a new sample of either device for so long, `CompensatedStream.read` raises."""
@@ -161,6 +163,7 @@ class CompensatedStream(ProcessedStream):
         self, arm: DeviceInfo, sensor: DeviceInfo, sensor_rate_Hz: float, arm_rate_Hz: float, status: ArmStatus
     ) -> StreamInfo:
         tcp = np.full(6, np.nan) if status.tcp_offset is None else np.array(status.tcp_offset)
+        verification, state = self._trusted()
         return StreamInfo(
             calibration=self._calibration,
             calibration_name=self._name,
@@ -174,7 +177,15 @@ class CompensatedStream(ProcessedStream):
             R_flange_tcp=np.eye(3) if status.tcp_offset is None else Rotation.from_rotvec(tcp[3:]).as_matrix(),
             p_flange_tcp_m=tcp[:3],
             versions=versions(),
+            verification=verification,
+            calibration_state=state,
         )
+
+    def _trusted(self) -> tuple[VerificationRecord | None, str]:
+        """Return the last verification of the calibration, and what is said of its age and of that."""
+        path = Path(self._name)
+        verification = last_verification(path) if path.exists() else None
+        return verification, calibration_in_words(self._calibration, verification, datetime.now(UTC))
 
     def use_tool(self, name: str) -> StreamEvent:
         """Continue with the newest accepted calibration of another tool, after a change of tools.
@@ -193,9 +204,17 @@ class CompensatedStream(ProcessedStream):
         except ConfigError:
             self._wanted = before
             raise
+        verification, state = self._trusted()
         old, self.info = (
             self._processor,
-            replace(self.info, calibration=self._calibration, calibration_name=self._name, tool=name),
+            replace(
+                self.info,
+                calibration=self._calibration,
+                calibration_name=self._name,
+                tool=name,
+                verification=verification,
+                calibration_state=state,
+            ),
         )
         self._processor = Processor(self.info, old.frame, old.stages, false_alarm_rate=self._begin[2])
         for event in old.take_events():

@@ -44,7 +44,7 @@ class Plan:
     """A closed tour of poses; `to_dict` defines the file."""
 
     kind: str
-    """constant, wrist, posture, box, cone or reachable."""
+    """constant, wrist, posture, box, cone, reachable or verification."""
     why: tuple[str, ...]
     """What was tried, and the loss of accuracy of this choice."""
     made_for: Mapping[str, str]

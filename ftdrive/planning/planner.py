@@ -5,12 +5,14 @@ rest come first. If some orientations are out of reach, the most informative rea
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from calib.poses.information import SUBSET_6, T12, Guess, special
+from calib.poses.verification import FEWEST
 from drivers.ur.kinematics import Array
 from ftdrive.cell.config import USUAL_KG
 from ftdrive.errors import ConfigError, PlanRefused
@@ -19,7 +21,7 @@ from ftdrive.planning.geometry.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan, make_plan
 from ftdrive.planning.search import constant_tour
-from ftdrive.planning.search.chosen import Chosen, chosen_tour
+from ftdrive.planning.search.chosen import Chosen, chosen_tour, verification_tour
 from ftdrive.planning.search.nodes import WRIST_6_RAD, box_nodes, wrist_nodes
 from ftdrive.planning.search.postures import with_room
 from ftdrive.planning.search.tours import clear_tour
@@ -181,6 +183,44 @@ def plan_box(
         "reach, or no tour of them is proven clear: give a larger box, or another centre"
     )
     return _first_found([("box", [_box_words(centre, half_size_m)], found)], refusal, certifier, speeds, guess)
+
+
+def plan_verification(
+    certifier: Certifier, q_rad: ArrayLike, poses: int, R_fitted: Array, *, speeds: Speeds, guess: Guess
+) -> Plan:
+    """Plan a tour of poses that are far from those of a calibration.
+
+    Parameters
+    ----------
+    q_rad : array_like, shape (6,)
+        Present joint angles.
+    poses : int
+        2 or more.
+    R_fitted : array, shape (k, 3, 3)
+        Orientations R_base_flange of the calibration.
+    guess : Guess
+        As of `plan_tour`.
+
+    Raises
+    ------
+    PlanRefused
+        Too few poses are reachable by moves that are proven clear.
+    """
+    q_now = checked_joints(q_rad)
+    if poses < FEWEST:
+        raise ConfigError(f"{poses} poses cannot verify a calibration: give {FEWEST} or more")
+    found = verification_tour(certifier, q_now, poses, R_fitted, speeds)
+    if found is None:
+        raise PlanRefused(
+            f"no tour of {poses} fresh poses is reachable and proven clear: jog the arm to another posture, or clear "
+            "the surroundings"
+        )
+    nearest = -int(np.abs(found[1] - q_now).max(axis=1).argmin())  # a closed tour may begin anywhere
+    numbers, q = np.roll(found[0], nearest), np.roll(found[1], nearest, axis=0)
+    why = [f"{poses} poses that were not used in the calibration, far from its {len(R_fitted)} poses."]
+    why += [] if np.array_equal(q[0, :3], q_now[:3]) else [_elsewhere_words(q[0])]
+    plan = make_plan("verification", why, certifier, numbers.tolist(), q, speeds, guess)
+    return replace(plan, why=tuple(why))  # without the accuracy of a calibration from these poses
 
 
 def _numbers(poses: int) -> tuple[int, ...]:

@@ -19,6 +19,7 @@ from calib.files import JSON, check_format
 from drivers.interfaces import DeviceInfo, Fact
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import Block, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame
+from ftdrive.runs.verification import VerificationRecord
 
 FORMAT: Final = "ftdrive.recording/1"
 
@@ -73,10 +74,11 @@ class Header:
     @property
     def words(self) -> str:
         """What the wrench columns hold, for people."""
-        return (
+        words = (
             "raw_fx..raw_tz as measured, sensor axes, about the sensor origin; "
             f"fx..tz compensated, {self.frame}; N, N·m, m, rad"
         )
+        return f"{words}; {self.info.calibration_state}" if self.info.calibration_state else words
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the header as JSON; numbers that are not finite are null."""
@@ -85,6 +87,7 @@ class Header:
         values |= {name: _finite(values[name]) for name in _ARRAYS}
         values |= {"arm": asdict(info.arm), "sensor": asdict(info.sensor), "versions": dict(info.versions)}
         values["calibration"] = info.calibration.to_dict()
+        values["verification"] = None if info.verification is None else info.verification.to_dict()
         frame, stages = self.frame.to_dict(), asdict(self.stages)
         return {"format": FORMAT, **values, "frame": frame, "stages": stages, "configuration": dict(self.configuration)}
 
@@ -93,10 +96,16 @@ class Header:
         """Build from the content of a file; unknown fields are ignored. Raises `BadRecording`."""
         check_format(document, FORMAT, BadRecording)
         try:
-            values = {item.name: document[item.name] for item in fields(StreamInfo)}
+            values = {
+                item.name: document[item.name]
+                for item in fields(StreamInfo)
+                if item.name in document or item.name not in _LATER
+            }
             values |= {name: np.array(values[name], np.float64) for name in _ARRAYS}
             values |= {"arm": _device(values["arm"]), "sensor": _device(values["sensor"])}
             values["calibration"] = CalibrationResult.from_dict(values["calibration"])
+            if values.get("verification") is not None:
+                values["verification"] = VerificationRecord.from_dict(values["verification"])
             stages = {item.name: document["stages"][item.name] for item in fields(Stages)}
             return cls(StreamInfo(**values), frame_of(document["frame"]), Stages(**stages), document["configuration"])
         except KeyError as error:
@@ -105,6 +114,8 @@ class Header:
             raise BadRecording(f"the header cannot be read ({error}): the file is damaged") from error
 
 
+_LATER = ("verification", "calibration_state")
+"""Fields that older recordings lack."""
 _ARRAYS = ("p_flange_sensor_m", "R_flange_tcp", "p_flange_tcp_m")
 
 
@@ -175,7 +186,9 @@ class Recording:
 
     def with_calibration(self, calibration: CalibrationResult, name: str) -> Self:
         """Return the recording with another calibration in its header."""
-        info = replace(self.header.info, calibration=calibration, calibration_name=name)
+        info = replace(
+            self.header.info, calibration=calibration, calibration_name=name, verification=None, calibration_state=""
+        )
         return replace(self, header=replace(self.header, info=info))
 
     def pieces(self, length: int) -> Iterator[tuple[Rows, Sequence[StreamEvent], Header]]:

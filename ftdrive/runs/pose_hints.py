@@ -40,8 +40,8 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[str
     change = _lasting_change(result, records)
     if change is not None:
         what, row = change
-        return (what.in_words(names[row]), *_moved(records, names), *mismatches(result))
-    words = _moved(records, names)
+        return (what.in_words(names[row]), *moved(records), *mismatches(result))
+    words = moved(records)
     odd = [row for row in out if _steady(records[row])]
     pulled = [row for row in odd if _pulled(result, row)]
     for row in odd:
@@ -75,9 +75,10 @@ def _steady(record: PoseRecord) -> bool:
     return record.steady and turned_rad(record.before, record.after) < MOVED_RAD
 
 
-def _moved(records: Sequence[PoseRecord], names: Sequence[str]) -> list[str]:
+def moved(records: Sequence[PoseRecord]) -> list[str]:
+    """Name the poses that were not steady; each row of a dataset has one record."""
     words = []
-    for record, name in zip(records, names, strict=True):
+    for record, name in zip(records, names_of(records), strict=True):
         turn_rad = turned_rad(record.before, record.after)
         if turn_rad >= MOVED_RAD:
             words.append(f"{name} turned by {np.degrees(turn_rad):.2f}° while it was averaged: repeat it")

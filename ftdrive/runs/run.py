@@ -5,7 +5,8 @@ plan.json         ftdrive.plan/1: the plan the arm followed; not where a person 
 events.ndjson     what happened, one object a line, as `ftdrive.session.events` has it
 poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm moves on; 01-2.npz took its place
 dataset.json      ftdrive.dataset/1: means and covariances; dataset-2.json after poses were added or taken again
-calibration.json  ftdrive.calibration/1: the result; calibration-2.json likewise
+calibration.json  ftdrive.calibration/1: the result; calibration-2.json likewise. Of a verification: the accepted update
+verification.json ftdrive.verification/1: the outcome of a verification; see `ftdrive.runs.verified`
 """
 
 import io
@@ -111,9 +112,14 @@ class Run:
         return self.folder / "plan.json"
 
     @property
+    def command(self) -> str:
+        """Command that made the run: "calibrate" or "verify"."""
+        return str(self.header().get("command", "calibrate"))
+
+    @property
     def resume_command(self) -> str:
         """Command that continues the run."""
-        return f"ftdrive calibrate --resume {shlex.quote(str(self.folder))}"
+        return f"ftdrive {self.command} --resume {shlex.quote(str(self.folder))}"
 
     @property
     def solve_command(self) -> str:
@@ -217,6 +223,7 @@ _OBJECT: _Kind = "an object", _is_object
 _OBJECTS: _Kind = "an object of objects", lambda value: _is_object(value) and all(map(_is_object, value.values()))
 _KINDS: Mapping[str, _Kind] = {
     "config": _OBJECTS,
+    "command": _TEXT,
     "devices": _OBJECTS,
     "devices.arm.serial": _TEXT,
     "devices.sensor.serial": _TEXT,
@@ -230,6 +237,7 @@ _KINDS: Mapping[str, _Kind] = {
     "station": _OBJECT,
     "station.sensor": _TEXT,
     "station.options": _TEXTS,
+    "verification": _OBJECT,
 }
 """Types of the fields of run.json; `recorded` checks those of config."""
 

@@ -170,6 +170,24 @@ class Estimated(Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Compared(Event):
+    """A pose of a verification, beside the prediction of the calibration."""
+
+    stop: int
+    number: int
+    residual: Array
+    """(6,) measured minus predicted, N and N·m."""
+    sigma: Array
+    """(6,) one standard deviation of that, of noise and calibration together."""
+    poses: int
+    """Number of poses so far."""
+    light: str
+    """green if the poses suffice, else amber."""
+    hint: str = ""
+    """What to do, if the pose does not count."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Weighed(Event):
     """The running fit is reliable: the identified mass, beside the payload set on the controller."""
 

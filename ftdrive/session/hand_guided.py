@@ -26,6 +26,7 @@ from drivers.clock import REAL, Clock
 from drivers.errors import DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import ArmState, ArmStatus, ForceTorqueSensor, FtSamples
 from ftdrive.session.events import (
+    Compared,
     Estimated,
     Noted,
     PoseTaken,
@@ -70,13 +71,15 @@ class WatchedArm(Protocol):
 class Recorder:
     """What happens to each pose."""
 
-    estimate: Callable[[PoseRecord], Estimated]
+    judge: Callable[[PoseRecord], Estimated | Compared]
     """Takes each pose, in place of one with the same stop; judges whether the poses suffice, and gives a hint.
-    `Running.add` of `ftdrive.session.live_fit`."""
+    `Judge.add` of `ftdrive.session.live_fit`."""
     commit: Callable[[PoseRecord], None]
     """Takes each record and returns when it is safe on disk; one with the `stop` of an earlier one replaces it."""
     earlier: Sequence[PoseRecord] = ()
-    """Poses of the resumed run; `estimate` takes them too."""
+    """Poses of the resumed run; `judge` takes them too."""
+    goal: str = "the coverage is green"
+    """When the poses suffice."""
 
 
 def collect_manually(
@@ -347,8 +350,16 @@ class _Collection:
         if record.steady:  # the quietest pose gives the scatter of the untouched sensor
             std = record.samples.wrench.std(axis=0, ddof=1)
             self._level = std if self._level is None else np.minimum(self._level, std)
-        estimated = self._recorder.estimate(record)
-        self._operator.show(replace(estimated, hint="") if self._listen else estimated)
+        judged = self._recorder.judge(record)
+        self._operator.show(replace(judged, hint="") if self._listen else judged)
+        touched = isinstance(judged, Estimated) and self._note_if_touched(record, judged)
+        self._enough = judged.light == "green" and record.steady and not touched
+        if judged.light == "green" != self._light and not (self._listen or self._ends_by_itself):
+            self._note("These poses are enough: press k to finish, or go on for a better result.")
+        self._light = judged.light
+
+    def _note_if_touched(self, record: PoseRecord, estimated: Estimated) -> bool:
+        """Show a pose that differs from the fit of the others."""
         sigmas, force_N = estimated.residual_sigma or 0.0, estimated.residual_force_N or 0.0
         touched = estimated.poses >= LEAST_TO_COMPARE and sigmas > SURPRISE_SIGMA and force_N > SURPRISE_N
         if touched:
@@ -358,10 +369,7 @@ class _Collection:
                 f"free it{again}.",
                 warning=True,
             )
-        self._enough = estimated.light == "green" and record.steady and not touched
-        if estimated.light == "green" != self._light and not (self._listen or self._ends_by_itself):
-            self._note("These poses are enough: press k to finish, or go on for a better result.")
-        self._light = estimated.light
+        return touched
 
     def _unrest(self, samples: FtSamples) -> str:
         """Describe what is not quiet; empty if all is."""
@@ -403,7 +411,7 @@ class _Collection:
                 f"of them let go of the tool and {self._hold_still()}."
             )
         if self._ends_by_itself:
-            self._note("It ends and solves once the coverage is green. Press Ctrl-C to end it earlier.")
+            self._note(f"It ends once {self._recorder.goal}. Press Ctrl-C to end it earlier.")
 
     def _hold_still(self) -> str:
         seconds = STILL_S + self._sampling.average_s + 3 * LOOK_S
@@ -414,7 +422,7 @@ class _Collection:
     def _end(self, why: str) -> None:
         self._over = True
         kept = f"{len(self._taken)} {'pose is' if len(self._taken) == 1 else 'poses are'} kept"
-        enough = "" if self._light == "green" else f"; the light is {self._light}, a calibration of them may be refused"
+        enough = "" if self._light == "green" else f"; the light is {self._light}: they may be too few or too similar"
         self._note(f"{why}: {kept}{enough}.", warning=bool(enough))
 
     def _show_state(self, state: State, words: str = "") -> None:

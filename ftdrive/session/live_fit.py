@@ -1,7 +1,7 @@
 """The fit over the poses so far, their coverage, and the most useful next pose."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,7 +23,7 @@ from calib.published.yu import weight_and_tilt
 from calib.routine import PoseRecord, dataset_from, is_return
 from ftdrive.cell.config import USUAL_KG
 from ftdrive.checks.controller_settings import axes_along
-from ftdrive.session.events import Estimated
+from ftdrive.session.events import Compared, Estimated
 
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
 """As good as gravity directions within 50 to 60 degrees of one another; see `calib.poses.information.Prediction`."""
@@ -31,6 +31,23 @@ AMBER = {"cond9": 8.0, "cond_u1": 25.0}
 """As within 30 to 45 degrees."""
 TRUSTED_SHARE = 0.05
 """`Running.predict` returns None if its sigma of the force is more than this share of the weight."""
+
+
+class Judge(Protocol):
+    """Judges the poses so far."""
+
+    @property
+    def weighed_kg(self) -> float | None:
+        """Mass that the sensor carries; None while it is uncertain."""
+
+    def add(self, record: PoseRecord) -> Estimated | Compared:
+        """Add a pose, in place of one with the same `stop`; return what the poses show now."""
+
+    def remove(self, stop: int) -> None:
+        """Remove a pose, so that it can be taken again; a stop that was not taken is ignored."""
+
+    def predict(self, R_base_flange: Array) -> Array | None:
+        """Wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain."""
 
 
 class Running:

@@ -1,4 +1,4 @@
-"""A whole session: open the cell, then look, check, predict, tour, solve and save."""
+"""A whole session: open the cell, then look, check, predict and tour. A calibration is then solved and saved."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -19,12 +19,11 @@ from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.errors import ConfigError, Declined, NotAccepted
 from ftdrive.planning.approach import arm_moves, plan_approach
-from ftdrive.planning.cell_plan import certifier_for, plan_for, speeds_of
+from ftdrive.planning.cell_plan import certifier_for, speeds_of
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.planning.motion import slower
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import guess_of
 from ftdrive.planning.search.constant_tour import constant_tour
 from ftdrive.planning.show.words import way_in_words
 from ftdrive.runs.outcome import Outcome, solve_and_save
@@ -32,7 +31,7 @@ from ftdrive.runs.run import Mode, Run
 from ftdrive.session import preflight
 from ftdrive.session.completed_plans import has_completed, remember_completed
 from ftdrive.session.events import GuardTripped, Noted, Planned, State, StateChanged
-from ftdrive.session.forecast import at_most, moves_s, prediction
+from ftdrive.session.forecast import at_most, moves_s
 from ftdrive.session.guards import (
     ContactGuard,
     Guard,
@@ -49,10 +48,11 @@ from ftdrive.session.guards import (
 from ftdrive.session.hand_guided import Recorder, collect_manually
 from ftdrive.session.identity import require_same_devices
 from ftdrive.session.journal import Journal
-from ftdrive.session.live_fit import Running
+from ftdrive.session.live_fit import Judge
 from ftdrive.session.operator import Operator
 from ftdrive.session.recovery import GuardedCell, Recovery
 from ftdrive.session.safety_questions import SafetyQuestions
+from ftdrive.session.task import Task
 from ftdrive.session.tour import SLOW, Measuring, Pace, Tour
 from ftdrive.session.watchdog import Watcher
 
@@ -100,7 +100,15 @@ class Options:
 
 
 def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Limits | None = None) -> Outcome | None:
-    """Guide the operator through a calibration; None after a dry run.
+    """Guide the operator through a calibration; None after a dry run. Raises as `take_poses`."""
+    run = take_poses(cell, operator, options, Task(), limits)
+    return None if run is None else solve_and_save(run)
+
+
+def take_poses(
+    cell: CellConfig, operator: Operator, options: Options, task: Task, limits: Limits | None = None
+) -> Run | None:
+    """Guide the operator through the poses of a task; None after a dry run.
 
     Raises
     ------
@@ -117,6 +125,8 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
     options = with_recorded_mode(options)
     by_hand = options.mode in _BY_HAND
     run = None if options.resume is None else Run(options.resume, cell.clock)
+    if run is not None and run.command != task.command:
+        raise ConfigError(f"{run.folder} was not made by {task.command}: continue it with {run.resume_command}")
     plan = None if by_hand else _plan_on_disk(options, run)
     device, driver = build_sensor(cell), build_arm(cell)
     if run is not None:
@@ -128,15 +138,18 @@ def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Li
             preflight.require_no_program(arm, cell.clock, limits)
             if options.real and not options.dry_run:
                 journal.show(Noted(words=kept_awake))
-        devices = {"arm": asdict(arm.identify()), "sensor": asdict(sensor.identify())}
-        session = _Session(cell, arm, sensor, journal, options, limits, run, devices)
-        run = _by_hand(session) if by_hand else _along_a_plan(session, *_certified_plan(cell, arm, options, plan))
+        connected = {"arm": arm.identify(), "sensor": sensor.identify()}
+        for words in task.require(connected):
+            journal.show(Noted(words=words, warning=True))
+        devices = {role: asdict(device) for role, device in connected.items()}
+        session = _Session(cell, arm, sensor, journal, options, task, limits, run, devices)
+        run = _by_hand(session) if by_hand else _along_a_plan(session, *_certified_plan(session, plan))
     if run is None:
         return None
     if not run.stops():
         raise Declined(f"ended before the first pose: {run.folder} has no pose to solve")
     journal.show(StateChanged(state=State.REPORT))
-    return solve_and_save(run)
+    return run
 
 
 def with_recorded_mode(options: Options) -> Options:
@@ -175,8 +188,9 @@ def _plan_on_disk(options: Options, run: Run | None) -> Plan | None:
     return plan
 
 
-def _certified_plan(cell: CellConfig, arm: RobotArm, options: Options, plan: Plan | None) -> tuple[Certifier, Plan]:
+def _certified_plan(session: "_Session", plan: Plan | None) -> tuple[Certifier, Plan]:
     """Describe the cell to a certifier; without a plan, make one where the arm stands."""
+    cell, arm, options = session.cell, session.arm, session.options
     if not options.dry_run and arm.status().tcp_offset is None:
         arm.open(control=True)  # an old controller reports no poses before
     certifier = certifier_for(cell, arm.identify().model)
@@ -185,7 +199,7 @@ def _certified_plan(cell: CellConfig, arm: RobotArm, options: Options, plan: Pla
     q = np.round(arm.state().q_rad / _GRID_RAD) * _GRID_RAD
     with suppress(ConfigError):  # the planner reports it, with what to do
         q[3:5] = constant_tour(q)[0, 3:5]  # joint 6 keeps its turn: it shows how the cable is wound
-    return certifier, plan_for(cell, certifier, q, options.poses)
+    return certifier, session.task.plan(cell, certifier, q, options.poses)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,6 +211,7 @@ class _Session:
     sensor: ForceTorqueSensor
     journal: Journal
     options: Options
+    task: Task
     limits: Limits
     run: Run | None
     """The run that is resumed."""
@@ -213,7 +228,8 @@ class _Session:
 
     def new_run(self) -> Run:
         """Create the run folder."""
-        options, description = self.options, _description(self.cell, self.devices, self.options)
+        options = self.options
+        description = {"command": self.task.command, **_description(self.cell, self.devices, options)}
         return Run.create(options.runs, options.name, description, self.cell.clock)
 
     def listen(self, duration_s: float) -> FtSamples:
@@ -239,7 +255,7 @@ class _Looked:
     """Stops left to take."""
     taken: int
     """Poses taken before."""
-    running: Running
+    judge: Judge
 
     @property
     def slow(self) -> bool:
@@ -280,11 +296,11 @@ def _along_a_plan(session: _Session, certifier: Certifier, plan: Plan) -> Run | 
 def _look(session: _Session, certifier: Certifier, plan: Plan) -> _Looked:
     """Find what is left to take, plan the approach, listen to the resting sensor; show all of it."""
     cell, arm, options = session.cell, session.arm, session.options
-    running = Running(g_m_s2=cell.site.g_m_s2, down_base=certifier.scene.down_base, advise=False)
+    judge = session.task.judge(cell, certifier.scene.down_base, by_hand=False)
     q = arm.state().q_rad
     todo, taken = _what_is_left(session, plan)
     for record in taken:
-        session.journal.show(running.add(record))
+        session.journal.show(judge.add(record))
     first = todo[0] - 1 if todo else 0
     goal = np.array(plan.steps[first % len(plan.steps)].q_rad)
     before = preflight.Before(
@@ -302,7 +318,7 @@ def _look(session: _Session, certifier: Certifier, plan: Plan) -> _Looked:
         sensor_range=_range_of(session.sensor),
     )
     _show(session, before)
-    return _Looked(session, before, q, todo, len(taken), running)
+    return _Looked(session, before, q, todo, len(taken), judge)
 
 
 def _what_is_left(session: _Session, plan: Plan) -> tuple[list[int], list[PoseRecord]]:
@@ -356,12 +372,11 @@ def _predict(looked: _Looked) -> _Predicted:
     """Choose how long to average; show the accuracy to expect with this sensor's noise, and the duration."""
     session, before = looked.session, looked.before
     sampling, noise = _chosen_sampling(looked)
-    mass_kg, average_s = session.cell.tool.mass_kg, sampling.average_s
-    assumed = session.options.real and not mass_kg
-    session.note(prediction(before.plan, guess_of(before.certifier, mass_kg), average_s, noise, assumed=assumed))
+    cell, average_s, real = session.cell, sampling.average_s, session.options.real
+    session.note(session.task.forecast(cell, before.certifier, before.plan, average_s, noise, real=real))
     if session.options.fast and looked.slow:
         why = f": {_NO_SERIAL}" if session.serial == NOT_REPORTED else ""
-        session.note(f"{'every' if why else 'the first'} run of a plan is slow, also with --fast{why}", warning=True)
+        session.note(f"{'every' if why else 'the first'} run of a plan is slow{why}", warning=True)
     speeds = speeds_of(session.cell)
     driven = at_most(before.plan, before.certifier, slower(speeds, SLOW) if looked.slow else speeds)
     fastest_rad_s = max(step.speed_rad_s for step in driven.steps)
@@ -436,7 +451,7 @@ def _tour(predicted: _Predicted) -> tuple[Run, list[int]]:
             predicted.driven,
             before.certifier,
             run,
-            looked.running,
+            looked.judge,
             Recovery(cell, contact, partial(_recheck, looked, questions)),
             Measuring(predicted.sampling, quiet_std, load, session.cell.sensor.mass_kg),
             Pace(options.mode == "step", trusted=before.known, asks=options.questions, yes=options.yes),
@@ -451,7 +466,7 @@ def _contact_guard(predicted: _Predicted, quiet_std: Array) -> ContactGuard:
     heaviest_kg = session.cell.tool.mass_kg or _HEAVIEST_KG.get(arm.name, _HEAVIEST_OF_ALL_KG)
     reach_m = max(float(np.hypot(part.to_m, part.reach_m)) for part in arm.tool)
     acceleration_rad_s2 = predicted.driven.acceleration_rad_s2
-    return ContactGuard(session.limits, heaviest_kg, reach_m, acceleration_rad_s2, quiet_std, looked.running.predict)
+    return ContactGuard(session.limits, heaviest_kg, reach_m, acceleration_rad_s2, quiet_std, looked.judge.predict)
 
 
 def _run_of(looked: _Looked) -> Run:
@@ -510,7 +525,7 @@ def _kept(journal: Journal, run: Run) -> Iterator[None]:
         yield
     except BaseException:
         words = f"{len(run.stops())} poses saved in {run.folder}; continue with {run.resume_command}"
-        words += f", or solve them with {run.solve_command}" if run.stops() else ""
+        words += f", or solve them with {run.solve_command}" if run.stops() and run.command == "calibrate" else ""
         journal.show(Noted(words=words), sync=True)
         raise
 
@@ -525,14 +540,14 @@ def _by_hand(session: _Session) -> Run:
         require_same_devices(run, cell.sensor, session.arm, session.sensor)
         earlier = run.records()
     down_base = down_of(cell.workcell.mounting)
-    running = Running(g_m_s2=cell.site.g_m_s2, down_base=down_base)
+    judge = session.task.judge(cell, down_base, by_hand=True)
     with _kept(journal, run):
         collect_manually(
             session.arm,
             session.sensor,
             cell.sampling,
             journal,
-            Recorder(running.add, run.commit, earlier),
+            Recorder(judge.add, run.commit, earlier, session.task.goal),
             clock=cell.clock,
             down_base=down_base,
             listen=session.options.mode == "listen",

@@ -35,7 +35,7 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.guards import RangeGuard, Tripped, fault
 from ftdrive.session.hazards import Hazard
-from ftdrive.session.live_fit import Running
+from ftdrive.session.live_fit import Judge
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.progress import Progress
@@ -104,13 +104,13 @@ class Tour:
         plan: Plan,
         certifier: Certifier,
         run: Run,
-        running: Running,
+        judge: Judge,
         recovery: Recovery,
         measuring: Measuring,
         pace: Pace,
     ) -> None:
         self._arm, self._sensor, self._journal, self._watcher = cell.arm, cell.sensor, cell.journal, cell.watcher
-        self._plan, self._certifier, self._run, self._running = plan, certifier, run, running
+        self._plan, self._certifier, self._run, self._judge = plan, certifier, run, judge
         self._recovery, self._measuring, self._pace = recovery, measuring, pace
         self._nodes = np.array([step.q_rad for step in plan.steps])
         self._now = Progress(len(plan.steps))
@@ -161,7 +161,7 @@ class Tour:
 
     def _compare_payload(self) -> None:
         """Row 7: show the mass on the sensor, and whether the configured payload differs; once for each payload."""
-        mass_kg = self._running.weighed_kg
+        mass_kg = self._judge.weighed_kg
         payload_kg = None if mass_kg is None else self._arm.status().payload_kg
         if mass_kg is None or payload_kg is None or payload_kg == self._now.payload_kg:
             return
@@ -249,7 +249,7 @@ class Tour:
         stop = self._now.taken_last
         if stop is None:
             return
-        self._running.remove(stop)
+        self._judge.remove(stop)
         self._now = self._now.redo(stop)
         self._note(f"pose {stop} is taken again")
 
@@ -260,7 +260,7 @@ class Tour:
         stay = set(dropped).intersection(self._run.stops())
         for record in self._run.records() if stay else ():
             if record.stop in stay:
-                self._journal.show(self._running.add(record))
+                self._journal.show(self._judge.add(record))
                 self._note(f"{names[record.stop]} stays as it was measured", warning=True)
         if left := [name for stop, name in names.items() if stop not in stay]:
             way = f"the arm goes on to pose {self._now.todo[0]}" if self._now.todo else "it was the last"
@@ -303,7 +303,7 @@ class Tour:
             sync=True,
         )
         self._recovery.show_new()
-        self._journal.show(self._running.add(record))
+        self._journal.show(self._judge.add(record))
 
     def _go(self, index: int, stop: int) -> None:
         """Move the arm to a pose of the plan, along certified moves only."""

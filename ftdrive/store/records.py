@@ -52,7 +52,7 @@ class StoredResult:
 
     @property
     def parameters(self) -> Parameters:
-        """Estimates; with `covariance` they make a `calib.extras.update.Calibrated`."""
+        """Estimates; with `covariance` they make a `calib.extras.difference.Estimated`."""
         return Parameters(**{name: np.array(self.numbers[name]) for name in _NUMBERS})
 
     @property

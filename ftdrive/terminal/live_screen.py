@@ -19,13 +19,12 @@ from textual.strip import Strip
 from textual.widget import Widget
 from textual.widgets import Input
 
-from calib import CalibrationDataset
-from calib.errors import BadDataset
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import check_calibration
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.samples import Axes, Point, StreamInfo, WrenchFrame
+from ftdrive.live.samples import Axes, Point, WrenchFrame
+from ftdrive.runs.verification import fitted_dataset
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.live.feed import Feed, Sink, Stream
 from ftdrive.terminal.live.history import SPANS_S
@@ -83,7 +82,8 @@ def run_live(stream: Stream, *, recorder: Callable[[Path], Sink] | None = None, 
     info = stream.info
     devices = check_calibration(info.calibration, {"arm": info.arm, "sensor": info.sensor})
     feed = Feed(stream, recorder)
-    app = LiveApp(feed, Summary(feed, [devices, *checks], _dataset_of(info)))
+    dataset = fitted_dataset(info.calibration, Path(info.calibration_name))
+    app = LiveApp(feed, Summary(feed, [devices, *checks], dataset))
     feed.start()
     try:
         app.run()
@@ -95,19 +95,6 @@ def run_live(stream: Stream, *, recorder: Callable[[Path], Sink] | None = None, 
         raise feed.crash
     if feed.failure is not None:
         raise feed.failure
-
-
-def _dataset_of(info: StreamInfo) -> CalibrationDataset | None:
-    """Read the poses of a calibration from its folder; None where they are not there."""
-    place = Path(info.calibration_name)
-    for path in (place if place.is_dir() else place.parent).glob("dataset*.json"):
-        try:
-            dataset = CalibrationDataset.load(path)
-        except (BadDataset, OSError):
-            continue
-        if dataset.sha256() == info.calibration.provenance.get("dataset_sha256"):
-            return dataset
-    return None
 
 
 class Canvas(Widget):

@@ -25,6 +25,7 @@ from drivers.interfaces import Array
 from ftdrive.errors import Declined
 from ftdrive.session.events import (
     Asked,
+    Compared,
     Estimated,
     Event,
     GuardTripped,
@@ -40,7 +41,7 @@ from ftdrive.terminal.console import hanging, talk
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, prompt, read_line
 from ftdrive.terminal.report import drift_in_words
-from ftdrive.terminal.session_text import Line, SessionText, in_words, rms_sigma
+from ftdrive.terminal.session_text import Line, SessionText, in_words, rms_sigma, sigmas_of
 
 REFRESH_HZ = 4
 KEYS = {Key.KEEP: "finish", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "stop"}
@@ -61,6 +62,7 @@ _CUBE_WIDTH = 25
 _NUMBER_WIDTH = 9
 _TABLE_WIDTH = 53
 _NARROWEST_BAR = 8
+_OFF_SIGMA = 5.0
 _ROUNDED = 1e-9
 """A standard deviation below this, N or N·m, comes from rounding: its value was not fitted."""
 _ASCII = str.maketrans(
@@ -73,6 +75,7 @@ _ASCII = str.maketrans(
 class View:
     """The state that the screen draws."""
 
+    command: str = "calibrate"
     now: StateChanged | None = None
     since_s: float = 0.0
     """Start of the state, in the clock of `frame`."""
@@ -82,6 +85,8 @@ class View:
     """By stop, with the time."""
     last: PoseTaken | None = None
     estimated: Estimated | None = None
+    compared: dict[int, Compared] = field(default_factory=dict)
+    """By stop, in a verification."""
     drift: DriftCheck | None = None
     note: str = ""
     waiting: tuple[Key, ...] = ()
@@ -101,6 +106,8 @@ class View:
                 self._take(event, now_s)
             case Estimated():
                 self.estimated = event
+            case Compared():
+                self.compared[event.stop] = event
             case Noted(warning=True) | GuardTripped():
                 self.note = in_words(event)
 
@@ -128,8 +135,7 @@ def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Gro
         blocks += [
             (3, _last(view)),
             (9, [_rule(width)]),
-            *_estimates(view, with_cube=wide and height > 20),
-            *_coverage(view, width),
+            *_findings(view, width, with_cube=wide and height > 20),
             (5, [_drift(view)]),
         ]
     blocks += [
@@ -157,7 +163,7 @@ def _title(view: View, now_s: float, width: int) -> Text:
         usual_s = median(b - a for a, b in pairwise(times_s))  # a stop with questions takes longer than usual
         rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)  # a hold does not shorten the rest
         right += f", about {_minutes(rest_s)} left"
-    name = "ftdrive calibrate"
+    name = f"ftdrive {view.command}"
     room = width - len(name) - len(right)
     if view.last is None or room < _NARROWEST_BAR + 4:
         return Text.assemble((name, "bold"), " " * max(room, 2), right)
@@ -201,13 +207,31 @@ def _last(view: View) -> list[Text]:
         line.append(f", {pose.attempts} tries")
     if not pose.steady:
         line.append(", NOT STEADY", "bold yellow")
+    if view.compared:
+        return [line]
     if fit is None or fit.residual_sigma is None or fit.residual_force_N is None:
         return [line, Text("     residual: no fit before it", "dim")]
-    off = fit.residual_sigma > 5
+    off = fit.residual_sigma > _OFF_SIGMA
     residual = Text("     residual ")
     residual.append(f"{fit.residual_force_N:.3f} N, {fit.residual_sigma:.1f} sigma", "bold yellow" if off else "")
     residual.append(" OUT OF LINE: press r to redo" if off else " against the fit before it")
     return [line, residual]
+
+
+def _findings(view: View, width: int, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
+    """Return what the poses show: estimates and their coverage, or in a verification the poses compared."""
+    if view.command == "calibrate":
+        return [*_estimates(view, with_cube=with_cube), *_coverage(view, width)]
+    lines = [Text("measured minus predicted, ± one sigma expected", "dim")]
+    for event in view.compared.values():
+        size, expected = (
+            (np.linalg.norm(vector[:3]), np.linalg.norm(vector[3:])) for vector in (event.residual, event.sigma)
+        )
+        sigmas = sigmas_of(event)
+        numbers = f"{size[0]:8.3f} ± {expected[0]:.3f} N {size[1]:9.4f} ± {expected[1]:.4f} N·m {sigmas:6.1f} sigma"
+        lines.append(Text.assemble(f"R{event.number:02d}", (numbers, "bold yellow" if sigmas > _OFF_SIGMA else "")))
+    hint = next(iter(reversed(view.compared.values()))).hint if view.compared else ""
+    return [(1, lines), (4, _folded(view, hint, width))]
 
 
 def _estimates(view: View, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
@@ -285,7 +309,8 @@ def _drift(view: View) -> Text:
         words, bad = drift_in_words(view.drift)
         return Text(f"drift  {words}", "bold yellow" if bad else "")
     if fit is None or not fit.values:
-        return Text("drift  not known before the fit", "dim")
+        when = "the fit" if view.command == "calibrate" else "the first pose is measured again"
+        return Text(f"drift  not known before {when}", "dim")
     if "drift" not in fit.values:
         return Text("drift  none seen so far")
     change, sigma = fit.values["drift"], fit.sigma["drift"]
@@ -355,6 +380,8 @@ class Screen:
         Without it there are no keys; questions are still answered by lines.
     verbose : bool
         Print every check, the table of the plan and each pose above the frame.
+    command : str
+        The task: "calibrate" or "verify".
     """
 
     def __init__(
@@ -364,11 +391,12 @@ class Screen:
         *,
         stdin: TextIO | None = None,
         verbose: bool = False,
+        command: str = "calibrate",
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._console, self._keyboard, self._stdin = console, keyboard, stdin or sys.stdin
         self._clock = clock
-        self._view = View(ascii_only=console.options.ascii_only)
+        self._view = View(command, ascii_only=console.options.ascii_only)
         self._text = SessionText(verbose=verbose, poses=False)
         self._lock = RLock()
         self._live = self._new_live()
@@ -463,15 +491,15 @@ def _history(event: Event, view: View) -> bool:
             return event.state is State.HOLD and event.words not in view.note
         case Asked():
             return event.answer != ""
-        case Estimated():
+        case Estimated() | Compared():
             return False
         case _:
             return True
 
 
 @contextmanager
-def open_operator(*, as_json: bool = False) -> Iterator[Operator]:
-    """Choose the operator: JSON if requested, a live screen in a terminal, otherwise plain lines.
+def open_operator(*, as_json: bool = False, command: str = "calibrate") -> Iterator[Operator]:
+    """Choose the operator of a task: JSON if requested, a live screen in a terminal, otherwise plain lines.
 
     The screen is drawn on stderr. A dumb terminal and `-q` get plain lines.
     """
@@ -486,5 +514,5 @@ def open_operator(*, as_json: bool = False) -> Iterator[Operator]:
             operator.finish()
         return
     keyboard = Keyboard(0) if Keyboard.usable(0) else None
-    with Screen(talk, keyboard, verbose=talk.verbose) as screen:
+    with Screen(talk, keyboard, verbose=talk.verbose, command=command) as screen:
         yield screen

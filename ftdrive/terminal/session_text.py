@@ -9,6 +9,7 @@ from ftdrive.planning.show.words import plan_in_words, point_in_words
 from ftdrive.session.events import (
     Asked,
     Checked,
+    Compared,
     Estimated,
     Event,
     GuardTripped,
@@ -87,7 +88,7 @@ class SessionText:
         match event:
             case Planned() if not self._verbose:
                 return [Line("   ", words) for words in (*plan_in_brief(event.plan), event.way_words)]
-            case RunOpened() | PoseTaken() if not self._poses:
+            case RunOpened() | PoseTaken() | Compared() if not self._poses:
                 return []
             case Estimated(hint="") if not self._verbose:
                 return []
@@ -144,6 +145,8 @@ def head_and_words(event: Event) -> tuple[str, str]:
             return "", pose_in_words(event)
         case Estimated():
             return "  ", estimate_in_words(event)
+        case Compared():
+            return "  ", comparison_in_words(event)
         case GuardTripped():
             return "", f"STOPPED by guard {event.hazard}: {event.words}"
         case Asked():
@@ -173,6 +176,21 @@ def estimate_in_words(event: Estimated) -> str:
     if event.residual_sigma is not None and event.residual_force_N is not None:
         words += f", {event.residual_force_N:.3f} N from the fit before, {event.residual_sigma:.1f} sigma"
     return f"{words}; helps most: {event.hint}" if event.hint else words
+
+
+def comparison_in_words(event: Compared) -> str:
+    """Describe how far a pose is from the prediction, and how far it is expected to be (one sigma)."""
+    found, expected = (
+        f"{np.linalg.norm(vector[:3]):.3f} N, {np.linalg.norm(vector[3:]):.4f} N·m"
+        for vector in (event.residual, event.sigma)
+    )
+    words = f"{found} from the prediction, {expected} expected, {sigmas_of(event):.1f} sigma"
+    return f"{words}; {event.hint}" if event.hint else words
+
+
+def sigmas_of(event: Compared) -> float:
+    """Largest of the six differences over its standard deviation."""
+    return float(np.max(np.abs(event.residual) / event.sigma))
 
 
 def rms_sigma(event: PoseTaken) -> tuple[float, float]:

@@ -39,6 +39,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
     "export plan": ("--format", "csv"),
     "report": ("--format", "md"),
     "record": ("--output", "a.csv", "--count", "500"),
+    "verify": ("--yes", "--quick", "--max-force", "0.5"),
     "transcript record": ("--output", "sensor.jsonl", "--duration", "0.5"),
 }
 """What a command cannot do without; any other must work with --simulate and --json alone."""
@@ -48,6 +49,9 @@ OFFLINE = ("convert", "compensate", "history", "diff", "export formats")
 
 REHEARSED = ("replay", "report", "solve", "export calibration")
 """They calibrate an emulated cell first, as do live, push (test_push.py) and demo (test_demo.py)."""
+
+GUIDED = ("calibrate", "verify")
+"""They print their events too, one object a line."""
 
 SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     "calibrate": lambda answer: answer["verdict"] != "rejected",
@@ -66,6 +70,7 @@ SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     "report": lambda answer: answer["result"]["n_poses"] >= 6 and answer["tour"]["emulated"] and answer["file"] is None,
     "solve": lambda answer: answer["n_poses"] >= 6,
     "transcript play": lambda answer: answer["played"]["samples"] > 1000,
+    "verify": lambda answer: answer["passed"] and len(answer["poses"]) == 2,
     "transcript record": lambda answer: answer["recorded"]["error"] is None,
 }
 
@@ -126,7 +131,7 @@ def test_a_full_disk_and_a_reader_that_is_gone_are_no_crash() -> None:
 @pytest.mark.parametrize(
     "command",
     [
-        pytest.param(name, marks=pytest.mark.slow) if name == "calibrate" else name
+        pytest.param(name, marks=pytest.mark.slow) if name in GUIDED else name
         for name in names(cli)
         if name not in ("demo", "live", "push", "record", "stream", *REHEARSED, *OFFLINE)
     ],
@@ -163,7 +168,7 @@ def works_with_simulate_and_json(command: str, ftdrive: CommandLine, capfd: pyte
     assert outcome.returncode == 0, outcome.stderr
     assert "Exception" not in outcome.stderr + capfd.readouterr().err
     *events, answer = map(json.loads, outcome.stdout.splitlines())
-    assert bool(events) == (command == "calibrate")  # it prints its events too, one object a line
+    assert bool(events) == (command in GUIDED)
     assert answer["schema_version"] == 1
     assert SHOWN.get(command, bool)(answer)
 

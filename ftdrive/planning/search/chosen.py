@@ -1,9 +1,10 @@
-"""A tour of the most informative poses that the wrist reaches, within a cone or anywhere.
+"""A tour of chosen poses that the wrist reaches: the most informative ones, or those far from a calibration's.
 
-The poses follow the design of `calib.poses.selection`, which keeps the second solution away and the gravity directions
-out of one plane.
+Informative poses follow the design of `calib.poses.selection`, which keeps the second solution away and the gravity
+directions out of one plane.
 """
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +12,12 @@ from numpy.typing import ArrayLike
 
 from calib.poses.information import Guess, predicted_sigma
 from calib.poses.selection import choose, cone_candidates
+from calib.poses.verification import choose_verification_poses
 from drivers.ur.kinematics import Array
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import wrist_inverse
 from ftdrive.planning.motion import Speeds
-from ftdrive.planning.search.nodes import wrist_nodes
+from ftdrive.planning.search.nodes import Nodes, wrist_nodes
 from ftdrive.planning.search.postures import grid
 from ftdrive.planning.search.tours import clear_tour, connected
 
@@ -96,27 +98,84 @@ def _at(
     guess: Guess,
     ideal: float,
 ) -> Chosen | None:
-    """Choose from the poses that are reachable at this posture and connected by clear moves."""
+    """Choose the most informative of the poses that are reachable at this posture."""
+
+    def most_informative(reached: Array) -> Nodes:
+        return choose(reached, poses, guess)
+
+    for numbers, q in _tours_at(certifier, q_now, candidates, spins, poses, most_informative, speeds):
+        rms = predicted_sigma(certifier.arm.frames(q).R_base_flange, guess).force_rms_N
+        if np.isfinite(rms):  # else these poses leave a parameter unobservable
+            return Chosen(numbers, q, rms, ideal, elsewhere=False)
+    return None
+
+
+def verification_tour(
+    certifier: Certifier, q_rad: ArrayLike, poses: int, R_fitted: Array, speeds: Speeds
+) -> tuple[tuple[int, ...], Array] | None:
+    """Choose poses far from those of a calibration, and find a short closed tour through them.
+
+    Parameters
+    ----------
+    q_rad : array_like, shape (6,)
+        Present joint angles; joints 1 to 3 move only if the wrist alone has no such tour here.
+    poses : int
+        2 or more.
+    R_fitted : array, shape (k, 3, 3)
+        Orientations R_base_flange of the calibration.
+
+    Returns
+    -------
+    numbers : tuple of int
+        From 101 on, in the order of choice.
+    q_rad : array, shape (n, 6)
+        In the order of travel. None instead of both if too few poses are reachable.
+    """
+    q_now = np.asarray(q_rad, dtype=np.float64)
+    candidates = cone_candidates(np.pi, SPINS_OF_A_LUMP, DIRECTIONS_OF_A_LUMP, certifier.scene.down_base)
+
+    def far_from_fitted(reached: Array) -> Nodes:
+        return choose_verification_poses(reached, R_fitted, poses, gravity_direction_base=certifier.scene.down_base)
+
+    def tours(q: Array) -> Iterator[tuple[tuple[int, ...], Array]]:
+        return _tours_at(certifier, q, candidates, SPINS_OF_A_LUMP, poses, far_from_fitted, speeds)
+
+    if (here := next(tours(q_now), None)) is not None:
+        return here
+    others = (np.array([*posture, *q_now[3:]]) for posture in _others(certifier, q_now, candidates))
+    return next((tour for q in others for tour in tours(q)), None)
+
+
+def _tours_at(
+    certifier: Certifier,
+    q_now: Array,
+    candidates: Array,
+    spins: int,
+    poses: int,
+    choice: Callable[[Array], Nodes],
+    speeds: Speeds,
+) -> Iterator[tuple[tuple[int, ...], Array]]:
+    """Yield tours of chosen candidates that are reachable at this posture and connected by clear moves.
+
+    Each is given as numbers from 101 on, in the order of choice, and joint vectors (n, 6) in the order of travel.
+    `choice` gets the reachable orientations (m, 3, 3) and returns indices of `poses` of them.
+    """
     q, group = wrist_nodes(certifier, q_now, candidates)
     if not len(q):
-        return None
+        return
     part = connected(certifier, q, group % spins)
     reached = [np.unique(group[part == p]) for p in range(part.max() + 1)]
     for p in sorted(range(len(reached)), key=lambda p: -len(reached[p]))[:MOST_PARTS]:
         if len(reached[p]) < poses:
             break
-        chosen = reached[p][choose(candidates[reached[p]], poses, guess)]
+        chosen = reached[p][choice(candidates[reached[p]])]
         nodes = np.flatnonzero((part == p) & np.isin(group, chosen))
         place = np.full(len(candidates), -1)
         place[chosen] = np.arange(poses)
         order = clear_tour(certifier, q[nodes], place[group[nodes]], speeds)
-        if order is None:
-            continue
-        nodes = nodes[order]
-        rms = predicted_sigma(candidates[group[nodes]], guess).force_rms_N
-        if np.isfinite(rms):  # else these poses leave a parameter unobservable
-            return Chosen(tuple((101 + place[group[nodes]]).tolist()), q[nodes], rms, ideal, elsewhere=False)
-    return None
+        if order is not None:
+            nodes = nodes[order]
+            yield tuple((101 + place[group[nodes]]).tolist()), q[nodes]
 
 
 def _others(certifier: Certifier, q_now: Array, candidates: Array) -> Array:

@@ -126,9 +126,13 @@ def shortest_tour(
     shakes : int
     """
     groups = [np.flatnonzero(group == g) for g in range(group.max() + 1)] if len(group) else []
-    if len(groups) < 3 or not all(len(nodes) for nodes in groups):
+    if len(groups) < 2 or not all(len(nodes) for nodes in groups):
         return None
     cost = np.where(allowed, cost_s, FORBIDDEN_S)
+    if len(groups) == 2:  # there and back
+        both = (cost + cost.T)[np.ix_(*groups)]
+        i, j = np.unravel_index(both.argmin(), both.shape)
+        return np.array([groups[0][i], groups[1][j]]) if both[i, j] < FORBIDDEN_S else None
     rng = np.random.default_rng(0)
     best = _improved(_nearest_neighbours(groups, cost) if start is None else start, groups, cost)
     for _ in range(shakes):

@@ -72,19 +72,26 @@ def _summary(plan: Plan) -> list[str]:
     nearest = min(plan.steps, key=lambda step: step.clearance_m)
     count, most = len(plan.steps), np.degrees(max(step.turn_rad for step in plan.steps))
     proven = "all proven clear" if plan.certified else "NOT ALL PROVEN CLEAR"
-    sigma, guess = plan.predicted, plan.description["guess"]
-    tilt_deg = np.degrees(_largest([sigma["tilt_alpha_rad"], sigma["tilt_beta_rad"]]))
     return [
         f"{count} poses, {count} moves {proven}, none above {most:.0f}°: "
         f"{sum(step.duration_s for step in plan.steps):.0f} s of motion at the plan's speeds.",
         f"Nearest: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
         room_in_words(plan),
+        *([] if plan.kind == "verification" else [_accuracy(plan)]),
+    ]
+
+
+def _accuracy(plan: Plan) -> str:
+    """Return the predicted accuracy of a calibration from these poses."""
+    sigma, guess = plan.predicted, plan.description["guess"]
+    tilt_deg = np.degrees(_largest([sigma["tilt_alpha_rad"], sigma["tilt_beta_rad"]]))
+    return (
         f"Predicted for {guess['mass_kg']:g} kg and averages good to {guess['sigma_force_N']} N, "
         f"{guess['sigma_torque_Nm']} N·m (one sigma): mass {1e3 * _largest(sigma['mass_kg']):.1f} g, "
         f"centre of mass {1e3 * _largest(sigma['p_sensor_com_m']):.2f} mm, "
         f"force bias {_largest(sigma['force_bias_N']):.3f} N, tilt {tilt_deg:.2f}°; "
-        f"compensation {_largest(sigma['force_rms_N']):.3f} N, {_largest(sigma['torque_rms_Nm']):.4f} N·m.",
-    ]
+        f"compensation {_largest(sigma['force_rms_N']):.3f} N, {_largest(sigma['torque_rms_Nm']):.4f} N·m."
+    )
 
 
 def _largest(sigma: object) -> float:

@@ -16,6 +16,7 @@ from ftdrive.checks.devices import AXES, check_rate
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import LinkStatus, Stages, StreamInfo, WrenchFrame
+from ftdrive.runs.verification import age_in_words
 from ftdrive.terminal.live import braille
 from ftdrive.terminal.live.braille import Codes
 from ftdrive.terminal.live.history import Columns
@@ -122,14 +123,14 @@ def state(view: View, width: int) -> Line:
     line = Line(" cal ")
     line.add(calibration.id[:6]).add(" ")
     line.add(calibration.verdict.upper(), GOOD if calibration.verdict == "good" else WARNING)
-    line.add(_age(view)).add(f", {calibration.n_poses} poses")
-    line.add("   tare ")
+    line.add(_age(view)).add(", ").add(*_verified(view))
+    line.add("  tare ")
     if status.tare is None or status.tare_t_host_ns is None:
         line.add("none", FAINT)
     else:
         force_N = float(np.linalg.norm(status.tare[:3]))
         line.add(f"{_time_of_day(view.info, status.tare_t_host_ns)[:5]} {force_N:.2f} N")
-    line.add(f"   drift {_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h")
+    line.add(f"  drift {_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h")
     return line.fit(width)
 
 
@@ -141,9 +142,20 @@ def _age(view: View) -> str:
     created = view.info.calibration.provenance.get("created_utc")
     if not isinstance(created, str) or view.reading is None:
         return ""
-    now_s = (view.reading.t_host_ns + view.info.utc_offset_ns) * 1e-9
-    hours = max(0.0, now_s - datetime.fromisoformat(created).timestamp()) / 3600
-    return f" {hours * 60:.0f} min" if hours < 1 else f" {hours:.0f} h" if hours < 48 else f" {hours / 24:.0f} d"
+    return f" {age_in_words(_now(view.info, view.reading) - datetime.fromisoformat(created))}"
+
+
+def _verified(view: View) -> tuple[str, str]:
+    """Name the last verification, and its style."""
+    found = view.info.verification
+    if found is None:
+        return "not verified", FAINT
+    now = found.created_utc if view.reading is None else _now(view.info, view.reading)
+    return found.in_words(now), GOOD if found.passed else BAD
+
+
+def _now(info: StreamInfo, reading: Reading) -> datetime:
+    return datetime.fromtimestamp((reading.t_host_ns + info.utc_offset_ns) * 1e-9, UTC)
 
 
 def rule(view: View, width: int) -> Line:

@@ -29,7 +29,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
 from ftdrive.runs.outcome import Outcome
 from ftdrive.runs.run import Run
-from ftdrive.session import session
+from ftdrive.session import session, task
 from ftdrive.session.events import (
     Event,
     Noted,
@@ -378,7 +378,7 @@ class Lab:
         """Of each session that came to its tour."""
         monkeypatch.setattr(session, "build_arm", lambda _: self.arm)
         monkeypatch.setattr(session, "build_sensor", lambda _: self.sensor)
-        monkeypatch.setattr(session, "plan_for", planned_once)
+        monkeypatch.setattr(task, "plan_for", planned_once)
         monkeypatch.setattr("calib.poses.information.second_minimum", second_minimum_once)
         monkeypatch.setattr(session, "Watcher", self._watcher)
         monkeypatch.setattr("shutil.which", lambda _: None)

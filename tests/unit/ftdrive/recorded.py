@@ -1,6 +1,8 @@
 """A compensated stream that never was: a calibration, its header and its blocks."""
 
+from datetime import UTC, datetime
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -10,6 +12,7 @@ from calib.model import predict
 from calib.published.yu import SPECIAL_R_flange_base
 from drivers.interfaces import DeviceInfo, Fact
 from ftdrive.live.samples import Block, Stages, StreamInfo, WrenchFrame
+from ftdrive.runs.verification import VerificationRecord
 
 TRUTH = Parameters(
     Rotation.from_rotvec([0.02, -0.01, 0.5]).as_matrix(),
@@ -49,6 +52,10 @@ def info() -> StreamInfo:
         R_flange_tcp=np.eye(3),
         p_flange_tcp_m=np.array([0.0, 0.0, 0.1]),
         versions={"ftdrive": "1"},
+        verification=VerificationRecord(
+            Path("verification.json"), "0" * 12, datetime(2026, 11, 22, tzinfo=UTC), False, "bias", "…", 0.5, 0.01
+        ),
+        calibration_state="calibration 29ce87, good, 3 d old, VERIFICATION FAILED 2 h ago (bias)",
     )
 
 

@@ -211,8 +211,8 @@ def test_the_table_fits_into_80_columns(axes: Any) -> None:
     )
     assert isinstance(console.file, io.StringIO)
     lines = console.file.getvalue().splitlines()
-    assert "delay 3.1 ± 0.2 ms" in lines[2]
-    assert "± 1 sigma" in lines[3]
+    assert "delay 3.1 ± 0.2 ms" in lines[3]
+    assert "± 1 sigma" in lines[4]
 
 
 def test_columns_stand_still_when_a_sign_changes() -> None:

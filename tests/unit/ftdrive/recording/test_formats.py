@@ -19,6 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import Stages, StreamEvent, WrenchFrame
 from ftdrive.recording import Recorder, Recording, read_recording, write_recording
+from ftdrive.recording.recording import Header
 from tests.unit.ftdrive.recorded import BASE_TCP, CONFIGURATION, UTC_OFFSET_NS, block, info
 
 ENDINGS = (".mcap", ".csv", ".parquet")
@@ -77,6 +78,15 @@ def test_a_recording_holds_what_was_measured(paths: Sequence[Path]) -> None:
     assert recording.header.info.sensor == info().sensor
     assert recording.header.info.calibration.to_dict() == info().calibration.to_dict()
     assert np.isnan(recording.header.info.p_flange_sensor_m[2])
+    assert recording.header.info.verification == info().verification
+    assert "VERIFICATION FAILED 2 h ago (bias)" in recording.header.words
+
+
+def test_a_recording_without_a_verification_is_read(paths: Sequence[Path]) -> None:
+    document = read_recording(paths[0]).header.to_dict()
+    del document["verification"], document["calibration_state"]
+    header = Header.from_dict(document)
+    assert (header.info.verification, header.info.calibration_state) == (None, "")
 
 
 def test_conversion_is_lossless(paths: Sequence[Path], tmp_path: Path) -> None:

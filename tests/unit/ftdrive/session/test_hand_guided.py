@@ -17,7 +17,7 @@ from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
 from drivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from drivers.follow import Follow
 from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
-from ftdrive.session.events import Estimated, Event, Noted, PoseTaken, State, StateChanged
+from ftdrive.session.events import Compared, Estimated, Event, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.hand_guided import Recorder, collect_manually
 from ftdrive.session.operator import Key, Question
 from tests.fake_clock import FakeClock
@@ -212,6 +212,24 @@ class Fit:
         )
 
 
+class Verification:
+    """Compares each pose with a calibration from which all differ; seven poses are enough."""
+
+    def __init__(self) -> None:
+        self.poses = 0
+
+    def add(self, record: PoseRecord) -> Compared:
+        self.poses += 1
+        return Compared(
+            stop=record.stop,
+            number=record.pose.number,
+            residual=np.full(6, 9.0),
+            sigma=np.full(6, 0.1),
+            poses=self.poses,
+            light="green" if self.poses == 7 else "amber",
+        )
+
+
 class Outcome:
     """What a collection leaves."""
 
@@ -223,7 +241,7 @@ class Outcome:
         keys: dict[float, Key] | None = None,
         earlier: Sequence[PoseRecord] = (),
         says: Callable[[float], ArmStatus] | None = None,
-        fit: Fit | None = None,
+        fit: Any = None,
         has_keys: bool = True,
         raises: Any = None,
         **cell: Any,
@@ -280,6 +298,13 @@ def test_every_standstill_at_a_new_orientation_is_a_pose() -> None:
     assert len(dataset) == 6  # none is taken for the return to the first
     result = solve(dataset)
     assert np.abs(result.force_bias_N - BIAS[:3]).max() < 4 * np.max(result.sigma["force_bias_N"])
+
+
+def test_a_verification_ends_with_the_last_pose_however_far_from_the_prediction() -> None:
+    more = Rotation.from_euler("xyz", (40, 30, 0), degrees=True)
+    outcome = Outcome(dwells(*AROUND, more, UP * more), fit=Verification(), has_keys=False)
+    assert outcome.stops == [1, 2, 3, 4, 5, 6, 7]
+    assert "touched" not in outcome.person.words()
 
 
 def test_a_pose_is_on_disk_before_it_is_told() -> None:

@@ -1,6 +1,8 @@
 """A stream without devices, in the states that the live screen must show."""
 
 import math
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -20,6 +22,7 @@ from ftdrive.live.samples import (
     StreamStatus,
     WrenchFrame,
 )
+from ftdrive.runs.verification import VerificationRecord
 
 Scenario = Literal["still", "contact", "stale", "tare-refused"]
 
@@ -88,6 +91,16 @@ INFO = StreamInfo(
     R_flange_tcp=np.eye(3),
     p_flange_tcp_m=np.array([0.0, 0.0, 0.17]),
     versions={"ftdrive": "1.0"},
+    verification=VerificationRecord(
+        path=Path("runs/2026-11-16T060000Z-verify/verification.json"),
+        calibration_id=calibration().id,
+        created_utc=datetime(2026, 11, 16, 6, tzinfo=UTC),
+        passed=True,
+        change=None,
+        reason="the calibration holds",
+        force_max_N=0.08,
+        torque_max_Nm=0.002,
+    ),
 )
 
 

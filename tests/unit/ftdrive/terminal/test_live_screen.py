@@ -4,7 +4,6 @@ import asyncio
 import threading
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -15,17 +14,16 @@ from rich.cells import cell_len
 from syrupy.assertion import SnapshotAssertion
 from textual.pilot import Pilot
 
-from calib import CalibrationDataset
 from drivers.errors import DeviceTimeout
 from ftdrive.checks.check import Check
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import STEP_S, ReplayedStream
-from ftdrive.live.samples import Block, Paired, Stages, StreamInfo, WrenchFrame
+from ftdrive.live.samples import Block, Paired, Stages, WrenchFrame
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.layout import frame
 from ftdrive.terminal.live.summary import Summary
-from ftdrive.terminal.live_screen import LiveApp, _dataset_of, run_live
+from ftdrive.terminal.live_screen import LiveApp, run_live
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.terminal.fake_stream import FREE, INFO, R_BASE_FLANGE, SIGMA, START_NS, FakeStream, Scenario
 
@@ -290,23 +288,6 @@ def test_an_error_of_the_reading_thread_is_raised() -> None:
 
     with pytest.raises(ConfigError, match="another device"):
         run_live(Other())
-
-
-def test_the_poses_of_a_calibration_are_found_by_their_hash(tmp_path: Path) -> None:
-    poses = CalibrationDataset(
-        np.tile(R_BASE_FLANGE, (4, 1, 1)), np.zeros((4, 6)), None, np.zeros(4, np.int64), np.full(4, np.nan)
-    )
-    poses.save(tmp_path / "dataset-2.json")
-    (tmp_path / "dataset.json").write_text("damaged")
-
-    def info(digest: str) -> StreamInfo:
-        calibration = replace(INFO.calibration, provenance={"dataset_sha256": digest})
-        return replace(INFO, calibration=calibration, calibration_name=str(tmp_path / "calibration.json"))
-
-    found = _dataset_of(info(poses.sha256()))
-    assert found is not None
-    assert found.sha256() == poses.sha256()
-    assert _dataset_of(info("0" * 64)) is None
 
 
 def styles(screen: Screen) -> set[Any]:

@@ -23,6 +23,7 @@ from syrupy.assertion import SnapshotAssertion
 from ftdrive.session.events import (
     Asked,
     Checked,
+    Compared,
     Estimated,
     Event,
     GuardTripped,
@@ -546,3 +547,21 @@ def test_the_frame_is_erased_after_success_and_stays_after_an_error(error: type[
     assert ("✔ 6 averages kept in runs/2026" in last) == (error is None)
     assert "SETTLE" in file.getvalue()
     assert "settled 0.9 s, 2000 samples in" not in file.getvalue(), "the frame shows the poses"
+
+
+@pytest.mark.parametrize("width", [80, 60])
+def test_a_verification_shows_each_pose_beside_its_prediction(width: int) -> None:
+    view = View("verify")
+    for stop, number, off in ((1, 103, 1.0), (2, 101, 20.0)):
+        view.update(pose(stop, number, stops=3), float(stop))
+        residual, sigma = np.repeat([0.03 * off, 0.001 * off], 3), np.repeat([0.03, 0.001], 3)
+        view.update(
+            Compared(stop=stop, number=number, residual=residual, sigma=sigma, poses=stop, light="amber"), float(stop)
+        )
+    lines = [str(line) for line in frame(view, 3.0, width=width, height=24).renderables]
+    assert lines[0].startswith("ftdrive verify")
+    assert [line.split() for line in lines if line.startswith(("R103  ", "R101  "))] == [
+        ["R103", "0.052", "±", "0.052", "N", "0.0017", "±", "0.0017", "N·m", "1.0", "sigma"],
+        ["R101", "1.039", "±", "0.052", "N", "0.0346", "±", "0.0017", "N·m", "20.0", "sigma"],
+    ]
+    assert not any("coverage" in line or "estimate" in line for line in lines)

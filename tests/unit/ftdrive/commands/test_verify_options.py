@@ -1,0 +1,83 @@
+"""Options of `ftdrive verify` that exclude one another, and the outcome that it prints."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from calib.extras.update import reestimate
+from calib.extras.verification import Verification
+from ftdrive.commands import verify as command
+from ftdrive.errors import ConfigError
+from ftdrive.runs.run import Run
+from ftdrive.runs.verified import AcceptanceLimits, Verified
+from ftdrive.terminal.verification_text import verdict_in_words
+from tests.unit.ftdrive.recorded import calibration
+
+
+@pytest.fixture
+def begun(tmp_path: Path) -> Path:
+    """An interrupted verification."""
+    limits = {"force_N": 0.5, "torque_Nm": None}
+    about = {"path": "cell/calibration.json", "id": "1" * 12, "poses": 3, "quick": False, "limits": limits}
+    return Run.create(tmp_path, "verify", {"command": "verify", "mode": "auto", "verification": about}).folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--quick", "--poses", "3", "--simulate"), "--quick and --poses exclude one another"),
+        ((), "no calibration: give --calibration PATH, or --simulate"),
+        (("--simulate", "--robot", "10.0.0.2"), "--robot does not go with --simulate"),
+        (("--resume", "RUN", "--quick"), "leave out --quick"),
+        (("--resume", "RUN", "--max-force", "1"), "leave out --max-force or --max-torque"),
+    ],
+)
+def test_options_that_contradict_are_refused(arguments: tuple[str, ...], words: str, begun: Path) -> None:
+    given = [str(begun) if word == "RUN" else word for word in arguments]
+    outcome = CliRunner().invoke(command.verify, given)
+    assert isinstance(outcome.exception, ConfigError)
+    assert words in str(outcome.exception)
+
+
+def test_a_resumed_verification_keeps_its_options(begun: Path) -> None:
+    wanted = command._wanted(None, quick=False, poses=None, limits=AcceptanceLimits(), resume=begun)
+    assert (wanted.path, wanted.poses) == (Path("cell/calibration.json"), 3)
+    assert wanted.limits == AcceptanceLimits(force_N=0.5)
+    calibrate = Run.create(begun.parent, "calibrate", {"mode": "auto"}).folder
+    with pytest.raises(ConfigError, match="ftdrive calibrate --resume"):
+        command._wanted(None, quick=False, poses=None, limits=AcceptanceLimits(), resume=calibrate)
+
+
+def failed(folder: Path, limits: AcceptanceLimits) -> Any:
+    """A failed verification of two poses, without its files."""
+    R, noise = np.stack([np.eye(3), np.diag([1.0, -1.0, -1.0])]), np.eye(12) * 1e-4
+    wrench = -calibration().compensate(np.zeros((2, 6)), R) + np.repeat([0.3, 0.0], 3)
+    update = reestimate(calibration(), R, wrench, noise, "bias")
+    found = Verification(np.full((2, 6), 0.3), np.full((2, 6), 0.1), 99.0, 12, 1e-9, False, "bias", "…", (), update)
+    path = folder / "verification.json"
+    return Verified(Run(folder), calibration(), folder / "a.json", limits, None, (), found, None, path)  # type: ignore[arg-type]
+
+
+def test_the_limits_that_decide_are_named(tmp_path: Path) -> None:
+    assert "p 1e-09 (1 % of unchanged cells fail)" in verdict_in_words(failed(tmp_path, AcceptanceLimits()))
+    given = failed(tmp_path, AcceptanceLimits(force_N=1.0, torque_Nm=0.1))
+    assert verdict_in_words(given) == "largest difference 0.520 N, 0.5196 N·m; limit 1 N, 0.1 N·m"
+    assert given.exceeded == ("0.52 N·m is above --max-torque 0.1 N·m",)
+
+
+@pytest.mark.parametrize(
+    ("update", "typed", "wanted"),
+    [("no", "yes\n", False), ("yes", "", True), ("ask", "yes\n", True), ("ask", "no\n", False), ("ask", "", False)],
+)
+def test_an_update_is_saved_only_if_it_is_wanted(update: Any, typed: str, wanted: bool, tmp_path: Path) -> None:
+    with CliRunner().isolation(typed) as (out, *_):
+        found = command._wants_update(failed(tmp_path, AcceptanceLimits()), update, as_json=True)
+        printed = out.getvalue().decode()
+    assert found is wanted
+    if update == "ask":
+        assert json.loads(printed.splitlines()[0])["text"].startswith("An update of the bias is sufficient.")
+    assert not command._wants_update(failed(tmp_path, AcceptanceLimits(force_N=1.0)), "yes", as_json=True)

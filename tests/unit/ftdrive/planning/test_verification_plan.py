@@ -1,0 +1,64 @@
+"""Plans for a verification: far from the calibration, proven clear, the same each time, short."""
+
+import numpy as np
+import pytest
+
+from calib.poses.information import special
+from ftdrive.errors import ConfigError
+from ftdrive.planning.approach import plan_approach
+from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.scene import BASE_PLANE, Plane, Scene
+from ftdrive.planning.motion import Speeds
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_verification
+from ftdrive.planning.show.words import plan_in_words
+from ftdrive.session.forecast import moves_s
+from ftdrive.session.tour import SLOW
+
+CERTIFIER = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene((BASE_PLANE,)))
+FITTED = special(range(1, 25))
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def plan(poses: int, certifier: Certifier = CERTIFIER) -> Plan:
+    guess = guess_of(certifier)
+    return plan_verification(certifier, USUAL_POSTURE_RAD, poses, FITTED, speeds=Speeds(), guess=guess)
+
+
+@pytest.mark.parametrize("poses", [2, 6])
+def test_gravity_is_far_from_where_it_was_in_the_calibration(poses: int) -> None:
+    made = plan(poses)
+    assert made.certified
+    assert made.arm_rests
+    assert len({step.number for step in made.steps}) == poses
+    R = np.array([step.R_base_flange for step in made.steps])
+    nearest = ((DOWN @ R) @ (DOWN @ FITTED).T).max(axis=1)
+    assert np.degrees(np.arccos(nearest)).min() > 20
+    assert plan(poses).sha256 == made.sha256
+
+
+def test_two_poses_take_less_than_30_s_of_robot_time() -> None:
+    made = plan(2)
+    q = USUAL_POSTURE_RAD
+    approach = plan_approach(CERTIFIER, q, np.array(made.steps[0].q_rad), SLOW)
+    assert moves_s(made, [1, 2, 3], q, approach) + 3 * (2.0 + 0.6) < 30
+
+
+def test_its_words_promise_no_calibration() -> None:
+    words = plan_in_words(plan(2))
+    assert "2 poses that were not used in the calibration, far from its 24 poses." in words
+    assert "nan" not in words
+    assert "Predicted" not in words
+
+
+def test_another_posture_is_found_and_named() -> None:
+    ceiling = Plane((0.0, 0.0, -1.0), -0.75)
+    made = plan(6, Certifier(CERTIFIER.arm, Scene((BASE_PLANE, ceiling))))
+    assert made.certified
+    assert "A tour exists with joints 1 to 3 at" in made.why[1]
+
+
+def test_one_pose_is_too_few() -> None:
+    with pytest.raises(ConfigError, match="1 poses cannot verify"):
+        plan(1)
