@@ -24,10 +24,10 @@ from mocks.kinematics import MODELS, Vector6, rotation, vector3, vector6
 from mocks.recording import RecordedArm, RecordedWorld, Recording
 from mocks.sensors.catalogue import WRIST, Sensor
 from mocks.ur.operator import Operator
-from mocks.ur.robot import Robot, RobotSettings
+from mocks.ur.robot import INSTALLED_G_M_S2, Robot, RobotSettings
 from mocks.ur.server import UrServer
 from mocks.workcell import Workcell
-from mocks.world import MOUNTS_RAD, Truth, World
+from mocks.world import MOUNTS_RAD, Truth, World, up_of
 
 FORMAT = "mocks.station/1"
 HOST_TRIALS = 20
@@ -151,6 +151,7 @@ class Station:
                 tcp=vector6(options.tcp),
                 payload_kg=self.world.truth.mass_kg if options.payload is None else options.payload,
                 payload_cog_m=vector3(options.payload_cog),
+                gravity_m_s2=vector3(INSTALLED_G_M_S2 * up_of(0.0, MOUNTS_RAD[options.mount])),
                 joint_limit_rad=math.radians(options.joint_limit_deg),
                 plane=options.plane,
                 unknown_outputs=frozenset({"tcp_offset"} if options.no_tcp_offset else ()),
@@ -315,6 +316,7 @@ class Station:
             "tcp_offset": list(robot.tcp_offset),
             "payload_kg": robot.payload_kg,
             "payload_cog_m": list(robot.payload_cog_m),
+            "target_gravity_m_s2": list(robot.target_gravity_m_s2),
             "speed_fraction": arm.speed_fraction,
             "speed_scaling": arm.pace,
             **({} if self._recording is None else {"recording_s": self._recording.at_s(self._clock.now_s())}),

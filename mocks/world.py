@@ -88,9 +88,7 @@ class Truth:
     @property
     def gravity_m_s2(self) -> Array:
         """Acceleration of gravity in base axes, (3,): ``R_base_gravity = Ry(beta) Rx(alpha)`` applied to -z."""
-        a, b = self.tilt_alpha_rad, self.tilt_beta_rad
-        down = np.array([math.cos(a) * math.sin(b), -math.sin(a), math.cos(a) * math.cos(b)])
-        return -self.g_m_s2 * down
+        return -self.g_m_s2 * up_of(self.tilt_alpha_rad, self.tilt_beta_rad)
 
     @property
     def gravity_force_base_N(self) -> Array:
@@ -117,6 +115,12 @@ class Truth:
             "torque_drift_Nm_min": self.torque_drift_Nm_min.tolist(),
             "g_m_s2": self.g_m_s2,
         }
+
+
+def up_of(alpha_rad: float, beta_rad: float) -> Array:
+    """Return the direction away from the earth in base axes, (3,), for a tilted base."""
+    a, b = alpha_rad, beta_rad
+    return np.array([math.cos(a) * math.sin(b), -math.sin(a), math.cos(a) * math.cos(b)])
 
 
 def _on_circle(rng: np.random.Generator) -> Array:

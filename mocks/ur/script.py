@@ -335,7 +335,7 @@ class ControlScript:
         self._robot.tcp_offset = self._vector(0)
 
     def _set_gravity(self) -> None:
-        self._robot.gravity_m_s2 = (self._read(0), self._read(1), self._read(2))
+        self._robot.target_gravity_m_s2 = (self._read(0), self._read(1), self._read(2))
 
     def _set_watchdog(self) -> None:
         self._robot.set_watchdog(f"input_int_register_{self._int_offset}", self._read(0))

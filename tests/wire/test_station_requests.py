@@ -78,6 +78,8 @@ def test_cables_drift_and_payload(station: StationProcess) -> None:
         ("push-joint", {"joint": 0, "off_deg": 1}, "joint 0"),
         ("set-payload", {"payload_kg": -1}, "payload -1"),
         ("set-payload", {"payload_kg": 1, "payload_cog_m": [0, 0]}, "not enough values"),
+        ("set-mounting", {}, "up"),
+        ("set-mounting", {"up": [0, 0, 0]}, "no direction"),
         ("slider", {"fraction": 2}, "not between"),
         ("delay", {}, "sensor_ms"),
         ("delay", {"sensor_ms": -1}, "0 to 1000 ms"),
