@@ -504,11 +504,16 @@ class Robot:
         return self.arm.still_s >= STEADY_AFTER_S
 
     def flange_wrench(self) -> Array:
-        """Return the wrench on the arm's own sensor, (6,): N and N·m, exerted on the flange, its axes and origin."""
+        """Return the wrench on the arm's own sensor, (6,): N and N·m, exerted on the flange, its axes and origin.
+
+        What hangs on the flange are the tool and the station's sensor.
+        """
         truth = self.world.truth
         felt = self.world.load_wrench(self.cycle_s) + self.world.contact_wrench(self.cycle_s)
         force = truth.R_flange_sensor @ felt[:3]
-        return np.concatenate((force, truth.R_flange_sensor @ felt[3:] + cross(truth.p_flange_sensor_m, force)))
+        torque = truth.R_flange_sensor @ felt[3:] + cross(truth.p_flange_sensor_m, force)
+        wrench: Array = np.concatenate((force, torque)) + self.world.sensor_load(self.cycle_s)
+        return wrench
 
     def raw_wrench(self) -> Vector6:
         """ft_raw_wrench: a new reading in every cycle, flange axes."""

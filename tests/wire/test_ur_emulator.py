@@ -226,7 +226,7 @@ def test_one_variable_alone(station: StationProcess, name: str) -> None:
     expected = {
         "tcp_offset": (0.01, 0.02, 0.03, 0.1, 0.2, 0.3),
         "payload": 0.7,
-        "payload_cog": (0.0, 0.0, 0.0),
+        "payload_cog": tuple(station.hello["truth"]["payload_cog_m"]),
         "actual_q": tuple(station.ask("state")["q_rad"]),
         "safety_status_bits": 1,
     }[name]
