@@ -325,6 +325,7 @@ class ControlScript:
         self._set_payload()
         a, b, c, d, e, f = (self._read(4 + i) for i in range(6))
         self._robot.payload_inertia = (a, b, c, d, e, f)
+        self._robot.zero_ft()
 
     def _set_cog(self) -> None:
         cog = (self._read(1), self._read(2), self._read(3))

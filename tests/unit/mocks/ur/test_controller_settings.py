@@ -100,3 +100,12 @@ def test_another_gravity_shows_in_the_force_of_an_arm_at_rest() -> None:
     robot.target_gravity_m_s2 = WALL
     left_N = TRUTH.payload_kg * (np.array(WALL) - UPRIGHT)
     np.testing.assert_allclose(robot.tcp_wrench()[:3], left_N, atol=1e-12)
+
+
+def test_a_target_payload_zeroes_the_force_and_a_payload_does_not() -> None:
+    robot = started("rtde_control", "", informed())
+    command(robot, 17, TRUTH.payload_kg + 1.0, 0.0, 0.0, 0.04)
+    assert np.linalg.norm(robot.tcp_wrench()[:3]) == pytest.approx(9.82)
+    command(robot, 65, TRUTH.payload_kg + 2.0, 0.0, 0.0, 0.05, *[0.01] * 6)
+    assert robot.payload_kg == TRUTH.payload_kg + 2.0
+    np.testing.assert_allclose(robot.tcp_wrench(), 0.0, atol=1e-12)
