@@ -43,7 +43,7 @@ def _positive(text: str) -> float:
     return value
 
 
-def _pace(text: str) -> float:
+def _not_negative(text: str) -> float:
     value = float(text)
     if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"{text} is negative or not finite")
@@ -67,7 +67,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--sensor-delay-ms", type=float, metavar="D", help="time between the measurement of a sample and its sending")
     add("--rtde-delay-ms", type=float, metavar="D", help="the same for the samples of the arm")
     add("--recording", type=Path, metavar="FILE.csv", help="serve the raw wrench and the joints of a recording")
-    add("--pace", type=_pace, metavar="K", help="play it K times faster (default 1; 0: hold the first row)")
+    add("--pace", type=_not_negative, metavar="K", help="play it K times faster (default 1; 0: hold the first row)")
     add("--do", action="append", default=[], metavar="JSON", help="a request of the control channel to begin with")
 
     arm = station.add_argument_group("arm")
@@ -77,8 +77,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--no-tcp-offset", action="store_true", help="answer NOT_FOUND to the RTDE output tcp_offset")
     add("--serial-number", default="20225500001")
     add("--tcp", type=_vector(6), default=[0.0] * 6, metavar="x,y,z,rx,ry,rz", help="active TCP, m and rad")
-    add("--payload", type=float, metavar="kg", help="payload set in the controller (default: the tool's true mass)")
-    add("--payload-cog", type=_vector(3), default=[0.0] * 3, metavar="x,y,z", help="its centre in the flange, m")
+    add("--payload", type=float, metavar="kg", help="payload set in the controller (default: tool and sensor)")
+    add("--payload-cog", type=_vector(3), metavar="x,y,z", help="its centre in the flange, m (default: theirs)")
     add("--start-q-deg", type=_vector(6), metavar="q1,…,q6", help="start posture (default near the tour's first pose)")
     add("--joint-limit-deg", type=_positive, default=360.0)
     add("--plane", type=_plane, metavar="nx,ny,nz,d", help="safety plane in base: n·p >= d (m) is allowed")
@@ -102,6 +102,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     add(
         "--sensor-origin", type=_vector(3), metavar="x,y,z", help="of the sensor in the flange frame, m (default 0,0,0)"
+    )
+    add(
+        "--sensor-mass-kg",
+        type=_not_negative,
+        metavar="kg",
+        help="sensor and adapter, halfway between flange and sensor origin (default 0.25; 0 for ur-ft)",
     )
     add("--sensor-rotvec-deg", type=_vector(3), metavar="x,y,z", help="R_flange_sensor as a rotation vector, degrees")
     add("--mount", choices=sorted(MOUNTS_RAD), default="floor")

@@ -24,10 +24,10 @@ from mocks.kinematics import MODELS, Vector6, rotation, vector3, vector6
 from mocks.recording import RecordedArm, RecordedWorld, Recording
 from mocks.sensors.catalogue import WRIST, Sensor
 from mocks.ur.operator import Operator
-from mocks.ur.robot import Robot, RobotSettings
+from mocks.ur.robot import INSTALLED_G_M_S2, Robot, RobotSettings
 from mocks.ur.server import UrServer
 from mocks.workcell import Workcell
-from mocks.world import MOUNTS_RAD, Truth, World
+from mocks.world import MOUNTS_RAD, Truth, World, up_of
 
 FORMAT = "mocks.station/1"
 HOST_TRIALS = 20
@@ -36,6 +36,9 @@ WITHOUT_EFFECT_ON_A_RECORDING = ("payload-shift", "push-joint", "hand-guide", "s
 
 START_Q_DEG = (45.0, -100.0, 60.0, -50.0, 90.0, 45.0)
 """Near the first pose of the tour: q4 = -90° - q2 - q3."""
+
+SENSOR_MASS_KG = 0.25
+"""Of a sensor with its adapter."""
 
 START_SCATTER_DEG = 5.0
 """The wrist starts this far off at most, so that the arm moves to the first pose."""
@@ -70,6 +73,7 @@ def truth_from(options: Namespace) -> Truth:
         changes["tilt_beta_rad"] = math.remainder(MOUNTS_RAD[options.mount] + beta, 2 * math.pi)
     if options.inertia is not None:
         changes["gyration_m2"] = _gyration(options.inertia, changes.get("mass_kg", truth.mass_kg))
+    changes["sensor_mass_kg"] = _sensor_mass_kg(options)
     if options.noise is not None:
         changes["noise_force_N"], changes["noise_torque_Nm"] = options.noise
     if options.sensor == WRIST:
@@ -87,6 +91,15 @@ def _gyration(inertia: str, mass_kg: float) -> Array | None:
     if tensor.any() and not mass_kg > 0.0:
         raise ValueError(f"--inertia: a payload of {mass_kg} kg has no inertia tensor: set --mass too")
     return tensor / (mass_kg or 1.0)
+
+
+def _sensor_mass_kg(options: Namespace) -> float:
+    """Return the mass of sensor and adapter, which the sensor in the arm's wrist does not add."""
+    if options.sensor == WRIST:
+        if options.sensor_mass_kg:
+            raise ValueError(f"the sensor {WRIST} is part of the arm: leave --sensor-mass-kg out")
+        return 0.0
+    return SENSOR_MASS_KG if options.sensor_mass_kg is None else float(options.sensor_mass_kg)
 
 
 def _recording(options: Namespace) -> Recording | None:
@@ -149,8 +162,9 @@ class Station:
                 polyscope=options.polyscope,
                 serial_number=options.serial_number,
                 tcp=vector6(options.tcp),
-                payload_kg=self.world.truth.mass_kg if options.payload is None else options.payload,
-                payload_cog_m=vector3(options.payload_cog),
+                payload_kg=truth.payload_kg if options.payload is None else options.payload,
+                payload_cog_m=vector3(truth.payload_cog_m if options.payload_cog is None else options.payload_cog),
+                gravity_m_s2=vector3(INSTALLED_G_M_S2 * up_of(0.0, MOUNTS_RAD[options.mount])),
                 joint_limit_rad=math.radians(options.joint_limit_deg),
                 plane=options.plane,
                 unknown_outputs=frozenset({"tcp_offset"} if options.no_tcp_offset else ()),
@@ -315,6 +329,7 @@ class Station:
             "tcp_offset": list(robot.tcp_offset),
             "payload_kg": robot.payload_kg,
             "payload_cog_m": list(robot.payload_cog_m),
+            "target_gravity_m_s2": list(robot.target_gravity_m_s2),
             "speed_fraction": arm.speed_fraction,
             "speed_scaling": arm.pace,
             **({} if self._recording is None else {"recording_s": self._recording.at_s(self._clock.now_s())}),

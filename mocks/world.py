@@ -17,7 +17,7 @@ from mocks.arrays import Array
 from mocks.clock import CellClock
 from mocks.disturbances import Contact, Drift
 from mocks.inertia import drawn_gyration, moved_load
-from mocks.kinematics import Dh, JointState, Vector6, cross, flange_motion, forward, rotation
+from mocks.kinematics import Dh, FlangeMotion, JointState, Vector6, cross, flange_motion, forward, rotation
 
 MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
 """Tilt beta of the base for each mounting."""
@@ -55,6 +55,8 @@ class Truth:
     p_flange_sensor_m: Array = field(default_factory=_zero3)
     gyration_m2: Array | None = None
     """Inertia tensor per mass about the centre of mass, (3, 3), sensor axes; None for a payload without inertia."""
+    sensor_mass_kg: float = 0.0
+    """Sensor and adapter, which the sensor does not feel: a point mass halfway between flange and sensor origin."""
 
     @classmethod
     def drawn(cls, seed: int, mount: str = "floor") -> "Truth":
@@ -88,14 +90,29 @@ class Truth:
     @property
     def gravity_m_s2(self) -> Array:
         """Acceleration of gravity in base axes, (3,): ``R_base_gravity = Ry(beta) Rx(alpha)`` applied to -z."""
-        a, b = self.tilt_alpha_rad, self.tilt_beta_rad
-        down = np.array([math.cos(a) * math.sin(b), -math.sin(a), math.cos(a) * math.cos(b)])
-        return -self.g_m_s2 * down
+        return -self.g_m_s2 * up_of(self.tilt_alpha_rad, self.tilt_beta_rad)
 
     @property
     def gravity_force_base_N(self) -> Array:
         """Weight as a force vector in base axes, (3,)."""
         return self.mass_kg * self.gravity_m_s2
+
+    @property
+    def p_flange_sensor_com_m(self) -> Array:
+        """Centre of mass of sensor and adapter in the flange frame, (3,)."""
+        return self.p_flange_sensor_m / 2
+
+    @property
+    def payload_kg(self) -> float:
+        """Mass of all that hangs on the flange: tool, sensor and adapter."""
+        return self.mass_kg + self.sensor_mass_kg
+
+    @property
+    def payload_cog_m(self) -> Array:
+        """Centre of mass of all that hangs on the flange, (3,), flange frame; zeros where nothing does."""
+        p_flange_tool_m = self.p_flange_sensor_m + self.R_flange_sensor @ self.p_sensor_com_m
+        moment = self.mass_kg * p_flange_tool_m + self.sensor_mass_kg * self.p_flange_sensor_com_m
+        return moment / (self.payload_kg or 1.0)
 
     def to_json(self) -> dict[str, Any]:
         """The truth as plain numbers and row-major lists."""
@@ -109,6 +126,9 @@ class Truth:
             "p_sensor_com_m": self.p_sensor_com_m.tolist(),
             "inertia_kg_m2": None if self.inertia_kg_m2 is None else self.inertia_kg_m2.tolist(),
             "p_flange_sensor_m": self.p_flange_sensor_m.tolist(),
+            "sensor_mass_kg": self.sensor_mass_kg,
+            "payload_kg": self.payload_kg,
+            "payload_cog_m": self.payload_cog_m.tolist(),
             "tilt_alpha_rad": self.tilt_alpha_rad,
             "tilt_beta_rad": self.tilt_beta_rad,
             "noise_force_N": self.noise_force_N,
@@ -117,6 +137,12 @@ class Truth:
             "torque_drift_Nm_min": self.torque_drift_Nm_min.tolist(),
             "g_m_s2": self.g_m_s2,
         }
+
+
+def up_of(alpha_rad: float, beta_rad: float) -> Array:
+    """Return the direction away from the earth in base axes, (3,), for a tilted base."""
+    a, b = alpha_rad, beta_rad
+    return np.array([math.cos(a) * math.sin(b), -math.sin(a), math.cos(a) * math.cos(b)])
 
 
 def _on_circle(rng: np.random.Generator) -> Array:
@@ -166,7 +192,8 @@ class World:
         self._lock = threading.Lock()
         self._noise = np.random.default_rng([seed, 2])
         self._noise_sd = np.repeat([truth.noise_force_N, truth.noise_torque_Nm], 3)
-        self._load: tuple[Vector6, Truth, Array] | None = None
+        self._still: tuple[Vector6, Truth, tuple[Array, Array]] | None = None
+        self._moved: tuple[JointState, FlangeMotion] | None = None
         self._override: Array | None = None
         self._known: tuple[float, Array] = (-math.inf, _NOTHING)
         """The truth at the end of the last burst, where the next one begins."""
@@ -221,12 +248,12 @@ class World:
         """Return the wrench of gravity and inertia, (6,), sensor axes, about the sensor origin; time as above."""
         joints, moves = self._joints(self.now_s if t_s is None else t_s)
         if not moves:
-            return self._still_load(joints.q)
+            return self._still_loads(joints.q)[0]
         truth = self.truth
         if truth.gyration_m2 is None:
             return _weight(truth, forward(self.dh, joints.q)[:3, :3])
         load: Array = truth.mass_kg * moved_load(
-            flange_motion(self.dh, joints),
+            self._motion(joints),
             truth.gravity_m_s2,
             truth.R_flange_sensor,
             truth.p_flange_sensor_m,
@@ -235,13 +262,34 @@ class World:
         )
         return load
 
-    def _still_load(self, q: Vector6) -> Array:
-        truth, known = self.truth, self._load
+    def sensor_load(self, t_s: float) -> Array:
+        """Return the wrench of sensor and adapter on the flange, (6,), its axes and origin; time as above."""
+        joints, moves = self._joints(t_s)
+        truth = self.truth
+        if not moves or truth.gyration_m2 is None:
+            return self._still_loads(joints.q)[1]
+        at_flange = np.eye(3), np.zeros(3), truth.p_flange_sensor_com_m, np.zeros((3, 3))
+        load: Array = truth.sensor_mass_kg * moved_load(self._motion(joints), truth.gravity_m_s2, *at_flange)
+        return load
+
+    def _still_loads(self, q: Vector6) -> tuple[Array, Array]:
+        """Return the wrench of gravity alone on the sensor, and that of the sensor on the flange."""
+        truth, known = self.truth, self._still
         if known is not None and known[0] is q and known[1] is truth:
             return known[2]
-        load = _weight(truth, forward(self.dh, q)[:3, :3])
-        self._load = (q, truth, load)
-        return load
+        R_base_flange = forward(self.dh, q)[:3, :3]
+        sensor_N = truth.sensor_mass_kg * R_base_flange.T @ truth.gravity_m_s2
+        sensor_load = np.concatenate((sensor_N, cross(truth.p_flange_sensor_com_m, sensor_N)))
+        loads = (_weight(truth, R_base_flange), sensor_load)
+        self._still = (q, truth, loads)
+        return loads
+
+    def _motion(self, joints: JointState) -> FlangeMotion:
+        """Return the motion of the flange, which one control cycle needs several times."""
+        known = self._moved
+        if known is None or known[0] != joints:
+            self._moved = known = (joints, flange_motion(self.dh, joints))
+        return known[1]
 
     def contact_wrench(self, t_s: float | None = None) -> Array:
         """Return the wrench of all contacts, (6,), sensor axes, about the sensor origin; time as above."""

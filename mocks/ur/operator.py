@@ -7,8 +7,8 @@ from typing import Any
 from mocks.kinematics import ZERO6, vector3, vector6
 from mocks.ur import dashboard
 from mocks.ur.hand import REST_S, guided_by_hand, pendant_program
-from mocks.ur.modes import PERMITTED, RobotMode, SafetyMode
-from mocks.ur.robot import Robot
+from mocks.ur.modes import PERMITTED, RobotMode, Runtime, SafetyMode
+from mocks.ur.robot import INSTALLED_G_M_S2, Robot
 from mocks.ur.script import Upload
 from mocks.ur.server import UrServer
 from mocks.ur.swing import Swing, SwingProgram
@@ -56,6 +56,7 @@ class Operator:
             "remote-control": self._remote_control,
             "set-tcp": self._set_tcp,
             "set-payload": self._set_payload,
+            "set-mounting": self._set_mounting,
             "freeze": self._freeze,
             "silent": self._silent,
             "silence-arm": self._silence_arm,
@@ -130,6 +131,17 @@ class Operator:
         self._robot.payload_kg, self._robot.payload_cog_m = payload_kg, cog_m
         self._robot.note("operator", "set-payload", payload_kg=payload_kg, payload_cog_m=list(cog_m))
         return {"done": "set-payload"}
+
+    def _set_mounting(self, request: Request) -> dict[str, Any]:
+        robot, up = self._robot, vector3(request["up"])
+        length = math.hypot(*up)
+        if not 0.0 < length < math.inf:
+            raise ValueError(f"up {request['up']} is no direction")
+        if robot.runtime != Runtime.STOPPED:
+            raise ValueError(f"the installation cannot be changed: the program is {robot.runtime.name}")
+        robot.target_gravity_m_s2 = vector3([INSTALLED_G_M_S2 * part / length for part in up])
+        robot.note("operator", "set-mounting", target_gravity_m_s2=list(robot.target_gravity_m_s2))
+        return {"done": "set-mounting"}
 
     def _push_joint(self, request: Request) -> dict[str, Any]:
         joint, off_rad = int(request["joint"]), math.radians(request["off_deg"])

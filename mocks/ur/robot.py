@@ -30,6 +30,8 @@ PROGRAM_START_S = 0.1
 POWER_STEP_S = 0.5
 COMMAND_REGISTERS = {"input_int_register_0", "input_int_register_24"}
 HAND_ACCELERATION_RAD_S2 = 1.5
+INSTALLED_G_M_S2 = 9.82
+"""Gravity in an installation, wherever on earth."""
 
 AnyProgram = ControlScript | Program | SwingProgram
 
@@ -76,6 +78,8 @@ class RobotSettings:
         Software version, three numbers.
     tcp
         Active TCP at power-up as a UR pose, m and rad.
+    gravity_m_s2
+        Of the installation, away from the earth: what its mounting implies, base axes.
     unknown_outputs
         RTDE outputs this controller answers with NOT_FOUND although its version knows them.
     time_scale
@@ -88,6 +92,7 @@ class RobotSettings:
     tcp: Vector6 = ZERO6
     payload_kg: float = 0.0
     payload_cog_m: Vector3 = (0.0, 0.0, 0.0)
+    gravity_m_s2: Vector3 = (0.0, 0.0, INSTALLED_G_M_S2)
     joint_limit_rad: float = 2 * np.pi
     plane: tuple[float, float, float, float] | None = None
     unknown_outputs: frozenset[str] = frozenset()
@@ -125,8 +130,8 @@ class Robot:
         self.payload_kg = settings.payload_kg
         self.payload_cog_m = settings.payload_cog_m
         self.payload_inertia: Vector6 = ZERO6
-        down = world.truth.gravity_m_s2
-        self.gravity_m_s2: Vector3 = (float(-down[0]), float(-down[1]), float(-down[2]))
+        self.target_gravity_m_s2 = settings.gravity_m_s2
+        """What the controller takes for the acceleration away from the earth, base axes."""
         self.tcp_offset = settings.tcp
         self.inputs: dict[str, Value] = {}
         self.output_ints = [0] * 48
@@ -499,11 +504,16 @@ class Robot:
         return self.arm.still_s >= STEADY_AFTER_S
 
     def flange_wrench(self) -> Array:
-        """Return the wrench on the arm's own sensor, (6,): N and N·m, exerted on the flange, its axes and origin."""
+        """Return the wrench on the arm's own sensor, (6,): N and N·m, exerted on the flange, its axes and origin.
+
+        What hangs on the flange are the tool and the station's sensor.
+        """
         truth = self.world.truth
         felt = self.world.load_wrench(self.cycle_s) + self.world.contact_wrench(self.cycle_s)
         force = truth.R_flange_sensor @ felt[:3]
-        return np.concatenate((force, truth.R_flange_sensor @ felt[3:] + cross(truth.p_flange_sensor_m, force)))
+        torque = truth.R_flange_sensor @ felt[3:] + cross(truth.p_flange_sensor_m, force)
+        wrench: Array = np.concatenate((force, torque)) + self.world.sensor_load(self.cycle_s)
+        return wrench
 
     def raw_wrench(self) -> Vector6:
         """ft_raw_wrench: a new reading in every cycle, flange axes."""
@@ -517,7 +527,8 @@ class Robot:
         """actual_TCP_force: payload-compensated and zeroed, base axes, at the TCP, exerted on the tool."""
         world = self.world
         felt_now = (world.q, world.load_wrench(self.cycle_s), world.contact_wrench(self.cycle_s))
-        key = (*felt_now, self.payload_kg, self.payload_cog_m, self._tcp_offset, self._ft_zero)
+        assumed = (self.payload_kg, self.payload_cog_m, self.target_gravity_m_s2)
+        key = (*felt_now, *assumed, self._tcp_offset, self._ft_zero)
         if self._wrench is None or any(a is not b for a, b in zip(self._wrench[0], key, strict=True)):
             felt = self._compensated() - self._ft_zero
             R_base_flange = forward(self.arm.dh, world.q)[:3, :3]
@@ -531,6 +542,6 @@ class Robot:
 
     def _compensated(self) -> Array:
         R = forward(self.arm.dh, self.world.q)[:3, :3]
-        weight = R.T @ np.array(self.gravity_m_s2) * -self.payload_kg
+        weight = R.T @ np.array(self.target_gravity_m_s2) * -self.payload_kg
         rest: Array = self.flange_wrench() - np.concatenate((weight, cross(self.payload_cog_m, weight)))
         return rest

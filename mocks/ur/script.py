@@ -325,6 +325,7 @@ class ControlScript:
         self._set_payload()
         a, b, c, d, e, f = (self._read(4 + i) for i in range(6))
         self._robot.payload_inertia = (a, b, c, d, e, f)
+        self._robot.zero_ft()
 
     def _set_cog(self) -> None:
         cog = (self._read(1), self._read(2), self._read(3))
@@ -335,7 +336,7 @@ class ControlScript:
         self._robot.tcp_offset = self._vector(0)
 
     def _set_gravity(self) -> None:
-        self._robot.gravity_m_s2 = (self._read(0), self._read(1), self._read(2))
+        self._robot.target_gravity_m_s2 = (self._read(0), self._read(1), self._read(2))
 
     def _set_watchdog(self) -> None:
         self._robot.set_watchdog(f"input_int_register_{self._int_offset}", self._read(0))

@@ -81,6 +81,7 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
     "payload_cog": ("VECTOR3D", lambda r: r.payload_cog_m),
     "payload_inertia": ("VECTOR6D", lambda r: r.payload_inertia),
     "tcp_offset": ("VECTOR6D", lambda r: r.tcp_offset),
+    "target_gravity": ("VECTOR3D", lambda r: r.target_gravity_m_s2),
     "output_bit_registers0_to_31": ("UINT32", _fixed(0)),
     "output_bit_registers32_to_63": ("UINT32", _fixed(0)),
 }
@@ -112,8 +113,12 @@ _SINCE: dict[str, dict[int, tuple[int, int]]] = {
     "payload_cog": {3: (11, 0), 5: (5, 1)},
     "payload_inertia": {3: (15, 0), 5: (11, 0)},
     "actual_current_as_torque": {5: (23, 0)},
+    "target_gravity": {5: (26, 0)},
 }
-"""First minor version and bug fix of each major one that knows an output."""
+"""First minor version and bug fix of each major one that knows an output.
+
+`target_gravity` follows a maintainer of Universal Robots' client library (its pull request 420).
+"""
 
 INPUTS: dict[str, str] = {
     "speed_slider_mask": "UINT32",

@@ -78,6 +78,8 @@ def test_cables_drift_and_payload(station: StationProcess) -> None:
         ("push-joint", {"joint": 0, "off_deg": 1}, "joint 0"),
         ("set-payload", {"payload_kg": -1}, "payload -1"),
         ("set-payload", {"payload_kg": 1, "payload_cog_m": [0, 0]}, "not enough values"),
+        ("set-mounting", {}, "up"),
+        ("set-mounting", {"up": [0, 0, 0]}, "no direction"),
         ("slider", {"fraction": 2}, "not between"),
         ("delay", {}, "sensor_ms"),
         ("delay", {"sensor_ms": -1}, "0 to 1000 ms"),
@@ -199,7 +201,8 @@ def test_the_truth_names_the_inertia_and_the_sensor_origin(station: StationProce
     )
     assert given["p_flange_sensor_m"] == [0, 0.01, 0.04]
     changed = {name for name in drawn if drawn[name] != given[name]}
-    assert changed == {"mass_kg", "weight_N", "gravity_force_base_N", "inertia_kg_m2", "p_flange_sensor_m"}
+    whole = {"payload_kg", "payload_cog_m"}
+    assert changed == {"mass_kg", "weight_N", "gravity_force_base_N", "inertia_kg_m2", "p_flange_sensor_m", *whole}
 
 
 def write_recording(path: Path) -> None:
@@ -250,6 +253,7 @@ def test_requests_to_begin_with() -> None:
     [
         (["--do", '{"do": "dance"}'], "not understood"),
         (["--sensor", "ur-ft", "--sensor-rotvec-deg", "0,0,30"], "leave --sensor-rotvec-deg out"),
+        (["--sensor", "ur-ft", "--sensor-mass-kg", "0.2"], "leave --sensor-mass-kg out"),
         (["--sensor", "lab"], "invalid choice"),
         (["--inertia", "1,1,3,0,0,0"], "no body has"),
         (["--recording", "missing.csv"], "cannot read the recording"),

@@ -24,6 +24,7 @@ from mocks.clock import LEAD_NS
 from mocks.ur import rtde
 from mocks.ur.script import take_uploads
 from mocks.ur.variables import INPUTS, OUTPUTS
+from tests.wire.rtde_socket import RtdeSocket
 from tests.wire.station_process import ROOT, StationProcess
 from tests.wire.waiting import LIMIT_S, wait_until
 
@@ -87,46 +88,6 @@ def run_client(scenario: str, station: StationProcess, timeout_s: float = 90.0) 
     return result
 
 
-class RtdeSocket:
-    """The smallest RTDE client: plain bytes."""
-
-    def __init__(self, host: str) -> None:
-        self._socket = socket.create_connection((host, 30004), LIMIT_S)
-        self._buffer = bytearray()
-
-    def __enter__(self) -> "RtdeSocket":
-        return self
-
-    def __exit__(self, *_exc: object) -> None:
-        self._socket.close()
-
-    def send(self, hexadecimal: str) -> None:
-        self._socket.sendall(bytes.fromhex(hexadecimal))
-
-    def send_package(self, kind: str, payload: bytes = b"") -> None:
-        self._socket.sendall(struct.pack(">HB", 3 + len(payload), ord(kind)) + payload)
-
-    def answer(self) -> bytes:
-        """The next whole package, header included."""
-        while len(self._buffer) < 3 or len(self._buffer) < struct.unpack_from(">H", self._buffer)[0]:
-            data = self._socket.recv(4096)
-            if not data:
-                raise ConnectionError("the server hung up")
-            self._buffer += data
-        (size,) = struct.unpack_from(">H", self._buffer)
-        package = bytes(self._buffer[:size])
-        del self._buffer[:size]
-        return package
-
-    def ask(self, kind: str, payload: bytes = b"") -> bytes:
-        """Payload of the answer of the same kind; samples on the way are skipped."""
-        self.send_package(kind, payload)
-        while True:
-            package = self.answer()
-            if package[2:3] == kind.encode():
-                return package[3:]
-
-
 # -- codec ------------------------------------------------------------------------------------------------------------
 
 CONTROL_OUTPUTS = [
@@ -147,6 +108,11 @@ def test_packages_of_the_guide() -> None:
     sample = recipe.pack([1.5, 1, 1, 2, 1, 0, 0, *[0.0] * 6])
     assert len(sample) == 84
     assert sample.startswith(bytes.fromhex("00545501 3ff8000000000000 00000001"))
+    gravity = rtde.Recipe(2, ["target_gravity"], [OUTPUTS["target_gravity"][0]])
+    assert gravity.answer() == b"\x02VECTOR3D"
+    assert gravity.pack([(0.0, 0.0, 9.82)]) == bytes.fromhex(
+        "001c5502 0000000000000000 0000000000000000 4023a3d70a3d70a4"
+    )
 
 
 @pytest.mark.parametrize(
@@ -163,8 +129,13 @@ def test_packages_of_the_guide() -> None:
             ["input_int_register_0", "input_double_register_0", "input_int_register_1"],
             {"input_int_register_0": 34, "input_double_register_0": 2.0, "input_int_register_1": 0},
         ),
+        (
+            "00 28 55 07 0000003b 0000000000000000 0000000000000000 4023a3d70a3d70a4 0000000000000000",
+            ["input_int_register_0", *[f"input_double_register_{i}" for i in range(4)]],
+            {"input_int_register_0": 59, "input_double_register_1": 0.0, "input_double_register_2": 9.82},
+        ),
     ],
-    ids=["stopScript", "setPayload", "stopJ"],
+    ids=["stopScript", "setPayload", "stopJ", "setGravity"],
 )
 def test_commands_as_ur_rtde_sends_them(data: str, names: list[str], fields: dict[str, float]) -> None:
     ((kind, payload),) = rtde.take_packages(bytearray(bytes.fromhex(data)))
@@ -255,7 +226,7 @@ def test_one_variable_alone(station: StationProcess, name: str) -> None:
     expected = {
         "tcp_offset": (0.01, 0.02, 0.03, 0.1, 0.2, 0.3),
         "payload": 0.7,
-        "payload_cog": (0.0, 0.0, 0.0),
+        "payload_cog": tuple(station.hello["truth"]["payload_cog_m"]),
         "actual_q": tuple(station.ask("state")["q_rad"]),
         "safety_status_bits": 1,
     }[name]
@@ -268,7 +239,8 @@ def test_one_variable_alone(station: StationProcess, name: str) -> None:
 
 def test_every_documented_variable_can_be_read_and_unknown_ones_are_named(station: StationProcess) -> None:
     with RtdeSocket(station.host) as client:
-        known = [name for name in OUTPUTS if "register" not in name and name != "actual_current_as_torque"]
+        newer = {"actual_current_as_torque", "target_gravity"}
+        known = [name for name in OUTPUTS if "register" not in name and name not in newer]
         answer = client.ask("O", struct.pack(">d", 500.0) + ",".join(known).encode())
         assert answer[1:].decode().split(",") == [OUTPUTS[name][0] for name in known]
         assert client.ask("S") == b"\x01"

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Any
 
-from mocks.kinematics import vector6
+from mocks.kinematics import vector3, vector6
 from mocks.ur.motion import JointMove
 
 if TYPE_CHECKING:
@@ -81,11 +81,18 @@ def get_actual_joint_positions(program: "Program") -> list[float]:
     return list(program.robot.arm.actual_q)
 
 
+def set_gravity(program: "Program", d: object) -> None:
+    """Set the acceleration away from the earth that the controller assumes, m/s², base axes."""
+    if not isinstance(d, list) or len(d) != 3:
+        raise ScriptError(f"set_gravity: d must be three numbers, not {text_of(d)}")
+    program.robot.target_gravity_m_s2 = vector3([number(value, "set_gravity: d") for value in d])
+
+
 def norm(_program: "Program", a: object) -> float:
     """Return the absolute value of a number, or the Euclidean length of a list."""
     return math.hypot(*(number(value, "norm") for value in (a if isinstance(a, list) else [a])))
 
 
-_FUNCTIONS = (movej, sleep, textmsg, popup, get_actual_joint_positions, norm)
+_FUNCTIONS = (movej, sleep, textmsg, popup, get_actual_joint_positions, set_gravity, norm)
 FUNCTIONS: dict[str, Callable[..., Any]] = {function.__name__: function for function in _FUNCTIONS}
 """By name."""

@@ -198,19 +198,22 @@ def test_limiter_and_slider_multiply_and_only_the_slider_is_the_fraction() -> No
 @pytest.mark.parametrize(
     ("polyscope", "unknown"),
     [
-        ((3, 15, 0), {"ft_raw_wrench", "actual_current_as_torque"}),
-        ((5, 4, 0), {"ft_raw_wrench", "actual_current_as_torque", "payload", "payload_inertia"}),
-        ((5, 5, 0), {"ft_raw_wrench", "actual_current_as_torque", "payload", "payload_inertia"}),
-        ((5, 5, 1), {"ft_raw_wrench", "actual_current_as_torque", "payload_inertia"}),
-        ((5, 9, 0), {"actual_current_as_torque", "payload_inertia"}),
-        ((5, 10, 0), {"actual_current_as_torque", "payload_inertia"}),
-        ((5, 15, 0), {"actual_current_as_torque"}),
-        ((5, 23, 0), set()),
+        ((3, 15, 0), {"ft_raw_wrench", "actual_current_as_torque", "target_gravity"}),
+        ((5, 4, 0), {"ft_raw_wrench", "actual_current_as_torque", "target_gravity", "payload", "payload_inertia"}),
+        ((5, 5, 0), {"ft_raw_wrench", "actual_current_as_torque", "target_gravity", "payload", "payload_inertia"}),
+        ((5, 5, 1), {"ft_raw_wrench", "actual_current_as_torque", "target_gravity", "payload_inertia"}),
+        ((5, 9, 0), {"actual_current_as_torque", "target_gravity", "payload_inertia"}),
+        ((5, 10, 0), {"actual_current_as_torque", "target_gravity", "payload_inertia"}),
+        ((5, 15, 0), {"actual_current_as_torque", "target_gravity"}),
+        ((5, 23, 0), {"target_gravity"}),
+        ((5, 25, 9), {"target_gravity"}),
+        ((5, 26, 0), set()),
     ],
 )
 def test_outputs_of_a_version(polyscope: tuple[int, int, int], unknown: set[str]) -> None:
     robot = new_robot(polyscope=polyscope)
     candidates = {"ft_raw_wrench", "actual_current_as_torque", "payload", "payload_inertia", "tcp_offset"}
+    candidates.add("target_gravity")
     assert {name for name in candidates if output_type(robot, name) == "NOT_FOUND"} == unknown
     assert robot.frequency_hz == (125 if polyscope[0] == 3 else 500)
 
