@@ -39,18 +39,20 @@ def CELL(command: F) -> F:
     return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller.")(command))
 
 
-def CALIBRATION(command: F) -> F:
+CALIBRATION = click.option(
+    "--calibration",
+    "path",
+    metavar="PATH",
+    type=click.Path(exists=True, path_type=Path),
+    help="A calibration.json or its run folder. With --simulate the default is a new one.",
+)
+
+
+def CALIBRATION_OR_TOOL(command: F) -> F:
     """Add the options --calibration, --tool and --force, which `open_source` takes."""
-    path = click.option(
-        "--calibration",
-        "path",
-        metavar="PATH",
-        type=click.Path(exists=True, path_type=Path),
-        help="A calibration.json or its run folder. With --simulate the default is a new one.",
-    )
     tool = click.option("--tool", metavar="NAME", help="Newest accepted calibration of this tool on this cell.")
     force = click.option("--force", is_flag=True, help="Apply a calibration of another arm, sensor or mount.")
-    return path(tool(force(command)))
+    return CALIBRATION(tool(force(command)))
 
 
 class Number(click.FloatRange):

@@ -20,7 +20,7 @@ from drivers.interfaces import Array
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import AXES, check_weighed_payload
 from ftdrive.commands.common import (
-    CALIBRATION,
+    CALIBRATION_OR_TOOL,
     CELL,
     FRAME,
     JSON,
@@ -48,7 +48,7 @@ _RECOVER_S = 10.0
 
 
 @click.command()
-@CALIBRATION
+@CALIBRATION_OR_TOOL
 @CELL
 @simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
 @click.option(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ftdrive.commands.common import (
-    CALIBRATION,
+    CALIBRATION_OR_TOOL,
     CELL,
     FRAME,
     JSON,
@@ -55,7 +55,7 @@ class Duration(click.ParamType):  # type: ignore[type-arg]  # a generic type in 
 )
 @click.option("--duration", "duration_s", type=Duration(), help="Such as 60s, 10min or 1h; otherwise Ctrl-C ends.")
 @click.option("--count", type=click.IntRange(1), help="Number of samples.")
-@CALIBRATION
+@CALIBRATION_OR_TOOL
 @CELL
 @simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
 @FRAME

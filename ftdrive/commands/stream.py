@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from drivers.errors import DriverError
-from ftdrive.commands.common import CALIBRATION, CELL, FRAME, check_simulate, read_frame, simulate
+from ftdrive.commands.common import CALIBRATION_OR_TOOL, CELL, FRAME, check_simulate, read_frame, simulate
 from ftdrive.commands.live_source import open_source
 from ftdrive.errors import ConfigError
 from ftdrive.live.processing import ProcessedStream
@@ -27,7 +27,7 @@ RECOVER_S = 10.0
 
 
 @click.command()
-@CALIBRATION
+@CALIBRATION_OR_TOOL
 @CELL
 @simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
 @FRAME

@@ -13,6 +13,7 @@ from ftdrive.commands.common import (
     FOLDER,
     Number,
     check_simulate,
+    index_run,
     read_cell,
     runs,
     simulate,
@@ -111,6 +112,7 @@ def verify(
         run, calibration, path = _take_poses(cell, station, path, wanted, options, as_json=as_json)
     verified = verify_run(run, calibration, path, wanted.limits)
     _report(verified, update, as_json=as_json)
+    index_run(run.folder, None if simulate else cell)
     if not verified.passed:
         words = verified.exceeded if verified.limits.given else (verified.verification.reason,)
         raise NotAccepted(f"the verification failed: {'; '.join(words)}")

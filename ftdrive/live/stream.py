@@ -184,7 +184,7 @@ class CompensatedStream(ProcessedStream):
     def _trusted(self) -> tuple[VerificationRecord | None, str]:
         """Return the last verification of the calibration, and what is said of its age and of that."""
         path = Path(self._name)
-        verification = last_verification(path) if path.exists() else None
+        verification = last_verification(path) if path.name and path.exists() else None
         return verification, calibration_in_words(self._calibration, verification, datetime.now(UTC))
 
     def use_tool(self, name: str) -> StreamEvent:

@@ -139,7 +139,7 @@ def take_poses(
             if options.real and not options.dry_run:
                 journal.show(Noted(words=kept_awake))
         connected = {"arm": arm.identify(), "sensor": sensor.identify()}
-        for words in task.require(connected):
+        for words in task.require(connected, cell.sensor.mount):
             journal.show(Noted(words=words, warning=True))
         devices = {role: asdict(device) for role, device in connected.items()}
         session = _Session(cell, arm, sensor, journal, options, task, limits, run, devices)

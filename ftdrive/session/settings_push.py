@@ -95,7 +95,7 @@ def propose(
         raise NotAccepted(f"{name} is rejected ({'; '.join(result.reasons)}): calibrate again")
     mass_kg, height_m = _sensor_of(cell)
     connected = {"arm": arm.identify(), "sensor": sensor.identify()}
-    if others := devices.belonging(result, connected).others:
+    if others := devices.belonging(result, connected, cell.sensor.mount).others:
         raise NotAccepted(f"{others[0]}: push the calibration of this cell")
     require_ready(cell, arm)
     load, old = flange_load(result, mass_kg, height_m), arm.controller_settings()

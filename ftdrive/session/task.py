@@ -22,9 +22,9 @@ class Task:
     goal: str = "the coverage is green"
     """When the poses suffice that the operator moves the arm to."""
 
-    def require(self, devices: Mapping[str, DeviceInfo]) -> tuple[str, ...]:
-        """Return what is uncertain about arm and sensor; raises `ConfigError` for devices that do not fit the task."""
-        del devices
+    def require(self, devices: Mapping[str, DeviceInfo], mount: str | None) -> tuple[str, ...]:
+        """Return what is uncertain about arm, sensor and its mounting; raises `ConfigError` if they do not fit."""
+        del devices, mount
         return ()
 
     def plan(self, cell: CellConfig, certifier: Certifier, q_rad: Array, poses: int) -> Plan:

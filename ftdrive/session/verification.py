@@ -68,9 +68,9 @@ class Verifying(Task):
         dataset = fitted_dataset(self.calibration, self.path)
         return np.zeros((0, 3, 3)) if dataset is None else dataset.R_base_flange
 
-    def require(self, devices: Mapping[str, DeviceInfo]) -> tuple[str, ...]:
-        """Raise `ConfigError` for another arm or sensor than the calibration's."""
-        belongs = belonging(self.calibration, devices)
+    def require(self, devices: Mapping[str, DeviceInfo], mount: str | None) -> tuple[str, ...]:
+        """Raise `ConfigError` for another arm, sensor or mounting than the calibration's."""
+        belongs = belonging(self.calibration, devices, mount)
         if belongs.others:
             raise ConfigError(f"{belongs.others[0]}: calibrate this cell")
         if len(self.R_fitted):
