@@ -36,8 +36,6 @@ MOVED_BY: Mapping[str, tuple[Mapping[str, Any], str]] = {
 }
 """How the emulated arm moves in modes in which the session does not move it: the request to the cell, and words."""
 
-_PAYLOAD_COG_M = "0,0,0.06"
-"""Payload centre that is set in its controller, beside the mass."""
 TOOL_MM = (0.0, 200.0, 100.0)
 
 
@@ -61,7 +59,7 @@ class Station:
 
     def __enter__(self) -> Self:
         command = [sys.executable, "-P", "-m", "mocks", "station", "--sensor", self.sensor]
-        command += ["--time-scale", str(TIME_SCALE), "--payload-cog", _PAYLOAD_COG_M, *self.options]
+        command += ["--time-scale", str(TIME_SCALE), *self.options]
         # A session of its own: Ctrl-C in the terminal is for us, not for the emulated cell.
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
@@ -115,10 +113,10 @@ class Station:
         """Configuration that reaches this station as it would reach a real cell."""
         arm = self.endpoints["arm"]
         url = next(iter(self.endpoints["sensors"].values()))["url"]
-        height_m = self.truth["p_flange_sensor_m"][2]
+        truth = self.truth
         return CellConfig(
             robot=RobotConfig(arm["host"], arm["model"], speed_deg_s=60.0, acceleration_deg_s2=80.0),
-            sensor=SensorConfig(url, height_mm=1e3 * height_m),
+            sensor=SensorConfig(url, height_mm=1e3 * truth["p_flange_sensor_m"][2], mass_kg=truth["sensor_mass_kg"]),
             tool=ToolConfig("emulated", (TOOL_MM,)),
             workcell=WorkcellConfig(self.mounting, measured=True),
             sampling=Sampling(average_s=0.4, noise_record_s=0.0),

@@ -161,8 +161,6 @@ def calibration(
     with _calibrated(source, sensor, simulate=simulate) as path:
         result = load_calibration(path)
         recorded_height_mm, recorded_mass_kg = recorded_sensor(path, result)
-    if simulate:
-        recorded_mass_kg = 0.0  # an emulated sensor weighs nothing
     settings = Settings(
         base_frame=base_frame,
         flange_frame=flange_frame,

@@ -5,7 +5,7 @@ import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -25,7 +25,6 @@ from ftdrive.terminal.console import in_whole_words, talk
 from ftdrive.terminal.operators import JsonOperator, PlainOperator
 from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
 
-_EMULATED_SENSOR_KG = 0.25
 _PATH = click.Path(exists=True, path_type=Path)
 
 
@@ -109,4 +108,4 @@ def _emulated_cell(of: CalibrationResult | Receipt, sensor: str | None) -> Itera
     made_by = (of.provenance.get("station") if isinstance(of, CalibrationResult) else None) or {}
     name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
     with Station(name, made_by.get("options", ())) as station:
-        yield replace(station.cell, sensor=replace(station.cell.sensor, mass_kg=_EMULATED_SENSOR_KG))
+        yield station.cell

@@ -56,12 +56,14 @@ def test_text_goes_to_stdout_and_notes_to_stderr(saved: Path) -> None:
     assert "gravity_in_reference_frame = [0, 0, -9.80665]" in " ".join(outcome.stderr.split())
 
 
-def test_an_emulated_sensor_weighs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = Run.create(tmp_path, "simulated", {"config": {"sensor": {"url": "x", "height_mm": 0.0}}}).folder
+def test_the_mass_of_an_emulated_sensor_is_that_of_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Run.create(
+        tmp_path, "simulated", {"config": {"sensor": {"url": "x", "height_mm": 0.0, "mass_kg": 0.25}}}
+    ).folder
     calibration().save(folder / "calibration.json")
     monkeypatch.setattr(emulated_run, "rehearsed_run", lambda _: nullcontext(folder))
     outcome = export("calibration", "--simulate", "--format", "franka")
-    assert yaml.safe_load(outcome.stdout)["mass"] == pytest.approx(2.0)
+    assert yaml.safe_load(outcome.stdout)["mass"] == pytest.approx(2.25)
 
 
 def test_json_has_text_notes_and_what_is_set_elsewhere(saved: Path) -> None:
