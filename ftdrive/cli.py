@@ -22,6 +22,7 @@ _COMMANDS = {
     "doctor": ("ftdrive.commands.doctor", "Check robot, sensor and computer. Moves nothing."),
     "devices": ("ftdrive.commands.devices", "List serial ports and CAN interfaces."),
     "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
+    "report": ("ftdrive.commands.report", "Report a calibration in one file: verdict, reasons, figures."),
     "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
     "record": ("ftdrive.commands.record", "Record raw and compensated wrench with pose and events."),
     "convert": ("ftdrive.commands.convert", "Convert a recording between MCAP, CSV and Parquet."),

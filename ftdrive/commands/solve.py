@@ -2,21 +2,20 @@
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from textwrap import fill
-from typing import Any, Literal
+from typing import Any
 
 import click
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, Known, read_csv
+from calib import CalibrationDataset, CalibrationResult, Known
 from calib import solve as solve_dataset
 from calib.compare import compare
 from calib.errors import CalibError
 from calib.likelihood.session import Drift
-from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE
+from calib.model import UP_IN_BASE
 from calib.result import Method
 from calib.routine import drift_check
 from ftdrive.cli import exit_code
@@ -33,13 +32,11 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.runs.outcome import dataset_of
 from ftdrive.runs.pose_hints import hints
-from ftdrive.runs.run import Run, versions
+from ftdrive.runs.run import Run
+from ftdrive.runs.source import Orientation, read_source
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.report import print_comparison, print_result
-
-Orientation = Literal["R_base_flange", "R_flange_base"]
 
 _METHODS = (
     *("ml", "srom", "lrom", "carlson-relaxation", "carlson-cayley", "carlson-eigen", "carlson-nullspace"),
@@ -106,7 +103,7 @@ def solve(
         raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
     if output is not None and (len(sources) > 1 or method == "all"):
         raise ConfigError("--output takes one result: give one dataset and one method")
-    options = {"drift": drift, "known": _known(mass_kg, level_deg, mounting_deg)}
+    options = {"drift": drift, "known": known_values(mass_kg, level_deg, mounting_deg)}
     with rehearsed_run(sensor) if simulate else nullcontext() as run:
         _solve_each(sources if run is None else [run], method, orientation, options, output, force, as_json)
 
@@ -123,12 +120,9 @@ def _solve_each(
     first_failure: CalibError | NotAccepted | None = None
     for source in sources:
         try:
-            dataset, circumstances, provenance = _read(source, orientation)
+            dataset, circumstances, provenance = read_source(source, orientation, options["known"])
             payload_kg = circumstances.pop("payload_kg", None)
-            known = options["known"]
-            if known is not None and known.gravity_direction_base is not None:  # level with respect to the mounting
-                known = replace(known, gravity_direction_base=-circumstances["up_in_base"])
-            here = {**options, **circumstances, "known": known}
+            here = {**options, **circumstances}
             if method == "all":
                 _show_all(source, dataset, here, as_json)
                 continue
@@ -155,15 +149,6 @@ def _solve_each(
         raise SystemExit(exit_code(first_failure))
 
 
-def _read(source: Path, orientation: Orientation) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
-    if source.is_dir():
-        run = Run(source)
-        return dataset_of(run, run.records())
-    dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
-    circumstances = {"g_m_s2": STANDARD_GRAVITY_M_S2, "up_in_base": UP_IN_BASE}
-    return dataset, circumstances, {"source": source.name, "versions": versions()}
-
-
 def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) -> CalibrationResult:
     chosen: Method = method
     try:
@@ -180,7 +165,8 @@ def _show_all(source: Path, dataset: CalibrationDataset, options: dict[str, Any]
         print_comparison(compared)
 
 
-def _known(mass_kg: float | None, level_deg: float | None, mounting_deg: str | None) -> Known | None:
+def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: str | None) -> Known | None:
+    """Return the known values of the options in degrees; None without any. Raises `ConfigError`."""
     if mass_kg is None and level_deg is None and mounting_deg is None:
         return None
     R_flange_sensor = None

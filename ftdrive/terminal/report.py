@@ -83,15 +83,13 @@ def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
     for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
         if truth is not None or title not in {"truth", "error / sigma"}:
             table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may be folded
-    for label, scale, unit, key in _ROWS:
+    for label, scale, unit, key in QUANTITIES:
         if key in _DERIVED and not talk.verbose:
             continue
-        estimates, sigmas = (_values(source[key], key) * scale for source in (data, data["sigma"]))
-        truths = None if truth is None else _values(truth[key], key) * scale
+        estimates, sigmas = (values_of(source[key], key) * scale for source in (data, data["sigma"]))
+        truths = None if truth is None else values_of(truth[key], key) * scale
         fixed = sigmas <= fixed_below * scale
-        least = sigmas[~fixed].min(initial=np.inf)
-        # two digits of the smallest sigma
-        digits = 4 if fixed.all() else int(np.clip(1 - np.floor(np.log10(max(least, 1e-9))), 0, 7))
+        digits = 4 if fixed.all() else decimals(sigmas[~fixed].min())
         for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
             spread = "fixed" if fixed[i] else f"{sigmas[i]:.{digits}f}"
             known = [] if truths is None else [f"{truths[i]:.{digits}f}"]
@@ -99,6 +97,11 @@ def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
             name = f"{label} {axis}".strip() + f", {unit}"
             table.add_row(name, *known, f"{estimates[i]:.{digits}f}", spread, *error)
     return table
+
+
+def decimals(sigma: float) -> int:
+    """Return how many decimals show two digits of a sigma, at most 7."""
+    return int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 7))
 
 
 def _error_style(error_sigma: float) -> str:
@@ -161,8 +164,7 @@ def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str 
     )
 
 
-# Label, factor from the file's unit to the screen's, unit on the screen, key.
-_ROWS: Sequence[tuple[str, float, str, str]] = (
+QUANTITIES: Sequence[tuple[str, float, str, str]] = (
     ("mass", 1.0, "kg", "mass_kg"),
     ("centre of mass", 1e3, "mm", "p_sensor_com_m"),
     ("force bias", 1.0, "N", "force_bias_N"),
@@ -172,9 +174,11 @@ _ROWS: Sequence[tuple[str, float, str, str]] = (
     ("base tilt alpha", 180 / np.pi, "deg", "tilt_alpha_rad"),
     ("base tilt beta", 180 / np.pi, "deg", "tilt_beta_rad"),
 )
+"""Label, factor from the unit of the file to that of the screen, unit on the screen, key in the file."""
 
 
-def _values(value: Any, key: str) -> Array:
+def values_of(value: Any, key: str) -> Array:
+    """Return a quantity or its sigma as numbers; a mounting as its rotation vector, rad."""
     values = np.asarray(value, dtype=np.float64)
     if key == "R_flange_sensor" and values.ndim == 2:  # shown as a rotation vector
         values = Rotation.from_matrix(values).as_rotvec()
@@ -189,7 +193,7 @@ def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict
     """
     data = result.to_dict()
     errors = {}
-    for _, _, _, key in _ROWS:
+    for _, _, _, key in QUANTITIES:
         if key == "R_flange_sensor":
             error = Rotation.from_matrix(result.R_flange_sensor @ np.transpose(truth[key])).as_rotvec()
         else:

@@ -1,0 +1,110 @@
+"""`ftdrive report`: one file that says whether a calibration is good, and why."""
+
+import shlex
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Literal
+
+import click
+
+from calib.files import require_new, write_new
+from calib.likelihood.session import Drift
+from calib.result import Method
+from ftdrive.commands.common import (
+    EMULATED_SENSOR,
+    JSON,
+    NewFile,
+    check_simulate,
+    simulate,
+    write_json,
+)
+from ftdrive.commands.emulated_run import rehearsed_run
+from ftdrive.commands.solve import known_values
+from ftdrive.commands.solve import solve as solve_command
+from ftdrive.errors import ConfigError
+from ftdrive.report.facts import facts_of
+from ftdrive.report.report import Format
+from ftdrive.report.report import report as written
+from ftdrive.report.subject import SolveOptions, read_subject
+from ftdrive.runs.source import Orientation
+from ftdrive.terminal.console import hanging, talk
+
+_SOLVING = ("method", "orientation", "drift", "mass_kg", "level_deg", "mounting_deg")
+DEFAULT = Path("report.html")
+
+
+@click.command(params=[one for one in solve_command.params if one.name in _SOLVING])
+@click.argument("source", required=False, type=click.Path(exists=True, path_type=Path))
+@click.option("-o", "--output", type=NewFile(), help=f"New file. [default: {DEFAULT}; stdout for md and json]")
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["html", "md", "json"]),
+    default="html",
+    show_default=True,
+    help="A page (needs ftdrive[report]), Markdown, or the facts as JSON.",
+)
+@click.option(
+    "--parent",
+    metavar="RESULT",
+    type=click.Path(exists=True, path_type=Path),
+    help="Compare with this calibration.json or run folder. Default: the parent that the result names.",
+)
+@simulate("Report a short run of an emulated cell.")
+@EMULATED_SENSOR
+@JSON
+def report(
+    source: Path | None,
+    output: Path | None,
+    form: Format,
+    parent: Path | None,
+    method: Method | Literal["all"],
+    orientation: Orientation,
+    drift: Drift,
+    mass_kg: float | None,
+    level_deg: float | None,
+    mounting_deg: str | None,
+    simulate: bool,
+    sensor: str | None,
+    as_json: bool,
+) -> None:
+    """Report SOURCE: a calibration.json, a run folder, a dataset.json or a CSV file, as `ftdrive solve` takes them.
+
+    The report has verdict, reasons, next step, uncertainty, cross-validation, residuals, drift, noise, coverage,
+    settings and provenance. An unsolved source is solved with the options of `ftdrive solve`. Rejected results are
+    reported too, with exit code 0.
+    """
+    check_simulate(simulate, real={"SOURCE": source}, emulated={"--sensor": sensor})
+    if source is None and not simulate:
+        raise ConfigError("nothing to report: give a calibration.json, a run folder or a CSV file, or --simulate")
+    if output is None and form == "html":
+        try:
+            require_new(output := DEFAULT)
+        except OSError as error:
+            raise ConfigError(f"{error} with --output") from error
+    if method == "all":
+        raise ConfigError("--method all is no method: a report of one method compares all of them")
+    options = SolveOptions(
+        method, orientation, drift, known_values(mass_kg, level_deg, mounting_deg), _typed(click.get_current_context())
+    )
+    with nullcontext(source) if source is not None else rehearsed_run(sensor) as found:
+        facts = facts_of(read_subject(found, options, parent))
+    text = written(facts, form)
+    if output is not None:
+        write_new(output, text)
+        talk.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}"))
+        talk.print(f" Saved {output}")
+    if as_json:
+        write_json({**facts, "file": None if output is None else str(output)})
+    elif output is None:
+        click.echo(text, nl=False)
+
+
+def _typed(context: click.Context) -> tuple[str, ...]:
+    """Return the options of solve that differ from their defaults, as words for a shell."""
+    return tuple(
+        word
+        for one in context.command.params
+        if one.name in _SOLVING and context.params[one.name] != one.default
+        for word in (one.opts[0], shlex.quote(str(context.params[one.name])))
+    )
