@@ -16,7 +16,7 @@ SENSOR_KG: Final = 0.3
 LEAN_DEG: Final = 0.2
 """About the accuracy of an arm's own orientation."""
 _SIGNIFICANT: Final = 4.0
-_OTHER_MOUNTING_DEG: Final = 10.0
+OTHER_MOUNTING_DEG: Final = 10.0
 """A larger angle is another mounting, not a lean."""
 _ALIGNED: Final = np.sin(np.radians(22.5))
 
@@ -25,7 +25,7 @@ def mismatches(result: CalibrationResult) -> tuple[str, ...]:
     """Return the differences from the `setup` in the result's provenance, in words; none for a rejected result.
 
     The setup has `payload_kg` as the controller reports it, `sensor_mass_kg` and `mounting` as configured; null where
-    unknown.
+    unknown. Words that are reasons of the verdict already are left out.
     """
     setup: Any = result.provenance.get("setup")
     if setup is None or result.verdict == "rejected":
@@ -35,7 +35,7 @@ def mismatches(result: CalibrationResult) -> tuple[str, ...]:
         words.append(payload_in_words(setup["payload_kg"], result.mass_kg, setup["sensor_mass_kg"]))
     if setup["mounting"] is not None:
         words.append(lean_in_words(result.gravity_force_base_N, result.covariance[3:6, 3:6], setup["mounting"]))
-    return tuple(one for one in words if one)
+    return tuple(one for one in words if one and one not in result.reasons)
 
 
 def payload_in_words(payload_kg: float, weighed_kg: float, sensor_kg: float | None) -> str:
@@ -81,19 +81,16 @@ def lean_in_words(gravity_force_base_N: Array, covariance: Array, mounting: str)
     mounting : str
         As in [workcell]; assumed to be set in the controller too.
     """
-    down = down_of(mounting)
-    along_N = float(gravity_force_base_N @ down)
-    aside_N = gravity_force_base_N - along_N * down
-    size_N = float(np.linalg.norm(aside_N))
-    lean_deg = float(np.degrees(np.arctan2(size_N, along_N)))
+    along_N, aside_N = _along_and_aside(gravity_force_base_N, mounting)
+    lean_deg = lean_of_gravity_deg(gravity_force_base_N, mounting)
     name = mounting if mounting.isalpha() else f"{float(mounting):g}°"
     mounted = f"[workcell] mounting ({name})"
-    if lean_deg > _OTHER_MOUNTING_DEG:
+    if lean_deg > OTHER_MOUNTING_DEG:
         return (
             f"gravity is {lean_deg:.0f}° off the direction of {mounted}: correct the mounting, here and in PolyScope; "
             "near 180°, check the sensor's sign first"
         )
-    low = aside_N / max(size_N, 1e-12)
+    low = aside_N / max(float(np.linalg.norm(aside_N)), 1e-12)
     sigma_deg = float(np.degrees(np.sqrt(low @ covariance @ low) / along_N))
     if lean_deg < max(LEAN_DEG, _SIGNIFICANT * sigma_deg):
         return ""
@@ -102,6 +99,18 @@ def lean_in_words(gravity_force_base_N: Array, covariance: Array, mounting: str)
         f"the base leans {lean_deg:.2f}° (sigma {sigma_deg:.2f}°) towards its {side}, compared with {mounted} and "
         "assuming PolyScope has the same mounting: level the base, or set its mounting in PolyScope"
     )
+
+
+def lean_of_gravity_deg(gravity_force_base_N: Array, mounting: str) -> float:
+    """Return the angle between gravity (3,) and its direction for a mounting."""
+    along_N, aside_N = _along_and_aside(gravity_force_base_N, mounting)
+    return float(np.degrees(np.arctan2(np.linalg.norm(aside_N), along_N)))
+
+
+def _along_and_aside(gravity_force_base_N: Array, mounting: str) -> tuple[float, Array]:
+    down = down_of(mounting)
+    along_N = float(gravity_force_base_N @ down)
+    return along_N, gravity_force_base_N - along_N * down
 
 
 def axes_along(direction: Array) -> list[str]:
