@@ -17,6 +17,10 @@ class BadRecording(Exception):
     """A file does not contain a recording that this version can read."""
 
 
+class BadBundle(Exception):
+    """A file is not a bundle that this version can read."""
+
+
 class RecordingHasGaps(Exception):
     """Samples are missing in a recording that is otherwise complete."""
 
