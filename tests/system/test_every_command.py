@@ -44,10 +44,11 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
 OFFLINE = ("convert", "compensate")
 """They read files and know no cell."""
 
-REHEARSED = ("replay", "solve")
+REHEARSED = ("bundle", "replay", "solve")
 """They calibrate an emulated cell first, as do live, and demo, which is run and looked at in test_demo.py."""
 
 SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
+    "bundle": lambda answer: answer["file"].endswith(".zip") and not answer["left_out"],
     "calibrate": lambda answer: answer["verdict"] != "rejected",
     "config show": lambda answer: (
         answer["config"]["robot"]["model"] == "UR5e" and answer["config"]["workcell"]["measured"]
@@ -192,7 +193,7 @@ def test_the_sensor_that_is_named_is_emulated(
         (("doctor", "--simulate", "--robot", "10.0.0.2"), "--robot does not go with --simulate"),
         (("solve", "--simulate", "."), "DATASET does not go with --simulate"),
         (("solve", "--sensor", "emulated://bota", "."), "--sensor goes only with --simulate"),
-        *(((command,), "--simulate") for command in ("solve", "replay", "live")),
+        *(((command,), "--simulate") for command in ("solve", "replay", "bundle", "live")),
         (("record", "-o", "a.csv"), "--simulate"),
         (("transcript", "play"), "--simulate"),
         (("export", "plan", "--format", "csv"), "--simulate"),
