@@ -480,7 +480,10 @@ def check_calibration(result: CalibrationResult, connected: Mapping[str, DeviceI
     belongs = belonging(result, connected)
     if belongs.others:
         return Check(name, "failed", "; ".join(belongs.others), "ftdrive calibrate")
-    made = f"verdict {result.verdict}, made at {result.provenance.get('created_utc', 'an unknown time')}"
+    created = result.provenance.get("created_utc")
+    made = f"verdict {result.verdict}, made at an unknown time"
+    if isinstance(created, str):
+        made = f"verdict {result.verdict}, made on {created[:10]} at {created[11:16]} UTC"
     if belongs.unknown:
         fix = "add serial=… (from its label) to the sensor's address, and calibrate with it once"
         return Check(name, "warning", f"{made}; {'; '.join(belongs.unknown)}", fix)

@@ -3,9 +3,10 @@
 import shlex
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import get_args
 
 import click
+from click.core import ParameterSource
 
 from calib.files import require_new, write_new
 from calib.likelihood.session import Drift
@@ -30,11 +31,19 @@ from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.source import Orientation
 from ftdrive.terminal.console import hanging, talk
 
-_SOLVING = ("method", "orientation", "drift", "mass_kg", "level_deg", "mounting_deg")
+_SHARED = ("orientation", "drift", "mass_kg", "level_deg", "mounting_deg")
 DEFAULT = Path("report.html")
 
 
-@click.command(params=[one for one in solve_command.params if one.name in _SOLVING])
+@click.command(params=[one for one in solve_command.params if one.name in _SHARED])
+@click.option(
+    "--method",
+    metavar="METHOD",
+    type=click.Choice(get_args(Method)),
+    default="ml",
+    show_default=True,
+    help="As of `ftdrive solve`; the report compares the others with it.",
+)
 @click.argument("source", required=False, type=click.Path(exists=True, path_type=Path))
 @click.option("-o", "--output", type=NewFile(), help=f"New file. [default: {DEFAULT}; stdout for md and json]")
 @click.option(
@@ -59,7 +68,7 @@ def report(
     output: Path | None,
     form: Format,
     parent: Path | None,
-    method: Method | Literal["all"],
+    method: Method,
     orientation: Orientation,
     drift: Drift,
     mass_kg: float | None,
@@ -83,8 +92,6 @@ def report(
             require_new(output := DEFAULT)
         except OSError as error:
             raise ConfigError(f"{error} with --output") from error
-    if method == "all":
-        raise ConfigError("--method all is no method: a report of one method compares all of them")
     options = SolveOptions(
         method, orientation, drift, known_values(mass_kg, level_deg, mounting_deg), _typed(click.get_current_context())
     )
@@ -105,10 +112,10 @@ def report(
 
 
 def _typed(context: click.Context) -> tuple[str, ...]:
-    """Return the options of solve that differ from their defaults, as words for a shell."""
+    """Return the options of solve that were given, as words for a shell."""
     return tuple(
         word
         for one in context.command.params
-        if one.name in _SOLVING and context.params[one.name] != one.default
+        if one.name in ("method", *_SHARED) and context.get_parameter_source(one.name) is not ParameterSource.DEFAULT
         for word in (one.opts[0], shlex.quote(str(context.params[one.name])))
     )

@@ -10,7 +10,7 @@ from calib.model import PARAMETER_NAMES, Array
 
 GROUPS = (
     ("mounting of the sensor", slice(0, 3)),
-    ("weight and its direction in base", slice(3, 6)),
+    ("weight in base", slice(3, 6)),
     ("force bias", slice(6, 9)),
     ("centre of mass", slice(9, 12)),
     ("torque bias", slice(12, 15)),

@@ -14,6 +14,11 @@ class Table:
     folded: bool = False
     """A long one, which a page shows on request."""
 
+    @property
+    def narrow(self) -> bool:
+        """Whether it fits beside a figure."""
+        return 2 < len(self.columns) <= 4
+
 
 @dataclass(frozen=True, slots=True)
 class Figure:

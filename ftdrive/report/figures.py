@@ -14,7 +14,9 @@ import numpy as np
 
 from calib.model import Array
 from ftdrive.errors import ConfigError
-from ftdrive.report.sections import SUSPICIOUS_SIGMAS, label_of, shown_poses
+from ftdrive.report.fit_sections import SUSPICIOUS_SIGMAS
+from ftdrive.report.origin_sections import LIMIT_SIGMAS
+from ftdrive.report.words import label_of, shown_poses
 
 Facts = Mapping[str, Any]
 
@@ -30,8 +32,14 @@ VARIABLES = {
 """Colour that stands for each variable of the page."""
 WIDTH_IN = 5.0
 """Of every figure: on a phone its letters keep their size, on a desk two stand side by side."""
+LONG_S = 200
+"""Longer times are shown in minutes."""
+MOST_DOTS = 400
+"""Of many poses every second, third, … is drawn, because each dot has its size in the file."""
+INVISIBLE = 0.02
+"""Weaker correlations are not drawn."""
 _MARKERS = "osD"
-_STYLE = {
+_STYLE: Mapping[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "ftdrive",
     "font.family": "sans-serif",
@@ -69,7 +77,7 @@ def draw(name: str, facts: Facts) -> str:
         raise ConfigError("figures need matplotlib: pip install 'ftdrive[report]'") from None
     height, fill = _FIGURES[name]
     size_in = WIDTH_IN, height(facts) if callable(height) else height
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(dict(_STYLE)):
         figure = Figure(figsize=size_in, layout="constrained")
         fill(figure, facts)
         written = StringIO()
@@ -90,13 +98,15 @@ def inlined(svg: str, name: str) -> str:
 
 
 def _map(figure: Any, facts: Facts, kind: str, unit: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     found = facts["error_map"]
     elevation, azimuth = (np.radians(found[name]) for name in ("elevation_deg", "azimuth_deg"))
     axes = figure.add_subplot()
     error = np.array(found[kind]["map"])
     scale = 1e3
     x, y = _hammer(*np.meshgrid(elevation, azimuth, indexing="ij"))
-    levels = np.linspace(0, scale * error.max() * 1.001 or 1.0, 13)
+    levels = MaxNLocator(12).tick_values(0, scale * error.max() or 1.0)
     filled = axes.contourf(x, y, scale * error, levels=levels, cmap="viridis", antialiased=False)
     filled.set_edgecolor("face")
     with _globe(axes):
@@ -105,7 +115,7 @@ def _map(figure: Any, facts: Facts, kind: str, unit: str) -> None:
         _dots(axes, [found[kind]["worst_direction"]], color="white", edgecolor="black", marker="X", s=90)
     bar = figure.colorbar(filled, ax=axes, orientation="horizontal", shrink=0.8, aspect=30, format="{x:.3g}")
     bar.outline.set_visible(False)
-    bar.set_ticks(levels[::3])
+    bar.set_ticks(levels[::2])
     bar.set_label(f"predicted {kind.partition('_')[0]} error, {unit}, 1 sigma")
 
 
@@ -128,6 +138,7 @@ def _globe(axes: Any) -> Iterator[None]:
     """Draw outline and graticule of a map, before and after what is on it, and name the axes."""
     axes.set_aspect("equal")
     axes.axis("off")
+    axes.set(xlim=(-2.95, 2.95), ylim=(-1.75, 1.75))
     quarter, half = np.linspace(-np.pi / 2, np.pi / 2, 61), np.linspace(-np.pi, np.pi, 121)
     for azimuth in np.radians([-180, -90, 0, 90, 180]):
         axes.plot(*_hammer(quarter, np.full_like(quarter, azimuth)), color=INK, linewidth=0.5, alpha=0.6)
@@ -136,9 +147,10 @@ def _globe(axes: Any) -> Iterator[None]:
     yield
     box = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "edgecolor": "none"}
     for name, elevation, azimuth in (("+x", 0, 0), ("+y", 0, 90), ("-y", 0, -90), ("-x", 0, 180), ("-x", 0, -180)):
-        axes.text(*_hammer(*np.radians([elevation, azimuth])), name, ha="center", va="center", fontsize=8, bbox=box)
-    axes.text(0, np.sqrt(2) + 0.05, "+z", ha="center", va="bottom", fontsize=8)
-    axes.text(0, -np.sqrt(2) - 0.05, "-z", ha="center", va="top", fontsize=8)
+        x, y = _hammer(*np.radians([elevation, azimuth]))
+        axes.text(x, y - 0.2, name, ha="center", va="center", fontsize=8, bbox=box)  # below a pose that points there
+    axes.text(0, np.sqrt(2) + 0.08, "+z", ha="center", va="bottom", fontsize=8)
+    axes.text(0, -np.sqrt(2) - 0.08, "-z", ha="center", va="top", fontsize=8)
 
 
 def _hammer(elevation: Any, azimuth: Any) -> tuple[Array, Array]:
@@ -154,7 +166,8 @@ def _on_map(directions: Any) -> tuple[Array, Array]:
 
 
 def _dots(axes: Any, directions: Any, **style: Any) -> None:
-    axes.scatter(*_on_map(directions), linewidth=0.8, zorder=3, clip_on=False, **style)
+    step = -(-len(directions) // MOST_DOTS)
+    axes.scatter(*_on_map(directions[::step]), linewidth=0.8, zorder=3, clip_on=False, **style)
 
 
 def _correlation(figure: Any, facts: Facts) -> None:
@@ -163,7 +176,7 @@ def _correlation(figure: Any, facts: Facts) -> None:
     n = len(matrix)
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
-    for i, j in np.ndindex(n, n):
+    for i, j in np.argwhere(matrix > INVISIBLE):
         # the strength is opacity, so that 0 is the page itself
         axes.fill([j, j + 1, j + 1, j], [i, i, i + 1, i + 1], color=SERIES[0], alpha=float(matrix[i, j]), linewidth=0)
     for edge in range(0, n + 1, 3):
@@ -212,7 +225,9 @@ def _pose_residuals(figure: Any, facts: Facts) -> None:
 def _time_residuals(figure: Any, facts: Facts) -> None:
     poses = shown_poses(facts["poses"])
     timed = all(pose["t_s"] is not None for pose in poses)
-    at = np.array([pose["t_s"] / 60 if timed else pose["row"] for pose in poses], dtype=float)
+    at = np.array([pose["t_s"] if timed else pose["row"] for pose in poses], dtype=float)
+    long = timed and np.ptp(at) > LONG_S
+    at = at / 60 if long else at
     order = np.argsort(at, kind="stable")
     residual = np.array([pose["residual"] for pose in poses])[order]
     both = figure.subplots(2, 1, sharex=True)
@@ -230,7 +245,10 @@ def _time_residuals(figure: Any, facts: Facts) -> None:
             )
         axes.set_ylabel(label)
         axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), borderaxespad=0.1)
-    axes.set_xlabel("time since the first pose, min" if timed else "pose, in the order of the rows")
+    unit = "min" if long else "s"
+    if not timed:
+        axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.set_xlabel(f"time since the first pose, {unit}" if timed else "pose, in the order of the rows")
 
 
 def _noise(figure: Any, facts: Facts) -> None:
@@ -241,6 +259,7 @@ def _noise(figure: Any, facts: Facts) -> None:
         values = scale * np.array(facts["noise"][key])[rows]
         axes.bar(np.arange(len(rows)), values, color=SERIES[0])
         axes.axhline(float(np.median(values)), color=INK, linewidth=1, linestyle="--")
+        axes.grid(visible=False, axis="x")
         axes.set_ylabel(label)
     _name_poses(axes, [facts["poses"][row] for row in rows])
 
@@ -257,10 +276,15 @@ def _comparison(figure: Any, facts: Facts) -> None:
     values = [one["sigmas"] or 0.0 for one in found]
     axes.barh([label_of(one["name"]) for one in found], values, color=SERIES[0], height=0.6)
     axes.axvline(0, color=INK, linewidth=1)
-    for limit in (-3, 3):
+    for limit in (-LIMIT_SIGMAS, LIMIT_SIGMAS):
         axes.axvline(limit, color=INK, linewidth=1, linestyle="--")
-    most = max(4.0, 1.1 * max(map(abs, values)))
+    most = max(10.0, 1.2 * max(map(abs, values)))
+    axes.set_xscale("symlog", linthresh=LIMIT_SIGMAS)
     axes.set_xlim(-most, most)
+    ticks = LIMIT_SIGMAS * 10.0 ** np.arange(0, math.log10(most / LIMIT_SIGMAS), max(1, math.log10(most) // 2))
+    axes.set_xticks([*-ticks, 0, *ticks])
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.minorticks_off()
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
     axes.set_xlabel("difference, sigma")

@@ -14,8 +14,8 @@ def markdown(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
 
 def _lines(facts: Mapping[str, Any], sections: Sequence[Section]) -> Iterator[str]:
     yield f"# Calibration {facts['id']}: {facts['verdict'].upper()}\n"
-    yield f"{_escaped(facts['error']['words'])}\n"
-    yield from (f"* {_escaped(one)}" for one in [*facts["reasons"], *facts["hints"]])
+    yield f"Compensation error {_escaped(facts['error']['words'])}.\n"
+    yield from (f"* {_escaped(one[:1].upper() + one[1:])}" for one in [*facts["reasons"], *facts["hints"]])
     yield f"\n**Next:** {_escaped(facts['next_step'])}\n"
     for section in sections:
         yield f"## {section.title}\n"
@@ -28,7 +28,8 @@ def _table(table: Table) -> Iterator[str]:
     if table.caption:
         yield f"{_escaped(table.caption)}:\n"
     yield _row(table.columns)
-    yield _row(["---", *["---:"] * (len(table.columns) - 1)], escape=False)
+    numbers = "---:" if len(table.columns) > 2 else "---"
+    yield _row(["---", *[numbers] * (len(table.columns) - 1)], escape=False)
     yield from map(_row, table.rows)
     yield ""
 

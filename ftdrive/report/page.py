@@ -19,8 +19,8 @@ def page(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
         raise ConfigError("a report in HTML needs jinja2: pip install 'ftdrive[report]', or --format md") from None
 
     def sentence(text: str) -> Markup:
-        """Escape a sentence, and set what stands between backticks as code."""
-        return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))
+        """Escape a sentence, start it with a capital, and set what stands between backticks as code."""
+        return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text[:1].upper() + text[1:]))))
 
     environment = Environment(
         loader=PackageLoader("ftdrive.report"),

@@ -76,10 +76,13 @@ def read_subject(source: Path, options: SolveOptions, parent: Path | None = None
 
 
 def is_calibration(source: Path) -> bool:
-    """Check whether a file says that it is a calibration."""
+    """Check whether a file says that it is a calibration; False if it is no JSON, which reading it as data reports."""
     if source.is_dir() or source.suffix != ".json":
         return False
-    return str(read_object(source, BadCalibration).get("format", "")).startswith("ftdrive.calibration/")
+    try:
+        return str(read_object(source, BadCalibration).get("format", "")).startswith("ftdrive.calibration/")
+    except BadCalibration:
+        return False
 
 
 def _of_result(source: Path, result: CalibrationResult) -> Subject:

@@ -3,79 +3,122 @@
     uv run ftdrive report RUN -o report.html
     uv run python tests/benchmarks/report_pictures.py report.html --out pictures
 
-Prints a line per picture. The exit code is 1 if the browser writes anything to its console or the page is wider than
-the screen. Needs the command `chromium`.
+Prints a line per picture. The exit code is 1 if the browser reports a message of the console, a request to anything but
+the page, or a page wider than its window. Needs the command `chromium`.
 """
 
-import re
+import base64
+import json
 import subprocess
 import sys
+import time
 from argparse import ArgumentParser
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
+from urllib.request import urlopen
+
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 
 WIDTHS_PX = (1200, 400)
-SCHEMES = {"dark": 0, "light": 1}
-"""As Chromium numbers `prefers-color-scheme`."""
+SCHEMES = ("light", "dark")
 OPTIONS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run", "--disable-sync"),
-    *("--disable-quic", "--disable-background-networking", "--disable-component-update", "--enable-logging=stderr"),
+    *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync", "--disable-quic"),
+    *("--disable-background-networking", "--disable-component-update", "--remote-debugging-port=0"),
 )
-MEASURE = """<script>addEventListener("load", () => {
-  const page = document.documentElement;
-  document.title = `size ${page.scrollWidth} ${page.scrollHeight}`;
-})</script>"""
+LONGEST_S = 30
 
 
-def chromium(page: Path, *options: str) -> tuple[str, list[str]]:
-    """Load a page; return what the browser prints and the lines of its console."""
-    with TemporaryDirectory() as profile:
-        command = ["chromium", *OPTIONS, f"--user-data-dir={profile}", *options, page.absolute().as_uri()]
-        ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    return ended.stdout, [line for line in ended.stderr.splitlines() if ":CONSOLE:" in line or "CONSOLE(" in line]
+class Browser:
+    """One tab of Chromium, by its debugging protocol; events other than answers are kept."""
+
+    def __init__(self, socket: Connection) -> None:
+        self._socket = socket
+        self._sent = 0
+        self.events: list[dict[str, Any]] = []
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Send a command and return its result."""
+        self._sent += 1
+        self._socket.send(json.dumps({"id": self._sent, "method": method, "params": parameters}))
+        while (message := self._receive()).get("id") != self._sent:
+            self.events.append(message)
+        if "error" in message:
+            raise RuntimeError(f"{method}: {message['error']['message']}")
+        return dict(message["result"])
+
+    def wait_for(self, method: str) -> None:
+        """Return when this event arrives."""
+        while (message := self._receive()).get("method") != method:
+            self.events.append(message)
+
+    def _receive(self) -> dict[str, Any]:
+        return dict(json.loads(self._socket.recv(timeout=LONGEST_S)))
 
 
-def size_px(page: Path, width: int, folder: Path) -> tuple[int, int]:
-    """Return the width and height (px) of the page in a window of this width."""
-    measured = folder / f"measured-{width}.html"
-    measured.write_text(page.read_text(encoding="utf-8").replace("</body>", f"{MEASURE}</body>"), encoding="utf-8")
-    printed, _ = chromium(measured, f"--window-size={width},1000", "--dump-dom")
-    found = re.search(r"<title>size (\d+) (\d+)</title>", printed)
-    if found is None:
-        sys.exit(f"chromium did not load {page}")
-    return int(found[1]), int(found[2])
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """Start Chromium with a profile of its own and connect to its tab."""
+    with TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        command = ["chromium", *OPTIONS, f"--user-data-dir={profile}", "about:blank"]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            port_file = Path(profile) / "DevToolsActivePort"
+            for _ in range(10 * LONGEST_S):
+                if port_file.exists() and port_file.read_text():
+                    break
+                time.sleep(0.1)
+            port = port_file.read_text().split()[0]
+            with urlopen(f"http://127.0.0.1:{port}/json") as answer:
+                tab = next(one for one in json.load(answer) if one["type"] == "page")
+            with connect(tab["webSocketDebuggerUrl"], max_size=None) as socket:
+                yield Browser(socket)
+        finally:
+            process.terminate()
+            process.wait()
 
 
-def pictures(page: Path, out: Path) -> Iterator[str]:
-    """Write the pictures; yield each fault."""
-    out.mkdir(exist_ok=True)
-    with TemporaryDirectory() as folder:
-        sizes = {width: size_px(page, width, Path(folder)) for width in WIDTHS_PX}
-    for width, (scheme, number) in product(WIDTHS_PX, SCHEMES.items()):
-        needed, height = sizes[width]
+def pictures(browser: Browser, page: Path, out: Path) -> Iterator[str]:
+    """Write the pictures of a page; yield each fault."""
+    for domain in ("Page", "Runtime", "Log", "Network"):
+        browser.call(f"{domain}.enable")
+    for width, scheme in product(WIDTHS_PX, SCHEMES):
+        browser.events.clear()
+        metrics = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+        browser.call("Emulation.setDeviceMetricsOverride", **metrics)
+        browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        browser.call("Page.navigate", url=page.absolute().as_uri())
+        browser.wait_for("Page.loadEventFired")
+        size = browser.call("Page.getLayoutMetrics")["cssContentSize"]
+        browser.call("Emulation.setDeviceMetricsOverride", **(metrics | {"height": int(size["height"])}))
         picture = out / f"{page.stem}-{scheme}-{width}.png"
-        _, console = chromium(
-            page,
-            f"--blink-settings=preferredColorScheme={number}",
-            f"--window-size={width},{height}",
-            f"--screenshot={picture.absolute()}",
-        )
-        print(f"{picture}  {width} x {height} px")
-        yield from console
-        if needed > width:
-            yield f"the page is {needed} px wide in a window of {width} px"
+        picture.write_bytes(base64.b64decode(browser.call("Page.captureScreenshot")["data"]))
+        sys.stdout.write(f"{picture}  {width} x {size['height']:.0f} px\n")
+        if size["width"] > width:
+            yield f"{picture}: the page is {size['width']:.0f} px wide"
+        for event in browser.events:
+            said, parameters = event.get("method", ""), event.get("params", {})
+            if said in ("Log.entryAdded", "Runtime.consoleAPICalled", "Runtime.exceptionThrown"):
+                yield f"{picture}: {said} {json.dumps(parameters)[:300]}"
+            url = parameters.get("request", {}).get("url", "") if said == "Network.requestWillBeSent" else ""
+            if not url.startswith(("file:", "data:")) and url:
+                yield f"{picture}: the page requests {url}"
 
 
 def main() -> int:
     """Draw every page of the command line."""
-    parser = ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = ArgumentParser(description="Pictures of reports in headless Chromium.")
     parser.add_argument("pages", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, default=Path("pictures"))
     options = parser.parse_args()
-    faults = [f"{page}: {fault}" for page in options.pages for fault in pictures(page, options.out)]
-    print("\n".join(faults) or "no message in the console, no page too wide")
+    options.out.mkdir(exist_ok=True)
+    with chromium() as browser:
+        faults = [fault for page in options.pages for fault in pictures(browser, page, options.out)]
+    sys.stdout.write("\n".join([*faults, f"{len(faults)} faults"]) + "\n")
     return 1 if faults else 0
 
 

@@ -36,6 +36,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
     "calibrate": ("--minimal", "--yes"),
     "live": ("--once",),
     "export plan": ("--format", "csv"),
+    "report": ("--format", "md"),
     "record": ("--output", "a.csv", "--count", "500"),
     "transcript record": ("--output", "sensor.jsonl", "--duration", "0.5"),
 }
@@ -44,7 +45,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
 OFFLINE = ("convert", "compensate")
 """They read files and know no cell."""
 
-REHEARSED = ("bundle", "replay", "solve")
+REHEARSED = ("bundle", "replay", "report", "solve")
 """They calibrate an emulated cell first, as do live, and demo, which is run and looked at in test_demo.py."""
 
 SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
@@ -61,6 +62,7 @@ SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     "plan": lambda answer: answer["description"]["model"] == "UR5e" and answer["poses"] == 24,
     "record": lambda answer: answer["samples"] == 500,
     "replay": lambda answer: answer["n_poses"] >= 6,
+    "report": lambda answer: answer["result"]["n_poses"] >= 6 and answer["tour"]["emulated"] and answer["file"] is None,
     "solve": lambda answer: answer["n_poses"] >= 6,
     "transcript play": lambda answer: answer["played"]["samples"] > 1000,
     "transcript record": lambda answer: answer["recorded"]["error"] is None,
@@ -193,7 +195,7 @@ def test_the_sensor_that_is_named_is_emulated(
         (("doctor", "--simulate", "--robot", "10.0.0.2"), "--robot does not go with --simulate"),
         (("solve", "--simulate", "."), "DATASET does not go with --simulate"),
         (("solve", "--sensor", "emulated://bota", "."), "--sensor goes only with --simulate"),
-        *(((command,), "--simulate") for command in ("solve", "replay", "bundle", "live")),
+        *(((command,), "--simulate") for command in ("solve", "replay", "report", "bundle", "live")),
         (("record", "-o", "a.csv"), "--simulate"),
         (("transcript", "play"), "--simulate"),
         (("export", "plan", "--format", "csv"), "--simulate"),

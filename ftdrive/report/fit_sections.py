@@ -1,0 +1,286 @@
+"""Sections about the fit: estimates, error, cross-validation, residuals, drift, noise and coverage, from the facts."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from ftdrive.report.document import Figure, Section, Table
+from ftdrive.report.words import in_words, label_of, rounded, shown_poses
+from ftdrive.terminal.report import QUANTITIES, decimals, values_of
+
+Facts = Mapping[str, Any]
+
+SUSPICIOUS_SIGMAS = 1.9
+"""One good pose in 1000 deviates more, in root mean square over the six channels."""
+_ROUNDED = 1e-9
+"""A sigma below this share of the largest one belongs to a known value."""
+_AXES = "xyz"
+
+
+def estimates(facts: Facts) -> Section:
+    """Show the estimates with sigma, their correlations, and gain and cross-talk if found."""
+    result, strong = facts["result"], facts["correlation"]["strong"]
+    pairs = "; ".join(f"{label_of(one)} and {label_of(other)} {value:+.2f}" for one, other, value in strong[:5])
+    text = [
+        f"Method {result['method']}, {result['n_poses']} poses, gravity {result['g_m_s2']:g} m/s². Wrenches are on the "
+        "sensor, in its axes, about its origin. Centre of mass and biases are in sensor axes.",
+        f"Strongest correlations: {pairs}." if pairs else "No two parameters are correlated by more than 0.7.",
+    ]
+    figure = Figure(
+        "correlation",
+        f"Matrix of the correlations of the 15 estimated parameters. {text[1]}",
+        "Correlation of the estimates. Good: faint everywhere beside the diagonal. A strong field means that the poses "
+        "hardly separate two parameters: add other orientations.",
+    )
+    tables = [Table("", ("quantity", "estimate", "± 1 sigma"), list(_estimate_rows(result)))]
+    if result["response"] is not None:
+        columns = ("entry", "value", "± 1 sigma")
+        tables.append(Table("Gain and cross-talk of the sensor", columns, _response(result), folded=True))
+    return Section("estimates", "Estimates", text, [figure], tables)
+
+
+def _estimate_rows(result: Facts) -> Iterator[tuple[str, str, str]]:
+    fixed_below = _ROUNDED * float(np.sqrt(np.diag(result["covariance"]).max()))
+    for label, scale, unit, key in QUANTITIES:
+        values, sigmas = (values_of(source[key], key) * scale for source in (result, result["sigma"]))
+        fixed = sigmas <= fixed_below * scale
+        digits = 4 if fixed.all() else decimals(float(sigmas[~fixed].min()))
+        for axis, value, sigma, known in zip(_AXES, values, sigmas, fixed, strict=False):
+            name = f"{label} {axis}, {unit}" if len(values) > 1 else f"{label}, {unit}"
+            yield name, f"{value:.{digits}f}", "fixed" if known else f"{sigma:.{digits}f}"
+
+
+def _response(result: Facts) -> list[tuple[str, str, str]]:
+    kinds = (("force_gain", 100, "%", "force gain"), ("cross_talk_m", 1e3, "mN·m/N", "cross-talk"))
+    return [
+        (
+            f"{label} {_AXES[i]}{_AXES[j]}, {unit}",
+            f"{scale * result['response'][key][i][j]:.2f}",
+            f"{scale * result['response']['sigma'][key][i][j]:.2f}",
+        )
+        for key, scale, unit, label in kinds
+        for i in range(3)
+        for j in range(i, 3)
+    ]
+
+
+def error(facts: Facts) -> Section:
+    """Show the predicted error over all orientations, and its worst direction."""
+    force, torque = facts["error_map"]["force_N"], facts["error_map"]["torque_Nm"]
+    text = [
+        f"Compensation error of a free tool: {facts['error']['words']}.",
+        f"Worst direction of the tool axis for the force: {force['words']}, {rounded(force['largest'])} N.",
+        f"Worst direction for the torque: {torque['words']}, {rounded(torque['largest'])} N·m.",
+    ]
+    trust = (
+        "The map shows the stated uncertainty only: the cross-validated error above is larger."
+        if "cross-validated" in facts["error"]["words"]
+        else "The measured noise explains the residuals, so the map can be trusted."
+    )
+    figures = [
+        Figure(
+            f"{kind}_map",
+            f"Map of the predicted {kind} error over the directions of the tool axis, "
+            f"{rounded(float(np.min(one['map'])))} to {rounded(one['largest'])} {unit}, largest {one['words']}.",
+            f"Predicted {kind} error (one sigma, worst turn of the tool about its axis) for each direction of the tool "
+            "axis (flange z) in base. Dots: poses. Cross: worst direction. Good: one colour, and every value below "
+            f"the contact {kind} that matters to you. {trust}",
+        )
+        for kind, one, unit in (("force", force, "N"), ("torque", torque, "N·m"))
+    ]
+    rows = [
+        (name, rounded(one["rms"]), rounded(one["largest"]), one["words"].removesuffix(" of the base"))
+        for name, one in (("force, N", force), ("torque, N·m", torque))
+    ]
+    caption = "Predicted error, one sigma: rms over all orientations, and largest"
+    columns = ("error", "rms", "largest", "tool axis there, in base")
+    return Section("error", "Compensation error over all orientations", text, figures, [Table(caption, columns, rows)])
+
+
+def cross_validation(facts: Facts) -> Section:
+    """Show the error in predicting each pose from the others, by method."""
+    found = facts["cross_validation"]
+    text = []
+    if found["force_N"] is not None:
+        text.append(
+            f"Each pose predicted from all others: {rounded(found['force_N'])} N, {rounded(found['torque_Nm'])} N·m "
+            "rms. Good: well below the contact that matters to you."
+        )
+    if found["reason"]:
+        text.append(f"Methods are not compared. {found['reason']}")
+        return Section("cross-validation", "Cross-validation", text)
+    solved = [one for one in found["methods"] if "reason" not in one]
+    rows = [
+        (
+            one["method"],
+            rounded(one["mass_kg"], 4),
+            f"{math.degrees(one['rotation_difference_rad']):.2f}",
+            rounded(one["residual"]["force_rms_N"]),
+            rounded(one["residual"]["torque_rms_Nm"]),
+            rounded(one["cross_validated"]["force_rms_N"]),
+            rounded(one["cross_validated"]["torque_rms_Nm"]),
+        )
+        for one in solved
+    ]
+    columns = (
+        "method",
+        "mass, kg",
+        "mounting differs, °",
+        "residual, N",
+        "residual, N·m",
+        "left out, N",
+        "left out, N·m",
+    )
+    tables = [Table("Methods on the same poses", columns, rows)]
+    if missing := [(one["method"], one["reason"]) for one in found["methods"] if "reason" in one]:
+        tables.append(Table("Methods without a result", ("method", "reason"), missing, folded=True))
+    crossed = [one for one in solved if one["cross_validated"]["force_rms_N"]]
+    best = min(crossed, key=lambda one: float(one["cross_validated"]["force_rms_N"]), default=None)
+    figure = Figure(
+        "methods",
+        "Bars of the cross-validated force and torque error of each method"
+        + (f"; {best['method']} has the smallest force error." if best else "."),
+        "Error in predicting each pose from all others, by method, logarithmic. Good: the method of this result "
+        "(orange) has one of the shortest bars. Methods with a known mounting fail if the sensor is mounted otherwise.",
+    )
+    return Section("cross-validation", "Cross-validation", text, [figure] if crossed else [], tables)
+
+
+def residuals(facts: Facts) -> Section:
+    """Show the residuals of each pose, and in time."""
+    result, poses = facts["result"], facts["poses"]
+    sums = result["residual"]
+    text = [
+        f"Residuals: force {rounded(sums['force_rms_N'])} N rms, {rounded(sums['force_max_N'])} N at most; torque "
+        f"{rounded(sums['torque_rms_Nm'])} N·m rms, {rounded(sums['torque_max_Nm'])} N·m at most.",
+        f"They are {result['noise_factor']:.2f} times the measured noise (p = {in_words(result['p_value'])})."
+        if result["p_value"] is not None
+        else "The noise was not measured but estimated from the residuals, so their size does not test the fit.",
+    ]
+    if result["rejected_poses"]:
+        names = ", ".join(poses[row - 1]["name"] for row in result["rejected_poses"])
+        text.append(f"Rejected, because they do not fit the others: pose {names}.")
+    known = [pose for pose in poses if pose["sigmas"] is not None]
+    figures = []
+    if known:
+        worst = max(known, key=lambda pose: float(pose["sigmas"]))
+        figures.append(
+            Figure(
+                "pose_residuals",
+                f"Bars of the cross-validated residual of each pose in sigma; the largest is {worst['sigmas']:.1f} at "
+                f"pose {worst['name']}.",
+                "Residual of each pose if all others predict it, in sigma. Good: bars about 1, none above the dashed "
+                f"line at {SUSPICIOUS_SIGMAS:g}. Repeat a pose above it. Hatched: rejected.",
+            )
+        )
+    timed = all(pose["t_s"] is not None for pose in poses)
+    figures.append(
+        Figure(
+            "time_residuals",
+            f"Force and torque residuals along x, y and z against {'time' if timed else 'the order of the poses'}.",
+            f"Measured minus predicted wrench, drift included, in the order of {'time' if timed else 'the rows'}. "
+            "Good: a scatter about zero. A slope or slow wave is drift; one point far away is contact or a cable.",
+        )
+    )
+    rows = [
+        (
+            pose["name"],
+            "-" if pose["t_s"] is None else f"{pose['t_s']:.0f}",
+            *(f"{value:.3f}" for value in pose["residual"][:3]),
+            *(f"{1e3 * value:.1f}" for value in pose["residual"][3:]),
+            rounded(pose["sigmas"], 2),
+            "yes" if pose["used"] else "no",
+        )
+        for pose in shown_poses(poses)
+    ]
+    columns = ("pose", "t, s", *(f"F{a}, N" for a in _AXES), *(f"T{a}, mN·m" for a in _AXES), "sigma", "used")
+    few = "" if len(rows) == len(poses) else f" ({len(rows)} of {len(poses)} poses, the worst among them)"
+    return Section(
+        "residuals", "Residuals", text, figures, [Table(f"Table of the residuals{few}", columns, rows, folded=True)]
+    )
+
+
+def drift(facts: Facts) -> Section:
+    """Show the drift in the fit and of the repeated first pose."""
+    seen = facts["drift"]
+    found, again = seen["in_fit"], seen["first_pose_again"]
+    text = []
+    if again is not None:
+        text.append(f"{again['words'][0].upper()}{again['words'][1:]}.")
+    if seen["lag1"] is not None:
+        text.append(
+            f"Residuals of successive poses are correlated by {seen['lag1']:.2f}. Good: near 0. Drift makes it larger."
+        )
+    if found is None:
+        text.append("The fit found no drift of the bias.")
+    else:
+        model = "random walk" if any(name.startswith("walk") for name in seen["components"]) else "linear"
+        text.append(f"The fit includes a drift of the bias ({model}), listed below. Good: within 3 sigma.")
+    rows = [
+        (f"{name}, {unit}", f"{scale * change:+.{digits}f}", f"{scale * sigma:.{digits}f}", f"{change / sigma:+.1f}")
+        if sigma > _ROUNDED
+        else (f"{name}, {unit}", "-", "-", "-")
+        for name, unit, scale, digits, change, sigma in (
+            ()
+            if found is None
+            else (
+                (f"{'FT'[k // 3]}{_AXES[k % 3]}", *(("N", 1.0, 3), ("mN·m", 1e3, 2))[k // 3], *pair)
+                for k, pair in enumerate(zip(found["change"], found["sigma"], strict=True))
+            )
+        )
+    ]
+    columns = ("channel", "change of the bias", "± 1 sigma", "in sigma")
+    return Section(
+        "drift",
+        "Drift",
+        text,
+        (),
+        [Table("Bias at the last pose minus bias at the first", columns, rows)] if rows else (),
+    )
+
+
+def noise(facts: Facts) -> Section:
+    """Show the noise of the mean at each pose."""
+    measured = facts["noise"]
+    if measured is None:
+        why = "The source states no noise of its poses: add columns sigma_fx to sigma_tz, or calibrate with ftdrive."
+        return Section("noise", "Noise of each pose", [why])
+    force, torque = np.array(measured["force_N"]), np.array(measured["torque_Nm"])
+    text = [
+        f"Standard error of the mean of one axis, median over the poses: {rounded(float(np.median(force)))} N, "
+        f"{rounded(float(np.median(torque)))} N·m. Largest: {rounded(float(force.max()))} N, "
+        f"{rounded(float(torque.max()))} N·m."
+    ]
+    if measured["unsteady"]:
+        stops = ", ".join(map(str, measured["unsteady"]))
+        text.append(f"Not steady while averaged: stop {stops}. Something swung or was touched there.")
+    figure = Figure(
+        "noise",
+        f"Noise of the mean at each pose, {rounded(float(force.min()))} to {rounded(float(force.max()))} N.",
+        "Noise of the mean wrench at each pose (one axis, one sigma). Good: bars of similar height. A pose far above "
+        "the others swung, was touched, or was averaged over too few samples.",
+    )
+    return Section("noise", "Noise of each pose", text, [figure])
+
+
+def coverage(facts: Facts) -> Section:
+    """Show which directions of gravity the poses cover."""
+    found, title = facts["coverage"], "Coverage of orientations"
+    if found is None:
+        return Section("coverage", title, ["The calibration file holds no orientations: report its run folder."])
+    gap_deg = math.degrees(found["largest_gap_rad"])
+    text = [
+        f"{found['words'][0].upper()}{found['words'][1:]}",
+        f"{found['orientations']} different orientations (24 or more count as 24) determine {found['rank']} of 15 "
+        "parameters.",
+        f"Largest gap: {gap_deg:.0f}° around the direction {found['gap_words']}.",
+    ]
+    figure = Figure(
+        "coverage",
+        f"Map of the directions of gravity in flange axes; the largest gap has a radius of {gap_deg:.0f}°.",
+        "Direction of gravity in flange axes at each pose. Good: dots in all parts of the map. The circle is the "
+        f"largest gap, {gap_deg:.0f}°; the 24 orientations of the paper leave 55°.",
+    )
+    return Section("coverage", title, text, [figure])

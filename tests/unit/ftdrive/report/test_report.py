@@ -1,0 +1,389 @@
+"""A report: its formats agree with the result, nothing leaves the page, and names of devices stay text."""
+
+import json
+import re
+import sys
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
+
+from calib import CalibrationDataset, CalibrationResult, Parameters, solve
+from calib.errors import BadCalibration, BadDataset
+from calib.model import predict
+from calib.routine import PoseRecord, TourPose
+from drivers.interfaces import FtSamples
+from ftdrive.cli import cli
+from ftdrive.errors import ConfigError
+from ftdrive.report.comparison import compared
+from ftdrive.report.error_map import error_map, orientations
+from ftdrive.report.facts import facts_of
+from ftdrive.report.figures import VARIABLES
+from ftdrive.report.report import report
+from ftdrive.report.sections import sections_of
+from ftdrive.report.subject import SolveOptions, Subject, read_subject
+from ftdrive.report.words import shown_poses
+from ftdrive.runs.run import Reading, Run
+
+TRUTH = Parameters(
+    Rotation.from_rotvec([0.02, -0.01, 0.5]).as_matrix(),
+    np.array([0.1, -0.2, -12.0]),
+    np.array([1.0, -2.0, 3.0]),
+    np.array([0.004, -0.002, 0.05]),
+    np.array([0.01, 0.02, -0.03]),
+)
+SIGMA = np.repeat([5e-3, 2e-4], 3)
+EVIL = '<script>alert("x")</script>"><img src=http://x onerror=alert(1)> | `'
+R8 = Rotation.random(8, rng=4).as_matrix()
+
+
+@cache
+def dataset(seed: int = 0) -> CalibrationDataset:
+    wrench = predict(TRUTH, R8) + np.random.default_rng(seed).normal(0, SIGMA, (8, 6))
+    cov = np.tile(np.diag(SIGMA**2), (8, 1, 1))
+    return CalibrationDataset(R8, wrench, cov, np.full(8, 400), np.arange(8.0), {"by": EVIL})
+
+
+@cache
+def result(seed: int = 0) -> CalibrationResult:
+    return solve(dataset(seed), provenance={"devices": {"sensor": {"serial": EVIL}}, EVIL: "1"})
+
+
+@cache
+def facts() -> Mapping[str, Any]:
+    subject = Subject(Path(f"{EVIL}.csv"), result(), "", dataset(), solved_with={"drift": "auto"}, parent=result(1))
+    return facts_of(replace(subject, parent_name=EVIL))
+
+
+@cache
+def html() -> str:
+    return report(facts())
+
+
+class Page(HTMLParser):
+    """Elements with their attributes, and the text outside of styles."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str]]] = []
+        self.text = ""
+        self.style = ""
+        self.feed(html())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {name: value or "" for name, value in attrs}))
+
+    def handle_data(self, data: str) -> None:
+        if self.elements[-1:] and self.elements[-1][0] == "style":
+            self.style += data
+        else:
+            self.text += data + "\n"
+
+    def of(self, tag: str) -> Iterator[dict[str, str]]:
+        return (attributes for name, attributes in self.elements if name == tag)
+
+
+@cache
+def page() -> Page:
+    return Page()
+
+
+def test_page_and_markdown_show_the_numbers_of_the_result() -> None:
+    markdown = report(facts(), "md")
+    for text in (markdown, page().text):
+        assert result().id in text
+        assert result().verdict.upper() in text
+        assert f"{result().quality['loo_force_rms_N']:.3g}" in text
+        assert str(result().provenance["dataset_sha256"]) in text
+    mass = next(line for line in markdown.splitlines() if line.startswith("| mass, kg"))
+    estimate, sigma = (float(cell) for cell in mass.split("|")[2:4])
+    assert sigma == pytest.approx(result().sigma["mass_kg"], rel=0.06)
+    assert estimate == pytest.approx(result().mass_kg, abs=sigma / 10)
+    assert mass.split("|")[2].strip() in page().text.split()
+    assert markdown.count("\n| ml |") == 1
+    assert all(section.title in page().text for section in sections_of(facts()))
+
+
+def test_json_is_the_facts_and_the_whole_result() -> None:
+    document = json.loads(report(facts(), "json"))
+    assert document == json.loads(json.dumps(facts()))
+    assert document["format"] == "ftdrive.report/1"
+    assert document["result"] == json.loads(json.dumps(result().to_dict()))
+    assert [pose["residual"] for pose in document["poses"]] == result().residuals.tolist()
+    np.testing.assert_allclose(document["noise"]["force_N"], SIGMA[0])
+    assert document["coverage"]["rank"] == 15
+
+
+def test_the_page_refers_to_nothing_outside_and_runs_nothing() -> None:
+    assert not {name for name, _ in page().elements} & {"script", "link", "iframe", "object", "embed", "img", "image"}
+    for _, attributes in page().elements:
+        assert not [name for name in attributes if name.startswith("on")]
+        for name in ("href", "src", "xlink:href", "action", "data"):
+            assert attributes.get(name, "#").startswith("#")
+        assert not re.search(r"url\((?!#)", " ".join(attributes.values()))
+    assert "@import" not in page().style
+    assert "url(" not in page().style
+    assert len(html().encode()) < 3_000_000
+
+
+def test_ids_are_unique_and_references_lead_somewhere() -> None:
+    ids = Counter(attributes["id"] for _, attributes in page().elements if "id" in attributes)
+    assert ids.most_common(1)[0][1] == 1
+    wanted = [attributes["href"] for _, attributes in page().elements if "href" in attributes]
+    wanted += re.findall(r"url\((#[^)]*)\)", html())
+    assert {one.removeprefix("#") for one in wanted} <= ids.keys()
+
+
+def test_the_page_can_be_read_aloud() -> None:
+    assert [one.get("lang") for one in page().of("html")] == ["en"]
+    assert [len(list(page().of(tag))) for tag in ("title", "h1", "main")] == [1, 1, 1]
+    assert all(one.get("scope") in {"col", "row"} for one in page().of("th"))
+    figures = len(list(page().of("figure")))
+    assert (
+        figures
+        == len(list(page().of("figcaption")))
+        == len([one for one in page().of("div") if "role" in one]) - len(list(page().of("table")))
+    )
+    assert all(len(one["aria-label"]) > 20 for one in page().of("div") if one.get("role") == "img")
+    captions = [figure.caption for section in sections_of(facts()) for figure in section.figures]
+    assert len(captions) == figures >= 8
+    assert all("Good:" in caption for caption in captions)
+
+
+def test_figures_take_their_ink_from_the_page() -> None:
+    svg = html()[html().index("<svg") :]
+    assert not [colour for colour in VARIABLES if colour in html()]
+    assert "currentColor" in svg
+    defined = set(re.findall(r"(--[\w-]+):", page().style))
+    assert set(re.findall(r"var\((--[\w-]+)\)", html())) <= defined
+    dark = page().style[page().style.index("prefers-color-scheme: dark") :]
+    assert {"--paper", "--ink", "--series-0", "--series-1", "--series-2", "--grid", "--bad"} <= set(
+        re.findall(r"(--[\w-]+):", dark[: dark.index("body")])
+    )
+
+
+def test_a_malicious_name_stays_text() -> None:
+    assert page().text.count(EVIL) >= 3  # source, parent, serial number
+    markdown = report(facts(), "md")
+    assert "<script" not in markdown
+    assert "<img" not in markdown
+    row = next(line for line in markdown.splitlines() if line.startswith("| devices.sensor.serial"))
+    assert len(re.findall(r"(?<!\\)\|", row)) == 3
+
+
+def with_covariance(diagonal: Mapping[int, float]) -> CalibrationResult:
+    covariance = np.zeros((15, 15))
+    for k, variance in diagonal.items():
+        covariance[k, k] = variance
+    level = Parameters(np.eye(3), np.array([0, 0, -10.0]), np.zeros(3), np.array([0, 0, 0.1]), np.zeros(3))
+    return replace(result(), parameters=level, covariance=covariance, response=None)
+
+
+def test_the_error_map_follows_from_the_covariance() -> None:
+    turned = error_map(with_covariance({2: 0.01**2}))["force_N"]  # about flange z: nothing while the tool is vertical
+    np.testing.assert_allclose(np.array(turned["map"])[[0, -1]], 0, atol=1e-12)
+    assert turned["largest"] == pytest.approx(10 * 0.01)
+    assert turned["worst_direction"][2] == pytest.approx(0, abs=1e-12)
+    assert np.array(turned["map"]).shape == (19, 37)
+    biased = error_map(with_covariance({6: 0.03**2, 13: 0.004**2}))
+    np.testing.assert_allclose(biased["force_N"]["map"], 0.03)
+    assert biased["force_N"]["rms"] == pytest.approx(0.03)
+    assert biased["torque_Nm"]["largest"] == pytest.approx(0.004)
+
+
+def test_the_map_names_the_direction_of_flange_z() -> None:
+    R = orientations(np.radians([-90.0, 0.0]), np.radians([0.0, 90.0]))
+    np.testing.assert_allclose(R[0, :, :, :, 2], np.broadcast_to([0, 0, -1], (2, 12, 3)), atol=1e-12)
+    np.testing.assert_allclose(R[1, 1, :, :, 2], np.broadcast_to([0, 1, 0], (12, 3)), atol=1e-12)
+    tilted = error_map(with_covariance({2: 0.01**2}))["force_N"]
+    assert "z" not in tilted["words"]
+
+
+def test_a_moved_centre_of_mass_is_the_only_group_that_changed() -> None:
+    before = result()
+    step = np.zeros(15)
+    step[9] = 8 * np.sqrt(2 * before.covariance[9, 9])
+    after = replace(before, parameters=before.parameters.moved(step), provenance={"dataset_sha256": "other"})
+    found = compared(after, before)
+    changed = [one["name"] for one in found["groups"] if one["p_value"] < 1e-3]
+    assert changed == ["centre of mass", "all but the biases", "all"]
+    assert found["parameters"][9]["change"] == pytest.approx(step[9])
+    assert found["parameters"][9]["sigmas"] == pytest.approx(8)
+    assert not found["same_data"]
+    assert compared(before, before)["same_data"]
+
+
+def test_two_results_of_one_tool_do_not_differ() -> None:
+    assert min(one["p_value"] for one in facts()["comparison"]["groups"]) > 1e-5
+
+
+def test_parameters_known_in_both_are_not_tested() -> None:
+    one = with_covariance({6: 0.01**2, 9: 1e-8})
+    found = compared(one, one)
+    assert [group["name"] for group in found["groups"]] == [
+        "force bias",
+        "centre of mass",
+        "all but the biases",
+        "all",
+    ]
+    assert found["parameters"][0]["sigmas"] is None
+    assert found["groups"][-1]["dof"] == 2
+
+
+def test_the_worst_of_many_poses_are_shown() -> None:
+    poses: list[dict[str, Any]] = [{"row": k, "sigmas": 9.0 if k % 97 == 0 else 1.0} for k in range(1000)]
+    rows = [pose["row"] for pose in shown_poses(poses)]
+    assert set(range(0, 1000, 97)) <= set(rows)
+    assert len(rows) <= 200
+    assert rows == sorted(rows)
+
+
+CONFIG = {
+    "site": {"g_m_s2": 9.80665},
+    "workcell": {"mounting": "floor"},
+    "robot": {"host": "10.0.0.2"},
+    "sensor": {"url": "ati-can://can0"},
+}
+DEVICES = {"arm": {"model": "UR5e", "serial": "1"}, "sensor": {"model": EVIL, "serial": "FT1"}}
+
+
+def recorded(folder: Path, noise: float) -> Run:
+    """A run of eight poses taken by hand; `noise` is added to each pose as a whole."""
+    run = Run.create(folder, "manual", {"mode": "manual", "config": CONFIG, "devices": DEVICES})
+    rng, n = np.random.default_rng(5), 100
+    for stop, R in enumerate(R8, start=1):
+        reading = Reading(stop * 10**9, np.zeros(6), R)
+        wrench = predict(TRUTH, R) + rng.normal(0, noise, 6) * [1, 1, 1, 0.1, 0.1, 0.1] + rng.normal(0, SIGMA, (n, 6))
+        t_ns = stop * 10**9 + np.arange(n) * 10**6
+        samples = FtSamples(
+            t_ns, np.full(n, np.nan), np.arange(n), np.zeros((n, 0), np.int32), wrench, np.zeros(n, np.uint32)
+        )
+        run.commit(PoseRecord(stop, TourPose(100 + stop, np.zeros(6)), reading, reading, samples, steady=stop != 3))
+    return run
+
+
+@pytest.fixture
+def no_other_methods(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spare the seconds that a comparison of methods takes."""
+    monkeypatch.setattr("ftdrive.report.facts.compare", lambda *_, **__: [])
+
+
+def command(*arguments: str | Path) -> Any:
+    return CliRunner().invoke(cli, ["report", *map(str, arguments)])
+
+
+@pytest.mark.usefixtures("no_other_methods")
+def test_a_rejected_run_gets_a_report_with_its_reasons(tmp_path: Path) -> None:
+    run = recorded(tmp_path, noise=5.0)
+    outcome = command(run.folder, "--format", "md")
+    assert outcome.exit_code == 0, outcome.output
+    assert "REJECTED" in outcome.stdout
+    assert "Do not compensate" in outcome.stdout
+    assert "R103 was not steady" in outcome.stdout
+    assert "| sensor |" in outcome.stdout
+    assert not run.calibration_path.exists()
+
+
+def test_a_saved_result_is_reported_with_the_data_of_its_run(tmp_path: Path) -> None:
+    run = recorded(tmp_path, noise=0.0)
+    saved = read_subject(run.folder, SolveOptions()).result
+    saved.save(run.calibration_path)
+    for source in (run.folder, run.calibration_path):
+        subject = read_subject(source, SolveOptions(), run.calibration_path)
+        assert subject.result.provenance == saved.provenance
+        assert subject.dataset is not None
+        assert len(subject.records) == 8
+        assert subject.parent is not None
+        assert subject.reproduce == run.solve_command
+    moved = tmp_path / "calibration.json"
+    saved.save(moved)
+    assert read_subject(moved, SolveOptions()).dataset is None
+    with pytest.raises(ConfigError, match="solved already"):
+        read_subject(moved, SolveOptions(drift="none"))
+
+
+def test_the_named_parent_is_found_beside_the_result_or_its_absence_is_reported(tmp_path: Path) -> None:
+    result(1).save(tmp_path / "old.json")
+    named = replace(result(), provenance={"parent": {"id": result(1).id, "path": "old.json"}})
+    named.save(tmp_path / "new.json")
+    assert read_subject(tmp_path / "new.json", SolveOptions()).parent is not None
+    (tmp_path / "old.json").unlink()
+    subject = read_subject(tmp_path / "new.json", SolveOptions())
+    assert subject.parent is None
+    assert "--parent" in subject.parent_name
+    with pytest.raises((BadCalibration, OSError)):
+        read_subject(tmp_path / "new.json", SolveOptions(), tmp_path / "old.json")
+
+
+def test_a_result_without_its_data_is_reported_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    result().save(path)
+    outcome = command(path, "--format", "md", "-o", tmp_path / "report.md")
+    assert outcome.exit_code == 0, outcome.output
+    text = (tmp_path / "report.md").read_text()
+    assert "report its run folder" in text
+    assert "Methods are not compared." in text
+    assert "does not" not in command(path, "--format", "json").output
+
+
+def test_a_damaged_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "half.json"
+    path.write_text('{"format": "ftd')
+    with pytest.raises(BadDataset, match=r"half\.json"):
+        read_subject(path, SolveOptions())
+
+
+@pytest.mark.usefixtures("no_other_methods")
+@pytest.mark.parametrize(
+    ("name", "verdicts", "words"),
+    [
+        ("agimus_mini45_b", ("good", "usable"), "The bias drifted by 0.17 N"),
+        ("foamcutting_2013_06_12", ("rejected",), "The force residual is 22.4 % of the weight"),
+    ],
+)
+def test_real_recordings_are_judged_and_explained(
+    name: str, verdicts: Sequence[str], words: str, real_data: Path
+) -> None:
+    outcome = command(real_data / name / "poses.csv", "--orientation", "R_flange_base", "--format", "md")
+    assert outcome.exit_code == 0
+    assert outcome.stdout.splitlines()[0].rpartition(" ")[2].lower() in verdicts
+    assert words in outcome.stdout
+
+
+def test_no_report_is_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    dataset().save(tmp_path / "dataset.json")
+    (tmp_path / "report.html").write_text("mine")
+    for arguments in ((), ("-o", "report.html"), ("--format", "md", "-o", "report.html")):
+        outcome = command("dataset.json", *arguments)
+        assert isinstance(outcome.exception, ConfigError)
+        assert "never overwritten" in str(outcome.exception)
+    assert (tmp_path / "report.html").read_text() == "mine"
+
+
+@pytest.mark.parametrize("missing", ["jinja2", "matplotlib.figure"])
+def test_a_page_without_its_extra_is_a_matter_of_installation(missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(ConfigError, match=r"ftdrive\[report\]"):
+        report(facts())
+    assert report(facts(), "md").startswith("# Calibration")
+
+
+@pytest.mark.usefixtures("no_other_methods")
+def test_the_options_of_solve_are_those_that_reproduce_the_result(tmp_path: Path) -> None:
+    path = tmp_path / "my poses.csv"
+    rows = np.c_[np.swapaxes(R8, 1, 2).reshape(8, 9), dataset().wrench]
+    header = "r11,r12,r13,r21,r22,r23,r31,r32,r33,fx,fy,fz,tx,ty,tz"
+    np.savetxt(path, rows, delimiter=",", header=header, comments="")
+    outcome = command(path, "--orientation", "R_flange_base", "--drift", "none", "--format", "json")
+    document = json.loads(outcome.stdout)
+    assert document["reproduce"].endswith("my poses.csv' --orientation R_flange_base --drift none")
+    assert document["result"]["mass_kg"] == pytest.approx(12 / 9.80665, rel=0.01)
