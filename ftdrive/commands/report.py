@@ -98,7 +98,8 @@ def report(
     with unpacked(source) if source is not None else rehearsed_run(sensor) as found:
         subject = read_subject(found, options, parent)
         if source is not None and found != source:  # unpacked
-            subject = replace(subject, source=source, reproduce=f"ftdrive solve {shlex.quote(str(source))}")
+            reproduce = subject.reproduce.replace(str(found), shlex.quote(str(source)))
+            subject = replace(subject, source=source, reproduce=reproduce)
         facts = facts_of(subject)
     text = written(facts, form)
     if output is not None:
