@@ -101,7 +101,11 @@ def test_a_bundle_gives_the_result_of_its_run_to_the_last_digit(run: Run, tmp_pa
 
 def test_the_bytes_of_a_transcript_keep_their_number(run: Run, tmp_path: Path) -> None:
     page = "GET /netftapi2.xml HTTP/1.1\r\nHost: 192.168.7.31\r\n\r\n"
-    lines = [{"sensor": "ati-netft://192.168.7.31"}, {"request": page.encode().hex()}, {"hex": "c0a8071f00ff"}]
+    lines = [
+        {"sensor": "ati-netft://192.168.7.31"},
+        {"request": page.encode().hex()},
+        {"hex": "c0a8071f00ff" + b"alice".hex()},
+    ]
     transcript = tmp_path / "netft.jsonl"
     transcript.write_text("".join(json.dumps(line) + "\n" for line in lines))
     write_bundle(run.folder, tmp_path / "a.zip", [transcript])
