@@ -12,7 +12,10 @@ from scipy.spatial.transform import Rotation
 from calib import CalibrationDataset, CalibrationResult, Parameters, solve
 from calib.model import predict
 from calib.poses.information import special
+from ftdrive.cell.config import SensorConfig
 from ftdrive.checks.plausibility import com_in_words, judged
+from ftdrive.runs.outcome import solve_records
+from tests.unit.ftdrive.fake_cell import Lab
 
 Array = NDArray[np.float64]
 
@@ -140,3 +143,20 @@ def test_gravity_far_from_the_configured_mounting_is_named(gravity: str, says: s
 def test_a_rejected_result_is_left_as_it_is() -> None:
     given = with_setup(replace(result(), verdict="rejected"), payload_kg=9.0)
     assert judged(given) is given
+
+
+def test_a_session_saves_no_such_result_as_good(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, sensor=SensorConfig("fake://", height_mm=180.0))
+    outcome = lab.calibrate()
+    assert outcome is not None
+    saved = CalibrationResult.load(outcome.run.calibration_path)
+    assert saved.verdict == "usable"
+    assert "outside the tool of [tool] cylinders_mm" in saved.reasons[0]
+
+
+def test_a_tool_that_was_not_measured_is_no_reason(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, sensor=SensorConfig("fake://", height_mm=180.0))
+    lab.calibrate()
+    path = lab.run().folder / "run.json"
+    path.write_text(path.read_text().replace('"measured": true', '"measured": false'))
+    assert solve_records(lab.run(), lab.run().records()).result.verdict == "good"
