@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from calib.assessment.contradictions import contradictions, other_unit
 from calib.assessment.cross_validation import AssessedFit, IndependentFit
-from calib.assessment.faults import faults
+from calib.assessment.faults import faults, other_poses
 from calib.assessment.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
 from calib.assessment.verdict import SIGNIFICANT_SIGMAS, judge
 from calib.data.dataset import CalibrationDataset
@@ -101,7 +101,8 @@ def solve(
         )
         _require_determined(dataset.R_base_flange, best, known)
     except NotObservable as exc:
-        if mixed_up := faults(dataset.R_base_flange, dataset.wrench, up_in_base):
+        poses = dataset.R_base_flange, dataset.wrench
+        if mixed_up := faults(*poses, up_in_base) or other_poses(*poses):
             raise NotObservable(f"{mixed_up[0]}.") from exc
         raise
     assessed: AssessedFit = best

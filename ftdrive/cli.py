@@ -33,6 +33,7 @@ _COMMANDS = {
     "compensate": ("ftdrive.commands.compensate", "Compensate a recording. Needs no device."),
     "stream": ("ftdrive.commands.stream", "Serve the wrench to Foxglove, Lichtblick and PlotJuggler."),
     "replay": ("ftdrive.commands.replay", "Repeat a recorded run through the same routine and solver."),
+    "bundle": ("ftdrive.commands.bundle", "Write a run into one file for a bug report, without addresses."),
     "export": ("ftdrive.commands.export", "Write a plan or a calibration for another program."),
     "transcript": ("ftdrive.commands.transcript", "Record or play the bytes on a sensor's wire."),
 }
@@ -90,14 +91,22 @@ def exit_code(error: BaseException) -> int | None:
     from calib.errors import BadCalibration, BadDataset, CalibError, TooFewSamples
     from drivers.errors import ConnectError, DeviceFault, DriverError
     from drivers.transcript.recorder import BadTranscript
-    from ftdrive.errors import BadPlan, BadRecording, BadStore, ConfigError, NotAccepted, RecordingHasGaps
+    from ftdrive.errors import (
+        BadBundle,
+        BadPlan,
+        BadRecording,
+        BadStore,
+        ConfigError,
+        NotAccepted,
+        RecordingHasGaps,
+    )
 
     codes: list[tuple[int, tuple[type[BaseException], ...]]] = [
         (2, (ConfigError,)),
         (3, (ConnectError,)),
         (5, (DeviceFault,)),
         (4, (DriverError, TooFewSamples)),
-        (6, (BadDataset, BadCalibration, BadTranscript, BadPlan, BadRecording, BadStore)),
+        (6, (BadDataset, BadCalibration, BadTranscript, BadPlan, BadRecording, BadStore, BadBundle)),
         (7, (CalibError, NotAccepted)),
         (8, (RecordingHasGaps,)),
         (6, (OSError,)),

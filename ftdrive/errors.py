@@ -21,6 +21,10 @@ class BadStore(Exception):
     """The store of results cannot be read or written."""
 
 
+class BadBundle(Exception):
+    """A file is not a bundle that this version can read."""
+
+
 class RecordingHasGaps(Exception):
     """Samples are missing in a recording that is otherwise complete."""
 

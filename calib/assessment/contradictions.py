@@ -45,7 +45,7 @@ def contradictions(
         along = found.gravity_force_base_N / (weight_N or 1.0)
         mass_kg, sigma_kg = weight_N / g_m_s2, float(np.sqrt(along @ covariance[3:6, 3:6] @ along)) / g_m_s2
         if abs(mass_kg - known.mass_kg) > sigmas * np.hypot(sigma_kg, known.mass_tolerance_kg):
-            why = _as_with(found, _force_units(mass_kg, known.mass_kg, SAME_UNIT))
+            why = as_with(found, _force_units(mass_kg, known.mass_kg, SAME_UNIT))
             words.append(f"mass {known.mass_kg:g} kg (data: {_with_sigma(mass_kg, sigma_kg, ' kg')}{why})")
     if known.gravity_direction_base is not None:
         direction = np.asarray(known.gravity_direction_base)
@@ -84,20 +84,21 @@ def other_unit(found: Parameters, payload_kg: float, g_m_s2: float) -> list[str]
         return []
     return [
         f"the load is {mass_kg:.2f} kg, but {payload_kg:.2f} kg by the payload in the controller"
-        f"{_as_with(found, force_units(mass_kg, payload_kg))}: check the units of the sensor, or correct the payload"
+        f"{as_with(found, force_units(mass_kg, payload_kg))}: check the units of the sensor, or correct the payload"
     ]
 
 
 def force_units(mass_kg: float, payload_kg: float) -> list[str]:
-    """Name the units of force that make a load (kg) of the data agree with a payload (kg), if it is much lighter."""
-    return _force_units(mass_kg, payload_kg, PAYLOAD_SHARE) if payload_kg - mass_kg > PAYLOAD_KG else []
+    """Name the units of force that make a load (kg) of the data agree with a payload (kg), if they differ a lot."""
+    return _force_units(mass_kg, payload_kg, PAYLOAD_SHARE) if abs(payload_kg - mass_kg) > PAYLOAD_KG else []
 
 
 def _force_units(mass_kg: float, true_kg: float, tolerance: float) -> list[str]:
-    return [unit for unit, size in FORCE_UNITS_N.items() if size > 1 and abs(mass_kg * size / true_kg - 1) < tolerance]
+    off = {unit: abs(mass_kg * size / true_kg - 1) for unit, size in FORCE_UNITS_N.items() if size != 1}
+    return [unit for unit, share in off.items() if share < tolerance]
 
 
-def _as_with(found: Parameters, forces: list[str]) -> str:
+def as_with(found: Parameters, forces: list[str]) -> str:
     """Name these units of force, and those of torque that give a usual centre of mass."""
     named = units(float(np.linalg.norm(found.p_sensor_com_m)), forces) or [f"forces in {unit}" for unit in forces]
     return f", as with {', or '.join(named)}" if named else ""

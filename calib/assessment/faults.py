@@ -24,6 +24,8 @@ IMPLAUSIBLE = 1.0
 """Penalty of a weight that does not pull downwards, in the logarithm of the residuals."""
 TIED = 1.3
 """Residuals that differ by less than this factor are equal: the simpler explanation is taken."""
+OTHER_POSES, OF_A_WEIGHT = 0.2, 0.1
+"""Forces of a weight in other poses than given: large residuals, in shares of the weight, and little of them radial."""
 IN_BASE_RAD = np.deg2rad(10.0)
 """A constant force that points down this exactly is a weight in base axes."""
 STEADY = 0.05
@@ -31,7 +33,7 @@ STEADY = 0.05
 SAME_UNIT = 0.04
 """A ratio this close to that of two units is one."""
 USUAL_COM_M = (0.02, 0.2)
-FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216, "kgf": 9.80665}
+FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216, "kgf": 9.80665, "mN": 1e-3, "kN": 1e3}
 TORQUE_UNITS_NM = {
     "N·m": 1.0,
     "N·mm": 1e-3,
@@ -39,10 +41,11 @@ TORQUE_UNITS_NM = {
     "lbf·ft": 1.3558179,
     "kgf·cm": 0.0980665,
     "kgf·m": 9.80665,
+    "kN·m": 1e3,
 }
 UNITS = (
-    *(("N", "N·mm"), ("N", "lbf·in"), ("lbf", "N·m"), ("kgf", "N·m")),
-    *(("lbf", "lbf·in"), ("lbf", "lbf·ft"), ("kgf", "kgf·cm"), ("kgf", "kgf·m")),
+    *(("N", "N·mm"), ("N", "lbf·in"), ("lbf", "N·m"), ("kgf", "N·m"), ("mN", "N·m"), ("kN", "N·m")),
+    *(("lbf", "lbf·in"), ("lbf", "lbf·ft"), ("kgf", "kgf·cm"), ("kgf", "kgf·m"), ("mN", "N·mm"), ("kN", "kN·m")),
 )
 """Units that are taken for N and N·m, the simplest mistake first."""
 
@@ -114,6 +117,31 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
             f"{best.force_rms_N:.2g} N: {advice}"
         ]
     return _axes(as_read, wrench[:, 3:], up)
+
+
+def other_poses(R_base_flange: Array, wrench: Array) -> list[str]:
+    """Recognise the wrenches of a weight in other poses than given: forces on a sphere, torques that belong to them.
+
+    A sphere does not depend on the orientations, so it also shows an order or a form of them that `faults` cannot undo.
+    """
+    if len(wrench) < RECOMMENDED_POSES + 1:
+        return []
+    as_read, force_N, torque_Nm = _Rough.of(R_base_flange, wrench), wrench[:, :3], wrench[:, 3:]
+    design = np.column_stack([2 * force_N, np.ones(len(force_N))])
+    solution = np.linalg.lstsq(design, np.sum(force_N**2, axis=1))[0]
+    center_N = solution[:3]
+    weight_N = float(np.sqrt(max(float(solution[3] + center_N @ center_N), 0.0)))
+    radial_N = np.linalg.norm(force_N - center_N, axis=1) - weight_N
+    radial_rms_N = float(np.sqrt(np.sum(radial_N**2) / (len(force_N) - len(solution))))
+    torque_rms_Nm = _torque_rms(force_N - center_N, torque_Nm, *com_and_torque_bias(force_N - center_N, torque_Nm))
+    elsewhere = as_read.force_rms_N > OTHER_POSES * weight_N and radial_rms_N < OF_A_WEIGHT * as_read.force_rms_N
+    if not elsewhere or torque_rms_Nm > COLLAPSE * as_read.torque_rms_Nm:
+        return []
+    return [
+        f"the forces are those of a weight of {weight_N:.3g} N to {radial_rms_N:.2g} N, but in these orientations only "
+        f"to {as_read.force_rms_N:.2g} N: the wrenches are paired with other poses, or the orientations have another "
+        "form (Euler angles, degrees, another order): check both"
+    ]
 
 
 def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[str]:

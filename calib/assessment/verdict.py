@@ -12,7 +12,7 @@ from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtr as normal_cdf
 
 from calib.assessment.cross_validation import AssessedFit, standardized
-from calib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, units
+from calib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, other_poses, units
 from calib.assessment.load_shift import lasting_change
 from calib.assessment.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
 from calib.likelihood.fit import DriftEstimate
@@ -25,6 +25,8 @@ Verdict = Literal["good", "usable", "rejected"]
 SIGNIFICANT_SIGMAS = 5.0
 FARTHEST_COM_M = 0.5
 NEAREST_COM_M = 5e-4
+LIGHTEST_N, HEAVIEST_N = 0.05, 2000.0
+"""Weights beyond these look like forces in another unit: 5 g, and far more than any UR arm carries."""
 NOISE_FACTOR = 3.0
 USABLE_SHARE, REJECTED_SHARE = 0.02, 0.10
 SENSELESS_SHARE = 0.5
@@ -125,11 +127,13 @@ def judge(
         *explanation,
         *_weight_reasons(fit, weight_N, up_in_base),
         *_second_solution_reasons(fit),
+        *(_force_unit(parameters) if weight_N > HEAVIEST_N else []),
         *com_too_far,
         *(inexact if at.largest_share > REJECTED_SHARE else []),
         *changed,
     ]
     usable = [
+        *(_force_unit(parameters) if weight_N < LIGHTEST_N else []),
         *([] if com_too_far else _com_too_near(parameters)),
         *(inexact if at.largest_share <= REJECTED_SHARE else []),
         *([] if contradicted or at.largest_share <= NOISY_SHARE else _contradiction_reasons(fit, unconstrained)),
@@ -219,13 +223,18 @@ def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
 
 
 def _faults(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None, up_in_base: ArrayLike) -> list[str]:
-    """Look for faults in all poses, or of many in evenly spread runs, and if there are none, in the used poses."""
+    """Look for faults in all poses, or of many in evenly spread runs, and if there are none, in the used poses.
+
+    A wrong pose or two were rejected; only the used poses show whether most of them are wrong.
+    """
     n = len(used)
     order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
     order = order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0]
     found = faults(fit.R_base_flange[order], fit.wrench[order], up_in_base)
     order = order[used[order]]
-    return found if found or used.all() else faults(fit.R_base_flange[order], fit.wrench[order], up_in_base)
+    if not found and not used.all():
+        found = faults(fit.R_base_flange[order], fit.wrench[order], up_in_base)
+    return found or other_poses(fit.R_base_flange[order], fit.wrench[order])
 
 
 def successive_correlation(standardized: Array, t_s: Array | None = None) -> tuple[float, float]:
@@ -283,7 +292,8 @@ def reversed_signs(
     if inside_m:
         return [
             f"the weight pulls upwards ({angle_deg:.0f}° from down) and the centre of mass lies on the robot's side of "
-            "the sensor: the forces are reversed and the torques are not"
+            "the sensor: the forces are reversed and the torques are not, or the orientations are mirrored "
+            "(left-handed axes)"
         ]
     return [
         f"the weight pulls upwards ({angle_deg:.0f}° from down): the sensor reports the reaction (set sign = -1), or "
@@ -417,6 +427,14 @@ def _pose_notes(at: _Statistics) -> list[str]:
     if n >= RECOMMENDED_POSES and worst**2 > chi2_isf(6, SURE / n) / 6 * max(typical, 1.0):
         notes.append(f"pose {at.worst_pose + 1} deviates from the others by {worst:.1f} sigma: consider repeating it")
     return notes
+
+
+def _force_unit(parameters: Parameters) -> list[str]:
+    """Name the unit of force that makes an implausible weight usual."""
+    weight_N, com_m = (float(np.linalg.norm(v)) for v in (parameters.gravity_force_base_N, parameters.p_sensor_com_m))
+    unit = "mN" if weight_N > HEAVIEST_N else "kN"
+    like = " or ".join(units(com_m, (unit,)) or [f"forces in {unit}"])
+    return [f"the weight is {weight_N:.5g} N, as with {like}: check the units of force and torque"]
 
 
 def _com_too_far(parameters: Parameters, farthest_com_m: float) -> list[str]:

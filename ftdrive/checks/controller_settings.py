@@ -17,7 +17,7 @@ SENSOR_KG: Final = 0.3
 LEAN_DEG: Final = 0.2
 """About the accuracy of an arm's own orientation."""
 _SIGNIFICANT: Final = 4.0
-_OTHER_MOUNTING_DEG: Final = 10.0
+OTHER_MOUNTING_DEG: Final = 10.0
 """A larger angle is another mounting, not a lean."""
 _ALIGNED: Final = np.sin(np.radians(22.5))
 
@@ -26,7 +26,7 @@ def mismatches(result: CalibrationResult) -> tuple[str, ...]:
     """Return the differences from the `setup` in the result's provenance, in words; none for a rejected result.
 
     The setup has `payload_kg` as the controller reports it, `sensor_mass_kg` and `mounting` as configured; null where
-    unknown.
+    unknown. Words that are reasons of the verdict already are left out.
     """
     setup: Any = result.provenance.get("setup")
     if setup is None or result.verdict == "rejected":
@@ -36,7 +36,7 @@ def mismatches(result: CalibrationResult) -> tuple[str, ...]:
         words.append(payload_in_words(setup["payload_kg"], result.mass_kg, setup["sensor_mass_kg"]))
     if setup["mounting"] is not None:
         words.append(lean_in_words(result.gravity_force_base_N, result.covariance[3:6, 3:6], setup["mounting"]))
-    return tuple(one for one in words if one)
+    return tuple(one for one in words if one and one not in result.reasons)
 
 
 def payload_in_words(payload_kg: float, weighed_kg: float, sensor_kg: float | None) -> str:
@@ -110,7 +110,7 @@ class Lean:
     @property
     def is_other_mounting(self) -> bool:
         """Whether it is too large for a lean."""
-        return self.deg > _OTHER_MOUNTING_DEG
+        return self.deg > OTHER_MOUNTING_DEG
 
     @property
     def is_significant(self) -> bool:

@@ -102,7 +102,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
 @click.option(
     "--sensor-com",
     metavar="X,Y,Z",
-    help="Centre of mass of sensor and adapter, mm from the flange face along its axes.",
+    help="Centre of mass of sensor and adapter, mm from the flange face along its axes. [default: half way up]",
 )
 @click.option(
     "--base-frame",

@@ -9,7 +9,6 @@ from calib import CalibrationResult
 from calib.routine import PoseRecord, Sampling, take_pose
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
-    FOLDER,
     JSON,
     check_simulate,
     simulate,
@@ -18,6 +17,7 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.outcome import solve_records
 from ftdrive.runs.replay_source import RecordedRun
 from ftdrive.runs.run import Run
@@ -26,23 +26,27 @@ from ftdrive.terminal.report import print_result
 
 
 @click.command()
-@click.argument("folder", metavar="RUN", required=False, type=FOLDER)
+@click.argument("source", metavar="RUN", required=False, type=click.Path(exists=True, path_type=Path))
 @simulate("Record a short run of an emulated cell, then repeat it.")
 @EMULATED_SENSOR
 @JSON
-def replay(folder: Path | None, simulate: bool, sensor: str | None, as_json: bool) -> None:
-    """Repeat the recorded RUN and compare the result with the saved one: they must be equal to the last digit."""
-    check_simulate(simulate, real={"RUN": folder}, emulated={"--sensor": sensor})
+def replay(source: Path | None, simulate: bool, sensor: str | None, as_json: bool) -> None:
+    """Repeat the recorded RUN and compare the result with the saved one: they must be equal to the last digit.
+
+    RUN is a run folder, or the file of `ftdrive bundle`.
+    """
+    check_simulate(simulate, real={"RUN": source}, emulated={"--sensor": sensor})
     if simulate:
         with rehearsed_run(sensor) as recorded:
-            _repeat(Run(recorded), as_json)
-    elif folder is not None:
-        _repeat(Run(folder), as_json)
+            _repeat(Run(recorded), recorded, as_json)
+    elif source is not None:
+        with unpacked(source) as folder:
+            _repeat(Run(folder), source, as_json)
     else:
-        raise ConfigError("no run: give its folder, or --simulate")
+        raise ConfigError("no run: give its folder or bundle, or --simulate")
 
 
-def _repeat(run: Run, as_json: bool) -> None:
+def _repeat(run: Run, source: Path, as_json: bool) -> None:
     recorded = RecordedRun(run.records())
     records: list[PoseRecord] = []
     sampling = Sampling(**run.header()["config"]["sampling"])
@@ -60,7 +64,7 @@ def _repeat(run: Run, as_json: bool) -> None:
     stop_unless_accepted(outcome.result)
     if run.calibration_path.exists():
         _compare(outcome.result, CalibrationResult.load(run.calibration_path))
-        talk.print(hanging(" ✔ ", f"equal to the last digit: {run.calibration_path}"))
+        talk.print(hanging(" ✔ ", f"equal to the last digit: {run.calibration_path.name} of {source}"))
 
 
 def _compare(again: CalibrationResult, saved: CalibrationResult) -> None:

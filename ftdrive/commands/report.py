@@ -1,7 +1,7 @@
 """`ftdrive report`: one file that says whether a calibration is good, and why."""
 
 import shlex
-from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -27,6 +27,7 @@ from ftdrive.report.facts import facts_of
 from ftdrive.report.report import Format
 from ftdrive.report.report import report as written
 from ftdrive.report.subject import SolveOptions, read_subject
+from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.source import Orientation
 from ftdrive.terminal.console import hanging, talk
 
@@ -94,8 +95,12 @@ def report(
     options = SolveOptions(
         method, orientation, drift, known_values(mass_kg, level_deg, mounting_deg), _typed(click.get_current_context())
     )
-    with nullcontext(source) if source is not None else rehearsed_run(sensor) as found:
-        facts = facts_of(read_subject(found, options, parent))
+    with unpacked(source) if source is not None else rehearsed_run(sensor) as found:
+        subject = read_subject(found, options, parent)
+        if source is not None and found != source:  # unpacked
+            reproduce = subject.reproduce.replace(str(found), shlex.quote(str(source)))
+            subject = replace(subject, source=source, reproduce=reproduce)
+        facts = facts_of(subject)
     text = written(facts, form)
     if output is not None:
         write_new(output, text)

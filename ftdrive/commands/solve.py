@@ -18,6 +18,7 @@ from calib.likelihood.session import Drift
 from calib.model import UP_IN_BASE
 from calib.result import Method
 from calib.routine import drift_check
+from ftdrive.checks.plausibility import judged
 from ftdrive.cli import exit_code
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
@@ -32,7 +33,8 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.commands.emulated_run import rehearsed_run
-from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.errors import BadBundle, ConfigError, NotAccepted
+from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.pose_hints import hints
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import Orientation, read_source
@@ -94,7 +96,7 @@ def solve(
     sensor: str | None,
     as_json: bool,
 ) -> None:
-    """Solve each DATASET: a run folder, a dataset.json, or a CSV file.
+    """Solve each DATASET: a run folder, the file of `ftdrive bundle`, a dataset.json, or a CSV file.
 
     A CSV has a header with r11..r33 (or the rotation vector rx,ry,rz), fx,fy,fz,tx,ty,tz in N and N·m, and optionally
     t in seconds and sigma_fx..sigma_tz, the standard error of each pose's mean. With --json, one object a line.
@@ -120,28 +122,29 @@ def _solve_each(
     force: bool,
     as_json: bool,
 ) -> None:
-    first_failure: CalibError | NotAccepted | None = None
+    first_failure: CalibError | NotAccepted | BadBundle | None = None
     for source in sources:
         try:
-            dataset, circumstances, provenance = read_source(source, orientation, options["known"])
-            payload_kg = circumstances.pop("payload_kg", None)
-            here = {**options, **circumstances}
-            if method == "all":
-                _show_all(source, dataset, here, as_json)
-                continue
-            result = _solve(dataset, method, {**here, "payload_kg": payload_kg, "provenance": provenance})
-            records = Run(source).records() if source.is_dir() else []  # for hints and drift
-            if as_json:
-                found = list(hints(result, records)) if records else []
-                write_json({"source": str(source), "hints": found, **result.to_dict()})
-            else:
-                print_result(result, drift=drift_check(records), records=records)
-            if not force:
-                stop_unless_accepted(result, to_be_saved=output is not None)
-            if output is not None:
-                result.save(output)
-                talk.print(f" Saved {output}")
-        except (CalibError, NotAccepted) as error:
+            with unpacked(source) as place:
+                dataset, circumstances, provenance = read_source(place, orientation, options["known"])
+                payload_kg = circumstances.pop("payload_kg", None)
+                here = {**options, **circumstances}
+                if method == "all":
+                    _show_all(source, dataset, here, as_json)
+                    continue
+                result = _solve(dataset, method, {**here, "payload_kg": payload_kg, "provenance": provenance})
+                records = Run(place).records() if place.is_dir() else []  # for hints and drift
+                if as_json:
+                    found = list(hints(result, records)) if records else []
+                    write_json({"source": str(source), "hints": found, **result.to_dict()})
+                else:
+                    print_result(result, drift=drift_check(records), records=records)
+                if not force:
+                    stop_unless_accepted(result, to_be_saved=output is not None)
+                if output is not None:
+                    result.save(output)
+                    talk.print(f" Saved {output}")
+        except (CalibError, NotAccepted, BadBundle) as error:
             if len(sources) == 1:
                 raise
             first_failure = first_failure or error
@@ -155,7 +158,7 @@ def _solve_each(
 def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) -> CalibrationResult:
     chosen: Method = method
     try:
-        return solve_dataset(dataset, chosen, **options)
+        return judged(solve_dataset(dataset, chosen, **options))
     except ValueError as error:
         raise ConfigError(str(error)) from error
 

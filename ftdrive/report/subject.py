@@ -12,6 +12,7 @@ from calib.files import read_object
 from calib.likelihood.session import Drift
 from calib.result import Method
 from calib.routine import PoseRecord
+from ftdrive.checks.plausibility import judged
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import Orientation, read_source
@@ -102,7 +103,7 @@ def _of_data(source: Path, options: SolveOptions) -> Subject:
     if run is not None and options == SolveOptions() and run.calibration_path.is_file():
         result = CalibrationResult.load(run.calibration_path)
     if result is None or result.provenance.get("dataset_sha256") != dataset.sha256():
-        result = solve(dataset, options.method, drift=options.drift, **circumstances, provenance=provenance)
+        result = judged(solve(dataset, options.method, drift=options.drift, **circumstances, provenance=provenance))
     records = [] if run is None else run.records()
     command = " ".join(["ftdrive solve", shlex.quote(str(source)), *options.words])
     return Subject(source, result, command, dataset, run, records, _for_compare(circumstances, options))

@@ -8,6 +8,7 @@ from typing import Any
 
 from calib import CalibrationDataset, CalibrationResult, solve
 from calib.routine import DriftCheck, PoseRecord, dataset_from, drift_check
+from ftdrive.checks.plausibility import judged
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.run import Run, versions
 
@@ -34,7 +35,7 @@ def solve_and_save(run: Run) -> Outcome:
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     """Solve records of a run, as they are on disk or as a replay gives them."""
     dataset, circumstances, provenance = dataset_of(run, records)
-    result = solve(dataset, **circumstances, provenance=provenance)
+    result = judged(solve(dataset, **circumstances, provenance=provenance))
     return Outcome(run, dataset, result, drift_check(records))
 
 
@@ -68,10 +69,14 @@ def _setup(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
     for event in run.events():
         if event.get("event") == "weighed":
             payload_kg = event["payload_kg"]
+    sensor, tool, workcell = (config.get(section, {}) for section in ("sensor", "tool", "workcell"))
     return {
         "payload_kg": payload_kg,
-        "sensor_mass_kg": config.get("sensor", {}).get("mass_kg"),
-        "mounting": config.get("workcell", {}).get("mounting"),
-        "tool": config.get("tool", {}).get("name"),
-        "mount": config.get("sensor", {}).get("mount"),
+        "sensor_mass_kg": sensor.get("mass_kg"),
+        "mounting": workcell.get("mounting"),
+        "height_mm": sensor.get("height_mm"),
+        "tool_mass_kg": tool.get("mass_kg"),
+        "cylinders_mm": [list(row) for row in tool.get("cylinders_mm", ())] if workcell.get("measured") else [],
+        "tool": tool.get("name"),
+        "mount": sensor.get("mount"),
     }

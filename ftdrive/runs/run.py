@@ -43,7 +43,10 @@ RUN_FORMAT = "ftdrive.run/1"
 RECORDING_FORMAT = "ftdrive.recording/1"
 
 _RESTORE = "take it from a copy"
-_DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+_DAMAGE = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, MemoryError),
+    *(NotImplementedError, zipfile.BadZipFile, zlib.error),
+)
 """Errors of numpy for a damaged file."""
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 """Of a recording, named as in `FtSamples`."""

@@ -17,14 +17,17 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, CalibrationResult, NotObservable, Parameters, read_csv, solve
 from calib.errors import BadDataset
 from calib.known import Known
 from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array
+from ftdrive.checks.plausibility import judged
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.scenarios import Rng, Truth
 
@@ -35,8 +38,10 @@ STEPS = 3
 ROTATION_RAD, WEIGHT_SHARE = np.deg2rad(1.0), 0.01
 """An answer this close is the truth: mounting, and the wrench over all orientations, torque at the centre of mass."""
 LBF_N, KGF_N, LBF_IN_NM = 4.4482216, 9.80665, 0.11298483
+HEIGHT_MM = 40.0
 ALL_NAMES = ("inverted", "quaternion", "base axes", "each wrench", "axes disagree", "reversed", "reaction", "N·mm",
-             "lbf", "kgf", "stuck", "identical", "one tool")  # fmt: skip
+             "forces in", "stuck", "identical", "one tool", "other poses", "outside the tool", "hang on",
+             "[workcell]")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,8 @@ class Case:
     up: Array = field(default_factory=lambda: UP_IN_BASE)
     unit_rad: float = 1.0
     """Of the rotation vectors in the file."""
+    setup: dict[str, Any] = field(default_factory=dict)
+    """The described cell, as `ftdrive.checks.plausibility` takes it."""
     rng: Rng = field(default_factory=np.random.default_rng)
     """Draws what a fault leaves open."""
 
@@ -76,6 +83,22 @@ def shifted(case: Case, by: int = 1) -> Case:
     early, late = slice(None, -1), slice(1, None)
     own, other = (late, early) if by > 0 else (early, late)
     return replace(case, R=case.R[own], wrench=case.wrench[other])
+
+
+def elsewhere(case: Case, rows: Callable[[int, Rng], NDArray[Any]]) -> Case:
+    """Pair the wrenches with other poses."""
+    return replace(case, wrench=case.wrench[rows(len(case.R), case.rng)])
+
+
+def mirrored(case: Case, S: Array) -> Case:
+    """Give the orientations in left-handed axes."""
+    return replace(case, R=S @ case.R @ S)
+
+
+def as_euler_angles(case: Case) -> Case:
+    """Read roll, pitch and yaw as a rotation vector."""
+    angles = Rotation.from_matrix(case.R).as_euler("xyz")
+    return replace(case, R=Rotation.from_rotvec(angles).as_matrix())
 
 
 def axes(case: Case, *, Q: Array, groups: str) -> Case:
@@ -134,6 +157,17 @@ def with_payload(case: Case) -> Case:
     return replace(case, payload_kg=MASS_KG * case.rng.uniform(0.9, 1.1))
 
 
+def with_tool(case: Case, **different: object) -> Case:
+    """Describe the tool: its centre of mass in the middle of a cylinder."""
+    length_mm = HEIGHT_MM + 2e3 * float(case.truth.P @ case.truth.R[:, 2])
+    tool = {"cylinders_mm": [[0.0, length_mm, 100.0]], "height_mm": HEIGHT_MM, "mounting": "floor"}
+    return replace(case, setup=tool | different)
+
+
+def with_tool_mass(case: Case) -> Case:
+    return with_tool(case, cylinders_mm=(), tool_mass_kg=MASS_KG * case.rng.uniform(0.9, 1.1))
+
+
 def with_mounting(case: Case) -> Case:
     return replace(case, known=Known(R_flange_sensor=case.truth.R.T))
 
@@ -179,6 +213,29 @@ FAULTS: dict[str, tuple[Callable[[Case], Case], str]] = {
     "lbf, payload known": (both(with_payload, scaled, force=LBF_N), "forces in lbf"),
     "kgf, payload known": (both(with_payload, scaled, force=KGF_N), "forces in kgf"),
     "kgf and kgf·m, payload known": (both(with_payload, scaled, force=KGF_N, torque=KGF_N), "forces in kgf"),
+    "mN": (partial(scaled, force=1e-3), "forces in mN"),
+    "kN": (partial(scaled, force=1e3), "forces in kN"),
+    "mN and N·mm": (partial(scaled, force=1e-3, torque=1e-3), "forces in mN and torques in N·mm"),
+    "kN and kN·m": (partial(scaled, force=1e3, torque=1e3), "forces in kN and torques in kN·m"),
+    "mN and N·mm, mass known": (both(with_mass, scaled, force=1e-3, torque=1e-3), "forces in mN and torques in N·mm"),
+    "mN and N·mm, payload known": (
+        both(with_payload, scaled, force=1e-3, torque=1e-3), "forces in mN and torques in N·mm"),
+    "lbf, tool described": (both(with_tool, scaled, force=LBF_N), "outside the tool.*forces in lbf"),
+    "lbf and lbf·ft, tool described": (
+        both(with_tool, scaled, force=LBF_N, torque=12 * LBF_IN_NM), "outside the tool.*lbf·ft"),
+    "lbf and lbf·in, tool mass": (both(with_tool_mass, scaled, force=LBF_N, torque=LBF_IN_NM), "forces in lbf"),
+    "lbf and lbf·ft, tool mass": (both(with_tool_mass, scaled, force=LBF_N, torque=12 * LBF_IN_NM), "forces in lbf"),
+    "kgf and kgf·m, tool mass": (both(with_tool_mass, scaled, force=KGF_N, torque=KGF_N), "forces in kgf"),
+    "torques reversed, tool described": (
+        both(with_tool, axes, Q=-np.eye(3), groups="T"), "outside the tool|torques are reversed"),
+    "orientations in left-handed axes": (partial(mirrored, S=MIRROR), "orientations are mirrored"),
+    "x, y swapped in orientations": (partial(mirrored, S=SWAP), "orientations are mirrored"),
+    "conjugate quaternions in another order": (
+        both(with_tool, lambda case: quaternions(transposed(case))), r"\[workcell\] mounting|outside the tool"),
+    "wrench of two poses before": (partial(elsewhere, rows=lambda n, _: np.roll(np.arange(n), 2)), "other poses"),
+    "wrenches in reverse order": (partial(elsewhere, rows=lambda n, _: np.arange(n)[::-1]), "other poses"),
+    "wrenches in any order": (partial(elsewhere, rows=lambda n, rng: rng.permutation(n)), "other poses"),
+    "Euler angles read as rotation vectors": (as_euler_angles, "other poses, or the orientations"),
     "one channel constant": (stuck, "stuck"),
     "rows copied": (copied, "identical wrenches and orientations"),
     "wrench not updated once": (stale, "identical wrenches in different orientations"),
@@ -190,7 +247,7 @@ FAULTS: dict[str, tuple[Callable[[Case], Case], str]] = {
 
 
 UNITS = {"lbf": LBF_N, "kgf": KGF_N, "N·mm": 1e-3, "lbf·in": LBF_IN_NM, "lbf·ft": 12 * LBF_IN_NM, "kgf·m": KGF_N,
-         "kgf·cm": KGF_N / 100}  # fmt: skip
+         "kgf·cm": KGF_N / 100, "mN": 1e-3, "kN": 1e3, "kN·m": 1e3}  # fmt: skip
 
 
 def in_flange(case: Case) -> Case:
@@ -211,7 +268,7 @@ def taken_from(text: str) -> Array:
 
 
 ORDER = r"((?:[xyz](?: and [xyz])* reversed)|(?:x, y, z taken from \([-xyz, ]+\)))"
-UNIT = r"(?:forces in (lbf|kgf))?(?: and )?(?:torques in (\S+·\w+))?"
+UNIT = r"(?:forces in (lbf|kgf|mN|kN))?(?: and )?(?:torques in (\S+·\w+))?"
 
 
 def followed(reason: str, case: Case, clean: Case) -> list[Case]:
@@ -231,6 +288,10 @@ def followed(reason: str, case: Case, clean: Case) -> list[Case]:
             axes(case, Q=taken_from(order), groups={"force": "F", "torque": "T", "wrench": "FT"}[group])
             for group, order in re.findall(f"(force|torque|wrench) {ORDER}", reason)
         ]
+    if "other poses" in reason or "[workcell] mounting" in reason:
+        return [clean]
+    if "orientations are mirrored" in reason:
+        return [axes(case, Q=-np.eye(3), groups="F"), *(mirrored(case, S) for S in (MIRROR, SWAP))]
     if "forces are reversed" in reason or "torques are reversed" in reason:
         return [axes(case, Q=-np.eye(3), groups="F" if "forces are" in reason else "T")]
     if "pulls upwards" in reason:
@@ -295,7 +356,8 @@ def solved(case: Case, *, measured: bool) -> CalibrationResult:
     dataset = CalibrationDataset(case.R, case.wrench, cov, np.zeros(n, np.int64), np.arange(float(n)))
     if case.unit_rad != 1.0:
         dataset = from_file(case)
-    return solve(dataset, known=case.known, payload_kg=case.payload_kg, up_in_base=case.up)
+    result = solve(dataset, known=case.known, payload_kg=case.payload_kg, up_in_base=case.up)
+    return judged(replace(result, provenance={"setup": case.setup}))
 
 
 def from_file(case: Case) -> CalibrationDataset:
@@ -341,6 +403,10 @@ def sound(seed: int) -> str | None:
     path, _ = sim.walk(n, rng.uniform(0, 0.1) / np.sqrt(n), rng)
     payload_kg = MASS_KG * rng.uniform(0.8, 1.2) + rng.uniform(0, 0.3)
     case = Case(truth, R, wrench + path, payload_kg=payload_kg, up=base.apply([0.0, 0.0, 1.0]))
+    height_mm = None if rng.integers(2) else HEIGHT_MM
+    tool_mass_kg, sensor_mass_kg = MASS_KG * rng.uniform(0.8, 1.2), None
+    cell = {"tool_mass_kg": tool_mass_kg, "payload_kg": payload_kg, "sensor_mass_kg": sensor_mass_kg}
+    case = with_tool(case, mounting=None, height_mm=height_mm, **cell)
     _, reasons, _ = answer(case, measured=bool(rng.integers(2)))
     return next((name for name in ALL_NAMES if name in " | ".join(reasons)), None)
 

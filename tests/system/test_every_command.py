@@ -47,13 +47,14 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
 OFFLINE = ("convert", "compensate", "history", "diff", "export formats")
 """They know no cell."""
 
-REHEARSED = ("replay", "report", "solve", "export calibration")
+REHEARSED = ("bundle", "replay", "report", "solve", "export calibration")
 """They calibrate an emulated cell first, as do live, push (test_push.py) and demo (test_demo.py)."""
 
 GUIDED = ("calibrate", "verify")
 """They print their events too, one object a line."""
 
 SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
+    "bundle": lambda answer: answer["file"].endswith(".zip") and not answer["left_out"],
     "calibrate": lambda answer: answer["verdict"] != "rejected",
     "config show": lambda answer: (
         answer["config"]["robot"]["model"] == "UR5e" and answer["config"]["workcell"]["measured"]
@@ -201,7 +202,7 @@ def test_the_sensor_that_is_named_is_emulated(
         (("doctor", "--simulate", "--robot", "10.0.0.2"), "--robot does not go with --simulate"),
         (("solve", "--simulate", "."), "DATASET does not go with --simulate"),
         (("solve", "--sensor", "emulated://bota", "."), "--sensor goes only with --simulate"),
-        *(((command,), "--simulate") for command in ("solve", "replay", "report", "live", "push")),
+        *(((command,), "--simulate") for command in ("solve", "replay", "report", "bundle", "live", "push")),
         (("push", ".", "--restore", "."), "--restore takes everything"),
         (("record", "-o", "a.csv"), "--simulate"),
         (("transcript", "play"), "--simulate"),

@@ -81,6 +81,7 @@ def franka(calibration: CalibrationResult, settings: Settings) -> Exported:
     mass_kg, com_m = settings.payload("franka", calibration)
     document = {"mass": mass_kg, "F_x_Cload": numbers(com_m), "load_inertia": [0.0] * 9}
     notes = (
+        *settings.assumed,
         "The inertia was not identified: zeros stand for a point mass. Put values of the CAD model there.",
         "Franka names the centre of mass F_x_center_load in ROS 1 and center_of_mass in ROS 2.",
         "The load has no bias. How the controller uses the load is not public: compare O_F_ext_hat_K without "
@@ -104,6 +105,7 @@ def ur_payload(calibration: CalibrationResult, settings: Settings) -> Exported:
     cog = ", ".join(_fixed(x) for x in com_m)
     text = f"set_target_payload({_fixed(mass_kg)}, [{cog}], [0, 0, 0, 0, 0, 0])\n"
     notes = (
+        *settings.assumed,
         "The controller zeroes its own force sensor when this runs: keep the tool free and the arm still.",
         "The inertia was not identified: zeros stand for a point mass. Needs PolyScope 5.10; set_payload before that.",
         "The payload has no bias. How the controller uses it is not public: compare get_tcp_force() without contact in "

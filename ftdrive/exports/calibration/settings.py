@@ -37,7 +37,7 @@ class Settings:
     sensor_mass_kg: float | None = None
     """Of sensor and adapter."""
     sensor_com_mm: tuple[float, ...] | None = None
-    """Centre of mass of sensor and adapter, from the flange, in flange axes."""
+    """Centre of mass of sensor and adapter, from the flange, in flange axes; None: half way up on the flange axis."""
 
     def __post_init__(self) -> None:
         for field in ("base_frame", "flange_frame", "sensor_frame", "tool_frame"):
@@ -85,7 +85,7 @@ class Settings:
         Raises
         ------
         ConfigError
-            Height, mass or centre of mass of the sensor was not measured.
+            Height or mass of the sensor was not measured.
         """
         com_m = self.p_flange_sensor_m(target) + calibration.R_flange_sensor @ calibration.p_sensor_com_m
         if self.sensor_mass_kg is None:
@@ -95,14 +95,21 @@ class Settings:
             )
         if self.sensor_mass_kg == 0.0:
             return calibration.mass_kg, com_m
-        if self.sensor_com_mm is None:
-            raise ConfigError(
-                f"{target} needs the centre of mass of sensor and adapter ({self.sensor_mass_kg:g} kg): "
-                "give --sensor-com X,Y,Z in mm from the flange face, along its axes"
-            )
+        sensor_com_m = self.p_flange_sensor_m(target) / 2
+        if self.sensor_com_mm is not None:
+            sensor_com_m = np.array(self.sensor_com_mm) / 1e3
         mass_kg = calibration.mass_kg + self.sensor_mass_kg
-        moment = calibration.mass_kg * com_m + self.sensor_mass_kg * np.array(self.sensor_com_mm) / 1e3
-        return mass_kg, moment / mass_kg
+        return mass_kg, (calibration.mass_kg * com_m + self.sensor_mass_kg * sensor_com_m) / mass_kg
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """Note about the centre of mass of the sensor, if it was not measured."""
+        if not self.sensor_mass_kg or self.sensor_com_mm is not None:
+            return ()
+        return (
+            f"The centre of mass of sensor and adapter ({self.sensor_mass_kg:g} kg) is taken half way up, on the axis of "
+            "the flange, as `ftdrive push` does: give --sensor-com X,Y,Z if you know it.",
+        )
 
 
 def recorded_sensor(path: Path, calibration: CalibrationResult) -> tuple[float | None, float | None]:

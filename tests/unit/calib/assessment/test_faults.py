@@ -58,6 +58,54 @@ def test_a_wrench_of_the_neighbouring_pose_is_named(by: int) -> None:
     assert f"that of the pose {'before' if by > 0 else 'after'} it" in first(R, wrench)
 
 
+@pytest.mark.parametrize("order", ["reverse", "two before", "any"])
+def test_wrenches_of_other_poses_are_named(order: str) -> None:
+    _, R, wrench = session(3)
+    n = len(R)
+    rows = {"reverse": np.arange(n)[::-1], "two before": np.roll(np.arange(n), 2)}
+    wrench = wrench[rows.get(order, np.random.default_rng(1).permutation(n))]
+    assert "wrenches are paired with other poses" in first(R, wrench)
+
+
+def test_two_exchanged_poses_are_rejected_and_not_called_a_wrong_pairing() -> None:
+    _, R, wrench = session(3, 24)
+    wrench[[4, 5]] = wrench[[5, 4]]
+    reasons = " | ".join(solved(R, wrench).reasons)
+    assert "repeat 5, 6" in reasons
+    assert "other poses" not in reasons
+
+
+def test_roll_pitch_and_yaw_that_were_read_as_a_rotation_vector_are_named() -> None:
+    _, R, wrench = session(4)
+    angles = Rotation.from_matrix(R).as_euler("xyz")
+    assert "orientations have another form (Euler angles" in first(Rotation.from_rotvec(angles).as_matrix(), wrench)
+
+
+@pytest.mark.parametrize("S", [np.diag([1.0, -1, 1]), SWAP])
+def test_orientations_in_left_handed_axes_are_named(S: Array) -> None:
+    _, R, wrench = session(5)
+    assert "the orientations are mirrored (left-handed axes)" in first(S @ R @ S, wrench)
+
+
+@pytest.mark.parametrize(
+    ("force", "torque", "says"),
+    [
+        (1e-3, 1e-3, "as with forces in mN and torques in N·mm: check"),
+        (1e-3, 1.0, "as with forces in mN: check"),
+        (1e3, 1e3, "as with forces in kN and torques in kN·m: check"),
+        (1e3, 1.0, "or forces in kN: check"),
+    ],
+)
+def test_a_factor_of_1000_is_named_without_a_known_mass(force: float, torque: float, says: str) -> None:
+    p, R, wrench = session(7)
+    wrench /= np.repeat([force, torque], 3)
+    assert says in first(R, wrench)
+    mass_kg = float(np.linalg.norm(p.gravity_force_base_N)) / 9.80665
+    unit = "mN" if force < 1 else "kN"
+    assert f"forces in {unit}" in first(R, wrench, payload_kg=mass_kg)
+    assert f"forces in {unit}" in first(R, wrench, Known(mass_kg=mass_kg, mass_tolerance_kg=0.01))
+
+
 @pytest.mark.parametrize("Q", [SWAP, CYCLE])
 @pytest.mark.parametrize("group", ["force", "torque"])
 def test_axes_that_disagree_are_named_with_their_order(Q: Array, group: str) -> None:

@@ -385,7 +385,7 @@ def test_wrong_units_of_torque_are_detected() -> None:
     wrench = noisy(np.random.default_rng(22), R24)
     for factor, verdict, says in (
         (1e3, "rejected", "the centre of mass is 73.5"),
-        (1e3, "rejected", "farther than 0.5 m, as with torques in N·mm: check"),
+        (1e3, "rejected", "farther than 0.5 m, as with torques in N·mm, or forces in kN: check"),
         (1e-3, "usable", "the centre of mass is only 0.074 mm from the sensor"),
         (10, "rejected", "farther than 0.5 m, as with torques in lbf·in, or forces in lbf, or forces in kgf: check"),
     ):

@@ -170,7 +170,9 @@ def test_a_wrong_payload_is_told_once_when_the_fit_knows_and_at_the_end(lab: Lab
     assert weighed.mass_kg == pytest.approx(MEASURED_KG, abs=0.05)
     assert lab.holds() == []
     assert outcome is not None
-    assert [one for one in hints(outcome.result, outcome.run.records()) if "2.50 kg" in one]
+    assert outcome.result.verdict == "usable"
+    assert outcome.result.reasons[0] == words[0].words
+    assert hints(outcome.result, outcome.run.records()) == ()
 
 
 def test_a_run_whose_payload_is_right_in_pounds_is_not_good(lab: Lab) -> None:
@@ -191,7 +193,8 @@ def test_the_mass_of_the_sensor_counts(payload_kg: float, sensor_kg: float | Non
     outcome = lab.calibrate()
     assert ("PolyScope: 2.00 kg" in lab.said()) is reported
     assert outcome is not None
-    assert any("payload" in one for one in hints(outcome.result, outcome.run.records())) is reported
+    assert any("payload" in one for one in outcome.result.reasons) is reported
+    assert (outcome.result.verdict == "good") is not reported
 
 
 @pytest.mark.slow
@@ -226,7 +229,7 @@ def test_a_payload_that_was_corrected_before_the_run_goes_on_is_no_longer_report
     again = lab.calibrate(resume=run.folder, redo=(4,))
     assert "PolyScope" not in lab.said()
     assert again is not None
-    assert not any("payload" in one for one in hints(again.result, again.run.records()))
+    assert not any("payload" in one for one in again.result.reasons)
     saved = json.loads(run.calibration_path.read_text())
-    expected = {"payload_kg": 1.3, "sensor_mass_kg": None, "mounting": "floor"}
-    assert expected.items() <= saved["provenance"]["setup"].items()
+    known = {"payload_kg": 1.3, "sensor_mass_kg": None, "mounting": "floor", "height_mm": None, "tool_mass_kg": None}
+    assert (known | {"cylinders_mm": [[0.0, 200.0, 100.0]]}).items() <= saved["provenance"]["setup"].items()

@@ -169,14 +169,16 @@ def test_solve_says_of_a_run_what_calibrate_says(as_json: bool, lab: Lab, capsys
     records = outcome.run.records()
     expected = hints(outcome.result, records)
     assert any("the base leans" in one for one in expected)
-    assert any("2.50 kg" in one for one in expected)
+    assert "2.50 kg" in outcome.result.reasons[0]
     capsys.readouterr()
     print_result(outcome.result, drift=outcome.drift, records=records)
     by_calibrate = capsys.readouterr().err
     solve_command.main([str(outcome.run.folder), *["--json"][:as_json]], standalone_mode=False)
     by_solve = capsys.readouterr()
     if as_json:
-        assert json.loads(by_solve.out)["hints"] == list(expected)
+        answer = json.loads(by_solve.out)
+        assert answer["hints"] == list(expected)
+        assert answer["reasons"] == list(outcome.result.reasons)
     else:
         assert by_solve.err == by_calibrate
 

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from math import radians, sin, sqrt
-from typing import Any
 
 import numpy as np
 import pytest
@@ -111,13 +110,18 @@ def test_the_place_of_the_sensor_is_never_invented(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["franka", "ur-payload"])
-@pytest.mark.parametrize(
-    ("missing", "option"), [("sensor_mass_kg", "--sensor-mass KG"), ("sensor_com_mm", "--sensor-com X,Y,Z")]
-)
-def test_the_mass_of_the_sensor_is_never_invented(name: str, missing: str, option: str) -> None:
-    changes: dict[str, Any] = {missing: None}
-    with pytest.raises(ConfigError, match=option):
-        export(calibration(), name, replace(MEASURED, **changes))
+def test_the_mass_of_the_sensor_is_never_invented(name: str) -> None:
+    with pytest.raises(ConfigError, match="--sensor-mass KG"):
+        export(calibration(), name, replace(MEASURED, sensor_mass_kg=None))
+
+
+@pytest.mark.parametrize("name", ["franka", "ur-payload"])
+def test_the_centre_of_the_sensor_is_half_way_up_unless_given(name: str) -> None:
+    assert MEASURED.height_mm is not None
+    half_way = (0.0, 0.0, MEASURED.height_mm / 2)
+    assumed = export(calibration(), name, replace(MEASURED, sensor_com_mm=None))
+    assert assumed.text == export(calibration(), name, replace(MEASURED, sensor_com_mm=half_way)).text
+    assert any("--sensor-com" in note for note in assumed.notes)
 
 
 @pytest.mark.parametrize("name", [name for name, one in FORMATS.items() if one.file.endswith("yaml")])

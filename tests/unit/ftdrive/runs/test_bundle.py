@@ -1,0 +1,210 @@
+"""A bundle gives the result of its run without its addresses, and a damaged or hostile one does nothing."""
+
+import io
+import json
+import re
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from calib import CalibrationResult, Parameters
+from calib.errors import BadDataset
+from calib.model import predict
+from calib.poses.information import special
+from calib.routine import PoseRecord, TourPose
+from drivers.interfaces import FtSamples
+from ftdrive.cli import cli
+from ftdrive.cli import run as run_command
+from ftdrive.errors import BadBundle
+from ftdrive.runs import bundle
+from ftdrive.runs.bundle import unpacked, write_bundle
+from ftdrive.runs.outcome import solve_and_save
+from ftdrive.runs.run import Reading, Run
+
+TRUTH = Parameters(np.eye(3), np.array([0.0, 0, -12]), np.ones(3), np.array([0.0, 0, 0.06]), np.ones(3))
+SERIAL_PORT = "/dev/serial/by-id/usb-FTDI_USB-RS485_FT6ABC12-if00-port0"
+SECRETS = ("192.168.7.31", "ur5e-hall3", "example.org", "alice", "fe80::a00:27ff", "08:00:27:12:34:56", "10.9.8.7")
+CONFIG = {
+    "robot": {"host": "ur5e-hall3.example.org", "driver": "ur"},
+    "sensor": {"url": "ati-netft://192.168.7.31?onrobot=0"},
+    "sampling": {"average_s": 0.1},
+    "site": {"g_m_s2": 9.81},
+}
+DEVICES = {"arm": {"serial": "20235501234", "firmware": "5.15.0.17"}, "sensor": {"serial": "FT12345"}}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A solved one of 8 poses; its files give away hosts and a person."""
+    header = {"config": CONFIG, "devices": DEVICES, "said": {"robot": "ur5e-hall3", "config": "/home/alice/cell.toml"}}
+    run = Run.create(tmp_path_factory.mktemp("runs"), "gripper", header)
+    rng, n = np.random.default_rng(1), 50
+    for stop, R in enumerate(special([1, 5, 9, 11, 14, 18, 20, 23]), 1):
+        reading = Reading(stop * 10**9, np.full(6, 0.1 * stop), R)
+        wrench = predict(TRUTH, R[None]) + rng.normal(0, 0.01, (n, 6))
+        t_ns = stop * 10**9 + np.arange(n) * 10**6
+        samples = FtSamples(
+            t_ns, np.full(n, np.nan), np.arange(n), np.zeros((n, 0), np.int32), wrench, np.zeros(n, "u4")
+        )
+        run.commit(PoseRecord(stop, TourPose(stop, reading.q_rad), reading, reading, samples, steady=True))
+    run.append_event({"event": "noted", "words": f"alice@ur5e-hall3 lost 10.9.8.7, by {SERIAL_PORT}"})
+    run.append_event({"event": "noted", "words": "fe80::a00:27ff on 08:00:27:12:34:56, 127.0.0.1, 12:30:45"})
+    with (run.folder / "events.ndjson").open("a") as file:
+        file.write('{"event": "noted", "words": "cut off at 192.168.7.31')
+    solve_and_save(run)
+    return run
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def test_no_text_of_a_bundle_has_an_address_or_a_name_and_serial_numbers_stay(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "a.zip"
+    bundled = write_bundle(run.folder, path)
+    files = contents(path)
+    texts = {name: content.decode() for name, content in files.items() if not name.endswith(".npz")}
+    assert not [(name, secret) for name, text in texts.items() for secret in SECRETS if secret in text]
+    everything = "".join(texts.values())
+    for kept in (SERIAL_PORT, "FT12345", "20235501234", "5.15.0.17", "127.0.0.1", "12:30:45", "ati-netft://<ip-1>?"):
+        assert kept in everything, kept
+    assert bundled.redacted["home"] == bundled.redacted["mac"] == 1
+    assert json.loads(files["bundle.json"])["redacted"] == bundled.redacted
+    header = json.loads(texts[f"{run.folder.name}/run.json"])
+    assert header["config"]["robot"]["host"].startswith("<host-")
+    assert header["said"]["config"].startswith("<home-1>/")
+    assert "numpy" in json.loads(texts["environment.json"])["packages"]
+
+
+def test_a_bundle_gives_the_result_of_its_run_to_the_last_digit(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "a.zip"
+    write_bundle(run.folder, path)
+    saved = CalibrationResult.load(run.calibration_path)
+    for command in ("replay", "solve"):
+        answer = CliRunner().invoke(cli, [command, str(path), "--json"])
+        assert answer.exit_code == 0, answer.output
+        again = json.loads(answer.stdout)
+        expected = json.loads(json.dumps(saved.to_dict()))
+        assert {key: again[key] for key in expected if key != "provenance"} == {
+            key: value for key, value in expected.items() if key != "provenance"
+        }
+    with unpacked(path) as folder:
+        assert len(Run(folder).records()) == 8
+    assert not folder.exists()
+
+
+def test_the_bytes_of_a_transcript_keep_their_number(run: Run, tmp_path: Path) -> None:
+    page = "GET /netftapi2.xml HTTP/1.1\r\nHost: 192.168.7.31\r\n\r\n"
+    lines = [
+        {"sensor": "ati-netft://192.168.7.31"},
+        {"request": page.encode().hex()},
+        {"hex": "c0a8071f00ff" + b"alice".hex()},
+    ]
+    transcript = tmp_path / "netft.jsonl"
+    transcript.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_bundle(run.folder, tmp_path / "a.zip", [transcript])
+    header, request, raw = map(json.loads, contents(tmp_path / "a.zip")["transcripts/1-netft.jsonl"].splitlines())
+    assert header == {"sensor": "ati-netft://<ip-1>"}
+    assert bytes.fromhex(request["request"]).decode() == page.replace("192.168.7.31", "x" * 12)
+    assert raw == lines[2]
+
+
+def test_what_cannot_be_redacted_is_left_out_and_named(run: Run, tmp_path: Path) -> None:
+    binary, link = run.folder / "peg.mcap", run.folder / "secrets.txt"
+    binary.write_bytes(b"\x89MCAP0\r\n\0 192.168.7.31")
+    link.symlink_to(tmp_path / "elsewhere.txt")
+    (tmp_path / "elsewhere.txt").write_text("password")
+    try:
+        bundled = write_bundle(run.folder, tmp_path / "a.zip")
+    finally:
+        binary.unlink()
+        link.unlink()
+    assert bundled.left_out == ["peg.mcap", "secrets.txt"]
+    assert not [name for name in contents(tmp_path / "a.zip") if "peg" in name or "secrets" in name]
+
+
+def test_a_damaged_run_can_be_bundled_and_a_folder_without_a_run_cannot(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    with pytest.raises(BadDataset, match=r"no run\.json"):
+        write_bundle(tmp_path / "run", tmp_path / "a.zip")
+    (tmp_path / "run" / "run.json").write_text('{"format": "ftdrive.run/1", "config": ')
+    write_bundle(tmp_path / "run", tmp_path / "a.zip")
+    assert "not valid JSON" in json.loads(contents(tmp_path / "a.zip")["environment.json"])["error"]
+
+
+def test_a_bundle_never_replaces_a_file(run: Run, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.zip"
+    path.write_text("mine")
+    assert run_command(["bundle", str(run.folder), "-o", str(path)]) == 2
+    assert "never overwritten" in capfd.readouterr().err
+    with pytest.raises(FileExistsError):
+        write_bundle(run.folder, path)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.zip"]
+    assert path.read_text() == "mine"
+
+
+def zipped(path: Path, files: Mapping[str, Any]) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return path
+
+
+ABOUT = json.dumps({"format": bundle.FORMAT, "run": "r"})
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({"../evil": "", "bundle.json": ABOUT}, "leads out of its folder"),
+        ({"r/../../evil": "", "bundle.json": ABOUT}, "leads out of its folder"),
+        ({"/tmp/evil": "", "bundle.json": ABOUT}, "leads out of its folder"),
+        ({"C:/evil": "", "bundle.json": ABOUT}, "leads out of its folder"),
+        ({"r/run.json": "{}"}, "has no bundle.json"),
+        ({"bundle.json": ABOUT}, "has no run 'r'"),
+        ({"bundle.json": ABOUT.replace('"r"', '"../r"'), "r/run.json": "{}"}, "has no run '../r'"),
+        ({"bundle.json": ABOUT.replace("/1", "/2"), "r/run.json": "{}"}, "version '2'"),
+        ({"bundle.json": "[]", "r/run.json": "{}"}, "not an object"),
+        ({"bundle.json": ABOUT, "r/run.json": "{}", "r/zeros": bytes(2_000_000)}, "unpacks to more"),
+    ],
+)
+def test_a_hostile_or_damaged_bundle_is_refused(
+    files: Mapping[str, Any], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bundle, "MOST_BYTES", 1_000_000)
+    path = zipped(tmp_path / "a.zip", files)
+    with pytest.raises(BadBundle, match=words), unpacked(path):
+        pass
+    assert [file.name for file in tmp_path.iterdir()] == ["a.zip"]
+
+
+def test_arrays_that_unpack_to_too_much_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bundle, "MOST_BYTES", 1_000_000)
+    np.savez_compressed(inner := io.BytesIO(), wrench=np.zeros(200_000))
+    files = {"bundle.json": ABOUT, "r/run.json": "{}", "r/poses/01.npz": inner.getvalue()}
+    with pytest.raises(BadBundle, match="do not use"), unpacked(zipped(tmp_path / "a.zip", files)):
+        pass
+
+
+def test_a_cut_off_bundle_and_another_file_are_named(
+    run: Run, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_bundle(run.folder, tmp_path / "a.zip")
+    whole = (tmp_path / "a.zip").read_bytes()
+    for number, content in enumerate((whole[: len(whole) // 2], b"hello", b"")):
+        path = tmp_path / f"{number}.zip"
+        path.write_bytes(content)
+        for command in ("replay", "solve"):
+            assert run_command([command, str(path)]) == 6
+            # half of a bundle may end in a pose, which is a zip file too
+            assert re.search(rf"{number}\.zip is not a (zip file|bundle)", capfd.readouterr().err)
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 0xFF
+    (tmp_path / "b.zip").write_bytes(flipped)
+    assert run_command(["replay", str(tmp_path / "b.zip")]) == 6
