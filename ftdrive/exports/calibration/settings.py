@@ -107,8 +107,8 @@ class Settings:
         if not self.sensor_mass_kg or self.sensor_com_mm is not None:
             return ()
         return (
-            f"The centre of mass of sensor and adapter ({self.sensor_mass_kg:g} kg) is taken half way up, on the axis of "
-            "the flange, as `ftdrive push` does: give --sensor-com X,Y,Z if you know it.",
+            f"The centre of mass of sensor and adapter ({self.sensor_mass_kg:g} kg) is taken half way up, on the axis "
+            "of the flange, as `ftdrive push` does: give --sensor-com X,Y,Z if you know it.",
         )
 
 
