@@ -19,7 +19,6 @@ ROOT = Path(__file__).resolve().parents[2]
     [
         ["ruff", "check", "."],
         ["ruff", "format", "--check", "."],
-        ["mypy", "ftdrive", "calib", "drivers", "mocks"],
         pytest.param(["mypy"], marks=pytest.mark.slow),
         ["lint-imports"],
     ],

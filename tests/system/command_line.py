@@ -46,7 +46,7 @@ class CommandLine:
             f'[sensor]\nurl = "{cell.sensor.url}"\n'
             f"[tool]\ncylinders_mm = {[list(row) for row in cell.tool.cylinders_mm]}\n"
             f'[workcell]\nmounting = "{cell.workcell.mounting}"\nmeasured = true\n'
-            f"[sampling]\naverage_s = {cell.sampling.average_s}\n"
+            f"[sampling]\naverage_s = {cell.sampling.average_s}\nnoise_record_s = {cell.sampling.noise_record_s}\n"
         )
         return path
 

@@ -94,13 +94,6 @@ def test_what_cannot_be_pushed_is_refused_with_the_reason(station: Station, run:
 
 
 @pytest.mark.slow
-def test_an_emulated_cell_is_calibrated_pushed_and_needs_no_word(ftdrive: CommandLine) -> None:
-    answer = ftdrive.json("push", "--simulate")
-    assert answer["error"] is None
-    assert answer["read_back"]["mass_kg"] == answer["new"]["mass_kg"] != answer["old"]["mass_kg"]
-
-
-@pytest.mark.slow
 def test_a_rehearsed_push_keeps_its_receipt_in_the_run(run: Path, ftdrive: CommandLine) -> None:
     answer = ftdrive.json("push", run, "--simulate")
     assert answer["file"] == str(run / "push.json")
