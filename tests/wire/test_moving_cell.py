@@ -123,6 +123,6 @@ def test_the_wrench_is_that_of_the_motion_and_the_links_are_late_by_their_delays
 
     tried_s = 1e-3 * np.arange(-30, 30, 0.25)
     found_s = tried_s[np.argmin([np.sum(residual(moved, delay_s) ** 2) for delay_s in tried_s])]
-    assert found_s == pytest.approx(1e-3 * (sensor_ms - rtde_ms), abs=3e-3), "the computer adds its own"
+    assert found_s == pytest.approx(1e-3 * (sensor_ms - rtde_ms), abs=11e-3), "a busy computer adds the clock's lead"
     assert residual(moved, found_s) == pytest.approx(np.ones(6), abs=6 / np.sqrt(2 * used.sum()))
     assert residual(still, found_s).min() > 3.0, "inertia is no trifle here"
