@@ -57,6 +57,16 @@ class Station:
         """The cell's own, once it has started."""
         self._process: subprocess.Popen[str] | None = None
 
+    @classmethod
+    def of(cls, made_by: Mapping[str, Any] | None, sensor: str | None = None, options: Sequence[str] = ()) -> Self:
+        """Describe the station that a run or a calibration names as its `station`, or the usual one; not started.
+
+        An address emulated://NAME in `sensor` replaces its sensor; `options` come after its own.
+        """
+        made_by = made_by or {}
+        name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
+        return cls(name, (*made_by.get("options", ()), *options))
+
     def __enter__(self) -> Self:
         command = [sys.executable, "-P", "-m", "mocks", "station", "--sensor", self.sensor]
         command += ["--time-scale", str(TIME_SCALE), *self.options]

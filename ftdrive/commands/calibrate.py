@@ -98,7 +98,7 @@ def calibrate(
     word. If there is room, only the three wrist joints move. Ctrl-C stops the arm; the poses are kept, and --resume
     continues.
     """
-    from ftdrive.cell.emulated import MOVED_BY, Station, sensor_name
+    from ftdrive.cell.emulated import MOVED_BY, Station
     from ftdrive.commands.emulated_run import described
     from ftdrive.errors import Declined
     from ftdrive.runs.run import Run
@@ -112,11 +112,10 @@ def calibrate(
     mode: Mode = "step" if step else "manual" if manual else "listen" if listen else "auto"
     with ExitStack() as stack:
         description: dict[str, Any] = {}
-        made_by = {} if resume is None else Run(resume).header_to_resume().get("station") or {}
+        made_by = None if resume is None else Run(resume).header_to_resume().get("station")
         simulate = simulate or bool(made_by and not (config or robot or tool))  # a resumed run keeps its cell
         if simulate:
-            name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
-            station = stack.enter_context(Station(name, made_by.get("options", ())))
+            station = stack.enter_context(Station.of(made_by, sensor))
             cell = station.cell
             description = described(station)
         else:

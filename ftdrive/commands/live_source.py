@@ -71,7 +71,6 @@ def _emulated(
         with Station(sensor_name(sensor)) as quick, TemporaryDirectory(prefix="ftdrive-") as runs:
             calibration = rehearse(quick, Path(runs), "simulated", poses=6, kept=False).result
         stop_unless_accepted(calibration)
-    made_by = calibration.provenance.get("station") or {}
-    name = sensor_name(sensor) if sensor else made_by.get("sensor", "can")
-    options = (*made_by.get("options", ()), "--time-scale", "1")  # a stream pairs by the controller's clock
-    return calibration, stack.enter_context(Station(name, options)).cell
+    made_by = calibration.provenance.get("station")
+    pace = ("--time-scale", "1")  # a stream pairs by the controller's clock
+    return calibration, stack.enter_context(Station.of(made_by, sensor, pace)).cell

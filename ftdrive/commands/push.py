@@ -3,8 +3,7 @@
 import json
 import shlex
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import click
 from calib import CalibrationResult
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
-from ftdrive.cell.emulated import Station, sensor_name
+from ftdrive.cell.emulated import Station
 from ftdrive.commands.common import CELL, JSON, check_simulate, read_cell, simulate, write_json
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, Declined
@@ -65,7 +64,7 @@ def push(
         path = source or receipt or stack.enter_context(rehearsed_run(sensor))
         folder = path if path.is_dir() else path.parent
         of = load_calibration(path) if receipt is None else Receipt.load(path)
-        cell = stack.enter_context(_emulated_cell(of, sensor)) if simulate else read_cell(config, robot, sensor)
+        cell = _emulated_cell(of, sensor, stack) if simulate else read_cell(config, robot, sensor)
         arm = stack.enter_context(closing(build_arm(cell)))
         arm.open()
         if isinstance(of, Receipt):
@@ -102,10 +101,7 @@ def push(
         talk.print(f" Receipt {saved}; undo: ftdrive push --restore {shlex.quote(str(saved))}")
 
 
-@contextmanager
-def _emulated_cell(of: CalibrationResult | Receipt, sensor: str | None) -> Iterator[CellConfig]:
-    """Start the emulated cell of a calibration, or any; its sensor is given a mass."""
-    made_by = (of.provenance.get("station") if isinstance(of, CalibrationResult) else None) or {}
-    name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
-    with Station(name, made_by.get("options", ())) as station:
-        yield station.cell
+def _emulated_cell(of: CalibrationResult | Receipt, sensor: str | None, stack: ExitStack) -> CellConfig:
+    """Start the emulated cell of a calibration, or any."""
+    made_by = of.provenance.get("station") if isinstance(of, CalibrationResult) else None
+    return stack.enter_context(Station.of(made_by, sensor)).cell

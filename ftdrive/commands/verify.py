@@ -208,13 +208,12 @@ def _report(verified: "Verified", update: Answer, *, as_json: bool) -> None:
 
 def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Path) -> tuple["Station", Path]:
     """Start the cell of a calibration, or calibrate a new one; return it with the path of its calibration."""
-    from ftdrive.cell.emulated import Station, sensor_name
+    from ftdrive.cell.emulated import Station
     from ftdrive.commands.emulated_run import rehearse
     from ftdrive.live.stream import load_calibration
 
-    made_by = {} if path is None else load_calibration(path).provenance.get("station") or {}
-    name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
-    station = stack.enter_context(Station(name, made_by.get("options", ())))
+    made_by = None if path is None else load_calibration(path).provenance.get("station")
+    station = stack.enter_context(Station.of(made_by, sensor))
     if path is None:
         outcome = rehearse(station, runs, "simulated", poses=6)
         stop_unless_accepted(outcome.result, to_be_saved=True)

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 
 from calib.errors import BadDataset, CalibError
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.cell.emulated import Station
 from ftdrive.cli import cli, exit_code
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
@@ -169,12 +170,12 @@ def stations(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Sequence[str]]]
     """Which emulated cells are started, by sensor and options; none is."""
     found = list[tuple[str, Sequence[str]]]()
 
-    class Emulated:
+    class Emulated(Station):
         cell = CellConfig(RobotConfig("127.0.0.1"), SensorConfig("emulated://"))
         truth: Mapping[str, Any] = MappingProxyType({})
 
         def __init__(self, sensor: str, options: Sequence[str] = ()) -> None:
-            self.sensor, self.options = sensor, options
+            super().__init__(sensor, options)
             found.append((sensor, tuple(options)))
 
         def __enter__(self) -> "Emulated":
