@@ -281,6 +281,10 @@ class ForceTorqueSensor(_Device):
     def health(self) -> Health:
         """Return the counters since `open`."""
 
+    def temperature_C(self) -> float | None:
+        """Return the sensor's temperature, as it came with its newest sample; None where a sensor reports none."""
+        return None
+
     def __enter__(self) -> Self:
         self.open()
         return self

@@ -8,6 +8,7 @@ stream running. The driver does not wait for the boot text, which may have been 
 """
 
 import logging
+import math
 from itertools import pairwise
 from statistics import median
 from typing import TYPE_CHECKING, Self
@@ -58,11 +59,16 @@ class BotaSensor(StreamingSensor):
         super().__init__(f"Bota sensor on {port}", sign=sign, clock=clock)
         self._port = SerialPort(self.name, port, _BAUD, clock=clock)
         self._sinc = sinc
+        self._temperature_C = math.nan
 
     @classmethod
     def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``bota:///dev/serial/by-id/…?sinc=512``."""
         return cls(address, sinc=options.integer("sinc", 0, 0, 512) or None, sign=sign, clock=clock)
+
+    def temperature_C(self) -> float | None:
+        """Return the temperature of the newest frame."""
+        return self._temperature_C if math.isfinite(self._temperature_C) else None
 
     def _connect(self) -> DeviceInfo:
         self._port.open()
@@ -95,6 +101,7 @@ class BotaSensor(StreamingSensor):
         times = [self._elapse(frame.t_us) for frame in frames]
         status = np.array([frame.status for frame in frames], np.uint32)
         self._judge(int(np.bitwise_or.reduce(status)))
+        self._temperature_C = frames[-1].temperature_C
         return FtSamples.of(
             t_host_ns,
             [seq for _, seq in times],

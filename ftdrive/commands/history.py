@@ -68,7 +68,7 @@ def history(folders: Sequence[Path], tool: str | None, index: Sequence[Path], re
         talk.print(hanging(" ! ", words), style="yellow")
 
 
-_TITLES = ("id", "date, UTC", "age, d", "tool", "verdict", "mass, kg", "force bias, N", "parent", "verified")
+_TITLES = ("id", "date, UTC", "age, d", "tool", "verdict", "mass, kg", "force bias, N", "°C", "parent", "verified")
 
 
 def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime) -> tuple[str, ...]:
@@ -88,6 +88,7 @@ def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime)
         one.verdict,
         f"{one.mass_kg:.4f} ± {one.mass_sigma_kg:.4f}",
         " ".join(f"{value:+.2f}" for value in one.parameters.force_bias_N),
+        "-" if one.temperature_C is None else f"{one.temperature_C:.0f}",
         f"{one.parent[:6]} ({one.update})" if one.parent else "-",
         verified,
     )

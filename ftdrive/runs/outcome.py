@@ -52,6 +52,7 @@ def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationData
         "run": run.folder.name,
         "station": header.get("station"),
         "setup": _setup(run, config),
+        "temperature_C": run.temperature_C(),
     }
     mounting = config.get("workcell", {}).get("mounting", "floor")
     setup = provenance["setup"]

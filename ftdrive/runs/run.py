@@ -41,6 +41,8 @@ from ftdrive.errors import ConfigError
 
 RUN_FORMAT = "ftdrive.run/1"
 RECORDING_FORMAT = "ftdrive.recording/1"
+POSE = "pose-taken"
+"""The event of a pose that is on disk, `ftdrive.session.events.PoseTaken`."""
 
 _RESTORE = "take it from a copy"
 _DAMAGE = (
@@ -151,6 +153,12 @@ class Run:
                 continue
             if isinstance(event, dict):
                 yield event
+
+    def temperature_C(self) -> float | None:
+        """Return the mean temperature of the sensor over the poses; None where it reported none."""
+        found = {event.get("stop"): event.get("temperature_C") for event in self.events() if event.get("event") == POSE}
+        known = [float(value) for value in found.values() if isinstance(value, int | float)]
+        return sum(known) / len(known) if known else None
 
     def header(self) -> Mapping[str, Any]:
         """Read run.json; raises `BadDataset` if it is damaged."""

@@ -123,10 +123,20 @@ class PoseTaken(Event):
     average_s: float
     attempts: int
     steady: bool
+    temperature_C: float | None = None
+    """Of the sensor, where it reports it."""
 
     @classmethod
     def of(
-        cls, record: PoseRecord, down_base: Array, *, stops: int, settle_s: float, average_s: float, attempts: int
+        cls,
+        record: PoseRecord,
+        down_base: Array,
+        *,
+        stops: int,
+        settle_s: float,
+        average_s: float,
+        attempts: int,
+        temperature_C: float | None,
     ) -> "PoseTaken":
         """Describe a record on disk; `down_base` (3,) is the unit vector down in base, as mounted."""
         return cls(
@@ -141,6 +151,7 @@ class PoseTaken(Event):
             average_s=average_s,
             attempts=attempts,
             steady=record.steady,
+            temperature_C=temperature_C,
         )
 
 

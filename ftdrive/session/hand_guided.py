@@ -326,6 +326,7 @@ class _Collection:
                 settle_s=settle_s,
                 average_s=self._sampling.average_s,
                 attempts=attempts,
+                temperature_C=self._sensor.temperature_C(),
             )
         )
         self._learn(record)

@@ -299,6 +299,7 @@ class Tour:
                 settle_s=settled_s,
                 average_s=self._measuring.sampling.average_s,
                 attempts=attempts,
+                temperature_C=self._sensor.temperature_C(),
             ),
             sync=True,
         )

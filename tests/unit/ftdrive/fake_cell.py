@@ -177,6 +177,7 @@ class FakeSensor(ForceTorqueSensor):
         self.failure: DriverError | None = None
         self.stuck = False
         self.heals = False
+        self.warm_C: float | None = None
         self.collecting: Callable[[], None] = lambda: None
         self._newest = np.zeros(6)
         self._seq = 0
@@ -191,6 +192,9 @@ class FakeSensor(ForceTorqueSensor):
 
     def identify(self) -> DeviceInfo:
         return DeviceInfo("fake", "S1", "1")
+
+    def temperature_C(self) -> float | None:
+        return self.warm_C
 
     def _wrench(self) -> Array:
         if not self.stuck:

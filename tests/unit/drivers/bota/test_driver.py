@@ -44,6 +44,7 @@ def test_it_is_only_listened_to(table: Table) -> None:
     with table.serial([], stream()) as wire, Sensor(wire.clock) as sensor:
         samples = sensor.collect(0.5)
         assert sensor.health().nominal_rate_Hz == pytest.approx(100)
+        assert sensor.temperature_C() == 25.5
     assert wire.sent == []
     np.testing.assert_allclose(samples.wrench.min(axis=0), NUMBERS, rtol=1e-6)
     np.testing.assert_allclose(np.diff(samples.t_device_s), 0.01, atol=1e-9)

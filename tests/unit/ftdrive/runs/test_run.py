@@ -129,3 +129,11 @@ def test_what_is_to_be_typed_survives_the_shell(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "my $HOME 'runs'", "calibrate", {})
     assert shlex.split(run.resume_command) == ["ftdrive", "calibrate", "--resume", str(run.folder)]
     assert shlex.split(run.solve_command) == ["ftdrive", "solve", str(run.folder)]
+
+
+def test_the_temperature_is_the_mean_over_the_poses_as_they_were_last_taken(run: Run) -> None:
+    assert run.temperature_C() is None
+    for stop, temperature_C in ((1, 60.0), (2, None), (3, 24.0), (1, 22.0)):
+        run.append_event({"event": "pose-taken", "stop": stop, "temperature_C": temperature_C})
+    run.append_event({"event": "estimated", "stop": 4, "temperature_C": 99.0})
+    assert run.temperature_C() == 23.0

@@ -89,6 +89,7 @@ def test_an_unchanged_cell_passes_at_poses_that_were_not_used(
     lab: Lab, calibration: CalibrationResult, take: Callable[..., Run]
 ) -> None:
     used = [record.before.R_base_flange for record in records_of(lab, calibration)]
+    lab.sensor.warm_C = 31.5
     run = take(6)
     assert [event.stop for event in lab.operator.of(Compared)] == [1, 2, 3, 4, 5, 6, 7]
     fresh = [record.before.R_base_flange for record in run.records()]
@@ -100,6 +101,7 @@ def test_an_unchanged_cell_passes_at_poses_that_were_not_used(
     assert document["format"] == "ftdrive.verification/1"
     assert document["calibration"]["id"] == calibration.id
     assert len(document["poses"]) == 6
+    assert (document["temperature_C"], calibration.provenance["temperature_C"]) == (31.5, None)
     last = last_verification(run.folder.parent / str(calibration.provenance["run"]))
     assert last is not None
     assert (last.passed, last.path) == (True, found.path.absolute())
