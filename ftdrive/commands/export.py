@@ -155,12 +155,14 @@ def calibration(
     from ftdrive.exports.calibration import registry
     from ftdrive.exports.calibration.settings import Settings, recorded_sensor
     from ftdrive.live.stream import load_calibration
+    from ftdrive.runs.verification import last_verification
     from ftdrive.terminal.console import hanging, talk
 
     check_simulate(simulate, real={"RESULT": source}, emulated={"--sensor": sensor})
     with _calibrated(source, sensor, simulate=simulate) as path:
         result = load_calibration(path)
         recorded_height_mm, recorded_mass_kg = recorded_sensor(path, result)
+        verification = last_verification(path)
     settings = Settings(
         base_frame=base_frame,
         flange_frame=flange_frame,
@@ -169,10 +171,13 @@ def calibration(
         height_mm=recorded_height_mm if height_mm is None else height_mm,
         sensor_mass_kg=recorded_mass_kg if sensor_mass_kg is None else sensor_mass_kg,
         sensor_com_mm=None if sensor_com is None else tuple(numbers("--sensor-com", sensor_com, ",", [3])),
+        verification=verification,
     )
     made = registry.export(result, target, settings, max_force_error_N=max_force_error_N)
     for note in made.notes:
         talk.print(hanging(" note: ", note))
+    if verification is not None and not verification.passed:
+        talk.print(hanging(" note: ", f"the last verification of this calibration failed: {verification.reason}"))
     if output is not None:
         write_new(output, made.text)
         talk.print(f" Wrote {output}")

@@ -40,11 +40,14 @@ def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, J
     result = calibration.to_dict()
     response = calibration.response
     origin_m = None if settings.height_mm is None else settings.p_flange_sensor_m("json").tolist()
-    made = calibration.provenance.get("created_utc")
+    made, last = calibration.provenance.get("created_utc"), settings.verification
     return {
         "format": FORMAT,
         "id": calibration.id,
         "created_utc": made if isinstance(made, str) else None,
+        "verification": None
+        if last is None
+        else {"created_utc": last.created_utc.isoformat(), "passed": last.passed, "change": last.change},
         "made_by": f"ftdrive {__version__}",
         "sign": "wrench on the sensor, sensor axes, about the sensor origin; contact = raw - bias - weight",
         **{name: result[name] for name in _FIELDS},

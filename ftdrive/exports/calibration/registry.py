@@ -92,7 +92,8 @@ def export(
                 )
             notes.insert(0, f"{words}.")
     notes += [f"Also set {place} = {_in_words(value)}." for place, value in exported.elsewhere.items()]
-    text = with_header(exported.text, target.comment, [made_by(calibration), target.description, *notes])
+    origin = made_by(calibration, settings.verification)
+    text = with_header(exported.text, target.comment, [origin, target.description, *notes])
     return Export(text, tuple(notes), exported.elsewhere, force_N, torque_Nm)
 
 

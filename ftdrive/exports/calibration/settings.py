@@ -12,6 +12,7 @@ from calib.model import Array
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import sensor_origin_m
 from ftdrive.runs.run import Run
+from ftdrive.runs.verification import VerificationRecord
 
 _NAME = re.compile(r"[A-Za-z_](-?[A-Za-z0-9_./])*")
 """Also inside a comment of XML, where `--` is an error."""
@@ -38,6 +39,8 @@ class Settings:
     """Of sensor and adapter."""
     sensor_com_mm: tuple[float, ...] | None = None
     """Centre of mass of sensor and adapter, from the flange, in flange axes; None: half way up on the flange axis."""
+    verification: VerificationRecord | None = None
+    """The last one of the calibration; None if there is none."""
 
     def __post_init__(self) -> None:
         for field in ("base_frame", "flange_frame", "sensor_frame", "tool_frame"):

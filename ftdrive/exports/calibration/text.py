@@ -13,6 +13,7 @@ from calib.files import JSON
 from ftdrive import __version__
 from ftdrive.exports.calibration.formats import Comment
 from ftdrive.exports.common import plain
+from ftdrive.runs.verification import VerificationRecord
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +42,15 @@ def yaml_text(document: Mapping[str, Any] | list[float]) -> str:
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10**6)
 
 
-def made_by(calibration: CalibrationResult) -> str:
-    """Say which calibration this is, when it was made, and by which version."""
+def made_by(calibration: CalibrationResult, verification: VerificationRecord | None) -> str:
+    """Say which calibration this is, when it was made and last verified, and by which version."""
     made = calibration.provenance.get("created_utc")
     date = made if isinstance(made, str) else "at an unknown time"
-    return f"ftdrive calibration {calibration.id}, made {date}; made by ftdrive {__version__}"
+    verified = "not verified"
+    if verification is not None:
+        verified = "last verified" if verification.passed else "VERIFICATION FAILED"
+        verified += f" {verification.created_utc.isoformat()}"
+    return f"ftdrive calibration {calibration.id}, made {date}, {verified}; made by ftdrive {__version__}"
 
 
 def with_header(text: str, comment: Comment, lines: Iterable[str]) -> str:

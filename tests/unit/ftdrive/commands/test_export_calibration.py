@@ -16,6 +16,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.exports.calibration.formats import FORMATS
 from ftdrive.runs.run import Run
 from tests.unit.ftdrive.exports.calibration.example import calibration, tilted
+from tests.unit.ftdrive.store.run_folders import new_run, verified
 
 
 def export(*arguments: object) -> Result:
@@ -150,3 +151,15 @@ def test_the_text_compensates_as_the_result_does(saved: Path) -> None:
     force = wrench[:, :3] - value["force_bias_N"] - u
     torque = wrench[:, 3:] - value["torque_bias_Nm"] - np.cross(value["p_sensor_com_m"], u)
     np.testing.assert_allclose(np.hstack([force, torque]), calibration().compensate(wrench, R), atol=1e-12)
+
+
+def test_the_last_verification_stands_in_the_file_and_a_failed_one_in_a_note(run: Path, tmp_path: Path) -> None:
+    assert "not verified" in export("calibration", run, "--format", "ft-tools").stdout.splitlines()[0]
+    document = json.loads(export("calibration", run, "--format", "json").stdout)
+    assert document["verification"] is None
+    verified(new_run(tmp_path, "verify"), calibration().id, passed=False)
+    outcome = export("calibration", run, "--format", "ft-tools")
+    assert "VERIFICATION FAILED 2026-03-02" in outcome.stdout.splitlines()[0]
+    assert "failed: the force bias has changed by 0.5 N" in " ".join(outcome.stderr.split())
+    found = json.loads(export("calibration", run, "--format", "json").stdout)["verification"]
+    assert (found["passed"], found["change"]) == (False, "bias")

@@ -62,6 +62,8 @@ def verified(folder: Path, calibration_id: str, day: float = 1.0, *, passed: boo
         "passed": passed,
         "change": None if passed else "bias",
         "reason": "the prediction holds" if passed else "the force bias has changed by 0.5 N",
+        "force_max_N": 0.1,
+        "torque_max_Nm": 0.01,
         **more,
     }
     (folder / "verification.json").write_text(json.dumps(document))
