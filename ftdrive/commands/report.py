@@ -2,6 +2,7 @@
 
 import shlex
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import get_args
 
@@ -17,6 +18,7 @@ from ftdrive.commands.common import (
     NewFile,
     check_simulate,
     simulate,
+    store_url,
     write_json,
 )
 from ftdrive.commands.emulated_run import rehearsed_run
@@ -27,6 +29,7 @@ from ftdrive.report.facts import facts_of
 from ftdrive.report.report import Format
 from ftdrive.report.report import report as written
 from ftdrive.report.subject import SolveOptions, read_subject
+from ftdrive.report.trust import trust
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.source import Orientation
 from ftdrive.terminal.console import hanging, talk
@@ -97,6 +100,10 @@ def report(
     )
     with unpacked(source) if source is not None else rehearsed_run(sensor) as found:
         subject = read_subject(found, options, parent)
+        known = trust(subject.result, found, store_url, datetime.now(UTC))
+        subject = replace(subject, trust=known)
+        if known["store_error"]:
+            talk.print(hanging(" ! ", f"a later verification may be missing, because {known['store_error']}"))
         if source is not None and found != source:  # unpacked
             reproduce = subject.reproduce.replace(str(found), shlex.quote(str(source)))
             subject = replace(subject, source=source, reproduce=reproduce)

@@ -32,6 +32,10 @@ NEXT_STEP = {
         "Do not compensate with it. Fix the first reason, then calibrate again: later reasons are often its "
         "consequences."
     ),
+    "failed": (
+        "Its last verification failed. Run `ftdrive verify` again and accept the update that it proposes, or "
+        "calibrate again."
+    ),
 }
 NOTABLE_CORRELATION = 0.7
 _LONG = ("steps", "made_for", "description")
@@ -45,6 +49,8 @@ def facts_of(subject: Subject) -> dict[str, Any]:
     """
     result, dataset = subject.result, subject.dataset
     force_N, torque_Nm = result.likely_error().tolist()
+    last = (subject.trust or {}).get("last_verification")
+    failed = last is not None and not last["passed"] and result.verdict != "rejected"
     return {
         "format": FORMAT,
         "schema_version": 1,
@@ -54,7 +60,8 @@ def facts_of(subject: Subject) -> dict[str, Any]:
         "verdict": result.verdict,
         "reasons": list(result.reasons),
         "hints": list(hints(result, subject.records)) if subject.records else [],
-        "next_step": NEXT_STEP[result.verdict],
+        "trust": subject.trust,
+        "next_step": NEXT_STEP["failed" if failed else result.verdict],
         "error": {"words": error_in_words(result), "force_N": force_N, "torque_Nm": torque_Nm},
         "error_map": error_map(result),
         "correlation": _correlation(result.covariance),

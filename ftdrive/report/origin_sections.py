@@ -112,8 +112,17 @@ def provenance(facts: Facts) -> Section:
         text.append(f"Reproduce the result: `{facts['reproduce']}`. The id must be {facts['id']}.")
     else:
         text.append("The file holds no data: solve the dataset with the hash below to reproduce the result.")
+    text += _last_verification(facts["trust"] or {})
     rows, columns = list(flattened(facts["result"]["provenance"])), ("field", "value")
     long = [row for row in rows if row[0].startswith(("devices.", "station."))]
     tables = [Table("", columns, [row for row in rows if row not in long])]
     tables += [Table("Devices", columns, long, folded=True)] if long else []
     return Section("provenance", "Provenance and how to reproduce the result", text, (), tables)
+
+
+def _last_verification(trust: Facts) -> Iterator[str]:
+    if last := trust.get("last_verification"):
+        outcome = "passed" if last["passed"] else "FAILED"
+        yield f"Last verification {last['created_utc'][:16]} UTC, {outcome}: {last['reason']}. File {last['path']}."
+    if trust.get("store_error"):
+        yield f"A later verification may be missing, because {trust['store_error']}."

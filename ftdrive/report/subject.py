@@ -46,6 +46,8 @@ class Subject:
     parent: CalibrationResult | None = None
     parent_name: str = ""
     """Of the result to compare with, or why there is none."""
+    trust: Mapping[str, Any] | None = None
+    """Age and last verification, from `ftdrive.report.trust`; None if nothing was looked up."""
 
 
 def read_subject(source: Path, options: SolveOptions, parent: Path | None = None) -> Subject:

@@ -68,10 +68,7 @@ class VerificationRecord:
 
     def in_words(self, now: datetime) -> str:
         """Return the result and its age, such as "verified 2 h ago"."""
-        age = age_in_words(now - self.created_utc)
-        if self.passed:
-            return f"verified {age} ago"
-        return f"VERIFICATION FAILED {age} ago" + (f" ({self.change})" if self.change else "")
+        return outcome_in_words(now - self.created_utc, passed=self.passed, change=self.change)
 
 
 def last_verification(place: Path) -> VerificationRecord | None:
@@ -88,8 +85,12 @@ def last_verification(place: Path) -> VerificationRecord | None:
         The calibration cannot be read.
     """
     path = Run(place).calibration_path if place.is_dir() else place
-    wanted = CalibrationResult.load(path).id
-    found = [record for record in _records_near(path) if record.calibration_id == wanted]
+    return verification_near(path, CalibrationResult.load(path).id)
+
+
+def verification_near(path: Path, calibration_id: str) -> VerificationRecord | None:
+    """Return the newest verification of a calibration as `last_verification`, for a file that need not exist."""
+    found = [record for record in _records_near(path) if record.calibration_id == calibration_id]
     return max(found, key=lambda record: record.created_utc, default=None)
 
 
@@ -119,6 +120,13 @@ def fitted_dataset(calibration: CalibrationResult, place: Path) -> CalibrationDa
         if dataset.sha256() == calibration.provenance.get("dataset_sha256"):
             return dataset
     return None
+
+
+def outcome_in_words(age: timedelta, *, passed: bool, change: str | None) -> str:
+    """Return the outcome of a verification and its age, such as "verified 2 h ago"."""
+    if passed:
+        return f"verified {age_in_words(age)} ago"
+    return f"VERIFICATION FAILED {age_in_words(age)} ago" + (f" ({change})" if change else "")
 
 
 def age_in_words(age: timedelta) -> str:
