@@ -4,6 +4,8 @@ All residuals are tested jointly. Their covariance holds the noise of the readin
 found (`components`), the drift of the bias since, and the uncertainty of the calibration, which all poses share:
 
     S = noise + J C J' + drift,    chi2 = r' S^-1 r
+
+`calib.extras.expected_readings` has its limit, which allows for noise that was estimated from the fit.
 """
 
 from collections.abc import Mapping
@@ -11,16 +13,13 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.special import chdtrc as chi2_sf
-from scipy.special import fdtrc as f_sf
 
-from calib.compensation import Compensator
-from calib.data.dataset import finite
+from calib.data.dataset import CalibrationDataset, finite
 from calib.errors import BadDataset, NotObservable
+from calib.extras.expected_readings import Expected, expected_as_found, expected_with_inexact_orientations
 from calib.extras.update import BLOCKS, Update, reestimate
 from calib.files import JSON
-from calib.likelihood.gain_and_cross_talk import response_columns
-from calib.model import BIASES, Array, jacobian, read_only
+from calib.model import BIASES, Array, read_only
 from calib.result import CalibrationResult
 
 Change = Literal["bias", "payload", "centre of mass", "mounting", "base", "several"]
@@ -42,9 +41,6 @@ UNEXPLAINED = 1e-3
 INDISTINCT = 9.2
 """Two changes whose chi2 differ by less are not distinguished: odds of 100 to 1."""
 FEWEST = 2
-
-_AXES = {name: [k] for k, name in enumerate(("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm"))}
-_CHANNELS = _AXES | {"force_N": [0, 1, 2], "torque_Nm": [3, 4, 5]}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,35 +86,18 @@ class Verification:
         }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Expected:
-    """What unchanged readings scatter by."""
-
-    calibration: Update
-    """The calibration, with the drift of the bias since then in its covariance."""
-    noise: Array
-    """(6n, 6n) of the new readings: measured noise, errors of each pose, drift from the first to each."""
-    freedom: float
-    """Degrees of freedom from which the fit estimated this noise; infinite if all of it was measured."""
-
-    def p_value(self, chi2: float, dof: int) -> float:
-        """Probability of a larger chi2."""
-        return float(chi2_sf(dof, chi2) if np.isinf(self.freedom) else f_sf(dof, self.freedom, chi2 / dof))
-
-    def deviance(self, chi2: float, dof: int) -> float:
-        """-2 log likelihood: chi2, or that of Student's distribution if the noise was estimated."""
-        return chi2 if np.isinf(self.freedom) else (self.freedom + dof) * float(np.log1p(chi2 / self.freedom))
-
-
 def verify(
     calibration: CalibrationResult,
     R_base_flange: Array,
     wrench: Array,
     wrench_cov: Array,
     *,
+    fitted: CalibrationDataset | None = None,
     false_alarms: float = 0.01,
 ) -> Verification:
     """Test whether new poses agree with a calibration; on an alarm, name the change and propose the smallest update.
+
+    An alarm is a p-value below `false_alarms` under each explanation of what acted on the fit.
 
     Each change is a model that estimates some parameters again and keeps the others with their uncertainty. It explains
     the readings unless its remaining misfit exceeds that of 999 in 1000 good fits. Of these changes, the one with the
@@ -133,6 +112,9 @@ def verify(
         Mean readings of the free tool as measured, N and N·m, in the sensor frame.
     wrench_cov : array, shape (n, 6, 6)
         Covariance of those means, pooled if they come from fewer than 100 samples (`calib.data.pooling`).
+    fitted : CalibrationDataset, optional
+        The poses of the calibration. They show how uncertain the noise is that a fit of few poses found, see
+        `calib.extras.expected_readings`.
     false_alarms : float
         Share of unchanged sensors that do not pass.
 
@@ -148,33 +130,48 @@ def verify(
     wrench_cov = finite("wrench_cov", wrench_cov, (n, 6, 6))
     if not 0 < false_alarms < 1:
         raise ValueError(f"false_alarms is {false_alarms}, expected a share between 0 and 1")
-    expected = _expected(calibration, R_base_flange, wrench_cov)
-    p, response = calibration.parameters, expected.calibration.response
-    residual = np.asarray(Compensator(p, response=response).batch(wrench, R_base_flange), dtype=np.float64)
-    J, C = jacobian(p, R_base_flange), expected.calibration.covariance
-    if response is not None:
-        J, C = np.concatenate([J, response_columns(p, R_base_flange)], axis=2), response.covariance
-    K = J.reshape(6 * n, -1)
-    S = expected.noise + K @ C @ K.T
-    chi2, dof = float(residual.ravel() @ np.linalg.solve(S, residual.ravel())), 6 * n
-    p_value = expected.p_value(chi2, dof)
+    if fitted is not None and len(fitted) != calibration.n_poses:
+        raise BadDataset(f"{len(fitted)} poses are not those of the calibration, which has {calibration.n_poses}.")
+    p_value, expected = _likeliest(calibration, fitted, R_base_flange, wrench, wrench_cov)
+    residual, sigma, chi2 = expected.distance(R_base_flange, wrench)
     unchanged = Verification(
         residual=residual,
-        predicted_sigma=np.sqrt(np.diag(S)).reshape(n, 6),
+        predicted_sigma=sigma,
         chi2=chi2,
-        dof=dof,
+        dof=6 * n,
         p_value=p_value,
         passed=p_value >= false_alarms,
         change=None,
-        reason=f"the {n} poses agree with the calibration (chi2 {chi2:.0f} for {dof} readings, p {p_value:.2g})",
+        reason=f"the {n} poses agree with the calibration (chi2 {chi2:.0f} for {6 * n} readings, p {p_value:.2g})",
     )
     if unchanged.passed:
         return unchanged
     return _explained(unchanged, calibration, expected, R_base_flange, wrench)
 
 
+def _likeliest(
+    calibration: CalibrationResult,
+    fitted: CalibrationDataset | None,
+    R_base_flange: Array,
+    wrench: Array,
+    wrench_cov: Array,
+) -> tuple[float, Expected]:
+    """Return the largest p-value among the explanations of the fit, and the explanation."""
+    found = expected_as_found(calibration, R_base_flange, wrench_cov)
+    others = []
+    if fitted is not None:
+        others = expected_with_inexact_orientations(calibration, fitted, R_base_flange, wrench_cov)
+    p_found, *p_others = (
+        one.p_value(one.distance(R_base_flange, wrench)[2], 6 * len(wrench)) for one in (found, *others)
+    )
+    shares = [one.weight * p for one, p in zip(others, p_others, strict=True)]
+    if sum(shares) <= p_found:
+        return p_found, found
+    return sum(shares), others[int(np.argmax(shares))]
+
+
 def _explained(
-    alarm: Verification, calibration: CalibrationResult, expected: _Expected, R_base_flange: Array, wrench: Array
+    alarm: Verification, calibration: CalibrationResult, expected: Expected, R_base_flange: Array, wrench: Array
 ) -> Verification:
     """Name the change, with the update that makes up for it."""
     misfit = f"chi2 {alarm.chi2:.0f} for {alarm.dof} readings"
@@ -240,65 +237,3 @@ def _in_words(calibration: CalibrationResult, update: Update) -> str:
         along = float(old.gravity_force_base_N @ new.gravity_force_base_N)
         words.append(f"gravity has turned in the base by {np.rad2deg(np.arctan2(across, along)):.2g}°")
     return ", ".join(words)
-
-
-def _expected(calibration: CalibrationResult, R_base_flange: Array, wrench_cov: Array) -> _Expected:
-    """Add up what the fit found beyond the measured noise, as if the new poses continued the tour.
-
-    A random walk of variance q² a pose moves the bias by q² (N / 3 + 1) from its mean over the N poses of the tour to
-    the first new pose. A linear drift goes on for as long as the tour.
-    """
-    n, later = len(wrench_cov), np.arange(len(wrench_cov), dtype=np.float64)
-    n_used = calibration.n_poses - len(calibration.rejected_poses)
-    measured = np.zeros((n, 6, n, 6))
-    measured[range(n), :, range(n)] = wrench_cov
-    parts, gap = [], np.zeros(6)
-    for name, sigma in _components(calibration).items():
-        kind, _, channels = name.partition("_")
-        part, since = np.zeros((n, 6, n, 6)), np.zeros(6)
-        c = _CHANNELS.get(channels, [])
-        freedom = len(c) * calibration.dof / 6
-        if kind == "walk":
-            part[:, c, :, c], since[c] = sigma**2 * np.minimum.outer(later, later), sigma**2 * (n_used / 3 + 1)
-            freedom = len(c) * (n_used - 1) / 2  # the other half is that of the white noise
-        elif kind == "slope":
-            part[:, c, :, c], since[c] = sigma**2 * np.outer(later, later) / n_used**2, sigma**2
-            freedom = len(c)
-        elif kind == "rotation":  # turns about gravity do not show
-            turn = jacobian(calibration.parameters, R_base_flange)[..., :3]
-            part[range(n), :, range(n)] = sigma**2 * turn @ np.swapaxes(turn, 1, 2)
-            freedom = max(2 * n_used - 6, 2)
-        elif kind == "white":  # with unmeasured noise all of it
-            known = np.zeros_like(wrench_cov) if calibration.noise_source == "measured" else wrench_cov
-            for k in c:
-                part[range(n), k, range(n), k] = np.maximum(sigma**2 - known[:, k, k], 0.0)
-        else:  # gain and cross-talk act through the response
-            continue
-        gap += since
-        part[:, range(6), :, range(6)] += since[:, None, None]
-        parts.append((part.reshape(6 * n, 6 * n), freedom))
-    # Satterthwaite: the variances of independent estimates add up, each by its share of the noise
-    total = measured.reshape(6 * n, 6 * n) + sum((part for part, _ in parts), np.zeros((6 * n, 6 * n)))
-    inverse = np.linalg.inv(total)
-    spread = sum((float(np.vdot(inverse, part)) / (6 * n)) ** 2 / freedom for part, freedom in parts)
-    noise = total - np.kron(np.ones((n, n)), np.diag(gap))
-    return _Expected(_drifted(calibration, gap), noise, 1 / spread if spread else np.inf)
-
-
-def _components(calibration: CalibrationResult) -> Mapping[str, float]:
-    """Components of the noise, and a linear drift that was part of the model."""
-    found = dict(calibration.components)
-    if calibration.drift is not None and not any(name.startswith(("walk", "slope")) for name in found):
-        found |= {f"slope_{name}": float(abs(calibration.drift.change[c[0]])) for name, c in _AXES.items()}
-    return found
-
-
-def _drifted(calibration: CalibrationResult, gap: Array) -> Update:
-    """Add variances (6,) of the bias to the covariance of a calibration."""
-    covariance, response = calibration.covariance.copy(), calibration.response
-    covariance[BIASES, BIASES] += gap
-    if response is not None:
-        joint = response.covariance.copy()
-        joint[BIASES, BIASES] += gap
-        response = replace(response, covariance=joint)
-    return Update(calibration.parameters, covariance, 0.0, 0, response=response)

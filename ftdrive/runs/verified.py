@@ -22,7 +22,7 @@ from calib.files import JSON, write_new
 from calib.model import Array
 from calib.routine import DriftCheck, PoseRecord, dataset_from, drift_check, is_return
 from ftdrive.runs.run import Run, versions
-from ftdrive.runs.verification import FORMAT
+from ftdrive.runs.verification import FORMAT, fitted_dataset
 
 FALSE_ALARMS: Final = 0.01
 """Share of verifications of an unchanged cell that fail."""
@@ -171,7 +171,10 @@ def verify_run(run: Run, calibration: CalibrationResult, path: Path, limits: Acc
     if dataset.wrench_cov is None:
         raise BadDataset(f"{run.folder} has no noise of its poses: repeat the verification")
     wrench_cov = pooled_covariance(dataset.wrench_cov, dataset.n_samples)
-    found = verify(calibration, dataset.R_base_flange, dataset.wrench, wrench_cov, false_alarms=FALSE_ALARMS)
+    fitted = fitted_dataset(calibration, path)
+    found = verify(
+        calibration, dataset.R_base_flange, dataset.wrench, wrench_cov, fitted=fitted, false_alarms=FALSE_ALARMS
+    )
     kept = tuple(record for record in records if not is_return(record, records))
     file = run.new_path("verification")
     verified = Verified(run, calibration, path, limits, dataset, kept, found, drift_check(records), file)
