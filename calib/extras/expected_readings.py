@@ -28,10 +28,8 @@ from calib.likelihood.gain_and_cross_talk import Response, response_columns
 from calib.model import BIASES, Array, Parameters, jacobian
 from calib.result import CalibrationResult
 
-USUAL_ACCURACY_RAD = np.deg2rad([0.005, 0.5])
-"""Between these, any error of an arm's orientations is as likely as any other of half its size."""
-RATIOS = 20
-"""Number of orientation errors, evenly spaced in the logarithm, over which the average is taken."""
+USUAL_ERRORS_RAD = np.deg2rad(np.geomspace(0.005, 0.5, 20))
+"""Errors of an arm's orientations over which the average is taken. Before the fit, each is as likely as any other."""
 MANY_POSES = 1000
 LEAST_FACTOR = 0.1
 """Of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck."""
@@ -157,7 +155,7 @@ def expected_with_inexact_orientations(
         before[15:, 15:], pull[15:] = np.diag(information), -information * response.coefficients
         squares = float(information @ response.coefficients**2)
     found, likelihood = [], []
-    for variance in np.geomspace(*USUAL_ACCURACY_RAD, RATIOS) ** 2:
+    for variance in USUAL_ERRORS_RAD**2:
         V = D + variance * turn
         W = np.linalg.inv(V)
         WJ = W @ J
