@@ -4,10 +4,10 @@ Source: Universal Robots, "The URScript Programming Language", modules motion, i
 Python signature of each function, behind the program, is its signature in URScript.
 
 Chosen here: the period of `get_steptime` is that of the cell's clock whatever ``--time-scale`` is, so a program that
-counts cycles to watch its client keeps the cell's time. `sleep` and motions keep the time of the arm. `abs` is the
-function of that name that the programs of this project expect.
+counts cycles to watch its client keeps the cell's time. `sleep` and motions keep the time of the arm.
 
 Does not model: every other function (its name is a compile error), blends (a radius is taken as 0), goals as poses.
+URScript has no ``abs``: `norm` of a number is its absolute value.
 """
 
 import math
@@ -188,11 +188,6 @@ def norm(_program: "Program", a: Value) -> float:
     return math.hypot(*(number(value, "norm: a") for value in (a if isinstance(a, list) else [a])))
 
 
-def absolute(_program: "Program", value: Value) -> float:
-    """Return the absolute value of a number."""
-    return abs(number(value, "abs"))
-
-
 def floor(_program: "Program", f: Value) -> int:
     """Return the largest whole number not above a number."""
     return math.floor(number(f, "floor: f"))
@@ -212,5 +207,5 @@ _SINCE = {"set_target_payload": {3: 15, 5: 10}}
 def functions(polyscope: tuple[int, int, int]) -> Mapping[str, Built_in]:
     """Return the functions that a version of PolyScope knows, by name."""
     major, minor, _bugfix = polyscope
-    known = {function.__name__: function for function in _FUNCTIONS} | {"abs": absolute}
+    known = {function.__name__: function for function in _FUNCTIONS}
     return {name: called for name, called in known.items() if minor >= _SINCE.get(name, {}).get(major, 0)}

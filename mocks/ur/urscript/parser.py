@@ -1,10 +1,10 @@
 """The parser of URScript: from the words of a program to its statements.
 
-Source: Universal Robots, "The URScript Programming Language", chapter 1.
+Source: Universal Robots, "The URScript Programming Language", chapter 1; the external control program of the client
+library of Universal Robots for line breaks in a statement.
 
-Chosen here: one statement a line and no line break inside brackets, as the manual shows programs. Operators bind as in
-Python, ``xor`` between ``or`` and ``and``. A name is known when the program assigns it anywhere, or defines a function
-of that name anywhere.
+Chosen here: one statement a line, as the manual shows programs. Operators bind as in Python, ``xor`` between ``or`` and
+``and``. A name is known when the program assigns it anywhere, or defines a function of that name anywhere.
 
 Does not model: structs, matrices, ``switch``, ``assert``, program labels, ``+=``, remote procedure calls. Such a text
 is rejected as a syntax error.

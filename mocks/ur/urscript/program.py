@@ -11,7 +11,8 @@ Chosen here, where the manual is silent:
   which it is started.
 * ``kill`` takes the arm from a thread that moves it. The arm then slows down by itself, and a ``stopj`` in the same
   cycle replaces that. A motion command while another thread moves the arm is a run-time error.
-* A critical section that waits holds all other threads.
+* A critical section changes nothing, because a thread is never interrupted before it waits. It does not hold others
+  while it waits: the external control program of the client library moves the arm in one, and is stopped meanwhile.
 * Everything ends with the main program. ``return`` ends a thread, whatever its value is.
 * A condition must be True or False.
 * A thread that computes for ever in one cycle is a run-time error. The manual lets it go on in the next cycle, and
@@ -78,7 +79,6 @@ class Program:
         self._threads = [self._main]
         self._started = 0
         self._current = self._main
-        self._critical: Thread | None = None
         self._left = 0
         self._checked: set[int] = set()
         """Calls, by identity, whose arguments fit the function."""
@@ -102,17 +102,14 @@ class Program:
             When the program stops with a run-time error.
         """
         for thread in self._threads:  # a thread started in this cycle runs in it
-            if self._critical in (None, thread):
-                self._current = thread
-                self._left = STATEMENTS_PER_CYCLE
-                try:
-                    thread.step()
-                except Halt:
-                    return False
-                except RecursionError:
-                    raise ScriptError("functions call each other, or expressions are nested, without end") from None
-            if self._critical is not None and self._critical.is_done:
-                self._critical = None
+            self._current = thread
+            self._left = STATEMENTS_PER_CYCLE
+            try:
+                thread.step()
+            except Halt:
+                return False
+            except RecursionError:
+                raise ScriptError("functions call each other, or expressions are nested, without end") from None
         self._threads = [thread for thread in self._threads if not thread.is_done]
         return not self._main.is_done
 
@@ -169,19 +166,15 @@ class Program:
             scope.thread.place = loop.place
 
     def _keyword(self, scope: Scope, statement: Keyword) -> Run:
-        word, thread = statement.word, scope.thread
+        word = statement.word
         value = None if statement.value is None else (yield from self._value(scope, statement.value))
         match word:
             case "halt":
                 raise Halt
             case "break" | "continue" | "return":
                 raise Leave(word, value)
-            case "enter_critical":
-                self._critical = thread
-            case "exit_critical":
-                self._critical = None
             case "kill" | "join":
-                if not isinstance(value, Thread) or value is thread:
+                if not isinstance(value, Thread) or value is scope.thread:
                     raise ScriptError(f"{word} needs another thread, not {text_of(value)}")
                 if word == "kill":
                     value.kill()

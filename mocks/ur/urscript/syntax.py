@@ -155,6 +155,10 @@ _TOKEN = re.compile(
 )
 
 
+_CONTINUED_BY = {"and", "or", "xor", "not", "=", "==", "!=", "<", ">", "<=", ">=", "+", "-", "*", "/", "%"}
+"""Words behind which a statement goes on in the next line."""
+
+
 def syntax_error(text: str, place: Place, sentence: str) -> UrscriptSyntaxError:
     """Return the error that the controller reports for a line of `text`."""
     line = (*text.split("\n"), "")[place.line - 1]
@@ -164,22 +168,29 @@ def syntax_error(text: str, place: Place, sentence: str) -> UrscriptSyntaxError:
 def tokens_of(text: str) -> Iterator[Token]:
     """Yield the words of a program, without blanks and comments, and ``end`` behind the last.
 
+    A line break inside brackets, or behind an operator, is a blank.
+
     Raises
     ------
     UrscriptSyntaxError
         When a character belongs to no word.
     """
-    at, line, line_start = 0, 1, 0
+    at, line, line_start, depth = 0, 1, 0, 0
+    goes_on = False
     while at < len(text):
         place = Place(line, at - line_start + 1)
         found = _TOKEN.match(text, at)
         if found is None:
             raise syntax_error(text, place, f"{text[at : at + 20].splitlines()[0]!r} is no URScript")
-        kind = str(found.lastgroup)
-        if kind != "blank":
-            yield Token(kind, found[kind], place)
-        at = found.end()
+        kind, at = str(found.lastgroup), found.end()
+        word = found[kind]
         if kind == "newline":
             line, line_start = line + 1, at
+        if kind == "blank" or (kind == "newline" and (depth or goes_on)):
+            continue
+        yield Token(kind, word, place)
+        goes_on = kind in ("name", "sign") and word in _CONTINUED_BY
+        depth += (kind == "pose" or (kind == "sign" and word in "([")) - (kind == "sign" and word in ")]")
+        depth = max(0, depth)
     yield Token("newline", "\n", Place(line, at - line_start + 1))
     yield Token("end", "the end of the program", Place(line, at - line_start + 1))

@@ -32,9 +32,9 @@ BUILT_IN = functions((5, 15, 0))
         ("[[1, 2], [3, 4]][1][0]", "3"),
         ("p[0, 0, 1, 0, 0, 0][2]", "1"),
         ("p[0, 0, 1, 0, 0, 0]", "p[0, 0, 1, 0, 0, 0]"),
-        ("norm([3, 4])", "5.0"),
+        ("norm([3,\n  4  # in the next line\n])", "5.0"),
+        ("1 +\n  2 *\n 3", "7"),
         ("norm(-2)", "2.0"),
-        ("abs(-2)", "2"),
         ("floor(-1.5)", "-2"),
         ("get_actual_joint_positions()", str(list(HOME))),
         ("get_target_joint_positions()", str(list(HOME))),
@@ -158,7 +158,7 @@ def test_run_time_errors_say_what_is_wrong_and_where(body: str, place: tuple[int
 @pytest.mark.parametrize(
     ("text", "place", "why"),
     [
-        ("def f():\n  x = \nend\n", (3, 1), "a name expected, found the end of the line"),
+        ("def f():\n  x = \nend\n", (3, 1), "a name expected, found 'end'"),
         ("def f():\n  if x\n  end\nend\n", (3, 3), "':' expected"),
         ("def f():\n  while True:\n  sleep(1)\nend\n", (5, 1), "'end' expected"),
         ("def f():\n  x = 1 ! 2\nend\n", (2, 9), "'! 2' is no URScript"),
@@ -189,6 +189,7 @@ def test_what_is_no_program_is_rejected_with_its_place(text: str, place: tuple[i
         ("def silly()\nend\n", (2, 1), "syntax_error_on_line:2:end:"),
         ('def silly():\n txtmsg("")\nend\n', (2, 2), "compile_error_name_not_found:txtmsg:"),
         ('def f():\n  textmsg("log ", get_tcp_offset()\nend\n', (3, 1), "syntax_error_on_line:3:end:"),
+        ("def f():\n  x = abs(-1)\nend\n", (2, 7), "compile_error_name_not_found:abs:"),
         ("def illegal_fun():\n  calldoesntexist()\nend", (2, 3), "compile_error_name_not_found:calldoesntexist:"),
     ],
 )
