@@ -163,19 +163,24 @@ def test_the_port_closes_and_opens_with_its_kind(station: StationProcess) -> Non
     assert "is none of" in station.refusal("drop", what="api")
 
 
-HANGING = """
-import socket, struct, sys, time
+CLIENT = """
+import socket, struct, sys
+
+from ftdrive.cell.emulated_clock import EmulatedClock
 
 rtde, primary = (socket.create_connection((sys.argv[1], port)) for port in (30004, 30001))
+
 def send(kind, payload):
     rtde.sendall(struct.pack(">HB", 3 + len(payload), ord(kind)) + payload)
-send("I", b"input_int_register_24")
-primary.sendall(sys.stdin.read().encode())
-beat = 0
-while True:
-    beat += 1
-    send("U", b"\\1" + struct.pack(">i", beat))
-    time.sleep(0.005)
+
+clock, beat = EmulatedClock(sys.argv[2]), 0
+with clock.keeping_up():
+    send("I", b"input_int_register_24")
+    primary.sendall(sys.stdin.read().encode())
+    while True:
+        beat += 1
+        send("U", b"\\1" + struct.pack(">i", beat))
+        clock.sleep(0.005)
 """
 
 
@@ -184,7 +189,8 @@ def test_a_program_stops_the_arm_when_its_client_is_gone_and_registers_keep_thei
     station: StationProcess, how: str
 ) -> None:
     known = len(station.ask("state")["events"])
-    client = subprocess.Popen([sys.executable, "-c", HANGING, station.host], cwd=ROOT, stdin=subprocess.PIPE)
+    command = [sys.executable, "-c", CLIENT, station.host, station.hello["clock"]]
+    client = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE)
     try:
         assert client.stdin is not None
         client.stdin.write(HEARTBEAT.encode())
