@@ -83,7 +83,7 @@ def read_only_error(robot: Robot) -> bytes:
 
 
 def messages_of(event: Event) -> bytes:
-    """Return what clients hear of an entry of the event log: messages, or nothing."""
+    """Return what clients receive about an entry of the event log: messages, or nothing."""
     at = _us(event.t_robot_s)
     word, _, name = event.what.partition(" ")
     if event.by == "safety":

@@ -245,7 +245,7 @@ class Robot:
         return self.arm.obstacle
 
     def upload(self, upload: Upload, *, by: str = "script port") -> bool:
-        """Accept a program from the script port, which replaces the running one; return False when it is refused."""
+        """Accept a program from a client, which replaces the running one; return False when it is refused."""
         if upload.secondary:
             self.note(by, f"secondary program {upload.name}", accepted=False, why="not interpreted")
             return False

@@ -31,6 +31,13 @@ CLIENTS: dict[str, type[Client]] = {
 }
 
 
+def _ports_of(polyscope: tuple[int, int, int]) -> dict[int, str]:
+    """Return the ports that not every version has."""
+    if polyscope < (api.POLYSCOPE_X, 0, 0):
+        return {DASHBOARD_PORT: "dashboard"}
+    return {API_PORT: "api"} if polyscope[:2] >= min(api.API_VERSIONS) else {}
+
+
 class UrServer:
     """The controller on the network.
 
@@ -63,8 +70,7 @@ class UrServer:
         """While false RTDE clients are answered, but get no samples."""
         self.delay_s = 0.0
         """Time between the cycle in which a sample is taken and its sending."""
-        polyscope_x = robot.settings.polyscope[0] >= api.POLYSCOPE_X
-        self.ports = PORTS | ({API_PORT: "api"} if polyscope_x else {DASHBOARD_PORT: "dashboard"})
+        self.ports = {**PORTS, **_ports_of(robot.settings.polyscope)}
         """Kind of client by port."""
         self._silent: set[str] = set()
         self._cycle_real_ns = robot.clock.real_ns()
