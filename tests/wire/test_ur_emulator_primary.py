@@ -3,6 +3,7 @@
 import http.client
 import itertools
 import json
+import signal
 import socket
 import struct
 import subprocess
@@ -184,7 +185,7 @@ with clock.keeping_up():
 """
 
 
-@pytest.mark.parametrize("how", ["killed", "silenced"])
+@pytest.mark.parametrize("how", ["killed", "silenced", pytest.param("suspended", marks=pytest.mark.slow)])
 def test_a_program_stops_the_arm_when_its_client_is_gone_and_registers_keep_their_value(
     station: StationProcess, how: str
 ) -> None:
@@ -198,8 +199,7 @@ def test_a_program_stops_the_arm_when_its_client_is_gone_and_registers_keep_thei
         station.wait_for(lambda state: state["moving"])
         if how == "silenced":
             station.ask("silence-arm")
-        client.kill()
-        client.wait()
+        client.send_signal(signal.SIGSTOP if how == "suspended" else signal.SIGKILL)
         lost = station.wait_for_event("textmsg", since=known)
         assert station.wait_for_event("stands", since=known)["t_robot_s"] <= lost["t_robot_s"]
     finally:
