@@ -24,6 +24,7 @@ from calib.compensation import Compensator
 from calib.data.dataset import CalibrationDataset
 from calib.data.pooling import pooled_covariance
 from calib.extras.update import Update
+from calib.likelihood.descent import column_scale
 from calib.likelihood.gain_and_cross_talk import Response, response_columns
 from calib.model import BIASES, Array, Parameters, jacobian
 from calib.result import CalibrationResult
@@ -147,22 +148,27 @@ def expected_with_inexact_orientations(
         return []
     R, D = fitted.R_base_flange[kept], pooled_covariance(fitted.wrench_cov, fitted.n_samples)[kept]
     e = np.asarray(Compensator(p, response=response).batch(fitted.wrench[kept], R), dtype=np.float64)
-    J, turn, turn_new = _columns(p, response, R), _turns(p, R), _turns(p, R_base_flange)
-    before, pull, squares = np.zeros((J.shape[2], J.shape[2])), np.zeros(J.shape[2]), 0.0
-    if response is not None:  # its coefficients count as measured: zero, with the variance that the fit found
-        size = np.repeat([calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")], [5, 6])
-        information = 1 / np.maximum(size, 1e-9) ** 2
-        before[15:, 15:], pull[15:] = np.diag(information), -information * response.coefficients
-        squares = float(information @ response.coefficients**2)
+    turn, turn_new = _turns(p, R), _turns(p, R_base_flange)
+    # Found coefficients of gain and cross-talk count as measured: zero, with the variance that the fit found.
+    size = np.full(15, np.inf)
+    if response is not None:
+        size = np.append(
+            size, np.repeat([calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")], [5, 6])
+        )
+    seen = np.flatnonzero(size)
+    J, before = _columns(p, response, R)[..., seen], size[seen] ** -2
+    offset = np.zeros(15) if response is None else np.append(np.zeros(15), response.coefficients)
     found, likelihood = [], []
     for variance in USUAL_ERRORS_RAD**2:
         V = D + variance * turn
         W = np.linalg.inv(V)
         WJ = W @ J
-        H = np.einsum("nij,nik->jk", J, WJ) + before
-        g = np.einsum("nij,ni->j", WJ, e) + pull
-        C = np.linalg.inv(H)
-        rest = float(np.einsum("ni,nij,nj->", e, W, e)) + squares - float(g @ C @ g)
+        H = np.einsum("nij,nik->jk", J, WJ) + np.diag(before)
+        g = np.einsum("nij,ni->j", WJ, e) - before * offset[seen]
+        scale = np.outer(column_scale(H), column_scale(H))
+        C = np.zeros((len(size), len(size)))
+        C[np.ix_(seen, seen)] = np.linalg.inv(H / scale) / scale
+        rest = float(np.einsum("ni,nij,nj->", e, W, e) + before @ offset[seen] ** 2 - g @ C[np.ix_(seen, seen)] @ g)
         logdet = float(np.linalg.slogdet(V)[1].sum() + np.linalg.slogdet(H)[1])
         likelihood.append(-0.5 * (logdet + dof * np.log(rest)))
         joint = None if response is None else replace(response, covariance=C)

@@ -156,7 +156,7 @@ def _likeliest(
     wrench: Array,
     wrench_cov: Array,
 ) -> tuple[float, Expected]:
-    """Return the largest p-value among the explanations of the fit, and the explanation."""
+    """Return the larger p-value of both explanations of the fit, and that explanation, where it is likeliest."""
     found = expected_as_found(calibration, R_base_flange, wrench_cov)
     others = []
     if fitted is not None:
@@ -164,10 +164,10 @@ def _likeliest(
     p_found, *p_others = (
         one.p_value(one.distance(R_base_flange, wrench)[2], 6 * len(wrench)) for one in (found, *others)
     )
-    shares = [one.weight * p for one, p in zip(others, p_others, strict=True)]
-    if sum(shares) <= p_found:
+    p_other = sum(one.weight * p for one, p in zip(others, p_others, strict=True))
+    if p_other <= p_found:
         return p_found, found
-    return sum(shares), others[int(np.argmax(shares))]
+    return p_other, max(others, key=lambda one: one.weight)
 
 
 def _explained(

@@ -252,6 +252,22 @@ def test_a_change_is_found_all_the_same() -> None:
     assert (found.passed, found.change) == (False, "bias")
 
 
+def test_gain_and_cross_talk_keep_the_size_that_the_fit_found() -> None:
+    R = special(range(1, 25))
+    wrench = readings(TRUTH, R, 2, COEFFICIENTS)
+    fitted = CalibrationDataset(R, wrench, noise_of(24), np.zeros(24, np.int64), np.full(24, np.nan))
+    calibration = calibrated(gain=True)
+    assert calibration.response is not None
+    new = orientations(6)
+    for components in (calibration.components, {"gain": calibration.components["gain"]}):  # cross-talk not found
+        other = replace(calibration, components=components)
+        least = expected_with_inexact_orientations(other, fitted, new, noise_of(6))[0]
+        _, sigma, _ = least.distance(new, readings(TRUTH, new, 3, COEFFICIENTS))
+        assert least.factor == pytest.approx(1.0, abs=0.5)
+        own = verify(calibration, new, readings(TRUTH, new, 3, COEFFICIENTS), noise_of(6)).predicted_sigma
+        np.testing.assert_allclose(sigma, np.sqrt(least.factor) * own, rtol=0.35)
+
+
 def test_poses_of_another_kind_of_fit_explain_nothing() -> None:
     fitted, R, _ = inexact(6, 1)
     calibration = solve(fitted)
