@@ -165,13 +165,13 @@ def false_alarms(lab: Lab) -> Iterator[Row]:
         yield from alarms(lab, more, (24, 12, 6), lab.count(500, 60))
     yield from alarms(lab, "gain 1 %", (24, 12), lab.count(500, 60))
     for more in ("0.02°", "0.05°", "0.2°"):
-        yield from alarms(lab, more, (24, 12, 6), lab.count(200, 20))
+        yield from alarms(lab, more, (24, 12, 6), lab.count(120, 20))
 
 
 def beyond(lab: Lab) -> Iterator[Row]:
     """The same where it cannot: a gain from six poses, and a bias that walks; no target."""
-    yield from alarms(lab, "gain 1 %", (6,), lab.count(300, 20), holds=False)
-    yield from alarms(lab, "walk 0.02 N", (24, 12, 6), lab.count(200, 20), holds=False)
+    yield from alarms(lab, "gain 1 %", (6,), lab.count(120, 20), holds=False)
+    yield from alarms(lab, "walk 0.02 N", (24, 12, 6), lab.count(120, 20), holds=False)
 
 
 def alarms(lab: Lab, more: str, fits: tuple[int, ...], runs: int, *, holds: bool = True) -> Iterator[Row]:

@@ -236,3 +236,12 @@ def test_a_tool_reaches_the_stream(run: Callable[..., Ran], monkeypatch: pytest.
         run("live", "--tool", "gripper", "--robot", "10.0.0.2", "--sensor", "ati-can://can0", *more)
     assert opened == [("gripper", False), ("gripper", True)]
     assert "--tool does not go with --replay" in run("live", "--tool", "gripper", "--replay", ".")[2]
+
+
+def test_the_temperature_is_a_column_if_a_sensor_reports_it(run: Callable[..., Ran], tmp_path: Path) -> None:
+    new_run(tmp_path / "cold", "a", result(0))
+    assert "°C" not in run("history", tmp_path / "cold")[1]
+    new_run(tmp_path / "warm", "a", result(0, temperature_C=31.4))
+    titles, row = run("history", tmp_path / "warm")[1].splitlines()
+    assert titles.split()[-1] == "°C"
+    assert row.split()[-1] == "31"
