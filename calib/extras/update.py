@@ -120,12 +120,14 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
         weighted = np.linalg.solve(S, H).T
         information = weighted @ H
         _require_determined(information, kind, n)
-        G = np.linalg.solve(information, weighted)
+        scale = np.sqrt(np.diag(information))  # units apart by 10^8 would look singular
+        inverse = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+        G = inverse @ weighted
         left = np.asarray(Compensator(new, response=response).batch(wrench, R_base_flange), dtype=np.float64).ravel()
         x = G @ left
         if "weight" in BLOCKS[kind]:
             weight_N = float(np.linalg.norm(new.gravity_force_base_N) + x[0])
-            _require_significant(weight_N, float(np.sqrt(np.linalg.inv(information)[0, 0])))
+            _require_significant(weight_N, float(np.sqrt(inverse[0, 0])))
         if float(x @ information @ x) < SETTLED * max(1.0, float(left @ np.linalg.solve(S, left))):
             break
         new = _moved(new, estimated, x, BLOCKS[kind])
