@@ -202,7 +202,7 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
 def arm_class(name: str = "ur") -> type[RobotArm]:
     """Find the class of an arm by its name.
 
-    Its constructor takes the arguments of `drivers.ur.arm.UrArm`: the host, and by keyword `model`, `speed_rad_s` and
+    Its constructor takes these arguments of `drivers.ur.arm.UrArm`: the host, and by keyword `model`, `speed_rad_s` and
     `acceleration_rad_s2`.
 
     Raises

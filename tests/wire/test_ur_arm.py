@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from drivers.ur.arm import UrArm
-from drivers.ur.control import ControlProcess
+from drivers.ur.control_process import ControlProcess
 from drivers.ur.kinematics import MODELS, forward
 from drivers.ur.timing import UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, Station
@@ -356,7 +356,7 @@ def test_a_controller_that_is_gone(station: Station, arm: UrArm) -> None:
 
 @pytest.mark.slow
 def test_a_control_process_that_is_gone(station: Station, arm: UrArm) -> None:
-    assert arm._control is not None
+    assert isinstance(arm._control, ControlProcess)
     pid = arm._control._process.pid
     q = away(arm)
     with pytest.raises(StreamBroken, match="control"):
@@ -373,7 +373,7 @@ def test_a_control_process_that_is_gone(station: Station, arm: UrArm) -> None:
 def test_a_control_process_that_hangs(station: Station, new_arm: NewArm, caplog: pytest.LogCaptureFixture) -> None:
     arm = new_arm(timing=replace(UrTiming.emulated(), progress_s=2.0))
     arm.open(control=True)
-    assert arm._control is not None
+    assert isinstance(arm._control, ControlProcess)
     pid = arm._control._process.pid
     with pytest.raises(DeviceTimeout, match="did not answer"):
         arm.move_to(away(arm), timeout_s=30, guard=Trigger(arm, lambda: os.kill(pid, signal.SIGSTOP)))

@@ -57,7 +57,7 @@ import pytest
 from drivers.clock import REAL
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.ur.arm import UrArm
-from drivers.ur.control import ControlProcess
+from drivers.ur.control_process import ControlProcess
 from drivers.ur.timing import STRICT, UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, TIME_SCALE, Station
 
@@ -554,7 +554,7 @@ def test_a_program_that_took_the_place_of_ours_is_not_ended_when_the_arm_is_open
 
 @slow
 def test_what_runs_after_ours_was_seen_to_have_ended_is_not_ours(station: Station, arm: UrArm) -> None:
-    assert arm._control is not None
+    assert isinstance(arm._control, ControlProcess)
     os.kill(arm._control._process.pid, signal.SIGKILL)  # so that it cannot be asked whose program it runs
     station.wait_for(lambda _: arm._control is not None and not arm._control.alive)
     station.ask("dashboard-stop")

@@ -1,0 +1,377 @@
+"""The control path without ur_rtde: a program of ours on the controller, which stops the arm when we fall silent.
+
+`program.script` describes the registers. A thread answers every sample of the controller with a heartbeat, on the
+connection that owns the inputs. If the heartbeat stands still for 0.2 s of the controller's time, the program stops the
+arm and ends: after a crash, a suspension, a cut cable or a power failure of this computer.
+
+Ref: Universal Robots, URScript manual, "Real-Time Data Exchange (RTDE) Guide".
+Checked on hardware: no.
+"""
+
+import logging
+import secrets
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from importlib.resources import files
+from typing import Any, Final
+
+from drivers.clock import Clock, Follower
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from drivers.ur.control import Control, LookOut, ProgramRefused
+from drivers.ur.control_child import DECELERATION_RAD_S2
+from drivers.ur.primary import Code, Failed, Note, Primary
+from drivers.ur.rtde import Subscription
+from drivers.ur.timing import Patience, UrTiming
+
+log = logging.getLogger(__name__)
+
+STOPS_ITSELF_S: Final = 0.3
+"""The arm decelerates within this time after the last heartbeat: 0.2 s, and the cycles of both ends."""
+INPUTS: Final = {f"input_int_register_{k}": "INT32" for k in range(24, 28)} | {
+    f"input_double_register_{k}": "DOUBLE" for k in range(24, 34)
+}
+"""Heartbeat, token, sequence number, command; numbers of the command. The lower ranges belong to fieldbuses."""
+OUTPUTS: Final = (
+    {"timestamp": "DOUBLE"}
+    | {f"output_int_register_{k}": "INT32" for k in range(24, 28)}
+    | {f"output_double_register_{k}": "DOUBLE" for k in range(24, 30)}
+)
+"""Token, state, sequence number and answer of the last command; the TCP."""
+_RATE_HZ: Final = 125.0
+_LOOK_OUT_S: Final = 0.05
+_LARGEST: Final = 2**31 - 1
+_NUMBERS: Final = 10
+_MOVING: Final = 2
+_NO_HEARTBEAT: Final = -2
+_COMMANDS: Final = {
+    "move": 1,
+    "stop": 2,
+    "within_safety_limits": 3,
+    "tcp_offset": 4,
+    "set_payload": 5,
+    "set_gravity": 6,
+    "quit": 7,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What the program has written into its output registers."""
+
+    token: int = 0
+    state: int = 0
+    sequence: int = 0
+    answer: int = 0
+    tcp_offset: tuple[float, ...] = ()
+
+
+def program_text(token: int, version: Sequence[int]) -> str:
+    """Return the program for one session on a controller of this version."""
+    p, i = "[ft_number(1), ft_number(2), ft_number(3)]", ", ".join(f"ft_number({k})" for k in range(4, 10))
+    takes_inertia = tuple(version[:2]) >= (5, 10)
+    payload = f"set_target_payload(ft_number(0), {p}, [{i}])" if takes_inertia else f"set_payload(ft_number(0), {p})"
+    text = files("drivers.ur").joinpath("program.script").read_text("ascii")
+    fields = {"$TOKEN": str(token), "$DECELERATION": str(DECELERATION_RAD_S2), "$SET_PAYLOAD": payload}
+    for field, value in fields.items():
+        text = text.replace(field, value)
+    return text
+
+
+class ScriptControl(Control):
+    """Our program on the controller, and the connections to it. Connected while it exists.
+
+    Raises `ConnectError` when the controller cannot be reached or another client has the registers.
+    """
+
+    stops_itself = True
+
+    def __init__(self, host: str, version: Sequence[int], *, clock: Clock, timing: UrTiming) -> None:
+        self._host = host
+        self._clock = clock
+        self._timing = timing
+        self._token = 1 + secrets.randbelow(_LARGEST - 1)
+        self._program = program_text(self._token, version)
+        self._changed = threading.Condition(threading.RLock())
+        self._calling = threading.RLock()  # re-entrant: a signal handler may stop the arm during a call
+        self._beat = secrets.randbelow(_LARGEST)
+        self._command: tuple[int, int, tuple[float, ...]] = (0, 0, (0.0,) * _NUMBERS)
+        """Sequence number, command, numbers."""
+        self._report = Report()
+        self._beats = 0
+        self._failure: DriverError | None = None
+        self._end_reason: DriverError | None = None
+        self._refusal: ProgramRefused | None = None
+        self._killed = False
+        self._moving = self._unwatched = False
+        self._asked_s = self._heard_s = clock.now_s()
+        self._silent_s = 0.0
+        self._t_device_s = -1.0
+        self._primary: Primary | None = None
+        self._stream = Subscription(host, OUTPUTS, _RATE_HZ, timeout_s=timing.connect_s, clock=clock, inputs=INPUTS)
+        self._thread = Follower(clock, self._run, "ur-heartbeat")
+        try:
+            self._thread.start()
+        except BaseException:
+            self._stream.close()
+            raise
+
+    @property
+    def alive(self) -> bool:
+        """Whether it accepts calls."""
+        return not self._killed and self._failure is None
+
+    def wait_until_ready(self, look_out: LookOut) -> None:
+        """Send the program, and return when it answers to heartbeats of this session; see `Control`."""
+        timeout_s = self._timing.starting_s
+        wait = partial(self._wait, timeout_s=timeout_s, look_out=look_out, what="start")
+        wait(lambda: self._beats >= 2)  # token and sequence number are in the registers
+        try:
+            primary = Primary(self._host, timeout_s=self._timing.connect_s)
+        except ConnectError as error:
+            raise ProgramRefused(error.found, error.fix) from error
+        try:
+            primary.send(self._program)
+        except OSError as error:
+            primary.close()
+            raise StreamBroken(f"the program was not sent ({error})") from error
+        with self._changed:
+            self._primary = primary
+        wait(lambda: self._report.token == self._token or self._refusal is not None)
+        if self._refusal is not None:
+            raise self._refusal
+
+    def call(self, name: str, *args: object, timeout_s: float | None = None, look_out: LookOut = lambda: None) -> Any:
+        """Send a command and wait for its answer; see `Control`."""
+        while not self._calling.acquire(timeout=0.02):
+            self._clock.now_ns()  # an emulated cell may wait for this thread
+        try:
+            self._asked_s = self._clock.now_s()
+            if name == "progress":
+                return self._progress()
+            with self._changed:
+                if not self.alive:
+                    raise self._loss()
+                sequence = self._request(_COMMANDS[name], tuple(_flat(args)))
+            self._wait(
+                lambda: self._report.sequence >= sequence,
+                timeout_s=self._timing.call_s if timeout_s is None else timeout_s,
+                look_out=look_out,
+                what=f"answer the command {name}",
+            )
+            with self._changed:
+                report = self._report
+                self._moving = self._moving or (name == "move" and bool(report.answer))
+            if report.sequence > sequence:
+                raise StreamBroken(f"another command replaced {name}", "open the arm again")
+            if name == "tcp_offset":
+                return list(report.tcp_offset)
+            return bool(report.answer)
+        finally:
+            self._calling.release()
+
+    def quit(self, *, timeout_s: float) -> bool:
+        """Stop the arm, end the program and the link; return whether that was confirmed in time."""
+        try:
+            self.call("quit", timeout_s=timeout_s)
+        except DriverError as error:
+            log.debug("the control program of %s did not end by itself: %s", self._host, error)
+            return False
+        finally:
+            self.kill()
+        return True
+
+    def kill(self) -> None:
+        """Request the end of the program once more, then fall silent; the arm stops within 0.3 s. Idempotent.
+
+        A program that is paused finds the request in the registers when it is resumed, and does not move.
+        """
+        with self._changed:
+            if not self._killed:
+                self._killed = True
+                with suppress(OSError):  # it may be gone
+                    self._request(_COMMANDS["quit"], ())
+            self._changed.notify_all()
+        self._stream.close()
+        if self._thread.is_alive() and threading.current_thread() is not self._thread:
+            self._thread.join(timeout=1.0)
+        if self._primary is not None:
+            self._primary.close()
+
+    def end_reason(self) -> DriverError | None:
+        """Return why the program has ended: a runtime error, no heartbeat, or a lost link."""
+        return self._end_reason or self._failure
+
+    def explained(self, error: DriverError) -> DriverError:
+        """Return the error of a lost controller: its program stops the arm."""
+        return type(error)(
+            f"{error.found}, so the control program stops the arm by itself within {STOPS_ITSELF_S} s",
+            "check the robot and the network, then open the arm again",
+        )
+
+    def _progress(self) -> tuple[bool, bool]:
+        with self._changed:
+            if not self.alive:
+                raise self._loss()
+            ended = self._report.state != _MOVING
+            self._moving = self._moving and not ended
+            return ended, self._unwatched
+
+    def _wait(self, done: Callable[[], bool], *, timeout_s: float, look_out: LookOut, what: str) -> None:
+        patience = Patience(self._clock, timeout_s)
+        looked_s = self._clock.now_s()
+        while True:
+            with self._changed:
+                if not done() and self.alive and not patience.is_over:
+                    patience.wait(self._changed)
+                if done():
+                    return
+                if not self.alive:
+                    raise self._loss()
+            if patience.is_over:
+                self.kill()
+                raise DeviceTimeout(
+                    f"the control program did not {what} within {timeout_s:.1f} s, so its heartbeat was ended",
+                    "check the robot and the network, then open the arm again",
+                )
+            if self._clock.now_s() - looked_s >= _LOOK_OUT_S:
+                look_out()
+                looked_s = self._clock.now_s()
+
+    def _loss(self) -> DriverError:
+        return self._failure or StreamBroken(f"the control of {self._host} was ended", "open the arm again")
+
+    # ------------------------------------------------------------------ the heartbeat
+
+    def _run(self) -> None:
+        while self._turn():
+            pass
+
+    def _turn(self) -> bool:
+        """Read what has arrived and answer it with a heartbeat; return whether to continue."""
+        try:
+            outputs = self._stream.decode(self._stream.read(self._clock.poll_s)[-1:])
+        except TimeoutError:
+            return self._pause()
+        except DriverError as error:
+            return self._fail(error.found)
+        except OSError as error:
+            return self._fail(str(error))
+        t_device_s, *numbers = (column[-1].item() for column in outputs.values())
+        if t_device_s == self._t_device_s:
+            return self._pause()  # a repeated sample is no sign of life
+        self._t_device_s, self._silent_s, self._heard_s = t_device_s, 0.0, self._clock.now_s()
+        with self._changed:
+            if self._killed:
+                return False
+            token, state, sequence, answer = map(int, numbers[:4])
+            self._report = Report(token, state, sequence, answer, tuple(numbers[4:]))
+            if self._report.state == _NO_HEARTBEAT and self._report.token == self._token:
+                self._end_reason = self._end_reason or DeviceTimeout(
+                    "the control program has stopped the arm and ended, because it saw no heartbeat for 0.2 s",
+                    "keep the computer awake, check the network, then open the arm again",
+                )
+            try:
+                self._watch()
+                self._beat = (self._beat + 1) % _LARGEST
+                self._beats += 1
+                self._write()
+            except OSError as error:
+                return self._fail(str(error))
+            self._changed.notify_all()
+        self._read_messages()
+        return True
+
+    def _pause(self) -> bool:
+        """Count the silence of the controller; a suspension of this process counts as two turns at most."""
+        now_s = self._clock.now_s()  # an emulated cell waits for this thread
+        self._silent_s += min(now_s - self._heard_s, 2 * self._clock.poll_s)
+        self._heard_s = now_s
+        if self._silent_s > self._timing.stale_s:
+            return self._fail(f"the controller sent nothing for {self._silent_s:.2f} s")
+        return not self._killed
+
+    def _fail(self, why: str) -> bool:
+        with self._changed:
+            if not self._killed and self._failure is None:
+                self._failure = self.explained(
+                    StreamBroken(f"the connection to the control program on {self._host} was lost ({why})")
+                )
+            self._changed.notify_all()
+        self._stream.close()  # so that no command can arrive later
+        return False
+
+    def _watch(self) -> None:
+        """Stop a move that no caller has watched for too long."""
+        if self._moving and self._clock.now_s() - self._asked_s > self._timing.unwatched_s:
+            self._moving = False
+            if self._report.state == _MOVING:
+                self._unwatched = True
+                self._set(_COMMANDS["stop"], ())
+
+    def _read_messages(self) -> None:
+        primary = self._primary
+        if primary is None or primary.closed:
+            return
+        for message in primary.read():
+            if isinstance(message, Failed):
+                log.warning("%s: line %d, column %d: %s", self._host, message.line, message.column, message.text)
+                found = f"the control program failed in line {message.line}: {message.text}"
+                fix = "take the other control path, and report this error"
+                self._conclude(ProgramRefused(found, fix), DeviceFault(found, fix))
+            elif isinstance(message, Code) and message.is_read_only:
+                self._conclude(self._read_only("error code 210: the connection is read-only"))
+            else:
+                log.log(logging.INFO if isinstance(message, Note) else logging.DEBUG, "%s: %s", self._host, message)
+        if primary.closed:
+            log.info("%s closed the primary interface", self._host)
+            self._conclude(self._read_only("the controller closed the connection"))
+
+    def _conclude(self, refusal: ProgramRefused, end_reason: DriverError | None = None) -> None:
+        """Note why the program does not start, or why it has ended."""
+        with self._changed:
+            if self._report.token != self._token:
+                self._refusal = self._refusal or refusal
+            else:
+                self._end_reason = self._end_reason or end_reason
+            self._changed.notify_all()
+
+    def _read_only(self, how: str) -> ProgramRefused:
+        return ProgramRefused(
+            f"{self._host} takes no programs from the network ({how})",
+            "switch the pendant to remote control (PolyScope X: Safety overview, Control mode, Remote)",
+        )
+
+    # ------------------------------------------------------------------ the registers
+
+    def _request(self, command: int, numbers: Sequence[float]) -> int:
+        """Send a command at once; return its sequence number."""
+        self._set(command, numbers)
+        try:
+            self._write()
+        except OSError as error:
+            if not self._killed:
+                self._fail(str(error))
+                raise self._loss() from error
+        return self._command[0]
+
+    def _set(self, command: int, numbers: Sequence[float]) -> None:
+        if _COMMANDS["move"] == command:
+            self._unwatched = False
+        padding = (0.0,) * (_NUMBERS - len(numbers))
+        self._command = (self._command[0] + 1, command, (*numbers, *padding))
+
+    def _write(self) -> None:
+        sequence, command, numbers = self._command
+        self._stream.write((self._beat, self._token, sequence, command, *numbers))
+
+
+def _flat(values: Sequence[object]) -> Iterator[float]:
+    """Yield the numbers of an argument list; None stands for none."""
+    for value in values:
+        if isinstance(value, Sequence):
+            yield from _flat(value)
+        elif value is not None:
+            yield float(value)  # type: ignore[arg-type]  # checked by the caller
