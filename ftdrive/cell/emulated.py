@@ -47,25 +47,37 @@ class Station:
     sensor : one of `SENSORS`, "both" (can and serial) or "none"
     options : sequence of str
         More options of `python -m mocks station`.
+    control_path : str
+        As `control` of `[robot]`.
     """
 
-    def __init__(self, sensor: str = "can", options: Sequence[str] = ()) -> None:
+    def __init__(self, sensor: str = "can", options: Sequence[str] = (), *, control_path: str = "auto") -> None:
         self.sensor = sensor
         self.options = tuple(options)
+        self.control_path = control_path
         self.endpoints: Mapping[str, Any] = {}
         self.clock: Clock = REAL
         """The cell's own, once it has started."""
         self._process: subprocess.Popen[str] | None = None
 
     @classmethod
-    def of(cls, made_by: Mapping[str, Any] | None, sensor: str | None = None, options: Sequence[str] = ()) -> Self:
+    def of(
+        cls,
+        made_by: Mapping[str, Any] | None,
+        sensor: str | None = None,
+        options: Sequence[str] = (),
+        *,
+        control_path: str | None = None,
+    ) -> Self:
         """Describe the station that a run or a calibration names as its `station`, or the usual one; not started.
 
-        An address emulated://NAME in `sensor` replaces its sensor; `options` come after its own.
+        An address emulated://NAME in `sensor` replaces its sensor, and `control_path` its control path; `options` come
+        after its own.
         """
         made_by = made_by or {}
         name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
-        return cls(name, (*made_by.get("options", ()), *options))
+        path = control_path or made_by.get("control_path", "auto")
+        return cls(name, (*made_by.get("options", ()), *options), control_path=path)
 
     def __enter__(self) -> Self:
         command = [sys.executable, "-P", "-m", "mocks", "station", "--sensor", self.sensor]
@@ -125,7 +137,14 @@ class Station:
         url = next(iter(self.endpoints["sensors"].values()))["url"]
         truth = self.truth
         return CellConfig(
-            robot=RobotConfig(arm["host"], arm["model"], speed_deg_s=60.0, acceleration_deg_s2=80.0),
+            robot=RobotConfig(
+                arm["host"],
+                arm["model"],
+                speed_deg_s=60.0,
+                acceleration_deg_s2=80.0,
+                control=self.control_path,
+                api_port=arm.get("api_port", 80),
+            ),
             sensor=SensorConfig(url, height_mm=1e3 * truth["p_flange_sensor_m"][2], mass_kg=truth["sensor_mass_kg"]),
             tool=ToolConfig("emulated", (TOOL_MM,)),
             workcell=WorkcellConfig(self.mounting, measured=True),

@@ -289,8 +289,11 @@ def check_arm(info: DeviceInfo, robot: RobotConfig) -> Check:
     name = "robot.identity"
     if robot.serial not in {None, info.serial}:
         found = f"the arm at {robot.host} has serial {info.serial}, [robot] serial is {robot.serial}"
+        if info.serial == NOT_REPORTED:
+            return Check(name, "failed", f"{found}: they cannot be compared", "remove [robot] serial")
         return Check(name, "failed", found, "correct one of the two")
-    return Check(name, "ok", who(info))
+    control = info.facts.get("control")
+    return Check(name, "ok", who(info) if control is None else f"{who(info)}; control path {control.value}")
 
 
 def check_finding(finding: Finding) -> Check:
