@@ -30,13 +30,13 @@ log = logging.getLogger(__name__)
 
 STOPS_ITSELF_S: Final = 0.3
 """The arm decelerates within this time after the last heartbeat: 0.2 s, and the cycles of both ends."""
-INPUTS: Final = {f"input_int_register_{k}": "INT32" for k in range(24, 28)} | {
+INPUTS: Final = {f"input_int_register_{k}": "INT32" for k in range(32, 36)} | {
     f"input_double_register_{k}": "DOUBLE" for k in range(24, 34)
 }
-"""Heartbeat, token, sequence number, command; numbers of the command. The lower ranges belong to fieldbuses."""
+"""Heartbeat, token, sequence number, command; numbers of the command."""
 OUTPUTS: Final = (
     {"timestamp": "DOUBLE"}
-    | {f"output_int_register_{k}": "INT32" for k in range(24, 28)}
+    | {f"output_int_register_{k}": "INT32" for k in range(32, 36)}
     | {f"output_double_register_{k}": "DOUBLE" for k in range(24, 30)}
 )
 """Token, state, sequence number and answer of the last command; the TCP."""

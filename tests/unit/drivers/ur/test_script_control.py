@@ -64,12 +64,12 @@ def test_the_program_is_complete(version: tuple[int, int]) -> None:
 
 def test_program_and_driver_agree_on_registers_and_commands() -> None:
     text = program_text(1, (5, 15))
-    assert {int(k) for k in re.findall(r"read_input_integer_register\((\d+)\)", text)} == {24, 25, 26, 27}
+    assert {int(k) for k in re.findall(r"read_input_integer_register\((\d+)\)", text)} == {32, 33, 34, 35}
     written = {int(k) for k in re.findall(r"write_output_integer_register\((\d+),", text)}
-    assert written == {24, 25, 26, 27}
+    assert written == {32, 33, 34, 35}
     numbers = {int(k) for k in re.findall(r"ft_number\((\d+)\)", text)}
     assert numbers == set(range(10))
-    for command in (f"input_int_register_{k}" for k in range(24, 28)):
+    for command in (f"input_int_register_{k}" for k in range(32, 36)):
         assert command in script_control.INPUTS
     named = {int(number): name for name, number in re.findall(r"global ft_(\w+) = ([1-7])\n", text)}
     assert len(named) == len(script_control._COMMANDS) == len(COMMANDS)
@@ -271,7 +271,7 @@ def test_a_runtime_error_is_the_reason_of_an_ended_program(
 
 def test_registers_of_another_client_are_not_taken(make_arm: MakeArm, controller: Controller) -> None:
     controller.registers_taken = True
-    with pytest.raises(ConnectError, match=r"input_int_register_24 and 13 more"):
+    with pytest.raises(ConnectError, match=r"input_int_register_32 and 13 more"):
         make_arm().open(control=True)
     assert controller.did == []
 
