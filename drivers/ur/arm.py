@@ -531,7 +531,9 @@ class UrArm(RobotArm):
         if self._control is None:
             raise ConnectError(f"the arm at {self._host} was opened for reading only", "open it with control")
         if not self._control.alive:
-            raise StreamBroken(f"the control of {self._host} has ended", "check the robot, then open the arm again")
+            raise self._control.end_reason() or StreamBroken(
+                f"the control of {self._host} has ended", "check the robot, then open the arm again"
+            )
         return self._control
 
     def _reading(self) -> Reader:

@@ -84,10 +84,11 @@ class Opening:
         except ProgramRefused:
             control.kill()
             self.program.is_gone()
+            self._look_out()  # a control path seldom knows the reason
             raise
         except (StreamBroken, DeviceTimeout) as error:
             control.kill()
-            self._look_out()  # a control path seldom knows the reason
+            self._look_out()
             raise _refusal(self.host, path, error) from error
         except BaseException:
             control.kill()

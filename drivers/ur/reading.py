@@ -248,11 +248,10 @@ class Reader:
             reported = read_model(self._host, timeout_s=self._timing.connect_s, clock=self._clock)
         known = None if reported is None else model_named(reported, self.version[0])
         if model is None and known is None:
-            raise ModelUnknown(
-                f"{self._host} reports the model {reported!r}, which is unknown (CB3 before 3.12 and e-Series before "
-                "5.6 do not report it)",
-                "set the model of the arm",
-            )
+            found = f"reports the unknown model {reported!r}"
+            if reported is None:
+                found = "does not report its model, as CB3 before 3.12 and e-Series before 5.6"
+            raise ModelUnknown(f"{self._host} {found}", "set the model of the arm")
         if model is not None and known is not None and MODELS[known] != MODELS[model]:
             raise ConnectError(f"{self._host} is a {known}, not a {model}", "check the address and the model")
         return DeviceInfo(

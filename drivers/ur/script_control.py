@@ -13,6 +13,7 @@ import secrets
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
@@ -81,10 +82,7 @@ def program_text(token: int, version: Sequence[int]) -> str:
 
 
 class ScriptControl(Control):
-    """Our program on the controller, and the connections to it. Connected while it exists.
-
-    Raises `ConnectError` when the controller cannot be reached or another client has the registers.
-    """
+    """Our program on the controller, and the connections to it."""
 
     stops_itself = True
 
@@ -110,13 +108,9 @@ class ScriptControl(Control):
         self._silent_s = 0.0
         self._t_device_s = -1.0
         self._primary: Primary | None = None
-        self._stream = Subscription(host, OUTPUTS, _RATE_HZ, timeout_s=timing.connect_s, clock=clock, inputs=INPUTS)
+        self._stream: Subscription | None = None
         self._thread = Follower(clock, self._run, "ur-heartbeat")
-        try:
-            self._thread.start()
-        except BaseException:
-            self._stream.close()
-            raise
+        self._thread.start()
 
     @property
     def alive(self) -> bool:
@@ -127,7 +121,9 @@ class ScriptControl(Control):
         """Send the program, and return when it answers to heartbeats of this session; see `Control`."""
         timeout_s = self._timing.starting_s
         wait = partial(self._wait, timeout_s=timeout_s, look_out=look_out, what="start")
-        wait(lambda: self._beats >= 2)  # token and sequence number are in the registers
+        wait(lambda: self._beats >= 2 or self._refusal is not None)  # token and sequence number are in the registers
+        if self._refusal is not None:
+            raise self._refusal
         try:
             primary = Primary(self._host, timeout_s=self._timing.connect_s)
         except ConnectError as error:
@@ -194,7 +190,7 @@ class ScriptControl(Control):
                 with suppress(OSError):  # it may be gone
                     self._request(_COMMANDS["quit"], ())
             self._changed.notify_all()
-        self._stream.close()
+        self._close_stream()
         if self._thread.is_alive() and threading.current_thread() is not self._thread:
             self._thread.join(timeout=1.0)
         if self._primary is not None:
@@ -202,13 +198,13 @@ class ScriptControl(Control):
 
     def end_reason(self) -> DriverError | None:
         """Return why the program has ended: a runtime error, no heartbeat, or a lost link."""
-        return self._end_reason or self._failure
+        return copy(self._end_reason or self._failure)
 
     def explained(self, error: DriverError) -> DriverError:
         """Return the error of a lost controller: its program stops the arm."""
         return type(error)(
             f"{error.found}, so the control program stops the arm by itself within {STOPS_ITSELF_S} s",
-            "check the robot and the network, then open the arm again",
+            "check the robot and the cable, then open the arm again",
         )
 
     def _progress(self) -> tuple[bool, bool]:
@@ -241,18 +237,31 @@ class ScriptControl(Control):
                 looked_s = self._clock.now_s()
 
     def _loss(self) -> DriverError:
-        return self._failure or StreamBroken(f"the control of {self._host} was ended", "open the arm again")
+        return copy(self._failure) or StreamBroken(f"the control of {self._host} was ended", "open the arm again")
 
     # ------------------------------------------------------------------ the heartbeat
 
     def _run(self) -> None:
-        while self._turn():
+        try:
+            with self._clock.away():
+                stream = self._connect()
+        except DriverError as error:
+            self._conclude(ProgramRefused(error.found, error.fix))
+            return
+        with self._changed:
+            self._stream = stream
+        while self._turn(stream):
             pass
+        stream.close()  # so that no command can arrive later
 
-    def _turn(self) -> bool:
+    def _connect(self) -> Subscription:
+        timeout_s = self._timing.connect_s
+        return Subscription(self._host, OUTPUTS, _RATE_HZ, timeout_s=timeout_s, clock=self._clock, inputs=INPUTS)
+
+    def _turn(self, stream: Subscription) -> bool:
         """Read what has arrived and answer it with a heartbeat; return whether to continue."""
         try:
-            outputs = self._stream.decode(self._stream.read(self._clock.poll_s)[-1:])
+            outputs = stream.decode(stream.read(self._clock.poll_s)[-1:])
         except TimeoutError:
             return self._pause()
         except DriverError as error:
@@ -300,8 +309,12 @@ class ScriptControl(Control):
                     StreamBroken(f"the connection to the control program on {self._host} was lost ({why})")
                 )
             self._changed.notify_all()
-        self._stream.close()  # so that no command can arrive later
+        self._close_stream()  # so that no command can arrive later
         return False
+
+    def _close_stream(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
 
     def _watch(self) -> None:
         """Stop a move that no caller has watched for too long."""
@@ -365,7 +378,8 @@ class ScriptControl(Control):
 
     def _write(self) -> None:
         sequence, command, numbers = self._command
-        self._stream.write((self._beat, self._token, sequence, command, *numbers))
+        if self._stream is not None:
+            self._stream.write((self._beat, self._token, sequence, command, *numbers))
 
 
 def _flat(values: Sequence[object]) -> Iterator[float]:

@@ -17,6 +17,7 @@ from drivers.clock import Clock
 from drivers.registry import sensor_from_url
 from drivers.streaming.sensor import StreamingSensor
 from drivers.ur.arm import UrArm
+from drivers.ur.control import ControlSetting
 from drivers.ur.timing import UrTiming
 from ftdrive.cell.emulated_clock import EmulatedClock
 from tests.cell_time import CellTime
@@ -44,7 +45,8 @@ class Station(StationProcess):
 
     def arm(self, **how: Any) -> UrArm:
         """Make an arm that lives by the clock of this cell, if nothing else is said."""
-        given: dict[str, Any] = {"clock": self.clock, "timing": UrTiming.emulated(), **how}
+        api_port = self.hello["arm"].get("api_port", 80)
+        given: dict[str, Any] = {"clock": self.clock, "timing": UrTiming.emulated(), "api_port": api_port, **how}
         return UrArm(self.host, speed_rad_s=SPEED_RAD_S, acceleration_rad_s2=ACCELERATION_RAD_S2, **given)
 
     def is_as_new(self) -> bool:
@@ -95,11 +97,20 @@ def station(
         assert station.ask("state")["bad_inputs"] == []
 
 
+@pytest.fixture(params=["ur-rtde", pytest.param("script", marks=pytest.mark.slow)])
+def control(request: pytest.FixtureRequest) -> ControlSetting:
+    """The control path of the arms of a test."""
+    if request.param == "ur-rtde":
+        pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
+    path: ControlSetting = request.param
+    return path
+
+
 @pytest.fixture
-def new_arm(station: Station) -> Iterator[Callable[..., UrArm]]:
+def new_arm(station: Station, control: ControlSetting) -> Iterator[Callable[..., UrArm]]:
     """Make arms at the station, and close them after the test."""
     with ExitStack() as arms:
-        yield lambda **how: arms.enter_context(closing(station.arm(**how)))
+        yield lambda **how: arms.enter_context(closing(station.arm(**{"control": control, **how})))
 
 
 @pytest.fixture

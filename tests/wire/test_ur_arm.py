@@ -21,18 +21,19 @@ from scipy.spatial.transform import Rotation
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from drivers.ur.arm import UrArm
+from drivers.ur.control import Control
 from drivers.ur.control_process import ControlProcess
 from drivers.ur.kinematics import MODELS, forward
 from drivers.ur.timing import UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, Station
 from tests.wire.waiting import wait_until
 
-pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
-
 STEP_RAD = 1.2  # 1.3 s at the speed of these tests: long enough to be interrupted
 TCP = (0.1, -0.02, 0.25, 0.3, -1.2, 0.7)
 
 NewArm = Callable[..., UrArm]
+
+on_ur_rtde = pytest.mark.parametrize("control", ["ur-rtde"], indirect=True)
 
 
 def no_guard() -> None:
@@ -237,6 +238,7 @@ def test_an_arm_far_from_its_nominal_kinematics_is_refused(start_station: Callab
 # ---------------------------------------------------------------------- moving
 
 
+@pytest.mark.parametrize("control", ["ur-rtde", "script"], indirect=True)
 def test_move_stillness_and_limits(station: Station, arm: UrArm) -> None:
     q = away(arm, 0.6)
     calls: list[float] = []
@@ -318,14 +320,16 @@ def test_a_second_ctrl_c_does_not_let_the_arm_move_on(
     station: Station, arm: UrArm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     q = away(arm)
-    call = ControlProcess.call
+    assert arm._control is not None
+    kind = type(arm._control)
+    call = kind.call
 
-    def interrupted(self: ControlProcess, name: str, *args: object, **how: Any) -> object:
+    def interrupted(self: Control, name: str, *args: object, **how: Any) -> object:
         if name == "stop":
             raise KeyboardInterrupt
         return call(self, name, *args, **how)
 
-    monkeypatch.setattr(ControlProcess, "call", interrupted)
+    monkeypatch.setattr(kind, "call", interrupted)
     with pytest.raises(KeyboardInterrupt):
         arm.move_to(q, timeout_s=30, guard=Trigger(arm, lambda: signal.raise_signal(signal.SIGINT)))
     state = station.wait_for(lambda state: not state["moving"])
@@ -355,6 +359,7 @@ def test_a_controller_that_is_gone(station: Station, arm: UrArm) -> None:
 
 
 @pytest.mark.slow
+@on_ur_rtde
 def test_a_control_process_that_is_gone(station: Station, arm: UrArm) -> None:
     assert isinstance(arm._control, ControlProcess)
     pid = arm._control._process.pid
@@ -370,6 +375,7 @@ def test_a_control_process_that_is_gone(station: Station, arm: UrArm) -> None:
 
 
 @pytest.mark.slow
+@on_ur_rtde
 def test_a_control_process_that_hangs(station: Station, new_arm: NewArm, caplog: pytest.LogCaptureFixture) -> None:
     arm = new_arm(timing=replace(UrTiming.emulated(), progress_s=2.0))
     arm.open(control=True)

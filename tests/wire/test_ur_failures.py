@@ -57,11 +57,11 @@ import pytest
 from drivers.clock import REAL
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.ur.arm import UrArm
+from drivers.ur.control import Control, ControlPath, ControlSetting
 from drivers.ur.control_process import ControlProcess
+from drivers.ur.opening import Opening
 from drivers.ur.timing import STRICT, UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, TIME_SCALE, Station
-
-pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 
 ROOT = Path(__file__).parents[2]
 STEP_RAD = 1.2  # 1.3 s
@@ -71,6 +71,7 @@ REPORTED_S, RESUMED_S = 0.5, 2.0
 EMULATED = replace(UrTiming.emulated(), ours_s=2.0, ours_again_s=2.0, ours_closing_s=2.0, release_s=1.0)
 """Here other clients never answer and never let go."""
 slow, realtime = pytest.mark.slow, pytest.mark.realtime
+on_ur_rtde = pytest.mark.parametrize("control", ["ur-rtde"], indirect=True)
 
 NewArm = Callable[..., UrArm]
 
@@ -107,7 +108,7 @@ def release(station: Station) -> None:
 
 def cut(station: Station, *, connected: bool) -> None:
     """Pull all cables, as TCP sees it, or plug them in."""
-    for what in ("rtde", "dashboard", "script"):
+    for what in ("rtde", "dashboard", "script", "primary"):
         station.ask("listen", what=what, on=connected)
         if not connected:
             station.ask("drop", what=what, reset=True)
@@ -176,7 +177,7 @@ EVENTS = [
         "stopped or paused",
         hits_opening=False,
     ),
-    Event("crash-script", on("crash-script"), nothing, DeviceFault, "stopped or paused", hits_opening=False),
+    Event("crash-script", on("crash-script"), nothing, DeviceFault, "stopped or paused|in line", hits_opening=False),
     Event(
         "foreign-program",
         another_takes_over,
@@ -193,10 +194,15 @@ EVENTS = [
         on("silent", what="rtde", on=True),
         on("silent", what="rtde", on=False),
         LOST,
-        "press the emergency",
+        "press the emergency|by itself",
     ),
     Event(
-        "cable", on("silence-arm", on=True), on("silence-arm", on=False), LOST, "press the emergency", reachable=False
+        "cable",
+        on("silence-arm", on=True),
+        on("silence-arm", on=False),
+        LOST,
+        "press the emergency|by itself",
+        reachable=False,
     ),
     Event("freeze", on("freeze", on=True), on("freeze", on=False), LOST, "stood still", reachable=False),
     Event(
@@ -293,19 +299,19 @@ class Once:
 
 
 @events(fast="protective-stop")
-def test_in_move(station: Station, new_arm: NewArm, event: Event) -> None:
-    befall_move(station, opened(new_arm()), event)
+def test_in_move(station: Station, new_arm: NewArm, event: Event, control: ControlSetting) -> None:
+    befall_move(station, opened(new_arm()), event, stops_itself=control == "script")
 
 
 @realtime
 @pytest.mark.parametrize("event", EVENTS, ids=str)
-def test_in_move_in_time(station: Station, in_time: NewArm, event: Event) -> None:
-    reported_s, resumed_s = befall_move(station, opened(in_time()), event)
+def test_in_move_in_time(station: Station, in_time: NewArm, event: Event, control: ControlSetting) -> None:
+    reported_s, resumed_s = befall_move(station, opened(in_time()), event, stops_itself=control == "script")
     assert reported_s < event.reported_s
     assert resumed_s < RESUMED_S
 
 
-def befall_move(station: Station, arm: UrArm, event: Event) -> tuple[float, float]:
+def befall_move(station: Station, arm: UrArm, event: Event, *, stops_itself: bool) -> tuple[float, float]:
     """Let it happen in a move, and fix it; return after how long it was reported, and the arm usable again."""
     q = away(arm)
     provoke = Once(lambda: event.do(station), wait_until_moving(arm))
@@ -317,6 +323,8 @@ def befall_move(station: Station, arm: UrArm, event: Event) -> tuple[float, floa
         assert abs(state["q_rad"][5] - q[5]) > 0.1
     event.fix(station)
     where = station.wait_for(lambda state: not state["moving"])["q_rad"]  # whatever it was, it is one move long
+    if stops_itself:
+        assert abs(where[5] - q[5]) > 0.1
     begin_s = REAL.now_s()
     moves_again(arm)
     resumed_s = REAL.now_s() - begin_s
@@ -342,14 +350,14 @@ def test_at_rest(station: Station, new_arm: NewArm, event: Event) -> None:
 
 @events("protective-stop", "emergency-stop", "brakes", "rtde-fin", "rtde-silent", "cable", "freeze", "cut")
 def test_while_opening(station: Station, new_arm: NewArm, event: Event, monkeypatch: pytest.MonkeyPatch) -> None:
-    start = ControlProcess.__init__
+    start = Opening._start
     provoke = Once(lambda: event.do(station))
 
-    def provoking(self: ControlProcess, *args: Any, **how: Any) -> None:
-        provoke()  # all was well, and the control process is about to start
-        start(self, *args, **how)
+    def provoking(self: Opening, path: ControlPath) -> Control:
+        provoke()  # all was well, and the control path is about to start
+        return start(self, path)
 
-    monkeypatch.setattr(ControlProcess, "__init__", provoking)
+    monkeypatch.setattr(Opening, "_start", provoking)
     arm = new_arm()
     with pytest.raises(ConnectError, match=event.says):
         arm.open(control=True)
@@ -442,13 +450,15 @@ def test_a_slider_at_zero(station: Station, arm: UrArm) -> None:
 def test_an_end_before_the_goal_is_no_arrival(station: Station, arm: UrArm, monkeypatch: pytest.MonkeyPatch) -> None:
     where, q = arm.state().q_rad, away(arm)
     station.ask("slider", fraction=0.0)
-    call = ControlProcess.call
+    assert arm._control is not None
+    kind = type(arm._control)
+    call = kind.call
 
-    def hasty(self: ControlProcess, name: str, *args: object, **how: Any) -> object:
+    def hasty(self: Control, name: str, *args: object, **how: Any) -> object:
         return [True, False] if name == "progress" else call(self, name, *args, **how)
 
     with monkeypatch.context() as patch:
-        patch.setattr(ControlProcess, "call", hasty)  # as ur_rtde says it after it has connected again by itself
+        patch.setattr(kind, "call", hasty)  # as ur_rtde says it after it has connected again by itself
         with pytest.raises(DeviceFault, match="instead of"):
             arm.move_to(q, timeout_s=MOVE_S, guard=no_guard)
     station.ask("slider", fraction=1.0)
@@ -514,7 +524,7 @@ def test_a_program_that_cannot_be_asked_is_ended_by_leaving(
     def fail(*_: object, **__: object) -> object:
         raise StreamBroken("the control connection was lost")
 
-    monkeypatch.setattr(ControlProcess, "call", fail)
+    monkeypatch.setattr(type(arm._control), "call", fail)
     arm.close()
     assert station.ask("state")["runtime_state"] == "STOPPED"
 
@@ -553,6 +563,7 @@ def test_a_program_that_took_the_place_of_ours_is_not_ended_when_the_arm_is_open
 
 
 @slow
+@on_ur_rtde
 def test_what_runs_after_ours_was_seen_to_have_ended_is_not_ours(station: Station, arm: UrArm) -> None:
     assert isinstance(arm._control, ControlProcess)
     os.kill(arm._control._process.pid, signal.SIGKILL)  # so that it cannot be asked whose program it runs
@@ -578,6 +589,7 @@ def refused(station: Station, **how: Any) -> ConnectError:
 
 
 @slow
+@on_ur_rtde
 def test_registers_of_a_fieldbus(station: Station, new_arm: NewArm) -> None:
     station.ask("claim-registers", range="lower", on=True)
     error = refused(station)
@@ -590,10 +602,10 @@ def test_registers_of_a_fieldbus(station: Station, new_arm: NewArm) -> None:
 
 
 @slow
-def test_a_second_client_does_not_stop_the_first(station: Station, arm: UrArm) -> None:
+def test_a_second_client_does_not_stop_the_first(station: Station, arm: UrArm, control: ControlSetting) -> None:
     errors: list[ConnectError] = []
     q = away(arm, 0.8)
-    trying = threading.Thread(target=lambda: errors.append(refused(station)))
+    trying = threading.Thread(target=lambda: errors.append(refused(station, control=control)))
     arm.move_to(q, timeout_s=MOVE_S, guard=Once(trying.start, wait_until_moving(arm)))
     trying.join()
     assert "another client" in errors[0].found

@@ -153,10 +153,11 @@ class ScriptInMemory(ScriptControl):
     def __init__(self, link: Link, timing: UrTiming) -> None:
         self.link = link
         super().__init__(HOST, link.registers.far.version, clock=link.registers.far.clock, timing=timing)
+        self._stream = stream = self._connect()
 
         def cycle() -> None:
             link.sample()
-            if self.suspended or self._turn():
+            if self.suspended or self._turn(stream):
                 self._clock_at(CYCLE_S, cycle)
 
         self._clock_at(CYCLE_S, cycle)
