@@ -108,7 +108,7 @@ class Opening:
 
         path, why = path_for(self.setting, self.reader.version)
         stops = (
-            "; its program stops the arm within 0.3 s when this computer fails"
+            "; its program stops the arm within 0.3 s when computer or network fail"
             if path == "script"
             else "; if computer and network fail, the arm ends its present move"
         )

@@ -292,8 +292,7 @@ def check_arm(info: DeviceInfo, robot: RobotConfig) -> Check:
         if info.serial == NOT_REPORTED:
             return Check(name, "failed", f"{found}: they cannot be compared", "remove [robot] serial")
         return Check(name, "failed", found, "correct one of the two")
-    control = info.facts.get("control")
-    return Check(name, "ok", who(info) if control is None else f"{who(info)}; control path {control.value}")
+    return Check(name, "ok", who(info))
 
 
 def check_finding(finding: Finding) -> Check:
