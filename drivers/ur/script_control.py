@@ -250,9 +250,11 @@ class ScriptControl(Control):
             return
         with self._changed:
             self._stream = stream
-        while self._turn(stream):
-            pass
-        stream.close()  # so that no command can arrive later
+        try:
+            while self._turn(stream):
+                pass
+        finally:
+            self._fail("its thread has ended")  # unless the reason is known
 
     def _connect(self) -> Subscription:
         timeout_s = self._timing.connect_s

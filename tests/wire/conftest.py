@@ -17,7 +17,8 @@ from drivers.clock import Clock
 from drivers.registry import sensor_from_url
 from drivers.streaming.sensor import StreamingSensor
 from drivers.ur.arm import UrArm
-from drivers.ur.control import ControlSetting
+from drivers.ur.control import ControlPath
+from drivers.ur.opening import path_for
 from drivers.ur.timing import UrTiming
 from ftdrive.cell.emulated_clock import EmulatedClock
 from tests.cell_time import CellTime
@@ -97,17 +98,21 @@ def station(
         assert station.ask("state")["bad_inputs"] == []
 
 
-@pytest.fixture(params=["ur-rtde", pytest.param("script", marks=pytest.mark.slow)])
-def control(request: pytest.FixtureRequest) -> ControlSetting:
-    """The control path of the arms of a test."""
+@pytest.fixture(params=["auto", pytest.param("script", marks=pytest.mark.slow)])
+def control(request: pytest.FixtureRequest) -> ControlPath:
+    """The control path of the arms of a test: the one that is taken here, and the one that is there everywhere."""
     if request.param == "ur-rtde":
         pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
-    path: ControlSetting = request.param
-    return path
+    return path_for(request.param, (5, 15))[0]
+
+
+one_path = pytest.mark.parametrize("control", ["auto"], indirect=True)
+"""For tests of what has nothing to do with the control path."""
+on_ur_rtde = pytest.mark.parametrize("control", ["ur-rtde"], indirect=True)
 
 
 @pytest.fixture
-def new_arm(station: Station, control: ControlSetting) -> Iterator[Callable[..., UrArm]]:
+def new_arm(station: Station, control: ControlPath) -> Iterator[Callable[..., UrArm]]:
     """Make arms at the station, and close them after the test."""
     with ExitStack() as arms:
         yield lambda **how: arms.enter_context(closing(station.arm(**{"control": control, **how})))

@@ -52,7 +52,7 @@ def victim(host: str, page: str | None, ready: Connection) -> None:
 
 
 def trial(station: Station, kind: str, delay_s: float, *, real_clock: bool) -> float | None:
-    """Return after how long the arm decelerated, from the last heartbeat; None when it had stopped before.
+    """Return after how long the arm decelerated, from the last heartbeat; None when a busy computer had stopped it before.
 
     The controller's log has the failure and the standstill; braking from a constant speed is subtracted. The last
     heartbeat was sent at most one period before the failure, which is added.
@@ -71,10 +71,13 @@ def trial(station: Station, kind: str, delay_s: float, *, real_clock: bool) -> f
     page = None if real_clock else station.hello["clock"]
     process = multiprocessing.get_context("fork").Process(target=victim, args=(station.host, page, theirs))
     process.start()
+    theirs.close()
     assert process.pid is not None
     try:
-        assert ready.poll(60), "the victim did not open the arm"
-        goal_rad = ready.recv()
+        try:
+            goal_rad = ready.recv()
+        except EOFError:
+            return None
         station.wait_for_event("moves", since=begin)
         station.clock.sleep(delay_s)
         cut_ns = station.clock.now_ns()

@@ -8,7 +8,7 @@ import pytest
 from drivers.errors import DeviceFault
 from drivers.interfaces import ControllerSettings
 from drivers.ur.arm import UrArm
-from drivers.ur.control import ControlSetting
+from drivers.ur.control import ControlPath
 from tests.wire.conftest import Station
 
 pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
@@ -23,7 +23,7 @@ def taken(station: Station, since: int = 0) -> list[str]:
     return [event["why"] for event in events if event["why"] in SETTINGS_CALLS]
 
 
-def test_a_payload_is_kept_when_our_program_has_ended(station: Station, arm: UrArm, control: ControlSetting) -> None:
+def test_a_payload_is_kept_when_our_program_has_ended(station: Station, arm: UrArm, control: ControlPath) -> None:
     before = len(station.ask("state")["events"])
     arm.set_payload(1.442, COM_M, INERTIA)
     arm.set_gravity((0.0, 0.3, 9.81))

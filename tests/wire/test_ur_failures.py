@@ -45,7 +45,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,11 +57,11 @@ import pytest
 from drivers.clock import REAL
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.ur.arm import UrArm
-from drivers.ur.control import Control, ControlPath, ControlSetting
+from drivers.ur.control import Control, ControlPath
 from drivers.ur.control_process import ControlProcess
 from drivers.ur.opening import Opening
 from drivers.ur.timing import STRICT, UrTiming
-from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, TIME_SCALE, Station
+from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, TIME_SCALE, Station, on_ur_rtde, one_path
 
 ROOT = Path(__file__).parents[2]
 STEP_RAD = 1.2  # 1.3 s
@@ -71,7 +71,6 @@ REPORTED_S, RESUMED_S = 0.5, 2.0
 EMULATED = replace(UrTiming.emulated(), ours_s=2.0, ours_again_s=2.0, ours_closing_s=2.0, release_s=1.0)
 """Here other clients never answer and never let go."""
 slow, realtime = pytest.mark.slow, pytest.mark.realtime
-on_ur_rtde = pytest.mark.parametrize("control", ["ur-rtde"], indirect=True)
 
 NewArm = Callable[..., UrArm]
 
@@ -216,15 +215,20 @@ EVENTS = [
 ]
 
 
-def events(*names: str, fast: str = "") -> pytest.MarkDecorator:
-    """Parametrize by events, all where none is named; slow but for one."""
+def events(*names: str, fast: str = "", script: Sequence[str] | None = None) -> pytest.MarkDecorator:
+    """Parametrize by control path and event: all events where none is named; slow but for one.
+
+    `script` names those on the path of our own program, where the paths differ.
+    """
     return pytest.mark.parametrize(
-        "event",
+        ("control", "event"),
         [
-            pytest.param(event, marks=[] if event.name == fast else [slow])
+            pytest.param(path, event, marks=[] if (path, event.name) == ("auto", fast) else [slow])
+            for path in ("auto", "script")
             for event in EVENTS
-            if not names or event.name in names
+            if (not names or event.name in names) and (path == "auto" or script is None or event.name in script)
         ],
+        indirect=["control"],
         ids=str,
     )
 
@@ -299,13 +303,13 @@ class Once:
 
 
 @events(fast="protective-stop")
-def test_in_move(station: Station, new_arm: NewArm, event: Event, control: ControlSetting) -> None:
+def test_in_move(station: Station, new_arm: NewArm, event: Event, control: ControlPath) -> None:
     befall_move(station, opened(new_arm()), event, stops_itself=control == "script")
 
 
 @realtime
 @pytest.mark.parametrize("event", EVENTS, ids=str)
-def test_in_move_in_time(station: Station, in_time: NewArm, event: Event, control: ControlSetting) -> None:
+def test_in_move_in_time(station: Station, in_time: NewArm, event: Event, control: ControlPath) -> None:
     reported_s, resumed_s = befall_move(station, opened(in_time()), event, stops_itself=control == "script")
     assert reported_s < event.reported_s
     assert resumed_s < RESUMED_S
@@ -332,7 +336,10 @@ def befall_move(station: Station, arm: UrArm, event: Event, *, stops_itself: boo
     return reported_s, resumed_s
 
 
-@events("protective-stop", "power-off", "program-stop", "foreign-program", "rtde-reset", "rtde-silent", "cut")
+@events(
+    *("protective-stop", "power-off", "program-stop", "foreign-program", "rtde-reset", "rtde-silent", "cut"),
+    script=("protective-stop", "foreign-program", "rtde-silent"),
+)
 def test_at_rest(station: Station, new_arm: NewArm, event: Event) -> None:
     arm = opened(new_arm())
     if event.name != "foreign-program":  # while it stands, it may be anybody's program
@@ -348,7 +355,10 @@ def test_at_rest(station: Station, new_arm: NewArm, event: Event) -> None:
     moves_again(arm)
 
 
-@events("protective-stop", "emergency-stop", "brakes", "rtde-fin", "rtde-silent", "cable", "freeze", "cut")
+@events(
+    *("protective-stop", "emergency-stop", "brakes", "rtde-fin", "rtde-silent", "cable", "freeze", "cut"),
+    script=("protective-stop", "cable", "cut"),
+)
 def test_while_opening(station: Station, new_arm: NewArm, event: Event, monkeypatch: pytest.MonkeyPatch) -> None:
     start = Opening._start
     provoke = Once(lambda: event.do(station))
@@ -365,7 +375,10 @@ def test_while_opening(station: Station, new_arm: NewArm, event: Event, monkeypa
     moves_again(arm)
 
 
-@events("protective-stop", "safeguard", "program-pause", "foreign-program", "rtde-fin", "rtde-silent", "cable")
+@events(
+    *("protective-stop", "safeguard", "program-pause", "foreign-program", "rtde-fin", "rtde-silent", "cable"),
+    script=("protective-stop", "foreign-program", "cable"),
+)
 def test_while_closing(station: Station, new_arm: NewArm, event: Event) -> None:
     arm = opened(new_arm())
     assert arm._control is not None
@@ -382,6 +395,7 @@ def test_while_closing(station: Station, new_arm: NewArm, event: Event) -> None:
 
 
 @slow
+@one_path
 @pytest.mark.parametrize(
     ("do", "fix"),
     [
@@ -400,6 +414,21 @@ def test_what_disturbs_no_move(station: Station, arm: UrArm, do: Act, fix: Act) 
     arm.wait_until_still(timeout_s=30, guard=no_guard)
     assert np.allclose(arm.state().q_rad, q, atol=1e-4)
     fix(station)
+
+
+@slow
+@pytest.mark.parametrize("control", ["script"], indirect=True)
+def test_the_port_of_our_program_may_close_in_a_move(station: Station, arm: UrArm) -> None:
+    """As it does when the pendant is switched to local control."""
+    q = away(arm, 0.5)
+
+    def switch() -> None:
+        station.ask("remote-control", on=False)
+        station.ask("drop", what="primary")
+
+    arm.move_to(q, timeout_s=MOVE_S, guard=Once(switch, wait_until_moving(arm)))
+    assert np.allclose(arm.state().q_rad, q, atol=1e-3)
+    station.ask("remote-control", on=True)
 
 
 @realtime
@@ -482,6 +511,7 @@ def test_a_move_paused_by_a_protective_stop_cannot_be_played(station: Station, a
 
 
 @slow
+@one_path
 def test_a_new_arm_moves_after_a_protective_stop(station: Station, arm: UrArm, new_arm: NewArm) -> None:
     station.ask("protective-stop")
     arm.close()
@@ -506,6 +536,7 @@ def test_a_program_of_another_client_is_not_stopped_by_leaving(
 
 
 @slow
+@one_path
 def test_a_program_of_another_client_found_before_a_move_is_left_alone(station: Station, arm: UrArm) -> None:
     q = away(arm)
     another_takes_over(station)
@@ -602,7 +633,7 @@ def test_registers_of_a_fieldbus(station: Station, new_arm: NewArm) -> None:
 
 
 @slow
-def test_a_second_client_does_not_stop_the_first(station: Station, arm: UrArm, control: ControlSetting) -> None:
+def test_a_second_client_does_not_stop_the_first(station: Station, arm: UrArm, control: ControlPath) -> None:
     errors: list[ConnectError] = []
     q = away(arm, 0.8)
     trying = threading.Thread(target=lambda: errors.append(refused(station, control=control)))
