@@ -52,10 +52,10 @@ def victim(host: str, page: str | None, ready: Connection) -> None:
 
 
 def trial(station: Station, kind: str, delay_s: float, *, real_clock: bool) -> float | None:
-    """Return after how long the arm decelerated, from the last heartbeat; None when a busy computer had stopped it before.
+    """Return after how long the arm decelerated, from the last heartbeat; None when it had stopped before.
 
     The controller's log has the failure and the standstill; braking from a constant speed is subtracted. The last
-    heartbeat was sent at most one period before the failure, which is added.
+    heartbeat was sent at most one period before the failure, which is added. A busy computer may stop the arm before.
 
     Parameters
     ----------
