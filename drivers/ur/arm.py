@@ -172,6 +172,8 @@ class UrArm(RobotArm):
         """End our program through its control path, if that can be confirmed to work."""
         try:
             look = None if reader is None else reader.look(limit_s=self._timing.glance_s)
+            if control.has_ended:
+                self._program.is_gone()
             if look and control.alive and look.program_state == PROGRAM_PLAYING and not look.safety_fault():
                 if self._is_ours(control, timeout_s=self._timing.ours_closing_s):
                     if control.quit(timeout_s=self._timing.quit_s):
@@ -485,7 +487,10 @@ class UrArm(RobotArm):
         finally:  # also after a second Ctrl-C
             if not stopped:
                 control.kill()  # on a lost link ur_rtde would restart the program repeatedly
-                self._program.stop(silent=self._reader is not None and self._reader.silent)
+                if control.has_ended:
+                    self._program.is_gone()
+                else:
+                    self._program.stop(silent=self._reader is not None and self._reader.silent)
 
     def _stop_softly(self, control: Control) -> bool:
         try:

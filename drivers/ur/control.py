@@ -32,6 +32,11 @@ class Control(ABC):
     def alive(self) -> bool:
         """Whether it accepts calls."""
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether our program has reported its end, so that a program on the controller is not ours."""
+        return False
+
     @abstractmethod
     def wait_until_ready(self, look_out: LookOut) -> None:
         """Return when our program runs on the controller. Raises what `call` and `look_out` raise."""

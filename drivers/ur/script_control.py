@@ -23,12 +23,14 @@ from drivers.clock import Clock, Follower
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.ur.control import Control, LookOut, ProgramRefused
 from drivers.ur.control_child import DECELERATION_RAD_S2
-from drivers.ur.primary import Code, Failed, Note, Primary
+from drivers.ur.primary import Code, Failed, Primary, RobotType, Stopped
 from drivers.ur.rtde import Subscription
 from drivers.ur.timing import Patience, UrTiming
 
 log = logging.getLogger(__name__)
 
+PROGRAM: Final = "ftdrive_control"
+"""Its name on the controller."""
 STOPS_ITSELF_S: Final = 0.3
 """The arm decelerates within this time after the last heartbeat: 0.2 s, and the cycles of both ends."""
 INPUTS: Final = {f"input_int_register_{k}": "INT32" for k in range(32, 36)} | {
@@ -100,6 +102,8 @@ class ScriptControl(Control):
         self._report = Report()
         self._beats = 0
         self._failure: DriverError | None = None
+        self._error: DeviceFault | None = None
+        """The last program error on the controller, of whatever program."""
         self._end_reason: DriverError | None = None
         self._refusal: ProgramRefused | None = None
         self._killed = False
@@ -116,6 +120,11 @@ class ScriptControl(Control):
     def alive(self) -> bool:
         """Whether it accepts calls."""
         return not self._killed and self._failure is None
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the program has reported its end."""
+        return self._report.token == self._token and self._report.state < 0
 
     def wait_until_ready(self, look_out: LookOut) -> None:
         """Send the program, and return when it answers to heartbeats of this session; see `Control`."""
@@ -246,7 +255,7 @@ class ScriptControl(Control):
             with self._clock.away():
                 stream = self._connect()
         except DriverError as error:
-            self._conclude(ProgramRefused(error.found, error.fix))
+            self._refuse(error)
             return
         with self._changed:
             self._stream = stream
@@ -279,7 +288,7 @@ class ScriptControl(Control):
                 return False
             token, state, sequence, answer = map(int, numbers[:4])
             self._report = Report(token, state, sequence, answer, tuple(numbers[4:]))
-            if self._report.state == _NO_HEARTBEAT and self._report.token == self._token:
+            if self._report.state == _NO_HEARTBEAT and self.has_ended:
                 self._end_reason = self._end_reason or DeviceTimeout(
                     "the control program has stopped the arm and ended, because it saw no heartbeat for 0.2 s",
                     "keep the computer awake, check the network, then open the arm again",
@@ -331,30 +340,28 @@ class ScriptControl(Control):
         if primary is None or primary.closed:
             return
         for message in primary.read():
+            log.log(logging.DEBUG if isinstance(message, RobotType) else logging.INFO, "%s: %s", self._host, message)
             if isinstance(message, Failed):
-                log.warning("%s: line %d, column %d: %s", self._host, message.line, message.column, message.text)
-                found = f"the control program failed in line {message.line}: {message.text}"
                 fix = "take the other control path, and report this error"
-                self._conclude(ProgramRefused(found, fix), DeviceFault(found, fix))
+                self._error = DeviceFault(f"the control program failed in line {message.line}: {message.text}", fix)
+                self._refuse(self._error)
             elif isinstance(message, Code) and message.is_read_only:
-                self._conclude(self._read_only("error code 210: the connection is read-only"))
-            else:
-                log.log(logging.INFO if isinstance(message, Note) else logging.DEBUG, "%s: %s", self._host, message)
+                self._refuse(self._read_only("error code 210: the connection is read-only"))
+            elif isinstance(message, Stopped) and message.name == PROGRAM:
+                self._end_reason = self._end_reason or self._error
         if primary.closed:
             log.info("%s closed the primary interface", self._host)
-            self._conclude(self._read_only("the controller closed the connection"))
+            self._refuse(self._read_only("the controller closed the connection"))
 
-    def _conclude(self, refusal: ProgramRefused, end_reason: DriverError | None = None) -> None:
-        """Note why the program does not start, or why it has ended."""
+    def _refuse(self, error: DriverError) -> None:
+        """Note why the program does not start, if it has not."""
         with self._changed:
-            if self._report.token != self._token:
-                self._refusal = self._refusal or refusal
-            else:
-                self._end_reason = self._end_reason or end_reason
+            if self._report.token != self._token and self._refusal is None:
+                self._refusal = ProgramRefused(error.found, error.fix)
             self._changed.notify_all()
 
-    def _read_only(self, how: str) -> ProgramRefused:
-        return ProgramRefused(
+    def _read_only(self, how: str) -> ConnectError:
+        return ConnectError(
             f"{self._host} takes no programs from the network ({how})",
             "switch the pendant to remote control (PolyScope X: Safety overview, Control mode, Remote)",
         )

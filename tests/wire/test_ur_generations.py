@@ -122,3 +122,19 @@ def test_versions_that_cannot_be_used(
     assert fix in error.value.fix
     assert station.ask("state")["runtime_state"] == "STOPPED"
     station.kill()
+
+
+def test_local_control_shows_itself_when_the_program_is_refused(start_station: Callable[..., Station]) -> None:
+    """PolyScope X before 10.12 does not report its control mode."""
+    station = start_station("--polyscope", "10.11.0")
+    station.ask("remote-control", on=False)
+    with closing(station.arm()) as arm:
+        arm.open()
+        assert arm.in_remote_control() is None
+        with pytest.raises(ConnectError, match="takes no programs from the network") as error:
+            arm.open(control=True)
+        assert "remote control" in error.value.fix
+        station.ask("remote-control", on=True)
+        arm.open(control=True)
+    assert station.ask("state")["runtime_state"] == "STOPPED"
+    station.kill()

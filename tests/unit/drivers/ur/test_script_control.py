@@ -11,7 +11,7 @@ from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroke
 from drivers.ur import script_control
 from drivers.ur.arm import UrArm
 from drivers.ur.control_child import DECELERATION_RAD_S2
-from drivers.ur.primary import Code, Failed, Note
+from drivers.ur.primary import Code, Failed, Note, Stopped
 from drivers.ur.script_control import OUTPUTS, STOPS_ITSELF_S, program_text
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, HOST, Controller
@@ -164,6 +164,7 @@ def test_after_a_suspension_the_reason_is_reported(arm: UrArm, controller: Contr
     with pytest.raises(DeviceTimeout, match=r"no heartbeat for 0\.2 s; keep the computer awake"):
         arm.move_to(away(controller), timeout_s=9, guard=lambda: (asleep and asleep.pop()()) or None)
     assert controller.goal_rad is None
+    assert "dashboard stop" not in controller.did  # it could stop another program: ours has ended
     arm.open(control=True)
     arm.move_to(away(controller), timeout_s=5, guard=no_guard)
 
@@ -261,11 +262,21 @@ def test_a_runtime_error_is_the_reason_of_an_ended_program(
     arm: UrArm, script: Script, controller: Controller, clock: FakeClock
 ) -> None:
     def crash() -> None:
-        script.messages.append(Failed(60, 5, "is a joint limit violated?"))
+        script.messages += [Failed(60, 5, "is a joint limit violated?"), Stopped("ftdrive_control")]
         controller.program = 1
 
     clock.at(0.3, crash)
     with pytest.raises(DeviceFault, match="line 60: is a joint limit violated"):
+        arm.move_to(away(controller), timeout_s=5, guard=no_guard)
+
+
+def test_the_error_of_another_program_is_not_ours(
+    arm: UrArm, script: Script, controller: Controller, clock: FakeClock
+) -> None:
+    script.messages += [Failed(3, 1, "syntax_error_on_line:3:"), Stopped("other")]
+    clock.advance(0.1)
+    clock.at(0.3, lambda: setattr(controller, "program", 1))
+    with pytest.raises(DeviceFault, match="stopped or paused from outside"):
         arm.move_to(away(controller), timeout_s=5, guard=no_guard)
 
 
