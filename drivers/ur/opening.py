@@ -10,7 +10,7 @@ from typing import Final
 from drivers.clock import Clock
 from drivers.errors import ConnectError, DeviceTimeout, DriverError, StreamBroken
 from drivers.interfaces import Finding
-from drivers.ur import control_process, primary, script_control
+from drivers.ur import control_process, control_program, primary
 from drivers.ur.control import Control, ControlPath, ControlSetting, ProgramRefused
 from drivers.ur.control_process import ControlProcess
 from drivers.ur.own_program import OwnProgram
@@ -155,7 +155,7 @@ class Opening:
 
     def require_registers(self) -> None:
         """Raise `ConnectError` when another client keeps the registers, before any of its programs is stopped."""
-        inputs = control_process.INPUTS if self.path == "ur-rtde" else tuple(script_control.INPUTS)
+        inputs = control_process.INPUTS if self.path == "ur-rtde" else tuple(control_program.INPUTS)
         deadline_s = self.clock.now_s() + self.timing.release_s
         while taken := registers_in_use(self.host, inputs, timeout_s=self.timing.connect_s, clock=self.clock):
             if self.clock.now_s() > deadline_s:

@@ -14,73 +14,24 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass
 from functools import partial
-from importlib.resources import files
 from typing import Any, Final
 
 from drivers.clock import Clock, Follower
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.ur.control import Control, LookOut, ProgramRefused
-from drivers.ur.control_child import DECELERATION_RAD_S2
+from drivers.ur.control_program import COMMANDS, INPUTS, NAME, NUMBERS, OUTPUTS, Report, program_text
 from drivers.ur.primary import Code, Failed, Primary, RobotType, Stopped
 from drivers.ur.rtde import Subscription
 from drivers.ur.timing import Patience, UrTiming
 
 log = logging.getLogger(__name__)
 
-PROGRAM: Final = "ftdrive_control"
-"""Its name on the controller."""
 STOPS_ITSELF_S: Final = 0.3
 """The arm decelerates within this time after the last heartbeat: 0.2 s, and the cycles of both ends."""
-INPUTS: Final = {f"input_int_register_{k}": "INT32" for k in range(32, 36)} | {
-    f"input_double_register_{k}": "DOUBLE" for k in range(24, 34)
-}
-"""Heartbeat, token, sequence number, command; numbers of the command."""
-OUTPUTS: Final = (
-    {"timestamp": "DOUBLE"}
-    | {f"output_int_register_{k}": "INT32" for k in range(32, 36)}
-    | {f"output_double_register_{k}": "DOUBLE" for k in range(24, 30)}
-)
-"""Token, state, sequence number and answer of the last command; the TCP."""
 _RATE_HZ: Final = 125.0
 _LOOK_OUT_S: Final = 0.05
 _LARGEST: Final = 2**31 - 1
-_NUMBERS: Final = 10
-_MOVING: Final = 2
-_NO_HEARTBEAT: Final = -2
-_COMMANDS: Final = {
-    "move": 1,
-    "stop": 2,
-    "within_safety_limits": 3,
-    "tcp_offset": 4,
-    "set_payload": 5,
-    "set_gravity": 6,
-    "quit": 7,
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Report:
-    """What the program has written into its output registers."""
-
-    token: int = 0
-    state: int = 0
-    sequence: int = 0
-    answer: int = 0
-    tcp_offset: tuple[float, ...] = ()
-
-
-def program_text(token: int, version: Sequence[int]) -> str:
-    """Return the program for one session on a controller of this version."""
-    p, i = "[ft_number(1), ft_number(2), ft_number(3)]", ", ".join(f"ft_number({k})" for k in range(4, 10))
-    takes_inertia = tuple(version[:2]) >= (5, 10)
-    payload = f"set_target_payload(ft_number(0), {p}, [{i}])" if takes_inertia else f"set_payload(ft_number(0), {p})"
-    text = files("drivers.ur").joinpath("program.script").read_text("ascii")
-    fields = {"$TOKEN": str(token), "$DECELERATION": str(DECELERATION_RAD_S2), "$SET_PAYLOAD": payload}
-    for field, value in fields.items():
-        text = text.replace(field, value)
-    return text
 
 
 class ScriptControl(Control):
@@ -97,7 +48,7 @@ class ScriptControl(Control):
         self._changed = threading.Condition(threading.RLock())
         self._calling = threading.RLock()  # re-entrant: a signal handler may stop the arm during a call
         self._beat = secrets.randbelow(_LARGEST)
-        self._command: tuple[int, int, tuple[float, ...]] = (0, 0, (0.0,) * _NUMBERS)
+        self._command: tuple[int, int, tuple[float, ...]] = (0, 0, (0.0,) * NUMBERS)
         """Sequence number, command, numbers."""
         self._report = Report()
         self._beats = 0
@@ -124,7 +75,7 @@ class ScriptControl(Control):
     @property
     def has_ended(self) -> bool:
         """Whether the program has reported its end."""
-        return self._report.token == self._token and self._report.state < 0
+        return self._report.token == self._token and self._report.has_ended
 
     def wait_until_ready(self, look_out: LookOut) -> None:
         """Send the program, and return when it answers to heartbeats of this session; see `Control`."""
@@ -159,7 +110,7 @@ class ScriptControl(Control):
             with self._changed:
                 if not self.alive:
                     raise self._loss()
-                sequence = self._request(_COMMANDS[name], tuple(_flat(args)))
+                sequence = self._request(COMMANDS[name], tuple(_flat(args)))
             self._wait(
                 lambda: self._report.sequence >= sequence,
                 timeout_s=self._timing.call_s if timeout_s is None else timeout_s,
@@ -197,7 +148,7 @@ class ScriptControl(Control):
             if not self._killed:
                 self._killed = True
                 with suppress(OSError):  # it may be gone
-                    self._request(_COMMANDS["quit"], ())
+                    self._request(COMMANDS["quit"], ())
             self._changed.notify_all()
         self._close_stream()
         if self._thread.is_alive() and threading.current_thread() is not self._thread:
@@ -220,7 +171,7 @@ class ScriptControl(Control):
         with self._changed:
             if not self.alive:
                 raise self._loss()
-            ended = self._report.state != _MOVING
+            ended = not self._report.moves
             self._moving = self._moving and not ended
             return ended, self._unwatched
 
@@ -286,9 +237,8 @@ class ScriptControl(Control):
         with self._changed:
             if self._killed:
                 return False
-            token, state, sequence, answer = map(int, numbers[:4])
-            self._report = Report(token, state, sequence, answer, tuple(numbers[4:]))
-            if self._report.state == _NO_HEARTBEAT and self.has_ended:
+            self._report = Report.of(numbers)
+            if self.has_ended and self._report.missed_heartbeat:
                 self._end_reason = self._end_reason or DeviceTimeout(
                     "the control program has stopped the arm and ended, because it saw no heartbeat for 0.2 s",
                     "keep the computer awake, check the network, then open the arm again",
@@ -331,9 +281,9 @@ class ScriptControl(Control):
         """Stop a move that no caller has watched for too long."""
         if self._moving and self._clock.now_s() - self._asked_s > self._timing.unwatched_s:
             self._moving = False
-            if self._report.state == _MOVING:
+            if self._report.moves:
                 self._unwatched = True
-                self._set(_COMMANDS["stop"], ())
+                self._set(COMMANDS["stop"], ())
 
     def _read_messages(self) -> None:
         primary = self._primary
@@ -347,7 +297,7 @@ class ScriptControl(Control):
                 self._refuse(self._error)
             elif isinstance(message, Code) and message.is_read_only:
                 self._refuse(self._read_only("error code 210: the connection is read-only"))
-            elif isinstance(message, Stopped) and message.name == PROGRAM:
+            elif isinstance(message, Stopped) and message.name == NAME:
                 self._end_reason = self._end_reason or self._error
         if primary.closed:
             log.info("%s closed the primary interface", self._host)
@@ -380,9 +330,9 @@ class ScriptControl(Control):
         return self._command[0]
 
     def _set(self, command: int, numbers: Sequence[float]) -> None:
-        if _COMMANDS["move"] == command:
+        if COMMANDS["move"] == command:
             self._unwatched = False
-        padding = (0.0,) * (_NUMBERS - len(numbers))
+        padding = (0.0,) * (NUMBERS - len(numbers))
         self._command = (self._command[0] + 1, command, (*numbers, *padding))
 
     def _write(self) -> None:

@@ -18,11 +18,13 @@ another program
 RTDE closed (FIN, RST)  `StreamBroken`    stopped through the dashboard  the same
 RTDE silent, then back  `DeviceTimeout`   stopped through the dashboard  the same
 all links cut, silent   `StreamBroken`,   finishes its move: nothing of  the same; `test_in_move` sees it stand
-or refused              `DeviceTimeout`   ours can reach it
+or refused              `DeviceTimeout`   ours can reach it. Stopped by
+                                          itself on the path script
 dashboard lost          nothing           goes on, and arrives           `test_what_disturbs_no_move`
 local mode, reduced     nothing           goes on, and arrives           `test_what_disturbs_no_move`
 slider at zero          `DeviceTimeout`   stopped, still ours            `test_a_slider_at_zero`
-our process killed      -                 stopped by the child           `test_ur_arm.py`
+our process killed      -                 stopped by the child, or by    `test_ur_arm.py`, `test_heartbeat.py`
+                                          itself on the path script
 the child killed, hung  `StreamBroken`,   stopped through the dashboard  `test_ur_arm.py`
                         `DeviceTimeout`
 both killed             -                 finishes its move; its         `test_both_processes_killed`

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from drivers.errors import StreamBroken
 from drivers.ur import opening, script_control
+from drivers.ur.control_program import OUTPUTS
 from drivers.ur.primary import Message
-from drivers.ur.script_control import OUTPUTS, ScriptControl
+from drivers.ur.script_control import ScriptControl
 from drivers.ur.timing import UrTiming
 from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, HOST, Controller
 

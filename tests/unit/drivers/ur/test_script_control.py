@@ -8,11 +8,12 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from drivers.ur import script_control
+from drivers.ur import control_program
 from drivers.ur.arm import UrArm
 from drivers.ur.control_child import DECELERATION_RAD_S2
+from drivers.ur.control_program import OUTPUTS, program_text
 from drivers.ur.primary import Code, Failed, Note, Stopped
-from drivers.ur.script_control import OUTPUTS, STOPS_ITSELF_S, program_text
+from drivers.ur.script_control import STOPS_ITSELF_S
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, HOST, Controller
 from tests.unit.drivers.ur.program_in_memory import COMMANDS, Script, ScriptInMemory
@@ -70,10 +71,10 @@ def test_program_and_driver_agree_on_registers_and_commands() -> None:
     numbers = {int(k) for k in re.findall(r"ft_number\((\d+)\)", text)}
     assert numbers == set(range(10))
     for command in (f"input_int_register_{k}" for k in range(32, 36)):
-        assert command in script_control.INPUTS
+        assert command in control_program.INPUTS
     named = {int(number): name for name, number in re.findall(r"global ft_(\w+) = ([1-7])\n", text)}
-    assert len(named) == len(script_control._COMMANDS) == len(COMMANDS)
-    for name, number in script_control._COMMANDS.items():
+    assert len(named) == len(control_program.COMMANDS) == len(COMMANDS)
+    for name, number in control_program.COMMANDS.items():
         stem = {"within_safety_limits": "limits", "quit": "end"}.get(name, name.removeprefix("set_").split("_")[0])
         assert named[number] == stem
 
