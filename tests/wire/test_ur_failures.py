@@ -205,7 +205,7 @@ EVENTS = [
         "press the emergency|by itself",
         reachable=False,
     ),
-    Event("freeze", on("freeze", on=True), on("freeze", on=False), LOST, "stood still", reachable=False),
+    Event("freeze", on("freeze", on=True), on("freeze", on=False), LOST, "stood still|sent nothing", reachable=False),
     Event(
         "cut",
         lambda s: cut(s, connected=False),
