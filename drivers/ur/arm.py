@@ -512,10 +512,14 @@ class UrArm(RobotArm):
     def _check_ours(self, control: Control) -> None:
         """Raise `DeviceFault` when another program runs, whose registers mean nothing to us."""
         if not self._is_ours(control, timeout_s=self._timing.ours_s, look_out=self._look_out):
-            raise control.end_reason() or self._fault() or DeviceFault(
-                f"the control program on {self._host} does not answer: another program may be running, or "
-                "controller or computer are overloaded",
-                "check the program at the pendant, then open the arm again",
+            raise (
+                control.end_reason()
+                or self._fault()
+                or DeviceFault(
+                    f"the control program on {self._host} does not answer: another program may be running, or "
+                    "controller or computer are overloaded",
+                    "check the program at the pendant, then open the arm again",
+                )
             )
 
     def _is_ours(self, control: Control, *, timeout_s: float, look_out: Callable[[], object] = lambda: None) -> bool:

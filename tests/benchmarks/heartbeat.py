@@ -9,12 +9,14 @@ from the last heartbeat to the begin of the deceleration, by the event log of th
 computer's time. A trial in which a busy computer had stopped the arm before the failure is made again, and counted as
 false. Exit code 1 when a trial takes longer than 0.3 s.
 
-With `--minutes`, nothing fails: the arm moves to and fro, and false stops are counted. Exit code 1 for any.
+With `--minutes`, nothing fails: the arm moves to and fro, and false stops are counted: those by the heartbeat, and those
+by the limits of the reader, which hold on both control paths. Exit code 1 for one by the heartbeat.
 """
 
 import argparse
 import sys
 import time
+from collections import Counter
 from contextlib import closing
 
 import numpy as np
@@ -55,7 +57,7 @@ def try_all(kinds: tuple[str, ...], trials: int, seed: int) -> bool:
 
 def endure(minutes: float) -> bool:
     """Move to and fro; return whether nothing stopped the arm."""
-    stops: list[str] = []
+    stops: Counter[str] = Counter()
     moves = 0
     with (
         Station("--time-scale", "1") as station,
@@ -70,11 +72,10 @@ def endure(minutes: float) -> bool:
                 arm.move_to(q, timeout_s=30, guard=lambda: None)
                 moves += 1
             except DriverError as error:
-                stops.append(str(error))
-    say(f"{moves} moves in {minutes:g} minutes, {len(stops)} false stops")
-    for stop in stops:
-        say(f"  {stop}")
-    return not stops
+                by_program = "no heartbeat" in error.found or "connection to the control program" in error.found
+                stops["by the heartbeat" if by_program else "by the reader"] += 1
+    say(f"{moves} moves in {minutes:g} minutes; false stops: {dict(stops) or 'none'}")
+    return not stops["by the heartbeat"]
 
 
 def main() -> int:

@@ -11,8 +11,6 @@ from drivers.ur.arm import UrArm
 from drivers.ur.control import ControlPath
 from tests.wire.conftest import Station
 
-pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
-
 COM_M = (0.0095, 0.0048, 0.0809)
 INERTIA = (0.01, 0.02, 0.03, 0.0, -0.001, 0.0)
 SETTINGS_CALLS = ("setPayload", "setTargetPayload", "setGravity")

@@ -438,7 +438,7 @@ def test_a_controller_that_comes_back_is_still_told_to_stop(station: Station, in
     arm = opened(in_time())
     q = away(arm)
     provoke = Once(lambda: station.ask("freeze", on=True), wait_until_moving(arm))
-    with pytest.raises(LOST, match="press the emergency stop|by itself"):
+    with pytest.raises(LOST, match=r"press the emergency stop|by itself"):
         arm.move_to(q, timeout_s=MOVE_S, guard=provoke)
     assert provoke.ago_s() < REPORTED_S
     station.ask("freeze", on=False)
