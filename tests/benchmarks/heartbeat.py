@@ -9,8 +9,8 @@ from the last heartbeat to the begin of the deceleration, by the event log of th
 computer's time. A trial in which a busy computer had stopped the arm before the failure is made again, and counted as
 false. Exit code 1 when a trial takes longer than 0.3 s.
 
-With `--minutes`, nothing fails: the arm moves to and fro, and false stops are counted: those by the heartbeat, and those
-by the limits of the reader, which hold on both control paths. Exit code 1 for one by the heartbeat.
+With `--minutes`, nothing fails: the arm moves to and fro, and false stops are counted, by the heartbeat or by the
+limits of the reader, which hold on both control paths. Exit code 1 for one by the heartbeat.
 """
 
 import argparse
