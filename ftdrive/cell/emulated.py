@@ -2,6 +2,7 @@
 
 import atexit
 import json
+import platform
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,6 @@ from calib.routine import Sampling
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
-from ftdrive.cell.emulated_clock import EmulatedClock
 from ftdrive.errors import ConfigError
 
 TIME_SCALE = 20
@@ -41,6 +41,8 @@ TOOL_MM = (0.0, 200.0, 100.0)
 
 class Station:
     """One `mocks` process, ended by leaving its `with` block or by the end of ours.
+
+    Its `with` block raises `ConfigError` on another system than Linux.
 
     Parameters
     ----------
@@ -80,6 +82,12 @@ class Station:
         return cls(name, (*made_by.get("options", ()), *options), control_path=path)
 
     def __enter__(self) -> Self:
+        if sys.platform != "linux":
+            raise ConfigError(
+                f"an emulated cell needs Linux, and this is {platform.system()}: use recorded data, without --simulate"
+            )
+        from ftdrive.cell.emulated_clock import EmulatedClock
+
         command = [sys.executable, "-P", "-m", "mocks", "station", "--sensor", self.sensor]
         command += ["--time-scale", str(TIME_SCALE), *self.options]
         # A session of its own: Ctrl-C in the terminal is for us, not for the emulated cell.
