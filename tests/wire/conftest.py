@@ -22,6 +22,7 @@ from drivers.ur.opening import path_for
 from drivers.ur.timing import UrTiming
 from ftdrive.cell.emulated_clock import EmulatedClock
 from tests.cell_time import CellTime
+from tests.ur_rtde import require_ur_rtde
 from tests.wire.station_process import StationProcess
 
 TIME_SCALE = 10
@@ -102,7 +103,7 @@ def station(
 def control(request: pytest.FixtureRequest) -> ControlPath:
     """The control path of the arms of a test: the one that is taken here, and the one that is there everywhere."""
     if request.param == "ur-rtde":
-        pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
+        require_ur_rtde()
     return path_for(request.param, (5, 15))[0]
 
 
