@@ -119,9 +119,7 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
         S = noise + K @ C @ K.T
         weighted = np.linalg.solve(S, H).T
         information = weighted @ H
-        _require_determined(information, kind, n)
-        scale = np.sqrt(np.diag(information))  # units apart by 10^8 would look singular
-        inverse = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+        inverse = _inverse(information, kind, n)
         G = inverse @ weighted
         left = np.asarray(Compensator(new, response=response).batch(wrench, R_base_flange), dtype=np.float64).ravel()
         x = G @ left
@@ -297,13 +295,19 @@ def _require_significant(weight_N: float, sigma_N: float) -> None:
         )
 
 
-def _require_determined(information: Array, kind: str, n: int) -> None:
+def _inverse(information: Array, kind: str, n: int) -> Array:
+    """Invert; raise `NotObservable` if the poses leave a parameter free."""
     scale = np.sqrt(np.diag(information))
-    value = np.linalg.eigvalsh(information / np.outer(scale, scale)) if (scale > 0).all() else np.zeros(1)
-    if value[0] <= UNDETERMINED**2 * value[-1] or len(scale) > 6 * n:
-        raise NotObservable(
-            f"{n} {'pose does' if n == 1 else 'poses do'} not determine {kind}: add poses with other tilts of the tool."
-        )
+    units = np.outer(scale, scale)
+    try:
+        value = np.linalg.eigvalsh(information / units) if (scale > 0).all() else np.zeros(1)
+        if value[0] > UNDETERMINED**2 * value[-1] and len(scale) <= 6 * n:
+            return np.asarray(np.linalg.inv(information / units) / units)
+    except np.linalg.LinAlgError:  # rounding hides from the eigenvalues that it is singular
+        pass
+    raise NotObservable(
+        f"{n} {'pose does' if n == 1 else 'poses do'} not determine {kind}: add poses with other tilts of the tool."
+    )
 
 
 def _require_tilt(u: Array, retare: bool) -> None:
