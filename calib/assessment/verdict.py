@@ -103,7 +103,7 @@ def judge(
     unconstrained : AssessedFit, optional
         The best fit to the same poses without known values, if `fit` used some.
     contradicted : sequence of str
-        Known values that the unconstrained fit contradicts, from `calib.assessment.contradictions`.
+        That the unconstrained fit contradicts known values, from `calib.assessment.contradictions`.
     other_unit : sequence of str
         That the controller's payload agrees with forces in another unit, from the same module.
     """
@@ -158,9 +158,8 @@ def judge(
         notes += drifted
     if other_unit and plausible and not broken:
         (rejected or usable)[:0] = other_unit  # before its consequences
-    if contradicted and not at.fits_measured_noise:
-        cause = f"the known values contradict the data: {'; '.join(contradicted)}: correct the data or the known values"
-        (rejected or usable or notes).insert(0, cause)  # before its consequences
+    if not (broken or explanation or at.fits_measured_noise):
+        (rejected or usable or notes)[:0] = contradicted  # before its consequences
     return Quality(
         verdict="rejected" if rejected else "usable" if usable else "good",
         reasons=(*rejected, *usable, *notes),
