@@ -84,6 +84,10 @@ class DriftCheck:
     elapsed_s: float
     """Negative if the first pose was retaken after the return."""
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as JSON takes them."""
+        return {"change": self.change.tolist(), "sigma": self.sigma.tolist(), "elapsed_s": self.elapsed_s}
+
 
 def take_pose(
     arm: Arm,

@@ -73,7 +73,13 @@ def _parser() -> argparse.ArgumentParser:
     arm = station.add_argument_group("arm")
     add = arm.add_argument
     add("--model", choices=sorted(MODELS), help="default UR5e, UR5 with PolyScope 3")
-    add("--polyscope", type=_version, default=(5, 15, 0), metavar="X.Y.Z", help="software version (default 5.15.0)")
+    add(
+        "--polyscope",
+        type=_version,
+        default=(5, 15, 0),
+        metavar="X.Y.Z",
+        help="software version (default 5.15.0; 10: PolyScope X)",
+    )
     add("--no-tcp-offset", action="store_true", help="answer NOT_FOUND to the RTDE output tcp_offset")
     add("--serial-number", default="20225500001")
     add("--tcp", type=_vector(6), default=[0.0] * 6, metavar="x,y,z,rx,ry,rz", help="active TCP, m and rad")

@@ -25,7 +25,7 @@ from mocks.recording import RecordedArm, RecordedWorld, Recording
 from mocks.sensors.catalogue import WRIST, Sensor
 from mocks.ur.operator import Operator
 from mocks.ur.robot import INSTALLED_G_M_S2, Robot, RobotSettings
-from mocks.ur.server import UrServer
+from mocks.ur.server import API_PORT, UrServer
 from mocks.workcell import Workcell
 from mocks.world import MOUNTS_RAD, Truth, World, up_of
 
@@ -238,6 +238,7 @@ class Station:
             "clock": self._clock.path,
             "arm": {
                 "host": self.server.host,
+                **({"api_port": API_PORT} if API_PORT in self.server.ports else {}),
                 "model": self._options.model,
                 "serial_number": self._options.serial_number,
             },

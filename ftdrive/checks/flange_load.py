@@ -34,12 +34,13 @@ class FlangeLoad:
     """(3,) of the centre."""
 
 
-def flange_load(result: CalibrationResult, sensor_kg: float, height_m: float) -> FlangeLoad:
+def flange_load(
+    result: CalibrationResult, sensor_kg: float, height_m: float, p_flange_sensor_com_m: Array | None = None
+) -> FlangeLoad:
     """Add sensor and adapter to the load that a calibration has weighed.
 
     The sum is ``m = m_tool + m_sensor``, its centre ``(m_tool c_tool + m_sensor c_sensor) / m`` with
-    ``c_tool = p_flange_sensor + R_flange_sensor p_sensor_com``. The centre of sensor and adapter is taken half way up,
-    on the axis of the flange; its height counts as known within the whole height, evenly distributed.
+    ``c_tool = p_flange_sensor + R_flange_sensor p_sensor_com``.
 
     Parameters
     ----------
@@ -48,10 +49,13 @@ def flange_load(result: CalibrationResult, sensor_kg: float, height_m: float) ->
         Mass of sensor and adapter.
     height_m : float
         Of the sensor's origin above the flange face.
+    p_flange_sensor_com_m : array, shape (3,), optional
+        Known centre of mass of sensor and adapter. Default: half way up, on the axis of the flange; its height then
+        counts as known within the whole height, evenly distributed.
     """
     arm_m = result.R_flange_sensor @ result.p_sensor_com_m
     c_tool_m = np.array([0.0, 0.0, height_m]) + arm_m
-    c_sensor_m = np.array([0.0, 0.0, height_m / 2])
+    c_sensor_m = np.array([0.0, 0.0, height_m / 2]) if p_flange_sensor_com_m is None else p_flange_sensor_com_m
     mass_kg = result.mass_kg + sensor_kg
     share = result.mass_kg / mass_kg
     com_m = share * c_tool_m + (1 - share) * c_sensor_m
@@ -66,7 +70,8 @@ def flange_load(result: CalibrationResult, sensor_kg: float, height_m: float) ->
     covariance = jacobian @ result.covariance @ jacobian.T
     gain_variance = float(np.square(result.sigma["mass_kg"])) - covariance[0, 0]  # common to all axes, see `sigma`
     covariance += max(gain_variance, 0.0) * np.outer(by_mass, by_mass)
-    covariance[3, 3] += ((1 - share) * height_m) ** 2 / 12
+    if p_flange_sensor_com_m is None:
+        covariance[3, 3] += ((1 - share) * height_m) ** 2 / 12
     sigma = np.sqrt(np.diag(covariance))
     return FlangeLoad(mass_kg, com_m, float(sigma[0]), sigma[1:])
 

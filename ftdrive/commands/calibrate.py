@@ -11,6 +11,7 @@ from ftdrive.commands.common import (
     CELL,
     FILE,
     FOLDER,
+    YES,
     NewFile,
     index_run,
     rows,
@@ -62,11 +63,7 @@ _EXCLUDE_ONE_ANOTHER = (
     help="Continue an interrupted run in its mode, with its options and the present configuration files.",
 )
 @click.option("--redo", type=int, multiple=True, metavar="N", help="With --resume: repeat pose N. Repeatable.")
-@click.option(
-    "--yes",
-    is_flag=True,
-    help="Answer the safety questions automatically; never a first run, nor a move of the whole arm.",
-)
+@YES
 @runs()
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line: events, questions, the result.")
 def calibrate(
@@ -239,12 +236,9 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
 def _as_json(outcome: "Outcome") -> dict[str, Any]:
     from ftdrive.runs.pose_hints import hints
 
-    drift = outcome.drift
     return {
         "run": str(outcome.run.folder),
-        "drift_check": None
-        if drift is None
-        else {"change": drift.change.tolist(), "sigma": drift.sigma.tolist(), "elapsed_s": drift.elapsed_s},
+        "drift_check": None if outcome.drift is None else outcome.drift.to_dict(),
         "hints": list(hints(outcome.result, outcome.run.records())),
         **outcome.result.to_dict(),
     }

@@ -29,6 +29,11 @@ def runs(words: str = "Parent folder of the new run folder.") -> Callable[[F], F
     return click.option("--runs", type=folder, default=Path("runs"), show_default=True, help=words)
 
 
+YES = click.option(
+    "--yes",
+    is_flag=True,
+    help="Answer the safety questions automatically; never a first run, nor a move of the whole arm.",
+)
 CONFIG = click.option("--config", type=FILE, help="TOML file that describes the cell, instead of ./ftdrive.toml.")
 
 

@@ -18,7 +18,7 @@ from ftdrive.commands.common import (
     simulate,
     write_json,
 )
-from ftdrive.exports.calibration.formats import FORMATS
+from ftdrive.exports.calibration.formats import FORMATS, MAX_FORCE_ERROR_N
 
 if TYPE_CHECKING:
     from ftdrive.planning.plan import Plan
@@ -123,7 +123,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     "max_force_error_N",
     type=Number(0),
     metavar="N",
-    default=0.1,
+    default=MAX_FORCE_ERROR_N,
     show_default=True,
     help="Accept a target that cannot express everything if its force differs by no more, in any orientation.",
 )

@@ -1,6 +1,7 @@
 """`ftdrive history`: results and verifications of the store, with trends and warnings."""
 
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 @click.option("--rebuild", is_flag=True, help="First read all runs again, and forget those that were deleted.")
 @JSON
 def history(folders: Sequence[Path], tool: str | None, index: Sequence[Path], rebuild: bool, as_json: bool) -> None:
-    """List results with their age and last verification, and the trends of bias and payload.
+    """List results with their date and last verification, and the trends of bias and payload.
 
     They come from the store, where `calibrate` and `verify` add theirs, or from the run folders in RUNS. A trend is
     significant if the uncertainty of the results explains it in less than one case of 100, and so does their scatter.
@@ -60,44 +61,48 @@ def history(folders: Sequence[Path], tool: str | None, index: Sequence[Path], re
     if not results:
         talk.print("No results. `ftdrive calibrate` adds them, `ftdrive history --index runs` adds those of a folder.")
         return
-    for line in _table([_row(one, last.get(one.id), now) for one in results]):
-        click.echo(line)
+    _print_table([_row(one, last.get(one.id), now) for one in results])
     for drift in found:
         click.echo(f"trend: {drift}")
     for words in advice:
         talk.print(hanging(" ! ", words), style="yellow")
 
 
-_TITLES = ("id", "date, UTC", "age, d", "tool", "verdict", "mass, kg", "force bias, N", "parent", "verified")
+_TITLES = ("id", "date", "tool", "verdict", "kg", "force bias, N", "verified", "parent")
 
 
 def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime) -> tuple[str, ...]:
     from ftdrive.store.history import age_days
 
-    age = age_days(one.created_utc, now)
     verified = "-"
     if check is not None:
         since = age_days(check.created_utc, now)
-        verified = f"{'passed' if check.passed else 'FAILED'}{'' if since is None else f' {since:.0f} d ago'}"
+        verified = f"{'passed' if check.passed else 'FAILED'}{'' if since is None else f' {since:.0f} d'}"
         verified += f", {check.change}" if check.change else ""
     return (
         one.id[:6],
-        "-" if one.created_utc is None else one.created_utc[:16].replace("T", " "),
-        "-" if age is None else f"{age:.0f}",
+        "-" if one.created_utc is None else one.created_utc[:10],
         one.tool or "-",
         one.verdict,
-        f"{one.mass_kg:.4f} ± {one.mass_sigma_kg:.4f}",
-        " ".join(f"{value:+.2f}" for value in one.parameters.force_bias_N),
-        f"{one.parent[:6]} ({one.update})" if one.parent else "-",
+        f"{one.mass_kg:.4f}",
+        " ".join(f"{value:.2f}" for value in one.parameters.force_bias_N),
         verified,
+        f"{one.parent[:6]} ({one.update})" if one.parent else "",
     )
 
 
-def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    lines = [_TITLES, *rows]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    for line in lines:
-        yield "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
+def _print_table(rows: Sequence[Sequence[str]]) -> None:
+    """Print the table; a narrow terminal breaks the last columns, a file or pipe has one line a row."""
+    from rich.console import Console
+    from rich.table import Table
+
+    shown = [n for n, title in enumerate(_TITLES) if title != "parent" or any(row[n] for row in rows)]
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for n in shown:
+        table.add_column(_TITLES[n], no_wrap=_TITLES[n] not in {"tool", "verified", "parent"}, overflow="fold")
+    for row in rows:
+        table.add_row(*(row[n] for n in shown))
+    Console(width=None if sys.stdout.isatty() else 300, highlight=False, markup=False).print(table)
 
 
 def _as_json(one: "StoredResult", check: "StoredVerification | None", now: datetime) -> dict[str, Any]:

@@ -36,7 +36,6 @@ from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import BadBundle, ConfigError, NotAccepted
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.pose_hints import hints
-from ftdrive.runs.run import Run
 from ftdrive.runs.source import Orientation, read_source
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.report import print_comparison, print_result
@@ -126,19 +125,19 @@ def _solve_each(
     for source in sources:
         try:
             with unpacked(source) as place:
-                dataset, circumstances, provenance = read_source(place, orientation, options["known"])
+                data = read_source(place, orientation, options["known"])
+                circumstances = dict(data.circumstances)
                 payload_kg = circumstances.pop("payload_kg", None)
                 here = {**options, **circumstances}
                 if method == "all":
-                    _show_all(source, dataset, here, as_json)
+                    _show_all(source, data.dataset, here, as_json)
                     continue
-                result = _solve(dataset, method, {**here, "payload_kg": payload_kg, "provenance": provenance})
-                records = Run(place).records() if place.is_dir() else []  # for hints and drift
+                result = _solve(data.dataset, method, {**here, "payload_kg": payload_kg, "provenance": data.provenance})
                 if as_json:
-                    found = list(hints(result, records)) if records else []
+                    found = list(hints(result, data.records)) if data.records else []
                     write_json({"source": str(source), "hints": found, **result.to_dict()})
                 else:
-                    print_result(result, drift=drift_check(records), records=records)
+                    print_result(result, drift=drift_check(data.records), records=data.records)
                 if not force:
                     stop_unless_accepted(result, to_be_saved=output is not None)
                 if output is not None:

@@ -11,6 +11,7 @@ from ftdrive.commands.common import (
     CALIBRATION,
     CELL,
     FOLDER,
+    YES,
     Number,
     check_simulate,
     index_run,
@@ -54,11 +55,7 @@ Answer = Literal["ask", "no", "yes"]
     help="If something has changed: whether to save the smallest sufficient update as a new calibration.",
 )
 @click.option("--resume", type=FOLDER, help="Continue an interrupted verification in its mode.")
-@click.option(
-    "--yes",
-    is_flag=True,
-    help="Answer the safety questions automatically; never a first run, nor a move of the whole arm.",
-)
+@YES
 @runs()
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line: events, questions, the result.")
 def verify(

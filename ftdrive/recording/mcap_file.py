@@ -229,7 +229,7 @@ def _bytes(*records: "McapRecord") -> bytes:
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
-    return bytes(builder.end())  # type: ignore[no-untyped-call]
+    return bytes(builder.end())  # type: ignore[no-untyped-call]  # mcap has no types here
 
 
 def read_mcap(path: Path, _columns: Collection[str] = ()) -> Recording:

@@ -125,14 +125,7 @@ def _drift(subject: Subject) -> dict[str, Any]:
     return {
         "in_fit": result.to_dict()["drift"],
         "components": {k: v for k, v in result.components.items() if k.startswith(("walk", "slope"))},
-        "first_pose_again": None
-        if again is None
-        else {
-            "words": drift_in_words(again)[0],
-            "change": again.change.tolist(),
-            "sigma": again.sigma.tolist(),
-            "elapsed_s": again.elapsed_s,
-        },
+        "first_pose_again": None if again is None else {"words": drift_in_words(again)[0], **again.to_dict()},
         "lag1": result.quality.get("lag1"),
     }
 

@@ -88,25 +88,28 @@ def is_calibration(source: Path) -> bool:
 def _of_result(source: Path, result: CalibrationResult) -> Subject:
     folder = source.absolute().parent
     if (folder / "run.json").is_file():
-        dataset, circumstances, _ = read_source(folder, "R_base_flange")
-        if dataset.sha256() == result.provenance.get("dataset_sha256"):
+        data = read_source(folder, "R_base_flange")
+        if data.dataset.sha256() == result.provenance.get("dataset_sha256"):
             run = Run(folder)
-            solved_with = _for_compare(circumstances, SolveOptions())
-            return Subject(source, result, run.solve_command, dataset, run, run.records(), solved_with)
+            solved_with = _for_compare(data.circumstances, SolveOptions())
+            return Subject(source, result, run.solve_command, data.dataset, run, data.records, solved_with)
     return Subject(source, result, "")
 
 
 def _of_data(source: Path, options: SolveOptions) -> Subject:
-    dataset, circumstances, provenance = read_source(source, options.orientation, options.known)
+    data = read_source(source, options.orientation, options.known)
     run = Run(source) if source.is_dir() else None
     result = None
     if run is not None and options == SolveOptions() and run.calibration_path.is_file():
         result = CalibrationResult.load(run.calibration_path)
-    if result is None or result.provenance.get("dataset_sha256") != dataset.sha256():
-        result = judged(solve(dataset, options.method, drift=options.drift, **circumstances, provenance=provenance))
-    records = [] if run is None else run.records()
+    if result is None or result.provenance.get("dataset_sha256") != data.dataset.sha256():
+        solved = solve(
+            data.dataset, options.method, drift=options.drift, **data.circumstances, provenance=data.provenance
+        )
+        result = judged(solved)
     command = " ".join(["ftdrive solve", shlex.quote(str(source)), *options.words])
-    return Subject(source, result, command, dataset, run, records, _for_compare(circumstances, options))
+    solved_with = _for_compare(data.circumstances, options)
+    return Subject(source, result, command, data.dataset, run, data.records, solved_with)
 
 
 def _for_compare(circumstances: Mapping[str, Any], options: SolveOptions) -> dict[str, Any]:

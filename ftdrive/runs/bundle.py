@@ -121,6 +121,7 @@ def _unpack(source: Path, folder: Path) -> Path:
     except FileNotFoundError as error:
         raise BadBundle(f"{source} is not a bundle, it has no bundle.json: {_COPY_AGAIN}") from error
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        # NotImplementedError: a compression that Python does not know; RuntimeError: a password.
         raise BadBundle(f"{source} is not a zip file or is damaged ({error}): {_COPY_AGAIN}") from error
 
 

@@ -1,16 +1,14 @@
 """From a run on disk to a result."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Any
 
 from calib import CalibrationDataset, CalibrationResult, solve
 from calib.routine import DriftCheck, PoseRecord, dataset_from, drift_check
 from ftdrive.checks.plausibility import judged
 from ftdrive.planning.geometry.scene import down_of
-from ftdrive.runs.run import Run, versions
+from ftdrive.runs.run import Run, made_now
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,9 +43,7 @@ def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationData
     config, devices = header["config"], header.get("devices", {})
     dataset = dataset_from(records, {"run": run.folder.name, "devices": devices})
     provenance: dict[str, Any] = {
-        "created_utc": datetime.now(UTC).isoformat(),
-        "argv": sys.argv,
-        "versions": versions(),
+        **made_now(),
         "devices": devices,
         "run": run.folder.name,
         "station": header.get("station"),

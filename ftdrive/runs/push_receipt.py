@@ -5,10 +5,8 @@ push.json         ftdrive.push/1: devices, reason, old and new values, values re
 
 import json
 import re
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -17,7 +15,7 @@ import numpy as np
 from calib.errors import BadDataset
 from calib.files import check_format, read_object, write_new
 from drivers.interfaces import ControllerSettings, DeviceInfo
-from ftdrive.runs.run import Run, versions
+from ftdrive.runs.run import Run, made_now
 
 FORMAT: Final = "ftdrive.push/1"
 NAME: Final = "push"
@@ -47,9 +45,7 @@ def write_receipt(
     """
     receipt = {
         "format": FORMAT,
-        "created_utc": datetime.now(UTC).isoformat(),
-        "argv": sys.argv,
-        "versions": versions(),
+        **made_now(),
         "devices": {role: asdict(info) for role, info in devices.items()},
         **reason,
         **{name: None if one is None else asdict(one) for name, one in values.items()},

@@ -314,6 +314,11 @@ def _record(data: Mapping[str, Any]) -> PoseRecord:
     )
 
 
+def made_now() -> dict[str, Any]:
+    """Return what every file says of its making: when, by which command line, with which versions."""
+    return {"created_utc": datetime.now(UTC).isoformat(), "argv": sys.argv, "versions": versions()}
+
+
 def versions() -> dict[str, str]:
     """Return the versions of the software behind a result."""
     found = {"ftdrive": __version__, "python": platform.python_version(), "platform": platform.platform()}

@@ -5,9 +5,7 @@ calibration.json    in the same folder, if the operator accepted an update: its 
 """
 
 import json
-import sys
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +19,7 @@ from calib.extras.verification import Verification, verify
 from calib.files import JSON, write_new
 from calib.model import Array
 from calib.routine import DriftCheck, PoseRecord, dataset_from, drift_check, is_return
-from ftdrive.runs.run import Run, versions
+from ftdrive.runs.run import Run, made_now
 from ftdrive.runs.verification import FORMAT
 
 FALSE_ALARMS: Final = 0.01
@@ -78,7 +76,7 @@ class Verified:
 
     @property
     def exceeded(self) -> tuple[str, ...]:
-        """AcceptanceLimits that a pose exceeds, in words with the values."""
+        """Limits that a pose exceeds, in words with the values."""
         pairs = (
             (self.force_N, self.limits.force_N, "--max-force", "N"),
             (self.torque_Nm, self.limits.torque_Nm, "--max-torque", "N·m"),
@@ -105,7 +103,7 @@ class Verified:
         return {
             "format": FORMAT,
             "schema_version": 1,
-            "created_utc": datetime.now(UTC).isoformat(),
+            **made_now(),
             "run": self.run.folder.name,
             "calibration": {
                 "id": self.calibration.id,
@@ -129,16 +127,8 @@ class Verified:
             "dof": found.dof,
             "p_value": found.p_value,
             "poses": [self._pose(row) for row in range(len(self.records))],
-            "drift_check": None
-            if self.drift is None
-            else {
-                "change": self.drift.change.tolist(),
-                "sigma": self.drift.sigma.tolist(),
-                "elapsed_s": self.drift.elapsed_s,
-            },
+            "drift_check": None if self.drift is None else self.drift.to_dict(),
             "dataset_sha256": self.dataset.sha256(),
-            "argv": sys.argv,
-            "versions": versions(),
         }
 
     def _pose(self, row: int) -> dict[str, JSON]:
@@ -191,9 +181,7 @@ def save_update(verified: Verified) -> Path:
         raise NotObservable("no update makes up for the change: calibrate again")
     old, run = verified.calibration, verified.run
     provenance = {
-        "created_utc": datetime.now(UTC).isoformat(),
-        "argv": sys.argv,
-        "versions": versions(),
+        **made_now(),
         **{key: old.provenance[key] for key in _COPIED if key in old.provenance},
         "run": run.folder.name,
         "dataset_sha256": verified.dataset.sha256(),

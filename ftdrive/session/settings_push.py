@@ -271,8 +271,11 @@ def differences(sent: ControllerSettings, read_back: ControllerSettings | None) 
         "inertia": (sent.inertia_kg_m2, back.inertia_kg_m2),
         "gravity": (sent.up_base_m_s2, back.up_base_m_s2),
     }
-    known = {name: pair for name, pair in pairs.items() if None not in pair}
-    return [name for name, (a, b) in known.items() if not np.allclose(a, b, rtol=0.0, atol=_TOLERANCE)]  # type: ignore[arg-type]  # neither is None
+    return [
+        name
+        for name, (a, b) in pairs.items()
+        if a is not None and b is not None and not np.allclose(a, b, rtol=0.0, atol=_TOLERANCE)
+    ]
 
 
 def restore(cell: CellConfig, arm: RobotArm, receipt: Receipt) -> Push:

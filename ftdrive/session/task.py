@@ -19,8 +19,11 @@ class Task:
 
     command: ClassVar[str] = "calibrate"
     """The command line of the task; the run folder names it."""
-    goal: str = "the coverage is green"
-    """When the poses suffice that the operator moves the arm to."""
+
+    @property
+    def goal(self) -> str:
+        """When the poses suffice that the operator moves the arm to."""
+        return "the coverage is green"
 
     def require(self, devices: Mapping[str, DeviceInfo], mount: str | None) -> tuple[str, ...]:
         """Return what is uncertain about arm, sensor and its mounting; raises `ConfigError` if they do not fit."""

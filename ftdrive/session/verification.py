@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Final
 
@@ -58,11 +59,11 @@ class Verifying(Task):
     runs: Path
 
     @property
-    def goal(self) -> str:  # type: ignore[override]
+    def goal(self) -> str:
         """When the poses suffice that the operator moves the arm to."""
         return f"{self.poses} poses differ by {np.degrees(FRESH_RAD):.0f}° or more from those of the calibration"
 
-    @property
+    @cached_property
     def R_fitted(self) -> Array:
         """(k, 3, 3) orientations R_base_flange of the calibration; (0, 3, 3) if they are unknown."""
         dataset = fitted_dataset(self.calibration, self.path)

@@ -11,11 +11,10 @@ import numpy as np
 
 from calib import CalibrationResult
 from calib.errors import BadDataset, CalibError
-from calib.files import JSON, read_object
+from calib.files import JSON, check_format, read_object
 from calib.model import Array, Parameters
 from ftdrive.runs.run import Run
-
-VERIFICATION = "ftdrive.verification/1"
+from ftdrive.runs.verification import FORMAT
 
 _NUMBERS = tuple(field.name for field in fields(Parameters))
 
@@ -168,8 +167,7 @@ def _result(path: Path) -> StoredResult:
 
 def _verification(path: Path) -> StoredVerification:
     document = read_object(path, BadDataset)
-    if document.get("format") != VERIFICATION:
-        raise BadDataset(f"{path.name} has format {document.get('format')!r}: this version reads {VERIFICATION}")
+    check_format(document, FORMAT, BadDataset)
     calibration_id, passed = _text(_object(document.get("calibration")).get("id")), document.get("passed")
     if calibration_id is None or not isinstance(passed, bool):
         raise BadDataset(f"{path.name} lacks the id of its calibration or the outcome: the file is damaged")

@@ -1,1 +1,1 @@
-"""The UR controller: RTDE, dashboard and script ports, and the arm behind them."""
+"""The UR controller: RTDE, primary interface, dashboard, Robot API and script ports, and the arm behind them."""

@@ -15,8 +15,8 @@ class Event:
     t_robot_s
         The controller's clock, as on the wire.
     by
-        Source: ``dashboard``, ``script port``, ``rtde`` (clients), ``operator``, ``network`` (control channel),
-        ``program``, ``safety``, ``power``, ``arm`` (the controller itself).
+        Source: ``dashboard``, ``api``, ``script port``, ``primary port``, ``rtde`` (clients), ``operator``,
+        ``network`` (control channel), ``program``, ``safety``, ``power``, ``arm`` (the controller itself).
     what
         Name of the event, in fixed words.
     accepted

@@ -368,7 +368,7 @@ class Arm:
 
     def _seize(self, owner: str) -> None:
         if self.busy and self._owner not in (None, owner):
-            raise MotionError(f"another thread ({self._owner}) is already controlling the robot")
+            raise MotionError("Another thread is already controlling the robot")
         self._owner = owner
 
     def _follow(self, paths: list[Path]) -> None:

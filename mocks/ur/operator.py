@@ -183,7 +183,7 @@ class Operator:
         return {"done": "dashboard-stop", "reply": dashboard.answer(self._robot, "stop", by="another dashboard client")}
 
     def _crash_script(self, _request: Request) -> dict[str, Any]:
-        return {"done": "crash-script", "accepted": self._robot.stop_program("run-time error: requested")}
+        return {"done": "crash-script", "accepted": self._robot.crash("requested")}
 
     def _foreign_program(self, request: Request) -> dict[str, Any]:
         does = f"sleep({float(request.get('seconds', FOREIGN_PROGRAM_S))})"
@@ -214,7 +214,7 @@ class Operator:
         return {"done": "silent"}
 
     def _silence_arm(self, request: Request) -> dict[str, Any]:
-        for what in ("rtde", "dashboard", "script"):
+        for what in set(self._server.ports.values()):
             self._server.set_silent(what, _on(request))
         self._robot.note("network", "silence-arm", on=_on(request))
         return {"done": "silence-arm"}

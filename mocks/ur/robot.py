@@ -19,9 +19,9 @@ from mocks.ur.motion import Arm, CannotFollow, HandMove, MotionError
 from mocks.ur.rtde import Value
 from mocks.ur.script import STOP_SCRIPT, ControlScript, Upload
 from mocks.ur.swing import SwingProgram
-from mocks.ur.urscript.library import ScriptError
 from mocks.ur.urscript.program import Program
-from mocks.ur.urscript.syntax import UrscriptSyntaxError
+from mocks.ur.urscript.syntax import Place, UrscriptSyntaxError
+from mocks.ur.urscript.values import ScriptError
 from mocks.world import World
 
 UNLOCK_AFTER_S = 5.0
@@ -181,7 +181,7 @@ class Robot:
                 if not self._program.step():
                     self.stop_program("ended")
             except (ScriptError, MotionError, ArithmeticError, ValueError) as error:
-                self.stop_program(f"run-time error: {error}")
+                self.crash(str(error))
         before, stood = self.arm.q, self.arm.at_rest
         try:
             self.arm.step(dt, self.cycle_s)
@@ -245,17 +245,19 @@ class Robot:
         return self.arm.obstacle
 
     def upload(self, upload: Upload, *, by: str = "script port") -> bool:
-        """Accept a program from the script port, which replaces the running one; return False when it is refused."""
+        """Accept a program from a client, which replaces the running one; return False when it is refused."""
         if upload.secondary:
             self.note(by, f"secondary program {upload.name}", accepted=False, why="not interpreted")
             return False
         obstacle = self.obstacle if self.remote_control else "local control"
         program: ControlScript | Program | None = None
+        detail: dict[str, Any] = {}
         try:
             program = self._program_of(upload)
         except UrscriptSyntaxError as error:
             obstacle = obstacle or f"syntax error: {error}"
-        self.note(by, f"program {upload.name}", accepted=obstacle is None, why=obstacle or "")
+            detail = _exception(error.report, error.place)
+        self.note(by, f"program {upload.name}", accepted=obstacle is None, why=obstacle or "", **detail)
         if obstacle or program is None:
             return False
         self._start_soon(program)
@@ -289,12 +291,17 @@ class Robot:
         self.zero_ft()  # e-Series zeroes its sensor at every program start
         self.note("program", f"started {program.name}")
 
-    def stop_program(self, reason: str) -> bool:
+    def crash(self, error: str) -> bool:
+        """End the program with a run-time error, which is logged with its place; return False when there was none."""
+        place = self._program.place if isinstance(self._program, Program) else Place()
+        return self.stop_program(f"run-time error: {error}", **_exception(error, place))
+
+    def stop_program(self, reason: str, **detail: Any) -> bool:
         """End the program; a moving arm comes to rest by itself. Return False when there was none."""
         program, self._program = self._program, None
         if program is not None:
             program.close()
-            self.note("program", f"stopped {program.name}", why=reason)
+            self.note("program", f"stopped {program.name}", why=reason, **detail)
         self.popup = None
         self.arm.release()
         self.arm.paused = self.safety_mode not in PERMITTED
@@ -545,3 +552,8 @@ class Robot:
         weight = R.T @ np.array(self.target_gravity_m_s2) * -self.payload_kg
         rest: Array = self.flange_wrench() - np.concatenate((weight, cross(self.payload_cog_m, weight)))
         return rest
+
+
+def _exception(text: str, place: Place) -> dict[str, Any]:
+    """Return what the event log keeps of an error in a program."""
+    return {"error": text, "line": place.line, "column": place.column}

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from mocks.arrays import Array
 from mocks.kinematics import Vector6, forward, inverse, inverse_matrix, matrix_of, pose_of
 from mocks.ur.motion import JointMove, LineMove, Path
-from mocks.ur.urscript.library import ScriptError
+from mocks.ur.urscript.values import ScriptError
 
 if TYPE_CHECKING:
     from mocks.ur.robot import Robot

@@ -108,16 +108,17 @@ def _register_readers() -> None:
 _register_readers()
 
 _SINCE: dict[str, dict[int, tuple[int, int]]] = {
-    "ft_raw_wrench": {5: (9, 0)},
-    "payload": {3: (11, 0), 5: (5, 1)},
-    "payload_cog": {3: (11, 0), 5: (5, 1)},
-    "payload_inertia": {3: (15, 0), 5: (11, 0)},
-    "actual_current_as_torque": {5: (23, 0)},
-    "target_gravity": {5: (26, 0)},
+    "ft_raw_wrench": {5: (9, 0), 10: (0, 0)},
+    "payload": {3: (11, 0), 5: (5, 1), 10: (0, 0)},
+    "payload_cog": {3: (11, 0), 5: (5, 1), 10: (0, 0)},
+    "payload_inertia": {3: (15, 0), 5: (11, 0), 10: (0, 0)},
+    "actual_current_as_torque": {5: (23, 0), 10: (10, 0)},
+    "target_gravity": {5: (26, 0), 10: (13, 0)},
 }
 """First minor version and bug fix of each major one that knows an output.
 
-`target_gravity` follows a maintainer of Universal Robots' client library (its pull request 420).
+`target_gravity` follows a maintainer of Universal Robots' client library (its pull request 420). PolyScope X has what
+the PolyScope 5 of the same time has: 10.10 came with 5.23. That 10.13 came with 5.26 is assumed.
 """
 
 INPUTS: dict[str, str] = {

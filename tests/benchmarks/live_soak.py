@@ -62,7 +62,7 @@ class Both:
             self._received.append((samples.seq, samples.t_host_ns))
             add(samples)
 
-        stream._pairing.add_samples = noted  # type: ignore[method-assign]
+        stream._pairing.add_samples = noted  # type: ignore[method-assign]  # the only place to see it
 
     def write(self, block: Block) -> None:
         self._blocks += 1

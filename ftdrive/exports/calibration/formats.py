@@ -2,11 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 Property = Literal["tilt", "rotation", "response"]
 """Of a calibration: leaning base; turned sensor; gain and cross-talk of the sensor."""
 Comment = Literal["#", "# at the end", "<!-- -->", "none"]
+
+MAX_FORCE_ERROR_N: Final = 0.1
+"""By which the force of a target may differ from ours because it cannot express everything."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from calib.model import angle_between
 from ftdrive.errors import NotAccepted
 from ftdrive.exports.calibration import complete, models, robots, ros1, ros2
 from ftdrive.exports.calibration.difference import compensations, largest_difference
-from ftdrive.exports.calibration.formats import FORMATS, Format
+from ftdrive.exports.calibration.formats import FORMATS, MAX_FORCE_ERROR_N, Format
 from ftdrive.exports.calibration.settings import Settings
 from ftdrive.exports.calibration.text import Exported, made_by, with_header
 
@@ -35,8 +35,6 @@ TARGETS: Mapping[str, Callable[[CalibrationResult, Settings], Exported]] = {
     "json": complete.as_json,
     "yaml": complete.as_yaml,
 }
-
-MAX_FORCE_ERROR_N = 0.1
 
 
 @dataclass(frozen=True, slots=True)

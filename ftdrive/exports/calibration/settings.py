@@ -9,6 +9,7 @@ import numpy as np
 
 from calib import CalibrationResult
 from calib.model import Array
+from ftdrive.checks.flange_load import flange_load
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import sensor_origin_m
 from ftdrive.runs.run import Run
@@ -87,19 +88,15 @@ class Settings:
         ConfigError
             Height or mass of the sensor was not measured.
         """
-        com_m = self.p_flange_sensor_m(target) + calibration.R_flange_sensor @ calibration.p_sensor_com_m
+        height_m = float(self.p_flange_sensor_m(target)[2])
         if self.sensor_mass_kg is None:
             raise ConfigError(
                 f"{target} needs the mass of sensor and adapter, because the sensor cannot weigh itself: give "
                 "--sensor-mass KG from scale or datasheet (0 for a sensor inside the arm)"
             )
-        if self.sensor_mass_kg == 0.0:
-            return calibration.mass_kg, com_m
-        sensor_com_m = self.p_flange_sensor_m(target) / 2
-        if self.sensor_com_mm is not None:
-            sensor_com_m = np.array(self.sensor_com_mm) / 1e3
-        mass_kg = calibration.mass_kg + self.sensor_mass_kg
-        return mass_kg, (calibration.mass_kg * com_m + self.sensor_mass_kg * sensor_com_m) / mass_kg
+        sensor_com_m = None if self.sensor_com_mm is None else np.array(self.sensor_com_mm) / 1e3
+        load = flange_load(calibration, self.sensor_mass_kg, height_m, sensor_com_m)
+        return load.mass_kg, load.p_flange_com_m
 
     @property
     def assumed(self) -> tuple[str, ...]:

@@ -1,145 +1,196 @@
-"""URScript as text: from the characters of a program to its statements.
+"""URScript as text: the words of a program, and the statements and expressions they form.
 
-From: Universal Robots, "The URScript Programming Language", chapter 1. One statement a line; a block ends with ``end``.
-An expression of this subset is an expression of Python too, so Python's parser reads it after every token was checked.
-
-Does not model: all that the programs for this emulator do not use. Such a text is rejected as a syntax error: threads
-and functions of the program, ``global``, ``elif``, ``else``, ``return``, ``break``, ``and``, ``or``, ``not``, poses.
+Source: Universal Robots, "The URScript Programming Language", chapter 1. Wording and places of the errors: recorded
+streams of port 30001 of URSim, published by the Pharmaceutical Bioinformatics group of Uppsala (README of robotlab).
 """
 
-import ast
-import keyword
-import operator
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import chain
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
-OPERATORS: dict[type[ast.AST], Callable[[Any, Any], Any]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.Lt: operator.lt,
-    ast.Gt: operator.gt,
-    ast.LtE: operator.le,
-    ast.GtE: operator.ge,
-    ast.Eq: operator.eq,
-    ast.NotEq: operator.ne,
-}
-"""Operators with two operands."""
 
-_TOKEN = re.compile(
-    r"(?P<blank>[ \t\r]+|#.*)|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
-    r'|"(?P<text>[^"]*)"|(?P<name>[A-Za-z_]\w*)|(?P<sign>==|!=|<=|>=|[-+*/<>=()\[\],:])',
-    re.ASCII,
-)
-_NODES: tuple[type[ast.AST], ...] = (ast.Constant, ast.Name, ast.Load, ast.List, ast.Subscript, ast.Call, ast.keyword)
-_NODES += (ast.BinOp, ast.UnaryOp, ast.USub, ast.Compare, *OPERATORS)
-_RESERVED = {"end", "halt", "local", "global", "thread", "run", "kill", "join", *keyword.kwlist}
+class Place(NamedTuple):
+    """Where in a program something stands: line and column, both from 1."""
+
+    line: int = 1
+    column: int = 1
 
 
 class UrscriptSyntaxError(Exception):
-    """The text is no program."""
+    """The text is no program.
+
+    Parameters
+    ----------
+    place
+        Where the controller reports it.
+    sentence
+        What is wrong, in words.
+    report
+        The controller's text.
+    """
+
+    def __init__(self, place: Place, sentence: str, report: str) -> None:
+        super().__init__(f"line {place.line}: {sentence}")
+        self.place = place
+        self.report = report
+
+
+@dataclass(frozen=True)
+class Literal:
+    """A number, a truth value or a text."""
+
+    value: float | bool | str
+
+
+@dataclass(frozen=True)
+class Name:
+    """A variable."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Items:
+    """A list, or a pose ``p[…]``."""
+
+    items: tuple["Expression", ...]
+    is_pose: bool
+
+
+@dataclass(frozen=True)
+class Item:
+    """One element of a list."""
+
+    whole: "Expression"
+    index: "Expression"
+
+
+@dataclass(frozen=True)
+class Call:
+    """A function and its arguments, by place and by name; with `runs`, the start of a thread."""
+
+    place: Place
+    name: str
+    args: tuple["Expression", ...]
+    named: dict[str, "Expression"]
+    runs: bool
+
+
+@dataclass(frozen=True)
+class Operation:
+    """An operator with one or two operands."""
+
+    operator: str
+    operands: tuple["Expression", ...]
+
+
+Expression = Literal | Name | Items | Item | Call | Operation
 
 
 @dataclass(frozen=True)
 class Assignment:
-    """``name = value``, with or without ``local``."""
+    """``scope name = value`` or ``name[index] = value``; the scope is ``local``, ``global`` or nothing."""
+
+    place: Place
+    scope: str
+    name: str
+    index: Expression | None
+    value: Expression
+
+
+@dataclass(frozen=True)
+class If:
+    """Conditions with their blocks; the condition of ``else`` is true."""
+
+    place: Place
+    branches: tuple[tuple[Expression, "Block"], ...]
+
+
+@dataclass(frozen=True)
+class While:
+    """A loop."""
+
+    place: Place
+    condition: Expression
+    body: "Block"
+
+
+@dataclass(frozen=True)
+class Keyword:
+    """A statement of one word, and what follows it: ``return``, ``kill``, ``join``, ``break``, ``halt``, …."""
+
+    place: Place
+    word: str
+    value: Expression | None = None
+
+
+Statement = Assignment | If | While | Keyword | Call
+Block = tuple[Statement, ...]
+
+
+@dataclass(frozen=True)
+class Function:
+    """``def`` or ``thread``: its parameters, what it does, and the functions inside."""
 
     name: str
-    value: ast.expr
+    parameters: tuple[tuple[str, Expression | None], ...]
+    body: Block
+    is_thread: bool = False
+    functions: dict[str, "Function"] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Block:
-    """``if`` or ``while`` with its condition and its statements."""
+class Token(NamedTuple):
+    """One word of a program; `kind` is name, number, text, sign, pose, newline or end."""
 
-    word: str
-    condition: ast.expr
-    body: tuple["Statement", ...]
-
-
-@dataclass(frozen=True)
-class Halt:
-    """``halt``: the program ends."""
+    kind: str
+    text: str
+    place: Place
 
 
-Statement = Assignment | Block | Halt | ast.Call
+_TOKEN = re.compile(
+    r"(?P<blank>[ \t\r]+|#[^\n]*)|(?P<newline>\n)|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
+    r'|"(?P<text>[^"\n]*)"|(?P<pose>p\[)|(?P<name>[A-Za-z_]\w*)|(?P<sign>==|!=|<=|>=|[-+*/%<>=()\[\],:])',
+    re.ASCII,
+)
 
 
-def parse(text: str) -> tuple[Statement, ...]:
-    """Parse one program: a ``def`` without parameters, or bare statements.
+_CONTINUED_BY = {"and", "or", "xor", "not", "=", "==", "!=", "<", ">", "<=", ">=", "+", "-", "*", "/", "%"}
+"""Words behind which a statement goes on in the next line."""
+
+
+def syntax_error(text: str, place: Place, sentence: str) -> UrscriptSyntaxError:
+    """Return the error that the controller reports for a line of `text`."""
+    line = (*text.split("\n"), "")[place.line - 1]
+    return UrscriptSyntaxError(place, sentence, f"syntax_error_on_line:{place.line}:{line}:")
+
+
+def tokens_of(text: str) -> Iterator[Token]:
+    """Yield the words of a program, without blanks and comments, and ``end`` behind the last.
+
+    A line break inside brackets, or behind an operator, is a blank.
 
     Raises
     ------
     UrscriptSyntaxError
-        With the number of the line.
+        When a character belongs to no word.
     """
-    lines = ((number, found) for number, line in enumerate(text.split("\n"), 1) if (found := _tokens(number, line)))
-    number, head = next(lines, (0, []))
-    closed = head[:1] == ["def"]
-    if closed and head[2:] != ["(", ")", ":"]:
-        raise UrscriptSyntaxError(f"line {number}: a program starts with 'def NAME():'")
-    rest = lines if closed or not head else chain([(number, head)], lines)
-    try:
-        statements = _block(rest, closed=closed)
-    except RecursionError:
-        raise UrscriptSyntaxError("the program is nested too deeply") from None
-    if after := next(rest, None):
-        raise UrscriptSyntaxError(f"line {after[0]}: nothing more expected")
-    return statements
-
-
-def _tokens(number: int, line: str) -> list[str]:
-    """Return the tokens of one line, as Python writes them."""
-    tokens, at = [], 0
-    while at < len(line):
-        found = _TOKEN.match(line, at)
+    at, line, line_start, depth = 0, 1, 0, 0
+    goes_on = False
+    while at < len(text):
+        place = Place(line, at - line_start + 1)
+        found = _TOKEN.match(text, at)
         if found is None:
-            raise UrscriptSyntaxError(f"line {number}: {line[at : at + 20]!r} is no URScript")
-        if found.lastgroup == "text":
-            tokens.append(repr(found["text"]))
-        elif found.lastgroup != "blank":
-            tokens.append(found[0])
-        at = found.end()
-    return tokens
-
-
-def _block(lines: Iterator[tuple[int, list[str]]], *, closed: bool) -> tuple[Statement, ...]:
-    """Take the statements of one block from `lines`: up to its ``end`` when it is `closed` by one, else all."""
-    statements: list[Statement] = []
-    for number, tokens in lines:
-        match tokens:
-            case ["end"] if closed:
-                return tuple(statements)
-            case ["if" | "while" as word, *condition, ":"]:
-                statements.append(Block(word, _expression(number, condition), _block(lines, closed=True)))
-            case ["halt"]:
-                statements.append(Halt())
-            case ["local", name, "=", *value] | [name, "=", *value] if name.isidentifier() and name not in _RESERVED:
-                statements.append(Assignment(name, _expression(number, value)))
-            case _:
-                call = _expression(number, tokens)
-                if not isinstance(call, ast.Call):
-                    raise UrscriptSyntaxError(f"line {number}: an assignment or a call expected")
-                statements.append(call)
-    if closed:
-        raise UrscriptSyntaxError("'end' expected after the last line")
-    return tuple(statements)
-
-
-def _expression(number: int, tokens: list[str]) -> ast.expr:
-    source = " ".join(tokens)
-    try:
-        expression = ast.parse(source, mode="eval").body
-    except (SyntaxError, ValueError, MemoryError, RecursionError):
-        raise UrscriptSyntaxError(f"line {number}: {source[:40]!r} is no expression") from None
-    for node in ast.walk(expression):
-        known = isinstance(node, _NODES) and not (isinstance(node, ast.Constant) and node.value is None)
-        known &= not isinstance(node, ast.Call) or isinstance(node.func, ast.Name)
-        known &= not isinstance(node, ast.Compare) or len(node.ops) == 1
-        if not known:
-            raise UrscriptSyntaxError(f"line {number}: {source[:40]!r} is not modelled by this emulator")
-    return expression
+            raise syntax_error(text, place, f"{text[at : at + 20].splitlines()[0]!r} is no URScript")
+        kind, at = str(found.lastgroup), found.end()
+        word = found[kind]
+        if kind == "newline":
+            line, line_start = line + 1, at
+        if kind == "blank" or (kind == "newline" and (depth or goes_on)):
+            continue
+        yield Token(kind, word, place)
+        goes_on = kind in ("name", "sign") and word in _CONTINUED_BY
+        depth += (kind == "pose" or (kind == "sign" and word in "([")) - (kind == "sign" and word in ")]")
+        depth = max(0, depth)
+    yield Token("newline", "\n", Place(line, at - line_start + 1))
+    yield Token("end", "the end of the program", Place(line, at - line_start + 1))

@@ -121,7 +121,7 @@ def test_a_damaged_file_is_named_and_costs_only_itself(runs: Path, tmp_path: Pat
     indexed = store.index(runs)
     assert (indexed.results, indexed.verifications) == (3, 1)
     assert ["calibration.json" in indexed.unreadable[0], len(indexed.unreadable)] == [True, 3]
-    assert "ftdrive.verification/9" in indexed.unreadable[2]
+    assert "version '9'" in indexed.unreadable[2]
     (runs / "2026-03-01-calibrate" / "calibration.json").unlink()
     result(0).save(runs / "2026-03-01-calibrate" / "calibration.json")
     assert store.index(runs).results == 1

@@ -13,10 +13,12 @@ import pytest
 from mocks.clock import DEBT_NS, LEAD_NS, CellClock
 from mocks.kinematics import MODELS, vector6
 from mocks.station import free_hosts
+from mocks.ur.clients import BACKLOG_LIMIT_S
 from mocks.ur.modes import Runtime
 from mocks.ur.robot import Robot, RobotSettings
+from mocks.ur.rtde_client import RtdeClient
 from mocks.ur.script import Upload
-from mocks.ur.server import BACKLOG_LIMIT_S, RtdeClient, UrServer
+from mocks.ur.server import UrServer
 from mocks.world import Truth, World
 from tests.unit.mocks.real_time import RealTime
 

@@ -1,0 +1,151 @@
+"""What the emulated controller sends on port 30001: bytes of recorded streams, and a second decoder."""
+
+import pytest
+
+from mocks.kinematics import MODELS
+from mocks.ur import primary
+from mocks.ur.events import Event
+from mocks.ur.modes import RobotMode
+from mocks.ur.robot import Robot, RobotSettings
+from mocks.ur.script import Upload
+from mocks.world import Truth, World
+from tests.unit.mocks.ur.primary_decoder import decoded, packages
+from tests.unit.mocks.ur.urscript_robot import HOME, new_robot, run, start
+
+NEVER = 2**64 - 1
+
+
+def heard(robot: Robot, since: int = 0) -> list[dict[str, object]]:
+    """Messages of the events from a number on."""
+    found, rest = packages(b"".join(primary.messages_of(event) for event in robot.events[since:]))
+    assert rest == b""
+    return [decoded(package) for package in found]
+
+
+def event(by: str, what: str, why: str = "", t_robot_s: float = 0.0, **detail: object) -> Event:
+    return Event(0, t_robot_s, by, what, by == "program", why, detail)
+
+
+@pytest.mark.parametrize(
+    ("entry", "golden"),
+    [  # recorded from URSim 5.4: README of robotlab, Pharmaceutical Bioinformatics, Uppsala
+        (
+            event("program", "textmsg", "nonce nonce nonce pharmbio says hello", 16381.792),
+            "00000034 14 00000003d06e4f00 fd 00" + b"nonce nonce nonce pharmbio says hello".hex(),
+        ),
+        (
+            event("program", "stopped silly", "ended", 16634.482),
+            "00000030 14 00000003df7e0d50 fd 07 00000000 00000000 13" + b"PROGRAM_XXX_STOPPEDsilly".hex(),
+        ),
+        (
+            event("primary port", "program silly", error="syntax_error_on_line:2:end:", line=2, column=1),
+            "00000032 14 ffffffffffffffff fd 0a 00000002 00000001" + b"syntax_error_on_line:2:end:".hex(),
+        ),
+        (
+            event("primary port", "program silly", error="compile_error_name_not_found:txtmsg:", line=2, column=2),
+            "0000003b 14 ffffffffffffffff fd 0a 00000002 00000002" + b"compile_error_name_not_found:txtmsg:".hex(),
+        ),
+    ],
+)
+def test_messages_byte_by_byte(entry: Event, golden: str) -> None:
+    assert primary.messages_of(entry).hex(" ") == bytes.fromhex(golden).hex(" ")
+
+
+def test_the_version_comes_first() -> None:
+    robot = new_robot((5, 4, 0))
+    head = "14 ffffffffffffffff fe 03 09 5552436f6e74726f6c 05 04 00000000"  # as recorded, behind the size
+    assert primary.version_message(robot).startswith(bytes.fromhex("00000037" + head))
+    assert decoded(primary.version_message(robot)) == {
+        "type": "version",
+        "timestamp": NEVER,
+        "source": -2,
+        "project": "URControl",
+        "version": [5, 4, 0],
+        "build": 1261331,
+        "date": "24-03-2022, 12:00:00",
+    }
+
+
+def test_the_state_of_a_nominal_arm() -> None:
+    """Sizes, modes and kinematics as in a recorded state of a UR5e in URSim 5.8 (client library's parser test)."""
+    robot = new_robot()
+    whole = primary.state_package(robot, complete=True)
+    for head in ("0000002f00", "000000fb01", "0000006504", "000000e105" + "ff" * 24, "000001bd06"):
+        assert bytes.fromhex(head) in whole
+    state = decoded(whole)
+    flags = [state["mode"][name] for name in ("connected", "enabled", "power_on", "emergency", "protective")]
+    assert flags == [1, 1, 1, 0, 0]
+    assert (state["mode"]["robot_mode"], state["mode"]["running"], state["mode"]["limit"]) == (7, 0, 1.0)
+    assert [joint["actual"] for joint in state["joints"]] == list(HOME)
+    assert state["joints"][0]["mode"] == 253
+    assert state["cartesian"][:6] == pytest.approx(robot.tcp_pose("actual"))
+    dh = MODELS["UR5e"]
+    for part in ("kinematics", "configuration"):
+        assert [state[part][name] for name in ("theta", "a", "d", "alpha")] == [
+            list(row) for row in (dh.theta, dh.a, dh.d, dh.alpha)
+        ]
+    assert (state["configuration"]["robot_type"], state["configuration"]["sub_type"]) == (1, 3)
+    assert state["configuration"]["limits"][:2] == pytest.approx([-6.283, 6.283], abs=1e-3)
+    assert set(decoded(primary.state_package(robot))) == {"type", "mode", "joints", "cartesian"}
+
+
+def test_a_calibrated_arm_has_its_own_checksums() -> None:
+    dh = MODELS["UR3"].disturbed(1)
+    settings = RobotSettings(model="UR3", polyscope=(3, 15, 0))
+    state = decoded(primary.state_package(Robot(World(Truth.drawn(0), dh, HOME, 0), settings), complete=True))
+    assert len(set(state["kinematics"]["checksum"])) == 6
+    assert state["kinematics"]["a"] == list(dh.a)
+    assert (state["configuration"]["robot_type"], state["configuration"]["sub_type"]) == (3, 1)
+
+
+def test_modes_of_a_held_and_of_a_powerless_arm() -> None:
+    robot = start("def f():\n  sleep(9)\nend\n")
+    assert decoded(primary.state_package(robot))["mode"]["running"] == 1
+    robot.protective_stop("test")
+    mode = decoded(primary.state_package(robot))["mode"]
+    assert (mode["protective"], mode["running"], mode["paused"], mode["emergency"]) == (1, 0, 1, 0)
+    robot.emergency_stop(True)
+    mode = decoded(primary.state_package(robot))["mode"]
+    assert (mode["emergency"], mode["power_on"], mode["robot_mode"]) == (1, 0, RobotMode.POWER_OFF)
+    assert [message["mode"] for message in heard(robot) if message["type"] == "safety"] == [3, 7]
+
+
+def test_a_program_is_heard_from_its_start_to_its_end() -> None:
+    robot = start('def f():\n  textmsg("q = ", [1, 2.5])\nend\n')
+    begun, said, ended = heard(robot)
+    assert (begun["title"], begun["text"], begun["codes"]) == ("PROGRAM_XXX_STARTED", "f", [0, 0])
+    assert (said["text"], said["source"]) == ("q = [1, 2.5]", -3)
+    assert (ended["title"], ended["text"]) == ("PROGRAM_XXX_STOPPED", "f")
+    assert begun["timestamp"] == round(1e6 * robot.events[1].t_robot_s)
+
+
+def test_a_run_time_error_is_heard_with_its_place_before_the_end() -> None:
+    robot = start("def f():\n  sync()\n  movej([0, 0])\nend\n")
+    _begun, error, ended = heard(robot)
+    assert (error["type"], error["place"]) == ("exception", (3, 3))
+    assert error["text"] == "movej: q must be a list of 6 numbers, not [0, 0]"
+    assert error["timestamp"] == ended["timestamp"] != NEVER
+    assert ended["title"] == "PROGRAM_XXX_STOPPED"
+
+
+def test_a_replaced_program_ends_before_the_new_one_begins() -> None:
+    robot = start("def f():\n  sleep(9)\nend\n")
+    start("def g():\n  sleep(9)\nend\n", robot)
+    assert [(m["title"], m["text"]) for m in heard(robot)] == [
+        ("PROGRAM_XXX_STARTED", "f"),
+        ("PROGRAM_XXX_STOPPED", "f"),
+        ("PROGRAM_XXX_STARTED", "g"),
+    ]
+
+
+def test_a_program_that_may_not_start_is_not_heard() -> None:
+    robot = new_robot()
+    robot.set_mode(RobotMode.IDLE)
+    robot.upload(Upload("f", "def f():\nend\n", secondary=False))
+    run(robot, 0.2)
+    assert heard(robot) == []
+
+
+def test_a_connection_that_can_only_read_is_answered_by_c210() -> None:
+    error = decoded(primary.read_only_error(new_robot()))
+    assert (error["type"], error["code"], error["argument"], error["text"]) == ("error", 210, 0, "")

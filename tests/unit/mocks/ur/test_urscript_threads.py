@@ -1,0 +1,243 @@
+"""URScript programs that wait and move: threads, the heartbeat of a guarded move, popups, settings."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mocks.ur.dashboard import answer
+from mocks.ur.modes import Runtime
+from mocks.ur.robot import Robot
+from tests.unit.mocks.ur.urscript_robot import HOME, end_of, failure, logged, new_robot, results, run, start
+
+TOUR = """
+# made for the test
+def tour():
+  textmsg("poses: ", 3)
+  local poses = [[0.785, -1.745, 1.047, -0.873, 1.571, 0.785], [0.785, -1.745, 1.047, -0.873, 1.571, 0.0]]
+  local i = 0
+  popup("Is the tool free?", title="Tour", blocking=True)
+  while i < 2:
+    movej(poses[i], a=1.4, v=1.05)
+    sleep(0.5)
+    textmsg("pose ", i + 1)
+    i = i + 1
+  end
+end
+"""
+
+GUARDED = """
+def segment():
+  global done = False
+  thread mover():
+    movej([0.785, -1.745, 1.047, -0.873, 1.571, 2.785], a=0.7, v=0.5)
+    done = True
+    return False
+  end
+  local hb = read_input_integer_register(24)
+  local missed_s = 0
+  thr = run mover()
+  while not done:
+    local x = read_input_integer_register(24)
+    if x == hb:
+      missed_s = missed_s + get_steptime()
+    else:
+      missed_s = 0
+    end
+    hb = x
+    if (missed_s > 0.2) or (read_input_integer_register(25) != 0):
+      kill thr
+      stopj(2.0)
+      write_output_integer_register(24, -1)
+      halt
+    end
+    sync()
+  end
+  write_output_integer_register(24, 1)
+end
+"""
+
+
+def test_an_exported_tour_asks_moves_and_reports() -> None:
+    robot = start(TOUR)
+    run(robot, 1.0)
+    assert (robot.popup, logged(robot), robot.arm.at_rest) == ("Is the tool free?", ["poses: 3"], True)
+    asked = next(event for event in robot.events if event.what == "popup")
+    assert (asked.why, asked.detail["title"], asked.detail["blocking"]) == ("Is the tool free?", "Tour", True)
+    assert answer(robot, "close popup") == "closing popup"
+    run(robot, 0.1)
+    assert answer(robot, "programState") == "PLAYING tour"
+    run(robot, 6.0)
+    assert logged(robot)[1:] == ["pose 1", "pose 2"]
+    assert robot.arm.q[5] == 0.0
+    assert end_of(robot).why == "ended"
+
+
+def test_a_move_takes_its_speed_from_its_arguments() -> None:
+    robot = start("def f():\n  movej([0.785, -1.745, 1.047, -0.873, 1.571, 1.785], a=100, v=0.5)\nend\n")
+    run(robot, 1.0)
+    assert robot.arm.actual_qd[5] == pytest.approx(0.5, rel=1e-6)
+    assert answer(robot, "running") == "Program running: true"
+    run(robot, 1.1)
+    assert answer(robot, "running") == "Program running: false"
+
+
+def test_a_move_with_a_time_takes_that_time() -> None:
+    robot = start("def f():\n  movej([0.785, -1.745, 1.047, -0.873, 1.571, 1.785], t=1.5)\n  textmsg(1)\nend\n")
+    run(robot, 1.46)
+    assert logged(robot) == []
+    run(robot, 0.1)
+    assert logged(robot) == ["1"]
+
+
+@pytest.mark.parametrize("scale", [1.0, 20.0])
+def test_sleep_lasts_in_the_time_of_the_arm_and_steps_in_that_of_the_cell(scale: float) -> None:
+    robot = start("def f():\n  sleep(0.3)\n  sleep(1.0)\n  textmsg(get_steptime())\nend\n", new_robot(time_scale=scale))
+    while robot.runtime == Runtime.PLAYING:
+        robot.tick()
+    started = next(event for event in robot.events if event.what == "started f")
+    lasted_s = end_of(robot).t_robot_s - started.t_robot_s
+    assert lasted_s == pytest.approx(1.3, abs=2.1 * robot.period_s * scale)
+    assert logged(robot) == ["0.002"]
+
+
+def beat(robot: Robot, seconds: float) -> None:
+    """Let the client count its heartbeat every 8 ms."""
+    for _ in range(round(seconds / 0.008)):
+        robot.write_inputs({"input_int_register_24": robot.input_int(24) + 1})
+        run(robot, 0.008)
+
+
+@pytest.fixture
+def guarded() -> Robot:
+    """A guarded move of 2 rad, at its full speed while the heartbeat counts."""
+    robot = start(GUARDED)
+    beat(robot, 1.0)
+    assert robot.arm.actual_qd[5] == pytest.approx(0.5, rel=0.01)
+    return robot
+
+
+def test_a_guarded_move_ends_while_the_heartbeat_counts(guarded: Robot) -> None:
+    beat(guarded, 5.0)
+    assert guarded.output_ints[24] == 1
+    assert guarded.arm.q[5] == 2.785
+
+
+def test_a_guarded_move_stops_when_the_heartbeat_stands_still(guarded: Robot) -> None:
+    run(guarded, 0.19)
+    assert guarded.arm.qd[5] == pytest.approx(0.5, rel=1e-9)
+    run(guarded, 0.02)
+    assert guarded.arm.qd[5] < 0.5
+    run(guarded, 0.5 / 2.0)
+    assert guarded.arm.at_rest
+    assert guarded.output_ints[24] == -1
+    run(guarded, 0.01)
+    assert guarded.runtime == Runtime.STOPPED
+
+
+def test_the_stop_behind_a_kill_decelerates_as_it_says_from_the_first_cycle(guarded: Robot) -> None:
+    guarded.write_inputs({"input_int_register_25": 1})
+    speeds = [guarded.arm.qd[5]]
+    while not guarded.arm.at_rest:
+        guarded.tick()
+        speeds.append(guarded.arm.qd[5])
+    drops = [before - after for before, after in pairwise(speeds)]
+    assert np.max(drops) <= 2.0 * guarded.period_s + 1e-12
+    assert len(speeds) == pytest.approx(1 + 0.5 / 2.0 / guarded.period_s, abs=2)
+
+
+def test_two_threads_cannot_both_move_the_arm() -> None:
+    end = failure("  thread mover():\n    movej([0, -1.5, 1, -1, 1.5, 0])\n  end\n  run mover()\n  sync()\n  stopj(2)")
+    assert end.detail == {"error": "Another thread is already controlling the robot", "line": 7, "column": 3}
+
+
+def test_a_killed_thread_gives_the_arm_away_to_another_move() -> None:
+    goal = [*HOME[:5], HOME[5] - 0.1]
+    robot = start(
+        "def f():\n  thread mover():\n    movej([0, -1.5, 1, -1, 1.5, 0])\n  end\n  thr = run mover()\n  sleep(0.05)\n"
+        f"  kill thr\n  movej({goal})\nend\n"
+    )
+    run(robot, 3.0)
+    assert end_of(robot).why == "ended"
+    assert list(robot.arm.q) == goal
+
+
+def test_threads_run_side_by_side_in_the_order_of_their_start_and_are_joined() -> None:
+    before = """
+order = 0
+n = 0
+thread first():
+  while n < 5:
+    order = order * 10 + 1
+    n = n + 1
+    sync()
+  end
+  return False
+end
+thread second():
+  while n < 5:
+    order = order * 10 + 2
+    sync()
+  end
+end
+worker = run first()
+run second()
+order = order * 10 + 3
+join worker
+"""
+    assert results("order", before=before) == ["3121212121"]
+
+
+def test_a_thread_sees_the_globals_and_keeps_its_own_variables() -> None:
+    before = """
+shared = 1
+thread t():
+  shared = 2
+  own = 3
+  return False
+end
+join run t()
+own = 4
+"""
+    assert results("shared", "own", before=before) == ["2", "4"]
+
+
+def test_a_critical_section_is_executed_and_lets_others_run_while_it_waits() -> None:
+    before = """
+n = 0
+thread t():
+  enter_critical
+  sleep(1)
+  exit_critical
+end
+run t()
+enter_critical
+while n < 3:
+  sync()
+  n = n + 1
+end
+exit_critical
+"""
+    assert results("n", before=before) == ["3"]
+
+
+def test_the_end_of_the_program_ends_its_threads() -> None:
+    robot = start("def f():\n  thread t():\n    sleep(0.05)\n    textmsg(1)\n  end\n  run t()\nend\n")
+    run(robot, 0.2)
+    assert logged(robot) == []
+
+
+def test_settings_and_registers_of_a_program() -> None:
+    robot = start(
+        "def f():\n  set_payload(1.5, [0, 0, 0.1])\n  write_output_float_register(24, 2)\n"
+        "  write_output_integer_register(25, read_output_integer_register(24) - 3)\n"
+        "  write_output_float_register(25, read_input_float_register(24))\nend\n",
+    )
+    assert (robot.payload_kg, robot.payload_cog_m) == (1.5, (0.0, 0.0, 0.1))
+    assert (robot.output_doubles[24], robot.output_ints[25]) == (2.0, -3)
+    start("def g():\n  set_payload(1.6)\n  set_gravity([0, 9.82, 0])\n  zero_ftsensor()\nend\n", robot)
+    assert (robot.payload_kg, robot.payload_cog_m) == (1.6, (0.0, 0.0, 0.1))
+    assert robot.target_gravity_m_s2 == (0.0, 9.82, 0.0)
+    assert robot.tcp_wrench() == pytest.approx([0.0] * 6, abs=1e-9)
+    start("def h():\n  set_target_payload(1.7, [0, 0, 0.2], [1, 2, 3, 0, 0, 0])\nend\n", robot)
+    assert (robot.payload_kg, robot.payload_inertia) == (1.7, (1.0, 2.0, 3.0, 0.0, 0.0, 0.0))

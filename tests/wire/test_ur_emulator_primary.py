@@ -1,0 +1,255 @@
+"""Port 30001 and PolyScope X of the emulated controller, on the wires."""
+
+import http.client
+import itertools
+import json
+import signal
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.wire.primary_socket import PrimarySocket
+from tests.wire.rtde_socket import RtdeSocket
+from tests.wire.station_process import ROOT, StationProcess
+
+SLEEPING = "def f():\n  sleep(1000)\nend\n"
+HEARTBEAT = """
+def guarded():
+  thread mover():
+    movej([0, -1.5, 1, -1, 1.5, 0], a=1.4, v=0.2)
+    return False
+  end
+  thr = run mover()
+  beat = read_input_integer_register(24)
+  missed_s = 0
+  while missed_s < 0.2:
+    sync()
+    missed_s = missed_s + get_steptime()
+    if read_input_integer_register(24) != beat:
+      beat = read_input_integer_register(24)
+      missed_s = 0
+    end
+  end
+  kill thr
+  stopj(2)
+  textmsg("heartbeat lost at ", beat)
+end
+"""
+
+
+@pytest.fixture(scope="module")
+def station() -> Iterator[StationProcess]:
+    with StationProcess() as cell:
+        yield cell
+
+
+@pytest.fixture(scope="module")
+def polyscope_x() -> Iterator[StationProcess]:
+    with StationProcess("--polyscope", "10.12.0") as cell:
+        yield cell
+
+
+@pytest.fixture(autouse=True)
+def _as_it_was(request: pytest.FixtureRequest) -> Iterator[None]:
+    yield
+    for name in {"station", "polyscope_x"} & set(request.fixturenames):
+        cell: StationProcess = request.getfixturevalue(name)
+        cell.ask("remote-control")
+        cell.ask("silence-arm", on=False)
+        cell.ask("dashboard-stop")
+
+
+def ask_api(station: StationProcess, method: str, path: str, body: object = None) -> tuple[int, dict[str, Any]]:
+    connection = http.client.HTTPConnection(station.host, station.hello["arm"]["api_port"], timeout=30)
+    try:
+        connection.request(method, f"/universal-robots/robot-api{path}", None if body is None else json.dumps(body))
+        answer = connection.getresponse()
+        return answer.status, json.loads(answer.read())
+    finally:
+        connection.close()
+
+
+def test_a_connection_begins_with_version_and_complete_state_and_streams_ten_a_second(station: StationProcess) -> None:
+    with PrimarySocket(station.host) as client:
+        client.wait_for(lambda m: m["type"] == "state" and m["mode"]["timestamp"] > first_us(client) + 900_000)
+        assert client.received[0]["type"] == "version"
+        assert set(client.received[1]) >= {"mode", "joints", "cartesian", "kinematics", "configuration"}
+        steps = [message["mode"]["timestamp"] for message in client.received[2:] if message["type"] == "state"]
+        assert {b - a for a, b in itertools.pairwise(steps)} == {100_000}
+
+
+def first_us(client: PrimarySocket) -> int:
+    return int(client.received[1]["mode"]["timestamp"])
+
+
+def test_a_program_from_port_30001_runs_and_is_heard_by_every_client(station: StationProcess) -> None:
+    with PrimarySocket(station.host) as sender, PrimarySocket(station.host) as listener:
+        listener.next("version")
+        sender.send('def f():\n  textmsg("hello")\n  sync()\nend\n')
+        for client in (sender, listener):
+            assert client.next("key")["title"] == "PROGRAM_XXX_STARTED"
+            assert client.next("text")["text"] == "hello"
+            assert client.next("key")["title"] == "PROGRAM_XXX_STOPPED"
+    assert station.wait_for_event("program f")["by"] == "primary port"
+
+
+def test_errors_of_a_program_come_with_their_place(station: StationProcess) -> None:
+    with PrimarySocket(station.host) as client:
+        client.send("def f():\n  txtmsg(1)\nend\n")
+        error = client.next("exception")
+        assert (error["place"], error["text"]) == ((2, 3), "compile_error_name_not_found:txtmsg:")
+        client.send("def f():\n  sync()\n  x = [1][2]\nend\n")
+        error = client.next("exception")
+        assert (error["place"], error["text"]) == ((3, 3), "[1] has no element 2")
+
+
+def test_commands_of_the_primary_interface(station: StationProcess) -> None:
+    with PrimarySocket(station.host) as client:
+        client.send(SLEEPING)
+        client.wait_for(lambda m: m["type"] == "state" and m["mode"]["running"] == 1)
+        client.send("stop program\n")
+        client.wait_for(lambda m: m["type"] == "state" and m["mode"]["running"] == 0)
+
+
+def test_local_control_ends_connections_and_lets_new_ones_only_read(station: StationProcess) -> None:
+    known = len(station.ask("state")["events"])
+    with PrimarySocket(station.host) as before:
+        before.next("state")
+        station.ask("remote-control", on=False)
+        before.end()
+    with PrimarySocket(station.host) as client:
+        for remote in (False, True):
+            station.ask("remote-control", on=remote)
+            client.send(SLEEPING)
+            assert client.next("error")["code"] == 210
+            client.next("state")
+    refused = station.wait_for_event("program f", accepted=False, since=known)
+    assert (refused["by"], refused["why"]) == ("primary port", "read-only connection")
+    with PrimarySocket(station.host) as client:
+        client.send(SLEEPING)
+        assert client.next("key")["title"] == "PROGRAM_XXX_STARTED"
+
+
+def test_a_silent_arm_sends_what_has_waited_and_misses_the_end_of_a_client(station: StationProcess) -> None:
+    known = len(station.ask("state")["events"])
+    with PrimarySocket(station.host) as client:
+        client.next("state")
+        client.send(SLEEPING)
+        client.next("key")
+        station.ask("silence-arm")
+        client.send("def never():\nend\n")
+        station.ask("dashboard-stop")
+    missed = {"disconnected", "program never"}
+    assert not missed & {event["what"] for event in station.ask("state", since=known)["events"]}
+    station.ask("silence-arm", on=False)
+    station.wait_for_event("disconnected", since=known)
+
+
+def test_the_port_closes_and_opens_with_its_kind(station: StationProcess) -> None:
+    with PrimarySocket(station.host) as client:
+        client.next("state")
+        station.ask("listen", what="primary", on=False)
+        with pytest.raises(ConnectionRefusedError):
+            station.connect(30001)
+        client.next("state")
+        station.ask("listen", what="primary")
+        assert station.ask("drop", what="primary")["connections"] == 1
+        client.end()
+    station.connect(30001).close()
+    assert "is none of" in station.refusal("drop", what="api")
+
+
+CLIENT = """
+import socket, struct, sys
+
+from ftdrive.cell.emulated_clock import EmulatedClock
+
+rtde, primary = (socket.create_connection((sys.argv[1], port)) for port in (30004, 30001))
+
+def send(kind, payload):
+    rtde.sendall(struct.pack(">HB", 3 + len(payload), ord(kind)) + payload)
+
+clock, beat = EmulatedClock(sys.argv[2]), 0
+with clock.keeping_up():
+    send("I", b"input_int_register_24")
+    primary.sendall(sys.stdin.read().encode())
+    while True:
+        beat += 1
+        send("U", b"\\1" + struct.pack(">i", beat))
+        clock.sleep(0.005)
+"""
+
+
+@pytest.mark.parametrize("how", ["killed", "silenced", pytest.param("suspended", marks=pytest.mark.slow)])
+def test_a_program_stops_the_arm_when_its_client_is_gone_and_registers_keep_their_value(
+    station: StationProcess, how: str
+) -> None:
+    known = len(station.ask("state")["events"])
+    command = [sys.executable, "-c", CLIENT, station.host, station.hello["clock"]]
+    client = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE)
+    try:
+        assert client.stdin is not None
+        client.stdin.write(HEARTBEAT.encode())
+        client.stdin.close()
+        station.wait_for(lambda state: state["moving"])
+        if how == "silenced":
+            station.ask("silence-arm")
+        client.send_signal(signal.SIGSTOP if how == "suspended" else signal.SIGKILL)
+        lost = station.wait_for_event("textmsg", since=known)
+        assert station.wait_for_event("stands", since=known)["t_robot_s"] <= lost["t_robot_s"]
+    finally:
+        client.kill()
+        client.wait()
+    station.ask("silence-arm", on=False)
+    with RtdeSocket(station.host) as rtde:
+        rtde.ask("O", struct.pack(">d", 125.0) + b"input_int_register_24")
+        rtde.ask("S")
+        assert f"heartbeat lost at {struct.unpack('>i', rtde.answer()[4:])[0]}" == lost["why"]
+
+
+def test_polyscope_x_has_the_robot_api_in_place_of_the_dashboard(polyscope_x: StationProcess) -> None:
+    with pytest.raises(ConnectionRefusedError):
+        polyscope_x.connect(29999)
+    assert ask_api(polyscope_x, "GET", "/robotstate/v1/robotmode") == (200, {"mode": "RUNNING", "message": "OK"})
+    with PrimarySocket(polyscope_x.host) as client:
+        assert client.next("version")["version"] == [10, 12, 0]
+        client.send(SLEEPING)
+        client.wait_for(lambda m: m["type"] == "state" and m["mode"]["running"] == 1)
+        assert ask_api(polyscope_x, "GET", "/program/v1/state")[1]["state"] == "PLAYING"
+        assert ask_api(polyscope_x, "PUT", "/program/v1/state", {"action": "stop"})[0] == 200
+        assert client.wait_for(lambda m: m["type"] == "key" and "STOPPED" in m["title"])["text"] == "f"
+    polyscope_x.ask("remote-control", on=False)
+    assert ask_api(polyscope_x, "PUT", "/program/v1/state", {"action": "play"})[0] == 403
+    with RtdeSocket(polyscope_x.host) as rtde:
+        assert struct.unpack(">4I", rtde.ask("v"))[:3] == (10, 12, 0)
+        assert rtde.ask("O", struct.pack(">d", 125.0) + b"safety_mode,payload") == b"\x01INT32,DOUBLE"
+
+
+def test_the_robot_api_knows_the_faults_of_the_network(polyscope_x: StationProcess) -> None:
+    address = (polyscope_x.host, polyscope_x.hello["arm"]["api_port"])
+    request = b"GET /universal-robots/robot-api/openapi.json HTTP/1.1\r\nHost: x\r\n\r\n"
+    with socket.create_connection(address, 30) as client:
+        client.sendall(request)
+        assert client.recv(4096).startswith(b"HTTP/1.1 200 OK\r\n")
+        polyscope_x.ask("silence-arm")
+        client.sendall(request)
+        client.settimeout(0.1)
+        with pytest.raises(TimeoutError):
+            client.recv(1)
+        polyscope_x.ask("silence-arm", on=False)
+        client.settimeout(30)
+        assert client.recv(4096).startswith(b"HTTP/1.1 200 OK\r\n")
+        assert polyscope_x.ask("drop", what="api")["connections"] == 1
+        assert client.recv(1) == b""
+    polyscope_x.ask("listen", what="api", on=False)
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(address, 30)
+    polyscope_x.ask("listen", what="api")
+    with socket.create_connection(address, 30) as client:
+        client.sendall(b"hello\r\n\r\n")
+        assert client.recv(4096).startswith(b"HTTP/1.1 400 ")
