@@ -393,8 +393,6 @@ def test_wrong_units_of_torque_are_detected() -> None:
         got, reasons = solved(R24, wrench * np.repeat([1, factor], 3))
         assert got == verdict
         assert says in reasons
-    far = judge(fit(R24, wrench, white(24)), farthest_com_m=0.05)
-    assert (far.verdict, "farther than 0.05 m" in words(far)) == ("rejected", True)
 
 
 # Real sessions
