@@ -44,7 +44,7 @@ class ModelUnknown(ConnectError):
 
 
 class NoDashboard(ConnectError):
-    """The dashboard server of an arm does not answer, or refuses."""
+    """The dashboard server of an arm, or its Robot API, does not answer or refuses."""
 
 
 class StreamBroken(DriverError):

@@ -45,7 +45,8 @@ class DeviceInfo:
     firmware: str
     facts: dict[str, Fact] = field(default_factory=dict)
     """Of a sensor, as far as known: `serial`; `counts_per_N` and `counts_per_Nm`, the scale of the device's numbers;
-    `range`, (6,) the largest force in N and torque in N·m on each axis, in both directions; `sign`, 1 or -1."""
+    `range`, (6,) the largest force in N and torque in N·m on each axis, in both directions; `sign`, 1 or -1. Of an arm:
+    `control`, by what it is moved and why."""
 
 
 class _Columns:

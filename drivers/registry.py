@@ -8,6 +8,7 @@ where the class has a `from_url` like those of this project, and ``name = "packa
 ``ftdrive.arms``. An entry point cannot replace a driver of this project.
 """
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
@@ -202,7 +203,7 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
 def arm_class(name: str = "ur") -> type[RobotArm]:
     """Find the class of an arm by its name.
 
-    Its constructor takes the arguments of `drivers.ur.arm.UrArm`: the host, and by keyword `model`, `speed_rad_s` and
+    Its constructor takes these arguments of `drivers.ur.arm.UrArm`: the host, and by keyword `model`, `speed_rad_s` and
     `acceleration_rad_s2`.
 
     Raises
@@ -235,8 +236,13 @@ def _load(entry: EntryPoint) -> Any:
     try:
         return entry.load()
     except Exception as exc:  # a module of another package may raise anything
-        extra = _EXTRAS.get(getattr(exc, "name", None) or "")
-        fix = f"pip install 'ftdrive[{extra}]'" if extra else f"reinstall {_package(entry)}"
+        missing = (isinstance(exc, ImportError) and exc.name) or ""
+        if missing in _EXTRAS:
+            fix = f"pip install 'ftdrive[{_EXTRAS[missing]}]'"
+        elif missing in sys.stdlib_module_names:
+            fix = "use Linux, because this system lacks that module"
+        else:
+            fix = f"reinstall {_package(entry)}"
         raise BadUrl(f"the driver '{entry.name}' cannot be imported ({type(exc).__name__}: {exc}): {fix}") from exc
 
 

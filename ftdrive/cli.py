@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import platform
 import signal
 import sys
 from collections.abc import Sequence
@@ -88,6 +89,8 @@ class _TalkHandler(logging.Handler):
 
 def exit_code(error: BaseException) -> int | None:
     """Return the exit code of an error that a user can fix; None for a defect of ftdrive."""
+    if _not_on_this_system(error):
+        return 2
     from calib.errors import BadCalibration, BadDataset, CalibError, TooFewSamples
     from drivers.errors import ConnectError, DeviceFault, DriverError
     from drivers.transcript.recorder import BadTranscript
@@ -114,8 +117,15 @@ def exit_code(error: BaseException) -> int | None:
     return next((code for code, kinds in codes if isinstance(error, kinds)), None)
 
 
+def _not_on_this_system(error: BaseException) -> bool:
+    """Whether a module of the standard library is missing, as `termios` is on Windows."""
+    return isinstance(error, ModuleNotFoundError) and error.name in sys.stdlib_module_names
+
+
 def in_a_sentence(error: BaseException) -> str:
     """Return the message of an error; for an error of the system also its file and what to check."""
+    if isinstance(error, ModuleNotFoundError):
+        return f"Python on {platform.system()} has no module {error.name}, which this needs: use Linux"
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}: check this path, and who may read and write there"
     if isinstance(error, OSError) and error.errno == ENOSPC:

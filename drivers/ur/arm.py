@@ -1,10 +1,9 @@
 """A Universal Robots arm.
 
-This process reads (`reading.py`), a disposable one moves the arm (`control.py`). The dashboard server can stop the arm
+`reading.py` reads it, a control path (`control.py`) moves it. The dashboard server or the Robot API can stop the arm
 without either.
 
-Ref: ur_rtde 1.6.5, API reference; Universal Robots, "Dashboard Server, e-Series" manual; `is_steady` in the URScript
-manual.
+Ref: `is_steady` in the URScript manual.
 Checked on hardware: no.
 """
 
@@ -13,37 +12,45 @@ import math
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from math import radians
-from typing import Final
+from typing import Final, Literal
 
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
 from drivers.follow import Follow
-from drivers.interfaces import ArmState, ArmStates, ArmStatus, ControllerSettings, DeviceInfo, Finding, Guard, RobotArm
-from drivers.ur.control import ControlProcess
+from drivers.interfaces import (
+    ArmState,
+    ArmStates,
+    ArmStatus,
+    ControllerSettings,
+    DeviceInfo,
+    Fact,
+    Finding,
+    Guard,
+    RobotArm,
+)
+from drivers.ur.control import CONTROL_SETTINGS, Control, ControlSetting
 from drivers.ur.control_child import DECELERATION_RAD_S2
 from drivers.ur.controller_settings import checked_gravity, checked_payload, read_controller_settings
-from drivers.ur.dashboard import Dashboard, T, ask_dashboard
 from drivers.ur.kinematics import MODELS, model_named
+from drivers.ur.opening import SIMULATORS, Opening, path_for
+from drivers.ur.own_program import OwnProgram
 from drivers.ur.reading import Reader
-from drivers.ur.rtde import CONTROL_REGISTERS, SCRIPT_PORT, find_script_port, registers_in_use
+from drivers.ur.robot_api import PORT as API_PORT
 from drivers.ur.sample import PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Sample
 from drivers.ur.timing import UrTiming
 
 log = logging.getLogger(__name__)
 
-_CONTROL_HZ: Final = 125.0
-"""Rate of ur_rtde's own connection: the full rate of the CB3 generation."""
 _ARRIVED_RAD: Final = 1e-3
 _STANDING_RAD_S: Final = 1e-6
 """Speed of the set-point, which is exactly zero at rest."""
 _STILL_RAD_S: Final = 0.002
-_SIMULATORS: Final = ("localhost", "127.0.0.1", "192.168.56.101")
-"""Addresses of URSim, at which ur_rtde does not require remote control."""
 
 
 class UrArm(RobotArm):
-    """A Universal Robots arm of the CB3 generation or e-Series, through ur_rtde.
+    """A Universal Robots arm: CB3 generation, e-Series, or PolyScope X.
 
     Parameters
     ----------
@@ -53,6 +60,11 @@ class UrArm(RobotArm):
         Such as "UR5e", to compare poses with nominal kinematics; None takes the model that the controller reports.
     speed_rad_s, acceleration_rad_s2
         Defaults of the leading joint in `move_to`. The speed slider of the pendant scales them down further.
+    control
+        The control path: "ur-rtde", "script", or "auto", which takes ur_rtde where it is installed and the controller
+        has a dashboard server.
+    api_port
+        Of the Robot API of PolyScope X.
     clock
         Measures and waits; an emulated cell has its own.
     timing
@@ -66,10 +78,14 @@ class UrArm(RobotArm):
         model: str | None = None,
         speed_rad_s: float = radians(30),
         acceleration_rad_s2: float = radians(40),
+        control: ControlSetting = "auto",
+        api_port: int = API_PORT,
         clock: Clock = REAL,
         timing: UrTiming | None = None,
     ) -> None:
         _check_speed(speed_rad_s, acceleration_rad_s2)
+        if control not in CONTROL_SETTINGS:
+            raise ValueError(f"control is {control!r}; choose one of {', '.join(CONTROL_SETTINGS)}.")
         if model is not None and model_named(model, 0) is None:
             raise ValueError(f"model {model!r} is unknown; choose one of {', '.join(MODELS)}.")
         self._host = host
@@ -79,13 +95,13 @@ class UrArm(RobotArm):
         self._clock = clock
         self._timing = timing or UrTiming.of(clock)
         self._moves_at_rad_s = self._speed_rad_s
+        self._setting = control
+        self._api_port = api_port
         self._reader: Reader | None = None
-        self._control: ControlProcess | None = None
-        self._left_behind = False  # a program of ours may run on the controller without a control process
-        self._starting = False  # it was sent and has not been seen to play: it may still start after a stop
+        self._control: Control | None = None
+        self._program = OwnProgram(self._timing)
         self._goal: list[float] | None = None
         self._stop_requested = threading.Event()
-        self._stop_wanted = threading.Event()  # by an attempt in the background
 
     # ------------------------------------------------------------------ opening and closing
 
@@ -117,7 +133,7 @@ class UrArm(RobotArm):
             self.close()
             return
         if look.program_state == PROGRAM_STOPPED:
-            self._left_behind = self._starting  # a program that runs later is not ours
+            self._program.is_stopped()
         if not control or self._control is None:
             return
         plays = self._control.alive and not look.program_fault()
@@ -128,76 +144,17 @@ class UrArm(RobotArm):
 
     def _connect(self, control: bool) -> None:
         if self._reader is None:
-            self._reader = Reader(self._host, self._model, clock=self._clock, timing=self._timing)
+            self._reader = self._new_reader()
         if control and self._control is None:
-            self._open_control(self._reader)
+            self._control = self._opening(self._reader).open()
         if self._reader.look().robot_mode == ROBOT_RUNNING and (self._reader.reports_tcp or self._control is not None):
             self.state()  # checks the model
 
-    def _open_control(self, reader: Reader) -> None:
-        self._require_version()
-        major, minor = reader.version[:2]
+    def _new_reader(self, **rate: float) -> Reader:
+        return Reader(self._host, self._model, clock=self._clock, timing=self._timing, api_port=self._api_port, **rate)
 
-        def look_out() -> None:
-            if fault := reader.look().safety_fault():
-                raise ConnectError(f"the arm at {self._host} cannot move: {fault.found}", fault.fix)
-
-        def prepare(dashboard: Dashboard) -> None:
-            asks = major == 5 and minor > 5 and self._host not in _SIMULATORS
-            if asks and not dashboard.isInRemoteControl():
-                raise ConnectError(
-                    f"{self._host} is not in remote control",
-                    "press Local, Remote Control at the top right of the pendant (enable it first under Settings, "
-                    "System, Remote Control)",
-                )
-            if self._left_behind and reader.look().program_state != PROGRAM_STOPPED:
-                log.warning("%s still runs our earlier control program; stopping it", self._host)
-                dashboard.stop()
-
-        look_out()
-        find_script_port(self._host, timeout_s=self._timing.connect_s)
-        self._wait_for_registers()
-        self._stop_wanted.clear()  # an attempt in the background would stop the new program
-        self._ask_dashboard(prepare)
-        self._require_no_program(reader)
-        self._left_behind = self._starting = True
-        self._control = ControlProcess(self._host, _CONTROL_HZ, clock=self._clock, timing=self._timing)
-        try:
-            self._control.wait_until_ready(look_out)
-            self._starting = False
-        except (StreamBroken, DeviceTimeout) as error:
-            look_out()  # ur_rtde seldom knows the reason
-            raise _refusal(self._host, error.found) from error
-
-    def _require_version(self) -> None:
-        """Raise `ConnectError` for a PolyScope that ur_rtde can read but not control."""
-        major, minor = self._reading().version[:2]
-        if minor < 4:
-            raise ConnectError(
-                f"{self._host} runs PolyScope {major}.{minor}, which ur_rtde cannot control",
-                f"update it to {major}.4 or later",
-            )
-
-    def _wait_for_registers(self) -> None:
-        """Raise `ConnectError` when another client keeps the registers, before any of its programs is stopped."""
-        deadline_s = self._clock.now_s() + self._timing.release_s
-        connect_s = self._timing.connect_s
-        while taken := registers_in_use(self._host, CONTROL_REGISTERS, timeout_s=connect_s, clock=self._clock):
-            if self._clock.now_s() > deadline_s:
-                raise _taken(self._host, f"{taken[0]} and {len(taken) - 1} more")
-            self._clock.sleep(0.05)
-
-    def _require_no_program(self, reader: Reader) -> None:
-        """Raise `ConnectError` when a program stays on the controller: ur_rtde would stop it, or wait 300 s for it."""
-        deadline_s = self._clock.now_s() + self._timing.release_s
-        while reader.look().program_state != PROGRAM_STOPPED:
-            if self._clock.now_s() > deadline_s:
-                program = self.reported_program()
-                raise ConnectError(
-                    f"another program is on {self._host}{f' ({program})' if program else ''} and is not stopped "
-                    "automatically",
-                    "stop it at the pendant, then start again",
-                )
+    def _opening(self, reader: Reader) -> Opening:
+        return Opening(self._host, self._setting, reader, self._program, self._clock, self._timing)
 
     def close(self) -> None:
         """Stop the arm and its control script, then disconnect. Idempotent; takes 1.5 s at most."""
@@ -206,19 +163,22 @@ class UrArm(RobotArm):
         self._goal = None
         if control is not None:
             self._end_program(control, reader)
-        if self._left_behind:
-            self._stop_program(timeout_s=self._timing.stop_s)
+        if self._program.left_behind:
+            self._program.stop()
         if reader is not None:
             reader.close()
 
-    def _end_program(self, control: ControlProcess, reader: Reader | None) -> None:
-        """End our program through ur_rtde, if that can be confirmed to work."""
+    def _end_program(self, control: Control, reader: Reader | None) -> None:
+        """End our program through its control path, if that can be confirmed to work."""
         try:
             look = None if reader is None else reader.look(limit_s=self._timing.glance_s)
+            if control.has_ended:
+                self._program.is_gone()
             if look and control.alive and look.program_state == PROGRAM_PLAYING and not look.safety_fault():
                 if self._is_ours(control, timeout_s=self._timing.ours_closing_s):
-                    self._left_behind = not control.quit(timeout_s=self._timing.quit_s)
-                elif not self._left_behind:
+                    if control.quit(timeout_s=self._timing.quit_s):
+                        self._program.is_gone()
+                elif not self._program.left_behind:
                     log.warning("%s runs another program; it is not stopped", self._host)
         except DriverError as error:
             log.info("%s: %s", self._host, error)
@@ -226,8 +186,11 @@ class UrArm(RobotArm):
             control.kill()
 
     def identify(self) -> DeviceInfo:
-        """Return model, serial number and PolyScope version, as read when the arm was opened."""
-        return self._reading().info
+        """Return model, serial number and PolyScope version, as read when the arm was opened, and the control path."""
+        reader = self._reading()
+        path, why = path_for(self._setting, reader.version)
+        source: Literal["configured", "assumed"] = "assumed" if self._setting == "auto" else "configured"
+        return replace(reader.info, facts={"control": Fact(f"{path}: {why}", source)})
 
     def state(self) -> ArmState:
         """Read a new, consistent state; the pose is that of the mechanical flange, whatever TCP is active.
@@ -256,7 +219,7 @@ class UrArm(RobotArm):
         if not reader.reports_tcp:
             return super().follow()
         if not reader.reads_all:
-            quick = Reader(self._host, self._model, clock=self._clock, timing=self._timing, rate_Hz=math.inf)
+            quick = self._new_reader(rate_Hz=math.inf)
             self._reader = quick
             reader.close()
             reader = quick
@@ -275,47 +238,26 @@ class UrArm(RobotArm):
         return read_controller_settings(self._host, timeout_s=self._timing.connect_s, clock=self._clock)
 
     def in_remote_control(self) -> bool | None:
-        """Ask the dashboard server, which takes some milliseconds. Raises `NoDashboard`.
+        """Ask the dashboard server or the Robot API, which takes some milliseconds. Raises `NoDashboard`.
 
-        None before PolyScope 5.6, which does not report it, and at the addresses of URSim, which does not need it.
+        None before PolyScope 5.6 and on PolyScope X before 10.12, which do not report it, and at the addresses of
+        URSim, which does not need it.
         """
-        if self._reading().version[:2] < (5, 6) or self._host in _SIMULATORS:
+        reader = self._reading()
+        if reader.version[:2] < (5, 6) or self._host in SIMULATORS:
             return None
-        return self._ask_dashboard(lambda dashboard: dashboard.isInRemoteControl())
+        return reader.services.ask(lambda services: services.in_remote_control(), timeout_s=self._timing.connect_s)
 
     def reported_program(self) -> str | None:
-        """Ask the dashboard server for the program's state and name; None where it does not answer.
+        """Ask the controller for the program's state and name; None where it does not answer.
 
         A program that a client has sent may be reported with the name of the loaded one: not checked on hardware.
         """
-        try:
-            program = self._ask_dashboard(lambda dashboard: dashboard.programState())
-        except DriverError as error:
-            log.info("%s does not report its program: %s", self._host, error)
-            return None
-        return program.strip() or None
+        return self._reading().reported_program()
 
     def diagnose(self) -> list[Finding]:
-        """Check what control needs: the version of PolyScope, free RTDE registers, an open port for programs."""
-
-        def finding(name: str, require: Callable[[], None], found: str) -> Finding:
-            try:
-                require()
-            except DriverError as error:
-                return Finding(name, False, error.found, error.fix)
-            return Finding(name, True, found)
-
-        version = "PolyScope {}.{} can be controlled".format(*self._reading().version)
-        free = "the RTDE registers are free: no other client controls the arm"
-        is_open = f"port {SCRIPT_PORT}, which takes programs, is open"
-        return [
-            finding("version", self._require_version, version),
-            finding("registers", self._wait_for_registers, free),
-            finding("programs", lambda: find_script_port(self._host, timeout_s=self._timing.connect_s), is_open),
-        ]
-
-    def _ask_dashboard(self, ask: Callable[[Dashboard], T]) -> T:
-        return ask_dashboard(self._host, ask, timeout_s=self._timing.connect_s, clock=self._clock)
+        """Check what control needs: a control path, the version, free RTDE registers, an open port for programs."""
+        return self._opening(self._reading()).diagnose()
 
     # ------------------------------------------------------------------ moving
 
@@ -419,14 +361,14 @@ class UrArm(RobotArm):
                         self._check_ours(control)
                         checked_s = self._clock.now_s()
 
-    def _has_ended(self, control: ControlProcess) -> bool:
+    def _has_ended(self, control: Control) -> bool:
         if self._stop_requested.is_set():
             raise _stopped()
         ended, unwatched = control.call("progress", timeout_s=self._timing.progress_s, look_out=self._look_out)
         if unwatched:
             raise DeviceTimeout(
-                f"this program did not watch the move for {self._timing.unwatched_s} s, so the control process stopped "
-                "the arm",
+                f"this program did not watch the move for {self._timing.unwatched_s} s, so its control path "
+                "stopped the arm",
                 "keep the computer awake and give it less to do, then move again",
             )
         return bool(ended)
@@ -496,7 +438,12 @@ class UrArm(RobotArm):
 
     def _look_out(self) -> Sample:
         """Return a new sample; raise any fault of the arm, its program or the connections."""
-        look = self._reading().look()
+        try:
+            look = self._reading().look()
+        except (DeviceTimeout, StreamBroken) as error:
+            if self._control is None:
+                raise
+            raise self._control.explained(error) from error
         if self._control is not None:
             if fault := self._fault(look):
                 raise fault
@@ -507,7 +454,7 @@ class UrArm(RobotArm):
         with self._reporting_stop():
             return self._look_out()
 
-    def _fault(self, look: Sample | None = None) -> DeviceFault | None:
+    def _fault(self, look: Sample | None = None) -> DriverError | None:
         """Return why the arm does not move, if the controller reports a reason."""
         reader = self._reading()
         look = look or reader.look()
@@ -517,6 +464,8 @@ class UrArm(RobotArm):
         fault = look.safety_fault() or look.program_fault()
         if fault is None:
             return None
+        if self._control is not None and not look.safety_fault() and (reason := self._control.end_reason()):
+            return reason
         return DeviceFault(f"the arm at {self._host} stopped: {fault.found}", f"{fault.fix}, then open the arm again")
 
     @contextmanager
@@ -538,10 +487,12 @@ class UrArm(RobotArm):
         finally:  # also after a second Ctrl-C
             if not stopped:
                 control.kill()  # on a lost link ur_rtde would restart the program repeatedly
-                silent = self._reader is not None and self._reader.silent
-                self._stop_program(timeout_s=self._timing.stop_silent_s if silent else self._timing.stop_s)
+                if control.has_ended:
+                    self._program.is_gone()
+                else:
+                    self._program.stop(silent=self._reader is not None and self._reader.silent)
 
-    def _stop_softly(self, control: ControlProcess) -> bool:
+    def _stop_softly(self, control: Control) -> bool:
         try:
             if self._reading().silent:
                 return False
@@ -558,50 +509,40 @@ class UrArm(RobotArm):
             log.info("%s: stopJ failed: %s", self._host, error)
         return False
 
-    def _stop_program(self, *, timeout_s: float) -> None:
-        """End our program through the dashboard server; an attempt that takes longer goes on in the background."""
-
-        def stop(dashboard: Dashboard) -> None:
-            if self._stop_wanted.is_set():
-                dashboard.stop()
-
-        self._stop_wanted.set()
-        try:
-            ask_dashboard(self._host, stop, timeout_s=timeout_s, connect_s=self._timing.reach_s, clock=self._clock)
-            self._left_behind = self._starting
-        except DriverError as error:
-            log.warning("%s did not receive the stop; press the emergency stop if it moves: %s", self._host, error)
-
-    def _check_ours(self, control: ControlProcess) -> None:
+    def _check_ours(self, control: Control) -> None:
         """Raise `DeviceFault` when another program runs, whose registers mean nothing to us."""
         if not self._is_ours(control, timeout_s=self._timing.ours_s, look_out=self._look_out):
-            raise self._fault() or DeviceFault(
-                f"the control program on {self._host} does not answer: another program may be running, or "
-                "controller or computer are overloaded",
-                "check the program at the pendant, then open the arm again",
+            raise (
+                control.end_reason()
+                or self._fault()
+                or DeviceFault(
+                    f"the control program on {self._host} does not answer: another program may be running, or "
+                    "controller or computer are overloaded",
+                    "check the program at the pendant, then open the arm again",
+                )
             )
 
-    def _is_ours(
-        self, control: ControlProcess, *, timeout_s: float, look_out: Callable[[], object] = lambda: None
-    ) -> bool:
+    def _is_ours(self, control: Control, *, timeout_s: float, look_out: Callable[[], object] = lambda: None) -> bool:
         try:
             control.call("tcp_offset", timeout_s=timeout_s, look_out=look_out)
         except DeviceTimeout as error:
             if control.alive:
                 raise  # of `look_out`: the controller sends nothing, whatever program it runs
             log.info("%s: the control program does not answer: %s", self._host, error)
-            self._left_behind = False  # another program has probably replaced it
+            self._program.is_gone()  # another program has probably replaced it
             return False
         except DriverError as error:
             log.info("%s: the control program cannot be asked: %s", self._host, error)
             return False
         return True
 
-    def _in_control(self) -> ControlProcess:
+    def _in_control(self) -> Control:
         if self._control is None:
             raise ConnectError(f"the arm at {self._host} was opened for reading only", "open it with control")
         if not self._control.alive:
-            raise StreamBroken(f"the control of {self._host} has ended", "check the robot, then open the arm again")
+            raise self._control.end_reason() or StreamBroken(
+                f"the control of {self._host} has ended", "check the robot, then open the arm again"
+            )
         return self._control
 
     def _reading(self) -> Reader:
@@ -641,24 +582,3 @@ def _near(a_rad: Sequence[float], b_rad: Sequence[float]) -> bool:
 
 def _degrees(q_rad: Sequence[float]) -> str:
     return "(" + ", ".join(f"{math.degrees(angle):.1f}" for angle in q_rad) + ") degrees"
-
-
-def _refusal(host: str, words: str) -> ConnectError:
-    """Convert a message of ur_rtde to an error with a fix."""
-    if "already in use" in words:
-        return _taken(host, "registers")
-    if "remote control" in words:
-        return ConnectError(
-            f"{host} is not in remote control", "press Local, Remote Control at the top right of the pendant"
-        )
-    return ConnectError(
-        f"ur_rtde cannot control {host}: {words}",
-        "check at the pendant that no dialog is open and that no other program starts automatically",
-    )
-
-
-def _taken(host: str, what: str) -> ConnectError:
-    return ConnectError(
-        f"another client controls {host} and holds its RTDE registers ({what})",
-        "end it, or disable EtherNet/IP, PROFINET and other fieldbuses on the controller; wait 30 s after a cut cable",
-    )

@@ -23,13 +23,23 @@ from typing import Final
 import numpy as np
 
 from drivers.clock import Clock, Follower
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ModelUnknown, StreamBroken
+from drivers.errors import (
+    ConnectError,
+    DeviceFault,
+    DeviceTimeout,
+    DriverError,
+    ModelUnknown,
+    NoDashboard,
+    StreamBroken,
+)
 from drivers.follow import Follow, Unread
 from drivers.interfaces import NOT_REPORTED, ArmState, ArmStates, ArmStatus, Array, DeviceInfo
-from drivers.ur.dashboard import Dashboard, ask_dashboard
 from drivers.ur.kinematics import MODELS, Pose, flange_poses, forward, model_named
+from drivers.ur.primary import read_model
+from drivers.ur.robot_api import PORT as API_PORT
 from drivers.ur.rtde import Subscription
 from drivers.ur.sample import MEASURING, OPTIONAL, OUTPUTS, Sample
+from drivers.ur.services import Services, ServicesOf
 from drivers.ur.timing import Lateness, Patience, UrTiming
 
 log = logging.getLogger(__name__)
@@ -55,7 +65,14 @@ class Reader:
     """
 
     def __init__(
-        self, host: str, model: str | None, *, clock: Clock, timing: UrTiming, rate_Hz: float = STATES_HZ
+        self,
+        host: str,
+        model: str | None,
+        *,
+        clock: Clock,
+        timing: UrTiming,
+        rate_Hz: float = STATES_HZ,
+        api_port: int = API_PORT,
     ) -> None:
         self._host = host
         self._clock = clock
@@ -76,6 +93,7 @@ class Reader:
         self._stream = Subscription(host, OUTPUTS, rate_Hz, timeout_s=timing.connect_s, clock=clock)
         self.version = self._stream.version
         """Of the controller: major, minor, bugfix, build."""
+        self.services = ServicesOf(host, self.version, clock, api_port)
         missing = set(self._stream.missing)
         self.reports_tcp = "tcp_offset" not in missing
         """Whether the controller reports its TCP offset over RTDE; old ones do not."""
@@ -202,40 +220,45 @@ class Reader:
                 "check model and TCP, then read again",
             )
 
+    def reported_program(self) -> str | None:
+        """Ask the controller for the program's state and name; None where it does not answer."""
+        try:
+            return self.services.ask(lambda services: services.program(), timeout_s=self._timing.connect_s)
+        except DriverError as error:
+            log.info("%s does not report its program: %s", self._host, error)
+            return None
+
     def _identify(self, model: str | None, lacking: set[str]) -> DeviceInfo:
-        major = self.version[0]
-        if major > 5:
-            raise ConnectError(
-                f"{self._host} runs PolyScope X (version {major}), which has no dashboard server to stop the arm with",
-                "use a controller of PolyScope 5 or the CB3 generation",
-            )
         if lacking:
             raise ConnectError(
                 f"{self._host} does not report {', '.join(sorted(lacking))} over RTDE", "update its PolyScope"
             )
 
-        def ask(dashboard: Dashboard) -> tuple[str, str, str]:
-            reported = dashboard.getRobotModel().strip()
-            try:
-                serial = dashboard.getSerialNumber()
-            except RuntimeError as error:  # some controllers are older than this request
-                log.info("%s does not report its serial number: %s", self._host, error)
-                serial = NOT_REPORTED
-            return reported, serial, dashboard.polyscopeVersion().strip()
+        def ask(services: Services) -> tuple[str | None, str | None, str | None]:
+            return services.model(), services.serial(), services.polyscope()
 
-        reported, serial, polyscope = ask_dashboard(
-            self._host, ask, timeout_s=self._timing.connect_s, clock=self._clock
-        )
-        known = model_named(reported, major)
+        try:
+            reported, serial, polyscope = self.services.ask(ask, timeout_s=self._timing.connect_s)
+        except NoDashboard as error:
+            if not self.services.has_api:
+                raise
+            log.info("%s", error)  # the Robot API is younger than PolyScope X, and reading does not need it
+            reported = serial = polyscope = None
+        if reported is None and self.services.has_api:
+            reported = read_model(self._host, timeout_s=self._timing.connect_s, clock=self._clock)
+        known = None if reported is None else model_named(reported, self.version[0])
         if model is None and known is None:
-            raise ModelUnknown(
-                f"{self._host} reports the model {reported!r}, which is unknown (CB3 before 3.12 and e-Series before "
-                "5.6 do not report it)",
-                "set the model of the arm",
-            )
+            found = f"reports the unknown model {reported!r}"
+            if reported is None:
+                found = "does not report its model, as CB3 before 3.12 and e-Series before 5.6"
+            raise ModelUnknown(f"{self._host} {found}", "set the model of the arm")
         if model is not None and known is not None and MODELS[known] != MODELS[model]:
             raise ConnectError(f"{self._host} is a {known}, not a {model}", "check the address and the model")
-        return DeviceInfo(model=model or known or reported, serial=serial, firmware=polyscope)
+        return DeviceInfo(
+            model=model or known or NOT_REPORTED,
+            serial=serial or NOT_REPORTED,
+            firmware=polyscope or ".".join(map(str, self.version[:3])),
+        )
 
     # ------------------------------------------------------------------ following the stream
 

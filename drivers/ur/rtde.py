@@ -1,8 +1,8 @@
 """A small RTDE client: everything that is read from a controller passes through it.
 
 The receiving side of ur_rtde freezes the interpreter when the controller accepts and sends nothing. It repeats its last
-values when a link is lost, has no snapshot, and cannot parse `tcp_offset`, which the flange pose needs. This client
-never writes to the controller's registers, so it cannot disturb a program.
+values when a link is lost, has no snapshot, and cannot parse `tcp_offset`, which the flange pose needs. Only a
+subscription that claims inputs writes to the controller, so no other can disturb a program.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
 Checked on hardware: no.
@@ -15,6 +15,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -26,7 +27,6 @@ from drivers.errors import ConnectError, DeviceTimeout, ProtocolError, StreamBro
 log = logging.getLogger(__name__)
 
 PORT: Final = 30004
-SCRIPT_PORT: Final = 30003
 
 REQUEST_PROTOCOL_VERSION: Final = ord("V")
 GET_CONTROLLER_VERSION: Final = ord("v")
@@ -43,6 +43,7 @@ _FORMATS: Final[Mapping[str, tuple[str, tuple[int, ...]]]] = {
     "VECTOR3D": (">f8", (3,)),
     "VECTOR6D": (">f8", (6,)),
 }
+_INPUTS: Final[Mapping[str, str]] = {"INT32": "i", "DOUBLE": "d"}
 _RECEIVE_BYTES: Final = 65536
 _FULL_RATE_HZ: Final = (125.0, 500.0)
 """Of the CB3 generation, and from the e-Series on."""
@@ -113,6 +114,10 @@ class Recipe:
                 f"RTDE data of {len(payload)} bytes, {size} expected for recipe {self.id}: {payload.hex(' ')}"
             )
 
+    def taken(self, names: Sequence[str]) -> list[str]:
+        """Return which of these inputs belong to another client or a fieldbus."""
+        return [name for name, kind in zip(names, self.types, strict=False) if kind == "IN_USE"]
+
     def columns(self, payloads: Sequence[bytes]) -> list[NDArray[Any]]:
         """Decode n checked data packages: one array for each output, (n,) or (n, length of the vector)."""
         table = np.frombuffer(b"".join(payloads), _layout(self.types))
@@ -134,6 +139,7 @@ class _Connection:
         self._clock = clock
         self._deadline_s = clock.now_s() + timeout_s
         self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # a package must not wait for the next
         self._timeout_s = timeout_s
         self._buffer = bytearray()
 
@@ -173,6 +179,10 @@ class _Connection:
                 return payload
             log.debug("RTDE package of type %d instead of an answer: %s", kind, payload.hex(" "))
 
+    def send(self, package: bytes) -> None:
+        """Send a package that has no answer."""
+        self._socket.sendall(package)
+
     def close(self) -> None:
         """Close, and wake a thread that reads."""
         with contextlib.suppress(OSError):  # it may be gone already
@@ -182,6 +192,8 @@ class _Connection:
 
 class Subscription:
     """Outputs of one controller, sent `frequency_Hz` times a second; connected while the object exists.
+
+    It may also own inputs, which no other client can write meanwhile.
 
     Parameters
     ----------
@@ -195,17 +207,26 @@ class Subscription:
         Limit of the whole start-up.
     clock : Clock
         Measures it.
+    inputs : mapping of str to str
+        Name and type of every input that `write` sets; INT32 or DOUBLE.
 
     Raises
     ------
     Unreachable
         Nothing answers at the address.
     ConnectError
-        No RTDE, or outputs of other types.
+        No RTDE, outputs or inputs of other types, or inputs of another client.
     """
 
     def __init__(
-        self, host: str, outputs: Mapping[str, str], frequency_Hz: float, *, timeout_s: float, clock: Clock = REAL
+        self,
+        host: str,
+        outputs: Mapping[str, str],
+        frequency_Hz: float,
+        *,
+        timeout_s: float,
+        clock: Clock = REAL,
+        inputs: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         where = f"{host}:{PORT}"
         self.version = (0, 0, 0, 0)
@@ -220,7 +241,7 @@ class Subscription:
         except OSError as error:
             raise Unreachable(f"{where} cannot be reached ({error})", _fix_of(error, host)) from error
         try:
-            self._greet(outputs)
+            self._greet(host, outputs, inputs)
         except TimeoutError as error:
             self.close()
             raise ConnectError(
@@ -249,11 +270,15 @@ class Subscription:
         """Decode n samples: by the name of each known output, an array (n,) or (n, length of the vector)."""
         return dict(zip(self._names, self._recipe.columns(samples), strict=True))
 
+    def write(self, values: Sequence[float]) -> None:
+        """Set all inputs, in the order given. Not from two threads at once. Raises `OSError` on a lost connection."""
+        self._connection.send(encode(DATA, self._inputs.pack(self._input_recipe, *values)))
+
     def close(self) -> None:
         """Close the connection, and wake a thread that reads. Idempotent."""
         self._connection.close()
 
-    def _greet(self, outputs: Mapping[str, str]) -> None:
+    def _greet(self, host: str, outputs: Mapping[str, str], inputs: Mapping[str, str]) -> None:
         ask = self._connection.ask
         if ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02")) != b"\x01":
             raise ProtocolError("the controller refuses protocol version 2")
@@ -271,15 +296,20 @@ class Subscription:
             self._recipe = Recipe.decode(ask(encode_setup_outputs(self.rate_Hz, self._names)))
         if self._recipe.types != tuple(known.values()):
             raise ProtocolError(f"{', '.join(known)} have the types {', '.join(self._recipe.types)}")
+        if inputs:
+            self._claim(host, inputs)
         if ask(encode(START)) != b"\x01":
             raise ProtocolError("the controller does not start the stream")
 
-
-CONTROL_REGISTERS: Final = (
-    *(f"input_int_register_{k}" for k in range(8)),
-    *(f"input_double_register_{k}" for k in range(18)),
-)
-"""The inputs that ur_rtde's control interface writes, exclusively."""
+    def _claim(self, host: str, inputs: Mapping[str, str]) -> None:
+        recipe = Recipe.decode(self._connection.ask(encode_setup_inputs(tuple(inputs))))
+        if taken := recipe.taken(tuple(inputs)):
+            self.close()
+            raise registers_taken(host, taken)
+        if recipe.types != tuple(inputs.values()):
+            raise ProtocolError(f"{', '.join(inputs)} have the types {', '.join(recipe.types)}")
+        self._input_recipe = recipe.id
+        self._inputs = struct.Struct(">B" + "".join(_INPUTS[kind] for kind in recipe.types))
 
 
 def _fix_of(error: OSError, host: str) -> str:
@@ -309,15 +339,13 @@ def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float, clo
         raise DeviceTimeout(f"{host}:{PORT} did not answer within {timeout_s:.1f} s", "check the robot") from error
     except OSError as error:
         raise StreamBroken(f"{host}:{PORT} was lost ({error})", "check the robot and the cable") from error
-    return [name for name, kind in zip(names, recipe.types, strict=False) if kind == "IN_USE"]
+    return recipe.taken(names)
 
 
-def find_script_port(host: str, *, timeout_s: float) -> None:
-    """Check that the controller accepts programs, without sending one. Raises `ConnectError`."""
-    try:
-        socket.create_connection((host, SCRIPT_PORT), timeout=timeout_s).close()
-    except OSError as error:
-        raise ConnectError(
-            f"{host}:{SCRIPT_PORT}, which accepts programs, cannot be reached ({error})",
-            "enable the real-time client interface under Settings, Security, Services, and check the firewall",
-        ) from error
+def registers_taken(host: str, names: Sequence[str]) -> ConnectError:
+    """Return the error for inputs of another client; not all names have to be known."""
+    which = f" ({names[0]} and {len(names) - 1} more)" if names else ""
+    return ConnectError(
+        f"another client controls {host} and holds its RTDE registers{which}",
+        "end it, or disable EtherNet/IP, PROFINET and other fieldbuses on the controller; wait 30 s after a cut cable",
+    )

@@ -51,6 +51,13 @@ class RobotConfig:
         "of the tool's farthest point; 250 is the reduced speed of ISO 10218-1", 250.0, "mm/s", (1, 250)
     )
     driver: str = entry("ur, or the entry point of an arm of another package", "ur", reject=rules.reject_empty)
+    control: str = entry(
+        "auto, ur-rtde or script: what moves the arm; auto takes ur-rtde where it is installed and the controller has "
+        "what it needs; script stops the arm within 0.3 s when this computer or the network fails",
+        "auto",
+        reject=rules.reject_control,
+    )
+    api_port: int = entry("of the Robot API of PolyScope X", 80, between=(1, 65535))
     serial: str | None = entry("serial number; if set, nothing moves on another arm", None, reject=rules.reject_empty)
 
 

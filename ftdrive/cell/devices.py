@@ -20,11 +20,13 @@ def build_arm(cell: CellConfig) -> RobotArm:
         raise ConfigError(f"[robot] driver: {error}") from error
     # Only an emulated arm takes a clock: an arm of another package may not know it.
     emulated = {"clock": cell.clock} if cell.clock.emulated else {}
+    ur = {"control": cell.robot.control, "api_port": cell.robot.api_port} if cell.robot.driver == "ur" else {}
     arm = build(
         cell.robot.host,
         model=cell.robot.model,
         speed_rad_s=radians(cell.robot.speed_deg_s),
         acceleration_rad_s2=radians(cell.robot.acceleration_deg_s2),
+        **ur,
         **emulated,
     )
     _fits: Arm = arm  # checked statically: what the routine asks for is what the driver gives

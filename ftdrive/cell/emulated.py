@@ -2,6 +2,7 @@
 
 import atexit
 import json
+import platform
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,6 @@ from calib.routine import Sampling
 from drivers.clock import REAL, Clock
 from drivers.errors import ConnectError
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
-from ftdrive.cell.emulated_clock import EmulatedClock
 from ftdrive.errors import ConfigError
 
 TIME_SCALE = 20
@@ -42,32 +42,52 @@ TOOL_MM = (0.0, 200.0, 100.0)
 class Station:
     """One `mocks` process, ended by leaving its `with` block or by the end of ours.
 
+    Its `with` block raises `ConfigError` on another system than Linux.
+
     Parameters
     ----------
     sensor : one of `SENSORS`, "both" (can and serial) or "none"
     options : sequence of str
         More options of `python -m mocks station`.
+    control_path : str
+        As `control` of `[robot]`.
     """
 
-    def __init__(self, sensor: str = "can", options: Sequence[str] = ()) -> None:
+    def __init__(self, sensor: str = "can", options: Sequence[str] = (), *, control_path: str = "auto") -> None:
         self.sensor = sensor
         self.options = tuple(options)
+        self.control_path = control_path
         self.endpoints: Mapping[str, Any] = {}
         self.clock: Clock = REAL
         """The cell's own, once it has started."""
         self._process: subprocess.Popen[str] | None = None
 
     @classmethod
-    def of(cls, made_by: Mapping[str, Any] | None, sensor: str | None = None, options: Sequence[str] = ()) -> Self:
+    def of(
+        cls,
+        made_by: Mapping[str, Any] | None,
+        sensor: str | None = None,
+        options: Sequence[str] = (),
+        *,
+        control_path: str | None = None,
+    ) -> Self:
         """Describe the station that a run or a calibration names as its `station`, or the usual one; not started.
 
-        An address emulated://NAME in `sensor` replaces its sensor; `options` come after its own.
+        An address emulated://NAME in `sensor` replaces its sensor, and `control_path` its control path; `options` come
+        after its own.
         """
         made_by = made_by or {}
         name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
-        return cls(name, (*made_by.get("options", ()), *options))
+        path = control_path or made_by.get("control_path", "auto")
+        return cls(name, (*made_by.get("options", ()), *options), control_path=path)
 
     def __enter__(self) -> Self:
+        if sys.platform != "linux":
+            raise ConfigError(
+                f"an emulated cell needs Linux, and this is {platform.system()}: use recorded data, without --simulate"
+            )
+        from ftdrive.cell.emulated_clock import EmulatedClock
+
         command = [sys.executable, "-P", "-m", "mocks", "station", "--sensor", self.sensor]
         command += ["--time-scale", str(TIME_SCALE), *self.options]
         # A session of its own: Ctrl-C in the terminal is for us, not for the emulated cell.
@@ -125,7 +145,14 @@ class Station:
         url = next(iter(self.endpoints["sensors"].values()))["url"]
         truth = self.truth
         return CellConfig(
-            robot=RobotConfig(arm["host"], arm["model"], speed_deg_s=60.0, acceleration_deg_s2=80.0),
+            robot=RobotConfig(
+                arm["host"],
+                arm["model"],
+                speed_deg_s=60.0,
+                acceleration_deg_s2=80.0,
+                control=self.control_path,
+                api_port=arm.get("api_port", 80),
+            ),
             sensor=SensorConfig(url, height_mm=1e3 * truth["p_flange_sensor_m"][2], mass_kg=truth["sensor_mass_kg"]),
             tool=ToolConfig("emulated", (TOOL_MM,)),
             workcell=WorkcellConfig(self.mounting, measured=True),

@@ -128,6 +128,13 @@ def reject_model(value: str) -> str | None:
     return None if model_named(value, controller_major=0) else f"the models are {', '.join(MODELS)}"
 
 
+def reject_control(value: str) -> str | None:
+    """Reject an unknown control path."""
+    from drivers.ur.control import CONTROL_SETTINGS
+
+    return None if value in CONTROL_SETTINGS else f"give one of {', '.join(CONTROL_SETTINGS)}"
+
+
 def reject_mounting(value: str) -> str | None:
     """Reject what is neither a mounting nor an angle."""
     try:

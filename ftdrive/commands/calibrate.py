@@ -9,6 +9,7 @@ import click
 
 from ftdrive.commands.common import (
     CELL,
+    CONTROL,
     FILE,
     FOLDER,
     YES,
@@ -43,6 +44,7 @@ _EXCLUDE_ONE_ANOTHER = (
     metavar="FROM:TO:DIAMETER[:X:Y]",
     help="A cylinder of tool and sensor, mm from the flange face; replaces those of [tool]. Repeatable.",
 )
+@CONTROL
 @simulate()
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses.")
@@ -71,6 +73,7 @@ def calibrate(
     robot: str | None,
     sensor: str | None,
     tool: tuple[str, ...],
+    control: str | None,
     simulate: bool,
     quick: bool,
     minimal: bool,
@@ -112,11 +115,11 @@ def calibrate(
         made_by = None if resume is None else Run(resume).header_to_resume().get("station")
         simulate = simulate or bool(made_by and not (config or robot or tool))  # a resumed run keeps its cell
         if simulate:
-            station = stack.enter_context(Station.of(made_by, sensor))
+            station = stack.enter_context(Station.of(made_by, sensor, control_path=control))
             cell = station.cell
             description = described(station)
         else:
-            said = Said(str(config.absolute()) if config else None, robot, sensor, tool)
+            said = Said(str(config.absolute()) if config else None, robot, sensor, tool, control)
             description = {"said": asdict(said)}
             cell = said.cell() if resume is None else _cell_to_resume(resume, said)
         options = Options(
@@ -175,6 +178,7 @@ class Said:
     robot: str | None = None
     sensor: str | None = None
     tool: tuple[str, ...] = ()
+    control: str | None = None
 
     def settings(self) -> dict[str, Any]:
         """Return options, environment and files, in this order of precedence; see `cell.config.settings`."""
@@ -184,6 +188,7 @@ class Said:
             "robot.host": ("--robot", self.robot),
             "sensor.url": ("--sensor", self.sensor),
             "tool.cylinders_mm": ("--tool", rows("--tool", self.tool, (3, 5))),
+            "robot.control": ("--control", self.control),
         }
         return settings(None if self.config is None else Path(self.config), flags)
 
@@ -213,6 +218,7 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
         said.robot or begun["robot"],
         said.sensor or begun["sensor"],
         said.tool or tuple(begun["tool"]),
+        said.control or begun["control"],
     )
     found, before = said.settings(), recorded_cell(header["config"])
     undescribed = {"default", "not set", "--tool"}
@@ -227,7 +233,7 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
     cylinders_mm = found["tool.cylinders_mm"].value or before.tool.cylinders_mm
     return replace(
         before,
-        robot=replace(before.robot, host=said.robot or before.robot.host),
+        robot=replace(before.robot, host=said.robot or before.robot.host, control=said.control or before.robot.control),
         sensor=replace(before.sensor, url=said.sensor or before.sensor.url),
         tool=replace(before.tool, cylinders_mm=cylinders_mm),
     )

@@ -23,6 +23,13 @@ MODEL = click.option(
 )
 
 
+CONTROL = click.option(
+    "--control",
+    type=click.Choice(["auto", "ur-rtde", "script"]),
+    help="What moves the arm.  [default: [robot] control, else auto]",
+)
+
+
 def runs(words: str = "Parent folder of the new run folder.") -> Callable[[F], F]:
     """Make the option --runs."""
     folder = click.Path(file_okay=False, path_type=Path)

@@ -8,7 +8,7 @@ import click
 import numpy as np
 
 from ftdrive.cell.emulated import SENSORS, Station
-from ftdrive.commands.common import JSON, runs, stop_unless_accepted, write_json
+from ftdrive.commands.common import CONTROL, JSON, runs, stop_unless_accepted, write_json
 from ftdrive.commands.emulated_run import rehearse
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.report import compensation_error, errors_in_sigma, print_result
@@ -17,16 +17,21 @@ from ftdrive.terminal.report import compensation_error, errors_in_sigma, print_r
 @click.command()
 @click.option("--sensor", type=click.Choice(list(SENSORS)), default="can", show_default=True, help="Emulated sensor.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the random truth and noise.")
+@CONTROL
+@click.option(
+    "--polyscope", metavar="VERSION", help="Of the emulated controller, such as 10.11.0, which has no dashboard server."
+)
 @click.option("--simulate", is_flag=True, expose_value=False, help="Always on; every command accepts it.")
 @runs()
 @JSON
-def demo(sensor: str, seed: int, runs: Path, as_json: bool) -> None:
+def demo(sensor: str, seed: int, control: str | None, polyscope: str | None, runs: Path, as_json: bool) -> None:
     """Calibrate an emulated cell: no real device is connected or moved. Takes about 25 s.
 
     A UR5e and a sensor are emulated in another process, down to the bytes on their wires. The arm moves 20 times faster
     than a real one. The drivers, the session and the solver are those of a real cell.
     """
-    with Station(sensor, ["--seed", str(seed)]) as station:
+    options = ["--seed", str(seed), *(["--polyscope", polyscope] if polyscope else [])]
+    with Station(sensor, options, control_path=control or "auto") as station:
         truth = station.truth
         talk.print(f"Emulated UR5e, {SENSORS[sensor]}, tool of {truth['mass_kg']:.3f} kg. No real device is used.")
         outcome = rehearse(station, runs, "demo")

@@ -37,7 +37,8 @@ class _Unkept:
 
 def described(station: Station) -> dict[str, Any]:
     """Return what run.json says about an emulated cell."""
-    return {"station": {"sensor": station.sensor, "options": station.options, "truth": station.truth}}
+    said = {"sensor": station.sensor, "options": station.options, "control_path": station.control_path}
+    return {"station": {**said, "truth": station.truth}}
 
 
 def rehearse(station: Station, runs: Path, name: str, *, poses: int = 24, kept: bool = True) -> Outcome:

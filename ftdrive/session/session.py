@@ -283,6 +283,8 @@ def _along_a_plan(session: _Session, certifier: Certifier, plan: Plan) -> Run | 
         session.note("the controller's safety limits are not checked: only a program on the controller can query them")
     else:
         arm.open(control=True)
+        if path := arm.identify().facts.get("control"):
+            session.note(f"control path {path.value}")
         _check(session.journal, looked.before, preflight.IN_CONTROL)
     predicted = _predict(looked)
     if dry_run:

@@ -4,9 +4,7 @@ import atexit
 import os
 import re
 import select
-import termios
 import time
-import tty
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -42,7 +40,12 @@ class Keyboard:
 
     @staticmethod
     def usable(fd: int) -> bool:
-        """Whether this is a terminal in the foreground, whose keys can be read: not a pipe, not a background job."""
+        """Whether this is a terminal in the foreground, whose keys can be read: not a pipe, not a background job.
+
+        False on Windows, which has no `termios`.
+        """
+        if not hasattr(os, "tcgetpgrp"):
+            return False
         try:
             return os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp()
         except OSError:
@@ -74,6 +77,9 @@ class Keyboard:
             self._start()
 
     def _start(self) -> None:
+        import termios
+        import tty
+
         self._before = termios.tcgetattr(self._fd)
         atexit.register(self._restore)
         tty.setcbreak(self._fd, termios.TCSANOW)
@@ -92,6 +98,8 @@ class Keyboard:
     def _restore(self) -> None:
         if self._before is None:
             return
+        import termios
+
         with suppress(termios.error):  # a terminal that was closed needs nothing
             # at once: draining waits for Ctrl-Q after Ctrl-S
             termios.tcsetattr(self._fd, termios.TCSANOW, self._before)

@@ -2,7 +2,6 @@
 
 import json
 import sys
-import termios
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from threading import Lock
@@ -132,6 +131,8 @@ class PlainOperator(_Keyless):
         self._write_lines(withheld)
         self._quiet = quiet
         if self._stdin.isatty():
+            import termios  # Windows has none: an answer typed too early must not count, so none is read there
+
             with suppress(termios.error):  # a closed terminal: reading raises the error
                 termios.tcflush(self._stdin.fileno(), termios.TCIFLUSH)
         while True:

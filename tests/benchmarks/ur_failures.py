@@ -24,6 +24,7 @@ from pathlib import Path
 
 from drivers.errors import ConnectError, DriverError
 from drivers.ur.arm import UrArm
+from drivers.ur.control_process import ControlProcess
 from tests.wire.conftest import Station
 from tests.wire.test_ur_failures import (
     APPLICATION,
@@ -130,7 +131,7 @@ def kill(station: Station) -> None:
 
 def signal_child(number: signal.Signals) -> Do:
     def do(_: Station, arm: UrArm) -> None:
-        assert arm._control is not None
+        assert isinstance(arm._control, ControlProcess)
         os.kill(arm._control._process.pid, number)
 
     return do

@@ -43,6 +43,7 @@ class CommandLine:
             f'format = "{FORMAT}"\n'
             f'[robot]\nhost = "{cell.robot.host}"\nmodel = "{cell.robot.model}"\n'
             f"speed_deg_s = {cell.robot.speed_deg_s}\nacceleration_deg_s2 = {cell.robot.acceleration_deg_s2}\n"
+            f'control = "{cell.robot.control}"\napi_port = {cell.robot.api_port}\n'
             f'[sensor]\nurl = "{cell.sensor.url}"\n'
             f"[tool]\ncylinders_mm = {[list(row) for row in cell.tool.cylinders_mm]}\n"
             f'[workcell]\nmounting = "{cell.workcell.mounting}"\nmeasured = true\n'

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from ftdrive.cell.emulated import Station
+from ftdrive.commands.emulated_run import rehearse
 from tests.system.command_line import CommandLine, listen_for
 
 NAMED = {
@@ -22,6 +23,7 @@ NAMED = {
         "sensor.sign",
         "robot.speed",
         "robot.payload",
+        "robot.control",
         "robot.registers",
         "robot.programs",
         "robot.version",
@@ -104,6 +106,21 @@ def test_an_arm_that_cannot_be_controlled(ftdrive: CommandLine) -> None:
     assert bad_inputs == []
 
 
+@pytest.mark.slow
+def test_a_controller_without_dashboard_server(ftdrive: CommandLine) -> None:
+    """It completes, and reports what cannot be known; then a calibration completes."""
+    with Station("can", ["--polyscope", "10.11.0"]) as station:
+        checks = checks_of(ftdrive.run("doctor", "--config", ftdrive.connect(station), "--json"))
+        outcome = rehearse(station, ftdrive.folder, "without-dashboard", poses=6)
+    assert [name for name, check in checks.items() if check["state"] == "failed"] == []
+    assert checks["robot.remote"]["state"] == "skipped"
+    assert "does not report whether it accepts programs" in checks["robot.remote"]["found"]
+    assert "serial not reported" in checks["robot.identity"]["found"]
+    assert "script: PolyScope X has no dashboard server" in checks["robot.control"]["found"]
+    assert outcome.result.verdict != "rejected"
+    assert outcome.run.header()["devices"]["arm"]["facts"]["control"]["value"].startswith("script")
+
+
 slow = partial(pytest.param, marks=pytest.mark.slow)
 
 
@@ -111,13 +128,12 @@ slow = partial(pytest.param, marks=pytest.mark.slow)
     ("polyscope", "request_", "found", "fix"),
     [
         ("5.4.0", None, "model", 'model = "ur5e" under [robot]'),
-        ("10.7.0", None, "PolyScope X", "PolyScope 5"),
         slow("5.15.0", {"do": "silent", "what": "dashboard"}, "dashboard", "enable the dashboard server"),
         slow("5.15.0", {"do": "listen", "what": "dashboard", "on": False}, "dashboard", "enable the dashboard server"),
         slow("5.15.0", {"do": "listen", "what": "rtde", "on": False}, "refused", "enable RTDE"),
         slow("5.15.0", {"do": "silent", "what": "rtde"}, "did not answer", "finished starting"),
     ],
-    ids=["no model", "PolyScope X", "silent dashboard", "no dashboard", "no RTDE", "silent RTDE"],
+    ids=["no model", "silent dashboard", "no dashboard", "no RTDE", "silent RTDE"],
 )
 def test_each_way_not_to_reach_an_arm_has_its_own_cure(
     polyscope: str, request_: dict[str, Any] | None, found: str, fix: str, ftdrive: CommandLine

@@ -27,8 +27,6 @@ from ftdrive.session.operator import Key, Question
 from ftdrive.terminal.report import errors_in_sigma
 from tests.system.command_line import assert_found
 
-pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
-
 QUICK = (2, 4, 5, 7, 10, 12, 13, 15, 18, 20, 21, 23)
 """Of the paper's 24 orientations, as well conditioned as all of them."""
 

@@ -17,9 +17,12 @@ from drivers.clock import Clock
 from drivers.registry import sensor_from_url
 from drivers.streaming.sensor import StreamingSensor
 from drivers.ur.arm import UrArm
+from drivers.ur.control import ControlPath
+from drivers.ur.opening import path_for
 from drivers.ur.timing import UrTiming
 from ftdrive.cell.emulated_clock import EmulatedClock
 from tests.cell_time import CellTime
+from tests.ur_rtde import require_ur_rtde
 from tests.wire.station_process import StationProcess
 
 TIME_SCALE = 10
@@ -44,7 +47,8 @@ class Station(StationProcess):
 
     def arm(self, **how: Any) -> UrArm:
         """Make an arm that lives by the clock of this cell, if nothing else is said."""
-        given: dict[str, Any] = {"clock": self.clock, "timing": UrTiming.emulated(), **how}
+        api_port = self.hello["arm"].get("api_port", 80)
+        given: dict[str, Any] = {"clock": self.clock, "timing": UrTiming.emulated(), "api_port": api_port, **how}
         return UrArm(self.host, speed_rad_s=SPEED_RAD_S, acceleration_rad_s2=ACCELERATION_RAD_S2, **given)
 
     def is_as_new(self) -> bool:
@@ -95,11 +99,24 @@ def station(
         assert station.ask("state")["bad_inputs"] == []
 
 
+@pytest.fixture(params=["auto", pytest.param("script", marks=pytest.mark.slow)])
+def control(request: pytest.FixtureRequest) -> ControlPath:
+    """The control path of the arms of a test: the one that is taken here, and the one that is there everywhere."""
+    if request.param == "ur-rtde":
+        require_ur_rtde()
+    return path_for(request.param, (5, 15))[0]
+
+
+one_path = pytest.mark.parametrize("control", ["auto"], indirect=True)
+"""For tests of what has nothing to do with the control path."""
+on_ur_rtde = pytest.mark.parametrize("control", ["ur-rtde"], indirect=True)
+
+
 @pytest.fixture
-def new_arm(station: Station) -> Iterator[Callable[..., UrArm]]:
+def new_arm(station: Station, control: ControlPath) -> Iterator[Callable[..., UrArm]]:
     """Make arms at the station, and close them after the test."""
     with ExitStack() as arms:
-        yield lambda **how: arms.enter_context(closing(station.arm(**how)))
+        yield lambda **how: arms.enter_context(closing(station.arm(**{"control": control, **how})))
 
 
 @pytest.fixture

@@ -9,8 +9,6 @@ from drivers.interfaces import ArmStates, FtSamples
 from drivers.registry import sensor_from_url
 from tests.wire.conftest import Station
 
-pytest.importorskip("dashboard_client", reason="ur_rtde has no wheel for this platform")
-
 SECONDS = 2.0
 
 

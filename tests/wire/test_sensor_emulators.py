@@ -573,8 +573,9 @@ def test_net_box_pages(net_box: NetFtBox) -> None:
         assert b"<calsn>FT12345</calsn>" in client.page("/netftcalapi.xml?index=0")
         client.page("/comm.cgi?comrdtrate=700")
         assert b"<comrdtrate>700</comrdtrate>" in client.page("/netftapi2.xml")
-        with pytest.raises(urllib.error.HTTPError, match="404"):
+        with pytest.raises(urllib.error.HTTPError, match="404") as missing:
             client.page("/index.htm")
+        missing.value.close()
 
 
 def test_net_box_unplugged_leaves_its_ports_and_starts_again(net_box: NetFtBox) -> None:

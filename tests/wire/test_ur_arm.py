@@ -21,13 +21,12 @@ from scipy.spatial.transform import Rotation
 
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from drivers.ur.arm import UrArm
-from drivers.ur.control import ControlProcess
+from drivers.ur.control import Control
+from drivers.ur.control_process import ControlProcess
 from drivers.ur.kinematics import MODELS, forward
 from drivers.ur.timing import UrTiming
-from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, Station
+from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, Station, on_ur_rtde, one_path
 from tests.wire.waiting import wait_until
-
-pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 
 STEP_RAD = 1.2  # 1.3 s at the speed of these tests: long enough to be interrupted
 TCP = (0.1, -0.02, 0.25, 0.3, -1.2, 0.7)
@@ -72,6 +71,7 @@ def assert_flange_is_right(arm: UrArm) -> None:
     assert (tcp.inv() * Rotation.from_matrix(nominal.R)).magnitude() > 0.5  # there is something to take off
 
 
+@one_path
 def test_the_flange_does_not_depend_on_the_tcp(station: Station, new_arm: NewArm) -> None:
     arm = new_arm()
     arm.open()
@@ -97,6 +97,7 @@ def test_old_controllers_need_control_to_report_the_tcp(start_station: Callable[
         arm.close()
 
 
+@one_path
 def test_a_tcp_that_changes_while_reading_never_gives_a_wrong_flange(station: Station, new_arm: NewArm) -> None:
     arm = new_arm()
     arm.open()
@@ -112,6 +113,7 @@ def test_a_tcp_that_changes_while_reading_never_gives_a_wrong_flange(station: St
     assert len(seen) > 10
 
 
+@one_path
 def test_reading_disturbs_nothing_and_needs_no_remote_control(station: Station, arm: UrArm, new_arm: NewArm) -> None:
     reader = new_arm()
     q = away(arm)
@@ -134,6 +136,7 @@ def test_reading_disturbs_nothing_and_needs_no_remote_control(station: Station, 
     station.ask("remote-control", on=True)
 
 
+@one_path
 def test_identity_and_clock(station: Station, new_arm: NewArm) -> None:
     arm = new_arm()
     arm.open()
@@ -153,6 +156,7 @@ def test_identity_and_clock(station: Station, new_arm: NewArm) -> None:
     assert "ur-reader" not in left
 
 
+@one_path
 def test_status_is_what_the_controller_reports_now(station: Station, new_arm: NewArm) -> None:
     arm = new_arm()
     arm.open()
@@ -237,6 +241,7 @@ def test_an_arm_far_from_its_nominal_kinematics_is_refused(start_station: Callab
 # ---------------------------------------------------------------------- moving
 
 
+@pytest.mark.parametrize("control", ["auto", "script"], indirect=True)
 def test_move_stillness_and_limits(station: Station, arm: UrArm) -> None:
     q = away(arm, 0.6)
     calls: list[float] = []
@@ -254,6 +259,7 @@ def test_move_stillness_and_limits(station: Station, arm: UrArm) -> None:
     assert station.ask("state")["runtime_state"] == "STOPPED"
 
 
+@one_path
 def test_each_move_has_its_own_speed(station: Station, arm: UrArm) -> None:
     slow_rad_s, fast_rad_s2 = radians(3), radians(100)
     for by_rad, how, speed_rad_s, acceleration_rad_s2 in (
@@ -318,14 +324,16 @@ def test_a_second_ctrl_c_does_not_let_the_arm_move_on(
     station: Station, arm: UrArm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     q = away(arm)
-    call = ControlProcess.call
+    assert arm._control is not None
+    kind = type(arm._control)
+    call = kind.call
 
-    def interrupted(self: ControlProcess, name: str, *args: object, **how: Any) -> object:
+    def interrupted(self: Control, name: str, *args: object, **how: Any) -> object:
         if name == "stop":
             raise KeyboardInterrupt
         return call(self, name, *args, **how)
 
-    monkeypatch.setattr(ControlProcess, "call", interrupted)
+    monkeypatch.setattr(kind, "call", interrupted)
     with pytest.raises(KeyboardInterrupt):
         arm.move_to(q, timeout_s=30, guard=Trigger(arm, lambda: signal.raise_signal(signal.SIGINT)))
     state = station.wait_for(lambda state: not state["moving"])
@@ -355,8 +363,9 @@ def test_a_controller_that_is_gone(station: Station, arm: UrArm) -> None:
 
 
 @pytest.mark.slow
+@on_ur_rtde
 def test_a_control_process_that_is_gone(station: Station, arm: UrArm) -> None:
-    assert arm._control is not None
+    assert isinstance(arm._control, ControlProcess)
     pid = arm._control._process.pid
     q = away(arm)
     with pytest.raises(StreamBroken, match="control"):
@@ -370,10 +379,11 @@ def test_a_control_process_that_is_gone(station: Station, arm: UrArm) -> None:
 
 
 @pytest.mark.slow
+@on_ur_rtde
 def test_a_control_process_that_hangs(station: Station, new_arm: NewArm, caplog: pytest.LogCaptureFixture) -> None:
     arm = new_arm(timing=replace(UrTiming.emulated(), progress_s=2.0))
     arm.open(control=True)
-    assert arm._control is not None
+    assert isinstance(arm._control, ControlProcess)
     pid = arm._control._process.pid
     with pytest.raises(DeviceTimeout, match="did not answer"):
         arm.move_to(away(arm), timeout_s=30, guard=Trigger(arm, lambda: os.kill(pid, signal.SIGSTOP)))
@@ -384,6 +394,7 @@ def test_a_control_process_that_hangs(station: Station, new_arm: NewArm, caplog:
 
 
 @pytest.mark.slow
+@one_path
 def test_a_powered_off_arm(station: Station, new_arm: NewArm) -> None:
     arm = new_arm()
     station.dashboard("power off")

@@ -24,6 +24,7 @@ from mocks.clock import LEAD_NS
 from mocks.ur import rtde
 from mocks.ur.script import take_uploads
 from mocks.ur.variables import INPUTS, OUTPUTS
+from tests.ur_rtde import require_ur_rtde
 from tests.wire.rtde_socket import RtdeSocket
 from tests.wire.station_process import ROOT, StationProcess
 from tests.wire.waiting import LIMIT_S, wait_until
@@ -54,7 +55,7 @@ def fresh() -> Iterator[StationProcess]:
 
 def run_client(scenario: str, station: StationProcess, timeout_s: float = 90.0) -> dict[str, Any]:
     """Run a scenario of ur_emulator_client.py in its own process and hand its questions to the station."""
-    pytest.importorskip("rtde_control")
+    require_ur_rtde()
     client = subprocess.Popen(
         [sys.executable, str(Path(__file__).with_name("ur_emulator_client.py")), scenario, station.host],
         stdin=subprocess.PIPE,

@@ -22,6 +22,7 @@ from typing import Any
 import pytest
 
 from mocks.ur import rtde
+from tests.ur_rtde import require_ur_rtde
 from tests.wire.station_process import StationProcess
 from tests.wire.waiting import LIMIT_S
 
@@ -59,7 +60,7 @@ def play(scenario: str, station: StationProcess, *, hangs: bool = False) -> Play
 
     It is killed when it takes far too long, or when it `hangs` after the fact that it has begun.
     """
-    pytest.importorskip("rtde_control")
+    require_ur_rtde()
     client = subprocess.Popen(
         [sys.executable, str(CLIENT), scenario, station.host],
         stdin=subprocess.PIPE,

@@ -18,11 +18,13 @@ another program
 RTDE closed (FIN, RST)  `StreamBroken`    stopped through the dashboard  the same
 RTDE silent, then back  `DeviceTimeout`   stopped through the dashboard  the same
 all links cut, silent   `StreamBroken`,   finishes its move: nothing of  the same; `test_in_move` sees it stand
-or refused              `DeviceTimeout`   ours can reach it
+or refused              `DeviceTimeout`   ours can reach it. Stopped by
+                                          itself on the path script
 dashboard lost          nothing           goes on, and arrives           `test_what_disturbs_no_move`
 local mode, reduced     nothing           goes on, and arrives           `test_what_disturbs_no_move`
 slider at zero          `DeviceTimeout`   stopped, still ours            `test_a_slider_at_zero`
-our process killed      -                 stopped by the child           `test_ur_arm.py`
+our process killed      -                 stopped by the child, or by    `test_ur_arm.py`, `test_heartbeat.py`
+                                          itself on the path script
 the child killed, hung  `StreamBroken`,   stopped through the dashboard  `test_ur_arm.py`
                         `DeviceTimeout`
 both killed             -                 finishes its move; its         `test_both_processes_killed`
@@ -45,7 +47,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,11 +59,11 @@ import pytest
 from drivers.clock import REAL
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
 from drivers.ur.arm import UrArm
-from drivers.ur.control import ControlProcess
+from drivers.ur.control import Control, ControlPath
+from drivers.ur.control_process import ControlProcess
+from drivers.ur.opening import Opening
 from drivers.ur.timing import STRICT, UrTiming
-from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, TIME_SCALE, Station
-
-pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
+from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, TIME_SCALE, Station, on_ur_rtde, one_path
 
 ROOT = Path(__file__).parents[2]
 STEP_RAD = 1.2  # 1.3 s
@@ -107,7 +109,7 @@ def release(station: Station) -> None:
 
 def cut(station: Station, *, connected: bool) -> None:
     """Pull all cables, as TCP sees it, or plug them in."""
-    for what in ("rtde", "dashboard", "script"):
+    for what in ("rtde", "dashboard", "script", "primary"):
         station.ask("listen", what=what, on=connected)
         if not connected:
             station.ask("drop", what=what, reset=True)
@@ -176,7 +178,7 @@ EVENTS = [
         "stopped or paused",
         hits_opening=False,
     ),
-    Event("crash-script", on("crash-script"), nothing, DeviceFault, "stopped or paused", hits_opening=False),
+    Event("crash-script", on("crash-script"), nothing, DeviceFault, "stopped or paused|in line", hits_opening=False),
     Event(
         "foreign-program",
         another_takes_over,
@@ -193,12 +195,17 @@ EVENTS = [
         on("silent", what="rtde", on=True),
         on("silent", what="rtde", on=False),
         LOST,
-        "press the emergency",
+        "press the emergency|by itself",
     ),
     Event(
-        "cable", on("silence-arm", on=True), on("silence-arm", on=False), LOST, "press the emergency", reachable=False
+        "cable",
+        on("silence-arm", on=True),
+        on("silence-arm", on=False),
+        LOST,
+        "press the emergency|by itself",
+        reachable=False,
     ),
-    Event("freeze", on("freeze", on=True), on("freeze", on=False), LOST, "stood still", reachable=False),
+    Event("freeze", on("freeze", on=True), on("freeze", on=False), LOST, "stood still|sent nothing", reachable=False),
     Event(
         "cut",
         lambda s: cut(s, connected=False),
@@ -210,15 +217,20 @@ EVENTS = [
 ]
 
 
-def events(*names: str, fast: str = "") -> pytest.MarkDecorator:
-    """Parametrize by events, all where none is named; slow but for one."""
+def events(*names: str, fast: str = "", script: Sequence[str] | None = None) -> pytest.MarkDecorator:
+    """Parametrize by control path and event: all events where none is named; slow but for one.
+
+    `script` names those on the path of our own program, where the paths differ.
+    """
     return pytest.mark.parametrize(
-        "event",
+        ("control", "event"),
         [
-            pytest.param(event, marks=[] if event.name == fast else [slow])
+            pytest.param(path, event, marks=[] if (path, event.name) == ("auto", fast) else [slow])
+            for path in ("auto", "script")
             for event in EVENTS
-            if not names or event.name in names
+            if (not names or event.name in names) and (path == "auto" or script is None or event.name in script)
         ],
+        indirect=["control"],
         ids=str,
     )
 
@@ -293,19 +305,19 @@ class Once:
 
 
 @events(fast="protective-stop")
-def test_in_move(station: Station, new_arm: NewArm, event: Event) -> None:
-    befall_move(station, opened(new_arm()), event)
+def test_in_move(station: Station, new_arm: NewArm, event: Event, control: ControlPath) -> None:
+    befall_move(station, opened(new_arm()), event, stops_itself=control == "script")
 
 
 @realtime
 @pytest.mark.parametrize("event", EVENTS, ids=str)
-def test_in_move_in_time(station: Station, in_time: NewArm, event: Event) -> None:
-    reported_s, resumed_s = befall_move(station, opened(in_time()), event)
+def test_in_move_in_time(station: Station, in_time: NewArm, event: Event, control: ControlPath) -> None:
+    reported_s, resumed_s = befall_move(station, opened(in_time()), event, stops_itself=control == "script")
     assert reported_s < event.reported_s
     assert resumed_s < RESUMED_S
 
 
-def befall_move(station: Station, arm: UrArm, event: Event) -> tuple[float, float]:
+def befall_move(station: Station, arm: UrArm, event: Event, *, stops_itself: bool) -> tuple[float, float]:
     """Let it happen in a move, and fix it; return after how long it was reported, and the arm usable again."""
     q = away(arm)
     provoke = Once(lambda: event.do(station), wait_until_moving(arm))
@@ -317,6 +329,8 @@ def befall_move(station: Station, arm: UrArm, event: Event) -> tuple[float, floa
         assert abs(state["q_rad"][5] - q[5]) > 0.1
     event.fix(station)
     where = station.wait_for(lambda state: not state["moving"])["q_rad"]  # whatever it was, it is one move long
+    if stops_itself:
+        assert abs(where[5] - q[5]) > 0.1
     begin_s = REAL.now_s()
     moves_again(arm)
     resumed_s = REAL.now_s() - begin_s
@@ -324,7 +338,10 @@ def befall_move(station: Station, arm: UrArm, event: Event) -> tuple[float, floa
     return reported_s, resumed_s
 
 
-@events("protective-stop", "power-off", "program-stop", "foreign-program", "rtde-reset", "rtde-silent", "cut")
+@events(
+    *("protective-stop", "power-off", "program-stop", "foreign-program", "rtde-reset", "rtde-silent", "cut"),
+    script=("protective-stop", "foreign-program", "rtde-silent"),
+)
 def test_at_rest(station: Station, new_arm: NewArm, event: Event) -> None:
     arm = opened(new_arm())
     if event.name != "foreign-program":  # while it stands, it may be anybody's program
@@ -340,16 +357,19 @@ def test_at_rest(station: Station, new_arm: NewArm, event: Event) -> None:
     moves_again(arm)
 
 
-@events("protective-stop", "emergency-stop", "brakes", "rtde-fin", "rtde-silent", "cable", "freeze", "cut")
+@events(
+    *("protective-stop", "emergency-stop", "brakes", "rtde-fin", "rtde-silent", "cable", "freeze", "cut"),
+    script=("protective-stop", "cable", "cut"),
+)
 def test_while_opening(station: Station, new_arm: NewArm, event: Event, monkeypatch: pytest.MonkeyPatch) -> None:
-    start = ControlProcess.__init__
+    start = Opening._start
     provoke = Once(lambda: event.do(station))
 
-    def provoking(self: ControlProcess, *args: Any, **how: Any) -> None:
-        provoke()  # all was well, and the control process is about to start
-        start(self, *args, **how)
+    def provoking(self: Opening, path: ControlPath) -> Control:
+        provoke()  # all was well, and the control path is about to start
+        return start(self, path)
 
-    monkeypatch.setattr(ControlProcess, "__init__", provoking)
+    monkeypatch.setattr(Opening, "_start", provoking)
     arm = new_arm()
     with pytest.raises(ConnectError, match=event.says):
         arm.open(control=True)
@@ -357,7 +377,10 @@ def test_while_opening(station: Station, new_arm: NewArm, event: Event, monkeypa
     moves_again(arm)
 
 
-@events("protective-stop", "safeguard", "program-pause", "foreign-program", "rtde-fin", "rtde-silent", "cable")
+@events(
+    *("protective-stop", "safeguard", "program-pause", "foreign-program", "rtde-fin", "rtde-silent", "cable"),
+    script=("protective-stop", "foreign-program", "cable"),
+)
 def test_while_closing(station: Station, new_arm: NewArm, event: Event) -> None:
     arm = opened(new_arm())
     assert arm._control is not None
@@ -374,6 +397,7 @@ def test_while_closing(station: Station, new_arm: NewArm, event: Event) -> None:
 
 
 @slow
+@one_path
 @pytest.mark.parametrize(
     ("do", "fix"),
     [
@@ -394,12 +418,27 @@ def test_what_disturbs_no_move(station: Station, arm: UrArm, do: Act, fix: Act) 
     fix(station)
 
 
+@slow
+@pytest.mark.parametrize("control", ["script"], indirect=True)
+def test_the_port_of_our_program_may_close_in_a_move(station: Station, arm: UrArm) -> None:
+    """As it does when the pendant is switched to local control."""
+    q = away(arm, 0.5)
+
+    def switch() -> None:
+        station.ask("remote-control", on=False)
+        station.ask("drop", what="primary")
+
+    arm.move_to(q, timeout_s=MOVE_S, guard=Once(switch, wait_until_moving(arm)))
+    assert np.allclose(arm.state().q_rad, q, atol=1e-3)
+    station.ask("remote-control", on=True)
+
+
 @realtime
 def test_a_controller_that_comes_back_is_still_told_to_stop(station: Station, in_time: NewArm) -> None:
     arm = opened(in_time())
     q = away(arm)
     provoke = Once(lambda: station.ask("freeze", on=True), wait_until_moving(arm))
-    with pytest.raises(DeviceTimeout, match="press the emergency stop"):
+    with pytest.raises(LOST, match=r"press the emergency stop|by itself"):
         arm.move_to(q, timeout_s=MOVE_S, guard=provoke)
     assert provoke.ago_s() < REPORTED_S
     station.ask("freeze", on=False)
@@ -442,13 +481,15 @@ def test_a_slider_at_zero(station: Station, arm: UrArm) -> None:
 def test_an_end_before_the_goal_is_no_arrival(station: Station, arm: UrArm, monkeypatch: pytest.MonkeyPatch) -> None:
     where, q = arm.state().q_rad, away(arm)
     station.ask("slider", fraction=0.0)
-    call = ControlProcess.call
+    assert arm._control is not None
+    kind = type(arm._control)
+    call = kind.call
 
-    def hasty(self: ControlProcess, name: str, *args: object, **how: Any) -> object:
+    def hasty(self: Control, name: str, *args: object, **how: Any) -> object:
         return [True, False] if name == "progress" else call(self, name, *args, **how)
 
     with monkeypatch.context() as patch:
-        patch.setattr(ControlProcess, "call", hasty)  # as ur_rtde says it after it has connected again by itself
+        patch.setattr(kind, "call", hasty)  # as ur_rtde says it after it has connected again by itself
         with pytest.raises(DeviceFault, match="instead of"):
             arm.move_to(q, timeout_s=MOVE_S, guard=no_guard)
     station.ask("slider", fraction=1.0)
@@ -472,6 +513,7 @@ def test_a_move_paused_by_a_protective_stop_cannot_be_played(station: Station, a
 
 
 @slow
+@one_path
 def test_a_new_arm_moves_after_a_protective_stop(station: Station, arm: UrArm, new_arm: NewArm) -> None:
     station.ask("protective-stop")
     arm.close()
@@ -496,6 +538,7 @@ def test_a_program_of_another_client_is_not_stopped_by_leaving(
 
 
 @slow
+@one_path
 def test_a_program_of_another_client_found_before_a_move_is_left_alone(station: Station, arm: UrArm) -> None:
     q = away(arm)
     another_takes_over(station)
@@ -514,7 +557,7 @@ def test_a_program_that_cannot_be_asked_is_ended_by_leaving(
     def fail(*_: object, **__: object) -> object:
         raise StreamBroken("the control connection was lost")
 
-    monkeypatch.setattr(ControlProcess, "call", fail)
+    monkeypatch.setattr(type(arm._control), "call", fail)
     arm.close()
     assert station.ask("state")["runtime_state"] == "STOPPED"
 
@@ -553,8 +596,9 @@ def test_a_program_that_took_the_place_of_ours_is_not_ended_when_the_arm_is_open
 
 
 @slow
+@on_ur_rtde
 def test_what_runs_after_ours_was_seen_to_have_ended_is_not_ours(station: Station, arm: UrArm) -> None:
-    assert arm._control is not None
+    assert isinstance(arm._control, ControlProcess)
     os.kill(arm._control._process.pid, signal.SIGKILL)  # so that it cannot be asked whose program it runs
     station.wait_for(lambda _: arm._control is not None and not arm._control.alive)
     station.ask("dashboard-stop")
@@ -578,6 +622,7 @@ def refused(station: Station, **how: Any) -> ConnectError:
 
 
 @slow
+@on_ur_rtde
 def test_registers_of_a_fieldbus(station: Station, new_arm: NewArm) -> None:
     station.ask("claim-registers", range="lower", on=True)
     error = refused(station)
@@ -590,10 +635,10 @@ def test_registers_of_a_fieldbus(station: Station, new_arm: NewArm) -> None:
 
 
 @slow
-def test_a_second_client_does_not_stop_the_first(station: Station, arm: UrArm) -> None:
+def test_a_second_client_does_not_stop_the_first(station: Station, arm: UrArm, control: ControlPath) -> None:
     errors: list[ConnectError] = []
     q = away(arm, 0.8)
-    trying = threading.Thread(target=lambda: errors.append(refused(station)))
+    trying = threading.Thread(target=lambda: errors.append(refused(station, control=control)))
     arm.move_to(q, timeout_s=MOVE_S, guard=Once(trying.start, wait_until_moving(arm)))
     trying.join()
     assert "another client" in errors[0].found

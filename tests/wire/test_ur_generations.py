@@ -1,4 +1,4 @@
-"""`UrArm` with every generation of controllers: CB3, and PolyScope 5 from the oldest that ur_rtde controls."""
+"""`UrArm` with every generation of controllers: CB3, PolyScope 5 from the oldest that ur_rtde controls, PolyScope X."""
 
 import threading
 from collections.abc import Callable
@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConnectError, DeviceFault, ModelUnknown
+from drivers.interfaces import NOT_REPORTED
 from drivers.ur.arm import UrArm
 from drivers.ur.kinematics import MODELS, forward
 from tests.wire.conftest import TIME_SCALE, Station
 
-pytest.importorskip("rtde_control", reason="ur_rtde has no wheel for this platform")
 pytestmark = pytest.mark.slow
 
 
@@ -31,6 +31,8 @@ def no_guard() -> None:
         ("5.15.0", "UR16e"),
         ("5.23.0", "UR20"),
         ("5.26.0", "UR30"),
+        ("10.11.0", "UR20"),
+        ("10.14.0", "UR5e"),
     ],
 )
 def test_open_state_move_stop_limits_close(start_station: Callable[..., Station], polyscope: str, model: str) -> None:
@@ -49,7 +51,7 @@ def test_open_state_move_stop_limits_close(start_station: Callable[..., Station]
     )
     old = polyscope == "5.4.0"
     if old:
-        with pytest.raises(ModelUnknown, match="could not understand"):
+        with pytest.raises(ModelUnknown, match="does not report its model"):
             station.arm().open()
     with closing(station.arm(model=model if old else None)) as arm:
         use(arm, station, polyscope, model, tcp)
@@ -74,7 +76,8 @@ def use(arm: UrArm, station: Station, polyscope: str, model: str, tcp: str) -> N
     )
     assert status.tcp_offset == pytest.approx([float(value) for value in tcp.split(",")])
     assert (status.payload_kg is None) == (status.p_flange_payload_m is None) == old
-    assert arm.in_remote_control() is (None if old or polyscope.startswith("3") else True)
+    assert arm.in_remote_control() is (None if old or polyscope in ("3.15.8", "10.11.0") else True)
+    assert (arm.identify().serial == NOT_REPORTED) == (polyscope in ("5.4.0", "10.11.0"))
 
     q = arm.state().q_rad
     q[5] += -0.5 if q[5] > 0.5 else 0.5
@@ -106,7 +109,7 @@ def use(arm: UrArm, station: Station, polyscope: str, model: str, tcp: str) -> N
     ("polyscope", "control", "found", "fix"),
     [
         ("5.3.0", True, "PolyScope 5.3", "5.4"),
-        ("10.7.0", False, "PolyScope X", "PolyScope 5 or the CB3 generation"),
+        ("10.7.0", True, "PolyScope 10.7", "10.11"),
     ],
 )
 def test_versions_that_cannot_be_used(
@@ -117,5 +120,21 @@ def test_versions_that_cannot_be_used(
         station.arm(model="UR5e").open(control=control)
     assert found in error.value.found
     assert fix in error.value.fix
+    assert station.ask("state")["runtime_state"] == "STOPPED"
+    station.kill()
+
+
+def test_local_control_shows_itself_when_the_program_is_refused(start_station: Callable[..., Station]) -> None:
+    """PolyScope X before 10.12 does not report its control mode."""
+    station = start_station("--polyscope", "10.11.0")
+    station.ask("remote-control", on=False)
+    with closing(station.arm()) as arm:
+        arm.open()
+        assert arm.in_remote_control() is None
+        with pytest.raises(ConnectError, match="takes no programs from the network") as error:
+            arm.open(control=True)
+        assert "remote control" in error.value.fix
+        station.ask("remote-control", on=True)
+        arm.open(control=True)
     assert station.ask("state")["runtime_state"] == "STOPPED"
     station.kill()

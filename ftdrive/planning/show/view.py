@@ -1,6 +1,7 @@
 """A plan in three dimensions, in the browser, with a slider along the tour."""
 
 import os
+import sys
 import webbrowser
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
@@ -53,7 +54,7 @@ def shown(plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Array = (
 
 def open_in_browser(url: str) -> None:
     """Show a page where there is a screen."""
-    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+    if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         webbrowser.open(url)
 
 

@@ -292,6 +292,13 @@ def test_a_package_that_cannot_be_imported_is_named(install: Install, source: st
         sensor_from_url("broken://x")
 
 
+def test_a_driver_that_this_system_cannot_run_asks_for_linux(install: Install) -> None:
+    lacking = "raise ModuleNotFoundError('as on Windows', name='termios')"
+    install("posix_ft", "[ftdrive.sensors]\nposix = posix_ft:Sensor\n", lacking)
+    with pytest.raises(BadUrl, match=r"the driver 'posix' cannot be imported .*: use Linux"):
+        sensor_from_url("posix://x")
+
+
 def test_a_class_that_is_no_driver_is_named(install: Install) -> None:
     install("odd_ft", "[ftdrive.sensors]\nodd = odd_ft:Sensor\n", "class Sensor:\n    pass\n")
     with pytest.raises(BadUrl, match=r"odd://x: odd_ft:Sensor has no from_url, .*; reinstall odd_ft"):

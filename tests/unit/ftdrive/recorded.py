@@ -28,11 +28,16 @@ CONFIGURATION = {"robot": {"host": "10.0.0.2"}, "sensor": {"url": "ati-can://can
 
 
 @cache
-def calibration() -> CalibrationResult:
+def dataset() -> CalibrationDataset:
     R = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
     means = predict(TRUTH, R) + np.random.default_rng(0).normal(0, NOISE / 20, (24, 6))
     cov = np.tile(np.diag((NOISE / 20) ** 2), (24, 1, 1))
-    return solve(CalibrationDataset(R, means, cov, np.full(24, 400), np.full(24, np.nan)))
+    return CalibrationDataset(R, means, cov, np.full(24, 400), np.full(24, np.nan))
+
+
+@cache
+def calibration() -> CalibrationResult:
+    return solve(dataset())
 
 
 @cache

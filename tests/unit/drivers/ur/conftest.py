@@ -4,6 +4,7 @@ import pytest
 
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import Controller, install
+from tests.unit.drivers.ur.program_in_memory import Script, install_script
 
 
 @pytest.fixture
@@ -16,3 +17,9 @@ def controller(clock: FakeClock, monkeypatch: pytest.MonkeyPatch) -> Controller:
     controller = Controller(clock)
     install(controller, monkeypatch)
     return controller
+
+
+@pytest.fixture
+def script(controller: Controller, monkeypatch: pytest.MonkeyPatch) -> Script:
+    """The script path of the controller."""
+    return install_script(controller, monkeypatch)

@@ -1,7 +1,8 @@
-"""A UR controller, its dashboard server and the control process, all in memory and on a `FakeClock`.
+"""A UR controller, its dashboard server and both control paths, all in memory and on a `FakeClock`.
 
 The parts of `UrArm` that touch sockets and processes are replaced: the subscription, the dashboard client, the pipe to
 the control process and ur_rtde inside it. Everything else, `Calls` of the control process included, is the real code.
+The control program of the script path is in `program_in_memory.py`.
 """
 
 import json
@@ -18,16 +19,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drivers.clock import Clock
 from drivers.errors import NoDashboard
 from drivers.ur import arm as arm_module
-from drivers.ur import control_child, reading
-from drivers.ur.control import ControlProcess
-from drivers.ur.dashboard import Dashboard
+from drivers.ur import control_child, opening, reading
+from drivers.ur.control_process import ControlProcess
 from drivers.ur.kinematics import MODELS, Pose, forward
 from drivers.ur.reading import Reader
 from drivers.ur.rtde import Recipe
 from drivers.ur.sample import OUTPUTS
+from drivers.ur.services import Services, ServicesOf
 from drivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
 
@@ -62,6 +62,7 @@ class Controller:
         self.unknown: set[str] = set()
         """Outputs it does not know."""
         self.registers_taken = False
+        self.ur_rtde_is_installed = True
         self.silent = False
         """It sends no samples."""
         self.held_back = False
@@ -85,6 +86,7 @@ class Controller:
         self.stalled_until_s = self._arrives_s = 0.0
         self._sent: deque[bytes] = deque()
         self._operation = 0
+        self._services = ServicesInMemory(self)
 
     # ------------------------------------------------------------------ RTDE
 
@@ -191,41 +193,15 @@ class Controller:
 
     # ------------------------------------------------------------------ dashboard server
 
-    def ask_dashboard(
-        self, host: str, ask: Callable[[Dashboard], Any], *, timeout_s: float, clock: Clock, **_: float
-    ) -> Any:
-        assert host == HOST
+    def ask(self, question: Callable[[Services], Any], timeout_s: float) -> Any:
         self.dashboard_limits_s.append(timeout_s)
         if self.dashboard_late_s is not None:
-            self.clock.at(self.dashboard_late_s, lambda: ask(self))
+            self.clock.at(self.dashboard_late_s, lambda: question(self._services))
         if self.dashboard_late_s is not None or not self.dashboard_answers:
-            clock.sleep(timeout_s)
+            self.clock.sleep(timeout_s)
             raise NoDashboard("the dashboard server does not answer")
-        clock.sleep(0.02)
-        return ask(self)
-
-    def connect(self, timeout_ms: int) -> None: ...
-
-    def disconnect(self) -> None: ...
-
-    def stop(self) -> None:
-        self.did.append("dashboard stop")
-        self.program, self.goal_rad = 1, None
-
-    def getRobotModel(self) -> str:
-        return "UR5"
-
-    def getSerialNumber(self) -> str:
-        return "20225500001"
-
-    def polyscopeVersion(self) -> str:
-        return "5.15.0"
-
-    def programState(self) -> str:
-        return "PLAYING other.urp"
-
-    def isInRemoteControl(self) -> bool:
-        return True
+        self.clock.sleep(0.02)
+        return question(self._services)
 
     # ------------------------------------------------------------------ ur_rtde in the control process
 
@@ -281,6 +257,34 @@ class Controller:
         return True
 
 
+class ServicesInMemory:
+    """A dashboard server."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._far = controller
+
+    def stop(self) -> None:
+        self._far.did.append("dashboard stop")
+        self._far.program, self._far.goal_rad = 1, None
+
+    def model(self) -> str | None:
+        return "UR5"
+
+    def serial(self) -> str | None:
+        return "20225500001"
+
+    def polyscope(self) -> str | None:
+        return "5.15.0"
+
+    def program(self) -> str | None:
+        return "PLAYING other.urp"
+
+    def in_remote_control(self) -> bool | None:
+        return True
+
+    def close(self) -> None: ...
+
+
 class ControlInMemory(ControlProcess):
     """The control process without a process: its answers come by the fake clock."""
 
@@ -289,7 +293,7 @@ class ControlInMemory(ControlProcess):
         self._calls = control_child.Calls(controller)
         self._asked = 0
         self._hangs = False
-        super().__init__(HOST, 125.0, clock=controller.clock, timing=timing)
+        super().__init__(HOST, clock=controller.clock, timing=timing)
         assert isinstance(self._process, ProcessInMemory)
         self._process.take = self._take
         controller.clock.at(controller.starts_in_s, self._start)
@@ -381,11 +385,11 @@ def install(controller: Controller, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subprocess, "Popen", ProcessInMemory)
     monkeypatch.setattr(time, "sleep", controller.clock.sleep)  # in `Calls`
     monkeypatch.setattr(reading, "Subscription", lambda *_, **__: controller)
-    monkeypatch.setattr(reading, "ask_dashboard", controller.ask_dashboard)
-    monkeypatch.setattr(arm_module, "ask_dashboard", controller.ask_dashboard)
-    monkeypatch.setattr(arm_module, "find_script_port", lambda *_, **__: None)
-    monkeypatch.setattr(arm_module, "registers_in_use", lambda _, names, **__: [*names] * controller.registers_taken)
+    monkeypatch.setattr(ServicesOf, "ask", lambda _, question, *, timeout_s, **__: controller.ask(question, timeout_s))
+    monkeypatch.setattr(opening, "find_spec", lambda _: controller.ur_rtde_is_installed or None)
+    monkeypatch.setattr(opening, "find_program_port", lambda *_, **__: None)
+    monkeypatch.setattr(opening, "registers_in_use", lambda _, names, **__: [*names] * controller.registers_taken)
     monkeypatch.setattr(
         arm_module, "Reader", lambda _, model, *, timing, **__: ReaderInMemory(controller, model, timing)
     )
-    monkeypatch.setattr(arm_module, "ControlProcess", lambda *_, timing, **__: ControlInMemory(controller, timing))
+    monkeypatch.setattr(opening, "ControlProcess", lambda *_, timing, **__: ControlInMemory(controller, timing))

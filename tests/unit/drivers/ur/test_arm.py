@@ -13,19 +13,33 @@ import pytest
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from drivers.interfaces import Guard
 from drivers.ur import arm as arm_module
-from drivers.ur import dashboard
+from drivers.ur import opening
 from drivers.ur.arm import UrArm
+from drivers.ur.control import Control, ControlSetting
 from drivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import HOST, ControlInMemory, Controller
 
 MakeArm = Callable[..., UrArm]
 
+on_ur_rtde = pytest.mark.parametrize("path", ["ur-rtde"], indirect=True)
+on_script = pytest.mark.parametrize("path", ["script"], indirect=True)
+
+
+@pytest.fixture(params=["ur-rtde", "script"])
+def path(request: pytest.FixtureRequest) -> ControlSetting:
+    """The control path; both find the controller in memory."""
+    request.getfixturevalue("script")
+    setting: ControlSetting = request.param
+    return setting
+
 
 @pytest.fixture
-def make_arm(controller: Controller) -> MakeArm:
+def make_arm(controller: Controller, path: ControlSetting) -> MakeArm:
     def make(timing: UrTiming = STRICT) -> UrArm:
-        return UrArm(HOST, speed_rad_s=1.0, acceleration_rad_s2=3.0, clock=controller.clock, timing=timing)
+        return UrArm(
+            HOST, speed_rad_s=1.0, acceleration_rad_s2=3.0, control=path, clock=controller.clock, timing=timing
+        )
 
     return make
 
@@ -37,8 +51,8 @@ def arm(make_arm: MakeArm) -> UrArm:
     return arm
 
 
-def control_of(arm: UrArm) -> ControlInMemory:
-    assert isinstance(arm._control, ControlInMemory)
+def control_of(arm: UrArm) -> Control:
+    assert arm._control is not None
     return arm._control
 
 
@@ -129,13 +143,36 @@ def test_importing_the_driver_does_not_load_ur_rtde() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_without_ur_rtde_the_error_says_where_it_exists(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> None:
-        raise ModuleNotFoundError(f"No module named {name!r}")
-
-    monkeypatch.setattr(dashboard, "import_module", missing)
+@on_ur_rtde
+def test_without_ur_rtde_the_error_says_where_it_exists(make_arm: MakeArm, controller: Controller) -> None:
+    controller.ur_rtde_is_installed = False
     with pytest.raises(ConnectError, match=r"CPython 3\.11 or 3\.12"):
-        dashboard.ask_dashboard(HOST, lambda _: None, timeout_s=1)
+        make_arm().open(control=True)
+    assert controller.did == []
+
+
+@pytest.mark.parametrize(
+    ("setting", "version", "installed", "path", "why"),
+    [
+        ("auto", (5, 15), True, "ur-rtde", "is installed"),
+        ("auto", (5, 15), False, "script", "not installed"),
+        ("auto", (10, 11), True, "script", "no dashboard server"),
+        ("script", (5, 15), True, "script", "configured"),
+        ("ur-rtde", (5, 15), False, "ur-rtde", "configured"),
+    ],
+)
+def test_auto_takes_ur_rtde_where_it_can(
+    setting: ControlSetting, version: tuple[int, ...], installed: bool, path: str, why: str, controller: Controller
+) -> None:
+    controller.ur_rtde_is_installed = installed
+    taken, reason = opening.path_for(setting, version)
+    assert taken == path
+    assert why in reason
+
+
+def test_an_unknown_control_path_is_refused() -> None:
+    with pytest.raises(ValueError, match="auto, ur-rtde, script"):
+        UrArm(HOST, control="urscript")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -147,7 +184,7 @@ def test_without_ur_rtde_the_error_says_where_it_exists(monkeypatch: pytest.Monk
     ],
 )
 def test_the_librarys_words_become_advice(words: str, found: str, fix: str) -> None:
-    error = arm_module._refusal(HOST, words)
+    error = opening._refusal(HOST, "ur-rtde", StreamBroken(words))
     assert found in error.found
     assert fix in error.fix
 
@@ -173,7 +210,7 @@ def test_reading_starts_nothing(make_arm: MakeArm, controller: Controller) -> No
 
 
 @pytest.mark.parametrize("taken", [False, True])
-@pytest.mark.parametrize("minor", [15, 3])
+@pytest.mark.parametrize("minor", [15, 2])
 def test_what_control_needs_is_diagnosed_without_control(
     taken: bool, minor: int, make_arm: MakeArm, controller: Controller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -183,8 +220,8 @@ def test_what_control_needs_is_diagnosed_without_control(
     arm.open()
     found = {finding.name: finding for finding in arm.diagnose()}
     passed = {name: finding.passed for name, finding in found.items()}
-    assert passed == {"version": minor == 15, "registers": not taken, "programs": True}
-    assert ("5.4" in found["version"].fix) == (minor == 3)
+    assert passed == {"control": True, "version": minor == 15, "registers": not taken, "programs": True}
+    assert ("update it to 5." in found["version"].fix) == (minor == 2)
     assert ("EtherNet/IP" in found["registers"].fix) == taken
 
 
@@ -311,20 +348,26 @@ def test_still_needs_no_goal_where_the_arm_was_sent_nowhere(arm: UrArm, clock: F
 
 
 def test_a_silent_controller_is_found_in_a_fifth_of_a_second(
-    arm: UrArm, controller: Controller, clock: FakeClock
+    arm: UrArm, controller: Controller, clock: FakeClock, path: ControlSetting
 ) -> None:
     """Reported after 0.2 s and one short attempt at the dashboard server; the soft stop is not tried."""
     controller.dashboard_answers = False
     provoke = After(clock, 0.3, setting(controller, silent=True))
-    with pytest.raises(DeviceTimeout, match="press the emergency stop"):
+    says = "press the emergency stop" if path == "ur-rtde" else "stops the arm by itself"
+    with pytest.raises(DeviceTimeout, match=says):
         move(arm, controller, provoke)
     assert 0.2 < provoke.ago_s() < 0.2 + 0.15 + 0.02
     assert controller.dashboard_limits_s[-1] == 0.15
-    assert "stop softly" not in controller.did
     controller.silent, controller.dashboard_answers = False, True
     controller.dashboard_limits_s.clear()
     arm.open(control=True)  # what was left there is ended first
-    assert controller.did == ["start our program", "move", "dashboard stop", "start our program"]
+    ended = ["dashboard stop"] if path == "ur-rtde" else ["stop softly"]  # by itself
+    assert [did for did in controller.did if did != "end our program"] == [
+        "start our program",
+        "move",
+        *ended,
+        "start our program",
+    ]
 
 
 def test_a_lost_connection_is_reported_at_once(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
@@ -336,6 +379,7 @@ def test_a_lost_connection_is_reported_at_once(arm: UrArm, controller: Controlle
     assert controller.dashboard_limits_s[-1] == 0.4
 
 
+@on_ur_rtde
 @pytest.mark.parametrize(("answers_in_s", "ours"), [(0.38, True), (0.42, False)])
 def test_a_question_to_our_program_has_four_tenths_of_a_second(
     arm: UrArm, controller: Controller, clock: FakeClock, answers_in_s: float, ours: bool
@@ -363,8 +407,10 @@ def test_another_program_found_before_a_move_is_left_alone(arm: UrArm, controlle
     assert controller.did == ["start our program"]
 
 
-@pytest.mark.parametrize("hanging", ["progress", "move"])
-def test_a_control_process_that_hangs_is_killed(
+@pytest.mark.parametrize(
+    ("path", "hanging"), [("ur-rtde", "progress"), ("ur-rtde", "move"), ("script", "move")], indirect=["path"]
+)
+def test_a_control_path_that_hangs_is_killed(
     arm: UrArm, controller: Controller, clock: FakeClock, hanging: str
 ) -> None:
     controller.hanging = {hanging}
@@ -376,8 +422,11 @@ def test_a_control_process_that_hangs_is_killed(
     assert controller.did[-1] == "dashboard stop"
 
 
+@on_ur_rtde
 def test_a_control_process_that_ends_is_reported_at_once(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
-    provoke = After(clock, 0.3, lambda: control_of(arm).die())
+    control = control_of(arm)
+    assert isinstance(control, ControlInMemory)
+    provoke = After(clock, 0.3, control.die)
     with pytest.raises(StreamBroken, match=r"control.* ended \(exit code -11\)"):
         move(arm, controller, provoke)
     assert provoke.ago_s() < 0.05
@@ -429,12 +478,14 @@ def test_a_safety_stop_is_the_reason_of_an_ended_program(arm: UrArm, controller:
     ids=["works", "without effect", "hangs", "safety stop", "program ended"],
 )
 def test_the_ways_to_stop(
-    arm: UrArm, controller: Controller, clock: FakeClock, trouble: dict[str, Any], ways: list[str]
+    arm: UrArm, controller: Controller, clock: FakeClock, path: ControlSetting, trouble: dict[str, Any], ways: list[str]
 ) -> None:
     control_of(arm).call("move", away(controller), 1.0, 3.0)
     setting(controller, **trouble)()
     before, begin_s = len(controller.did), clock.now_s()
     arm.stop()
+    if path == "script" and "stopping_works" in trouble:
+        ways = ["stop softly", "stop softly", "end our program", "dashboard stop"]  # it is asked to end, too
     assert controller.did[before:] == ways
     assert control_of(arm).alive == (ways == ["stop softly"])
     assert clock.now_s() - begin_s < (0.85 if "hanging" in trouble else 0.25)  # 0.5 s, and the braking

@@ -15,7 +15,7 @@ import pytest
 from drivers.clock import REAL
 from drivers.errors import StreamBroken
 from drivers.ur import control_child
-from drivers.ur.control import ControlProcess
+from drivers.ur.control_process import ControlProcess
 from drivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import Controller
@@ -87,7 +87,7 @@ def test_what_the_library_says_comes_with_a_cure(tmp_path: Path, monkeypatch: py
         '    print(json.dumps({"id": json.loads(line)["id"], "error": "the connection was lost"}), flush=True)\n'
     )
     monkeypatch.setattr(control_child, "__file__", str(child))
-    control = ControlProcess("10.0.0.1", 125.0, clock=REAL, timing=UrTiming.emulated())
+    control = ControlProcess("10.0.0.1", clock=REAL, timing=UrTiming.emulated())
     try:
         control.wait_until_ready(lambda: None)
         with pytest.raises(StreamBroken, match="was lost") as error:

@@ -174,8 +174,8 @@ def stations(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Sequence[str]]]
         cell = CellConfig(RobotConfig("127.0.0.1"), SensorConfig("emulated://"))
         truth: Mapping[str, Any] = MappingProxyType({})
 
-        def __init__(self, sensor: str, options: Sequence[str] = ()) -> None:
-            super().__init__(sensor, options)
+        def __init__(self, sensor: str, options: Sequence[str] = (), *, control_path: str = "auto") -> None:
+            super().__init__(sensor, options, control_path=control_path)
             found.append((sensor, tuple(options)))
 
         def __enter__(self) -> "Emulated":

@@ -13,7 +13,7 @@ from ftdrive.commands import demo, emulated_run
 from ftdrive.runs.run import Run
 from ftdrive.session.events import Event, Noted, RunOpened
 
-STATION: Any = SimpleNamespace(sensor="can", options=(), truth={"mass_kg": 0.5}, cell=None)
+STATION: Any = SimpleNamespace(sensor="can", options=(), control_path="auto", truth={"mass_kg": 0.5}, cell=None)
 
 
 class Listener:
@@ -57,7 +57,7 @@ def test_the_demo_names_its_next_commands_as_they_can_be_typed(
     run = Run(Path("runs/a"))
     monkeypatch.setattr(Run, "records", lambda _: [])
     outcome = SimpleNamespace(run=run, result=SimpleNamespace(verdict="good"), drift=None)
-    monkeypatch.setattr(demo, "Station", lambda *_: nullcontext(STATION))
+    monkeypatch.setattr(demo, "Station", lambda *_, **__: nullcontext(STATION))
     monkeypatch.setattr(demo, "rehearse", lambda *_: outcome)
     monkeypatch.setattr(demo, "print_result", lambda *_, **__: None)
     with capsys.disabled():

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from syrupy.assertion import SnapshotAssertion
 
+from ftdrive import cli
 from ftdrive.errors import Declined
 from ftdrive.session.events import (
     Asked,
@@ -254,3 +255,16 @@ def test_checks_that_pass_share_a_line_and_details_need_verbose() -> None:
     brief_of_each = [f" {mark} {name}: about {name}" for mark, name in (("✔", "robot"), ("✘", "load"), ("✔", "disk"))]
     assert printed(verbose=True)[:4] == ["Checks", *brief_of_each]
     assert "coverage amber" in printed(verbose=True)[4]
+
+
+def test_a_terminal_that_cannot_discard_early_answers_gives_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setitem(sys.modules, "termios", None)  # as on Windows
+    typed = Terminal("MOVE\n")
+    with pytest.raises(ModuleNotFoundError) as error:
+        PlainOperator(stdin=typed, stderr=io.StringIO()).ask(Question("Type MOVE", ("MOVE",)))
+    assert typed.tell() == 0
+    assert cli.exit_code(error.value) == 2

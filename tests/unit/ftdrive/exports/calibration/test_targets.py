@@ -199,7 +199,7 @@ def test_mujoco_has_the_tool_at_the_site_of_the_sensor_and_the_parameters_of_the
     assert float(inertial.attrib["mass"]) == pytest.approx(2.0)
     assert inertial.attrib["diaginertia"] == "0 0 0"
     assert "not identified" in text.partition("<inertial ")[0].rpartition("<body")[2]
-    sensors = [(one.tag, one.get("name"), one.get("site")) for one in ET.fromstring(text).find("sensor") or ()]
+    sensors = [(one.tag, one.get("name"), one.get("site")) for one in ET.fromstring(text).iterfind("sensor/*")]
     assert sensors == [("force", "ft_sensor_force", "ft_sensor"), ("torque", "ft_sensor_torque", "ft_sensor")]
     parameters = yaml.safe_load("/**:" + text.partition("/**:")[2].partition("-->")[0])
     plugin = parameters["/**"]["ros__parameters"]["mujoco_plugins"]["fts_grav_comp_plugin"]

@@ -1,0 +1,303 @@
+"""The control path through a program of ours: its text, the heartbeat, what ends it; on a fake clock."""
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from drivers.ur import control_program
+from drivers.ur.arm import UrArm
+from drivers.ur.control_child import DECELERATION_RAD_S2
+from drivers.ur.control_program import OUTPUTS, program_text
+from drivers.ur.primary import Code, Failed, Note, Stopped
+from drivers.ur.script_control import STOPS_ITSELF_S
+from tests.fake_clock import FakeClock
+from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, HOST, Controller
+from tests.unit.drivers.ur.program_in_memory import COMMANDS, Script, ScriptInMemory
+
+MakeArm = Callable[[], UrArm]
+
+
+@pytest.fixture
+def make_arm(controller: Controller, request: pytest.FixtureRequest) -> MakeArm:
+    request.getfixturevalue("script")
+    return lambda: UrArm(HOST, speed_rad_s=1.0, acceleration_rad_s2=3.0, control="script", clock=controller.clock)
+
+
+@pytest.fixture
+def arm(make_arm: MakeArm) -> UrArm:
+    arm = make_arm()
+    arm.open(control=True)
+    return arm
+
+
+def control_of(arm: UrArm) -> ScriptInMemory:
+    assert isinstance(arm._control, ScriptInMemory)
+    return arm._control
+
+
+def away(controller: Controller) -> list[float]:
+    return [*controller.q_rad[:5], controller.q_rad[5] + 1.0]  # 1 s
+
+
+def no_guard() -> None:
+    pass
+
+
+# ---------------------------------------------------------------------- the program
+
+
+@pytest.mark.parametrize("version", [(3, 15), (5, 9), (5, 15), (10, 11)])
+def test_the_program_is_complete(version: tuple[int, int]) -> None:
+    text = program_text(123456, version)
+    code = [line.split("#")[0].strip() for line in text.splitlines()]
+    assert "$" not in "".join(code)
+    assert "ft_token = 123456" in code[[line.startswith("def ") for line in code].index(True) + 1]
+    assert f"ft_deceleration = {DECELERATION_RAD_S2}" in text
+    assert ("set_target_payload(" in text) == (version >= (5, 10))
+    opened = sum(bool(re.match(r"(def|thread|if|while)\b.*:$", line)) for line in code)
+    assert opened == code.count("end")
+    assert text.isascii()
+
+
+def test_program_and_driver_agree_on_registers_and_commands() -> None:
+    text = program_text(1, (5, 15))
+    assert {int(k) for k in re.findall(r"read_input_integer_register\((\d+)\)", text)} == {32, 33, 34, 35}
+    written = {int(k) for k in re.findall(r"write_output_integer_register\((\d+),", text)}
+    assert written == {32, 33, 34, 35}
+    numbers = {int(k) for k in re.findall(r"ft_number\((\d+)\)", text)}
+    assert numbers == set(range(10))
+    for command in (f"input_int_register_{k}" for k in range(32, 36)):
+        assert command in control_program.INPUTS
+    named = {int(number): name for name, number in re.findall(r"global ft_(\w+) = ([1-7])\n", text)}
+    assert len(named) == len(control_program.COMMANDS) == len(COMMANDS)
+    for name, number in control_program.COMMANDS.items():
+        stem = {"within_safety_limits": "limits", "quit": "end"}.get(name, name.removeprefix("set_").split("_")[0])
+        assert named[number] == stem
+
+
+# ---------------------------------------------------------------------- the heartbeat
+
+
+@pytest.mark.usefixtures("arm")
+def test_every_sample_is_answered_with_one_heartbeat(script: Script, clock: FakeClock) -> None:
+    beats: list[float] = []
+    for _ in range(20):
+        clock.advance(CYCLE_S)
+        beats.append(script.registers.inputs[0])
+    assert len(set(beats)) == 20
+    script.link._sent.clear()
+    script.registers.far.silent = True
+    before = script.registers.inputs[0]
+    clock.advance(0.1)
+    assert script.registers.inputs[0] == before
+
+
+def test_a_repeated_sample_is_no_sign_of_life(
+    arm: UrArm, script: Script, clock: FakeClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    repeated = script.registers.far.t_s
+    monkeypatch.setattr(script.link, "decode", lambda _: script_control_sample(script, repeated))
+    clock.advance(2 * CYCLE_S)
+    before = script.registers.inputs[0]
+    clock.advance(0.3)
+    assert script.registers.inputs[0] == before
+    assert not control_of(arm).alive
+
+
+def script_control_sample(script: Script, t_s: float) -> dict[str, NDArray[np.float64]]:
+    return {name: np.array([value]) for name, value in zip(OUTPUTS, (t_s, *script.registers.outputs), strict=True)}
+
+
+@pytest.mark.parametrize("how", ["suspended", "cut", "killed"])
+@pytest.mark.parametrize("delay_s", [0.3, 0.302, 0.305, 0.307])
+def test_an_arm_without_heartbeat_stops_within_three_tenths_of_a_second(
+    arm: UrArm, script: Script, controller: Controller, clock: FakeClock, how: str, delay_s: float
+) -> None:
+    control = control_of(arm)
+    control.call("move", away(controller), 1.0, 3.0)
+    clock.advance(delay_s)
+    assert controller.goal_rad is not None
+    last = script.registers.inputs[0]
+    if how == "cut":
+        script.link.cut = True
+    else:
+        control.suspended = True
+        if how == "killed":
+            script.link.closed = True
+    clock.advance(STOPS_ITSELF_S)
+    assert script.registers.inputs[0] == last
+    assert controller.goal_rad is None
+    assert controller.did[-1] == "stop softly"
+    assert not script.registers.running
+    assert script.registers.outputs[1] == -2
+
+
+def test_a_lost_link_is_found_as_soon(arm: UrArm, script: Script, controller: Controller, clock: FakeClock) -> None:
+    """Its own connection alone falls silent; the reader's goes on."""
+    begin_s: list[float] = []
+
+    def cut() -> None:
+        script.link.cut = True
+        begin_s.append(clock.now_s())
+
+    clock.at(0.3, cut)
+    with pytest.raises((StreamBroken, DeviceTimeout)) as error:
+        arm.move_to(away(controller), timeout_s=5, guard=no_guard)
+    assert clock.now_s() - begin_s[0] < 0.5
+    assert "stop" in str(error.value)
+    assert "emergency" not in str(error.value)
+    assert controller.goal_rad is None
+
+
+def test_after_a_suspension_the_reason_is_reported(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    control = control_of(arm)
+
+    def suspend() -> None:
+        control.suspended = controller.held_back = True
+        clock.advance(2.0)
+        control.suspended = controller.held_back = False
+
+    asleep = [suspend]
+    with pytest.raises(DeviceTimeout, match=r"no heartbeat for 0\.2 s; keep the computer awake"):
+        arm.move_to(away(controller), timeout_s=9, guard=lambda: (asleep and asleep.pop()()) or None)
+    assert controller.goal_rad is None
+    assert "dashboard stop" not in controller.did  # it could stop another program: ours has ended
+    arm.open(control=True)
+    arm.move_to(away(controller), timeout_s=5, guard=no_guard)
+
+
+def test_a_lost_controller_is_reported_with_what_the_arm_does(
+    arm: UrArm, controller: Controller, clock: FakeClock
+) -> None:
+    controller.dashboard_answers = False
+    clock.at(0.3, lambda: setattr(controller, "silent", True))
+    with pytest.raises(DeviceTimeout, match=r"stood still .*stops the arm by itself within 0\.3 s"):
+        arm.move_to(away(controller), timeout_s=5, guard=no_guard)
+
+
+# ---------------------------------------------------------------------- nothing moves late
+
+
+def test_a_program_that_starts_after_it_was_given_up_does_not_move(
+    make_arm: MakeArm, script: Script, controller: Controller, clock: FakeClock
+) -> None:
+    controller.starts_in_s = 6.0
+    with pytest.raises(ConnectError, match=r"did not start within 4\.5 s"):
+        make_arm().open(control=True)
+    clock.advance(3.0)
+    assert "start our program" in controller.did
+    assert script.registers.outputs[0] == 0  # it never became ready
+    assert not script.registers.running
+
+
+@pytest.mark.usefixtures("arm")
+def test_a_program_of_another_session_ends(script: Script, clock: FakeClock) -> None:
+    script.registers.token += 1
+    clock.advance(2 * CYCLE_S)
+    assert script.registers.outputs[1] == -3
+
+
+def test_an_old_command_is_not_carried_out(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    control = control_of(arm)
+    arm.move_to(away(controller), timeout_s=5, guard=no_guard)
+    sequence, command, numbers = control._command
+    before = list(controller.did)
+    for old in (sequence, sequence - 1, 0):
+        control._command = (old, 1, (0.0,) * 5 + (1.5, 1.0, 3.0, 0.0, 0.0))
+        clock.advance(5 * CYCLE_S)
+    assert controller.did == before
+    control._command = (sequence, command, numbers)
+
+
+def test_a_move_paused_by_a_protective_stop_does_not_go_on(
+    arm: UrArm, script: Script, controller: Controller, clock: FakeClock
+) -> None:
+    """The dashboard server is lost too, so the program stays, paused, until the operator plays it."""
+    controller.dashboard_answers = False
+    clock.at(0.3, lambda: setattr(controller, "safety_bits", 0x404))
+    with pytest.raises(DeviceFault, match="protective stop"):
+        arm.move_to(away(controller), timeout_s=5, guard=no_guard)
+    where = controller.q_rad[5]
+    assert script.registers.running
+    controller.safety_bits = 1
+    clock.advance(1.0)
+    assert not script.registers.running
+    assert controller.q_rad[5] == pytest.approx(where, abs=0.009)  # one cycle of the controller in memory
+
+
+def test_a_new_session_does_not_disturb_a_program_that_runs(make_arm: MakeArm, controller: Controller) -> None:
+    controller.program = 2  # another client's
+    with pytest.raises(ConnectError, match="another program is on"):
+        make_arm().open(control=True)
+    assert controller.did == []
+
+
+# ---------------------------------------------------------------------- the start
+
+
+@pytest.mark.parametrize(
+    ("message", "read_only", "found", "fix"),
+    [
+        (Failed(17, 3, "compile_error_name_not_found:stopq:"), False, "line 17: compile_error", "other control path"),
+        (Code(210, 0, ""), False, "takes no programs", "remote control"),
+        (Note("hello"), True, "closed the connection", "remote control"),
+    ],
+)
+def test_a_program_that_is_not_taken(
+    make_arm: MakeArm, script: Script, controller: Controller, message: object, read_only: bool, found: str, fix: str
+) -> None:
+    script.messages.append(message)  # type: ignore[arg-type]
+    script.read_only = read_only
+    with pytest.raises(ConnectError) as error:
+        make_arm().open(control=True)
+    assert found in error.value.found
+    assert fix in error.value.fix
+    assert controller.did == []  # there is nothing of ours to be stopped
+
+
+def test_a_runtime_error_is_the_reason_of_an_ended_program(
+    arm: UrArm, script: Script, controller: Controller, clock: FakeClock
+) -> None:
+    def crash() -> None:
+        script.messages += [Failed(60, 5, "is a joint limit violated?"), Stopped("ftdrive_control")]
+        controller.program = 1
+
+    clock.at(0.3, crash)
+    with pytest.raises(DeviceFault, match="line 60: is a joint limit violated"):
+        arm.move_to(away(controller), timeout_s=5, guard=no_guard)
+
+
+def test_the_error_of_another_program_is_not_ours(
+    arm: UrArm, script: Script, controller: Controller, clock: FakeClock
+) -> None:
+    script.messages += [Failed(3, 1, "syntax_error_on_line:3:"), Stopped("other")]
+    clock.advance(0.1)
+    clock.at(0.3, lambda: setattr(controller, "program", 1))
+    with pytest.raises(DeviceFault, match="stopped or paused from outside"):
+        arm.move_to(away(controller), timeout_s=5, guard=no_guard)
+
+
+def test_registers_of_another_client_are_not_taken(make_arm: MakeArm, controller: Controller) -> None:
+    controller.registers_taken = True
+    with pytest.raises(ConnectError, match=r"input_int_register_32 and 13 more"):
+        make_arm().open(control=True)
+    assert controller.did == []
+
+
+# ---------------------------------------------------------------------- settings and questions
+
+
+def test_settings_and_questions_pass_through_the_registers(arm: UrArm, controller: Controller) -> None:
+    arm.set_payload(1.5, (0.01, 0.0, 0.05), (0.1, 0.2, 0.3, 0.0, 0.0, -0.01))
+    arm.set_gravity((0.0, 0.0, 9.82))
+    assert controller.did[-2:] == [
+        "payload 1.5 [0.01, 0.0, 0.05] [0.1, 0.2, 0.3, 0.0, 0.0, -0.01]",
+        "gravity [0.0, 0.0, 9.82]",
+    ]
+    assert arm.within_safety_limits(controller.q_rad)
+    assert not arm.within_safety_limits([*controller.q_rad[:5], 3.0])
+    assert control_of(arm).call("tcp_offset") == pytest.approx(controller.tcp_offset)
