@@ -88,6 +88,13 @@ def solve(
     wrench_cov = dataset.wrench_cov
     if wrench_cov is not None:
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
+
+    def contradicted(unconstrained: Fit | None) -> list[str]:
+        if known is None or unconstrained is None:
+            return []
+        found = unconstrained.parameters, unconstrained.covariance
+        return contradictions(known, *found, g_m_s2, SIGNIFICANT_SIGMAS, up_in_base)
+
     # Published methods use this fit too: for observability, and for the noise if it was not measured.
     try:
         best = fit(
@@ -102,8 +109,11 @@ def solve(
         _require_determined(dataset.R_base_flange, best, known)
     except NotObservable as exc:
         poses = dataset.R_base_flange, dataset.wrench
-        if mixed_up := faults(*poses, up_in_base) or other_poses(*poses):
-            raise NotObservable(f"{mixed_up[0]}.") from exc
+        named = faults(*poses, up_in_base) or other_poses(*poses)
+        if not named and known is not None:  # wrong ones can leave no weight, and so no centre of mass
+            named = contradicted(_unconstrained(dataset, wrench_cov, drift))
+        if named:
+            raise NotObservable(f"{named[0]}.") from exc
         raise
     assessed: AssessedFit = best
     if estimator:
@@ -125,18 +135,13 @@ def solve(
         )
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
     unconstrained = best if estimator else None if known is None else _unconstrained(dataset, wrench_cov, drift)
-    contradicted: list[str] = []
-    if known is not None and unconstrained is not None:
-        contradicted = contradictions(
-            known, unconstrained.parameters, unconstrained.covariance, g_m_s2, SIGNIFICANT_SIGMAS, up_in_base
-        )
     quality = judge(
         assessed,
         t_s=dataset.t_s,
         measured_sigma=measured_sigma,
         up_in_base=up_in_base,
         unconstrained=unconstrained,
-        contradicted=contradicted,
+        contradicted=contradicted(unconstrained),
         other_unit=[] if payload_kg is None else other_unit(assessed.parameters, payload_kg, g_m_s2),
     )
     chi2 = assessed.chi2 if wrench_cov is None else assessed.measured_chi2

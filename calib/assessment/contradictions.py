@@ -24,7 +24,7 @@ def contradictions(
     sigmas: float,
     up_in_base: ArrayLike = UP_IN_BASE,
 ) -> list[str]:
-    """List the known values that the data contradict, each with the value from the data.
+    """Name the known values that the data contradict, each with the value from the data: one reason, or none.
 
     Parameters
     ----------
@@ -35,26 +35,28 @@ def contradictions(
         Of that fit.
     g_m_s2 : float
     sigmas : float
-        Smallest difference to list, in standard deviations.
+        Smallest difference to name, in standard deviations.
     up_in_base : array_like, shape (3,)
         Where up should be.
     """
     words = []
+    weight_N = float(np.linalg.norm(found.gravity_force_base_N))
+    along = found.gravity_force_base_N / (weight_N or 1.0)
+    sigma_N = float(np.sqrt(along @ covariance[3:6, 3:6] @ along))
+    shows_directions = weight_N > sigmas * sigma_N
     if known.mass_kg is not None:
-        weight_N = float(np.linalg.norm(found.gravity_force_base_N))
-        along = found.gravity_force_base_N / (weight_N or 1.0)
-        mass_kg, sigma_kg = weight_N / g_m_s2, float(np.sqrt(along @ covariance[3:6, 3:6] @ along)) / g_m_s2
+        mass_kg, sigma_kg = weight_N / g_m_s2, sigma_N / g_m_s2
         if abs(mass_kg - known.mass_kg) > sigmas * np.hypot(sigma_kg, known.mass_tolerance_kg):
             why = as_with(found, _force_units(mass_kg, known.mass_kg, SAME_UNIT))
             words.append(f"mass {known.mass_kg:g} kg (data: {_with_sigma(mass_kg, sigma_kg, ' kg')}{why})")
-    if known.gravity_direction_base is not None:
+    if known.gravity_direction_base is not None and shows_directions:
         direction = np.asarray(known.gravity_direction_base)
         turn = turn_between(direction, unit_vector(found.gravity_force_base_N))
         across = np.cross(unit_vector(turn), direction)
         sigma = float(np.sqrt(across @ covariance[3:6, 3:6] @ across / np.sum(found.gravity_force_base_N**2)))
         if np.linalg.norm(turn) > sigmas * np.hypot(sigma, known.direction_tolerance_rad):
             words.append(f"direction of gravity in base (data: {_angle(turn, sigma)})")
-    if known.R_flange_sensor is not None:
+    if known.R_flange_sensor is not None and shows_directions:
         turn = Rotation.from_matrix(found.R_flange_sensor @ np.asarray(known.R_flange_sensor).T).as_rotvec()
         if known.yaw_only:
             z = np.array([0.0, 0.0, 1.0])
@@ -66,7 +68,9 @@ def contradictions(
             Q = np.asarray(known.R_flange_sensor).T @ found.R_flange_sensor * (-1 if upwards else 1)
             why = "" if known.yaw_only else _axes_taken(Q)
             words.append(f"mounting of the sensor (data: {_angle(turn, sigma)}{why})")
-    return words
+    if not words:
+        return []
+    return [f"the known values contradict the data: {'; '.join(words)}: correct the data or the known values"]
 
 
 def other_unit(found: Parameters, payload_kg: float, g_m_s2: float) -> list[str]:

@@ -77,7 +77,6 @@ def judge(
     *,
     t_s: Array | None = None,
     measured_sigma: Array | None = None,
-    farthest_com_m: float = FARTHEST_COM_M,
     up_in_base: ArrayLike = UP_IN_BASE,
     unconstrained: AssessedFit | None = None,
     contradicted: Sequence[str] = (),
@@ -96,14 +95,12 @@ def judge(
         When each pose was measured; the order of rows counts if it is missing or not finite.
     measured_sigma : array, shape (6,), optional
         Measured noise of a pose. With it, a load that shifted during the tour is detected.
-    farthest_com_m : float
-        Largest plausible distance of the centre of mass from the sensor.
     up_in_base : array_like, shape (3,)
         Expected up direction in base: +z for a robot on a table.
     unconstrained : AssessedFit, optional
         The best fit to the same poses without known values, if `fit` used some.
     contradicted : sequence of str
-        Known values that the unconstrained fit contradicts, from `calib.assessment.contradictions`.
+        That the unconstrained fit contradicts known values, from `calib.assessment.contradictions`.
     other_unit : sequence of str
         That the controller's payload agrees with forces in another unit, from the same module.
     """
@@ -114,7 +111,7 @@ def judge(
     suspect = inexact or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
     explanation = _faults(fit, at.used, t_s, up_in_base) if suspect else []
     plausible = not explanation and at.largest_share < SENSELESS_SHARE
-    com_too_far = _com_too_far(parameters, farthest_com_m)
+    com_too_far = _com_too_far(parameters)
     noise, left_out = _noise_reasons(fit, at), _left_out_reasons(at.used)
     noise_is_minor = (at.noise_factor or 0) <= NOISE_FACTOR and at.largest_share <= NOISY_SHARE
     changed = _change_reasons(fit, at, measured_sigma, t_s)
@@ -137,7 +134,7 @@ def judge(
         *([] if com_too_far else _com_too_near(parameters)),
         *(inexact if at.largest_share <= REJECTED_SHARE else []),
         *([] if contradicted or at.largest_share <= NOISY_SHARE else _contradiction_reasons(fit, unconstrained)),
-        *(reversed_signs(parameters, fit.covariance, up_in_base, farthest_com_m) if plausible else []),
+        *(reversed_signs(parameters, fit.covariance, up_in_base) if plausible else []),
         *([] if noise_is_minor else noise),
         *([] if few_rejected else left_out),
         *([] if n >= RECOMMENDED_POSES else [f"there are only {n} poses: take {RECOMMENDED_POSES} or more"]),
@@ -158,9 +155,8 @@ def judge(
         notes += drifted
     if other_unit and plausible and not broken:
         (rejected or usable)[:0] = other_unit  # before its consequences
-    if contradicted and not at.fits_measured_noise:
-        cause = f"the known values contradict the data: {'; '.join(contradicted)}: correct the data or the known values"
-        (rejected or usable or notes).insert(0, cause)  # before its consequences
+    if not (broken or explanation or at.fits_measured_noise):
+        (rejected or usable or notes)[:0] = contradicted  # before its consequences
     return Quality(
         verdict="rejected" if rejected else "usable" if usable else "good",
         reasons=(*rejected, *usable, *notes),
@@ -274,16 +270,11 @@ def expected_error(parameters: Parameters, covariance: Array, response: Response
     return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
 
 
-def reversed_signs(
-    parameters: Parameters,
-    covariance: Array,
-    up_in_base: ArrayLike = UP_IN_BASE,
-    farthest_com_m: float = FARTHEST_COM_M,
-) -> list[str]:
+def reversed_signs(parameters: Parameters, covariance: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[str]:
     """Explain a weight that pulls upwards, and a centre of mass on the robot's side of the sensor."""
     angle_deg, inside_m = _tilt_deg(parameters, up_in_base), _inside_m(parameters, covariance)
     if angle_deg < REVERSED_TILT_DEG:
-        if not 0 < inside_m <= farthest_com_m:
+        if not 0 < inside_m <= FARTHEST_COM_M:
             return []
         return [
             f"the centre of mass lies {1e3 * inside_m:.0f} mm on the robot's side of the sensor: the torques are "
@@ -437,13 +428,13 @@ def _force_unit(parameters: Parameters) -> list[str]:
     return [f"the weight is {weight_N:.5g} N, as with {like}: check the units of force and torque"]
 
 
-def _com_too_far(parameters: Parameters, farthest_com_m: float) -> list[str]:
+def _com_too_far(parameters: Parameters) -> list[str]:
     com_m = float(np.linalg.norm(parameters.p_sensor_com_m))
-    if com_m <= farthest_com_m:
+    if com_m <= FARTHEST_COM_M:
         return []
     like = f", as with {', or '.join(found)}" if (found := units(com_m)) else ""
     return [
-        f"the centre of mass is {com_m:.2f} m from the sensor, farther than {farthest_com_m:g} m{like}: "
+        f"the centre of mass is {com_m:.2f} m from the sensor, farther than {FARTHEST_COM_M:g} m{like}: "
         "check the units of force and torque"
     ]
 

@@ -74,16 +74,14 @@ def force_cost_from_gram(gram: Array, *, with_bias: bool = True) -> Array:
     return (Q + Q.T) / 2
 
 
-def given_rotation(
-    R_sensor_flange: Array, R_base_flange: Array, force_N: Array, weights: Array, *, with_bias: bool = True
-) -> tuple[Array, Array]:
-    """Give back the unknowns that `force_cost` eliminated.
+def given_rotation(R_sensor_flange: Array, R_base_flange: Array, force_N: Array, weights: Array) -> tuple[Array, Array]:
+    """Give back the unknowns that `force_cost` eliminated, with bias.
 
     Parameters
     ----------
     R_sensor_flange : (3, 3)
         A rotation of the mount, flange to sensor: `R_flange_sensor.T`, as in `Minimum`.
-    R_base_flange, force_N, weights, with_bias
+    R_base_flange, force_N, weights
         As in `force_cost`.
 
     Returns
@@ -91,13 +89,11 @@ def given_rotation(
     gravity_force_base_N : (3,)
         Weight of what hangs on the sensor, base frame. The shortest one, if the poses do not determine it.
     force_bias_N : (3,)
-        Sensor frame; zero without bias.
+        Sensor frame.
     """
-    gram, offset = _centred_gram(R_base_flange, force_N, weights, with_bias=with_bias)
-    _, gravity_square, gravity_force = _blocks(gram, with_bias=with_bias)
+    gram, offset = _centred_gram(R_base_flange, force_N, weights, with_bias=True)
+    _, gravity_square, gravity_force = _blocks(gram, with_bias=True)
     gravity_N = _inverse(gravity_square, gram[12, 12]) @ gravity_force @ R_sensor_flange.ravel()
-    if not with_bias:
-        return gravity_N, np.zeros(3)
     mean = gram[12, :12] / gram[12, 12] + offset[:12]
     return gravity_N, mean[:3] - R_sensor_flange @ mean[3:].reshape(3, 3).T @ gravity_N
 

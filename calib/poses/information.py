@@ -131,7 +131,7 @@ def information(J: Array, guess: Guess) -> Array:
     return np.asarray(stacked.T @ stacked)
 
 
-def predicted_sigma(R_base_flange: Array, guess: Guess, t_s: ArrayLike | None = None) -> Prediction:
+def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
     """Predict the uncertainty of a calibration from its poses (Cramér-Rao bound of the joint model).
 
     Parameters
@@ -139,22 +139,13 @@ def predicted_sigma(R_base_flange: Array, guess: Guess, t_s: ArrayLike | None = 
     R_base_flange : array, shape (n, 3, 3)
         In the order of measuring, which matters if the guess has a random walk of the bias.
     guess : Guess
-    t_s : array_like, shape (n,), optional
-        Times of the poses. If given, a linear drift of all six channels is estimated too, and biases are those at the
-        mean time.
 
     Returns
     -------
     Prediction
     """
     R_base_flange = np.asarray(R_base_flange, dtype=np.float64)
-    J = whitened_jacobian(R_base_flange, guess)
-    if t_s is not None:
-        J = np.concatenate([J, _drift_columns(t_s)], axis=2)
-    H = information(J, guess)
-    if t_s is not None:
-        H = H[:15, :15] - H[:15, 15:] @ np.linalg.pinv(H[15:, 15:], hermitian=True) @ H[15:, :15]
-    variance = _Variance(H, guess.scale)
+    variance = _Variance(information(whitened_jacobian(R_base_flange, guess), guess), guess.scale)
 
     std = np.sqrt(variance(np.eye(15)))
     weight, alpha, beta = np.sqrt(variance(_weight_and_tilt_rows(guess))).tolist()
@@ -231,13 +222,6 @@ class _Variance:
         scaled = rows * self._scale
         blind = ((scaled @ self._null) ** 2).sum(axis=1) > OBSERVABLE * (scaled**2).sum(axis=1)
         return np.where(blind, np.inf, ((scaled @ self._root) ** 2).sum(axis=1))
-
-
-def _drift_columns(t_s: ArrayLike) -> Array:
-    """Derivative (n, 6, 6) of the whitened wrench by a linear drift of each channel; zero if all times are equal."""
-    t = np.asarray(t_s, dtype=np.float64)
-    since = t - t.mean()
-    return np.asarray(np.multiply.outer(since / (np.abs(since).max() or 1.0), np.eye(6)))
 
 
 def _weight_and_tilt_rows(guess: Guess) -> Array:

@@ -11,6 +11,7 @@ from calib.assessment.contradictions import as_with, force_units
 from calib.assessment.faults import units
 from calib.assessment.verdict import REVERSED_TILT_DEG, reversed_signs
 from calib.model import Array
+from calib.poses.sphere import evenly_spread
 from ftdrive.checks.controller_settings import OTHER_MOUNTING_DEG, lean_from, lean_in_words, payload_in_words
 from ftdrive.planning.geometry.scene import down_of
 
@@ -112,15 +113,7 @@ def _mounting(result: CalibrationResult, setup: Mapping[str, Any]) -> str:
     return lean_in_words(force_N, covariance, mounting)
 
 
-def _directions(n: int) -> Array:
-    """(n, 3) unit vectors, evenly spread: a Fibonacci lattice."""
-    z = 1 - (2 * np.arange(n) + 1) / n
-    turn = np.pi * (1 + np.sqrt(5)) * np.arange(n)
-    across = np.sqrt(1 - z**2)
-    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
-
-
-_DIRECTIONS = np.vstack([_directions(2000), np.eye(3), -np.eye(3)])
+_DIRECTIONS = np.vstack([evenly_spread(2000), np.eye(3), -np.eye(3)])
 """Neighbours are about 4° apart, so the distance is exact to 0.1 %."""
 
 

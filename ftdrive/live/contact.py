@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtri
+from scipy.special import chdtri, fdtri
 
-from calib.extras.contact import contact_threshold
 from calib.likelihood.gain_and_cross_talk import Response, predicted_covariance
 from calib.model import Array, Parameters
 from ftdrive.live.noise import Noise, samples_in_reading
@@ -45,7 +44,7 @@ class ContactTest:
         """Orientation and the matrix that makes its readings white."""
         self.uncertainty = np.zeros((6, 6))
         """Covariance of the prediction at the newest orientation, sensor axes."""
-        self.limit = contact_threshold(false_alarm_rate)
+        self.limit = float(chdtri(6, false_alarm_rate))
         """Of the squared distance."""
         self.restart()
 

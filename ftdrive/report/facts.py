@@ -11,6 +11,7 @@ from calib.assessment.verdict import strong_correlations
 from calib.compare import compare
 from calib.errors import CalibError
 from calib.model import PARAMETER_NAMES, Array
+from calib.poses.sphere import largest_gap
 from calib.routine import drift_check
 from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.plan import Plan
@@ -154,7 +155,7 @@ def _coverage(subject: Subject, R_base_flange: Array) -> dict[str, Any]:
     seen = assess(R_base_flange, parameters, advise=False)
     down = parameters.gravity_force_base_N / (np.linalg.norm(parameters.gravity_force_base_N) or 1.0)
     gravity, tool = down @ R_base_flange, R_base_flange[:, :, 2]
-    gap_rad, towards = _largest_gap(gravity)
+    gap_rad, towards = largest_gap(gravity)
     return {
         "orientations": seen.orientations,
         "rank": seen.rank,
@@ -167,18 +168,6 @@ def _coverage(subject: Subject, R_base_flange: Array) -> dict[str, Any]:
         "gap_towards": towards.tolist(),
         "gap_words": direction_in_words(towards).replace("base", "flange"),
     }
-
-
-def _largest_gap(directions: Array) -> tuple[float, Array]:
-    """Return the largest angle from any direction to the nearest of these (n, 3), and that direction."""
-    k = np.arange(2000) + 0.5  # evenly spread points: Fibonacci's spiral
-    z, turn = 1 - k / 1000, np.pi * (1 + np.sqrt(5)) * k
-    r = np.sqrt(1 - z**2)
-    everywhere = np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
-    parts = np.array_split(directions, 1 + len(directions) // 500)
-    nearest = np.max([(everywhere @ part.T).max(axis=1) for part in parts], axis=0)
-    worst = int(np.argmin(nearest))
-    return float(np.arccos(np.clip(nearest[worst], -1, 1))), everywhere[worst]
 
 
 def _tour(run: Run, stops: int) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from calib.assessment.observability import (
 from calib.model import STANDARD_GRAVITY_M_S2, Array
 from calib.poses.information import Guess, Prediction, predicted_sigma
 from calib.poses.selection import next_pose
+from calib.poses.sphere import largest_gap
 from calib.published.yu import weight_and_tilt
 from calib.routine import PoseRecord, dataset_from, is_return
 from ftdrive.cell.config import USUAL_KG
@@ -100,7 +101,7 @@ class Running:
             faces=faces(gravity_flange),
             cond9=coverage.cond9,
             cond_u1=coverage.cond_u1,
-            empty_cap_deg=empty_cap_deg(gravity_flange),
+            empty_cap_deg=float(np.degrees(largest_gap(gravity_flange)[0])),
             light=light,
             hint=hint(R_base_flange, self._guess(), down) if self._advise and light != "green" else "",
         )
@@ -188,16 +189,6 @@ def faces(gravity_flange: Array) -> tuple[int, int, int, int, int, int]:
     negative = gravity_flange[np.arange(len(gravity_flange)), nearest] < 0
     a, b, c, d, e, f = np.bincount(2 * nearest + negative, minlength=6).tolist()
     return a, b, c, d, e, f
-
-
-def empty_cap_deg(gravity_flange: Array) -> float:
-    """Largest angle from any direction to the nearest of these (n, 3), in degrees, to about a degree."""
-    i = np.arange(4000) + 0.5  # evenly spread over the sphere: Fibonacci's spiral
-    z, azimuth = 1 - i / 2000, i * np.pi * (3 - np.sqrt(5))
-    rho = np.sqrt(1 - z**2)
-    everywhere = np.column_stack([rho * np.cos(azimuth), rho * np.sin(azimuth), z])
-    nearest = (everywhere @ gravity_flange.T).max(axis=1)
-    return float(np.degrees(np.arccos(np.clip(nearest.min(), -1, 1))))
 
 
 def hint(R_base_flange: Array, guess: Guess, down_base: Array) -> str:

@@ -24,12 +24,13 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from calib import CalibrationDataset, NotObservable, Parameters, read_csv, solve
+from calib.assessment.cross_validation import standardized
 from calib.assessment.observability import AMBIGUOUS_GAP, assess
-from calib.extras.contact import contact_chi2, contact_threshold
 from calib.known import Known
 from calib.likelihood import fit as likelihood
 from calib.likelihood import rotation_minima
-from calib.model import UP_IN_BASE, Array
+from calib.likelihood.gain_and_cross_talk import predicted_covariance
+from calib.model import UP_IN_BASE, Array, predict
 from calib.published.methods import published
 from calib.published.yu import SPECIAL_R_flange_base, lrom, srom
 from tests.benchmarks import carlson_figures, speed
@@ -183,14 +184,15 @@ def fit_run(seed: int, name: str, snr: float, starts: int = 0) -> dict[str, obje
     e, C = sim.error(truth, fit.parameters), fit.covariance
     R_test = Rotation.random(25, rng=rng).as_matrix()
     free = sim.readings(truth, R_test) + s * rng.normal(size=(25, 6))
-    distance = contact_chi2(free, R_test, fit.parameters, C, np.diag(s**2))
+    total = np.diag(s**2) + predicted_covariance(fit.parameters, C, None, R_test)
+    distance = (standardized(free - predict(fit.parameters, R_test), total) ** 2).sum(axis=1)
     record: dict[str, object] = {
         "square": sim.blocks(e**2),
         "bound": sim.blocks(np.diag(sim.bound(truth, R, np.diag(s**2)))),
         "covered": np.abs(e) < 1.959964 * np.sqrt(np.diag(C)),
         "distance": float(e @ np.linalg.solve(C, e)),
         "p_value": float(stats.chi2.sf(fit.measured_chi2, fit.dof)),
-        "alarms": float(np.mean(distance > contact_threshold(0.01))),
+        "alarms": float(np.mean(distance > stats.chi2.isf(0.01, 6))),
         "prediction": sim.prediction_square(truth, fit.parameters),
         "gross": float(np.linalg.norm(e[:3]) > GROSS_RAD),
         "rejected": float(np.mean(fit.weights == 0)),

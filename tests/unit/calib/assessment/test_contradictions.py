@@ -63,3 +63,13 @@ def test_agreement_is_no_contradiction() -> None:
     assert contradicted(known, 1e-6) == []
     lighter = replace(FOUND, gravity_force_base_N=np.array([0.0, 0.0, -5.0]))
     assert len(contradicted(known, 4, lighter)) == 1
+
+
+def test_without_a_significant_weight_no_direction_is_compared() -> None:
+    light = replace(FOUND, gravity_force_base_N=np.array([0.0, 0.0, -0.1]))
+    askew = Rotation.from_rotvec([2.0, 0, 0]).as_matrix()
+    known = Known(mass_kg=1.0, gravity_direction_base=(1, 0, 0), R_flange_sensor=askew)
+    (words,) = contradicted(known, 4, light)
+    assert "mass" in words
+    assert "gravity" not in words
+    assert "mounting" not in words

@@ -129,6 +129,26 @@ def test_axes_permuted_in_both_are_named_where_the_mounting_is_known(Q: Array, o
     assert "taken from" not in first(R, wrench, Known(R_flange_sensor=askew))
 
 
+def test_a_wrong_mounting_is_named_where_it_leaves_no_weight() -> None:
+    p, R, wrench = session(6)
+    turned = np.concatenate([part @ CYCLE.T for part in np.hsplit(wrench, 2)], axis=1)
+    known = Known(R_flange_sensor=p.R_flange_sensor)
+    with pytest.raises(NotObservable, match=r"contradict the data: mounting .* from \(z, x, y\)") as refused:
+        solved(R, turned, known)
+    assert "do not determine" in str(refused.value.__cause__)
+    still = np.tile(wrench[0], (len(R), 1)) + SIGMA * np.random.default_rng(0).normal(size=wrench.shape)
+    assert "hang something heavier" in first(R, still, known)
+
+
+def test_a_mistake_is_named_before_known_values_that_it_contradicts() -> None:
+    p, R, wrench = session(4)
+    known = Known(R_flange_sensor=p.R_flange_sensor, mass_kg=2.04, mass_tolerance_kg=0.01)
+    assert "inverted" in first(np.swapaxes(R, 1, 2), wrench, known)
+    stuck = wrench.copy()
+    stuck[:, 1] = stuck[0, 1]
+    assert "stuck" in first(R, stuck, known)
+
+
 def test_a_wrench_in_base_axes_is_named() -> None:
     p, R, wrench = session(5)
     turned = R @ p.R_flange_sensor

@@ -20,7 +20,7 @@ from calib.routine import PoseRecord, TourPose, dataset_from, drift_check
 from ftdrive.planning.search.constant_tour import NUMBERS
 from ftdrive.runs.pose_hints import hints
 from ftdrive.session.events import Estimated
-from ftdrive.session.live_fit import Running, _light, empty_cap_deg, faces
+from ftdrive.session.live_fit import Running, _light, faces
 from ftdrive.terminal.report import print_result
 from tests.pose_sets import AMBIGUOUS_6
 
@@ -279,10 +279,6 @@ def test_drift_is_told_with_the_estimates() -> None:
     event = run(drifting)
     assert event.values["drift"][0] == pytest.approx(0.5, abs=5 * event.sigma["drift"][0])
     assert "drift" not in run(tour()).values
-
-
-def test_the_empty_cap_of_one_direction_is_half_a_turn() -> None:
-    assert empty_cap_deg(np.array([[0.0, 0.0, 1.0]])) == pytest.approx(180, abs=2)
 
 
 # At the end: what happened at which pose.
