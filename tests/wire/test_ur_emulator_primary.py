@@ -209,7 +209,9 @@ def test_a_program_stops_the_arm_when_its_client_is_gone_and_registers_keep_thei
     with RtdeSocket(station.host) as rtde:
         rtde.ask("O", struct.pack(">d", 125.0) + b"input_int_register_24")
         rtde.ask("S")
-        assert f"heartbeat lost at {struct.unpack('>i', rtde.answer()[4:])[0]}" == lost["why"]
+        (kept,) = struct.unpack(">i", rtde.answer()[4:])
+    last = int(lost["why"].removeprefix("heartbeat lost at "))
+    assert kept == last or (how == "silenced" and kept > last)  # beats that waited in a silent connection arrive late
 
 
 def test_polyscope_x_has_the_robot_api_in_place_of_the_dashboard(polyscope_x: StationProcess) -> None:
