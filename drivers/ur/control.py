@@ -1,10 +1,13 @@
 """A control path: what moves the arm. `UrArm` does not know which one is in use."""
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Final, Literal
 
 from drivers.errors import ConnectError, DriverError
+
+log = logging.getLogger(__name__)
 
 ControlPath = Literal["ur-rtde", "script"]
 ControlSetting = Literal["auto", "ur-rtde", "script"]
@@ -49,9 +52,16 @@ class Control(ABC):
         hangs, and the errors of `look_out`.
         """
 
-    @abstractmethod
     def quit(self, *, timeout_s: float) -> bool:
         """Stop the arm, end our program and the link; return whether that was confirmed in time."""
+        try:
+            self.call("quit", timeout_s=timeout_s)
+        except DriverError as error:
+            log.debug("our program did not end by itself: %s", error)
+            return False
+        finally:
+            self.kill()
+        return True
 
     @abstractmethod
     def kill(self) -> None:

@@ -13,10 +13,10 @@ from contextlib import suppress
 from typing import IO, Any, Final, cast
 
 from drivers.clock import Clock
-from drivers.errors import DeviceTimeout, DriverError, StreamBroken
+from drivers.errors import DeviceTimeout, StreamBroken
 from drivers.ur import control_child
 from drivers.ur.control import Control, LookOut
-from drivers.ur.timing import Patience, UrTiming
+from drivers.ur.timing import Patience, UrTiming, held
 
 log = logging.getLogger(__name__)
 
@@ -76,9 +76,7 @@ class ControlProcess(Control):
 
     def call(self, name: str, *args: object, timeout_s: float | None = None, look_out: LookOut = lambda: None) -> Any:
         """Send a request to the process and wait for its reply; see `Control`."""
-        while not self._lock.acquire(timeout=0.02):
-            self._clock.now_ns()  # an emulated cell may wait for this thread
-        try:
+        with held(self._lock, self._clock):
             self._last_id += 1
             request = self._last_id
             try:
@@ -87,19 +85,6 @@ class ControlProcess(Control):
             except (OSError, ValueError):  # ValueError: closed by `kill`
                 raise self._loss() from None
             return self._answer(request, self._timing.call_s if timeout_s is None else timeout_s, look_out)
-        finally:
-            self._lock.release()
-
-    def quit(self, *, timeout_s: float) -> bool:
-        """Stop the arm, end its script and the process; return whether that was confirmed in time."""
-        try:
-            self.call("quit", timeout_s=timeout_s)
-        except DriverError as error:
-            log.debug("control of %s did not end by itself: %s", self._host, error)
-            return False
-        finally:
-            self.kill()
-        return True
 
     def kill(self) -> None:
         """Kill the process. The arm finishes its last command, so stop it through the dashboard server."""

@@ -23,7 +23,7 @@ from drivers.ur.control import Control, LookOut, ProgramRefused
 from drivers.ur.control_program import COMMANDS, INPUTS, NAME, NUMBERS, OUTPUTS, Report, program_text
 from drivers.ur.primary import Code, Failed, Primary, RobotType, Stopped
 from drivers.ur.rtde import Subscription
-from drivers.ur.timing import Patience, UrTiming
+from drivers.ur.timing import Patience, UrTiming, held
 
 log = logging.getLogger(__name__)
 
@@ -101,9 +101,7 @@ class ScriptControl(Control):
 
     def call(self, name: str, *args: object, timeout_s: float | None = None, look_out: LookOut = lambda: None) -> Any:
         """Send a command and wait for its answer; see `Control`."""
-        while not self._calling.acquire(timeout=0.02):
-            self._clock.now_ns()  # an emulated cell may wait for this thread
-        try:
+        with held(self._calling, self._clock):
             self._asked_s = self._clock.now_s()
             if name == "progress":
                 return self._progress()
@@ -125,19 +123,6 @@ class ScriptControl(Control):
             if name == "tcp_offset":
                 return list(report.tcp_offset)
             return bool(report.answer)
-        finally:
-            self._calling.release()
-
-    def quit(self, *, timeout_s: float) -> bool:
-        """Stop the arm, end the program and the link; return whether that was confirmed in time."""
-        try:
-            self.call("quit", timeout_s=timeout_s)
-        except DriverError as error:
-            log.debug("the control program of %s did not end by itself: %s", self._host, error)
-            return False
-        finally:
-            self.kill()
-        return True
 
     def kill(self) -> None:
         """Request the end of the program once more, then fall silent; the arm stops within 0.3 s. Idempotent.

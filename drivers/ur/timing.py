@@ -1,7 +1,10 @@
-"""Every time limit of a Universal Robots arm; lateness; a wait that does not count a suspension of this process."""
+"""Every time limit of a Universal Robots arm; lateness; waits for an event and for a lock."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from threading import RLock
 from typing import Final, Self
 
 from drivers.clock import Clock, Waitable
@@ -136,3 +139,14 @@ class Patience:
         now_ns = self._clock.now_ns()
         self._left_ns -= min(now_ns - self._counted_ns, 2 * _TURN_NS)
         self._counted_ns = now_ns
+
+
+@contextmanager
+def held(lock: RLock, clock: Clock) -> Iterator[None]:
+    """Hold a lock; a thread that waits for it keeps following the clock of an emulated cell."""
+    while not lock.acquire(timeout=0.02):
+        clock.now_ns()
+    try:
+        yield
+    finally:
+        lock.release()
