@@ -99,8 +99,7 @@ def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wren
             part[:, c, :, c], since[c] = sigma**2 * np.outer(later, later) / n_used**2, sigma**2
             freedom = len(c)
         elif kind == "rotation":  # turns about gravity do not show
-            turn = jacobian(calibration.parameters, R_base_flange)[..., :3]
-            part[range(n), :, range(n)] = sigma**2 * turn @ np.swapaxes(turn, 1, 2)
+            part[range(n), :, range(n)] = sigma**2 * _turns(calibration.parameters, R_base_flange)
             freedom = max(2 * n_used - 6, 2)
         elif kind == "white":  # with unmeasured noise all of it
             known = np.zeros_like(wrench_cov) if calibration.noise_source == "measured" else wrench_cov
