@@ -155,14 +155,14 @@ def calibration(
     from ftdrive.exports.calibration import registry
     from ftdrive.exports.calibration.settings import Settings, recorded_sensor
     from ftdrive.live.stream import load_calibration
-    from ftdrive.runs.verification import last_verification
+    from ftdrive.runs.verification import verification_near
     from ftdrive.terminal.console import hanging, talk
 
     check_simulate(simulate, real={"RESULT": source}, emulated={"--sensor": sensor})
     with _calibrated(source, sensor, simulate=simulate) as path:
         result = load_calibration(path)
         recorded_height_mm, recorded_mass_kg = recorded_sensor(path, result)
-        verification = last_verification(path)
+        verification = verification_near(path, result.id)
     settings = Settings(
         base_frame=base_frame,
         flange_frame=flange_frame,

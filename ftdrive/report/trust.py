@@ -7,7 +7,7 @@ from typing import Any
 
 from calib import CalibrationResult
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.runs.verification import age_in_words, outcome_in_words, verification_near
+from ftdrive.runs.verification import age_of, outcome_in_words, verification_near
 
 
 def trust(
@@ -24,19 +24,16 @@ def trust(
         Reads `[store] url`; None is the user's store.
     now : datetime
     """
-    near = verification_near(source / "calibration.json" if source.is_dir() else source, result.id)
+    near = verification_near(source, result.id)
     kept, error = _of_store(result.id, store_url)
     known = [_plain(one) for one in (near, kept) if one is not None and one.created_utc]
     last = max(known, key=lambda one: datetime.fromisoformat(one["created_utc"]), default=None)
-    made, words = result.provenance.get("created_utc"), []
-    if isinstance(made, str):
-        words.append(f"{age_in_words(now - datetime.fromisoformat(made))} old")
-    if last is None:
-        words.append("not verified")
-    else:
+    verified = "not verified"
+    if last is not None:
         age = now - datetime.fromisoformat(last["created_utc"])
-        words.append(outcome_in_words(age, passed=last["passed"], change=last["change"]))
-    return {"words": ", ".join(words), "last_verification": last, "store_error": error}
+        verified = outcome_in_words(age, passed=last["passed"], change=last["change"])
+    words = ", ".join([*age_of(result, now), verified])
+    return {"words": words, "last_verification": last, "store_error": error}
 
 
 def _of_store(calibration_id: str, url: Callable[[], str | None]) -> tuple[Any, str]:

@@ -85,17 +85,17 @@ def last_verification(place: Path) -> VerificationRecord | None:
         The calibration cannot be read.
     """
     path = Run(place).calibration_path if place.is_dir() else place
-    return verification_near(path, CalibrationResult.load(path).id)
+    return verification_near(place, CalibrationResult.load(path).id)
 
 
-def verification_near(path: Path, calibration_id: str) -> VerificationRecord | None:
-    """Return the newest verification of a calibration as `last_verification`, for a file that need not exist."""
-    found = [record for record in _records_near(path) if record.calibration_id == calibration_id]
+def verification_near(place: Path, calibration_id: str) -> VerificationRecord | None:
+    """Return the newest verification of a calibration as `last_verification`; its file need not be in that place."""
+    found = [record for record in _records_near(place) if record.calibration_id == calibration_id]
     return max(found, key=lambda record: record.created_utc, default=None)
 
 
-def _records_near(path: Path) -> Iterator[VerificationRecord]:
-    folder = path.absolute().parent
+def _records_near(place: Path) -> Iterator[VerificationRecord]:
+    folder = place.absolute() if place.is_dir() else place.absolute().parent
     for parent in dict.fromkeys((folder.parent, folder / "runs", Path("runs").absolute())):
         for file in sorted(parent.glob("*/verification*.json")):
             try:
@@ -135,10 +135,13 @@ def age_in_words(age: timedelta) -> str:
     return f"{hours * 60:.0f} min" if hours < 1 else f"{hours:.0f} h" if hours < 48 else f"{hours / 24:.0f} d"
 
 
+def age_of(calibration: CalibrationResult, now: datetime) -> list[str]:
+    """Return the age of a calibration, such as ["2 h old"]; empty if its file does not say when it was made."""
+    created = calibration.provenance.get("created_utc")
+    return [f"{age_in_words(now - datetime.fromisoformat(created))} old"] if isinstance(created, str) else []
+
+
 def calibration_in_words(calibration: CalibrationResult, verification: VerificationRecord | None, now: datetime) -> str:
     """Return id, verdict and age of a calibration, and the result of its last verification."""
-    words = f"calibration {calibration.id[:6]}, {calibration.verdict}"
-    created = calibration.provenance.get("created_utc")
-    if isinstance(created, str):
-        words += f", {age_in_words(now - datetime.fromisoformat(created))} old"
-    return f"{words}, {'not verified' if verification is None else verification.in_words(now)}"
+    verified = "not verified" if verification is None else verification.in_words(now)
+    return ", ".join([f"calibration {calibration.id[:6]}", calibration.verdict, *age_of(calibration, now), verified])
