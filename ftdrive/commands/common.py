@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args
 
 import click
 
+from drivers.ur.control import CONTROL_SETTINGS
+
 if TYPE_CHECKING:
     from calib import CalibrationResult
     from ftdrive.cell.config import CellConfig
@@ -25,7 +27,7 @@ MODEL = click.option(
 
 CONTROL = click.option(
     "--control",
-    type=click.Choice(["auto", "ur-rtde", "script"]),
+    type=click.Choice(CONTROL_SETTINGS),
     help="What moves the arm.  [default: [robot] control, else auto]",
 )
 
