@@ -126,7 +126,7 @@ def test_the_model_is_read_once_it_is_reported(monkeypatch: pytest.MonkeyPatch) 
         assert primary.read_model(host, timeout_s=5, clock=REAL) == "UR30"
     with served(lambda _: None, monkeypatch) as host:
         assert primary.read_model(host, timeout_s=5, clock=REAL) is None
-    assert primary.read_model("127.0.0.1", timeout_s=1, clock=REAL) is None  # nobody listens any more
+    assert primary.read_model("127.0.0.1", timeout_s=1, clock=REAL) is None  # its port is closed now
 
 
 def test_each_closed_port_has_its_fix() -> None:
