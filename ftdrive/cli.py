@@ -29,6 +29,7 @@ _COMMANDS = {
     "push": ("ftdrive.commands.push", "Set payload or gravity in the controller as calibrated."),
     "record": ("ftdrive.commands.record", "Record raw and compensated wrench with pose and events."),
     "history": ("ftdrive.commands.history", "List results and verifications, with their trends."),
+    "fleet": ("ftdrive.commands.fleet", "Watch many cells: what is due, what drifts, solve all again."),
     "diff": ("ftdrive.commands.diff", "Compare two calibrations, in sigmas."),
     "convert": ("ftdrive.commands.convert", "Convert a recording between MCAP, CSV and Parquet."),
     "compensate": ("ftdrive.commands.compensate", "Compensate a recording. Needs no device."),

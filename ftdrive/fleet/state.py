@@ -1,0 +1,69 @@
+"""The state of a fleet: what the status, its page, the metrics and the messages show."""
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Literal
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """Drift of the bias, from the verifications of the newest calibration."""
+
+    level_sigmas: float
+    """Largest change of a component of the bias since the calibration, in sigmas of one verification."""
+    found: bool
+    """Whether a component has begun to drift; a steady offset is none."""
+    words: str
+    """Such as "force bias x drifts by 0.12 N a week since 2026-03-02"; empty if `found` is false."""
+
+
+@dataclass(frozen=True, slots=True)
+class CellState:
+    """One tool of one cell. Without any calibration the cell has one state with `tool` None."""
+
+    cell: str
+    tool: str | None
+    arm_serial: str | None
+    sensor_serial: str | None
+    sensor_model: str | None
+    calibration_id: str | None
+    """Of the newest accepted calibration."""
+    verdict: str | None
+    calibrated: datetime | None
+    """UTC."""
+    verified: datetime | None
+    """Of the last verification of that calibration, UTC."""
+    passed: bool | None
+    change: str | None
+    """What the last verification found to have changed, such as "bias"."""
+    due: datetime | None
+    """When the next verification is due, UTC; None for a cell that was never calibrated, which is due at once."""
+    mass_kg: float | None
+    temperature_C: float | None
+    drift: Drift | None
+    """None with too few verifications."""
+
+    def is_due(self, now: datetime) -> bool:
+        """Whether a verification, or the first calibration, is due."""
+        return self.due is None or self.due <= now
+
+
+FindingKind = Literal["payload", "temperature", "base", "overdue"]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that several results show together."""
+
+    kind: FindingKind
+    cells: tuple[str, ...]
+    words: str
+    """What was found, with values, and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """All cells and what they show together."""
+
+    cells: tuple[CellState, ...]
+    findings: tuple[Finding, ...]
