@@ -1,5 +1,6 @@
 """Stores of older and newer versions: what is upgraded, when, and that nothing is lost."""
 
+import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -9,6 +10,8 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from sqlalchemy import select, text
 
+from ftdrive import cli
+from ftdrive.commands.common import index_run
 from ftdrive.errors import BadStore
 from ftdrive.store import tables
 from ftdrive.store.store import Store
@@ -46,7 +49,8 @@ def become_version_1(url: str) -> None:
         for table, found in zip(kept, rows, strict=True):
             names = {one[1] for one in known if one[0] == table.name}
             old = [{key: value for key, value in row.items() if key in names} for row in found]
-            connection.execute(table.insert(), old)
+            if old:
+                connection.execute(table.insert(), old)
 
 
 def require_same_tables(url: str) -> None:
@@ -129,3 +133,25 @@ def test_upgrades_at_once_wait_for_each_other(store_url: str, runs: Path) -> Non
 def test_a_missing_or_empty_store_needs_no_upgrade(store_url: str, tmp_path: Path) -> None:
     assert Store(store_url).upgrade() is None
     assert not (tmp_path / "store.sqlite").exists()
+
+
+def test_only_index_and_rebuild_upgrade_a_store(
+    store_url: str, runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A calibration at its end prints the sentence and goes on; its run is caught up by the command in it."""
+    Store(store_url).index(runs / "2026-03-01-calibrate")
+    become_version_1(store_url)
+    monkeypatch.setenv("FTDRIVE_STORE_URL", store_url)
+    fix = "has version 1, this ftdrive uses version 2: upgrade it with `ftdrive history --index .`"
+    assert cli.run(["history"]) == 6
+    assert fix in " ".join(capsys.readouterr().err.split())
+    index_run(runs / "2026-03-02-calibrate")
+    assert fix in " ".join(capsys.readouterr().err.split())
+    monkeypatch.chdir(runs)
+    assert cli.run(["history", "--index", "."]) == 0
+    out, err = capsys.readouterr()
+    assert len(out.splitlines()) >= 1 + 4
+    assert "is upgraded from version 1." in " ".join(err.split())
+    become_version_1(store_url)
+    assert cli.run(["history", "--rebuild", "--json", "--store", store_url]) == 0
+    assert len(json.loads(capsys.readouterr().out)["results"]) == 4
