@@ -31,7 +31,7 @@ def test_an_outage_in_mid_write_loses_no_run(
         if outage == "server killed":
             postgres.kill()
         else:
-            postgres.execute(f"SELECT pg_terminate_backend({pid})")
+            postgres.execute(f"SELECT pg_terminate_backend({pid}, 60000)")
 
     event.listen(database._engine, "commit", fail)
     with pytest.raises(BadStore, match=r"cannot be written \(.*\): check") as error:
