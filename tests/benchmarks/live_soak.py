@@ -66,8 +66,8 @@ class Both:
 
         def noted(samples: FtSamples) -> None:
             self._received.append((samples.seq, samples.t_host_ns))
-            self._batches[0].append(int(samples.seq[-1]))
-            self._batches[1].append(int(samples.t_host_ns[-1]))
+            self._batches[0].extend(samples.seq[-1:].tolist())
+            self._batches[1].extend(samples.t_host_ns[-1:].tolist())
             add(samples)
 
         stream._pairing.add_samples = noted  # type: ignore[method-assign]  # the only place to see it
