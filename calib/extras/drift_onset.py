@@ -72,6 +72,8 @@ def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: A
     calibration_sigma : array, shape (k,)
         Of the calibration, common to all.
     """
+    if len(t_days) < FEWEST:
+        return None
     weight, known = 1 / np.square(sigma), 1 / np.maximum(np.square(calibration_sigma), 1e-12 * np.square(sigma[0]))
     first = 0
     while len(t_days) - first >= FEWEST:
