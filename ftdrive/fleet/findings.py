@@ -51,14 +51,11 @@ def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[Findin
     if late:
         worst = min(late, key=lambda cell: late[cell])
         cells = tuple(sorted(late))
-        verb = "is" if len(cells) == 1 else "are"
-        longest = "" if len(cells) == 1 else f"; the longest is {worst}"
-        yield Finding(
-            "overdue",
-            cells,
-            f"the verification of {listed(cells)} {verb} late, by {(observed.now - late[worst]).days} d{longest}: "
-            "run `ftdrive fleet verify --due`",
-        )
+        days = (observed.now - late[worst]).days
+        what = f"the verification of {worst} is late by {days} d"
+        if len(cells) > 1:
+            what = f"the verifications of {listed(cells)} are late, that of {worst} by {days} d"
+        yield Finding("overdue", cells, f"{what}: run `ftdrive fleet verify --due`")
 
 
 # ---------------------------------------------------------------------------------------------------------------- base
