@@ -46,7 +46,7 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
     rows = []
     for state in fleet.cells:
         result = None if state.calibration_id is None else results[state.calibration_id]
-        changes = None if result is None else observed.bias_changes(result)
+        changes = None if result is None else observed.changes.get(result.id)
         drawn = "" if result is None or changes is None else plot(changes, when(result), observed.now)
         rows.append({"state": state, "plot": Markup(drawn), **_words(state, observed.now)})
     return environment.get_template("fleet.html.j2").render(
