@@ -52,9 +52,9 @@ def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[Findin
         worst = min(late, key=lambda cell: late[cell])
         cells = tuple(sorted(late))
         days = (observed.now - late[worst]).days
-        what = f"the verification of {worst} is late by {days} d"
+        what = f"The verification of {worst} is late by {days} d"
         if len(cells) > 1:
-            what = f"the verifications of {listed(cells)} are late, that of {worst} by {days} d"
+            what = f"The verifications of {listed(cells)} are late, that of {worst} by {days} d"
         yield Finding("overdue", cells, f"{what}: run `ftdrive fleet verify --due`")
 
 
@@ -159,9 +159,9 @@ def _centre(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
         yield Finding(
             "payload",
             cells,
-            f"{tool}: its centre of mass is {_mm(centre)} mm off the flange axis in {listed(cells)} alike, but the "
-            f"payloads of their controllers amount to {_mm(first.configured_off_axis_m)} mm (in {first.cell}): set the "
-            "payload with `ftdrive push`",
+            f"The tool {tool} has its centre of mass {_mm(centre)} mm off the flange axis in {listed(cells)} alike. "
+            f"The payloads of their controllers amount to others, such as {_mm(first.configured_off_axis_m)} mm in "
+            f"{first.cell}: set them with `ftdrive push`",
         )
 
 
@@ -180,9 +180,9 @@ def _mass(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
         yield Finding(
             "payload",
             cells,
-            f"{tool}: it weighs {mass_kg:.2f} kg without sensor and adapter in {listed(cells)} alike, but the payloads "
-            f"of their controllers are not that, such as {first.payload_kg:.2f} kg in {first.cell}: set the payload "
-            "with `ftdrive push`",
+            f"The tool {tool} weighs {mass_kg:.2f} kg without sensor and adapter in {listed(cells)} alike. "
+            f"The payloads of their controllers do not agree, such as {first.payload_kg:.2f} kg in {first.cell}: set them with "
+            "`ftdrive push`",
         )
 
 

@@ -81,7 +81,7 @@ def _finding(model: str, sensors: Mapping[str, _Sums]) -> Iterator[Finding]:
     yield Finding(
         "temperature",
         cells,
-        f"the bias of {len(following)} of {len(sensors)} sensors {model} follows their temperature, by up to "
+        f"The bias of {len(following)} of {len(sensors)} sensors {model} follows their temperature, by up to "
         f"{size} a kelvin (in {listed(cells)}): let them warm up before a calibration, and tare them at "
         "the temperature of the work",
     )

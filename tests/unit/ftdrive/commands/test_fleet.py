@@ -75,7 +75,7 @@ def test_from_an_empty_store_to_a_status(run: Callable[..., Ran], cells: Path, r
     assert press[:5] == ["press", "gripper", "good", "40 d", "24 h"]
     assert re.fullmatch(r"\d\.\d DRIFTS", press[5])
     assert press[6] == "in 6 d"
-    assert "2 cells: 1 never calibrated, 1 drifts" in err
+    assert "2 cells: 1 never calibrated, 1 drifting" in err
     assert "! press, gripper: force bias y drifts by 0.0" in err
     assert max(cell_len(line.rstrip()) for line in out.splitlines()) <= 80
 
@@ -109,7 +109,7 @@ def test_the_page_is_one_file_with_escaped_names(
     assert (code, out, err) == (0, "", f"Saved {tmp_path}/fleet.html")
     assert page.count("<svg") == 1
     assert page.count("<polyline") == 6
-    assert "Press, gripper: force bias y drifts by" in page
+    assert "press, gripper: force bias y drifts by" in page
     assert "&lt;b&gt;drill" in page
     assert "<b>drill" not in page
     assert not re.search(r"https?:|<script|<link|src=", page)
