@@ -181,8 +181,8 @@ def _mass(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
             "payload",
             cells,
             f"The tool {tool} weighs {mass_kg:.2f} kg without sensor and adapter in {listed(cells)} alike. "
-            f"The payloads of their controllers do not agree, such as {first.payload_kg:.2f} kg in {first.cell}: set them with "
-            "`ftdrive push`",
+            f"The payloads of their controllers do not agree, such as {first.payload_kg:.2f} kg in {first.cell}: set "
+            "them with `ftdrive push`",
         )
 
 

@@ -25,7 +25,9 @@ def status(store: str | None, page_path: Path | None, as_json: bool) -> None:
 
     The columns are the age of the calibration, that of the last verification, the drift of the bias in sigmas of a
     verification, and when the next one is due. A cell has one line for each tool in use. Below the list is what needs
-    attention, with what to do. The exit code is 0 also then. `ftdrive fleet add` adds cells, `ftdrive fleet index` adds runs from other computers.
+    attention, with what to do. The exit code is 0 also then.
+
+    `ftdrive fleet add` adds cells, `ftdrive fleet index` adds runs from other computers.
     """
     from calib.files import write_new
     from ftdrive.fleet.observed import Observed
