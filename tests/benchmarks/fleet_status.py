@@ -1,9 +1,9 @@
 """Speed of `ftdrive fleet status`: 200 cells with a year of daily verifications, beside reading the run folders.
 
-    uv run python -m tests.benchmarks.fleet_status [--cells 200] [--days 365] [--store URL] [--folders]
+    uv run python -m tests.benchmarks.fleet_status [--cells 200] [--days 365] [--postgres] [--folders]
 
-It fills a store, by default an SQLite file in a temporary folder. `--store` must name an empty database. `--folders`
-also writes every verification as a run folder, and reads them all (200 cells: 73 000 folders, 1.3 GB).
+It fills a store: an SQLite file in a temporary folder, or a private PostgreSQL server. `--folders` also writes every
+verification as a run folder, and reads them all (200 cells: 73 000 folders, 1 GB).
 """
 
 import argparse
@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,6 +25,7 @@ from ftdrive.fleet.status import fleet_state
 from ftdrive.runs.run import RUN_FORMAT
 from ftdrive.store.records import Record, StoredCell, StoredResult, StoredVerification, read_records, record_paths
 from ftdrive.store.store import Store
+from tests.postgres import Server, find_programs
 from tests.unit.ftdrive.live.simulated import calibrated
 
 NOW = datetime.now(UTC)
@@ -107,11 +109,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--cells", type=int, default=200)
     parser.add_argument("--days", type=int, default=365)
-    parser.add_argument("--store", help="Empty database.")
+    parser.add_argument("--postgres", action="store_true", help="Use a private PostgreSQL server.")
     parser.add_argument("--folders", action="store_true", help="Also read the run folders.")
     options = parser.parse_args()
-    with TemporaryDirectory(prefix="fleet-status-") as folder:
-        url = options.store or f"sqlite:///{folder}/store.sqlite"
+    with TemporaryDirectory(prefix="fleet-status-") as folder, ExitStack() as stack:
+        url = f"sqlite:///{folder}/store.sqlite"
+        if options.postgres:
+            programs = find_programs()
+            assert programs is not None, "install PostgreSQL 15 or newer"
+            Path(folder).chmod(0o755)
+            (data := Path(folder) / "postgres").mkdir()
+            server = Server(programs, data)
+            stack.callback(server.stop)
+            url = server.url(server.new_database())
         store = Store(url)
         fill(store, options.cells, options.days)
         click.echo(f"{store.name}: {options.cells} cells, {options.days} daily verifications each; best of 5, seconds")

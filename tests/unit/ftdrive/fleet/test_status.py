@@ -4,6 +4,8 @@ from datetime import timedelta
 
 import numpy as np
 
+from ftdrive.fleet.status import fleet_state
+from ftdrive.store.store import Store
 from tests.unit.ftdrive.fleet.fleet_records import NOW, cell, check, daily, fleet, result
 
 
@@ -103,3 +105,14 @@ def test_verifications_of_an_earlier_version_have_no_change_of_the_bias() -> Non
     made = result("a", 61)
     (one,) = fleet([cell("a")], [made], [check(made, day) for day in range(20)]).cells
     assert (one.drift, one.passed) == (None, True)
+
+
+def test_a_store_gives_the_same_state_as_its_records(store_url: str) -> None:
+    made, other = result("a", 61), result("b", 200, tool=None, payload_kg=1.9, payload_com_m=[0.0, 0.0, 0.05])
+    checks = [*daily(made, 60, 1, ramp(2.0, 21), temperature_C=25.0), check(other, 150, passed=False)]
+    cells = [cell("b"), cell("a"), cell("c", arm_serial="arm-c")]
+    store = Store(store_url)
+    store.put_cells(cells)
+    with store._database.writing() as connection:
+        store._write(connection, [made, other, *checks])
+    assert fleet_state(store, NOW) == fleet(cells, [made, other], checks)
