@@ -137,11 +137,12 @@ def test_a_cell_that_is_like_a_stored_one_is_refused(run: Callable[..., Ran], ce
     assert len(json.loads(run("status", "--json")[1])["cells"]) == 2
 
 
-@pytest.mark.usefixtures("cells", "runs")
+@pytest.mark.usefixtures("cells")
 @pytest.mark.parametrize("command", [("status",), ("add", "cells.toml"), ("remove", "press"), ("index", "runs")])
 def test_a_store_that_cannot_be_used_is_one_sentence(
     run: Callable[..., Ran], tmp_path: Path, command: tuple[str, ...]
 ) -> None:
+    (tmp_path / "runs").mkdir()
     code, _, err = run(*command, "--store", "nonsense")
     assert (code, err.startswith("error: ")) == (2, True)
     (damaged := tmp_path / "damaged.sqlite").write_text("no database " * 100)
