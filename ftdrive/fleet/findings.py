@@ -27,7 +27,7 @@ TILTED_RAD: Final = np.deg2rad(0.1)
 TILT_FLOOR_RAD: Final = np.deg2rad(0.02)
 """Added to the sigma of a tilt: postures of an arm bend it differently."""
 SURE: Final = 1e-4
-"""Largest p-value of a turned base: one in 100 fleets of 200 cells shows one by chance."""
+"""Largest p-value of a turned base: one in 50 fleets of 200 cells shows one by chance."""
 LATE: Final = timedelta(days=1)
 """A verification that is due today is not late yet."""
 
@@ -47,11 +47,11 @@ def findings(observed: Observed, states: Sequence[CellState]) -> tuple[Finding, 
 
 
 def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[Finding]:
-    late = {one.cell: one.due for one in reversed(states) if one.due is not None and one.due + LATE < observed.now}
+    late = [(one.due, one.cell) for one in states if one.due is not None and one.due + LATE < observed.now]
     if late:
-        worst = min(late, key=lambda cell: late[cell])
-        cells = tuple(sorted(late))
-        days = (observed.now - late[worst]).days
+        due, worst = min(late)
+        cells = tuple(sorted({cell for _, cell in late}))
+        days = (observed.now - due).days
         what = f"The verification of {worst} is late by {days} d"
         if len(cells) > 1:
             what = f"The verifications of {listed(cells)} are late, that of {worst} by {days} d"

@@ -19,7 +19,8 @@ from ftdrive.fleet.words import listed
 from ftdrive.report.words import rounded
 
 SURE: Final = 1e-5
-"""Largest p-value of one component of one sensor: one in 100 fleets of 200 sensors shows one by chance."""
+"""Largest p-value of one component of one sensor: in one of 80 fleets of 200 sensors one follows by chance, and two are
+needed."""
 FEWEST: Final = 8
 """Verifications of a calibration."""
 LEAST_K: Final = 3.0

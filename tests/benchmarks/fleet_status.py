@@ -30,7 +30,7 @@ from tests.unit.ftdrive.live.simulated import calibrated
 
 NOW = datetime.now(UTC)
 SIGMA = np.repeat([0.01, 0.0005], 3)
-EVERY_DAYS = 60
+EVERY_DAYS = 90
 """Between two calibrations."""
 FIELDS = ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")
 
