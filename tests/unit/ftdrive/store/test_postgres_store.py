@@ -1,5 +1,6 @@
 """A store on a server: outages, passwords and waiting writers. Each failure is one sentence, and no run is lost."""
 
+import socket
 import sys
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def test_an_outage_in_mid_write_loses_no_run(
         if outage == "server killed":
             postgres.kill()
         else:
-            postgres.execute(f"SELECT pg_terminate_backend({pid})")
+            postgres.execute(f"SELECT pg_terminate_backend({pid}, 60000)")
 
     event.listen(database._engine, "commit", fail)
     with pytest.raises(BadStore, match=r"cannot be written \(.*\): check") as error:
@@ -97,6 +98,15 @@ def test_a_calibration_does_not_fail_for_a_server_that_is_down(
     out, err = capsys.readouterr()
     assert out == ""
     assert "The run is saved but not in the history yet, because the store postgresql" in " ".join(err.split())
+
+
+@pytest.mark.slow
+def test_a_server_that_does_not_answer_is_one_sentence() -> None:
+    """It accepts the connection and stays silent; libpq waits for 2 s at least."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        with pytest.raises(BadStore, match=r"cannot be read .*timeout"):
+            Store(f"postgresql+psycopg://lab@127.0.0.1:{port}/db", wait_s=0.1).results()
 
 
 def test_a_missing_libpq_names_the_extra(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
