@@ -58,11 +58,16 @@ class Expected:
         """Return the residuals (n, 6), their sigma (n, 6), and chi2 of all of them together."""
         p, response = self.calibration.parameters, self.calibration.response
         residual = np.asarray(Compensator(p, response=response).batch(wrench, R_base_flange), dtype=np.float64)
-        C = self.calibration.covariance if response is None else response.covariance
-        K = _columns(p, response, R_base_flange).reshape(residual.size, -1)
-        S = self.noise + K @ C @ K.T
+        S = self.noise + self.common(R_base_flange)
         chi2 = float(residual.ravel() @ np.linalg.solve(S, residual.ravel()))
         return residual, np.sqrt(self.factor * np.diag(S)).reshape(residual.shape), chi2
+
+    def common(self, R_base_flange: Array) -> Array:
+        """Return the covariance (6n, 6n) of the predictions: the uncertainty of the calibration, without `factor`."""
+        p, response = self.calibration.parameters, self.calibration.response
+        C = self.calibration.covariance if response is None else response.covariance
+        K = _columns(p, response, R_base_flange).reshape(6 * len(R_base_flange), -1)
+        return np.asarray(K @ C @ K.T)
 
     def p_value(self, chi2: float, dof: int) -> float:
         """Probability of a larger chi2."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from calib.data.dataset import CalibrationDataset, finite
 from calib.errors import BadDataset, NotObservable
+from calib.extras.bias_change import BiasChange, bias_change
 from calib.extras.expected_readings import Expected, expected_as_found, expected_with_inexact_orientations
 from calib.extras.update import BLOCKS, Update, reestimate
 from calib.files import JSON
@@ -60,6 +61,8 @@ class Verification:
     change: Change | None
     """What has changed; None if passed, or if no change explains the readings."""
     reason: str
+    bias_change: BiasChange
+    """Change of the six biases, as if nothing else had changed."""
     alternatives: tuple[Change, ...] = ()
     """Other changes that explain the readings as well."""
     update: Update | None = None
@@ -82,6 +85,7 @@ class Verification:
             "p_value": self.p_value,
             "residual": self.residual.tolist(),
             "predicted_sigma": self.predicted_sigma.tolist(),
+            "bias_change": self.bias_change.to_dict(),
             "update": None if update is None else {"kind": update.kind, "chi2": update.chi2, "dof": update.dof},
         }
 
@@ -143,6 +147,7 @@ def verify(
         passed=p_value >= false_alarms,
         change=None,
         reason=f"the {n} poses agree with the calibration (chi2 {chi2:.0f} for {6 * n} readings, p {p_value:.2g})",
+        bias_change=bias_change(expected, R_base_flange, wrench),
     )
     if unchanged.passed:
         return unchanged

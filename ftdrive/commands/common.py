@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from calib import CalibrationResult
     from ftdrive.cell.config import CellConfig
     from ftdrive.live.samples import Axes, WrenchFrame
+    from ftdrive.store.store import Store
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -211,6 +212,14 @@ def index_run(folder: Path, cell: "CellConfig | None" = None) -> None:
         Store(store_url() if cell is None else cell.store.url).index(folder.resolve().parent)
     except (BadStore, ConfigError, OSError) as error:
         talk.print(f" The run is saved but not in the history yet, because {error}.")
+
+
+def upgrade_store(store: "Store") -> None:
+    """Migrate the tables of an older version, and print it."""
+    from ftdrive.terminal.console import talk
+
+    if (version := store.upgrade()) is not None:
+        talk.print(f"The store {store.name} is upgraded from version {version}.")
 
 
 def store_url(config: Path | None = None) -> str | None:

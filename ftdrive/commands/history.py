@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import FOLDER, JSON, store_url, write_json
+from ftdrive.commands.common import FOLDER, JSON, store_url, upgrade_store, write_json
 
 if TYPE_CHECKING:
     from ftdrive.store.records import StoredResult, StoredVerification
@@ -19,12 +19,17 @@ if TYPE_CHECKING:
 @click.option("--tool", metavar="NAME", help="Only results of this tool.")
 @click.option("--index", metavar="FOLDER", multiple=True, type=FOLDER, help="First add the runs in FOLDER. Repeatable.")
 @click.option("--rebuild", is_flag=True, help="First read all runs again, and forget those that were deleted.")
+@click.option("--store", "url", metavar="URL", help="Database to use, instead of [store] url.")
 @JSON
-def history(folders: Sequence[Path], tool: str | None, index: Sequence[Path], rebuild: bool, as_json: bool) -> None:
+def history(
+    folders: Sequence[Path], tool: str | None, index: Sequence[Path], rebuild: bool, url: str | None, as_json: bool
+) -> None:
     """List results with their date and last verification, and the trends of bias and payload.
 
     They come from the store, where `calibrate` and `verify` add theirs, or from the run folders in RUNS. A trend is
     significant if the uncertainty of the results explains it in less than one case of 100, and so does their scatter.
+
+    --index and --rebuild also upgrade a store of an older version.
     """
     from ftdrive.errors import ConfigError
     from ftdrive.store.history import drifts, warnings
@@ -35,17 +40,18 @@ def history(folders: Sequence[Path], tool: str | None, index: Sequence[Path], re
     left_out: tuple[str, ...] = ()
     name = None
     if folders:
-        if index or rebuild:
-            raise ConfigError(f"RUNS and {'--index' if index else '--rebuild'} exclude one another: leave one out")
+        if option := "--index" if index else "--rebuild" if rebuild else "--store" if url else "":
+            raise ConfigError(f"RUNS and {option} exclude one another: leave one out")
         records, left_out = read_records(record_paths(folders))
         results = [one for one in records if isinstance(one, StoredResult) and tool in {None, one.tool}]
         results.sort(key=lambda one: (one.created_utc or "", one.id))
         checks = [one for one in records if isinstance(one, StoredVerification)]
         checks.sort(key=lambda one: one.created_utc or "")
     else:
-        store = Store(store_url())
+        store = Store(url or store_url())
         name = store.name
         if index or rebuild:
+            upgrade_store(store)
             left_out = (store.rebuild(*index) if rebuild else store.index(*index)).unreadable
         results, checks = store.results(tool), store.verifications()
     for words in left_out:

@@ -62,13 +62,14 @@ def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationData
 
 def _setup(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a result is bound to or compared with: payload last reported, tool, mount label and mounting."""
-    payload_kg = None
+    payload_kg = p_flange_payload_m = None
     for event in run.events():
         if event.get("event") == "weighed":
-            payload_kg = event["payload_kg"]
+            payload_kg, p_flange_payload_m = event["payload_kg"], event.get("p_flange_payload_m")
     sensor, tool, workcell = (config.get(section, {}) for section in ("sensor", "tool", "workcell"))
     return {
         "payload_kg": payload_kg,
+        "p_flange_payload_m": p_flange_payload_m,
         "sensor_mass_kg": sensor.get("mass_kg"),
         "mounting": workcell.get("mounting"),
         "height_mm": sensor.get("height_mm"),

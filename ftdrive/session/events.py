@@ -205,6 +205,8 @@ class Weighed(Event):
     mass_kg: float
     """Of what the sensor carries, so without sensor and adapter."""
     payload_kg: float
+    p_flange_payload_m: tuple[float, ...] | None
+    """(3,) centre of mass of that payload, flange axes; None for a controller that does not report it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

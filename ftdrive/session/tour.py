@@ -162,11 +162,14 @@ class Tour:
     def _compare_payload(self) -> None:
         """Row 7: show the mass on the sensor, and whether the configured payload differs; once for each payload."""
         mass_kg = self._judge.weighed_kg
-        payload_kg = None if mass_kg is None else self._arm.status().payload_kg
-        if mass_kg is None or payload_kg is None or payload_kg == self._now.payload_kg:
+        if mass_kg is None:
+            return
+        status = self._arm.status()
+        payload_kg, com_m = status.payload_kg, status.p_flange_payload_m
+        if payload_kg is None or payload_kg == self._now.payload_kg:
             return
         self._now = replace(self._now, payload_kg=payload_kg)
-        self._journal.show(Weighed(mass_kg=mass_kg, payload_kg=payload_kg))
+        self._journal.show(Weighed(mass_kg=mass_kg, payload_kg=payload_kg, p_flange_payload_m=com_m))
         if words := payload_in_words(payload_kg, mass_kg, self._measuring.sensor_kg):
             self._note(words, warning=True)
 

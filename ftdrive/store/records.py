@@ -1,4 +1,4 @@
-"""What the store keeps of a run folder, read from its files."""
+"""What the store keeps: of a run folder, read from its files, and of a cell, as it was configured."""
 
 import hashlib
 from collections.abc import Iterable, Mapping
@@ -33,7 +33,11 @@ class StoredResult:
     """As ISO 8601 with microseconds, so that texts sort as times."""
     tool: str | None
     arm_serial: str | None
+    arm_model: str | None
     sensor_serial: str | None
+    sensor_model: str | None
+    robot_host: str | None
+    """Address of the controller in the configuration of the run."""
     mount: str | None
     verdict: str
     n_poses: int
@@ -48,6 +52,10 @@ class StoredResult:
     """What was updated, such as "bias"."""
     temperature_C: float | None
     """Of the sensor, where a device reports it."""
+    payload_kg: float | None
+    """That the controller reported during the calibration."""
+    payload_com_m: list[float] | None
+    """(3,) centre of mass of that payload, flange axes; None also for a run of an earlier version."""
 
     @property
     def parameters(self) -> Parameters:
@@ -80,6 +88,26 @@ class StoredVerification:
     """What has changed since the calibration, such as "bias"."""
     reason: str | None
     temperature_C: float | None
+    bias_change: list[float] | None
+    """(6,) change of the bias since the calibration, in N, then N·m, sensor frame."""
+    bias_change_sigma: list[float] | None
+    """(6,) its standard deviation from the readings of this verification."""
+    calibration_sigma: list[float] | None
+    """(6,) its standard deviation from the calibration, which all its verifications share."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredCell:
+    """One cell of a fleet. No run folder contains it, so a rebuild of the store keeps it."""
+
+    name: str
+    config: str
+    """Absolute path of its configuration file."""
+    verify_every_days: float
+    arm_serial: str | None
+    robot_host: str | None
+    sensor_url: str | None
+    tool: str | None
 
 
 Record = StoredResult | StoredVerification
@@ -140,6 +168,7 @@ def _result(path: Path) -> StoredResult:
     config = header.get("config", {})
     provenance, run_devices = result.provenance, header.get("devices", {})
     setup, devices = _object(provenance.get("setup")), _object(provenance.get("devices")) or run_devices
+    arm, sensor = (_object(devices.get(role)) for role in ("arm", "sensor"))
     parent = provenance.get("parent")
     return StoredResult(
         id=result.id,
@@ -147,8 +176,11 @@ def _result(path: Path) -> StoredResult:
         run=path.parent.name,
         created_utc=_utc(provenance.get("created_utc") or header.get("created_utc")),
         tool=_text(setup.get("tool")) or _text(_object(config.get("tool")).get("name")),
-        arm_serial=_text(_object(devices.get("arm")).get("serial")),
-        sensor_serial=_text(_object(devices.get("sensor")).get("serial")),
+        arm_serial=_text(arm.get("serial")),
+        arm_model=_text(arm.get("model")),
+        sensor_serial=_text(sensor.get("serial")),
+        sensor_model=_text(sensor.get("model")),
+        robot_host=_text(_object(config.get("robot")).get("host")),
         mount=_text(setup["mount"] if "mount" in setup else _object(config.get("sensor")).get("mount")),
         verdict=result.verdict,
         n_poses=result.n_poses,
@@ -162,6 +194,8 @@ def _result(path: Path) -> StoredResult:
         parent=_text(_object(parent).get("id")) or _text(parent),
         update=_text(provenance.get("update")),
         temperature_C=_number(provenance.get("temperature_C")),
+        payload_kg=_number(setup.get("payload_kg")),
+        payload_com_m=_numbers(setup.get("p_flange_payload_m"), 3),
     )
 
 
@@ -171,6 +205,7 @@ def _verification(path: Path) -> StoredVerification:
     calibration_id, passed = _text(_object(document.get("calibration")).get("id")), document.get("passed")
     if calibration_id is None or not isinstance(passed, bool):
         raise BadDataset(f"{path.name} lacks the id of its calibration or the outcome: the file is damaged")
+    bias_change = _object(document.get("bias_change"))
     return StoredVerification(
         id=hashlib.sha256(path.read_bytes()).hexdigest()[:12],
         path=str(path),
@@ -181,6 +216,9 @@ def _verification(path: Path) -> StoredVerification:
         change=_text(document.get("change")),
         reason=_text(document.get("reason")),
         temperature_C=_number(document.get("temperature_C")),
+        bias_change=_numbers(bias_change.get("value"), 6),
+        bias_change_sigma=_numbers(bias_change.get("sigma"), 6),
+        calibration_sigma=_numbers(bias_change.get("calibration_sigma"), 6),
     )
 
 
@@ -203,6 +241,13 @@ def _text(value: Any) -> str | None:
 def _number(value: Any) -> float | None:
     usable = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
     return float(value) if usable else None
+
+
+def _numbers(value: Any, n: int) -> list[float] | None:
+    """Return a list of n finite numbers, or None if it is not one."""
+    found = [_number(one) for one in value] if isinstance(value, list) else []
+    known = [one for one in found if one is not None]
+    return known if len(known) == len(found) == n else None
 
 
 def _utc(value: Any) -> str | None:

@@ -15,7 +15,8 @@ from ftdrive import cli
 from ftdrive.commands.common import index_run
 from ftdrive.runs.run import Run
 from ftdrive.session import session
-from ftdrive.store.store import Store, default_file
+from ftdrive.store.database import default_file
+from ftdrive.store.store import Store
 from tests.unit.ftdrive.live.simulated import calibrated
 from tests.unit.ftdrive.store.run_folders import new_run, result, verified
 
@@ -102,12 +103,12 @@ def test_a_store_that_cannot_be_used_is_one_sentence(
 ) -> None:
     Store().index(runs)
     with sqlite3.connect(default_file()) as connection:
-        connection.execute("UPDATE ftdrive_schema SET version = 2")
+        connection.execute("UPDATE ftdrive_schema SET version = 3")
     connection.close()
     for arguments in (["history"], ["history", "--index", runs], ["diff", "abcd", "abcd"]):
         code, out, err = run(*arguments)
         assert (code, out) == (6, "")
-        assert "has version 2, this ftdrive uses version 1: install a newer ftdrive" in err
+        assert "has version 3, this ftdrive uses version 2: install a newer ftdrive" in err
     monkeypatch.setenv("FTDRIVE_STORE_URL", "mysql://host/db")
     code, _, err = run("history")
     assert (code, "begins with mysql" in err) == (2, True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from calib.extras.bias_change import BiasChange
 from calib.extras.update import reestimate
 from calib.extras.verification import Verification
 from ftdrive.commands import verify as command
@@ -57,7 +58,10 @@ def failed(folder: Path, limits: AcceptanceLimits) -> Any:
     R, noise = np.stack([np.eye(3), np.diag([1.0, -1.0, -1.0])]), np.eye(12) * 1e-4
     wrench = -calibration().compensate(np.zeros((2, 6)), R) + np.repeat([0.3, 0.0], 3)
     update = reestimate(calibration(), R, wrench, noise, "bias")
-    found = Verification(np.full((2, 6), 0.3), np.full((2, 6), 0.1), 99.0, 12, 1e-9, False, "bias", "…", (), update)
+    change = BiasChange(np.full(6, 0.3), np.full(6, 0.1), np.zeros(6))
+    found = Verification(
+        np.full((2, 6), 0.3), np.full((2, 6), 0.1), 99.0, 12, 1e-9, False, "bias", "…", change, (), update
+    )
     path = folder / "verification.json"
     return Verified(Run(folder), calibration(), folder / "a.json", limits, None, (), found, None, path)  # type: ignore[arg-type]
 

@@ -15,7 +15,8 @@ from ftdrive.cli import cli
 from ftdrive.report.origin_sections import provenance
 from ftdrive.report.page import page
 from ftdrive.report.trust import trust
-from ftdrive.store.store import Store, default_file
+from ftdrive.store.database import default_file
+from ftdrive.store.store import Store
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
 
 NOW = FIRST + timedelta(days=10)

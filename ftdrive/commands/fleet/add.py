@@ -1,0 +1,30 @@
+"""`ftdrive fleet add`: cells from a cells.toml into the store."""
+
+from pathlib import Path
+
+import click
+
+from ftdrive.commands.common import FILE, store_url
+
+
+@click.command()
+@click.argument("file", metavar="CELLS.TOML", type=FILE)
+@click.option("--store", metavar="URL", help="Store to write, instead of [store] url.")
+def add(file: Path, store: str | None) -> None:
+    """Add the cells of CELLS.TOML to the store, or replace those of the same name.
+
+    Each has a table [cells.NAME] with `config`, the path of its ftdrive.toml, and `verify_every_days`. Its runs are
+    found by the serial number of the arm (`arm_serial`, or [robot] serial), else by [robot] host.
+    """
+    from ftdrive.fleet.cells import read_cells, refuse_ambiguous
+    from ftdrive.store.store import Store
+    from ftdrive.terminal.console import talk
+
+    found = Store(store or store_url())
+    cells = read_cells(file)
+    names = {cell.name for cell in cells}
+    known = found.cells()
+    refuse_ambiguous([*cells, *(cell for cell in known if cell.name not in names)])
+    found.put_cells(cells)
+    replaced = len(names & {cell.name for cell in known})
+    talk.print(f" {len(cells) - replaced} added, {replaced} replaced in {found.name}")

@@ -1,0 +1,100 @@
+"""`ftdrive fleet status`: what is due, what drifts, and what several cells show together."""
+
+import sys
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ftdrive.commands.common import JSON, NewFile, store_url, write_json
+
+if TYPE_CHECKING:
+    from ftdrive.fleet.state import CellState, Fleet
+
+_TITLES = ("cell", "tool", "verdict", "age", "verified", "drift, σ", "due")
+
+
+@click.command()
+@click.option("--store", metavar="URL", help="Store to read, instead of [store] url.")
+@click.option("--html", "page_path", metavar="FILE", type=NewFile(), help="New file: a page with plots of the drift.")
+@JSON
+def status(store: str | None, page_path: Path | None, as_json: bool) -> None:
+    """List all cells: age of the calibration, last verification, drift of the bias, and when a verification is due.
+
+    Below the list is what needs attention, with what to do. The exit code is 0 also then. A cell has one line for each
+    tool in use. `ftdrive fleet add` adds cells, `ftdrive fleet index` adds runs from other computers.
+    """
+    from calib.files import write_new
+    from ftdrive.fleet.observed import Observed
+    from ftdrive.fleet.status import fleet_of
+    from ftdrive.store.store import Store
+    from ftdrive.terminal.console import hanging, talk
+
+    found, now = Store(store or store_url()), datetime.now(UTC)
+    observed = Observed.read(found, now)
+    fleet = fleet_of(observed, found)
+    if page_path is not None:
+        from ftdrive.fleet.page import page
+
+        write_new(page_path, page(fleet, observed, found.name))
+        talk.print(f" Saved {page_path}")
+    if as_json:
+        write_json(_as_json(fleet, found.name, now))
+    elif not fleet.cells:
+        talk.print("No cells. `ftdrive fleet add cells.toml` adds them.")
+    elif page_path is None:
+        from ftdrive.fleet.words import attention, summary
+
+        _print_table(fleet, now)
+        talk.print(summary(fleet, now), style="bold")
+        for words in attention(fleet, now):
+            talk.print(hanging(" ! ", words), style="yellow")
+
+
+def _print_table(fleet: "Fleet", now: datetime) -> None:
+    """Print the table; a narrow terminal folds long names, a file or pipe has one line a row."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for title in _TITLES:
+        table.add_column(title, no_wrap=title not in {"cell", "tool"}, overflow="fold")
+    for one in fleet.cells:
+        table.add_row(*_row(one, now))
+    Console(width=None if sys.stdout.isatty() else 300, highlight=False, markup=False).print(table)
+
+
+def _row(one: "CellState", now: datetime) -> tuple[str, ...]:
+    from ftdrive.fleet.words import due_in_words, verified_in_words
+    from ftdrive.runs.verification import age_in_words
+
+    drift = "-"
+    if one.drift is not None:
+        drift = f"{one.drift.level_sigmas:.1f}{' DRIFTS' if one.drift.found else ''}"
+    return (
+        one.cell,
+        one.tool or "-",
+        one.verdict or "none",
+        "-" if one.calibrated is None else age_in_words(now - one.calibrated),
+        verified_in_words(one, now),
+        drift,
+        due_in_words(one.due, now),
+    )
+
+
+def _as_json(fleet: "Fleet", name: str, now: datetime) -> dict[str, Any]:
+    def plain(one: "CellState") -> dict[str, Any]:
+        values = {
+            key: value.isoformat() if isinstance(value, datetime) else value for key, value in asdict(one).items()
+        }
+        return {**values, "is_due": one.is_due(now)}
+
+    return {
+        "schema_version": 1,
+        "store": name,
+        "now": now.isoformat(),
+        "cells": [plain(one) for one in fleet.cells],
+        "findings": [asdict(one) for one in fleet.findings],
+    }

@@ -1,0 +1,103 @@
+"""What the store knows of a fleet: the accepted results of each cell, and the verifications of the last 90 days."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Final, Self
+
+import numpy as np
+
+from calib.model import Array
+from ftdrive.fleet.cells import Owners
+from ftdrive.store.records import StoredCell, StoredResult, StoredVerification
+from ftdrive.store.store import Store
+
+WINDOW: Final = timedelta(days=90)
+"""Of the verifications that are read. A drift of the bias shows within weeks, and the store is read every minute."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BiasChanges:
+    """Changes of the bias since a calibration, by n verifications; force first, N and N·m, sensor frame."""
+
+    t_days: Array
+    """(n,) since the calibration, ascending."""
+    change: Array
+    """(n, 6)"""
+    sigma: Array
+    """(n, 6) of the readings of each verification."""
+    calibration_sigma: Array
+    """(6,) of the calibration."""
+    temperature_C: Array
+    """(n,) nan where it is not known."""
+
+    @property
+    def in_sigmas(self) -> Array:
+        """(n, 6) in sigmas of each verification."""
+        return np.asarray(self.change / self.sigma)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """Results and verifications of a fleet."""
+
+    cells: tuple[StoredCell, ...]
+    results: Mapping[str, Sequence[StoredResult]]
+    """Accepted results with a time, by cell, the oldest first."""
+    checks: Mapping[str, Sequence[StoredVerification]]
+    """Verifications with a time, by calibration, the oldest first; none without, or older than `WINDOW`."""
+    now: datetime
+
+    @classmethod
+    def read(cls, store: Store, now: datetime) -> Self:
+        """Read the store; raises `BadStore`."""
+        cells = tuple(store.cells())
+        owners = Owners(cells)
+        results: dict[str, list[StoredResult]] = {cell.name: [] for cell in cells}
+        for one in store.results():
+            name = owners.cell_of(one)
+            if name is not None and one.verdict != "rejected" and one.created_utc is not None:
+                results[name].append(one)
+        checks = dict[str, list[StoredVerification]]()
+        for check in store.verifications(since=now - WINDOW):
+            if check.created_utc is not None:
+                checks.setdefault(check.calibration_id, []).append(check)
+        return cls(cells, results, checks, now)
+
+    def newest(self, cell: StoredCell) -> Iterator[StoredResult]:
+        """Yield the newest result of each tool in use, in the order of their names.
+
+        In use are the tool of the configuration, the one calibrated last, and each that was calibrated or verified
+        within `WINDOW`.
+        """
+        by_tool = {one.tool: one for one in self.results[cell.name]}
+        last = self.results[cell.name][-1:]
+        for tool in sorted(by_tool, key=lambda one: one or ""):
+            one = by_tool[tool]
+            recent = self.now - when(one) < WINDOW or one.id in self.checks
+            if recent or tool == cell.tool or one in last:
+                yield one
+
+    def is_cut(self, result: StoredResult) -> bool:
+        """Whether a calibration may have verifications that are too old to be read."""
+        return when(result) < self.now - WINDOW
+
+    def bias_changes(self, result: StoredResult) -> BiasChanges | None:
+        """Return what the verifications of a calibration say of its bias; None if none of them says it."""
+        start = when(result)
+        rows = [
+            (when(one), one.bias_change, one.bias_change_sigma, one.calibration_sigma, one.temperature_C)
+            for one in self.checks.get(result.id, ())
+            if one.bias_change and one.bias_change_sigma and one.calibration_sigma and min(one.bias_change_sigma) > 0
+        ]
+        if not rows:
+            return None
+        times, change, sigma, common, temperature = zip(*rows, strict=True)
+        days = np.array([(time - start).total_seconds() for time in times]) / 86400
+        known = np.array([np.nan if one is None else one for one in temperature])
+        return BiasChanges(days, np.array(change), np.array(sigma), np.median(np.array(common), axis=0), known)
+
+
+def when(one: StoredResult | StoredVerification) -> datetime:
+    """Return the time of a record that has one."""
+    return datetime.fromisoformat(str(one.created_utc))

@@ -1,0 +1,96 @@
+"""The state of a fleet as one HTML page without a link to anything outside it."""
+
+from datetime import datetime
+
+import numpy as np
+
+from ftdrive import __version__
+from ftdrive.errors import ConfigError
+from ftdrive.fleet.observed import WINDOW, BiasChanges, Observed, when
+from ftdrive.fleet.state import CellState, Fleet
+from ftdrive.fleet.words import attention, due_in_words, summary, verified_in_words
+from ftdrive.runs.verification import age_in_words
+
+WIDTH, HEIGHT, MARGIN = 220, 44, 3
+LEAST_SIGMAS = 4.0
+"""Half the height of a plot, unless the bias has changed by more."""
+
+
+def page(fleet: Fleet, observed: Observed, store: str) -> str:
+    """Write the page.
+
+    Parameters
+    ----------
+    store : str
+        Name of the store, without its password.
+
+    Raises
+    ------
+    ConfigError
+        The extra `fleet` is not installed.
+    """
+    try:
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+        from markupsafe import Markup
+    except ImportError:
+        raise ConfigError("the page of a fleet needs jinja2: pip install 'ftdrive[fleet]', or --json") from None
+
+    environment = Environment(
+        loader=PackageLoader("ftdrive.fleet"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    results = {one.id: one for name in observed.results for one in observed.results[name]}
+    rows = []
+    for state in fleet.cells:
+        result = None if state.calibration_id is None else results[state.calibration_id]
+        changes = None if result is None else observed.bias_changes(result)
+        drawn = "" if result is None or changes is None else plot(changes, when(result), observed.now)
+        rows.append({"state": state, "plot": Markup(drawn), **_words(state, observed.now)})
+    return environment.get_template("fleet.html.j2").render(
+        rows=rows,
+        summary=summary(fleet, observed.now),
+        attention=attention(fleet, observed.now),
+        now=observed.now,
+        store=store,
+        days=WINDOW.days,
+        version=__version__,
+    )
+
+
+def plot(changes: BiasChanges, start: datetime, now: datetime) -> str:
+    """Draw the changes of the six biases over the last 90 days as SVG, in sigmas of each verification.
+
+    Force is drawn in one colour, torque in another; the gray band is two sigmas to both sides.
+    """
+    first = (now - WINDOW - start).total_seconds() / 86400
+    x = MARGIN + (changes.t_days - first) / WINDOW.days * (WIDTH - 2 * MARGIN)
+    sigmas = changes.in_sigmas
+    most = max(LEAST_SIGMAS, float(np.abs(sigmas).max()))
+    middle, unit = HEIGHT / 2, (HEIGHT / 2 - MARGIN) / most
+    band = f'<rect x="0" y="{middle - 2 * unit:.1f}" width="{WIDTH}" height="{4 * unit:.1f}" class="band"/>'
+    lines = "".join(
+        f'<polyline class="{"force" if k < 3 else "torque"}" points="'
+        + " ".join(f"{a:.1f},{middle - unit * b:.1f}" for a, b in zip(x, sigmas[:, k], strict=True))
+        + '"/>'
+        for k in (3, 4, 5, 0, 1, 2)
+    )
+    label = f"changes of the six biases in the last {WINDOW.days} days, at most {most:.1f} sigmas"
+    return (
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" role="img" aria-label="{label}">'
+        f'{band}<path class="zero" d="M0 {middle}H{WIDTH}"/>{lines}'
+        f'<text x="{WIDTH - 2}" y="9" text-anchor="end">±{most:.0f} σ</text></svg>'
+    )
+
+
+def _words(state: CellState, now: datetime) -> dict[str, str]:
+    """Return what the columns show."""
+    drift = state.drift
+    return {
+        "age": "-" if state.calibrated is None else age_in_words(now - state.calibrated),
+        "verified": verified_in_words(state, now),
+        "due": due_in_words(state.due, now),
+        "drift": "-" if drift is None else f"{drift.level_sigmas:.1f} σ",
+    }

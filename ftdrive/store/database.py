@@ -1,0 +1,184 @@
+"""The database behind a store: its address, its lock, the version of its tables, and its errors in words."""
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from sqlalchemy import (
+    URL,
+    Connection,
+    Engine,
+    NullPool,
+    Table,
+    collate,
+    create_engine,
+    inspect,
+    make_url,
+    select,
+    text,
+)
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
+
+from ftdrive.errors import BadStore, ConfigError
+from ftdrive.store.tables import SCHEMA, schema
+
+_INSERT: Final[Mapping[str, Callable[[Table], Any]]] = {"sqlite": sqlite.insert, "postgresql": postgresql.insert}
+_BYTE_ORDER: Final = {"sqlite": "BINARY", "postgresql": "C"}
+"""Collation that sorts texts alike everywhere."""
+_WRITERS: Final = 0x66746472697665
+"""Key of the advisory lock of all writers: "ftdrive" in ASCII."""
+_UPGRADE: Final = "upgrade it with `ftdrive history --index .`"
+
+
+def default_file() -> Path:
+    """Return the store of a user; it need not exist."""
+    home = os.environ.get("XDG_DATA_HOME", "")
+    folder = Path(home) if Path(home).is_absolute() else Path("~/.local/share").expanduser()
+    return folder / "ftdrive" / "store.sqlite"
+
+
+class Database:
+    """An SQLite file or a PostgreSQL database; parameters and errors as of `ftdrive.store.store.Store`."""
+
+    def __init__(self, url: str | None, wait_s: float) -> None:
+        self._wait_s = wait_s
+        try:
+            self._url = URL.create("sqlite", database=str(default_file())) if url is None else make_url(url)
+            self._dialect = self._url.get_backend_name()
+            self._is_sqlite = self._dialect == "sqlite"
+            if self._dialect not in _INSERT:
+                raise ConfigError(
+                    f"[store] url begins with {self._dialect}: give sqlite:////PATH or postgresql+psycopg://…"
+                )
+            self._engine: Engine = create_engine(self._url, poolclass=NullPool, connect_args=self._limits())
+        except (ArgumentError, NoSuchModuleError) as error:
+            raise ConfigError("[store] url is no address of a database: give one such as sqlite:////PATH") from error
+        except ImportError as error:
+            raise ConfigError(
+                f"[store] url = {self.name!r} needs the package {error.name or 'psycopg'}: pip install 'ftdrive[fleet]'"
+            ) from error
+
+    @property
+    def name(self) -> str:
+        """The file, or the address without its password."""
+        return (self._is_sqlite and self._url.database) or self._url.render_as_string()
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether it is a file that does not exist; connecting would create it."""
+        return self._file is not None and not self._file.exists()
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection | None]:
+        """Connect; None if there are no tables yet."""
+        if self.is_missing:
+            yield None
+            return
+        with self._connected("read") as connection:
+            version = _version(connection)
+            self._require_usable(version)
+            yield None if version is None else connection
+
+    @contextmanager
+    def writing(self, *, upgrade: bool = False) -> Iterator[Connection]:
+        """Connect as the only writer, create the tables where they are missing, and commit at the end.
+
+        Tables of an older version are migrated if `upgrade` is true.
+        """
+        if self._file is not None:
+            with self._in_words("written"):
+                self._file.parent.mkdir(parents=True, exist_ok=True)
+        with self._connected("written") as connection:
+            if self._is_sqlite:
+                connection.exec_driver_sql("BEGIN IMMEDIATE")  # else two writers that read first cannot both go on
+            else:
+                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _WRITERS})
+            version = _version(connection)
+            self._require_usable(version, upgrade=upgrade)
+            if version != SCHEMA:
+                from ftdrive.store.migrations import migrate
+
+                migrate(connection)
+            yield connection
+            connection.commit()
+
+    @contextmanager
+    def older(self) -> Iterator[tuple[Connection, int] | None]:
+        """Connect to tables of an older version; None if there is nothing to upgrade."""
+        if self.is_missing:
+            yield None
+            return
+        with self._connected("read") as connection:
+            version = _version(connection)
+            self._require_usable(version, upgrade=True)
+            yield None if version is None or version == SCHEMA else (connection, version)
+
+    def upsert(self, table: Table, first_by: str | None = None) -> Any:
+        """Return a statement that inserts rows, or replaces those with the same primary key.
+
+        Parameters
+        ----------
+        first_by : str, optional
+            Replace only rows that have a greater text in this column.
+        """
+        insert = _INSERT[self._dialect](table)
+        new = {column.name: insert.excluded[column.name] for column in table.columns}
+        key = [column.name for column in table.primary_key]
+        where = None
+        if first_by is not None:
+            where = insert.excluded[first_by] <= collate(table.c[first_by], _BYTE_ORDER[self._dialect])
+        return insert.on_conflict_do_update(index_elements=key, set_=new, where=where)
+
+    def _require_usable(self, version: int | None, *, upgrade: bool = False) -> None:
+        if version is None or version == SCHEMA or (upgrade and version < SCHEMA):
+            return
+        fix = "install a newer ftdrive" if version > SCHEMA else _UPGRADE
+        raise BadStore(f"the store {self.name} has version {version}, this ftdrive uses version {SCHEMA}: {fix}")
+
+    @property
+    def _file(self) -> Path | None:
+        """The SQLite file; None for a server, memory or a file: URI."""
+        path = self._url.database or ""
+        return Path(path) if self._is_sqlite and path and not path.startswith("file:") else None
+
+    def _limits(self) -> dict[str, Any]:
+        """Return for how long the driver waits for a lock, or for a server that does not answer."""
+        if self._is_sqlite:
+            return {"timeout": self._wait_s}
+        wait_s = max(2, round(self._wait_s))
+        limits = {
+            "connect_timeout": wait_s,
+            "keepalives_idle": wait_s,
+            "keepalives_interval": 1,
+            "keepalives_count": wait_s,
+            "tcp_user_timeout": 1000 * wait_s,
+        }
+        return {name: value for name, value in limits.items() if name not in self._url.query}
+
+    @contextmanager
+    def _connected(self, verb: str) -> Iterator[Connection]:
+        with self._in_words(verb), self._engine.connect() as connection:
+            if not self._is_sqlite:
+                connection.exec_driver_sql(f"SET LOCAL lock_timeout = {round(1000 * self._wait_s)}")
+            yield connection
+
+    @contextmanager
+    def _in_words(self, verb: str) -> Iterator[None]:
+        """Turn an error of the database into one sentence."""
+        try:
+            yield
+        except (DBAPIError, OSError) as error:
+            reason = " ".join(str(error.orig if isinstance(error, DBAPIError) else error).split())
+            raise BadStore(
+                f"the store {self.name} cannot be {verb} ({reason}): check its address, and who may use it"
+            ) from error
+
+
+def _version(connection: Connection) -> int | None:
+    """Return the version of the tables; None where there are none, 0 where it is lost."""
+    if not inspect(connection).has_table(schema.name):
+        return None
+    return connection.scalar(select(schema.c.version)) or 0

@@ -1,0 +1,95 @@
+"""The tables of the store as this version reads and writes them, and their rows as records.
+
+A change of a column raises `SCHEMA` and adds a migration in `ftdrive.store.migrations`.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, Final
+
+from sqlalchemy import JSON, Boolean, Column, Float, Integer, MetaData, Row, String, Table
+
+from ftdrive.store.records import Record, StoredCell, StoredResult, StoredVerification
+
+SCHEMA: Final = 2
+"""Version of the tables, kept in the database."""
+
+_WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
+_WRENCHES = ("bias_change", "bias_change_sigma", "calibration_sigma")
+"""Fields of a verification with a column for each component: read three times as fast as JSON."""
+
+metadata: Final = MetaData()
+schema: Final = Table("ftdrive_schema", metadata, Column("version", Integer, primary_key=True, autoincrement=False))
+results: Final = Table(
+    "ftdrive_results",
+    metadata,
+    Column("id", String, primary_key=True),
+    Column("path", String, nullable=False),
+    Column("run", String, nullable=False),
+    Column("created_utc", String, index=True),
+    *(Column(name, String) for name in ("tool", "arm_serial", "sensor_serial", "mount")),
+    Column("verdict", String, nullable=False),
+    Column("n_poses", Integer, nullable=False),
+    *(Column(name, Float, nullable=False) for name in ("mass_kg", "g_m_s2")),
+    Column("numbers", JSON, nullable=False),
+    *(Column(name, String) for name in ("dataset_sha256", "parent", "update")),
+    Column("temperature_C", Float),
+    *(Column(name, String) for name in ("arm_model", "sensor_model", "robot_host")),
+    Column("payload_kg", Float),
+    Column("payload_com_m", JSON(none_as_null=True)),
+)
+verifications: Final = Table(
+    "ftdrive_verifications",
+    metadata,
+    Column("id", String, primary_key=True),
+    Column("path", String, nullable=False),
+    Column("run", String, nullable=False),
+    Column("calibration_id", String, nullable=False, index=True),
+    Column("created_utc", String, index=True),
+    Column("passed", Boolean, nullable=False),
+    *(Column(name, String) for name in ("change", "reason")),
+    Column("temperature_C", Float),
+    *(Column(f"{name}_{axis}", Float) for name in _WRENCHES for axis in _WRENCH),
+)
+cells: Final = Table(
+    "ftdrive_cells",
+    metadata,
+    Column("name", String, primary_key=True),
+    Column("config", String, nullable=False),
+    Column("verify_every_days", Float, nullable=False),
+    *(Column(name, String) for name in ("arm_serial", "robot_host", "sensor_url", "tool")),
+)
+RECORDS: Final[Mapping[type[Record], Table]] = {StoredResult: results, StoredVerification: verifications}
+
+_SINGLE = tuple(column.name for column in verifications.columns if not column.name.endswith(_WRENCH))
+
+
+def to_row(record: Record | StoredCell) -> dict[str, Any]:
+    """Return a record by columns."""
+    row = asdict(record)
+    for name in _WRENCHES if isinstance(record, StoredVerification) else ():
+        values = row.pop(name) or [None] * len(_WRENCH)
+        row |= {f"{name}_{axis}": value for axis, value in zip(_WRENCH, values, strict=True)}
+    return row
+
+
+def to_result(row: Row[Any]) -> StoredResult:
+    """Return a row of `results` as a record."""
+    return StoredResult(**row._asdict())
+
+
+def to_cell(row: Row[Any]) -> StoredCell:
+    """Return a row of `cells` as a record."""
+    return StoredCell(**row._asdict())
+
+
+def to_verification(row: Row[Any]) -> StoredVerification:
+    """Return a row of `verifications` as a record."""
+    single = dict(zip(_SINGLE, row, strict=False))
+    return StoredVerification(**single, **dict(zip(_WRENCHES, _wrenches(row), strict=True)))
+
+
+def _wrenches(values: Sequence[Any]) -> Iterator[list[float] | None]:
+    for start in range(len(_SINGLE), len(values), len(_WRENCH)):
+        wrench = values[start : start + len(_WRENCH)]
+        yield None if None in wrench else list(wrench)
