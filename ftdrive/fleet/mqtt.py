@@ -5,8 +5,7 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from datetime import datetime
+from dataclasses import dataclass, field
 from threading import Event, Lock
 from typing import Any, Final, Self
 from urllib.parse import unquote, urlsplit
@@ -15,7 +14,6 @@ from calib.files import JSON
 from drivers.clock import Clock
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.serve import Reading
-from ftdrive.fleet.state import CellState
 
 try:
     from paho.mqtt.client import Client
@@ -129,7 +127,7 @@ class Messages:
             )
         wanted = {self._server_topic: _encoded(_about_server(reading))}
         for name, content in _about_cells(reading).items():
-            wanted[self._cell_topics.replace("+", _level(name))] = _encoded(content)
+            wanted[self._cell_topics.replace("+", name)] = _encoded(content)
         with self._lock:
             before, self._wanted = self._wanted, wanted
             if self._answers:
@@ -203,7 +201,7 @@ def _about_server(reading: Reading) -> dict[str, JSON]:
         "schema_version": SCHEMA_VERSION,
         "online": True,
         "store_up": reading.store_up,
-        "state_utc": _text(reading.read),
+        "state_utc": reading.read.isoformat(),
         "cells": len({one.cell for one in reading.fleet.cells}),
     }
 
@@ -212,7 +210,7 @@ def _about_cells(reading: Reading) -> dict[str, dict[str, JSON]]:
     """Return the message of each cell by name: its tools, and the findings that concern it."""
     tools, findings = defaultdict[str, list[JSON]](list), defaultdict[str, list[JSON]](list)
     for one in reading.fleet.cells:
-        tools[one.cell].append(_about_tool(one, reading.now))
+        tools[one.cell].append(one.to_dict(reading.now))
     for finding in reading.fleet.findings:
         for cell in finding.cells:
             findings[cell].append({"kind": finding.kind, "words": finding.words})
@@ -222,23 +220,8 @@ def _about_cells(reading: Reading) -> dict[str, dict[str, JSON]]:
     }
 
 
-def _about_tool(one: CellState, now: datetime) -> dict[str, JSON]:
-    found = {name: _text(value) if isinstance(value, datetime) else value for name, value in asdict(one).items()}
-    del found["cell"]
-    return {**found, "is_due": one.is_due(now)}
-
-
-def _text(time: datetime) -> str:
-    return time.isoformat(timespec="seconds")
-
-
 def _encoded(content: dict[str, JSON]) -> bytes:
     return json.dumps(content, ensure_ascii=False).encode()
-
-
-def _level(name: str) -> str:
-    """Return a name as one level of a topic, with the characters that have a meaning there as %XX."""
-    return re.sub(r"[%/+#\x00]", lambda found: f"%{ord(found[0]):02X}", name)
 
 
 def _words(error: BaseException | None) -> str:

@@ -1,5 +1,6 @@
 """`ftdrive fleet verify`: one cell after the other, each with an operator at it."""
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from ftdrive.store.records import StoredCell
     from ftdrive.store.store import Store
 
+_OF_ONE_CELL = tuple(f"FTDRIVE_{section}_" for section in ("ROBOT", "SENSOR", "TOOL", "WORKCELL"))
+
 
 @click.command()
 @click.argument("names", metavar="[CELL]...", nargs=-1)
@@ -35,19 +38,15 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
     from ftdrive.fleet.status import fleet_state
     from ftdrive.store.store import Store
 
-    if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise ConfigError("fleet verify asks at every cell and never without a terminal: run it in one, at the cells")
+    _require_terminal()
     if names and due:
         raise ConfigError("CELL and --due exclude one another: leave one of them out")
     url = url or store_url()
-    store = Store(url)
-    now = datetime.now(UTC)
+    store, now = Store(url), datetime.now(UTC)
     fleet = fleet_state(store, now)
-    chosen = _named(store.cells(), names)
-    if due:
-        chosen = [one for one in chosen if _is_due(one, fleet, now)]
-        if not chosen:
-            click.echo("no cell is due", err=True)
+    chosen = [one for one in _named(store.cells(), names) if not due or _is_due(one, fleet, now)]
+    if not chosen:
+        click.echo("No cell is due.", err=True)
     failed, errors, lines = list[str](), list[Exception](), list[str]()
     try:
         for one in chosen:
@@ -70,6 +69,14 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
         raise NotAccepted(f"the verification failed in {', '.join(failed)}: the lines above have the reasons")
     if errors:
         raise errors[0]
+
+
+def _require_terminal() -> None:
+    """Raise `ConfigError` if no operator can read and answer, or if the environment describes a cell of its own."""
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise ConfigError("fleet verify asks at every cell and never without a terminal: run it in one, at the cells")
+    if alien := sorted(name for name in os.environ if name.startswith(_OF_ONE_CELL)):
+        raise ConfigError(f"{alien[0]} is set and would replace a value of every cell: unset it")
 
 
 def _named(cells: "Sequence[StoredCell]", names: Sequence[str]) -> "list[StoredCell]":
@@ -107,12 +114,11 @@ def _verify(one: "StoredCell", store: "Store", url: str | None, fleet: "Fleet") 
 
 
 def _described(one: "StoredCell") -> "CellConfig":
-    """Read the configuration of a cell; a variable of the environment that leads to another robot is refused."""
+    """Read the configuration of a cell; raises `ConfigError` if the store does not know its robot."""
     cell = read_cell(Path(one.config), None, None)
     if one.robot_host not in {None, cell.robot.host}:
         raise ConfigError(
-            f"its robot is {cell.robot.host}, the store has {one.robot_host}: unset FTDRIVE_ROBOT_HOST if it is set, "
-            "else update the store with `ftdrive fleet add`"
+            f"its robot is {cell.robot.host}, the store has {one.robot_host}: update the store with `ftdrive fleet add`"
         )
     return cell
 
