@@ -19,6 +19,7 @@ Where a step is significant and fits better than any onset, the series begins ag
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import fdtrc as f_sf
 
@@ -26,7 +27,7 @@ from calib.model import Array, read_only
 
 FEWEST = 6
 """Verifications: fewer do not show their scatter."""
-SIGNIFICANT = 3e-6
+SIGNIFICANT = 1e-5
 """Largest p-value of an onset that counts, in one component at one look. It allows for the search over onsets, six
 components and 365 looks a year: see the README of `ftdrive.fleet` for false alarms and delays in simulation."""
 LEAST_DAYS = 7.0
@@ -37,10 +38,10 @@ CLEARLY = 6.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftOnset:
-    """Likeliest onset of each of k components; arrays (k,) are read-only."""
+    """Likeliest onset of each of k components; arrays (k,)."""
 
-    found: Array
-    """1 where a drift is significant, else 0."""
+    found: NDArray[np.bool_]
+    """Whether the component drifts."""
     t0_days: Array
     """When it began."""
     slope: Array
@@ -53,7 +54,7 @@ class DriftOnset:
     """Time of the first verification that counts: the series begins again after a step."""
 
     def __post_init__(self) -> None:
-        for name in ("found", "t0_days", "slope", "sigma", "p_value"):
+        for name in ("t0_days", "slope", "sigma", "p_value"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
@@ -71,6 +72,8 @@ def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: A
     calibration_sigma : array, shape (k,)
         Of the calibration, common to all.
     """
+    if len(t_days) < FEWEST:
+        return None
     weight, known = 1 / np.square(sigma), 1 / np.maximum(np.square(calibration_sigma), 1e-12 * np.square(sigma[0]))
     first = 0
     while len(t_days) - first >= FEWEST:

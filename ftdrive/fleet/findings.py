@@ -17,7 +17,7 @@ from ftdrive.store.records import StoredResult
 
 SIGMAS: Final = 4.0
 ALIKE_M, WRONG_M = 0.003, 0.005
-"""Centres of mass of one tool are alike within the first, and that of a payload is wrong from the second on; or 4 sigma,
+"""Centres of mass of one tool are alike within the first, that of a payload is wrong from the second on; or 4 sigma,
 if that is more."""
 ALIKE_SHARE, WRONG_SHARE, WRONG_KG = 0.03, 0.1, 0.1
 """Likewise masses. A mass is wrong by the larger of share and kg."""

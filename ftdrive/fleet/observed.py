@@ -83,12 +83,18 @@ class Observed:
         return when(result) < self.now - WINDOW
 
     def bias_changes(self, result: StoredResult) -> BiasChanges | None:
-        """Return what the verifications of a calibration say of its bias; None if none of them says it."""
+        """Return how the bias has changed since a calibration; None if no verification has this.
+
+        A verification counts if it passed, or found that the bias has changed: another change, or a hand on the tool,
+        spoils the estimate.
+        """
         start = when(result)
         rows = [
             (when(one), one.bias_change, one.bias_change_sigma, one.calibration_sigma, one.temperature_C)
             for one in self.checks.get(result.id, ())
-            if one.bias_change and one.bias_change_sigma and one.calibration_sigma and min(one.bias_change_sigma) > 0
+            if (one.passed or one.change == "bias")
+            and (one.bias_change and one.bias_change_sigma and one.calibration_sigma)
+            and min(one.bias_change_sigma) > 0
         ]
         if not rows:
             return None

@@ -235,7 +235,8 @@ def _object(value: Any) -> Mapping[str, Any]:
 
 
 def _text(value: Any) -> str | None:
-    return value if isinstance(value, str) and value else None
+    """Return a text that every database takes: without zero characters and halves of a surrogate pair."""
+    return value.encode(errors="replace").decode().replace("\0", "\ufffd") if isinstance(value, str) and value else None
 
 
 def _number(value: Any) -> float | None:

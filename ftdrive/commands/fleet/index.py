@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from ftdrive.commands.common import FOLDER, store_url
+from ftdrive.commands.common import FOLDER, store_url, upgrade_store
 
 
 @click.command()
@@ -20,6 +20,7 @@ def index(folders: Sequence[Path], store: str | None) -> None:
     from ftdrive.terminal.console import hanging, talk
 
     found = Store(store or store_url())
+    upgrade_store(found)
     indexed = found.index(*folders)
     for words in indexed.unreadable:
         talk.print(hanging(" left out: ", words))

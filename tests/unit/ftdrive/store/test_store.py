@@ -1,52 +1,27 @@
-"""The store: it is rebuilt from run folders, two writers lose nothing, and its failures are one sentence each."""
+"""The store on SQLite and on PostgreSQL: what the files say comes back, and it is rebuilt from them."""
 
 import json
-import os
 import shutil
-import sqlite3
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from datetime import timedelta, timezone
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ftdrive.errors import BadStore, ConfigError
+from ftdrive.errors import ConfigError
 from ftdrive.store.database import default_file
+from ftdrive.store.records import StoredCell
 from ftdrive.store.store import Store
-from ftdrive.store.tables import SCHEMA
-from tests.unit.ftdrive.store.run_folders import new_run, result, verified
+from tests.postgres import Server
+from tests.unit.ftdrive.store.contents import dump, wipe
+from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
 
 
-@pytest.fixture
-def runs(tmp_path: Path) -> Path:
-    """Three runs, one with an update of the second, and a verification."""
-    runs = tmp_path / "runs"
-    found = [result(day) for day in (0, 30, 60)]
-    for day, one in enumerate(found):
-        new_run(runs, f"2026-03-0{day + 1}-calibrate", one)
-    update = result(31, parent={"id": found[1].id, "path": "p"}, update="bias", temperature_C=25)
-    verified(new_run(runs, "2026-04-01-verify", update), found[1].id, 31, passed=False)
-    verified(new_run(runs, "2026-04-02-verify"), found[1].id, 32)
-    (runs / "notes").mkdir()
-    return runs
-
-
-def store_in(folder: Path) -> Store:
-    return Store(f"sqlite:///{folder / 'store.sqlite'}", wait_s=0.05)
-
-
-def dump(folder: Path) -> list[str]:
-    """Everything in the database, as text."""
-    with sqlite3.connect(folder / "store.sqlite") as connection:
-        lines = sorted(connection.iterdump())
-    connection.close()
-    return lines
-
-
-def test_what_the_files_say_comes_back(runs: Path, tmp_path: Path) -> None:
-    store = store_in(tmp_path)
+def test_what_the_files_say_comes_back(runs: Path, store_url: str) -> None:
+    store = Store(store_url)
     indexed = store.index(runs)
     assert (indexed.results, indexed.verifications, indexed.unreadable) == (4, 2, ())
     found = store.results()
@@ -79,24 +54,39 @@ def test_what_the_files_say_comes_back(runs: Path, tmp_path: Path) -> None:
     assert (store.results("other"), store.find("%")) == ([], [])
 
 
-def test_rebuilt_twice_it_is_identical_and_the_same_as_one_that_grew(runs: Path, tmp_path: Path) -> None:
+def test_rebuilt_twice_it_is_identical_and_the_same_as_one_that_grew(runs: Path, store_url: str) -> None:
     """Runs arrive in any order, one of them as a copy of another, and are indexed again and again."""
     shutil.copytree(runs / "2026-03-03-calibrate", runs / "2026-01-01-copy")
-    grown, rebuilt = tmp_path / "grown", tmp_path / "rebuilt"
-    for folder in (grown, rebuilt):
-        folder.mkdir()
     for run in sorted(runs.iterdir(), reverse=True):
-        store_in(grown).index(run)
-        store_in(grown).index(run)
-    store_in(rebuilt).rebuild(runs)
-    first = dump(rebuilt)
-    store_in(rebuilt).rebuild()
-    assert dump(rebuilt) == first == dump(grown)
-    assert sum("INSERT" in line for line in first) == 1 + 1 + 4 + 2  # with two of the version
+        Store(store_url).index(run)
+        Store(store_url).index(run)
+    grown = dump(store_url)
+    wipe(store_url)
+    Store(store_url).rebuild(runs)
+    rebuilt = dump(store_url)
+    Store(store_url).rebuild()
+    assert dump(store_url) == rebuilt == grown
+    assert len(grown) == 4 + 2 + 2  # two rows have the version
 
 
-def test_a_deleted_run_is_forgotten_and_a_moved_one_is_followed(runs: Path, tmp_path: Path) -> None:
-    store = store_in(tmp_path)
+def test_it_is_the_same_in_every_database_whatever_its_order_of_texts(
+    runs: Path, tmp_path: Path, postgres: Server
+) -> None:
+    """In English "a" comes before "B", in bytes after it: the first by path is the same everywhere."""
+    for name in ("a", "B"):
+        shutil.copytree(runs / "2026-03-01-calibrate", runs / name)
+    (runs / "2026-03-01-calibrate" / "calibration.json").unlink()
+    english = postgres.new_database("TEMPLATE template0 LOCALE_PROVIDER icu ICU_LOCALE 'en'")
+    urls = [postgres.url(english), f"sqlite:///{tmp_path / 'store.sqlite'}"]
+    for url in urls:
+        for run in ("a", "B", "."):
+            Store(url).index(runs / run)
+        assert Store(url).results()[0].run == "B"
+    assert dump(urls[0]) == dump(urls[1])
+
+
+def test_a_deleted_run_is_forgotten_and_a_moved_one_is_followed(runs: Path, store_url: str) -> None:
+    store = Store(store_url)
     store.index(runs)
     shutil.rmtree(runs / "2026-03-01-calibrate")
     (runs / "2026-03-02-calibrate").rename(runs / "renamed")
@@ -106,143 +96,29 @@ def test_a_deleted_run_is_forgotten_and_a_moved_one_is_followed(runs: Path, tmp_
     assert [one.run for one in store.results()] == ["renamed", "2026-04-01-verify", "2026-03-03-calibrate"]
 
 
-def test_runs_that_cannot_be_reached_are_kept(runs: Path, tmp_path: Path) -> None:
-    store = store_in(tmp_path)
+def test_runs_that_cannot_be_reached_are_kept(runs: Path, store_url: str, tmp_path: Path) -> None:
+    store = Store(store_url)
     store.index(runs)
     runs.rename(tmp_path / "unmounted")
     store.rebuild()
     assert len(store.results()) == 4
 
 
-def test_a_damaged_file_is_named_and_costs_only_itself(runs: Path, tmp_path: Path) -> None:
+def test_a_damaged_file_is_named_and_costs_only_itself(runs: Path, store_url: str) -> None:
     (runs / "2026-03-01-calibrate" / "calibration.json").write_text("{")
     (runs / "2026-03-02-calibrate" / "run.json").write_text("{")
+    verified(runs / "2026-03-02-calibrate", "abc", 3, reason="a \0 and half a \ud800 pair")
     (runs / "2026-04-02-verify" / "verification.json").write_text('{"format": "ftdrive.verification/9"}')
     verified(runs / "2026-03-03-calibrate", "", 3)
-    store = store_in(tmp_path)
+    store = Store(store_url)
     indexed = store.index(runs)
-    assert (indexed.results, indexed.verifications) == (3, 1)
+    assert (indexed.results, indexed.verifications) == (3, 2)
+    assert store.verifications("abc")[0].reason == "a \ufffd and half a ? pair"
     assert ["calibration.json" in indexed.unreadable[0], len(indexed.unreadable)] == [True, 3]
     assert "version '9'" in indexed.unreadable[2]
     (runs / "2026-03-01-calibrate" / "calibration.json").unlink()
     result(0).save(runs / "2026-03-01-calibrate" / "calibration.json")
     assert store.index(runs).results == 1
-
-
-_WRITER = """
-import sys
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from ftdrive.store.store import Store
-store = Store(sys.argv[1], wait_s=30)
-for run in sorted(Path(sys.argv[2]).iterdir()):
-    store.index(run)
-"""
-
-
-def runs_of_two_writers(folder: Path, n: int) -> str:
-    """Each has its own runs, and one that both have; returns the address of the store."""
-    for writer in "ab":
-        for k in range(n):
-            new_run(folder / writer, f"{k:02d}", result(1000 * (writer == "b") + k))
-        new_run(folder / writer, "shared", result(5000))
-    return f"sqlite:///{folder / 'store.sqlite'}"
-
-
-def require_whole(folder: Path, n: int) -> None:
-    store = store_in(folder)
-    assert len(store.results()) == 2 * n + 1
-    before = dump(folder)
-    store.rebuild()
-    assert dump(folder) == before
-
-
-def test_two_connections_at_once_lose_nothing(tmp_path: Path) -> None:
-    url = runs_of_two_writers(tmp_path, 6)
-
-    def write(writer: str) -> None:
-        for run in sorted((tmp_path / writer).iterdir()):
-            Store(url, wait_s=30).index(run)
-
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(write, "ab"))
-    require_whole(tmp_path, 6)
-
-
-@pytest.mark.slow
-def test_two_processes_at_once_lose_nothing(tmp_path: Path) -> None:
-    url = runs_of_two_writers(tmp_path, 25)
-    command = [sys.executable, "-c", _WRITER, url]
-    processes = [subprocess.Popen([*command, tmp_path / writer]) for writer in "ab"]
-    assert [process.wait() for process in processes] == [0, 0]
-    require_whole(tmp_path, 25)
-
-
-def test_a_locked_store_is_one_sentence_and_is_caught_up_later(runs: Path, tmp_path: Path) -> None:
-    store = store_in(tmp_path)
-    store.index(runs / "2026-03-01-calibrate")
-    other = sqlite3.connect(tmp_path / "store.sqlite")
-    other.execute("BEGIN EXCLUSIVE")
-    for act in (lambda: store.index(runs), store.results):
-        with pytest.raises(BadStore, match=r"store\.sqlite cannot be .*\(database is locked\): check"):
-            act()
-    other.close()
-    store.index(runs)
-    assert len(store.results()) == 4
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="nothing is read-only for root")
-def test_a_read_only_store_can_be_read(runs: Path, tmp_path: Path) -> None:
-    store = store_in(tmp_path)
-    store.index(runs / "2026-03-01-calibrate")
-    (tmp_path / "store.sqlite").chmod(0o444)
-    assert len(store.results()) == 1
-    with pytest.raises(BadStore, match="readonly"):
-        store.index(runs)
-
-
-def test_a_store_opened_read_only_is_one_sentence(runs: Path, tmp_path: Path) -> None:
-    store_in(tmp_path).index(runs / "2026-03-01-calibrate")
-    read_only = Store(f"sqlite:///file:{tmp_path / 'store.sqlite'}?mode=ro&uri=true")
-    assert len(read_only.results()) == 1
-    with pytest.raises(BadStore, match=r"cannot be written \(attempt to write a readonly database\)"):
-        read_only.index(runs)
-
-
-def test_a_missing_store_is_empty_and_reading_does_not_create_it(tmp_path: Path) -> None:
-    store = Store(f"sqlite:///{tmp_path / 'new' / 'store.sqlite'}")
-    assert (store.results(), store.verifications(), store.find("ab")) == ([], [], [])
-    assert not (tmp_path / "new").exists()
-    store.index(new_run(tmp_path / "runs", "a", result()))
-    assert len(store.results()) == 1
-
-
-@pytest.mark.parametrize(("version", "fix"), [(SCHEMA + 1, "newer ftdrive"), (SCHEMA - 1, "history --index")])
-def test_another_version_is_neither_read_nor_changed(version: int, fix: str, runs: Path, tmp_path: Path) -> None:
-    store = store_in(tmp_path)
-    store.index(runs)
-    with sqlite3.connect(tmp_path / "store.sqlite") as connection:
-        connection.execute("UPDATE ftdrive_schema SET version = ?", [version])
-    connection.close()
-    before = dump(tmp_path)
-    for act in (lambda: store.rebuild(runs), store.results):
-        with pytest.raises(BadStore, match=rf"has version {version}.*{fix}"):
-            act()
-    assert dump(tmp_path) == before
-
-
-def test_another_file_is_no_store_and_stays_as_it_is(runs: Path, tmp_path: Path) -> None:
-    (tmp_path / "store.sqlite").write_text("my notes " * 1000)
-    for act in (lambda: store_in(tmp_path).index(runs), store_in(tmp_path).results):
-        with pytest.raises(BadStore, match="not a database"):
-            act()
-    assert (tmp_path / "store.sqlite").read_text() == "my notes " * 1000
-
-
-def test_a_folder_that_cannot_be_made_is_one_sentence(runs: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(BadStore, match="cannot be written"):
-        Store(f"sqlite:///{tmp_path / 'file' / 'store.sqlite'}").index(runs)
 
 
 @pytest.mark.parametrize(
@@ -272,7 +148,7 @@ def test_the_default_is_a_file_of_the_user(tmp_path: Path, monkeypatch: pytest.M
     assert default_file().is_relative_to(Path.home())
 
 
-def test_a_run_that_names_nothing_still_counts(tmp_path: Path) -> None:
+def test_a_run_that_names_nothing_still_counts(store_url: str, tmp_path: Path) -> None:
     """A result solved elsewhere and put into a run: its tool comes from the run's configuration."""
     folder = new_run(tmp_path, "a")
     (folder / "run.json").write_text(
@@ -287,12 +163,74 @@ def test_a_run_that_names_nothing_still_counts(tmp_path: Path) -> None:
     )
     document = result().to_dict() | {"provenance": {"update": 5, "parent": [], "temperature_C": "warm", "setup": None}}
     (folder / "calibration.json").write_text(json.dumps(document))
-    store = store_in(tmp_path)
+    store = Store(store_url)
     store.index(folder)
     (one,) = store.results("drill")
     assert (one.arm_serial, one.sensor_serial, one.mount) == ("arm-9", "ft-9", "left")
+    assert (one.arm_model, one.robot_host, one.payload_kg, one.payload_com_m) == (None, None, None, None)
     assert one.created_utc == "2026-05-01T08:00:00.000000+00:00"
     assert (one.parent, one.update, one.temperature_C, one.dataset_sha256) == (None, None, None, None)
+
+
+def test_models_host_and_payload_come_from_the_run(store_url: str, tmp_path: Path) -> None:
+    setup = {"tool": "gripper", "payload_kg": 1.5, "p_flange_payload_m": [0.0, 0.01, 0.1 + 0.2]}
+    folder = new_run(tmp_path, "a", result(setup=setup))
+    header = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(header | {"config": {"robot": {"host": "10.0.0.7"}}}))
+    Store(store_url).index(folder)
+    (one,) = Store(store_url).results()
+    assert (one.arm_model, one.sensor_model, one.robot_host) == ("ARM", "SENSOR", "10.0.0.7")
+    assert (one.payload_kg, one.payload_com_m) == (1.5, [0.0, 0.01, 0.1 + 0.2])
+
+
+def test_the_change_of_the_bias_comes_back_to_the_last_digit(store_url: str, tmp_path: Path) -> None:
+    value, sigma, shared = ((np.random.default_rng(k).normal(size=6) / 3).tolist() for k in range(3))
+    whole = {"value": value, "sigma": sigma, "calibration_sigma": shared}
+    found = []
+    for day, change in enumerate((whole, None, {"value": value[:5], "sigma": [*sigma[:5], None]}, [1])):
+        verified(new_run(tmp_path, f"v{day}"), "abc", day, bias_change=change)
+    Store(store_url).index(tmp_path)
+    for one in Store(store_url).verifications():
+        found.append((one.bias_change, one.bias_change_sigma, one.calibration_sigma))
+    assert found == [(value, sigma, shared), *3 * [(None, None, None)]]
+
+
+def test_the_newest_are_selected_by_time_in_any_zone(store_url: str, tmp_path: Path) -> None:
+    """A record without a time is the oldest."""
+    for day in range(4):
+        verified(new_run(tmp_path, f"{day}", result(day)), "abc", day)
+    verified(new_run(tmp_path, "no-time"), "abc", 9, created_utc=None)
+    store = Store(store_url)
+    store.index(tmp_path)
+    since = (FIRST + timedelta(days=2)).astimezone(timezone(timedelta(hours=-9)))
+    assert [one.run for one in store.verifications(since=since)] == ["2", "3"]
+    assert [one.run for one in store.results(since=since)] == ["2", "3"]
+    assert [one.run for one in store.verifications()] == ["no-time", "0", "1", "2", "3"]
+
+
+def test_cells_are_replaced_by_name_and_survive_a_rebuild(store_url: str, runs: Path) -> None:
+    store = Store(store_url)
+    assert store.cells() == []
+    cells = [
+        StoredCell(
+            name=name,
+            config=f"/cells/{name}.toml",
+            verify_every_days=0.1 + 0.2,
+            arm_serial=None,
+            robot_host="10.0.0.7",
+            sensor_url="ati-can://can0",
+            tool="gripper",
+        )
+        for name in ("b", "Ä", "a", "B")
+    ]
+    store.put_cells(cells)
+    other = replace(cells[2], config="/elsewhere.toml", arm_serial="7", tool=None)
+    store.put_cells([other])
+    store.put_cells([])
+    store.rebuild(runs)
+    assert store.cells() == [cells[3], other, cells[0], cells[1]]
+    assert store.remove_cells(["a", "c", "Ä"]) == ["c"]
+    assert store.cells() == [cells[3], cells[0]]
 
 
 @pytest.mark.slow
