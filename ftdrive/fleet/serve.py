@@ -87,7 +87,7 @@ def serve(
         except BadStore as error:
             reading = replace(reading, now=time, store_up=False)
             if was_up:
-                say(f"{error}. The last state, {age_in_words(time - reading.read)} old, is served until then.")
+                say(f"{error}. The last state is served meanwhile. It is {age_in_words(time - reading.read)} old.")
         else:
             if not was_up:
                 say("The store can be read again.")

@@ -31,7 +31,7 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
     """Verify cells one after the other, with an operator at each.
 
     For each cell the command first asks whether an operator stands there with the emergency stop in reach. Only yes
-    starts the session of `ftdrive verify`, with its own plan, checks, questions and confirmation; any other answer
+    starts the session of `ftdrive verify`, with its own plan, checks, questions and confirmation. Any other answer
     skips the cell. No option answers these questions, and a terminal is required.
     """
     from ftdrive.errors import Declined, NotAccepted
@@ -53,7 +53,9 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
             try:
                 outcome, words = _verify(one, store, url, fleet)
             except KeyboardInterrupt:
-                lines.append(f"{one.name}: interrupted; continue with --resume and --config {one.config}")
+                lines.append(
+                    f"{one.name}: interrupted; continue with ftdrive verify --resume RUN --config {one.config}"
+                )
                 raise
             except Declined as error:
                 outcome, words = "ended", str(error)
