@@ -76,8 +76,8 @@ class Messages:
     """Publishes the state of a fleet, and reconnects as long as it is open.
 
     A cell is published when its state has changed, and after each connection, because a broker may have lost it.
-    Messages of cells that the fleet no longer has are cleared. All have quality of service 0: one that is lost with a
-    connection is published again with the next.
+    Messages of cells that the fleet no longer has are cleared. All messages have quality of service 0. Those that are
+    lost with a connection are published again with the next.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ class Messages:
             self._client.loop_start()
 
     def close(self) -> None:
-        """Say that the server ends, and disconnect; waits for a broker for a second at most."""
+        """Publish that the server ends, and disconnect; waits for the broker for a second at most."""
         with self._lock:
             answers, self._is_open = self._answers, False
             if answers:
@@ -163,6 +163,8 @@ class Messages:
                 self._lost(str(reason))
             return
         with self._lock:
+            if not self._is_open:
+                return
             if self._answers is False:
                 self._say(f"The MQTT broker {self._broker} answers again.")
             self._answers = self._was_connected = True
@@ -184,7 +186,7 @@ class Messages:
                 self._retain(message.topic, b"")
 
     def _lost(self, reason: str) -> None:
-        """Say once that the broker does not answer."""
+        """Print once that the broker does not answer."""
         with self._lock:
             if self._answers is not False:
                 self._say(f"The MQTT broker {self._broker} does not answer ({reason}). ftdrive tries to reconnect.")

@@ -1,7 +1,9 @@
-"""A fleet of 200 cells under a real Prometheus: the alert of a drift fires for the cells that drift, and no others."""
+"""`fleet serve` as a process, and a fleet of 200 cells under a real Prometheus."""
 
 import json
+import re
 import shutil
+import signal
 import subprocess
 import urllib.request
 from collections.abc import Iterator
@@ -17,7 +19,7 @@ import pytest
 import yaml
 from sqlalchemy import create_engine
 
-import ftdrive.fleet
+from ftdrive.commands.fleet.serve import MONITORING
 from ftdrive.fleet.metrics import MetricsServer
 from ftdrive.fleet.serve import Reading
 from ftdrive.fleet.state import Fleet
@@ -25,10 +27,11 @@ from ftdrive.fleet.status import fleet_state
 from ftdrive.store import tables
 from ftdrive.store.records import StoredCell, StoredVerification, read_records
 from ftdrive.store.store import Store
-from tests.mosquitto import free_port, wait_until
+from tests.mosquitto import Mosquitto, free_port, wait_until
+from tests.system.command_line import CommandLine, end_of, listen_for
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result
 
-ALERTS = Path(ftdrive.fleet.__file__).parent / "monitoring" / "alerts.yml"
+ALERTS = MONITORING / "alerts.yml"
 CELLS = [f"cell-{n:03d}" for n in range(200)]
 DRIFTING = {"cell-007", "cell-042", "cell-099", "cell-150", "cell-199"}
 DAYS, DRIFT_DAYS = 365, 21
@@ -163,3 +166,27 @@ def test_the_alert_of_a_drift_fires_for_the_cells_that_drift_and_no_others(tmp_p
             server.update(Reading(Fleet(state.cells[:100], ()), now, now))
             gone = {("FtdriveBiasDrift", cell) for cell in DRIFTING if cell < "cell-100"}
             assert found.alerts(100) == gone
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("by", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -9)])
+def test_the_end_of_the_server_reaches_the_shop_floor(
+    by: signal.Signals, code: int, tmp_path: Path, ftdrive: CommandLine
+) -> None:
+    with Mosquitto(tmp_path, user="cell", password="top-secret") as mosquitto:
+
+        def is_online() -> bool:
+            found = mosquitto.retained()
+            return bool(found) and json.loads(found["ftdrive/server"])["online"]
+
+        url = f"mqtt://cell:top-secret@127.0.0.1:{mosquitto.port}"
+        process = ftdrive.start("fleet", "serve", "--metrics", "127.0.0.1:0", "--mqtt", url)
+        said = listen_for(process, "Ctrl-C ends.")
+        wait_until(is_online)
+        process.send_signal(by)
+        ended, more = end_of(process)
+        wait_until(lambda: not is_online())
+    assert ended == code, more
+    assert "secret" not in said + more
+    folder = Path(re.findall(r"dashboard are in (.+)", said)[0])
+    assert {one.name for one in folder.iterdir()} >= {"alerts.yml", "dashboard.json"}

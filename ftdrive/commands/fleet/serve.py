@@ -2,6 +2,7 @@
 
 from contextlib import ExitStack, closing
 from functools import partial
+from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,8 @@ if TYPE_CHECKING:
     from ftdrive.fleet.serve import Sink
 
 PORT = 10018
-"""Prometheus has given away all ports from 9100 to 9999."""
+"""Prometheus has assigned all ports from 9100 to 9999."""
+MONITORING = Path(__file__).parents[2] / "fleet" / "monitoring"
 
 
 @click.command()
@@ -38,7 +40,7 @@ def serve(address: str, broker_url: str | None, store: str | None) -> None:
     """Serve the state of all cells to Prometheus and to an MQTT broker.
 
     The store is read every 60 s. If it cannot be read later, the last state stays, with its age. Alert rules and a
-    dashboard for Grafana are in ftdrive/fleet/monitoring. Nothing moves. Ctrl-C ends.
+    dashboard for Grafana come with ftdrive: their folder is printed. Nothing moves. Ctrl-C ends.
     """
     from drivers.clock import REAL
     from ftdrive.fleet.metrics import MetricsServer
@@ -62,5 +64,6 @@ def serve(address: str, broker_url: str | None, store: str | None) -> None:
             broker = Broker.of(broker_url)
             sinks.append(stack.enter_context(closing(Messages(broker, REAL, wake, talk.print))))
             talk.print(f"Publishing at the MQTT broker {broker}, topics {broker.prefix}ftdrive/#")
+        talk.print(f"Alert rules and a dashboard are in {MONITORING}")
         talk.print("Ctrl-C ends.")
         serve_fleet(partial(fleet_state, found), sinks, REAL, wake, say=talk.print)
