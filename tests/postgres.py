@@ -11,6 +11,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -57,17 +58,19 @@ class Server:
         while not answers:
             try:
                 answers = bool(self.execute("SELECT 1"))
-            except psycopg.OperationalError:
+            except psycopg.OperationalError as error:
                 if self._process.poll() is not None or time.monotonic() > deadline_s:
-                    raise
+                    raise RuntimeError((self._folder / "log").read_text()) from error
                 time.sleep(0.01)
 
     def kill(self) -> None:
         """End all its processes at once with SIGKILL."""
         main = self._process.pid
-        for pid in Path(f"/proc/{main}/task/{main}/children").read_text().split():
-            os.kill(int(pid), signal.SIGKILL)
+        children = Path(f"/proc/{main}/task/{main}/children").read_text().split()
         self._process.kill()
+        for pid in children:
+            with suppress(ProcessLookupError):  # it has ended meanwhile
+                os.kill(int(pid), signal.SIGKILL)
         self._process.wait()
 
     def stop(self) -> None:
@@ -94,16 +97,21 @@ class Server:
         return f"postgresql+psycopg://{user}@/{database}?host={self._folder}"
 
 
+def find_programs() -> Path | None:
+    """Return the folder of the newest version, 15 at least, where Debian installs it."""
+    folders = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: int(path.parent.name))
+    return folders[-1] if folders and int(folders[-1].parent.name) >= 15 else None
+
+
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[Server]:
     """The server of this test process."""
     pytest.importorskip("psycopg", exc_type=ImportError)
-    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda path: int(path.parent.name))
-    if not programs or int(programs[-1].parent.name) < 15:
+    if (programs := find_programs()) is None:
         pytest.skip("PostgreSQL 15 or newer is not installed")
     folder = Path(tempfile.mkdtemp(prefix="ftdrive-postgres-"))
     try:
-        server = Server(programs[-1], folder)
+        server = Server(programs, folder)
         yield server
         server.stop()
     finally:

@@ -1,12 +1,12 @@
 """The store itself: results, verifications and cells, written from run folders and rebuilt from them at any time."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sqlalchemy import Connection, Row, Select, Table, bindparam, delete, select
+from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, select
 
 from ftdrive.store import tables
 from ftdrive.store.database import Database
@@ -21,6 +21,8 @@ from ftdrive.store.records import (
 
 WAIT_S = 5.0
 """For another writer."""
+
+_MOST = 5000
 
 _Stored = TypeVar("_Stored")
 
@@ -68,15 +70,18 @@ class Store:
 
         A file that is known by its path is not read again, because no file of a run is ever overwritten.
         """
-        known = self._known_paths()
-        return self._add(path for path in record_paths(folders) if str(path) not in known)
+        paths = record_paths(folders)
+        with self._database.reading() as connection:
+            known = set() if connection is None else _known(connection, paths)
+        return self._add(path for path in paths if str(path) not in known)
 
     def rebuild(self, *folders: Path) -> Indexed:
         """Read these folders and all that were indexed before again, and forget runs that were deleted.
 
         Runs whose parent folder cannot be reached are kept: a disk may be missing, or another computer has them.
         """
-        known = self._known_paths()
+        with self._database.reading() as connection:
+            known = set() if connection is None else _all_paths(connection)
         parents = {Path(path).parent.parent for path in known}
         gone = [path for path in known if not Path(path).exists() and Path(path).parent.parent.is_dir()]
         return self._add(record_paths([*folders, *parents]), forget=gone)
@@ -93,7 +98,7 @@ class Store:
             if found is None:
                 return None
             connection, version = found
-            known = _paths(connection)
+            known = _all_paths(connection)
         records, _ = read_records(map(Path, sorted(known)))
         with self._database.writing(upgrade=True) as connection:
             self._write(connection, records)
@@ -123,8 +128,7 @@ class Store:
         """Insert records; of two files with the same content the first by path counts, whatever the order."""
         for kind, table in tables.RECORDS.items():
             rows = [tables.to_row(one) for one in records if isinstance(one, kind)]
-            ids = {row["id"] for row in rows}
-            same = [path for id_, path in connection.execute(select(table.c.id, table.c.path)) if id_ in ids]
+            same = _paths_where(connection, table, table.c.id, [row["id"] for row in rows])
             if gone := [*forget, *(path for path in same if not Path(path).exists())]:
                 which = delete(table).where(table.c.path == bindparam("gone"))
                 connection.execute(which, [{"gone": path} for path in gone])
@@ -166,14 +170,22 @@ class Store:
         with self._database.reading() as connection:
             return [] if connection is None else [make(row) for row in connection.execute(query)]
 
-    def _known_paths(self) -> set[str]:
-        with self._database.reading() as connection:
-            return set() if connection is None else _paths(connection)
 
-
-def _paths(connection: Connection) -> set[str]:
+def _all_paths(connection: Connection) -> set[str]:
     """Return the path of every record, in tables of any version."""
     return {path for table in tables.RECORDS.values() for path in connection.scalars(select(table.c.path))}
+
+
+def _known(connection: Connection, paths: Iterable[Path]) -> set[str]:
+    """Return those of the paths that have a record."""
+    texts = [str(path) for path in paths]
+    return {path for table in tables.RECORDS.values() for path in _paths_where(connection, table, table.c.path, texts)}
+
+
+def _paths_where(connection: Connection, table: Table, column: Column[Any], values: Sequence[str]) -> Iterator[str]:
+    """Yield the paths of the rows whose column has one of the values; a statement takes only so many of them."""
+    for start in range(0, len(values), _MOST):
+        yield from connection.scalars(select(table.c.path).where(column.in_(values[start : start + _MOST])))
 
 
 def _oldest_first(table: Table, since: datetime | None) -> Select[Any]:

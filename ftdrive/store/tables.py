@@ -3,7 +3,7 @@
 A change of a column raises `SCHEMA` and adds a migration in `ftdrive.store.migrations`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -85,11 +85,13 @@ def to_cell(row: Row[Any]) -> StoredCell:
 
 def to_verification(row: Row[Any]) -> StoredVerification:
     """Return a row of `verifications` as a record."""
-    single = dict(zip(_SINGLE, row, strict=False))
-    return StoredVerification(**single, **dict(zip(_WRENCHES, _wrenches(row), strict=True)))
+    return StoredVerification(
+        **dict(zip(_SINGLE, row, strict=False)),
+        bias_change=_wrench(row[-18:-12]),
+        bias_change_sigma=_wrench(row[-12:-6]),
+        calibration_sigma=_wrench(row[-6:]),
+    )
 
 
-def _wrenches(values: Sequence[Any]) -> Iterator[list[float] | None]:
-    for start in range(len(_SINGLE), len(values), len(_WRENCH)):
-        wrench = values[start : start + len(_WRENCH)]
-        yield None if None in wrench else list(wrench)
+def _wrench(values: Sequence[Any]) -> list[float] | None:
+    return None if values[0] is None else list(values)

@@ -170,6 +170,9 @@ def test_a_wrong_payload_is_told_once_when_the_fit_knows_and_at_the_end(lab: Lab
     assert weighed.mass_kg == pytest.approx(MEASURED_KG, abs=0.05)
     assert lab.holds() == []
     assert outcome is not None
+    carried = lab.arm.status().p_flange_payload_m
+    assert carried is not None
+    assert outcome.result.provenance["setup"]["p_flange_payload_m"] == list(carried)
     assert outcome.result.verdict == "usable"
     assert outcome.result.reasons[0] == words[0].words
     assert hints(outcome.result, outcome.run.records()) == ()

@@ -1,32 +1,59 @@
-"""Everything that is in a database, whatever its kind."""
+"""Everything that is in a database, read without the code under test and in the same form from each kind."""
 
-from sqlalchemy import MetaData, NullPool, create_engine, inspect, select
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from sqlalchemy import Connection, NullPool, create_engine, text
+
+_TABLES = {
+    "sqlite": "SELECT name FROM sqlite_master WHERE type = 'table'",
+    "postgresql": "SELECT tablename FROM pg_tables WHERE schemaname = 'public'",
+}
+_COLUMNS = {
+    "sqlite": 'SELECT m.name, c.name, c.type, c."notnull" FROM sqlite_master m, pragma_table_info(m.name) c',
+    "postgresql": "SELECT table_name, column_name, data_type, is_nullable FROM information_schema.columns "
+    "WHERE table_schema = 'public'",
+}
+
+
+@contextmanager
+def connected(url: str) -> Iterator[Connection]:
+    """Connect, and commit at the end."""
+    with create_engine(url, poolclass=NullPool).begin() as connection:
+        yield connection
 
 
 def dump(url: str) -> list[str]:
-    """Return every row of every table, as text."""
-    engine, metadata = create_engine(url, poolclass=NullPool), MetaData()
-    with engine.connect() as connection:
-        metadata.reflect(connection)
+    """Return every row of every table, sorted by columns and as text."""
+    with connected(url) as connection:
         return sorted(
-            f"{table.name} {sorted(row.items())}"
-            for table in metadata.sorted_tables
-            for row in connection.execute(select(table)).mappings()
+            f"{name}: {sorted((key, _plain(value)) for key, value in row.items())}"
+            for name in _names(connection)
+            for row in connection.execute(text(f"SELECT * FROM {name}")).mappings()
         )
 
 
-def columns(url: str) -> dict[str, set[str]]:
-    """Return the columns and indexes of every table."""
-    inspector = inspect(create_engine(url, poolclass=NullPool))
-    return {
-        table: {f"{one['name']} {one['type']} {one['nullable']}" for one in inspector.get_columns(table)}
-        | {str(one["name"]) for one in inspector.get_indexes(table)}
-        for table in inspector.get_table_names()
-    }
+def columns(url: str) -> set[tuple[Any, ...]]:
+    """Return every column and index with its table."""
+    with connected(url) as connection:
+        return {tuple(row) for row in connection.execute(text(_COLUMNS[connection.dialect.name]))}
 
 
 def wipe(url: str) -> None:
     """Drop every table."""
-    engine, metadata = create_engine(url, poolclass=NullPool), MetaData()
-    metadata.reflect(engine)
-    metadata.drop_all(engine)
+    with connected(url) as connection:
+        for name in _names(connection):
+            connection.execute(text(f"DROP TABLE {name}"))
+
+
+def _names(connection: Connection) -> list[str]:
+    return list(connection.scalars(text(_TABLES[connection.dialect.name])))
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as PostgreSQL gives it: with lists, objects and truth values."""
+    if isinstance(value, str) and value[:1] in ("[", "{"):
+        return json.loads(value)
+    return int(value) if isinstance(value, bool) else value

@@ -33,8 +33,8 @@ def require_whole(url: str, n: int) -> None:
 
 def test_two_connections_at_once_lose_nothing(store_url: str, tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as pool:
-        list(pool.map(write, 2 * [store_url], new_runs(tmp_path, 2, 5)))
-    require_whole(store_url, 2 * 5 + 1)
+        list(pool.map(write, 2 * [store_url], new_runs(tmp_path, 2, 4)))
+    require_whole(store_url, 2 * 4 + 1)
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """A store on a server: outages, passwords and waiting writers. Each failure is one sentence, and no run is lost."""
 
+import socket
 import sys
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from tests.unit.ftdrive.store.contents import dump
 
 
 @pytest.mark.parametrize("outage", ["server killed", "connection cut"])
-def test_an_outage_in_mid_write_loses_no_run(outage: str, runs: Path, postgres: Server, postgres_url: str) -> None:
+def test_an_outage_in_mid_write_loses_no_run(
+    outage: str, runs: Path, postgres: Server, postgres_url: str, caplog: pytest.LogCaptureFixture
+) -> None:
     """All rows of the second run are written, but not committed yet."""
     store = Store(postgres_url)
     store.index(runs / "2026-03-01-calibrate")
@@ -28,12 +31,13 @@ def test_an_outage_in_mid_write_loses_no_run(outage: str, runs: Path, postgres: 
         if outage == "server killed":
             postgres.kill()
         else:
-            postgres.execute(f"SELECT pg_terminate_backend({pid})")
+            postgres.execute(f"SELECT pg_terminate_backend({pid}, 60000)")
 
     event.listen(database._engine, "commit", fail)
     with pytest.raises(BadStore, match=r"cannot be written \(.*\): check") as error:
         store.index(runs)
     assert "\n" not in str(error.value)
+    assert caplog.records == []  # SQLAlchemy would log a traceback if it could not return the connection
     event.remove(database._engine, "commit", fail)
     if outage == "server killed":
         with pytest.raises(BadStore, match="cannot be read"):
@@ -94,6 +98,15 @@ def test_a_calibration_does_not_fail_for_a_server_that_is_down(
     out, err = capsys.readouterr()
     assert out == ""
     assert "The run is saved but not in the history yet, because the store postgresql" in " ".join(err.split())
+
+
+@pytest.mark.slow
+def test_a_server_that_does_not_answer_is_one_sentence() -> None:
+    """It accepts the connection and stays silent; libpq waits for 2 s at least."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        with pytest.raises(BadStore, match=r"cannot be read .*timeout"):
+            Store(f"postgresql+psycopg://lab@127.0.0.1:{port}/db", wait_s=0.1).results()
 
 
 def test_a_missing_libpq_names_the_extra(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
