@@ -27,7 +27,7 @@ TILTED_RAD: Final = np.deg2rad(0.1)
 TILT_FLOOR_RAD: Final = np.deg2rad(0.02)
 """Added to the sigma of a tilt: postures of an arm bend it differently."""
 SURE: Final = 1e-4
-"""Largest p-value of a turned base: one in 100 fleets of 200 cells shows one by chance."""
+"""Largest p-value of a turned base: one in 50 fleets of 200 cells shows one by chance."""
 LATE: Final = timedelta(days=1)
 """A verification that is due today is not late yet."""
 
@@ -47,18 +47,15 @@ def findings(observed: Observed, states: Sequence[CellState]) -> tuple[Finding, 
 
 
 def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[Finding]:
-    late = {one.cell: one.due for one in reversed(states) if one.due is not None and one.due + LATE < observed.now}
+    late = [(one.due, one.cell) for one in states if one.due is not None and one.due + LATE < observed.now]
     if late:
-        worst = min(late, key=lambda cell: late[cell])
-        cells = tuple(sorted(late))
-        verb = "is" if len(cells) == 1 else "are"
-        longest = "" if len(cells) == 1 else f"; the longest is {worst}"
-        yield Finding(
-            "overdue",
-            cells,
-            f"the verification of {listed(cells)} {verb} late, by {(observed.now - late[worst]).days} d{longest}: "
-            "run `ftdrive fleet verify --due`",
-        )
+        due, worst = min(late)
+        cells = tuple(sorted({cell for _, cell in late}))
+        days = (observed.now - due).days
+        what = f"The verification of {worst} is late by {days} d"
+        if len(cells) > 1:
+            what = f"The verifications of {listed(cells)} are late, that of {worst} by {days} d"
+        yield Finding("overdue", cells, f"{what}: run `ftdrive fleet verify --due`")
 
 
 # ---------------------------------------------------------------------------------------------------------------- base
@@ -162,9 +159,9 @@ def _centre(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
         yield Finding(
             "payload",
             cells,
-            f"{tool}: its centre of mass is {_mm(centre)} mm off the flange axis in {listed(cells)} alike, but the "
-            f"payloads of their controllers amount to {_mm(first.configured_off_axis_m)} mm (in {first.cell}): set the "
-            "payload with `ftdrive push`",
+            f"The tool {tool} has its centre of mass {_mm(centre)} mm off the flange axis in {listed(cells)} alike. "
+            f"The payloads of their controllers amount to others, such as {_mm(first.configured_off_axis_m)} mm in "
+            f"{first.cell}: set them with `ftdrive push`",
         )
 
 
@@ -183,9 +180,9 @@ def _mass(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
         yield Finding(
             "payload",
             cells,
-            f"{tool}: it weighs {mass_kg:.2f} kg without sensor and adapter in {listed(cells)} alike, but the payloads "
-            f"of their controllers are not that, such as {first.payload_kg:.2f} kg in {first.cell}: set the payload "
-            "with `ftdrive push`",
+            f"The tool {tool} weighs {mass_kg:.2f} kg without sensor and adapter in {listed(cells)} alike. "
+            f"The payloads of their controllers do not agree, such as {first.payload_kg:.2f} kg in {first.cell}: set "
+            "them with `ftdrive push`",
         )
 
 

@@ -46,6 +46,8 @@ class Observed:
     """Accepted results with a time, by cell, the oldest first."""
     checks: Mapping[str, Sequence[StoredVerification]]
     """Verifications with a time, by calibration, the oldest first; none without, or older than `WINDOW`."""
+    changes: Mapping[str, BiasChanges]
+    """By calibration, where its verifications have them."""
     now: datetime
 
     @classmethod
@@ -62,7 +64,9 @@ class Observed:
         for check in store.verifications(since=now - WINDOW):
             if check.created_utc is not None:
                 checks.setdefault(check.calibration_id, []).append(check)
-        return cls(cells, results, checks, now)
+        known = [one for found in results.values() for one in found if one.id in checks]
+        changes = {one.id: found for one in known if (found := _changes(one, checks[one.id])) is not None}
+        return cls(cells, results, checks, changes, now)
 
     def newest(self, cell: StoredCell) -> Iterator[StoredResult]:
         """Yield the newest result of each tool in use, in the order of their names.
@@ -82,26 +86,27 @@ class Observed:
         """Whether a calibration may have verifications that are too old to be read."""
         return when(result) < self.now - WINDOW
 
-    def bias_changes(self, result: StoredResult) -> BiasChanges | None:
-        """Return how the bias has changed since a calibration; None if no verification has this.
 
-        A verification counts if it passed, or found that the bias has changed: another change, or a hand on the tool,
-        spoils the estimate.
-        """
-        start = when(result)
-        rows = [
-            (when(one), one.bias_change, one.bias_change_sigma, one.calibration_sigma, one.temperature_C)
-            for one in self.checks.get(result.id, ())
-            if (one.passed or one.change == "bias")
-            and (one.bias_change and one.bias_change_sigma and one.calibration_sigma)
-            and min(one.bias_change_sigma) > 0
-        ]
-        if not rows:
-            return None
-        times, change, sigma, common, temperature = zip(*rows, strict=True)
-        days = np.array([(time - start).total_seconds() for time in times]) / 86400
-        known = np.array([np.nan if one is None else one for one in temperature])
-        return BiasChanges(days, np.array(change), np.array(sigma), np.median(np.array(common), axis=0), known)
+def _changes(result: StoredResult, checks: Sequence[StoredVerification]) -> BiasChanges | None:
+    """Return how the bias has changed since a calibration; None if no verification has this.
+
+    A verification counts if it passed, or found that the bias has changed: another change, or a hand on the tool,
+    spoils the estimate.
+    """
+    start = when(result)
+    rows = [
+        (when(one), one.bias_change, one.bias_change_sigma, one.calibration_sigma, one.temperature_C)
+        for one in checks
+        if (one.passed or one.change == "bias")
+        and (one.bias_change and one.bias_change_sigma and one.calibration_sigma)
+        and min(one.bias_change_sigma) > 0
+    ]
+    if not rows:
+        return None
+    times, change, sigma, common, temperature = zip(*rows, strict=True)
+    days = np.array([(time - start).total_seconds() for time in times]) / 86400
+    known = np.array([np.nan if one is None else one for one in temperature])
+    return BiasChanges(days, np.array(change), np.array(sigma), np.median(np.array(common), axis=0), known)
 
 
 def when(one: StoredResult | StoredVerification) -> datetime:

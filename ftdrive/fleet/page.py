@@ -1,5 +1,6 @@
 """The state of a fleet as one HTML page without a link to anything outside it."""
 
+import re
 from datetime import datetime
 
 import numpy as np
@@ -31,9 +32,13 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
     """
     try:
         from jinja2 import Environment, PackageLoader, StrictUndefined
-        from markupsafe import Markup
+        from markupsafe import Markup, escape
     except ImportError:
         raise ConfigError("the page of a fleet needs jinja2: pip install 'ftdrive[fleet]', or --json") from None
+
+    def with_code(text: str) -> Markup:
+        """Escape a sentence, and set what stands between backticks as code."""
+        return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))
 
     environment = Environment(
         loader=PackageLoader("ftdrive.fleet"),
@@ -42,11 +47,12 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["with_code"] = with_code
     results = {one.id: one for name in observed.results for one in observed.results[name]}
     rows = []
     for state in fleet.cells:
         result = None if state.calibration_id is None else results[state.calibration_id]
-        changes = None if result is None else observed.bias_changes(result)
+        changes = None if result is None else observed.changes.get(result.id)
         drawn = "" if result is None or changes is None else plot(changes, when(result), observed.now)
         rows.append({"state": state, "plot": Markup(drawn), **_words(state, observed.now)})
     return environment.get_template("fleet.html.j2").render(
@@ -78,10 +84,11 @@ def plot(changes: BiasChanges, start: datetime, now: datetime) -> str:
         for k in (3, 4, 5, 0, 1, 2)
     )
     label = f"changes of the six biases in the last {WINDOW.days} days, at most {most:.1f} sigmas"
+    whole = WIDTH + 40
     return (
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" role="img" aria-label="{label}">'
+        f'<svg viewBox="0 0 {whole} {HEIGHT}" width="{whole}" height="{HEIGHT}" role="img" aria-label="{label}">'
         f'{band}<path class="zero" d="M0 {middle}H{WIDTH}"/>{lines}'
-        f'<text x="{WIDTH - 2}" y="9" text-anchor="end">±{most:.0f} σ</text></svg>'
+        f'<text x="{WIDTH + 6}" y="{middle + 3}">±{most:.0f} σ</text></svg>'
     )
 
 

@@ -81,7 +81,7 @@ def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: St
         due=max(calibrated, verified or calibrated) + timedelta(days=cell.verify_every_days),
         mass_kg=result.mass_kg,
         temperature_C=next((one for one in temperatures if one is not None), None),
-        drift=drift_of(observed.bias_changes(result), calibrated),
+        drift=drift_of(observed.changes.get(result.id), calibrated),
     )
 
 

@@ -34,12 +34,12 @@ def verified_in_words(state: CellState, now: datetime) -> str:
 
 
 def summary(fleet: Fleet, now: datetime) -> str:
-    """Count the cells and tools that need attention, such as "200 cells: 2 failed, 5 drift, 12 due"."""
+    """Count the cells and tools that need attention, such as "200 cells: 2 failed, 5 drifting, 12 due"."""
     tools, cells = fleet.cells, {one.cell for one in fleet.cells}
     counts = {
         "never calibrated": sum(one.calibration_id is None for one in tools),
         "failed": sum(one.passed is False for one in tools),
-        "drift" if sum(_drifts(one) for one in tools) > 1 else "drifts": sum(_drifts(one) for one in tools),
+        "drifting": sum(_drifts(one) for one in tools),
         "due": sum(one.is_due(now) and one.calibration_id is not None for one in tools),
     }
     found = ", ".join(f"{number} {what}" for what, number in counts.items() if number)
@@ -52,10 +52,11 @@ def attention(fleet: Fleet, now: datetime) -> list[str]:
     for one in fleet.cells:
         name = f"{one.cell}, {one.tool}" if one.tool else one.cell
         if one.passed is False and one.verified is not None:
-            cause = f"{one.change} changed" if one.change else "no single change explains it"
-            found.append(
-                f"{name}: the verification failed {age_in_words(now - one.verified)} ago ({cause}): calibrate again"
-            )
+            failed = f"{name}: the verification failed {age_in_words(now - one.verified)} ago"
+            if one.change:
+                found.append(f"{failed} ({one.change} changed): verify again and accept the update, or calibrate again")
+            else:
+                found.append(f"{failed}, and no change explains it: verify again with a free tool, or calibrate again")
         if one.drift is not None and one.drift.found:
             found.append(f"{name}: {one.drift.words}: calibrate again, and check the sensor if it goes on")
     return found + [one.words for one in fleet.findings]

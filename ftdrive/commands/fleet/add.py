@@ -11,10 +11,11 @@ from ftdrive.commands.common import FILE, store_url
 @click.argument("file", metavar="CELLS.TOML", type=FILE)
 @click.option("--store", metavar="URL", help="Store to write, instead of [store] url.")
 def add(file: Path, store: str | None) -> None:
-    """Add the cells of CELLS.TOML to the store, or replace those of the same name.
+    """Add the cells of CELLS.TOML to the store.
 
-    Each has a table [cells.NAME] with `config`, the path of its ftdrive.toml, and `verify_every_days`. Its runs are
-    found by the serial number of the arm (`arm_serial`, or [robot] serial), else by [robot] host.
+    Cells of the same name are replaced. Each has a table [cells.NAME] with `config`, the path of its ftdrive.toml, and
+    `verify_every_days`. Its runs are found by the serial number of the arm (`arm_serial`, or [robot] serial), else by
+    [robot] host.
     """
     from ftdrive.fleet.cells import read_cells, refuse_ambiguous
     from ftdrive.store.store import Store

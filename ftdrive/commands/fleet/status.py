@@ -21,10 +21,13 @@ _TITLES = ("cell", "tool", "verdict", "age", "verified", "drift, σ", "due")
 @click.option("--html", "page_path", metavar="FILE", type=NewFile(), help="New file: a page with plots of the drift.")
 @JSON
 def status(store: str | None, page_path: Path | None, as_json: bool) -> None:
-    """List all cells: age of the calibration, last verification, drift of the bias, and when a verification is due.
+    """List all cells: what is due, what drifts, what several show together.
 
-    Below the list is what needs attention, with what to do. The exit code is 0 also then. A cell has one line for each
-    tool in use. `ftdrive fleet add` adds cells, `ftdrive fleet index` adds runs from other computers.
+    The columns are the age of the calibration, that of the last verification, the drift of the bias in sigmas of a
+    verification, and when the next one is due. A cell has one line for each tool in use. Below the list is what needs
+    attention, with what to do. The exit code is 0 also then.
+
+    `ftdrive fleet add` adds cells, `ftdrive fleet index` adds runs from other computers.
     """
     from calib.files import write_new
     from ftdrive.fleet.observed import Observed

@@ -102,6 +102,11 @@ def test_an_unchanged_cell_passes_at_poses_that_were_not_used(
     assert document["calibration"]["id"] == calibration.id
     assert len(document["poses"]) == 6
     assert (document["temperature_C"], calibration.provenance["temperature_C"]) == (31.5, None)
+    change = document["bias_change"]
+    for one, bias, sigma, common in zip(
+        range(6), change["value"], change["sigma"], change["calibration_sigma"], strict=True
+    ):
+        assert abs(bias) < 6 * np.hypot(sigma, common), one
     last = last_verification(run.folder.parent / str(calibration.provenance["run"]))
     assert last is not None
     assert (last.passed, last.path) == (True, found.path.absolute())

@@ -1,0 +1,95 @@
+"""cells.toml: what it says becomes cells, every mistake is one sentence, and each result finds its cell."""
+
+from pathlib import Path
+
+import pytest
+
+from ftdrive.errors import ConfigError
+from ftdrive.fleet.cells import Owners, read_cells, refuse_ambiguous
+from tests.unit.ftdrive.fleet.fleet_records import cell, result
+
+HEAD = 'format = "ftdrive.config/1"\n'
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two configurations, one with the serial number of its arm."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a/ftdrive.toml").write_text(
+        HEAD + '[robot]\nhost = "10.0.0.1"\nserial = "111"\n[tool]\nname = "drill"\n'
+    )
+    (tmp_path / "b.toml").write_text(HEAD + '[robot]\nhost = "10.0.0.2"\n[sensor]\nurl = "ati-can://can0"\n')
+    (tmp_path / "empty.toml").write_text(HEAD)
+    return tmp_path
+
+
+def written(folder: Path, text: str, head: str = 'format = "ftdrive.cells/1"\n') -> Path:
+    path = folder / "cells.toml"
+    path.write_text(head + text)
+    return path
+
+
+def test_a_cell_has_what_its_configuration_says(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (
+        '[cells.press-4]\nconfig = "a/ftdrive.toml"\nverify_every_days = 7\n'
+        '[cells.lab]\nconfig = "b.toml"\nverify_every_days = 0.5\narm_serial = "222"\n'
+    )
+    path = written(folder, text)
+    (folder / "elsewhere").mkdir()
+    monkeypatch.chdir(folder / "elsewhere")  # paths are relative to the file
+    press, lab = read_cells(path)
+    assert (press.name, press.config) == ("press-4", str(folder / "a/ftdrive.toml"))
+    assert (press.arm_serial, press.robot_host, press.tool) == ("111", "10.0.0.1", "drill")
+    assert (press.verify_every_days, press.sensor_url) == (7.0, None)
+    assert (lab.arm_serial, lab.verify_every_days, lab.sensor_url) == ("222", 0.5, "ati-can://can0")
+
+
+_CELL = '[cells.a]\nconfig = "b.toml"\nverify_every_days = 7\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[cells.a\n", r"cells\.toml is not TOML"),
+        ("", "no cell is listed: write a table"),
+        ("[cells]\n", "no cell is listed"),
+        (f"schedule = 3\n{_CELL}", "the key schedule is unknown"),
+        (f"{_CELL}verify_every = 7\n", r"\[cells\.a\]: the key verify_every is unknown: the keys are config"),
+        ("[cells]\na = 3\n", "is 3: write a table"),
+        ('[cells."a/b"]\nconfig = "b.toml"\nverify_every_days = 7\n', "is no name of a cell"),
+        ("[cells.a]\nverify_every_days = 7\n", "config is None: give the path"),
+        ('[cells.a]\nconfig = "c.toml"\nverify_every_days = 7\n', r"c\.toml does not exist: `ftdrive init` writes one"),
+        ('[cells.a]\nconfig = "empty.toml"\nverify_every_days = 7\n', r"has no \[robot\] host"),
+        ('[cells.a]\nconfig = "b.toml"\n', "verify_every_days is None: give the days"),
+        ('[cells.a]\nconfig = "b.toml"\nverify_every_days = 0\n', "verify_every_days is 0: give"),
+        ('[cells.a]\nconfig = "b.toml"\nverify_every_days = true\n', "verify_every_days is True"),
+        ('[cells.a]\nconfig = "b.toml"\nverify_every_days = nan\n', "verify_every_days is nan"),
+        (f"{_CELL}arm_serial = 222\n", "arm_serial is 222: give the serial number as text"),
+    ],
+)
+def test_each_mistake_is_one_sentence(folder: Path, text: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        read_cells(written(folder, text))
+
+
+@pytest.mark.parametrize("head", ["", 'format = "ftdrive.cells/2"\n', "format = 1\n"])
+def test_the_format_must_be_known(folder: Path, head: str) -> None:
+    with pytest.raises(ConfigError, match=r'the format is .*: write format = "ftdrive\.cells/1"'):
+        read_cells(written(folder, _CELL, head))
+
+
+def test_cells_whose_runs_cannot_be_separated_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"a and b have the same \[robot\] host host-a.*give each its arm_serial"):
+        refuse_ambiguous([cell("a"), cell("b", robot_host="host-a")])
+    with pytest.raises(ConfigError, match="a and b have the same arm_serial 1"):
+        refuse_ambiguous([cell("a", arm_serial="1"), cell("b", arm_serial="1")])
+    refuse_ambiguous([cell("a", arm_serial="1"), cell("b", arm_serial="2", robot_host="host-a"), cell("c")])
+
+
+def test_a_result_belongs_to_a_cell_by_serial_number_then_by_host() -> None:
+    owners = Owners([cell("a"), cell("b", arm_serial="222"), cell("c", arm_serial="333", robot_host="host-a")])
+    assert owners.cell_of(result("a", 1)) == "a"
+    assert owners.cell_of(result("a", 1, arm_serial="222")) == "b"
+    assert owners.cell_of(result("a", 1, arm_serial="333")) == "c"
+    assert owners.cell_of(result("b", 1)) is None  # another arm at the address of a cell that has a serial number
+    assert owners.cell_of(result("a", 1, arm_serial=None, robot_host=None)) is None

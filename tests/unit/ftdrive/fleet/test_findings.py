@@ -1,0 +1,139 @@
+"""Findings across cells: each is named where it is planted, and nowhere else."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.model import Array
+from ftdrive.fleet.state import Finding
+from ftdrive.store.records import StoredResult
+from tests.unit.ftdrive.fleet.fleet_records import cell, check, daily, fleet, result
+from tests.unit.ftdrive.live.simulated import calibrated
+
+MASS_KG = result("a", 1).mass_kg
+OFF_AXIS_M = (calibrated().parameters.R_flange_sensor @ calibrated().parameters.p_sensor_com_m)[:2]
+
+
+def found(cells: str, results: list[StoredResult], checks: list[Any] | None = None) -> list[Finding]:
+    return list(fleet([cell(name, verify_every_days=1000.0) for name in cells], results, checks or []).findings)
+
+
+def noisy(seed: int) -> Array:
+    return np.random.default_rng(seed).multivariate_normal(np.zeros(15), calibrated().covariance)
+
+
+def payload(
+    name: str, kg: float = MASS_KG + 0.4, off_axis_m: Array | None = OFF_AXIS_M, step: Array | None = None, **more: Any
+) -> StoredResult:
+    """A result of a controller whose payload includes 0.4 kg of sensor on the axis, if it is right."""
+    share = MASS_KG / kg
+    com = None if off_axis_m is None else [*(share * off_axis_m), 0.05]
+    return result(name, 1, step=noisy(ord(name)) if step is None else step, payload_kg=kg, payload_com_m=com, **more)
+
+
+def test_right_payloads_are_no_finding() -> None:
+    assert found("abc", [payload("a"), payload("b"), payload("c", off_axis_m=None)]) == []
+    assert found("abc", [result(name, 1, step=noisy(ord(name))) for name in "abc"]) == []
+
+
+def test_a_centre_of_mass_that_is_wrong_in_several_controllers_is_named() -> None:
+    wrong = np.zeros(2)
+    (one,) = found("abcd", [payload("a"), *(payload(name, off_axis_m=wrong) for name in "bcd")])
+    assert (one.kind, one.cells) == ("payload", ("b", "c", "d"))
+    x, y = 1e3 * OFF_AXIS_M
+    assert one.words.startswith(
+        f"The tool gripper has its centre of mass ({x:.0f}, {y:.0f}) mm off the flange axis in b, c and d"
+    )
+    assert "amount to others, such as (0, 0) mm in b: set them with `ftdrive push`" in one.words
+
+
+def test_one_wrong_controller_is_no_finding_of_the_fleet() -> None:
+    assert found("abc", [payload("a"), payload("b"), payload("c", off_axis_m=np.zeros(2))]) == []
+
+
+def test_a_tool_that_differs_between_cells_is_not_called_alike() -> None:
+    """Three grippers with other centres: each controller may be wrong for a reason of its own."""
+    steps = [np.eye(15)[9] * shift for shift in (0.0, 0.02, 0.04)]
+    pairs = zip("abc", steps, strict=True)
+    assert found("abc", [payload(name, off_axis_m=np.array([0.1, 0.0]), step=step) for name, step in pairs]) == []
+
+
+@pytest.mark.parametrize(("kg", "wrong"), [(0.5, True), (MASS_KG, False), (MASS_KG + 0.9, False), (5.0, True)])
+def test_a_mass_that_is_wrong_in_several_controllers_is_named(kg: float, wrong: bool) -> None:
+    one = found("abc", [payload(name, kg, None) for name in "abc"])
+    assert [(each.kind, each.cells) for each in one] == ([("payload", ("a", "b", "c"))] if wrong else [])
+    if wrong:
+        assert (
+            f"The tool gripper weighs {MASS_KG:.2f} kg without sensor and adapter in a, b and c alike" in one[0].words
+        )
+        assert f"such as {kg:.2f} kg in a" in one[0].words
+
+
+def tilted(degrees: float) -> Array:
+    step = np.zeros(15)
+    step[3] = np.deg2rad(degrees) * MASS_KG * 9.80665
+    return step
+
+
+def test_a_base_that_turned_between_calibrations_is_named() -> None:
+    results = [
+        *(result(name, 60, step=noisy(1)) for name in "abc"),
+        result("a", 10, step=noisy(2)),
+        result("b", 10, step=noisy(3) + tilted(0.5), tool="drill"),
+        result("c", 30, step=noisy(4) + tilted(0.5)),
+        result("c", 10, step=noisy(5) + tilted(0.5)),  # the base rests since
+    ]
+    (one,) = found("abc", results)
+    assert (one.kind, one.cells) == ("base", ("b",))
+    assert one.words.startswith("b: gravity has turned by 0.5")
+    assert "between the calibrations of 2026-09-23 and 2026-11-12" in one.words
+
+
+def test_an_update_that_copies_gravity_hides_no_turned_base() -> None:
+    new = result("a", 10, step=tilted(0.5))
+    results = [result("a", 60), new, result("a", 5, numbers=new.numbers, update="bias", parent=new.id)]
+    assert [one.kind for one in found("a", results)] == ["base"]
+
+
+def test_sensors_that_follow_their_temperature_are_named_by_model() -> None:
+    rng = np.random.default_rng(0)
+    results = [result(name, 50, sensor_model="Rokubi" if name in "abc" else "Mini45") for name in "abcde"]
+    checks = []
+    for seed, one in enumerate(results):
+        warm = 20 + 10 * rng.random(40)
+        sign = 0.0 if one.robot_host in {"host-c", "host-e"} else (-1.0) ** seed
+        added = np.outer(warm - 25, [sign, 0, 0, 0, 0, 0])  # sigma a kelvin: 0.01 N
+        days = daily(one, 40, seed, added)
+        checks += [check_at(each, T) for each, T in zip(days, warm, strict=True)]
+    (one,) = found("abcde", results, checks)
+    assert (one.kind, one.cells) == ("temperature", ("a", "b"))
+    assert "The bias of 2 of 3 sensors Rokubi follows their temperature, by up to 0.0099 N a kelvin" in one.words
+
+
+def check_at(one: Any, T: float) -> Any:
+    from dataclasses import replace
+
+    return replace(one, temperature_C=float(T))
+
+
+def test_a_drift_in_a_warming_season_is_no_dependence_on_temperature() -> None:
+    results = [result(name, 60) for name in "abc"]
+    days = np.arange(60)
+    added = np.outer(days / 7, np.ones(6))
+    checks = [
+        check_at(each, T)
+        for seed, one in enumerate(results)
+        for each, T in zip(daily(one, 60, seed, added), 20 + days / 10, strict=True)
+    ]
+    assert [one.kind for one in found("abc", results, checks)] == []
+
+
+def test_late_verifications_are_one_finding() -> None:
+    results = [result("a", 30), result("b", 20), result("c", 7.5), result("d", 2)]
+    names = [cell(name) for name in "abcde"]  # e was never calibrated; c is due since half a day
+    (one,) = fleet(names, results, [check(results[1], 19)]).findings
+    assert (one.kind, one.cells) == ("overdue", ("a", "b"))
+    assert one.words == "The verifications of a and b are late, that of a by 23 d: run `ftdrive fleet verify --due`"
+    (alone,) = fleet([cell("a")], results).findings
+    assert alone.words.startswith("The verification of a is late by 23 d")

@@ -1,0 +1,118 @@
+"""The state of each cell: which calibration counts, when it is due, and whether its bias drifts."""
+
+from datetime import timedelta
+
+import numpy as np
+
+from ftdrive.fleet.status import fleet_state
+from ftdrive.store.store import Store
+from tests.unit.ftdrive.fleet.fleet_records import NOW, cell, check, daily, fleet, result
+
+
+def test_the_newest_accepted_calibration_of_each_tool_counts() -> None:
+    results = [
+        result("a", 50),
+        result("a", 40),
+        result("a", 30, verdict="rejected"),
+        result("a", 20, tool="drill", verdict="usable", temperature_C=25.0),
+        result("b", 10),
+        result("x", 5),  # of no cell
+    ]
+    states = fleet([cell("a"), cell("b"), cell("c")], results).cells
+    assert [(one.cell, one.tool, one.calibration_id) for one in states] == [
+        ("a", "drill", "a-20"),
+        ("a", "gripper", "a-40"),
+        ("b", "gripper", "b-10"),
+        ("c", None, None),
+    ]
+    drill = states[0]
+    assert (drill.verdict, drill.temperature_C, drill.sensor_serial, drill.sensor_model) == (
+        "usable",
+        25.0,
+        "ft-a",
+        "Mini45",
+    )
+    assert drill.calibrated == NOW - timedelta(days=20)
+    assert [one.is_due(NOW) for one in states] == [True, True, True, True]  # c was never calibrated
+
+
+def test_a_tool_out_of_use_is_not_listed_for_ever() -> None:
+    results = [
+        result("a", 200),
+        result("a", 150, tool="old"),
+        result("a", 100, tool="older"),
+        result("a", 1, tool="new"),
+    ]
+    one = fleet([cell("a")], results, [check(results[2], 3)])
+    assert [state.tool for state in one.cells] == ["gripper", "new", "older"]  # configured, newest, verified
+
+
+def test_due_counts_from_the_last_verification_whatever_its_outcome() -> None:
+    made = result("a", 30)
+    cells = [cell("a", verify_every_days=10.0)]
+    (one,) = fleet(cells, [made]).cells
+    assert (one.verified, one.passed, one.due) == (None, None, NOW - timedelta(days=20))
+    (one,) = fleet(cells, [made], [check(made, 12), check(made, 4, passed=False, temperature_C=31.0)]).cells
+    assert (one.verified, one.passed, one.change) == (NOW - timedelta(days=4), False, "bias")
+    assert (one.due, one.is_due(NOW), one.temperature_C) == (NOW + timedelta(days=6), False, 31.0)
+
+
+def test_a_verification_of_an_earlier_calibration_does_not_count() -> None:
+    old, new = result("a", 30), result("a", 3)
+    (one,) = fleet([cell("a")], [old, new], [check(old, 1)]).cells
+    assert (one.calibration_id, one.verified) == ("a-3", None)
+
+
+def test_a_verification_before_the_last_90_days_is_found_too() -> None:
+    made = result("a", 300)
+    (one,) = fleet([cell("a", verify_every_days=180.0)], [made], [check(made, 200)]).cells
+    assert (one.verified, one.drift) == (NOW - timedelta(days=200), None)
+    assert one.due == NOW - timedelta(days=20)
+
+
+def ramp(a_week: float, since_days_ago: float, days: int = 60) -> np.ndarray:
+    added = np.zeros((days, 6))
+    added[:, 0] = a_week / 7 * np.maximum(0.0, since_days_ago - np.arange(days)[::-1])
+    return added
+
+
+def test_a_drift_is_found_and_put_in_words() -> None:
+    made, still, few = result("a", 61), result("b", 61), result("c", 61)
+    checks = [*daily(made, 60, 1, ramp(2.0, 21)), *daily(still, 60, 2), *daily(few, 4, 3)]
+    found = {one.cell: one.drift for one in fleet([cell("a"), cell("b"), cell("c")], [made, still, few], checks).cells}
+    a, b, c = (found[name] for name in "abc")
+    assert a is not None
+    assert b is not None
+    assert c is None
+    assert a.found
+    assert a.words.startswith("force bias x drifts by 0.02")  # 2 sigmas of 0.01 N
+    assert " N a week since 2026-" in a.words
+    assert 4 < a.level_sigmas < 7
+    assert (b.found, b.words) == (False, "")
+    assert b.level_sigmas < 2
+
+
+def test_a_verification_with_a_hand_on_the_tool_does_not_hide_a_drift() -> None:
+    made = result("a", 61)
+    checks = daily(made, 60, 1, ramp(2.0, 21))
+    spoilt = check(made, 30.5, passed=False, change=None, bias_change=[3.0] * 6)
+    (one,) = fleet([cell("a")], [made], [*checks, spoilt]).cells
+    assert one.drift is not None
+    assert one.drift.found
+
+
+def test_verifications_of_an_earlier_version_have_no_change_of_the_bias() -> None:
+    made = result("a", 61)
+    (one,) = fleet([cell("a")], [made], [check(made, day) for day in range(20)]).cells
+    assert (one.drift, one.passed) == (None, True)
+
+
+def test_a_store_gives_the_same_state_as_its_records(store_url: str) -> None:
+    made, other = result("a", 61), result("b", 200, tool=None, payload_kg=1.9, payload_com_m=[0.0, 0.0, 0.05])
+    checks = [*daily(made, 60, 1, ramp(2.0, 21), temperature_C=25.0), check(other, 150, passed=False)]
+    cells = [cell("b"), cell("a"), cell("c", arm_serial="arm-c")]
+    store = Store(store_url)
+    store.put_cells(cells)
+    with store._database.writing() as connection:
+        store._write(connection, [made, other, *checks])
+    assert fleet_state(store, NOW) == fleet(cells, [made, other], checks)
