@@ -206,7 +206,7 @@ class CellConfig:
         """Return the sections as files have them; a password in the store's address is left out."""
         found = {name: asdict(getattr(self, name)) for name in SECTIONS}
         if self.store.url is not None:
-            found["store"]["url"] = re.sub(r"(://[^:/@]*):[^/]*@", r"\1@", self.store.url)
+            found["store"]["url"] = without_password(self.store.url)
         return found
 
 
@@ -218,6 +218,11 @@ class Setting:
     """None where it is not set and has no default."""
     origin: str
     """The option, variable or file that sets it; "default" or "not set"."""
+
+
+def without_password(text: str) -> str:
+    """Return an address, or a word of a command line, without the password in it."""
+    return re.sub(r"(://[^:/@]*):.*@", r"\1@", text)
 
 
 Flag = tuple[str, Any]

@@ -1,6 +1,5 @@
 """`ftdrive stream`: the compensated wrench for Foxglove, Lichtblick and PlotJuggler."""
 
-import ipaddress
 import socket
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
@@ -10,9 +9,17 @@ from typing import TYPE_CHECKING
 import click
 
 from drivers.errors import DriverError
-from ftdrive.commands.common import CALIBRATION_OR_TOOL, CELL, FRAME, check_simulate, read_frame, simulate
+from ftdrive.commands.common import (
+    CALIBRATION_OR_TOOL,
+    CELL,
+    FRAME,
+    check_simulate,
+    host_and_port,
+    is_loopback,
+    read_frame,
+    simulate,
+)
 from ftdrive.commands.live_source import open_source
-from ftdrive.errors import ConfigError
 from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.samples import Axes
 from ftdrive.live.stream import CompensatedStream
@@ -58,7 +65,7 @@ def stream(
 
     check_simulate(simulate, real={"--config": config, "--robot": robot})
     frame = read_frame(axes, about)
-    udp_address = None if udp is None else _address(udp)
+    udp_address = None if udp is None else host_and_port("--udp", udp, "127.0.0.1:9870")
     with ExitStack() as stack:
         source, _ = open_source(
             path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
@@ -102,13 +109,6 @@ def _send_events(source: CompensatedStream, sinks: Sequence["FoxgloveServer | Ud
             sink.event(event)
 
 
-def _address(text: str) -> tuple[str, int]:
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise ConfigError(f"--udp is '{text}': give HOST:PORT, such as 127.0.0.1:9870")
-    return host.strip("[]"), int(port)
-
-
 def _introduce(source: ProcessedStream, server: "FoxgloveServer", host: str, udp: tuple[str, int] | None) -> None:
     """Print what is served, and how to open it."""
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
@@ -118,7 +118,7 @@ def _introduce(source: ProcessedStream, server: "FoxgloveServer", host: str, udp
     talk.print(f"  PlotJuggler from 3.16: Streaming > Foxglove Bridge > {url}")
     if udp is not None:
         talk.print(f"  PlotJuggler before:    Streaming > UDP Server > port {udp[1]}, JSON, use the timestamp")
-    if _is_loopback(host):
+    if is_loopback(host):
         talk.print(f"  In a browser:          {server.app_url}")
     else:
         talk.print(
@@ -126,10 +126,3 @@ def _introduce(source: ProcessedStream, server: "FoxgloveServer", host: str, udp
             "frame and stages. There is no password and no encryption."
         )
     talk.print("Ctrl-C ends.")
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

@@ -81,9 +81,10 @@ def verify(
     --max-torque, 1 % of unchanged cells fail. If it fails, it names what has changed, offers the smallest sufficient
     update, and ends with exit code 7.
     """
-    from ftdrive.errors import NotAccepted
-    from ftdrive.runs.verified import AcceptanceLimits, verify_run
+    from ftdrive.errors import Declined, NotAccepted
+    from ftdrive.runs.verified import AcceptanceLimits
     from ftdrive.session.session import Options
+    from ftdrive.terminal.console import talk
 
     check_simulate(simulate, real={"--config": config, "--robot": robot})
     wanted = _wanted(path, quick, poses, AcceptanceLimits(force_N, torque_Nm), resume)
@@ -104,19 +105,67 @@ def verify(
         elif path is None:
             raise ConfigError("no calibration: give --calibration PATH, or --simulate")
         cell = read_cell(config, robot, sensor) if station is None else station.cell
-        if wanted.quick:  # 12 s of noise would take longer than the poses
-            cell = replace(cell, sampling=replace(cell.sampling, noise_record_s=0.0))
-        run, calibration, path = _take_poses(cell, station, path, wanted, options, as_json=as_json)
+        try:
+            verified = verify_cell(cell, path, wanted, options, station, update=update, as_json=as_json)
+        except Declined as error:
+            talk.print(str(error))
+            raise click.Abort from error
+    if not verified.passed:
+        raise NotAccepted(f"the verification failed: {failure_in_words(verified)}")
+
+
+def verify_cell(
+    cell: "CellConfig",
+    path: Path,
+    wanted: "Wanted",
+    options: "Options",
+    station: "Station | None" = None,
+    *,
+    update: Answer = "ask",
+    as_json: bool = False,
+) -> "Verified":
+    """Guide the operator through the poses, compare them with a calibration, report, and add the run to the store.
+
+    Parameters
+    ----------
+    cell : CellConfig
+    path : Path
+        The calibration file or its run folder.
+    wanted : Wanted
+    options : Options
+        Of the session.
+    station : Station, optional
+        The emulated cell that `cell` describes.
+    update : "ask", "no" or "yes"
+        Whether to save the smallest sufficient update.
+    as_json : bool
+        Print events, questions and the outcome as JSON.
+
+    Raises
+    ------
+    Declined
+        The operator ended the session.
+    NotAccepted, PlanRefused, ConfigError, DriverError, OSError
+        As `ftdrive.session.session.take_poses`.
+    """
+    from ftdrive.runs.verified import verify_run
+
+    if wanted.quick:  # 12 s of noise would take longer than the poses
+        cell = replace(cell, sampling=replace(cell.sampling, noise_record_s=0.0))
+    run, calibration, path = _take_poses(cell, station, path, wanted, options, as_json=as_json)
     verified = verify_run(run, calibration, path, wanted.limits)
     _report(verified, update, as_json=as_json)
-    index_run(run.folder, None if simulate else cell)
-    if not verified.passed:
-        words = verified.exceeded if verified.limits.given else (verified.verification.reason,)
-        raise NotAccepted(f"the verification failed: {'; '.join(words)}")
+    index_run(run.folder, cell if station is None else None)
+    return verified
+
+
+def failure_in_words(verified: "Verified") -> str:
+    """Return why a verification failed."""
+    return "; ".join(verified.exceeded if verified.limits.given else (verified.verification.reason,))
 
 
 @dataclass(frozen=True, slots=True)
-class _Wanted:
+class Wanted:
     """What is verified, and how; the run keeps it, so that --resume continues alike."""
 
     path: Path | None
@@ -127,7 +176,7 @@ class _Wanted:
 
 def _wanted(
     path: Path | None, quick: bool, poses: int | None, limits: "AcceptanceLimits", resume: Path | None
-) -> _Wanted:
+) -> Wanted:
     from ftdrive.runs.run import Run
     from ftdrive.runs.verified import AcceptanceLimits
     from ftdrive.session.verification import POSES, QUICK_POSES
@@ -135,7 +184,7 @@ def _wanted(
     if quick and poses is not None:
         raise ConfigError("--quick and --poses exclude one another: leave one of them out")
     if resume is None:
-        return _Wanted(path, poses or (QUICK_POSES if quick else POSES), quick, limits)
+        return Wanted(path, poses or (QUICK_POSES if quick else POSES), quick, limits)
     given = {"--calibration": path, "--quick": quick, "--poses": poses, "--max-force or --max-torque": limits.given}
     if wrong := [option for option, value in given.items() if value]:
         raise ConfigError(f"--resume continues with the options of its run: leave out {' and '.join(wrong)}")
@@ -143,14 +192,14 @@ def _wanted(
     if run.command != "verify":
         raise ConfigError(f"{resume} is not a verification: continue it with {run.resume_command}")
     begun = run.header()["verification"]
-    return _Wanted(Path(begun["path"]), begun["poses"], begun["quick"], AcceptanceLimits(**begun["limits"]))
+    return Wanted(Path(begun["path"]), begun["poses"], begun["quick"], AcceptanceLimits(**begun["limits"]))
 
 
 def _take_poses(
     cell: "CellConfig",
     station: "Station | None",
     path: Path,
-    wanted: _Wanted,
+    wanted: Wanted,
     options: "Options",
     *,
     as_json: bool,
@@ -158,7 +207,6 @@ def _take_poses(
     """Guide the operator through the poses; return the run, and the calibration with its file."""
     from ftdrive.cell.emulated import MOVED_BY
     from ftdrive.commands.emulated_run import described
-    from ftdrive.errors import Declined
     from ftdrive.live.stream import load_calibration
     from ftdrive.runs.run import Run
     from ftdrive.session.session import take_poses, with_recorded_mode
@@ -177,12 +225,8 @@ def _take_poses(
             station.control(**request)
             talk.print(f"The cell is emulated: {words}.")
     task = Verifying(calibration, path, wanted.poses, options.runs)
-    try:
-        with open_operator(as_json=as_json, command=task.command) as operator:
-            run = take_poses(cell, operator, replace(options, description=description), task)
-    except Declined as error:
-        talk.print(str(error))
-        raise click.Abort from error
+    with open_operator(as_json=as_json, command=task.command) as operator:
+        run = take_poses(cell, operator, replace(options, description=description), task)
     if run is None:
         raise RuntimeError("a verification is never a dry run")
     return run, calibration, path

@@ -1,8 +1,8 @@
 """The state of a fleet: what the status, its page, the metrics and the messages show."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
-from typing import Literal
+from typing import Any, Literal
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +46,13 @@ class CellState:
     def is_due(self, now: datetime) -> bool:
         """Whether a verification, or the first calibration, is due."""
         return self.due is None or self.due <= now
+
+    def to_dict(self, now: datetime) -> dict[str, Any]:
+        """Return the fields as JSON, and whether it is due."""
+        plain = {
+            key: value.isoformat() if isinstance(value, datetime) else value for key, value in asdict(self).items()
+        }
+        return {**plain, "is_due": self.is_due(now)}
 
 
 FindingKind = Literal["payload", "temperature", "base", "overdue"]

@@ -36,7 +36,7 @@ from calib.routine import PoseRecord, TourPose
 from drivers.clock import REAL, Clock
 from drivers.interfaces import FtSamples
 from ftdrive import __version__
-from ftdrive.cell.config import recorded
+from ftdrive.cell.config import recorded, without_password
 from ftdrive.errors import ConfigError
 
 RUN_FORMAT = "ftdrive.run/1"
@@ -99,7 +99,7 @@ class Run:
             "format": RUN_FORMAT,
             "created_utc": now.isoformat(),
             "created_host_ns": clock.now_ns(),
-            "argv": sys.argv,
+            "argv": command_line(),
             "versions": versions(),
             **description,
         }
@@ -324,7 +324,12 @@ def _record(data: Mapping[str, Any]) -> PoseRecord:
 
 def made_now() -> dict[str, Any]:
     """Return what every file says of its making: when, by which command line, with which versions."""
-    return {"created_utc": datetime.now(UTC).isoformat(), "argv": sys.argv, "versions": versions()}
+    return {"created_utc": datetime.now(UTC).isoformat(), "argv": command_line(), "versions": versions()}
+
+
+def command_line() -> list[str]:
+    """Return the command line without passwords in addresses."""
+    return [without_password(word) for word in sys.argv]
 
 
 def versions() -> dict[str, str]:

@@ -88,16 +88,10 @@ def _row(one: "CellState", now: datetime) -> tuple[str, ...]:
 
 
 def _as_json(fleet: "Fleet", name: str, now: datetime) -> dict[str, Any]:
-    def plain(one: "CellState") -> dict[str, Any]:
-        values = {
-            key: value.isoformat() if isinstance(value, datetime) else value for key, value in asdict(one).items()
-        }
-        return {**values, "is_due": one.is_due(now)}
-
     return {
         "schema_version": 1,
         "store": name,
         "now": now.isoformat(),
-        "cells": [plain(one) for one in fleet.cells],
+        "cells": [one.to_dict(now) for one in fleet.cells],
         "findings": [asdict(one) for one in fleet.findings],
     }

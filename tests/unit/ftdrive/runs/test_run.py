@@ -137,3 +137,12 @@ def test_the_temperature_is_the_mean_over_the_poses_as_they_were_last_taken(run:
         run.append_event({"event": "pose-taken", "stop": stop, "temperature_C": temperature_C})
     run.append_event({"event": "estimated", "stop": 4, "temperature_C": 99.0})
     assert run.temperature_C() == 23.0
+
+
+@pytest.mark.parametrize("password", ["secret", "sec/ret", "sec@ret"])
+def test_a_password_on_the_command_line_reaches_no_file(
+    password: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["ftdrive", "fleet", "verify", "--store", f"postgresql://u:{password}@host:1/db"])
+    run = Run.create(tmp_path, "verify", {})
+    assert run.header()["argv"][-1] == "postgresql://u@host:1/db"

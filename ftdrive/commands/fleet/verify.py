@@ -1,0 +1,167 @@
+"""`ftdrive fleet verify`: one cell after the other, each with an operator at it."""
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ftdrive.commands.common import read_cell, store_url
+from ftdrive.commands.verify import Wanted, failure_in_words, verify_cell
+from ftdrive.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ftdrive.cell.config import CellConfig
+    from ftdrive.fleet.state import Fleet
+    from ftdrive.store.records import StoredCell
+    from ftdrive.store.store import Store
+
+_OF_ONE_CELL = tuple(f"FTDRIVE_{section}_" for section in ("ROBOT", "SENSOR", "TOOL", "WORKCELL"))
+
+
+@click.command()
+@click.argument("names", metavar="[CELL]...", nargs=-1)
+@click.option("--due", is_flag=True, help="Only the cells whose verification is due.")
+@click.option("--store", "url", metavar="URL", help="Store that lists the cells, instead of [store] url.")
+def verify(names: Sequence[str], due: bool, url: str | None) -> None:
+    """Verify cells one after the other, with an operator at each.
+
+    For each cell the command first asks whether an operator stands there with the emergency stop in reach. Only yes
+    starts the session of `ftdrive verify`, with its own plan, checks, questions and confirmation. Any other answer
+    skips the cell. No option answers these questions, and a terminal is required.
+    """
+    from ftdrive.errors import Declined, NotAccepted
+    from ftdrive.fleet.status import fleet_state
+    from ftdrive.store.store import Store
+
+    _require_terminal()
+    if names and due:
+        raise ConfigError("CELL and --due exclude one another: leave one of them out")
+    url = url or store_url()
+    store, now = Store(url), datetime.now(UTC)
+    fleet = fleet_state(store, now)
+    chosen = [one for one in _named(store.cells(), names) if not due or _is_due(one, fleet, now)]
+    if not chosen:
+        click.echo("No cell is due.", err=True)
+    failed, errors, lines = list[str](), list[Exception](), list[str]()
+    try:
+        for one in chosen:
+            try:
+                outcome, words = _verify(one, store, url, fleet)
+            except KeyboardInterrupt:
+                lines.append(
+                    f"{one.name}: interrupted; continue with ftdrive verify --resume RUN --config {one.config}"
+                )
+                raise
+            except Declined as error:
+                outcome, words = "ended", str(error)
+            except Exception as error:
+                outcome, words = "not verified", _sentence(error)
+                errors.append(error)
+            if outcome == "FAILED":
+                failed.append(one.name)
+            lines.append(f"{one.name}: {outcome}{f', {words}' if words else ''}")
+    finally:
+        _print(lines)
+    if failed:
+        raise NotAccepted(f"the verification failed in {', '.join(failed)}: the lines above have the reasons")
+    if errors:
+        raise errors[0]
+
+
+def _require_terminal() -> None:
+    """Raise `ConfigError` if no operator can read and answer, or if the environment describes a cell of its own."""
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise ConfigError("fleet verify asks at every cell and never without a terminal: run it in one, at the cells")
+    if alien := sorted(name for name in os.environ if name.startswith(_OF_ONE_CELL)):
+        raise ConfigError(f"{alien[0]} is set and would replace a value of every cell: unset it")
+
+
+def _named(cells: "Sequence[StoredCell]", names: Sequence[str]) -> "list[StoredCell]":
+    """Return the cells with these names in their order; all without names."""
+    if not cells:
+        raise ConfigError("the store has no cells: add them with `ftdrive fleet add cells.toml`")
+    known = {one.name: one for one in cells}
+    if unknown := [name for name in names if name not in known]:
+        raise ConfigError(f"there is no cell '{unknown[0]}': the cells are {', '.join(known)}")
+    return [known[name] for name in dict.fromkeys(names)] if names else list(cells)
+
+
+def _is_due(one: "StoredCell", fleet: "Fleet", now: datetime) -> bool:
+    """Whether the mounted tool is due; without a name of it, whether any tool of the cell is."""
+    states = [state for state in fleet.cells if state.cell == one.name]
+    if one.tool is not None:
+        states = [state for state in states if state.tool in {one.tool, None}]
+    return not states or any(state.is_due(now) for state in states)
+
+
+def _verify(one: "StoredCell", store: "Store", url: str | None, fleet: "Fleet") -> tuple[str, str]:
+    """Ask at a cell and verify it; return the outcome and why. Raises as `verify_cell`."""
+    from ftdrive.runs.verified import AcceptanceLimits
+    from ftdrive.session.session import Options
+    from ftdrive.session.verification import POSES
+
+    cell = _described(one)
+    path = _calibration(one, cell.tool.name, store, fleet)
+    if not _is_attended(one, cell):
+        return "skipped", ""
+    options = Options(path.parent.parent, "verify", poses=POSES)
+    cell = replace(cell, store=replace(cell.store, url=url))
+    verified = verify_cell(cell, path, Wanted(path, POSES, quick=False, limits=AcceptanceLimits()), options)
+    return ("passed", "") if verified.passed else ("FAILED", failure_in_words(verified))
+
+
+def _described(one: "StoredCell") -> "CellConfig":
+    """Read the configuration of a cell; raises `ConfigError` if the store does not know its robot."""
+    cell = read_cell(Path(one.config), None, None)
+    if one.robot_host not in {None, cell.robot.host}:
+        raise ConfigError(
+            f"its robot is {cell.robot.host}, the store has {one.robot_host}: update the store with `ftdrive fleet add`"
+        )
+    return cell
+
+
+def _calibration(one: "StoredCell", tool: str, store: "Store", fleet: "Fleet") -> Path:
+    """Return the newest accepted calibration of a tool of a cell."""
+    for state in fleet.cells:
+        if (state.cell, state.tool) == (one.name, tool) and state.calibration_id is not None:
+            found = [result for result in store.find(state.calibration_id) if result.id == state.calibration_id]
+            if found:
+                return Path(found[0].path)
+    raise ConfigError(f"no accepted calibration of the tool '{tool}' is in the store: calibrate this cell")
+
+
+def _is_attended(one: "StoredCell", cell: "CellConfig") -> bool:
+    """Ask whether an operator stands at the cell; only yes counts, and the end of the input does not."""
+    from ftdrive.errors import Declined
+    from ftdrive.session.operator import Question
+    from ftdrive.terminal.operators import PlainOperator
+
+    text = (
+        f"Cell {one.name}, robot {cell.robot.host}, tool {cell.tool.name}: does an operator stand at this cell, with "
+        "the emergency stop in reach? Only yes starts its verification, Enter skips it"
+    )
+    try:
+        return PlainOperator().ask(Question(text, ("yes", "no", ""))) == "yes"
+    except Declined:
+        return False
+
+
+def _sentence(error: Exception) -> str:
+    """Return the message of an error that a user can fix; raises any other."""
+    from ftdrive.cli import exit_code, in_a_sentence
+
+    if exit_code(error) is None:
+        raise error
+    return in_a_sentence(error)
+
+
+def _print(lines: Sequence[str]) -> None:
+    from ftdrive.terminal.console import in_whole_words
+
+    for line in lines:
+        click.echo(in_whole_words(line, sys.stdout))

@@ -1,0 +1,123 @@
+"""The state of a fleet as metrics of Prometheus."""
+
+from collections.abc import Callable, Iterator, Mapping
+from datetime import datetime
+from typing import Final
+
+from ftdrive.errors import ConfigError
+from ftdrive.fleet.serve import Reading
+from ftdrive.fleet.state import CellState
+
+try:
+    from prometheus_client import CollectorRegistry, start_http_server
+    from prometheus_client.core import GaugeMetricFamily
+    from prometheus_client.registry import Collector
+except ImportError:
+    raise ConfigError("metrics need prometheus-client: pip install 'ftdrive[fleet]'") from None
+
+
+def _seconds(time: datetime | None) -> float | None:
+    return None if time is None else time.timestamp()
+
+
+OF_TOOL: Final[Mapping[str, tuple[str, Callable[[CellState], float | None]]]] = {
+    "ftdrive_calibration_timestamp_seconds": (
+        "When the newest accepted calibration was made.",
+        lambda one: _seconds(one.calibrated),
+    ),
+    "ftdrive_verification_timestamp_seconds": (
+        "When this calibration was last verified.",
+        lambda one: _seconds(one.verified),
+    ),
+    "ftdrive_verification_passed": ("1 if the last verification passed, else 0.", lambda one: one.passed),
+    "ftdrive_verification_due_timestamp_seconds": (
+        "When the next verification is due; absent without a calibration.",
+        lambda one: _seconds(one.due),
+    ),
+    "ftdrive_bias_drift_sigmas": (
+        "Largest change of a component of the bias since the calibration, in sigmas of one verification.",
+        lambda one: None if one.drift is None else one.drift.level_sigmas,
+    ),
+    "ftdrive_bias_drift_found": (
+        "1 if a component of the bias has begun to drift, else 0.",
+        lambda one: None if one.drift is None else one.drift.found,
+    ),
+    "ftdrive_tool_mass_kilograms": ("Identified mass of the tool.", lambda one: one.mass_kg),
+    "ftdrive_sensor_temperature_celsius": (
+        "Temperature of the sensor in its last result; absent if it reports none.",
+        lambda one: one.temperature_C,
+    ),
+}
+"""Metrics with the labels `TOOL`: what they mean, and their value; a value of None is left out."""
+TOOL: Final = ("cell", "tool")
+CELL_INFO: Final = "ftdrive_cell_info"
+CELL_INFO_LABELS: Final = (*TOOL, "arm_serial", "sensor_serial", "sensor_model", "calibration", "verdict")
+FINDING: Final = "ftdrive_finding"
+STORE_UP: Final = "ftdrive_store_up"
+STATE_TIME: Final = "ftdrive_state_timestamp_seconds"
+NAMES: Final = (*OF_TOOL, CELL_INFO, FINDING, STORE_UP, STATE_TIME)
+"""All metrics."""
+
+
+class MetricsServer(Collector):
+    """Serves the newest reading at /metrics, without a process or platform metric beside it.
+
+    Parameters
+    ----------
+    host : str
+        Address to listen at.
+    port : int
+        0 lets the system choose; see `port`.
+
+    Raises
+    ------
+    ConfigError
+        The address cannot be used.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._reading: Reading | None = None
+        registry = CollectorRegistry()
+        registry.register(self)
+        try:
+            self._server, self._thread = start_http_server(port, host, registry)
+        except OSError as error:
+            raise ConfigError(
+                f"/metrics cannot be served at {host}:{port} ({error.strerror}): choose another"
+            ) from None
+        self.port: int = self._server.server_port
+
+    def update(self, reading: Reading) -> None:
+        """Serve this reading from now on."""
+        self._reading = reading
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def collect(self) -> Iterator[GaugeMetricFamily]:
+        """Yield the metrics; called by a thread for each scrape."""
+        reading = self._reading  # the server may set another one meanwhile
+        if reading is None:
+            return
+        yield GaugeMetricFamily(STORE_UP, "1 if the store could be read, else 0.", value=reading.store_up)
+        yield GaugeMetricFamily(STATE_TIME, "When the state was read from the store.", value=reading.read.timestamp())
+        cells = reading.fleet.cells
+        info = GaugeMetricFamily(CELL_INFO, "1 for each tool of each cell.", labels=CELL_INFO_LABELS)
+        for one in cells:
+            about = (one.arm_serial, one.sensor_serial, one.sensor_model, one.calibration_id, one.verdict)
+            info.add_metric([one.cell, *(text or "" for text in (one.tool, *about))], 1)
+        yield info
+        for name, (help_text, value_of) in OF_TOOL.items():
+            family = GaugeMetricFamily(name, help_text, labels=TOOL)
+            for one in cells:
+                value = value_of(one)
+                if value is not None:
+                    family.add_metric([one.cell, one.tool or ""], value)
+            yield family
+        finding = GaugeMetricFamily(FINDING, "1 for each cell of a finding.", labels=("kind", "cell"))
+        for kind, cell in sorted({(one.kind, cell) for one in reading.fleet.findings for cell in one.cells}):
+            finding.add_metric([kind, cell], 1)
+        yield finding

@@ -1,0 +1,142 @@
+"""`fleet serve`: what it prints, how it ends, and what it refuses at the start."""
+
+import sqlite3
+import sys
+import urllib.request
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+
+from ftdrive import cli
+from ftdrive.errors import BadStore
+from ftdrive.fleet.state import Fleet
+from ftdrive.store.store import Store
+from tests.fake_clock import FakeClock
+from tests.unit.ftdrive.fleet.fleets import cell, fleet
+
+Ran = tuple[int, str]
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
+    """Run the command in an empty folder on a fake clock; return its exit code and what it prints for people."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setattr("drivers.clock.REAL", FakeClock())
+
+    def call(*arguments: str | Path) -> Ran:
+        code = cli.run(["fleet", "serve", *map(str, arguments)])
+        out, err = capsys.readouterr()
+        assert out == ""
+        return code, " ".join(err.split())
+
+    return call
+
+
+def answer_with(monkeypatch: pytest.MonkeyPatch, *answers: Fleet | BaseException) -> None:
+    """Have the store answer so; Ctrl-C follows."""
+    left = [*answers, KeyboardInterrupt()]
+
+    def fleet_state(_store: Store, _now: datetime) -> Fleet:
+        answer = left.pop(0)
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+    monkeypatch.setattr("ftdrive.fleet.status.fleet_state", fleet_state)
+
+
+def test_it_serves_until_ctrl_c_and_mentions_an_outage_once(
+    run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = BadStore("the store db cannot be read (connection refused)")
+    answer_with(monkeypatch, fleet(cell("A")), gone, gone, fleet())
+    code, said = run("--metrics", "127.0.0.1:0")
+    assert code == 130
+    assert "store.sqlite at http://127.0.0.1:" in said
+    assert said.count("the store db cannot be read") == said.count("The store can be read again.") == 1
+    assert "Unprotected" not in said
+    assert said.endswith("interrupted")
+
+
+def test_the_page_has_the_cells_as_long_as_it_serves(run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch) -> None:
+    pages = list[str]()
+
+    def look(_store: Store, _now: datetime) -> Fleet:
+        if not ports:
+            ports.append(opened[0].port)
+            return fleet(cell("press-4"))
+        with urllib.request.urlopen(f"http://127.0.0.1:{ports[0]}/metrics", timeout=30) as answer:
+            pages.append(answer.read().decode())
+        raise KeyboardInterrupt
+
+    from ftdrive.fleet import metrics
+
+    opened, ports = list[metrics.MetricsServer](), list[int]()
+
+    class Server(metrics.MetricsServer):
+        def __init__(self, host: str, port: int) -> None:
+            super().__init__(host, port)
+            opened.append(self)
+
+    monkeypatch.setattr(metrics, "MetricsServer", Server)
+    monkeypatch.setattr("ftdrive.fleet.status.fleet_state", look)
+    assert run("--metrics", "127.0.0.1:0")[0] == 130
+    assert 'ftdrive_bias_drift_found{cell="press-4",tool="gripper"} 0.0' in pages[0]
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(f"http://127.0.0.1:{ports[0]}/metrics", timeout=30)
+
+
+def test_another_address_is_said_to_be_unprotected(run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch) -> None:
+    answer_with(monkeypatch)
+    assert "Unprotected: any computer that reaches port" in run("--metrics", "0.0.0.0:0")[1]
+
+
+@pytest.mark.parametrize("address", ["10018", ":10018", "localhost:", "localhost:x", "localhost:65536"])
+def test_a_wrong_address_is_refused(address: str, run: Callable[..., Ran]) -> None:
+    code, said = run("--metrics", address)
+    assert (code, f"--metrics is '{address}': give HOST:PORT, such as 127.0.0.1:10018" in said) == (2, True)
+
+
+@pytest.mark.parametrize("by", ["option", "environment"])
+def test_a_wrong_broker_is_refused_without_its_password(
+    by: str, run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = "mqtt://cell:secret@broker:x"
+    monkeypatch.setenv("FTDRIVE_MQTT", url if by == "environment" else "")
+    code, said = run("--metrics", "127.0.0.1:0", *(("--mqtt", url) if by == "option" else ()))
+    assert (code, "--mqtt is no address of a broker" in said, "secret" in said) == (2, True, False)
+
+
+@pytest.mark.parametrize("option", [True, False])
+def test_a_store_that_cannot_be_read_at_the_start_is_one_sentence(
+    option: bool, run: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with sqlite3.connect(tmp_path / "new.sqlite") as connection:
+        connection.execute("CREATE TABLE ftdrive_schema (version INTEGER PRIMARY KEY)")
+        connection.execute("INSERT INTO ftdrive_schema VALUES (99)")
+    connection.close()
+    url = f"sqlite:///{tmp_path / 'new.sqlite'}"
+    if not option:
+        monkeypatch.setenv("FTDRIVE_STORE_URL", url)
+    code, said = run("--metrics", "127.0.0.1:0", *(("--store", url) if option else ()))
+    assert (code, "error: the store" in said, "99" in said) == (6, True, True)
+    assert run("--metrics", "127.0.0.1:0", "--store", "mysql://u:secret@host/db")[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("package", "module", "more"),
+    [
+        ("prometheus_client", "ftdrive.fleet.metrics", ()),
+        ("paho.mqtt.client", "ftdrive.fleet.mqtt", ("--mqtt", "mqtt://b")),
+    ],
+)
+def test_a_missing_package_is_one_sentence(
+    package: str, module: str, more: tuple[str, ...], run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.setitem(sys.modules, package, None)
+    code, said = run("--metrics", "127.0.0.1:0", *more)
+    assert (code, "pip install 'ftdrive[fleet]'" in said) == (2, True)

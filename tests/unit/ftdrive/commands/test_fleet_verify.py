@@ -1,0 +1,243 @@
+"""`fleet verify`: which cells it asks about, and that no session begins without a yes from a terminal."""
+
+import io
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from drivers.errors import ConnectError
+from ftdrive import cli
+from ftdrive.cell.config import CellConfig
+from ftdrive.errors import Declined
+from ftdrive.runs.verified import AcceptanceLimits
+from ftdrive.session.operator import Question
+from ftdrive.store.records import StoredCell
+from ftdrive.store.store import Store
+from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result
+
+Ran = tuple[int, list[str], str]
+NAMES = ("A", "B", "C")
+command: Any = import_module("ftdrive.commands.fleet.verify")  # the group has a command of the same name
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+class Lab:
+    """Three cells whose sessions and operators are scripts."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.folder, self.url = folder, f"sqlite:///{folder / 'fleet.sqlite'}"
+        self.answers: list[str | Exception] = []
+        self.asked: list[str] = []
+        self.outcomes: list[str | BaseException] = []
+        """Of the sessions: empty for one that passes, the reason of one that fails, or what it raises."""
+        self.sessions: list[tuple[CellConfig, Path, Any]] = []
+        self._monkeypatch = monkeypatch
+        monkeypatch.setattr(command, "verify_cell", self._session)
+        monkeypatch.setattr("ftdrive.terminal.operators.PlainOperator", lambda: self)
+        self.store = Store(self.url)
+        self.store.upgrade()
+        now = datetime.now(UTC)
+        for n, name in enumerate(NAMES):
+            day = (now - timedelta(days=20 * n) - FIRST) / timedelta(days=1)
+            new_run(folder / name / "runs", f"run-{name}", result(day, serials=(f"arm-{name}", "ft-1")))
+            self.store.index(folder / name / "runs")
+        self.put(*map(self.cell, NAMES))
+
+    def cell(self, name: str, tool: str = "gripper", host: str = "") -> StoredCell:
+        host = host or f"10.0.0.{ord(name)}"
+        config = self.folder / name / "ftdrive.toml"
+        config.parent.mkdir(exist_ok=True)
+        config.write_text(
+            f'format = "ftdrive.config/1"\n[robot]\nhost = "10.0.0.{ord(name)}"\n[sensor]\nurl = "ati-can://can0"\n'
+            f'[tool]\nname = "{tool}"\n'
+        )
+        return StoredCell(
+            name=name,
+            config=str(config),
+            verify_every_days=7,
+            arm_serial=f"arm-{name}",
+            robot_host=host,
+            sensor_url="ati-can://can0",
+            tool=tool,
+        )
+
+    def put(self, *cells: StoredCell) -> None:
+        self.store.put_cells(cells)
+
+    def ask(self, question: Question) -> str:
+        self.asked.append(question.text.split(",")[0].removeprefix("Cell "))
+        assert "emergency stop in reach?" in question.text
+        assert question.assumed is None
+        answer = self.answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def _session(self, cell: CellConfig, path: Path, wanted: Any, options: Any) -> Any:
+        assert wanted.path == path
+        self.sessions.append((cell, path, options))
+        outcome = self.outcomes.pop(0) if self.outcomes else ""
+        if isinstance(outcome, BaseException):
+            raise outcome
+        return SimpleNamespace(
+            passed=not outcome, limits=AcceptanceLimits(), verification=SimpleNamespace(reason=outcome)
+        )
+
+    @property
+    def verified(self) -> list[str]:
+        """Names of the cells that had a session."""
+        return [path.parents[2].name for _, path, _ in self.sessions]
+
+    def run(self, *arguments: str, answers: Sequence[str | Exception] = (), terminals: str = "ie") -> Ran:
+        self.answers = list(answers)
+        out, err = io.StringIO(), Terminal() if "e" in terminals else io.StringIO()
+        with self._monkeypatch.context() as here:
+            here.setattr(sys, "stdin", Terminal() if "i" in terminals else io.StringIO("yes\n" * 9))
+            here.setattr(sys, "stdout", out)
+            here.setattr(sys, "stderr", err)
+            code = cli.run(["fleet", "verify", "--store", self.url, *arguments])
+        assert self.answers == []
+        return code, out.getvalue().splitlines(), " ".join(err.getvalue().split())
+
+
+@pytest.fixture
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lab:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    return Lab(tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize("terminals", ["", "i", "e"])
+def test_without_a_terminal_nothing_is_asked_and_nothing_moves(terminals: str, lab: Lab) -> None:
+    code, out, err = lab.run(terminals=terminals)
+    assert (code, out, lab.asked, lab.sessions) == (2, [], [], [])
+    assert "never without a terminal" in err
+
+
+def test_no_option_answers_for_the_operator() -> None:
+    assert {one.name for one in command.verify.params} == {"names", "due", "url"}
+
+
+@pytest.mark.parametrize("no", ["", "no", Declined("no answer")])
+def test_only_yes_starts_a_session(no: str | Exception, lab: Lab) -> None:
+    code, out, _ = lab.run(answers=[no, "yes", no])
+    assert code == 0
+    assert lab.asked == ["A", "B", "C"]
+    assert lab.verified == ["B"]
+    assert out == ["A: skipped", "B: passed", "C: skipped"]
+
+
+def test_the_session_is_that_of_verify_with_its_questions(lab: Lab) -> None:
+    lab.run("B", answers=["yes"])
+    ((cell, path, options),) = lab.sessions
+    assert cell.robot.host == "10.0.0.66"
+    assert cell.store.url == lab.url
+    assert path == lab.folder / "B/runs/run-B/calibration.json"
+    assert options.runs == lab.folder / "B/runs"
+    assert (options.name, options.mode, options.yes, options.fast, options.questions) == (
+        "verify",
+        "auto",
+        False,
+        False,
+        True,
+    )
+
+
+def test_the_named_cells_are_asked_about_in_their_order(lab: Lab) -> None:
+    lab.run("C", "A", "C", answers=["", ""])
+    assert lab.asked == ["C", "A"]
+
+
+def test_only_cells_that_are_due(lab: Lab) -> None:
+    lab.run("--due", answers=["", ""])
+    assert lab.asked == ["B", "C"]
+
+
+def test_a_tool_that_was_never_calibrated_is_due_and_not_asked_about(lab: Lab) -> None:
+    lab.put(lab.cell("A", tool="drill"))
+    code, out, err = lab.run("--due", answers=["", ""])
+    assert (code, lab.asked) == (2, ["B", "C"])
+    assert out[0].startswith("A: not verified, no accepted calibration of the tool 'drill' is in the store")
+    assert "calibrate this cell" in err
+
+
+def test_a_failed_verification_ends_with_7_and_the_others_go_on(lab: Lab) -> None:
+    lab.outcomes = ["the force bias has changed by 0.5 N", "", ConnectError("10.0.0.67 does not answer", "check it")]
+    code, out, err = lab.run(answers=["yes"] * 3)
+    assert code == 7
+    assert out[:2] == ["A: FAILED, the force bias has changed by 0.5 N", "B: passed"]
+    assert out[2].startswith("C: not verified, 10.0.0.67 does not answer")
+    assert "error: the verification failed in A:" in err
+
+
+def test_a_cell_that_cannot_be_verified_gives_its_exit_code_at_the_end(lab: Lab) -> None:
+    lab.outcomes = [ConnectError("10.0.0.65 does not answer", "check it"), Declined("not confirmed, nothing moves")]
+    code, out, err = lab.run(answers=["yes"] * 3)
+    assert (code, lab.verified) == (3, ["A", "B", "C"])
+    assert out[1:] == ["B: ended, not confirmed, nothing moves", "C: passed"]
+    assert "error: 10.0.0.65 does not answer" in err
+
+
+def test_ctrl_c_in_a_session_ends_the_round(lab: Lab) -> None:
+    lab.outcomes = ["", KeyboardInterrupt()]
+    code, out, _ = lab.run(answers=["yes", "yes"])
+    assert (code, lab.asked) == (130, ["A", "B"])
+    assert out[0] == "A: passed"
+    assert out[1].startswith("B: interrupted")
+
+
+def test_a_defect_is_not_hidden(lab: Lab) -> None:
+    lab.outcomes = [RuntimeError("a defect")]
+    with pytest.raises(RuntimeError, match="a defect"):
+        lab.run(answers=["yes"])
+
+
+def test_a_robot_that_the_store_does_not_know_is_refused_before_the_question(lab: Lab) -> None:
+    lab.put(lab.cell("A", host="10.0.0.99"))
+    code, out, _ = lab.run("A")
+    assert (code, lab.asked) == (2, [])
+    assert out[0].startswith("A: not verified, its robot is 10.0.0.65, the store has 10.0.0.99")
+
+
+@pytest.mark.parametrize("name", ["FTDRIVE_ROBOT_HOST", "FTDRIVE_TOOL_CYLINDERS_MM"])
+def test_a_variable_that_would_describe_every_cell_is_refused(
+    name: str, lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(name, "10.0.0.66")
+    code, out, err = lab.run()
+    assert (code, out, lab.asked) == (2, [], [])
+    assert f"{name} is set" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("A", "--due"), "CELL and --due exclude one another"),
+        (("D",), "there is no cell 'D': the cells are A, B, C"),
+    ],
+)
+def test_a_wrong_choice_is_refused(arguments: tuple[str, ...], words: str, lab: Lab) -> None:
+    code, out, err = lab.run(*arguments)
+    assert (code, out, words in err) == (2, [], True)
+
+
+def test_a_store_without_cells_says_how_to_add_them(lab: Lab) -> None:
+    lab.store.remove_cells(list(NAMES))
+    code, _, err = lab.run()
+    assert (code, "`ftdrive fleet add cells.toml`" in err) == (2, True)
+
+
+def test_nothing_due_is_success(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "_is_due", lambda *_: False)
+    code, out, err = lab.run("--due")
+    assert (code, out, err) == (0, [], "No cell is due.")

@@ -1,0 +1,93 @@
+"""/metrics as a scrape sees it."""
+
+import shutil
+import subprocess
+import urllib.request
+from collections.abc import Iterator
+from contextlib import closing
+from datetime import timedelta
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from ftdrive.errors import ConfigError
+from ftdrive.fleet.metrics import NAMES, MetricsServer
+from ftdrive.fleet.state import Finding
+from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated, reading
+
+Samples = dict[tuple[str, str], float]
+
+
+@pytest.fixture
+def server() -> Iterator[MetricsServer]:
+    with closing(MetricsServer("127.0.0.1", 0)) as server:
+        yield server
+
+
+def scraped(server: MetricsServer) -> str:
+    with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/metrics", timeout=30) as answer:
+        text: str = answer.read().decode()
+    return text
+
+
+def samples(server: MetricsServer) -> Samples:
+    """Values by metric and cell, without those that describe a cell."""
+    families = text_string_to_metric_families(scraped(server))
+    return {(one.name, one.labels.get("cell", "")): one.value for family in families for one in family.samples}
+
+
+def test_every_field_of_a_cell_is_a_metric_and_what_is_unknown_is_absent(server: MetricsServer) -> None:
+    warm = cell("A", passed=False, drift=DRIFTING, temperature_C=31.5)
+    silent = cell("B", drift=None, verified=None, passed=None)
+    base = Finding("base", ("B",), "…")
+    server.update(reading(warm, silent, never_calibrated("C"), findings=(base, base), store_up=False))
+    assert samples(server) == {
+        ("ftdrive_store_up", ""): 0,
+        ("ftdrive_state_timestamp_seconds", ""): NOW.timestamp(),
+        **{("ftdrive_cell_info", name): 1 for name in "ABC"},
+        **{("ftdrive_calibration_timestamp_seconds", name): (NOW - timedelta(days=30)).timestamp() for name in "AB"},
+        **{
+            ("ftdrive_verification_due_timestamp_seconds", name): (NOW + timedelta(days=6)).timestamp() for name in "AB"
+        },
+        **{("ftdrive_tool_mass_kilograms", name): 1.25 for name in "AB"},
+        ("ftdrive_verification_timestamp_seconds", "A"): (NOW - timedelta(days=1)).timestamp(),
+        ("ftdrive_verification_passed", "A"): 0,
+        ("ftdrive_bias_drift_sigmas", "A"): 6.5,
+        ("ftdrive_bias_drift_found", "A"): 1,
+        ("ftdrive_sensor_temperature_celsius", "A"): 31.5,
+        ("ftdrive_finding", "B"): 1,
+    }
+
+
+def test_a_cell_that_disappears_disappears(server: MetricsServer) -> None:
+    assert samples(server) == {}
+    server.update(reading(cell("A"), cell("B")))
+    assert {name for _, name in samples(server)} == {"", "A", "B"}
+    server.update(reading(cell("B")))
+    assert {name for _, name in samples(server)} == {"", "B"}
+
+
+def test_tools_of_a_cell_are_told_apart_and_any_name_is_escaped(server: MetricsServer) -> None:
+    name = 'Zelle "7"\\ü\n'
+    server.update(reading(cell(name, "gripper"), cell(name, "drill", mass_kg=2.0)))
+    families = {one.name: one for one in text_string_to_metric_families(scraped(server))}
+    masses = {tuple(one.labels.values()): one.value for one in families["ftdrive_tool_mass_kilograms"].samples}
+    assert masses == {(name, "gripper"): 1.25, (name, "drill"): 2.0}
+    assert families.keys() == set(NAMES)
+
+
+def test_names_and_units_are_those_prometheus_asks_for(server: MetricsServer) -> None:
+    promtool = shutil.which("promtool")
+    if promtool is None:
+        pytest.skip("promtool is not installed")
+    server.update(reading(cell("A", temperature_C=30.0)))
+    command = [promtool, "check", "metrics"]
+    checked = subprocess.run(command, input=scraped(server), capture_output=True, text=True, check=False)
+    assert checked.stdout == ""
+    assert checked.stderr.splitlines() == ['ftdrive_tool_mass_kilograms use base unit "grams" instead of "kilograms"']
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "203.0.113.7"])
+def test_an_address_that_cannot_be_used_is_one_sentence(host: str, server: MetricsServer) -> None:
+    with pytest.raises(ConfigError, match=rf"/metrics cannot be served at {host}:{server.port} \(.+\): choose"):
+        MetricsServer(host, server.port)

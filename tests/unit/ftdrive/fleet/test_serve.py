@@ -1,0 +1,83 @@
+"""The loop of the server, on a fake clock: when it reads, and what it does while the store cannot be read."""
+
+from collections.abc import Callable
+from datetime import datetime, timedelta
+from threading import Event
+
+import pytest
+
+from ftdrive.errors import BadStore
+from ftdrive.fleet.serve import EVERY_S, Reading, serve
+from ftdrive.fleet.state import Fleet
+from tests.fake_clock import FakeClock
+from tests.unit.ftdrive.fleet.fleets import NOW, cell, fleet
+
+
+class Served:
+    """A server whose store answers with these, and which Ctrl-C ends after the last."""
+
+    def __init__(self, *answers: Fleet | Exception, on_update: Callable[["Served"], None] = lambda _: None) -> None:
+        self.clock, self.wake = FakeClock(), Event()
+        self.readings: list[tuple[float, Reading]] = []
+        self.said: list[str] = []
+        self._answers = [*answers, KeyboardInterrupt()]
+        self._on_update, self._start_s = on_update, self.clock.now_s()
+
+    @property
+    def t_s(self) -> float:
+        return self.clock.now_s() - self._start_s
+
+    def update(self, reading: Reading) -> None:
+        self.readings.append((self.t_s, reading))
+        self._on_update(self)
+
+    def run(self) -> None:
+        def now() -> datetime:
+            return NOW + timedelta(seconds=self.t_s)
+
+        serve(self._fleet_at, [self], self.clock, self.wake, say=self.said.append, now=now)
+
+    def _fleet_at(self, _now: datetime) -> Fleet:
+        answer = self._answers.pop(0)
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer
+
+
+def test_the_state_is_read_every_minute_until_ctrl_c() -> None:
+    served = Served(fleet(cell("A")), fleet(cell("A"), cell("B")))
+    with pytest.raises(KeyboardInterrupt):
+        served.run()
+    assert [t_s for t_s, _ in served.readings] == [0, EVERY_S]
+    assert [len(one.fleet.cells) for _, one in served.readings] == [1, 2]
+    assert [one.read for _, one in served.readings] == [NOW, NOW + timedelta(seconds=EVERY_S)]
+    assert served.t_s == 2 * EVERY_S
+    assert not served.said
+
+
+def test_an_outage_keeps_the_last_state_with_its_age_and_is_said_once() -> None:
+    served = Served(fleet(cell("A")), *[BadStore("the store db cannot be read (gone)")] * 3, fleet(cell("B")))
+    with pytest.raises(KeyboardInterrupt):
+        served.run()
+    found = [one for _, one in served.readings]
+    assert [one.store_up for one in found] == [True, False, False, False, True]
+    assert [one.fleet.cells[0].cell for one in found] == ["A", "A", "A", "A", "B"]
+    assert [(one.now - one.read) / timedelta(seconds=EVERY_S) for one in found] == [0, 1, 2, 3, 0]
+    assert served.said == [
+        "the store db cannot be read (gone). The last state is served meanwhile. It is 1 min old.",
+        "The store can be read again.",
+    ]
+
+
+def test_a_store_that_cannot_be_read_at_the_start_ends_the_server() -> None:
+    served = Served(BadStore("password authentication failed"))
+    with pytest.raises(BadStore, match="password authentication"):
+        served.run()
+    assert not served.readings
+
+
+def test_a_sink_can_ask_to_be_updated_at_once() -> None:
+    served = Served(fleet(), fleet(), fleet(), on_update=lambda one: one.wake.set() if len(one.readings) == 1 else None)
+    with pytest.raises(KeyboardInterrupt):
+        served.run()
+    assert [t_s for t_s, _ in served.readings] == [0, 0, EVERY_S]
