@@ -112,6 +112,11 @@ class Run:
         return _newest(self.folder / "calibration.json")
 
     @property
+    def dataset_path(self) -> Path:
+        """Where the newest dataset is kept."""
+        return _newest(self.folder / "dataset.json")
+
+    @property
     def plan_path(self) -> Path:
         """Where the plan is kept."""
         return self.folder / "plan.json"
