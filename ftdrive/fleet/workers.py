@@ -24,12 +24,14 @@ _ONE_THREAD: Final = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPEN
 """More threads than cores are slow, and their number can change the last digits."""
 _NO_ENGINE: Final = "solving many runs needs {}: pip install 'ftdrive[fleet]'"
 
+_DIED: Final = "each worker that was given it died: `ftdrive solve` may show the cause"
+
 Answer = bytes | BaseException
 """What a call returned or raised."""
 
 
 class WorkerDied(Exception):
-    """A worker ended each time it was given this call."""
+    """Each worker that was given this call ended without an answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +143,7 @@ def answers(
     for at_once in (2 * workers.count, 2 * workers.count, 1):
         left = yield from _round(function, arguments, left, workers, at_once)
     for item in left:
-        yield item, WorkerDied("its worker died three times: solve this run alone to see the cause")
+        yield item, WorkerDied(_DIED)
 
 
 def _round(
