@@ -22,7 +22,7 @@ NOISE = np.repeat([0.005, 0.0002], 3)
 
 
 @lru_cache(maxsize=256)
-def dataset(seed: int, poses: int = 12) -> CalibrationDataset:
+def dataset(seed: int, poses: int = 8) -> CalibrationDataset:
     """A tour with random orientations and a bias that drifts a little."""
     rng = np.random.default_rng(seed)
     truth = Parameters(
@@ -40,7 +40,7 @@ def dataset(seed: int, poses: int = 12) -> CalibrationDataset:
 
 
 def calibrated_run(
-    runs: Path, name: str, seed: int = 1, *, poses: int = 12, day: float = 0.0, header: Mapping[str, Any] = {}
+    runs: Path, name: str, seed: int = 1, *, poses: int = 8, day: float = 0.0, header: Mapping[str, Any] = {}
 ) -> Path:
     """Make the folder of a calibration; without its result if it is rejected or not observable, as `calibrate` does."""
     folder = runs / name

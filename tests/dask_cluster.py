@@ -1,14 +1,17 @@
-"""A Dask scheduler and its workers as processes on this computer."""
+"""A Dask scheduler and its workers as processes on this computer, and how to kill a worker."""
 
 import json
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+import psutil
 
 Process = subprocess.Popen[bytes]
 
@@ -19,14 +22,13 @@ class Cluster:
 
     address: str
     """dask://HOST:PORT"""
-    scheduler: Process
-    nannies: Sequence[Process]
-    """Each has one worker of one thread below it, and starts another if that is killed."""
+    start_worker: Callable[[], Process]
+    """Gives a process that has one worker of one thread below it, and starts another if that is killed."""
 
 
 @contextmanager
-def dask_cluster(workers: int = 2) -> Iterator[Cluster]:
-    """Start a scheduler and workers."""
+def dask_cluster() -> Iterator[Cluster]:
+    """Start a scheduler."""
     with TemporaryDirectory(prefix="ftdrive-dask-") as folder, ExitStack() as stack:
         log = stack.enter_context((Path(folder) / "log").open("wb"))
 
@@ -45,4 +47,11 @@ def dask_cluster(workers: int = 2) -> Iterator[Cluster]:
             time.sleep(0.05)
         address = str(json.loads(file.read_text())["address"]).replace("tcp://", "dask://")
         limits = ("--nthreads", "1", "--memory-limit", "0", "--host", "127.0.0.1", "--local-directory", folder)
-        yield Cluster(address, scheduler, [start("worker", *limits) for _ in range(workers)])
+        yield Cluster(address, partial(start, "worker", *limits))
+
+
+def kill_busiest_worker() -> None:
+    """Kill the process below this one that has computed most, be it of a pool or of a cluster."""
+    below = psutil.Process().children(recursive=True)
+    workers = [one for one in below if "dask" not in one.cmdline()]  # neither the scheduler nor what starts workers
+    max(workers, key=lambda one: one.cpu_times().user).kill()

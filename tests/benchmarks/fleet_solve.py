@@ -28,7 +28,7 @@ import psutil
 from ftdrive.fleet.resolve import solve_again, solved, solved_path, task_of
 from ftdrive.fleet.workers import Workers, cluster_workers, local_workers
 from tests.calibrated_runs import calibrated_run
-from tests.dask_cluster import dask_cluster
+from tests.dask_cluster import dask_cluster, kill_busiest_worker
 
 DISTINCT, POSES = 20, 24
 SPEED_UP, GROWTH_MB = 0.8, 20.0
@@ -66,8 +66,10 @@ def main() -> int:
             f"{options.workers} processes": lambda: local_workers(options.workers)
         }
         if options.dask:
-            address = stack.enter_context(dask_cluster(options.workers)).address
-            engines[f"Dask, {options.workers} workers"] = lambda: cluster_workers(address)
+            cluster = stack.enter_context(dask_cluster())
+            for _ in range(options.workers):
+                cluster.start_worker()
+            engines[f"Dask, {options.workers} workers"] = lambda: cluster_workers(cluster.address)
         for words, engine in engines.items():
             free = options.workers - psutil.cpu_percent(interval=3) / 100 * (os.cpu_count() or 1)
             for killed in (False, True):
@@ -112,7 +114,7 @@ def measure(
                 if isinstance(found, str):
                     say(found)
                 if kill and number == len(runs) // 2:
-                    busiest().kill()
+                    kill_busiest_worker()
         wall_s = perf_counter() - start_s
     wrong = 0
     for i, run in enumerate(runs):
@@ -121,13 +123,6 @@ def measure(
         wrong += not (path.exists() and path.read_text() == right)
         path.unlink(missing_ok=True)
     return Pass(wall_s, memory_MB, wrong)
-
-
-def busiest() -> psutil.Process:
-    """Return the worker that has computed most; the processes of a cluster are below this one too."""
-    below = psutil.Process().children(recursive=True)
-    workers = [one for one in below if {"-m", "dask"} - set(one.cmdline())]  # not the scheduler and the nannies
-    return max(workers, key=lambda one: one.cpu_times().user)
 
 
 @contextmanager

@@ -4,26 +4,18 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
 import pytest
 
 from drivers.errors import Unreachable
 from ftdrive.fleet.resolve import solve_again, solved, solved_path, task_of
 from ftdrive.fleet.workers import WorkerDied, Workers, answers, cluster_workers, local_workers
 from tests.calibrated_runs import calibrated_run
-from tests.dask_cluster import Cluster, dask_cluster
+from tests.dask_cluster import dask_cluster, kill_busiest_worker
 from tests.system.command_line import CommandLine, end_of, wait_until
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[Cluster]:
-    with dask_cluster(2) as cluster:
-        yield cluster
 
 
 @pytest.fixture
@@ -32,13 +24,12 @@ def runs(tmp_path: Path) -> list[Path]:
     return [calibrated_run(tmp_path / "runs", f"run-{number}", seed=number % 4) for number in range(8)]
 
 
-def solved_by(workers: Workers, runs: list[Path], *, kill_below: int | None = None) -> list[bytes]:
-    """Solve runs and take the results away; kill the worker of a process after the second result."""
+def solved_by(workers: Workers, runs: list[Path], *, kill: bool = False) -> list[bytes]:
+    """Solve runs and take the results away; kill a worker after the second result if wanted."""
     for number, (_, found) in enumerate(solve_again(runs, workers), 1):
         assert not isinstance(found, str), found
-        if kill_below is not None and number == 2:
-            below = psutil.Process(kill_below).children(recursive=True)
-            max(below, key=lambda one: one.cpu_times().user).kill()
+        if kill and number == 2:
+            kill_busiest_worker()
     results = [solved_path(run).read_bytes() for run in runs]
     for run in runs:
         solved_path(run).unlink()
@@ -46,28 +37,35 @@ def solved_by(workers: Workers, runs: list[Path], *, kill_below: int | None = No
 
 
 def test_processes_give_the_same_bytes_also_if_one_is_killed(runs: list[Path]) -> None:
-    expected = [solved(*task_of(run)) for run in runs]
-    with local_workers(1) as one:
-        assert solved_by(one, runs[:4]) == expected[:4]
-    with local_workers(2) as two:
-        assert solved_by(two, runs, kill_below=os.getpid()) == expected
+    with local_workers(2) as workers:
+        assert solved_by(workers, runs, kill=True) == [solved(*task_of(run)) for run in runs]
 
 
-def test_a_cluster_gives_the_same_bytes_also_if_a_worker_is_killed(runs: list[Path], cluster: Cluster) -> None:
-    expected = [solved(*task_of(run)) for run in runs]
-    with cluster_workers(cluster.address) as workers:
-        assert workers.count == 2
-        assert solved_by(workers, runs, kill_below=cluster.nannies[0].pid) == expected
+def test_a_cluster_gives_the_same_bytes_also_if_a_worker_is_killed(runs: list[Path]) -> None:
+    with pytest.raises(Unreachable, match=r"dask://127\.0\.0\.1:1 .*start it"):
+        solved_on("dask://127.0.0.1:1", runs)
+    with dask_cluster() as cluster:
+        with pytest.raises(Unreachable, match="no worker; start one: dask worker tcp://"):
+            solved_on(cluster.address, runs)
+        cluster.start_worker()
+        cluster.start_worker()
+        found = solved_on(cluster.address, runs, timeout_s=60, kill=True)
+    assert found == [solved(*task_of(run)) for run in runs]
+
+
+def solved_on(address: str, runs: list[Path], *, timeout_s: float = 0.1, kill: bool = False) -> list[bytes]:
+    with cluster_workers(address, timeout_s=timeout_s) as workers:
+        return solved_by(workers, runs, kill=kill)
 
 
 def test_a_call_that_kills_its_worker_is_given_up_and_the_others_are_answered() -> None:
     def script(item: Path) -> tuple[str]:
-        return ("__import__('os').kill(__import__('os').getpid(), 9)" if item.name in "37" else repr(item.name),)
+        return ("__import__('os').kill(__import__('os').getpid(), 9)" if item.name == "3" else repr(item.name),)
 
     with local_workers(2) as workers:
         found = {item.name: answer for item, answer in answers(eval, script, map(Path, "0123456789"), workers)}
-    assert {name for name, answer in found.items() if isinstance(answer, WorkerDied)} == {"3", "7"}
-    assert all(answer == name for name, answer in found.items() if name not in "37")
+    assert isinstance(found.pop("3"), WorkerDied)
+    assert found == {name: name for name in "012456789"}
 
 
 def test_ctrl_c_keeps_what_is_solved_and_the_command_continues(runs: list[Path], ftdrive: CommandLine) -> None:
@@ -84,17 +82,4 @@ def test_ctrl_c_keeps_what_is_solved_and_the_command_continues(runs: list[Path],
     assert 2 <= before < 8
     found = ftdrive.json("fleet", "solve", kept, "--workers", "1")
     assert (found["runs"], found["solved_before"], found["unchanged"]) == (8, before, 8)
-
-
-def test_a_cluster_that_does_not_answer_or_has_no_worker_is_an_error_with_its_address() -> None:
-    with (
-        pytest.raises(Unreachable, match=r"dask://127\.0\.0\.1:1 .*start it"),
-        cluster_workers("dask://127.0.0.1:1", timeout_s=0.1),
-    ):
-        pass
-    with (
-        dask_cluster(0) as empty,
-        pytest.raises(Unreachable, match=r"no worker; start one: dask worker tcp://"),
-        cluster_workers(empty.address, timeout_s=1),
-    ):
-        pass
+    assert [solved_path(run).read_bytes() for run in runs] == [solved(*task_of(run)) for run in runs]
