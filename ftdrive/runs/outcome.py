@@ -39,25 +39,29 @@ def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
 
 def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
     """Return a run's records as a dataset, the circumstances as `solve` takes them, and the provenance."""
+    circumstances, origin = circumstances_of(run)
+    dataset = dataset_from(records, {"run": run.folder.name, "devices": origin["devices"]})
+    return dataset, circumstances, {**made_now(), **origin}
+
+
+def circumstances_of(run: Run) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what `solve` takes beside the dataset of a run, and where the dataset comes from, without its poses."""
     header = run.header()
-    config, devices = header["config"], header.get("devices", {})
-    dataset = dataset_from(records, {"run": run.folder.name, "devices": devices})
-    provenance: dict[str, Any] = {
-        **made_now(),
-        "devices": devices,
+    config = header["config"]
+    setup = _setup(run, config)
+    origin: dict[str, Any] = {
+        "devices": header.get("devices", {}),
         "run": run.folder.name,
         "station": header.get("station"),
-        "setup": _setup(run, config),
+        "setup": setup,
         "temperature_C": run.temperature_C(),
     }
-    mounting = config.get("workcell", {}).get("mounting", "floor")
-    setup = provenance["setup"]
     circumstances = {
         "g_m_s2": float(config["site"]["g_m_s2"]),
-        "up_in_base": -down_of(mounting),
+        "up_in_base": -down_of(config.get("workcell", {}).get("mounting", "floor")),
         "payload_kg": None if setup["payload_kg"] is None else setup["payload_kg"] - (setup["sensor_mass_kg"] or 0.0),
     }
-    return dataset, circumstances, provenance
+    return circumstances, origin
 
 
 def _setup(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:

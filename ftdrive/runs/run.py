@@ -7,6 +7,7 @@ poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm
 dataset.json      ftdrive.dataset/1: means and covariances; dataset-2.json after poses were added or taken again
 calibration.json  ftdrive.calibration/1: the result; calibration-2.json likewise. Of a verification: the accepted update
 verification.json ftdrive.verification/1: the outcome of a verification; see `ftdrive.runs.verified`
+solved-0.1.0.json ftdrive.calibration/1: the result of a later version; see `ftdrive.fleet.resolve`
 """
 
 import io
@@ -110,6 +111,11 @@ class Run:
     def calibration_path(self) -> Path:
         """Where the newest result is kept."""
         return _newest(self.folder / "calibration.json")
+
+    @property
+    def dataset_path(self) -> Path:
+        """Where the newest dataset is kept."""
+        return _newest(self.folder / "dataset.json")
 
     @property
     def plan_path(self) -> Path:

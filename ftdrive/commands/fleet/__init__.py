@@ -6,6 +6,7 @@ from ftdrive.commands.fleet.add import add
 from ftdrive.commands.fleet.index import index
 from ftdrive.commands.fleet.remove import remove
 from ftdrive.commands.fleet.serve import serve
+from ftdrive.commands.fleet.solve import solve
 from ftdrive.commands.fleet.status import status
 from ftdrive.commands.fleet.verify import verify
 
@@ -19,5 +20,6 @@ fleet.add_command(add)
 fleet.add_command(remove)
 fleet.add_command(index)
 fleet.add_command(status)
+fleet.add_command(solve)
 fleet.add_command(verify)
 fleet.add_command(serve)

@@ -1,0 +1,171 @@
+"""`ftdrive fleet solve`: solve many runs again with this version, here or on a Dask cluster."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime, timedelta
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from ftdrive import __version__
+from ftdrive.commands.common import FOLDER, JSON, store_url, write_json
+
+if TYPE_CHECKING:
+    from ftdrive.fleet.resolve import Comparison
+
+T = TypeVar("T")
+
+
+class Since(click.ParamType):
+    """A time in the past: an age such as 90d or 12h, or a date."""
+
+    name = "time"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> datetime:
+        """Return the time, UTC."""
+        if isinstance(value, datetime):
+            return value
+        try:
+            if found := re.fullmatch(r"(\d+)([dh])", value):
+                number, unit = int(found[1]), found[2]
+                return datetime.now(UTC) - (timedelta(days=number) if unit == "d" else timedelta(hours=number))
+            time = datetime.fromisoformat(value)
+        except (ValueError, OverflowError):
+            self.fail(f"'{value}' is neither an age such as 90d or 12h nor a date such as 2026-08-31.", param, ctx)
+        return time if time.tzinfo else time.replace(tzinfo=UTC)
+
+
+@click.command()
+@click.argument("folders", metavar="[RUNS]...", nargs=-1, type=FOLDER)
+@click.option("--since", metavar="TIME", type=Since(), help="Only runs since then: 90d, 12h or a date (UTC).")
+@click.option("--workers", metavar="N", type=click.IntRange(min=1), help="Processes.  [default: one per core]")
+@click.option("--cluster", metavar="dask://HOST:PORT", help="Solve on this Dask cluster instead.")
+@click.option("--store", metavar="URL", help="Store that knows the runs, instead of [store] url.")
+@JSON
+def solve(
+    folders: Sequence[Path],
+    since: datetime | None,
+    workers: int | None,
+    cluster: str | None,
+    store: str | None,
+    as_json: bool,
+) -> None:
+    """Solve runs again with this version, and compare the results with the calibrations of the runs.
+
+    RUNS are run folders or folders of runs, by default all runs that the store knows. Verifications are left out. Each
+    result is written into its run folder as solved-VERSION.json, and no other command uses it. A run that has this file
+    is only compared, so an interrupted command continues when it is repeated.
+
+    The exit code is 7 if a run could not be solved.
+    """
+    from ftdrive.errors import ConfigError, NotAccepted
+    from ftdrive.fleet.resolve import solve_again, solved_path
+    from ftdrive.fleet.workers import cluster_workers, local_workers
+
+    for first, second, both in (
+        ("--workers", "--cluster", workers and cluster),
+        ("RUNS", "--store", folders and store),
+    ):
+        if both:
+            raise ConfigError(f"{first} and {second} exclude one another: leave one out")
+    runs = _runs(folders, store, since)
+    report = _Report(runs=len(runs), solved_before=sum(solved_path(run).exists() for run in runs))
+    with local_workers(workers) if cluster is None else cluster_workers(cluster) as pool:
+        for run, found in _with_progress(solve_again(runs, pool), len(runs)):
+            report.add(run, found)
+    if as_json:
+        write_json(report.to_dict())
+    else:
+        report.print()
+    if report.failed:
+        raise NotAccepted(f"{len(report.failed)} of {len(runs)} runs could not be solved: fix the reasons, and repeat")
+
+
+def _runs(folders: Sequence[Path], store: str | None, since: datetime | None) -> list[Path]:
+    """Return the calibrations to solve."""
+    from ftdrive.fleet.resolve import is_calibration, run_folders
+    from ftdrive.runs.run import Run
+    from ftdrive.store.store import Store
+    from ftdrive.terminal.console import talk
+
+    if folders:
+        found = run_folders(folders)
+    else:
+        found = sorted({Path(one.path).parent for one in Store(store or store_url()).results()})
+    runs, unfinished = list[Path](), 0
+    for run in found:
+        if is_calibration(run, since):
+            if run.is_dir() and not Run(run).dataset_path.exists():
+                unfinished += 1
+            else:
+                runs.append(run)
+    if unfinished:
+        words = "`ftdrive calibrate --resume RUN` finishes one"
+        talk.print(f"Left out, because they have no dataset: {unfinished} runs; {words}.")
+    if not found:
+        talk.print("No runs: name their folders, or add them to the store with `ftdrive fleet index RUNS`.")
+    return runs
+
+
+def _with_progress(found: Iterator[T], total: int) -> Iterator[T]:
+    """Show a progress bar on stderr."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from ftdrive.terminal.console import talk
+
+    columns = (TextColumn("Solving"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=talk, transient=True, disable=not talk.is_terminal) as progress:
+        yield from progress.track(found, total=total)
+
+
+@dataclass(slots=True)
+class _Report:
+    """What became of the runs."""
+
+    runs: int
+    solved_before: int
+    unchanged: int = 0
+    changed: list[dict[str, Any]] = field(default_factory=list)
+    other_verdict: list[dict[str, Any]] = field(default_factory=list)
+    failed: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, run: Path, found: "Comparison | str") -> None:
+        """Add a run."""
+        here = {"run": str(run)}
+        if isinstance(found, str):
+            self.failed.append({**here, "reason": found})
+            return
+        if found.has_changed:
+            sigmas = found.sigmas if isfinite(found.sigmas) else None
+            self.changed.append({**here, "parameter": found.parameter, "sigmas": sigmas})
+        if found.has_other_verdict:
+            verdicts = {"before": found.verdict_before, "now": found.verdict, "reason": found.reason}
+            self.other_verdict.append({**here, **verdicts})
+        self.unchanged += not (found.has_changed or found.has_other_verdict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as JSON."""
+        return {"schema_version": 1, "version": __version__, **asdict(self)}
+
+    def print(self) -> None:
+        """Print the numbers, then one line for each run that changed or failed."""
+        now = self.runs - self.solved_before - len(self.failed)
+        click.echo(
+            f"{self.runs} runs with ftdrive {__version__}: {now} solved now, {self.solved_before} before, "
+            f"{len(self.failed)} failed."
+        )
+        click.echo(
+            f"{self.unchanged} unchanged, {len(self.changed)} changed by more than 3 sigmas, "
+            f"{len(self.other_verdict)} with another verdict."
+        )
+        for one in self.changed:
+            how = "was known and differs" if one["sigmas"] is None else f"changed by {one['sigmas']:+.1f} sigmas"
+            click.echo(f"changed: {one['run']}: {one['parameter']} {how}")
+        for one in self.other_verdict:
+            why = f" ({one['reason']})" if one["reason"] else ""
+            click.echo(f"verdict: {one['run']}: {one['before'] or 'no result'} before, now {one['now']}{why}")
+        for one in self.failed:
+            click.echo(f"failed: {one['run']}: {one['reason']}")

@@ -1,0 +1,172 @@
+"""Processes of this computer, or the workers of a Dask cluster: both take calls and give futures."""
+
+import re
+import signal
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+from calib.errors import CalibError
+from drivers.errors import StreamBroken, Unreachable
+from ftdrive.errors import ConfigError
+
+CONNECT_S: Final = 10.0
+"""For a scheduler to answer, and for its first worker."""
+SAME: Final = ("ftdrive", "numpy", "scipy")
+"""Packages whose versions a cluster must share, because the last digits depend on them."""
+
+_ONE_THREAD: Final = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
+"""More threads than cores are slow, and their number can change the last digits."""
+_NO_ENGINE: Final = "solving many runs needs {}: pip install 'ftdrive[fleet]'"
+
+_DIED: Final = "each worker that was given it died: `ftdrive solve` may show the cause"
+
+Answer = bytes | BaseException
+"""What a call returned or raised."""
+
+
+class WorkerDied(Exception):
+    """Each worker that was given this call ended without an answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Workers:
+    """Where calls run at once."""
+
+    count: int
+    submit: Callable[..., "Future[bytes]"]
+    """Takes a function and its arguments."""
+    death: type[Exception]
+    """Of a future whose worker ended without an answer."""
+
+
+@contextmanager
+def local_workers(count: int | None = None) -> Iterator[Workers]:
+    """Start processes, by default one for each core that this program may use; they end with the context, at once."""
+    try:
+        from joblib.externals.loky import cpu_count, get_reusable_executor
+    except ModuleNotFoundError as error:
+        raise ConfigError(_NO_ENGINE.format(error.name)) from None
+    count = count or cpu_count()
+    executor = partial(  # gives a working one also after a worker was killed
+        get_reusable_executor,
+        max_workers=count,
+        timeout=None,
+        initializer=signal.signal,  # Ctrl-C reaches every process of a terminal, but only the parent must act on it
+        initargs=(signal.SIGINT, signal.SIG_IGN),
+        env=_ONE_THREAD,
+    )
+    try:
+        yield Workers(count, lambda *call: executor().submit(*call), BrokenExecutor)
+    finally:
+        executor().shutdown(kill_workers=True)
+
+
+@contextmanager
+def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[Workers]:
+    """Connect to a Dask cluster.
+
+    Parameters
+    ----------
+    address : str
+        Of its scheduler: dask://HOST:PORT.
+
+    Raises
+    ------
+    ConfigError
+        The address has another form, or a worker has another version of ftdrive, numpy or scipy.
+    Unreachable
+        No scheduler answers there, or it has no worker.
+    StreamBroken
+        The scheduler was lost while calls were running.
+    """
+    found = re.fullmatch(r"dask://([^/:@]+|\[[0-9a-fA-F:]+\]):(\d{1,5})/?", address)
+    if found is None:
+        raise ConfigError(f"--cluster is '{address}': give the address of a Dask scheduler, such as dask://host:8786")
+    try:
+        from distributed import Client, KilledWorker
+    except ModuleNotFoundError as error:
+        raise ConfigError(_NO_ENGINE.format(error.name)) from None
+    try:
+        client = Client(f"tcp://{found[1]}:{found[2]}", timeout=timeout_s, set_as_default=False)
+    except OSError as error:
+        raise Unreachable(
+            f"no Dask scheduler answers at {address} ({error})", "start it, or correct --cluster"
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=timeout_s)
+        except TimeoutError as error:
+            raise Unreachable(
+                f"the cluster {address} has no worker",
+                f"start one: dask worker tcp://{found[1]}:{found[2]} --nthreads 1",
+            ) from error
+        _require_same_versions(client.get_versions(packages=list(SAME)), address)
+        try:
+            submit = client.get_executor(pure=False).submit
+            yield Workers(sum(client.ncores().values()), submit, KilledWorker)
+        except CancelledError as error:
+            raise StreamBroken(f"the cluster {address} was lost", "start it, and repeat the command") from error
+
+
+def _require_same_versions(found: Any, address: str) -> None:
+    """Raise `ConfigError` for a worker of another version; `found` is as `distributed.Client.get_versions` has it."""
+    ours = found["client"]["packages"]
+    for worker, theirs in found["workers"].items():
+        for name in SAME:
+            if (other := theirs["packages"].get(name)) != ours[name]:
+                raise ConfigError(
+                    f"the worker {worker} of the cluster {address} has {name} {other or '(none)'}, this computer has "
+                    f"{ours[name]}: install {name} {ours[name]} there"
+                )
+
+
+def answers(
+    function: Callable[..., bytes], arguments: Callable[[Path], Iterable[Any]], items: Iterable[Path], workers: Workers
+) -> Iterator[tuple[Path, Answer]]:
+    """Call a function for each item, and yield item and answer as they come.
+
+    A call whose worker died is repeated: first among the others, because most workers are killed from outside, then
+    alone, so that the third death has one cause.
+
+    Parameters
+    ----------
+    arguments : callable
+        Makes the arguments of an item when it is its turn, so that few are in memory.
+    """
+    left: Iterable[Path] = items
+    for at_once in (2 * workers.count, 2 * workers.count, 1):
+        left = yield from _round(function, arguments, left, workers, at_once)
+    for item in left:
+        yield item, WorkerDied(_DIED)
+
+
+def _round(
+    function: Callable[..., bytes],
+    arguments: Callable[[Path], Iterable[Any]],
+    items: Iterable[Path],
+    workers: Workers,
+    at_once: int,
+) -> Generator[tuple[Path, Answer], None, list[Path]]:
+    """Call each item once, some at a time; return those whose worker died."""
+    waiting, running, died = iter(items), dict["Future[bytes]", Path](), list[Path]()
+    while (new := list(islice(waiting, at_once - len(running)))) or running:
+        for item in new:
+            try:
+                running[workers.submit(function, *arguments(item))] = item
+            except workers.death:
+                died.append(item)
+            except (CalibError, OSError) as error:
+                yield item, error
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            item, error = running.pop(future), future.exception()
+            if isinstance(error, workers.death):
+                died.append(item)
+            else:
+                yield item, future.result() if error is None else error
+    return died

@@ -1,0 +1,103 @@
+"""`fleet solve` as a command; the solver runs in this process."""
+
+import json
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from ftdrive import __version__, cli
+from ftdrive.fleet import workers
+from ftdrive.fleet.workers import Workers
+from ftdrive.store.store import Store
+from tests.calibrated_runs import calibrated_run
+
+Ran = tuple[int, str, str]
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
+    """Run a command in an empty folder; return its exit code, stdout and stderr."""
+
+    @contextmanager
+    def here(_: int | None) -> Iterator[Workers]:
+        with ThreadPoolExecutor(1) as thread:
+            yield Workers(1, thread.submit, BrokenExecutor)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setattr(workers, "local_workers", here)
+
+    def call(*arguments: str | Path) -> Ran:
+        code = cli.run(["fleet", "solve", *map(str, arguments)])
+        out, err = capsys.readouterr()
+        return code, out, " ".join(err.split())
+
+    return call
+
+
+def test_the_runs_of_the_store_are_solved_and_the_report_names_what_differs(
+    run: Callable[..., Ran], tmp_path: Path
+) -> None:
+    runs = tmp_path / "runs"
+    old = calibrated_run(runs, "old", day=-400)
+    worse = calibrated_run(runs, "worse")
+    file = worse / "calibration.json"
+    document = json.loads(file.read_text())
+    document["force_bias_N"][2] += 1.0
+    file.write_text(json.dumps(document | {"verdict": "usable"}))
+    damaged = calibrated_run(runs, "damaged")
+    Store().index(runs)
+    (damaged / "dataset.json").write_text("{}")
+
+    code, out, err = run("--since", "2026-07-31")
+    lines = out.splitlines()
+    assert code == 7
+    assert "1 of 2 runs could not be solved" in err
+    assert lines[:2] == [
+        f"2 runs with ftdrive {__version__}: 1 solved now, 0 before, 1 failed.",
+        "0 unchanged, 1 changed by more than 3 sigmas, 1 with another verdict.",
+    ]
+    assert lines[2].startswith(f"changed: {worse}: force_bias_N.z changed by -")
+    assert lines[3] == f"verdict: {worse}: usable before, now good"
+    assert lines[4].startswith(f"failed: {damaged}: the field 'format' is missing")
+    assert not list(old.glob("solved-*"))
+
+    code, out, _ = run("--json", worse, old)
+    found = json.loads(out)
+    assert code == 0
+    assert (found["schema_version"], found["version"]) == (1, __version__)
+    assert (found["runs"], found["solved_before"], found["unchanged"], found["failed"]) == (2, 1, 1, [])
+    (changed,) = found["changed"]
+    assert (changed["run"], changed["parameter"]) == (str(worse), "force_bias_N.z")
+    assert changed["sigmas"] < -3
+    assert found["other_verdict"] == [{"run": str(worse), "before": "usable", "now": "good", "reason": ""}]
+
+
+def test_runs_without_a_dataset_and_an_empty_store_are_mentioned(run: Callable[..., Ran], tmp_path: Path) -> None:
+    (calibrated_run(tmp_path / "runs", "interrupted") / "dataset.json").unlink()
+    code, out, err = run("runs")
+    assert code == 0
+    assert out.startswith("0 runs")
+    assert "they have no dataset: 1 runs" in err
+    assert "No runs: " in run()[2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["--workers", "2", "--cluster", "dask://host:1"], 2, "--workers and --cluster exclude one another"),
+        ([".", "--store", "sqlite:////x"], 2, "RUNS and --store exclude one another"),
+        (["--since", "soon"], 2, "'soon' is neither an age such as 90d or 12h nor a date such as 2026-08-31"),
+        (["--since", "999999999d"], 2, "is neither an age"),
+        (["--cluster", "host"], 2, "--cluster is 'host': give the address of a Dask scheduler"),
+        (["--store", "nowhere"], 2, "is no address of a database"),
+        (["--workers", "0"], 2, "0 is not in the range"),
+    ],
+)
+def test_a_mistake_is_one_sentence(run: Callable[..., Ran], arguments: list[str], code: int, words: str) -> None:
+    ended, out, err = run(*arguments)
+    assert (ended, out) == (code, "")
+    assert words in err

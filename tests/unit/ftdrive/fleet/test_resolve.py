@@ -1,0 +1,137 @@
+"""Runs solved again, in this process."""
+
+import json
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Future
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib import CalibrationResult
+from ftdrive.errors import ConfigError
+from ftdrive.fleet.resolve import (
+    Comparison,
+    is_calibration,
+    run_folders,
+    solve_again,
+    solved,
+    solved_path,
+    task_of,
+)
+from ftdrive.fleet.workers import Workers
+from tests.calibrated_runs import FIRST, calibrated_run, dataset
+
+
+def at_once(function: Callable[..., bytes], *arguments: Any) -> "Future[bytes]":
+    future = Future[bytes]()
+    try:
+        future.set_result(function(*arguments))
+    except Exception as error:
+        future.set_exception(error)
+    return future
+
+
+def again(*folders: Path, submit: Any = at_once) -> dict[Path, Comparison | str]:
+    return dict(solve_again(folders, Workers(1, submit, BrokenExecutor)))
+
+
+def rewrite(path: Path, **changes: Any) -> None:
+    """Change the calibration of a run."""
+    result = replace(CalibrationResult.load(path), **changes)
+    path.unlink()
+    result.save(path)
+
+
+def test_the_result_is_that_of_the_run_and_replaces_nothing(tmp_path: Path) -> None:
+    folder = calibrated_run(tmp_path, "run")
+    before = (folder / "calibration.json").read_bytes()
+    assert again(folder) == {folder: Comparison("good", "good", "", "R_flange_sensor.x", 0.0)}
+    own, new = CalibrationResult.load(folder / "calibration.json"), CalibrationResult.load(solved_path(folder))
+    assert new.id == own.id
+    assert new.provenance == {**own.provenance, "created_utc": FIRST.isoformat(), "run": "run"}
+    assert new.provenance["setup"]["tool"] == "gripper"
+    assert (folder / "calibration.json").read_bytes() == before
+    assert solved_path(folder).read_bytes() == solved(*task_of(folder))
+
+
+def test_a_run_that_has_the_result_is_not_solved_again(tmp_path: Path) -> None:
+    folder = calibrated_run(tmp_path, "run")
+    again(folder)
+    first = solved_path(folder).stat()
+
+    def never(*_: Any) -> "Future[bytes]":
+        raise AssertionError("solved twice")
+
+    assert again(folder, submit=never) == {folder: Comparison("good", "good", "", "R_flange_sensor.x", 0.0)}
+    assert solved_path(folder).stat() == first
+
+
+def test_changes_are_named_with_their_sigmas(tmp_path: Path) -> None:
+    folder = calibrated_run(tmp_path, "run")
+    path = folder / "calibration.json"
+    own = CalibrationResult.load(path)
+    sigma = np.sqrt(own.covariance[7, 7])
+    rewrite(path, parameters=own.parameters.moved(-8 * sigma * np.eye(15)[7]), verdict="usable", reasons=("worn",))
+    found = again(folder)[folder]
+    assert isinstance(found, Comparison)
+    assert (found.parameter, found.verdict_before, found.verdict) == ("force_bias_N.y", "usable", "good")
+    assert found.sigmas == pytest.approx(8 / np.sqrt(2))  # the sigmas of both
+    assert found.has_changed
+    assert found.has_other_verdict
+
+
+def test_a_run_without_a_result_of_its_newest_poses_has_another_verdict(tmp_path: Path) -> None:
+    folder = calibrated_run(tmp_path, "run")
+    dataset(2).save(folder / "dataset-2.json")  # more poses were taken, and the solve of all was rejected
+    found = again(folder)[folder]
+    assert isinstance(found, Comparison)
+    assert (found.verdict_before, found.has_changed, found.has_other_verdict) == (None, False, True)
+    assert CalibrationResult.load(solved_path(folder)).provenance["dataset_sha256"] == dataset(2).sha256()
+
+
+def test_a_failure_has_its_reason_and_concerns_one_run(tmp_path: Path) -> None:
+    few = calibrated_run(tmp_path, "few", poses=3)
+    damaged = calibrated_run(tmp_path, "damaged")
+    (damaged / "dataset.json").write_text('{"format": "ftdrive.data')
+    lost = calibrated_run(tmp_path, "lost")
+    (lost / "run.json").unlink()
+    fine = calibrated_run(tmp_path, "fine")
+    found = again(few, damaged, lost, fine)
+    assert "3 poses are too few" in str(found[few])
+    assert "not valid JSON" in str(found[damaged])
+    assert "no run.json" in str(found[lost])
+    assert isinstance(found[fine], Comparison)
+    assert [one.name for one in tmp_path.glob("*/solved-*")] == [solved_path(fine).name]
+
+
+def test_an_unexpected_error_is_named(tmp_path: Path) -> None:
+    folder = calibrated_run(tmp_path, "run")
+
+    def submit(*_: Any) -> "Future[bytes]":
+        return at_once(lambda: bytes(1 // 0))
+
+    assert again(folder, submit=submit) == {folder: "unexpected ZeroDivisionError: integer division or modulo by zero"}
+
+
+def test_a_worker_of_another_version_ends_it(tmp_path: Path) -> None:
+    folder = calibrated_run(tmp_path, "run")
+    data, task = task_of(folder)
+    other = json.dumps(json.loads(task) | {"version": "0.0.1"}).encode()
+    with pytest.raises(ConfigError, match=r"ftdrive 0\.0\.1: install the same"):
+        again(folder, submit=lambda *_: at_once(solved, data, other))
+    assert not solved_path(folder).exists()
+
+
+def test_which_runs_are_calibrations_of_that_time(tmp_path: Path) -> None:
+    old, new = calibrated_run(tmp_path, "old"), calibrated_run(tmp_path, "new", day=40)
+    verification = calibrated_run(tmp_path, "verification", day=40, header={"command": "verify"})
+    damaged = calibrated_run(tmp_path, "damaged")
+    (damaged / "run.json").write_text("{")
+    (tmp_path / "other").mkdir()
+    assert run_folders([tmp_path, new]) == [damaged, new, old, verification]
+    since = FIRST.replace(month=9)
+    assert [is_calibration(one, since) for one in (old, new, verification, damaged)] == [False, True, False, True]
+    assert [is_calibration(one, None) for one in (old, new, verification, damaged)] == [True, True, False, True]
