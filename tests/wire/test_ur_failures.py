@@ -70,8 +70,8 @@ ROOT = Path(__file__).parents[2]
 MOVE_S = 60.0
 REPORTED_S, RESUMED_S = 0.5, 2.0
 """On a real clock; tests/benchmarks/ur_failures.py measures more."""
-EMULATED = replace(UrTiming.emulated(), ours_s=2.0, ours_again_s=2.0, ours_closing_s=2.0, release_s=1.0)
-"""Here other clients never answer and never let go."""
+EMULATED = replace(UrTiming.emulated(), ours_s=2.0, ours_again_s=2.0, ours_closing_s=2.0, release_s=1.0, braking_s=5.0)
+"""Here other clients never answer, brake or let go."""
 slow, realtime = pytest.mark.slow, pytest.mark.realtime
 
 NewArm = Callable[..., UrArm]
