@@ -57,7 +57,7 @@ class Unattended:
 
 @pytest.fixture
 def station() -> Iterator[Station]:
-    with Station("can", ["--seed", "5"]) as station:
+    with Station("serial", ["--seed", "5"]) as station:
         yield station
 
 
@@ -65,7 +65,7 @@ def station() -> Iterator[Station]:
 def tour(station: Station, tmp_path: Path) -> Callable[[Happening], tuple[Outcome, Unattended]]:
     def run(happening: Happening) -> tuple[Outcome, Unattended]:
         operator = Unattended(happening)
-        cell = replace(station.cell, sampling=Sampling(average_s=0.3, noise_record_s=0.0))
+        cell = replace(station.cell, sampling=Sampling(average_s=0.2, noise_record_s=0.0))
         outcome = calibrate(cell, operator, Options(tmp_path, poses=POSES, real=False, questions=False))
         assert outcome is not None
         assert len(outcome.run.stops()) == POSES + 1
