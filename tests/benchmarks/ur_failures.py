@@ -26,17 +26,8 @@ from drivers.errors import ConnectError, DriverError
 from drivers.ur.arm import UrArm
 from drivers.ur.control_process import ControlProcess
 from tests.wire.conftest import Station
-from tests.wire.test_ur_failures import (
-    APPLICATION,
-    EVENTS,
-    STEP_RAD,
-    Once,
-    away,
-    no_guard,
-    nothing,
-    on,
-    wait_until_moving,
-)
+from tests.wire.moves import STEP_RAD, away, no_guard
+from tests.wire.test_ur_failures import APPLICATION, EVENTS, Once, nothing, on, wait_until_moving
 
 ROOT = Path(__file__).parents[2]
 FROZEN = "freeze"

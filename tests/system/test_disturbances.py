@@ -55,17 +55,20 @@ class Unattended:
         return {event.stop: event for event in self.shown if isinstance(event, PoseTaken)}
 
 
+Tour = Callable[..., tuple[Outcome, Unattended]]
+
+
 @pytest.fixture
 def station() -> Iterator[Station]:
-    with Station("can", ["--seed", "5"]) as station:
+    with Station("serial", ["--seed", "5"]) as station:
         yield station
 
 
 @pytest.fixture
-def tour(station: Station, tmp_path: Path) -> Callable[[Happening], tuple[Outcome, Unattended]]:
-    def run(happening: Happening) -> tuple[Outcome, Unattended]:
+def tour(station: Station, tmp_path: Path) -> Tour:
+    def run(happening: Happening, average_s: float = 0.2) -> tuple[Outcome, Unattended]:
         operator = Unattended(happening)
-        cell = replace(station.cell, sampling=Sampling(average_s=0.3, noise_record_s=0.0))
+        cell = replace(station.cell, sampling=Sampling(average_s=average_s, noise_record_s=0.0))
         outcome = calibrate(cell, operator, Options(tmp_path, poses=POSES, real=False, questions=False))
         assert outcome is not None
         assert len(outcome.run.stops()) == POSES + 1
@@ -103,7 +106,7 @@ def begins(event: Event, state: State, stop: int) -> bool:
 
 def test_pushes_and_a_tap_while_poses_are_averaged(
     station: Station,
-    tour: Callable[[Happening], tuple[Outcome, Unattended]],
+    tour: Tour,
     words_of: Callable[[Outcome], str],
 ) -> None:
     pushed, tapped, last = 4, 7, POSES + 1
@@ -133,7 +136,7 @@ def test_pushes_and_a_tap_while_poses_are_averaged(
 
 def test_a_cable_that_pulls_in_three_poses(
     station: Station,
-    tour: Callable[[Happening], tuple[Outcome, Unattended]],
+    tour: Tour,
     words_of: Callable[[Outcome], str],
 ) -> None:
     taut_deg = -60
@@ -151,10 +154,10 @@ def test_a_cable_that_pulls_in_three_poses(
 
 def test_a_sensor_that_drifts_by_half_a_newton(
     station: Station,
-    tour: Callable[[Happening], tuple[Outcome, Unattended]],
+    tour: Tour,
     words_of: Callable[[Outcome], str],
 ) -> None:
-    slope_N_s, began_ns = 0.06, 0
+    slope_N_s, began_ns = 0.08, 0
 
     def happening(event: Event) -> None:
         nonlocal began_ns
@@ -162,7 +165,7 @@ def test_a_sensor_that_drifts_by_half_a_newton(
             station.control(do="drift", force_N=[0, 0, slope_N_s * 100], seconds=100)
             began_ns = station.clock.now_ns()
 
-    outcome, _ = tour(happening)
+    outcome, _ = tour(happening, average_s=0.1)  # each average is steady
     records = outcome.run.records()[:POSES]
     offset_ns = records[0].clock_offset_ns
     drifted_N = slope_N_s * np.array([(r.t_mid_ns - offset_ns - began_ns) * 1e-9 for r in records])
@@ -182,7 +185,7 @@ def test_a_sensor_that_drifts_by_half_a_newton(
 
 def test_a_payload_that_shifts_in_mid_run(
     station: Station,
-    tour: Callable[[Happening], tuple[Outcome, Unattended]],
+    tour: Tour,
     words_of: Callable[[Outcome], str],
 ) -> None:
     since = 7

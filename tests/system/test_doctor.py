@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.ur.timing import UrTiming
 from ftdrive.cell.emulated import Station
 from ftdrive.commands.emulated_run import rehearse
 from tests.system.command_line import CommandLine, listen_for
@@ -109,7 +111,7 @@ def test_an_arm_that_cannot_be_controlled(ftdrive: CommandLine) -> None:
 @pytest.mark.slow
 def test_a_controller_without_dashboard_server(ftdrive: CommandLine) -> None:
     """It completes, and reports what cannot be known; then a calibration completes."""
-    with Station("can", ["--polyscope", "10.11.0"]) as station:
+    with Station("serial", ["--polyscope", "10.11.0"]) as station:
         checks = checks_of(ftdrive.run("doctor", "--config", ftdrive.connect(station), "--json"))
         outcome = rehearse(station, ftdrive.folder, "without-dashboard", poses=6)
     assert [name for name, check in checks.items() if check["state"] == "failed"] == []
@@ -136,8 +138,15 @@ slow = partial(pytest.param, marks=pytest.mark.slow)
     ids=["no model", "silent dashboard", "no dashboard", "no RTDE", "silent RTDE"],
 )
 def test_each_way_not_to_reach_an_arm_has_its_own_cure(
-    polyscope: str, request_: dict[str, Any] | None, found: str, fix: str, ftdrive: CommandLine
+    polyscope: str,
+    request_: dict[str, Any] | None,
+    found: str,
+    fix: str,
+    ftdrive: CommandLine,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    sooner = replace(UrTiming.emulated(), connect_s=5.0)  # a silent server is waited for to the end
+    monkeypatch.setattr(UrTiming, "emulated", lambda: sooner)
     with Station("serial", ["--time-scale", "1", "--polyscope", polyscope]) as station:
         if request_ is not None:
             station.control(**request_)

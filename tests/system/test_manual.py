@@ -121,7 +121,7 @@ class Fit:
 
 @pytest.fixture
 def station() -> Iterator[Station]:
-    with Station("can", ["--seed", "11"]) as station:
+    with Station("serial", ["--seed", "11"]) as station:
         yield station
 
 
@@ -189,7 +189,8 @@ def test_somebody_in_the_emulated_cell_brings_it_to_its_end(
 ) -> None:
     request, words = emulated.MOVED_BY[mode]
     monkeypatch.setattr(emulated, "MOVED_BY", {mode: ({**request, "rest_s": 1.2}, words)})  # in a hurry
-    arguments = ["calibrate", "--simulate", f"--{mode}", "--runs", str(tmp_path), "--json"]
+    cell = ["--simulate", "--sensor", "emulated://serial", f"--{mode}"]
+    arguments = ["calibrate", *cell, "--runs", str(tmp_path), "--json"]
     outcome = CliRunner().invoke(cli, arguments)
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)
     assert words in outcome.stderr

@@ -22,7 +22,7 @@ FIRST_MOTION = "MOVE\nyes\n"
 
 @pytest.fixture
 def station() -> Iterator[Station]:
-    with Station("can", ["--seed", "5", "--payload", "1.5"]) as station:
+    with Station("serial", ["--seed", "5", "--payload", "1.5"]) as station:
         yield station
 
 

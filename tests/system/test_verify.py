@@ -22,7 +22,7 @@ LIMITS = ("--max-force", "0.2", "--max-torque", "0.02")
 
 @pytest.fixture
 def station() -> Iterator[Station]:
-    with Station("can", ["--seed", "5"]) as station:
+    with Station("serial", ["--seed", "5"]) as station:
         yield station
 
 

@@ -26,23 +26,12 @@ from drivers.ur.control_process import ControlProcess
 from drivers.ur.kinematics import MODELS, forward
 from drivers.ur.timing import UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, Station, on_ur_rtde, one_path
+from tests.wire.moves import away, no_guard
 from tests.wire.waiting import wait_until
 
-STEP_RAD = 1.2  # 1.3 s at the speed of these tests: long enough to be interrupted
 TCP = (0.1, -0.02, 0.25, 0.3, -1.2, 0.7)
 
 NewArm = Callable[..., UrArm]
-
-
-def no_guard() -> None:
-    pass
-
-
-def away(arm: UrArm, by_rad: float = STEP_RAD) -> list[float]:
-    """Joint angles with joint 6 turned away from where it is, back and forth."""
-    q: list[float] = arm.state().q_rad.tolist()
-    q[5] += by_rad if q[5] < 0.5 else -by_rad
-    return q
 
 
 class Trigger:

@@ -64,14 +64,14 @@ from drivers.ur.control_process import ControlProcess
 from drivers.ur.opening import Opening
 from drivers.ur.timing import STRICT, UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, TIME_SCALE, Station, on_ur_rtde, one_path
+from tests.wire.moves import STEP_RAD, away, no_guard
 
 ROOT = Path(__file__).parents[2]
-STEP_RAD = 1.2  # 1.3 s
 MOVE_S = 60.0
 REPORTED_S, RESUMED_S = 0.5, 2.0
 """On a real clock; tests/benchmarks/ur_failures.py measures more."""
-EMULATED = replace(UrTiming.emulated(), ours_s=2.0, ours_again_s=2.0, ours_closing_s=2.0, release_s=1.0)
-"""Here other clients never answer and never let go."""
+EMULATED = replace(UrTiming.emulated(), ours_s=2.0, ours_again_s=2.0, ours_closing_s=2.0, release_s=1.0, braking_s=5.0)
+"""Here other clients never answer, brake or let go."""
 slow, realtime = pytest.mark.slow, pytest.mark.realtime
 
 NewArm = Callable[..., UrArm]
@@ -259,17 +259,6 @@ def in_time(new_arm: NewArm) -> NewArm:
 def opened(arm: UrArm) -> UrArm:
     arm.open(control=True)
     return arm
-
-
-def no_guard() -> None:
-    pass
-
-
-def away(arm: UrArm, by_rad: float = STEP_RAD) -> list[float]:
-    """Joint angles with joint 6 turned away from where it is, back and forth."""
-    q: list[float] = arm.state().q_rad.tolist()
-    q[5] += by_rad if q[5] < 0.5 else -by_rad
-    return q
 
 
 def moves_again(arm: UrArm) -> None:

@@ -13,12 +13,9 @@ from drivers.interfaces import NOT_REPORTED
 from drivers.ur.arm import UrArm
 from drivers.ur.kinematics import MODELS, forward
 from tests.wire.conftest import TIME_SCALE, Station
+from tests.wire.moves import no_guard
 
 pytestmark = pytest.mark.slow
-
-
-def no_guard() -> None:
-    pass
 
 
 @pytest.mark.parametrize(

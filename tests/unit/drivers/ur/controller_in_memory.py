@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from drivers.errors import NoDashboard
 from drivers.ur import arm as arm_module
 from drivers.ur import control_child, opening, reading
+from drivers.ur.arm import UrArm
 from drivers.ur.control_process import ControlProcess
 from drivers.ur.kinematics import MODELS, Pose, forward
 from drivers.ur.reading import Reader
@@ -33,6 +34,8 @@ from tests.fake_clock import FakeClock
 
 CYCLE_S = 0.008
 HOST = "192.0.2.1"
+
+MakeArm = Callable[..., UrArm]
 
 
 def pose_from_ur(pose: Sequence[float]) -> Pose:
@@ -393,3 +396,11 @@ def install(controller: Controller, monkeypatch: pytest.MonkeyPatch) -> None:
         arm_module, "Reader", lambda _, model, *, timing, **__: ReaderInMemory(controller, model, timing)
     )
     monkeypatch.setattr(opening, "ControlProcess", lambda *_, timing, **__: ControlInMemory(controller, timing))
+
+
+def away(controller: Controller) -> list[float]:
+    return [*controller.q_rad[:5], controller.q_rad[5] + 1.0]  # 1 s
+
+
+def no_guard() -> None:
+    pass

@@ -18,9 +18,7 @@ from drivers.ur.arm import UrArm
 from drivers.ur.control import Control, ControlSetting
 from drivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
-from tests.unit.drivers.ur.controller_in_memory import HOST, ControlInMemory, Controller
-
-MakeArm = Callable[..., UrArm]
+from tests.unit.drivers.ur.controller_in_memory import HOST, ControlInMemory, Controller, MakeArm, away, no_guard
 
 on_ur_rtde = pytest.mark.parametrize("path", ["ur-rtde"], indirect=True)
 on_script = pytest.mark.parametrize("path", ["script"], indirect=True)
@@ -29,39 +27,13 @@ on_script = pytest.mark.parametrize("path", ["script"], indirect=True)
 @pytest.fixture(params=["ur-rtde", "script"])
 def path(request: pytest.FixtureRequest) -> ControlSetting:
     """The control path; both find the controller in memory."""
-    request.getfixturevalue("script")
     setting: ControlSetting = request.param
     return setting
-
-
-@pytest.fixture
-def make_arm(controller: Controller, path: ControlSetting) -> MakeArm:
-    def make(timing: UrTiming = STRICT) -> UrArm:
-        return UrArm(
-            HOST, speed_rad_s=1.0, acceleration_rad_s2=3.0, control=path, clock=controller.clock, timing=timing
-        )
-
-    return make
-
-
-@pytest.fixture
-def arm(make_arm: MakeArm) -> UrArm:
-    arm = make_arm()
-    arm.open(control=True)
-    return arm
 
 
 def control_of(arm: UrArm) -> Control:
     assert arm._control is not None
     return arm._control
-
-
-def away(controller: Controller) -> list[float]:
-    return [*controller.q_rad[:5], controller.q_rad[5] + 1.0]  # 1 s
-
-
-def no_guard() -> None:
-    pass
 
 
 def move(arm: UrArm, controller: Controller, guard: Guard = no_guard) -> None:

@@ -1,7 +1,6 @@
 """The control path through a program of ours: its text, the heartbeat, what ends it; on a fake clock."""
 
 import re
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -10,41 +9,24 @@ from numpy.typing import NDArray
 from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from drivers.ur import control_program
 from drivers.ur.arm import UrArm
+from drivers.ur.control import ControlSetting
 from drivers.ur.control_child import DECELERATION_RAD_S2
 from drivers.ur.control_program import OUTPUTS, program_text
 from drivers.ur.primary import Code, Failed, Note, Stopped
 from drivers.ur.script_control import STOPS_ITSELF_S
 from tests.fake_clock import FakeClock
-from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, HOST, Controller
+from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, MakeArm, away, no_guard
 from tests.unit.drivers.ur.program_in_memory import COMMANDS, Script, ScriptInMemory
 
-MakeArm = Callable[[], UrArm]
-
 
 @pytest.fixture
-def make_arm(controller: Controller, request: pytest.FixtureRequest) -> MakeArm:
-    request.getfixturevalue("script")
-    return lambda: UrArm(HOST, speed_rad_s=1.0, acceleration_rad_s2=3.0, control="script", clock=controller.clock)
-
-
-@pytest.fixture
-def arm(make_arm: MakeArm) -> UrArm:
-    arm = make_arm()
-    arm.open(control=True)
-    return arm
+def path() -> ControlSetting:
+    return "script"
 
 
 def control_of(arm: UrArm) -> ScriptInMemory:
     assert isinstance(arm._control, ScriptInMemory)
     return arm._control
-
-
-def away(controller: Controller) -> list[float]:
-    return [*controller.q_rad[:5], controller.q_rad[5] + 1.0]  # 1 s
-
-
-def no_guard() -> None:
-    pass
 
 
 # ---------------------------------------------------------------------- the program
