@@ -305,17 +305,21 @@ def _tilt_notes(parameters: Parameters, up_in_base: ArrayLike) -> list[str]:
 
 def _drift_share(change: Array, weight_N: float) -> float:
     """Drift of the force relative to the weight, or of the torque to the weight at the usual lever."""
-    sizes = np.linalg.norm(change[:3]), np.linalg.norm(change[3:]) / USUAL_LEVER_M
-    return float(max(sizes) / weight_N) if weight_N else float("inf")
+    return _drift_size_N(change) / weight_N if weight_N else float("inf")
+
+
+def _drift_size_N(change: Array) -> float:
+    return float(max(np.linalg.norm(change[:3]), np.linalg.norm(change[3:]) / USUAL_LEVER_M))
 
 
 def _drift_reasons(drift: DriftEstimate | None) -> list[str]:
     if drift is None:
         return []
+    rounding = 1e-9 * _drift_size_N(drift.change)  # of a group without drift, whose sigma is as small
     found = [
         f"{np.linalg.norm(drift.change[part]):.2g} {unit}"
         for unit, part in (("N", slice(0, 3)), ("N·m", slice(3, 6)))
-        if (np.abs(drift.change[part]) > 3 * drift.sigma[part]).any()
+        if (np.abs(drift.change[part]) > np.maximum(3 * drift.sigma[part], rounding)).any()
     ]
     return [
         f"the bias drifted by {' and '.join(found)} from the first pose to the last: let the sensor warm up and "

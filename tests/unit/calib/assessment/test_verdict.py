@@ -14,12 +14,14 @@ from calib.assessment.cross_validation import IndependentFit, standardized
 from calib.assessment.faults import faults
 from calib.assessment.verdict import (
     Quality,
+    _drift_reasons,
     expected_error,
     judge,
     strong_correlations,
     successive_correlation,
 )
 from calib.data.dataset import read_csv
+from calib.likelihood.fit import DriftEstimate
 from calib.likelihood.gain_and_cross_talk import predicted_covariance
 from calib.model import Array, jacobian, predict
 from calib.published.yu import SPECIAL_R_flange_base
@@ -396,6 +398,12 @@ def test_wrong_units_of_torque_are_detected() -> None:
 
 
 # Real sessions
+
+
+def test_a_drift_of_rounding_size_is_not_mentioned() -> None:
+    change, sigma = np.array([0.0, 0.1, 0.0, 0.0, 0.0, 3e-20]), np.array([0.01] * 3 + [1e-21] * 3)
+    (reason,) = _drift_reasons(DriftEstimate(change, sigma, np.zeros((2, 6))))
+    assert reason.startswith("the bias drifted by 0.1 N from")
 
 
 def test_a_real_session_is_usable_and_one_with_drift_is_never_good(real_data: Path) -> None:
