@@ -50,7 +50,7 @@ class Server:
         import psycopg
 
         settings = [part for name, value in _SETTINGS.items() for part in ("-c", f"{name}={value}")]
-        command = [self._programs / "postgres", "-D", "data", "-k", self._folder, *settings]
+        command = [str(self._programs / "postgres"), "-D", "data", "-k", str(self._folder), *settings]
         with (self._folder / "log").open("ab") as log:
             self._process = subprocess.Popen(command, stderr=log, cwd=self._folder, **self._user)
         deadline_s = time.monotonic() + _START_S
@@ -83,7 +83,7 @@ class Server:
         import psycopg
 
         with psycopg.connect(host=str(self._folder), user="lab", dbname="postgres", autocommit=True) as connection:
-            cursor = connection.execute(statement)  # type: ignore[call-overload]  # it takes literals only
+            cursor = connection.execute(statement)
             return [] if cursor.description is None else cursor.fetchall()
 
     def new_database(self, options: str = "") -> str:
