@@ -10,7 +10,6 @@
 A run belongs to a cell by the serial number of its arm if the cell has one, else by the address of its controller.
 """
 
-import math
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -92,8 +91,7 @@ def _cell(path: Path, name: str, table: Any) -> StoredCell:
     config, days, serial = (table.get(key) for key in _KEYS)
     if not isinstance(config, str) or not config:
         raise ConfigError(f'{place} config is {config!r}: give the path of its ftdrive.toml, such as "{name}.toml"')
-    number = isinstance(days, int | float) and not isinstance(days, bool)
-    if not number or not math.isfinite(days) or not 0 < days <= MOST_DAYS:
+    if isinstance(days, bool) or not isinstance(days, int | float) or not 0 < days <= MOST_DAYS:  # nan is neither
         raise ConfigError(f"{place} verify_every_days is {days!r}: give the days between two verifications, such as 7")
     if serial is not None and not (isinstance(serial, str) and serial):
         raise ConfigError(f'{place} arm_serial is {serial!r}: give the serial number as text, such as "20225500001"')

@@ -1,4 +1,4 @@
-"""What the store knows of a fleet: the accepted results of each cell, and the verifications of the last 90 days."""
+"""What the store knows of a fleet: the newest accepted results of each cell, and the verifications of 90 days."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +14,8 @@ from ftdrive.store.store import Store
 
 WINDOW: Final = timedelta(days=90)
 """Of the verifications that are read. A drift of the bias shows within weeks, and the store is read every minute."""
+NEWEST: Final = 3
+"""Results of each tool of a cell that are read: the newest, and what it is compared with."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +45,7 @@ class Observed:
 
     cells: tuple[StoredCell, ...]
     results: Mapping[str, Sequence[StoredResult]]
-    """Accepted results with a time, by cell, the oldest first."""
+    """The newest accepted results of each tool, by cell, the oldest first."""
     checks: Mapping[str, Sequence[StoredVerification]]
     """Verifications with a time, by calibration, the oldest first; none without, or older than `WINDOW`."""
     changes: Mapping[str, BiasChanges]
@@ -56,9 +58,8 @@ class Observed:
         cells = tuple(store.cells())
         owners = Owners(cells)
         results: dict[str, list[StoredResult]] = {cell.name: [] for cell in cells}
-        for one in store.results():
-            name = owners.cell_of(one)
-            if name is not None and one.verdict != "rejected" and one.created_utc is not None:
+        for one in store.newest_accepted(NEWEST):
+            if (name := owners.cell_of(one)) is not None:
                 results[name].append(one)
         checks = dict[str, list[StoredVerification]]()
         for check in store.verifications(since=now - WINDOW):

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, select
+from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, func, select
 
 from ftdrive.store import tables
 from ftdrive.store.database import Database
@@ -144,6 +144,18 @@ class Store:
             query = query.where(tables.results.c.tool == tool)
         return self._read(query, tables.to_result)
 
+    def newest_accepted(self, most: int) -> list[StoredResult]:
+        """Return the newest results of each tool on each arm that are not rejected, the oldest first."""
+        table = tables.results
+        one = (table.c.arm_serial, table.c.robot_host, table.c.tool)
+        rank = func.row_number().over(partition_by=one, order_by=(table.c.created_utc.desc(), table.c.id.desc()))
+        ranked = select(table.c.id, rank.label("rank")).where(
+            table.c.verdict != "rejected", table.c.created_utc.is_not(None)
+        )
+        found = ranked.subquery()
+        newest = select(found.c.id).where(found.c.rank <= most)
+        return self._read(_oldest_first(table, None).where(table.c.id.in_(newest)), tables.to_result)
+
     def find(self, start: str) -> list[StoredResult]:
         """Return the results whose id begins so."""
         query = select(tables.results).where(tables.results.c.id.startswith(start, autoescape=True))
@@ -168,7 +180,7 @@ class Store:
 
     def _read(self, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
         with self._database.reading() as connection:
-            return [] if connection is None else [make(row) for row in connection.execute(query)]
+            return [] if connection is None else [make(row) for row in connection.execute(query).all()]
 
 
 def _all_paths(connection: Connection) -> set[str]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.extras.drift_onset import drift_onset
 from calib.model import Array
@@ -87,7 +88,7 @@ def simulated(case: Case, rng: np.random.Generator) -> Year:
     return Year(delay, alarms, days)
 
 
-def _looks(t: Array, change: Array) -> Iterator[tuple[Array, float]]:
+def _looks(t: Array, change: Array) -> Iterator[tuple[NDArray[np.bool_], float]]:
     """Yield at each verification which components are found to drift, and the time."""
     starts = np.searchsorted(t, t - WINDOW.days)
     for n, start in enumerate(starts, 1):

@@ -1,5 +1,6 @@
 """Cells, results and verifications of a fleet as the store has them, without files."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -98,8 +99,16 @@ class FakeStore:
     def cells(self) -> list[StoredCell]:
         return sorted(self.kept_cells, key=lambda one: one.name)
 
-    def results(self) -> list[StoredResult]:
-        return sorted(self.kept_results, key=lambda one: (one.created_utc or "", one.id))
+    def newest_accepted(self, most: int) -> list[StoredResult]:
+        found = sorted(self.kept_results, key=lambda one: (one.created_utc or "", one.id), reverse=True)
+        count = Counter[tuple[str | None, ...]]()
+        kept = []
+        for one in found:
+            key = (one.arm_serial, one.robot_host, one.tool)
+            if one.verdict != "rejected" and one.created_utc is not None and count[key] < most:
+                count[key] += 1
+                kept.append(one)
+        return kept[::-1]
 
     def verifications(self, *, since: datetime) -> list[StoredVerification]:
         start = since.isoformat(timespec="microseconds")

@@ -1,5 +1,6 @@
 """Findings across cells: each is named where it is planted, and nowhere else."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -106,14 +107,12 @@ def test_sensors_that_follow_their_temperature_are_named_by_model() -> None:
         added = np.outer(warm - 25, [sign, 0, 0, 0, 0, 0])  # sigma a kelvin: 0.01 N
         days = daily(one, 40, seed, added)
         checks += [check_at(each, T) for each, T in zip(days, warm, strict=True)]
-    (one,) = found("abcde", results, checks)
-    assert (one.kind, one.cells) == ("temperature", ("a", "b"))
-    assert "The bias of 2 of 3 sensors Rokubi follows their temperature, by up to 0.0099 N a kelvin" in one.words
+    (finding,) = found("abcde", results, checks)
+    assert (finding.kind, finding.cells) == ("temperature", ("a", "b"))
+    assert "The bias of 2 of 3 sensors Rokubi follows their temperature, by up to 0.0099 N a kelvin" in finding.words
 
 
 def check_at(one: Any, T: float) -> Any:
-    from dataclasses import replace
-
     return replace(one, temperature_C=float(T))
 
 

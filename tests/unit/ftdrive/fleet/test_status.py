@@ -109,10 +109,13 @@ def test_verifications_of_an_earlier_version_have_no_change_of_the_bias() -> Non
 
 def test_a_store_gives_the_same_state_as_its_records(store_url: str) -> None:
     made, other = result("a", 61), result("b", 200, tool=None, payload_kg=1.9, payload_com_m=[0.0, 0.0, 0.05])
+    more = [result("b", 210 + days, tool=None) for days in range(5)] + [result("b", 5, verdict="rejected")]
+    more += [result("b", 1, created_utc=None), result("b", 30, tool="drill"), result("b", 31, arm_serial=None)]
     checks = [*daily(made, 60, 1, ramp(2.0, 21), temperature_C=25.0), check(other, 150, passed=False)]
     cells = [cell("b"), cell("a"), cell("c", arm_serial="arm-c")]
     store = Store(store_url)
     store.put_cells(cells)
     with store._database.writing() as connection:
-        store._write(connection, [made, other, *checks])
-    assert fleet_state(store, NOW) == fleet(cells, [made, other], checks)
+        store._write(connection, [made, other, *more, *checks])
+    assert fleet_state(store, NOW) == fleet(cells, [made, other, *more], checks)
+    assert [one.id for one in store.newest_accepted(2) if one.tool is None] == ["b-210", "b-200"]
