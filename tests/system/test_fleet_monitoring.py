@@ -139,7 +139,7 @@ def test_the_alert_of_a_drift_fires_for_the_cells_that_drift_and_no_others(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("by", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -9)])
+@pytest.mark.parametrize(("by", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
 def test_the_end_of_the_server_reaches_the_shop_floor(
     by: signal.Signals, code: int, tmp_path: Path, ftdrive: CommandLine
 ) -> None:
