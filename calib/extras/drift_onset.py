@@ -32,6 +32,8 @@ SIGNIFICANT = 1e-5
 components and 365 looks a year: see the README of `ftdrive.fleet` for false alarms and delays in simulation."""
 LEAST_DAYS = 7.0
 """A drift has gone on for so long: a sudden change of the last days is no drift yet."""
+NEAR_DAYS = 14.0
+"""If the series begins later, the error of the calibration limits its level no more, because more may have changed."""
 CLEARLY = 6.0
 """A step fits better than an onset if its chi2 is larger by this: odds of 20 to 1."""
 
@@ -75,11 +77,14 @@ def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: A
     if len(t_days) < FEWEST:
         return None
     weight, known = 1 / np.square(sigma), 1 / np.maximum(np.square(calibration_sigma), 1e-12 * np.square(sigma[0]))
+    near = t_days[0] <= NEAR_DAYS
+    if not near:
+        known = np.zeros_like(known)
     first = 0
     while len(t_days) - first >= FEWEST:
         t, d, w = t_days[first:], change[first:], weight[first:]
         chi2 = np.sum(w * d * d, axis=0) - np.sum(w * d, axis=0) ** 2 / (np.sum(w, axis=0) + known)
-        ramp, slope, slope_sigma, t0 = _onsets(t, d, w, known, from_calibration=first == 0)
+        ramp, slope, slope_sigma, t0 = _onsets(t, d, w, known, from_calibration=near and first == 0)
         step, after = _steps(d, w, known)
         p_ramp, p_step = (_p_value(one, chi2, len(t) - 3) for one in (ramp, step))
         ahead = np.where(p_step < SIGNIFICANT, step - ramp, -np.inf)

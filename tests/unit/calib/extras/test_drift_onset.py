@@ -53,6 +53,12 @@ def test_an_unchanged_bias_does_not_drift() -> None:
         assert not searched(DAILY, series(DAILY, seed) + np.array([0.0, 20.0, 0.0, -8.0, 0.0, 100.0])).found.any()
 
 
+def test_an_offset_of_an_old_calibration_is_no_slow_drift_since_then() -> None:
+    """With the sigma of the calibration alone, a line from the calibration on would explain it."""
+    for seed in range(40):
+        assert not searched(DAILY + 200, series(DAILY, seed) + 2.5 * np.eye(6)[seed % 6]).found.any()
+
+
 @pytest.mark.parametrize("size", [10.0, 300.0])
 def test_a_tare_is_no_drift_on_any_day_after_it(size: float) -> None:
     for seed in range(4):

@@ -72,6 +72,7 @@ def test_an_upgraded_store_is_one_that_was_built_by_this_version(store_url: str,
     assert store.upgrade() is None
 
 
+@pytest.mark.slow
 def test_results_whose_files_are_gone_are_kept(store_url: str, runs: Path) -> None:
     store = Store(store_url)
     store.index(runs)
@@ -119,6 +120,7 @@ def test_an_upgrade_that_fails_changes_nothing(store_url: str, runs: Path) -> No
     assert (dump(store_url), columns(store_url)) == (before, built)
 
 
+@pytest.mark.slow
 def test_upgrades_at_once_wait_for_each_other(store_url: str, runs: Path) -> None:
     store = Store(store_url)
     store.index(runs)
