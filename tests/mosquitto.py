@@ -83,11 +83,14 @@ class Mosquitto:
             elif message.retain:
                 found[message.topic] = message.payload.decode()
 
+        def subscribe(*_: object) -> None:
+            client.subscribe([(topics, 0), ("end", 0)])
+            client.publish("end", b"")  # the broker sends it after what it has retained
+
         client = Client(CallbackAPIVersion.VERSION2)
         client.username_pw_set(self._user, self._password)
         client.on_message = note
-        # The broker sends what it has retained before what is published after the subscription.
-        client.on_connect = lambda *_: [client.subscribe([(topics, 0), ("end", 0)]), client.publish("end", b"")]
+        client.on_connect = subscribe
         client.connect("127.0.0.1", self.port)
         client.loop_start()
         wait_until(lambda: is_end)

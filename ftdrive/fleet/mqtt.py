@@ -6,12 +6,11 @@ import sys
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from threading import Event, Lock
+from threading import Event, Lock, Thread
 from typing import Any, Final, Self
 from urllib.parse import unquote, urlsplit
 
 from calib.files import JSON
-from drivers.clock import Clock
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.serve import Reading
 
@@ -82,16 +81,14 @@ class Messages:
     Parameters
     ----------
     broker : Broker
-    clock : Clock
-        Times the last message.
     wake : Event
         Set when the broker rejects user or password, so that `update` is called at once.
     say : callable
         Takes a sentence for the operator, from any thread.
     """
 
-    def __init__(self, broker: Broker, clock: Clock, wake: Event, say: Callable[[str], None]) -> None:
-        self._broker, self._clock, self._wake, self._say = broker, clock, wake, say
+    def __init__(self, broker: Broker, wake: Event, say: Callable[[str], None]) -> None:
+        self._broker, self._wake, self._say = broker, wake, say
         self._lock = Lock()
         self._wanted: dict[str, bytes] = {}
         """What is retained at the broker, or will be, by topic."""
@@ -99,7 +96,6 @@ class Messages:
         self._answers: bool | None = None
         """Whether the broker has answered last; None before its first answer or silence."""
         self._was_connected = self._is_open = False
-        self._ended = Event()
         self._server_topic = f"{broker.prefix}ftdrive/server"
         self._cell_topics = f"{broker.prefix}ftdrive/cells/+/state"
         self._offline = _encoded({"schema_version": SCHEMA_VERSION, "online": False})
@@ -144,12 +140,13 @@ class Messages:
     def close(self) -> None:
         """Publish that the server ends, and disconnect; waits for the broker for a second at most."""
         with self._lock:
-            answers, self._is_open = self._answers, False
-            if answers:
+            self._is_open = False
+            if self._answers:
                 self._retain(self._server_topic, self._offline)
         self._client.disconnect()
-        if answers:
-            self._clock.wait(self._ended, _GOODBYE_S)
+        stopping = Thread(target=self._client.loop_stop, daemon=True)  # it may be in an attempt to connect
+        stopping.start()
+        stopping.join(_GOODBYE_S)
 
     # ------------------------------------------------------------------------------------------------ thread of paho
 
@@ -176,7 +173,6 @@ class Messages:
         self._lost(_words(sys.exception()))  # paho calls this where it handles the error
 
     def _on_disconnect(self, _client: Client, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-        self._ended.set()
         if self._is_open and self._rejection is None:
             self._lost(str(reason))
 
@@ -191,7 +187,6 @@ class Messages:
             if self._answers is not False:
                 self._say(f"The MQTT broker {self._broker} does not answer ({reason}). ftdrive tries to reconnect.")
             self._answers = False
-            self._ended.clear()
 
     def _retain(self, topic: str, payload: bytes) -> None:
         """Have the broker keep a message; an empty one clears the topic."""

@@ -5,6 +5,7 @@ import os
 import pty
 import re
 import select
+import shutil
 import struct
 import subprocess
 import sys
@@ -12,11 +13,13 @@ import termios
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from ftdrive.cell.emulated import Station
-from ftdrive.commands.emulated_run import rehearse
+from ftdrive.live.stream import load_calibration
 from tests.system.command_line import CommandLine
 
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
@@ -41,20 +44,29 @@ class InTerminal:
 
     def end(self) -> int:
         """Read to its end; return the exit code."""
-        self._read_until(lambda: self.process.poll() is not None)
+        while self._read():
+            pass
         return self.process.returncode
 
     def _read_until(self, condition: Callable[[], object]) -> None:
         deadline_s = time.monotonic() + _LONG_S
         while not condition():
             assert time.monotonic() < deadline_s, self.screen
-            if select.select([self._keys], [], [], 0.1)[0]:
-                try:
-                    more = os.read(self._keys, 65536).decode(errors="replace")
-                except OSError:  # the process has ended
-                    self.process.wait(_LONG_S)
-                    continue
-                self.screen += _ESCAPES.sub("", more).replace("\r", "")
+            if not self._read():
+                break
+        assert condition(), self.screen
+
+    def _read(self) -> bool:
+        """Wait for more; return whether there can be more."""
+        if not select.select([self._keys], [], [], 0.1)[0]:
+            return True
+        try:
+            more = os.read(self._keys, 65536).decode(errors="replace")
+        except OSError:  # the process has ended
+            self.process.wait(_LONG_S)
+            return False
+        self.screen += _ESCAPES.sub("", more).replace("\r", "")
+        return True
 
 
 @contextmanager
@@ -76,24 +88,26 @@ def in_terminal(ftdrive: CommandLine, *arguments: str) -> Iterator[InTerminal]:
 
 
 @pytest.mark.slow
-def test_an_operator_verifies_a_cell_or_skips_it(ftdrive: CommandLine) -> None:
-    with Station("can", ["--seed", "5"]) as station:
-        runs = ftdrive.folder / "press" / "runs"
-        calibrated = rehearse(station, runs, "calibrate", poses=6)
+def test_an_operator_skips_a_cell_or_verifies_it(demo: dict[str, Any], ftdrive: CommandLine) -> None:
+    runs = ftdrive.folder / "press" / "runs"
+    calibrated = Path(shutil.copytree(demo["run"], runs / "calibrated"))
+    with Station.of(load_calibration(calibrated).provenance["station"]) as station:
         config = ftdrive.connect(station)
+        config.write_text(config.read_text().replace("[tool]", f'[tool]\nname = "{station.cell.tool.name}"'))
         (ftdrive.folder / "cells.toml").write_text(
             f'format = "ftdrive.cells/1"\n[cells.press]\nconfig = "{config.name}"\nverify_every_days = 7\n'
+            f'arm_serial = "{demo["result"]["provenance"]["devices"]["arm"]["serial"]}"\n'
         )
         for arguments in (("add", "cells.toml"), ("index", str(runs))):
             outcome = ftdrive.run("fleet", *arguments)
             assert outcome.returncode == 0, outcome.stderr
-        attended = r"Cell press, robot \S+, tool tool: does an operator stand at this cell"
+        attended = r"Cell press, robot \S+, tool emulated: does an operator stand at this cell"
         with in_terminal(ftdrive, "fleet", "verify") as command:
             command.type("yes")  # before the question
             command.answer(attended, "")
             assert command.end() == 0, command.screen
         assert command.screen.endswith("press: skipped\n")
-        assert list(runs.iterdir()) == [calibrated.run.folder]
+        assert list(runs.iterdir()) == [calibrated]
         with in_terminal(ftdrive, "fleet", "verify", "press") as command:
             command.answer(attended, "yes")
             command.answer("Is the tool free", "yes")
@@ -103,7 +117,7 @@ def test_an_operator_verifies_a_cell_or_skips_it(ftdrive: CommandLine) -> None:
             command.answer("Begin", "yes")
             assert command.end() == 0, command.screen
         assert command.screen.endswith("press: passed\n")
-    (verified,) = (run for run in runs.iterdir() if run != calibrated.run.folder)
+    (verified,) = (run for run in runs.iterdir() if run != calibrated)
     assert (verified / "verification.json").exists()
     (state,) = ftdrive.json("fleet", "status")["cells"]
     assert (state["cell"], state["passed"], state["is_due"]) == ("press", True, False)

@@ -62,7 +62,7 @@ def serve(address: str, broker_url: str | None, store: str | None) -> None:
             from ftdrive.fleet.mqtt import Broker, Messages
 
             broker = Broker.of(broker_url)
-            sinks.append(stack.enter_context(closing(Messages(broker, REAL, wake, talk.print))))
+            sinks.append(stack.enter_context(closing(Messages(broker, wake, talk.print))))
             talk.print(f"Publishing at the MQTT broker {broker}, topics {broker.prefix}ftdrive/#")
         talk.print(f"Alert rules and a dashboard are in {MONITORING}")
         talk.print("Ctrl-C ends.")
