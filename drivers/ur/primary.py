@@ -31,7 +31,7 @@ _MESSAGE: Final = struct.Struct(">QbB")  # time stamp, source, type
 _TEXT, _ERROR_CODE, _KEY, _EXCEPTION = 0, 6, 7, 10
 _KEY_HEAD: Final = struct.Struct(">iiB")  # code, argument, length of the title
 _EXCEPTION_HEAD: Final = struct.Struct(">ii")  # line, column
-_CODE_HEAD: Final = struct.Struct(">iiiBI")  # code, argument, level, type of the data, data
+_CODE_HEAD: Final = struct.Struct(">iiiBI")  # code, argument, level, type of the data (4 bytes in old documents), data
 _READ_ONLY_CODE: Final = 210
 _CONFIGURATION: Final = 6
 _ROBOT_TYPE: Final = struct.Struct(">432xi")
@@ -153,7 +153,7 @@ def _decode_message(kind: int, content: bytes) -> Iterator[Message]:
 
 
 def _text(data: bytes) -> str:
-    return data.rstrip(b"\0").decode("utf-8", "replace")
+    return data.strip(b"\0").decode("utf-8", "replace")
 
 
 class Primary:

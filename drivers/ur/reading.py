@@ -191,7 +191,8 @@ class Reader:
         measured = (outputs["robot_mode"] >= MEASURING[0]) & (outputs["robot_mode"] <= MEASURING[1])
         if not measured.any():
             self._check_measures(Sample.of(t_host_ns[-1], outputs))
-        states = states.rows(measured)
+        if not measured.all():
+            states = states.rows(measured)
         self._check_model(states.q_rad[-1], Pose(states.R_base_flange[-1], states.p_base_flange_m[-1]))
         return states
 

@@ -3,10 +3,11 @@
     uv run python tests/benchmarks/live_soak.py [--seconds 600] [--size 160x50]
 
 An ATI sensor at 7 kHz and the arm at 500 Hz, in another process and in real time. Printed: samples that are missing in
-the file, CPU and growth of memory of the whole program, and latencies (median, 95 %) of every sample in ms by the clock
-of the cell: from its measurement to its receipt, which is mostly the batch of the emulated adapter; from there to the
-block that is read from the stream; and from the measurement to client and terminal. Last, the age of the newest sample
-when a line of `ftdrive live --json` is read from a pipe, in a program of its own.
+the file, CPU and growth of memory of the whole program, and latencies (median, 95 %) in ms by the clock of the cell:
+from the measurement of a sample to its receipt from the wire, which is mostly the batch of the emulated adapter; from
+there to the block that is read from the stream, and to the WebSocket client; and from the measurement to client and
+terminal. Last, the age of the newest sample when a line of `ftdrive live --json` is read from a pipe, in a program of
+its own.
 """
 
 import argparse
@@ -17,6 +18,7 @@ import subprocess
 import sys
 import threading
 import time
+from array import array
 from collections import deque
 from contextlib import closing
 from dataclasses import replace
@@ -39,6 +41,7 @@ from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.summary import Summary
 from ftdrive.terminal.live_screen import LiveApp
 from tests.benchmarks.on_terminal import on_terminal
+from tests.benchmarks.stream_latency import EVERY
 from tests.unit.ftdrive.live.simulated import calibrated_from
 
 WARM_UP_S = 60.0
@@ -53,6 +56,9 @@ class Both:
     def __init__(self, recorder: Recorder, server: FoxgloveServer, stream: CompensatedStream) -> None:
         self.recorder, self._server, self._clock = recorder, server, stream.clock
         self._received = deque[tuple[NDArray[np.int64], NDArray[np.int64]]](maxlen=200)
+        self._batches = array("q"), array("q")
+        """Last sequence number and receipt of every batch."""
+        self._first = -1
         self._ages_ns = list[tuple[int, int]]()
         """Of one sample in every 20 blocks: all of them would fill the memory that is measured."""
         self._blocks = 0
@@ -60,12 +66,16 @@ class Both:
 
         def noted(samples: FtSamples) -> None:
             self._received.append((samples.seq, samples.t_host_ns))
+            self._batches[0].extend(samples.seq[-1:].tolist())
+            self._batches[1].extend(samples.t_host_ns[-1:].tolist())
             add(samples)
 
         stream._pairing.add_samples = noted  # type: ignore[method-assign]  # the only place to see it
 
     def write(self, block: Block) -> None:
         self._blocks += 1
+        if self._first < 0:
+            self._first = int(block.seq[0])
         if self._blocks % 20 == 0:
             seqs, times_ns = (np.concatenate(column) for column in zip(*self._received, strict=True))
             received_ns = int(times_ns[np.searchsorted(seqs, block.seq[0])])
@@ -83,6 +93,13 @@ class Both:
         """From measurement to receipt, and from there to the block."""
         received_ns, block_ns = zip(*self._ages_ns[SKIPPED:], strict=True)
         return {"received_ms": percentiles(list(received_ns)), "block_ms": percentiles(list(block_ns))}
+
+    def from_receipt(self, arrivals_ns: list[int]) -> list[float]:
+        """From the receipt of every 100th sample to its arrival at the client, without the first 10 %."""
+        seqs = self._first + EVERY * np.arange(len(arrivals_ns))
+        last_seq, received_ns = (np.frombuffer(column, np.int64) for column in self._batches)
+        ages_ns = np.array(arrivals_ns) - received_ns[np.searchsorted(last_seq, seqs)]
+        return percentiles(ages_ns[len(ages_ns) // 10 :])
 
 
 def percentiles(age_ns: NDArray[np.int64] | list[int] | list[float]) -> list[float]:
@@ -155,6 +172,7 @@ def run(duration_s: float) -> dict[str, object]:
             "cpu": cpu_s,
             "grown_MB": grown_MB,
             **both.stages(),
+            "wire_to_client_ms": both.from_receipt(received["arrivals_ns"]),
             "client_ms": [received["p50"], received["p95"]],
             "client_wrenches": received["wrenches"],
             "screen_ms": percentiles(app.drawn_ns),

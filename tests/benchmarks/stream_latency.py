@@ -26,6 +26,8 @@ from tests.unit.ftdrive.servers.fake_stream import INFO, RATE_HZ, FakeStream, bl
 
 BLOCK_S = 0.01
 TARGET_P95_MS = 10.0
+EVERY = 100
+"""Of so many wrenches the client keeps one time of arrival."""
 UPGRADE = (
     b"GET / HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
     b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
@@ -37,7 +39,7 @@ MESSAGE = struct.Struct("<BIQ")
 
 
 def run_client(port: int, clock: str) -> None:
-    """Receive until the server closes; print latencies in ms and counts.
+    """Receive until the server closes; print latencies in ms, counts, and when every 100th wrench arrived.
 
     It reads frames itself, because a WebSocket library takes half a core for 15 000 messages a second.
 
@@ -48,7 +50,8 @@ def run_client(port: int, clock: str) -> None:
         Page of the emulated cell whose time the messages have; empty for that of the computer.
     """
     now_ns = EmulatedClock(clock).now_ns if clock else time.monotonic_ns
-    latency_ms, count, compensated, buffer = [], 0, -1, bytearray()
+    latency_ms, arrivals_ns = list[float](), list[int]()
+    count, compensated, buffer = 0, -1, bytearray()
     with socket.create_connection(("127.0.0.1", port)) as client:
         client.sendall(UPGRADE)
         while b"\r\n\r\n" not in buffer:
@@ -60,6 +63,8 @@ def run_client(port: int, clock: str) -> None:
                 if opcode == BINARY:
                     _, channel, t_ns = MESSAGE.unpack_from(frame)
                     if channel == compensated:
+                        if len(latency_ms) % EVERY == 0:
+                            arrivals_ns.append(arrived_ns)
                         latency_ms.append((arrived_ns - t_ns) * 1e-6)
                     count += 1
                 elif opcode == CLOSE:
@@ -80,7 +85,10 @@ def run_client(port: int, clock: str) -> None:
             buffer += received
     p50, p95, most = np.percentile(latency_ms[len(latency_ms) // 10 :], [50, 95, 100])
     sys.stdout.write(
-        json.dumps({"p50": p50, "p95": p95, "max": most, "wrenches": len(latency_ms), "all": count}) + "\n"
+        json.dumps(
+            {"p50": p50, "p95": p95, "max": most, "wrenches": len(latency_ms), "all": count, "arrivals_ns": arrivals_ns}
+        )
+        + "\n"
     )
 
 

@@ -43,6 +43,7 @@ DOCUMENTED: list[tuple[bytes, list[Message]]] = [
         [Failed(4, 7, "syntax_error_on_line:4:end:")],
     ),
     (message(6, struct.pack(">iiiBI", 210, 0, 2, 0, 0) + b"text"), [Code(210, 0, "text")]),
+    (message(6, struct.pack(">iiiII", 210, 0, 2, 0, 0) + b"text"), [Code(210, 0, "text")]),
     (message(0, b"ftdrive control program, version 1\0"), [Note("ftdrive control program, version 1")]),
     (message(3, b"\x09URControl\x05\x0f"), []),
     (configuration(9), [RobotType("UR15")]),
