@@ -60,7 +60,7 @@ def solved_on(address: str, runs: list[Path], *, timeout_s: float = 0.1, kill: b
 
 def test_a_call_that_kills_its_worker_is_given_up_and_the_others_are_answered() -> None:
     def script(item: Path) -> tuple[str]:
-        return ("__import__('os').kill(__import__('os').getpid(), 9)" if item.name == "3" else repr(item.name.encode()),)
+        return ("__import__('signal').raise_signal(9)" if item.name == "3" else repr(item.name.encode()),)
 
     with local_workers(2) as workers:
         found = {item.name: answer for item, answer in answers(eval, script, map(Path, "0123456789"), workers)}
