@@ -99,7 +99,7 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
     dask: Any = distributed  # most of it has no types
     try:
         client = dask.Client(f"tcp://{found[1]}:{found[2]}", timeout=timeout_s, set_as_default=False)
-    except OSError as error:
+    except (OSError, ValueError, MemoryError) as error:  # the answer of another server may look like a huge length
         raise Unreachable(
             f"no Dask scheduler answers at {address} ({error})", "start it, or correct --cluster"
         ) from error
