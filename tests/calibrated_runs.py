@@ -36,7 +36,7 @@ def dataset(seed: int, poses: int = 8) -> CalibrationDataset:
     walk = np.cumsum(NOISE * rng.normal(size=(poses, 6)), axis=0)
     wrench = predict(truth, R) + walk + NOISE * rng.normal(size=(poses, 6))
     covariance = np.tile(np.diag(NOISE**2), (poses, 1, 1))
-    return CalibrationDataset(R, wrench, covariance, np.full(poses, 200), 5.0 * np.arange(poses))
+    return CalibrationDataset(R, wrench, covariance, np.full(poses, 200), np.linspace(0, 5 * poses, poses))
 
 
 def calibrated_run(

@@ -1,5 +1,6 @@
 """Processes of this computer, or the workers of a Dask cluster: both take calls and give futures."""
 
+import logging
 import re
 import signal
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -22,6 +23,7 @@ SAME: Final = ("ftdrive", "numpy", "scipy")
 
 _ONE_THREAD: Final = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
 """More threads than cores are slow, and their number can change the last digits."""
+_LOGS: Final = ("distributed", "distributed.client", "tornado.application")
 _NO_ENGINE: Final = "solving many runs needs {}: pip install 'ftdrive[fleet]'"
 
 _DIED: Final = "each worker that was given it died: `ftdrive solve` may show the cause"
@@ -89,12 +91,15 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
     if found is None:
         raise ConfigError(f"--cluster is '{address}': give the address of a Dask scheduler, such as dask://host:8786")
     try:
-        from distributed import Client, KilledWorker
+        import distributed
     except ModuleNotFoundError as error:
         raise ConfigError(_NO_ENGINE.format(error.name)) from None
+    for name in _LOGS:
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # a lost cluster is one sentence, not several tracebacks
+    dask: Any = distributed  # most of it has no types
     try:
-        client = Client(f"tcp://{found[1]}:{found[2]}", timeout=timeout_s, set_as_default=False)
-    except OSError as error:
+        client = dask.Client(f"tcp://{found[1]}:{found[2]}", timeout=timeout_s, set_as_default=False)
+    except (OSError, ValueError, MemoryError) as error:  # the answer of another server may look like a huge length
         raise Unreachable(
             f"no Dask scheduler answers at {address} ({error})", "start it, or correct --cluster"
         ) from error
@@ -109,7 +114,7 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
         _require_same_versions(client.get_versions(packages=list(SAME)), address)
         try:
             submit = client.get_executor(pure=False).submit
-            yield Workers(sum(client.ncores().values()), submit, KilledWorker)
+            yield Workers(sum(client.ncores().values()), submit, dask.KilledWorker)
         except CancelledError as error:
             raise StreamBroken(f"the cluster {address} was lost", "start it, and repeat the command") from error
 
@@ -164,9 +169,9 @@ def _round(
             except (CalibError, OSError) as error:
                 yield item, error
         for future in wait(running, return_when=FIRST_COMPLETED).done:
-            item, error = running.pop(future), future.exception()
-            if isinstance(error, workers.death):
+            item, raised = running.pop(future), future.exception()
+            if isinstance(raised, workers.death):
                 died.append(item)
             else:
-                yield item, future.result() if error is None else error
+                yield item, future.result() if raised is None else raised
     return died

@@ -3,8 +3,8 @@
     uv run python tests/benchmarks/fleet_solve.py [--runs 10000] [--workers N] [--dask]
 
 Prints one row per figure: name, figure, target, pass or FAIL. The exit code is the number of rows that failed. The run
-folders are copies of few distinct tours of 24 poses. Free cores are those that nothing else used in the three seconds
-before a pass.
+folders are copies of few distinct tours of 24 poses. Free cores are those that nothing else used during the pass, but
+not more than workers.
 `--dask` repeats it on a scheduler and as many workers of one thread, as processes on this computer.
 """
 
@@ -41,6 +41,8 @@ class Pass:
     """All runs solved once."""
 
     wall_s: float
+    free_cores: float
+    """Those that no other program used on average."""
     memory_MB: list[float]
     """Of this process, each second."""
     wrong: int
@@ -71,12 +73,12 @@ def main() -> int:
                 cluster.start_worker()
             engines[f"Dask, {options.workers} workers"] = lambda: cluster_workers(cluster.address)
         for words, engine in engines.items():
-            free = options.workers - psutil.cpu_percent(interval=3) / 100 * (os.cpu_count() or 1)
             for killed in (False, True):
                 found = measure(runs, engine, expected, kill=killed)
                 speed_up = serial_s * len(runs) / found.wall_s
                 what = f"{words}, one killed" if killed else words
                 if not killed:
+                    free = min(found.free_cores, options.workers)
                     share = speed_up / free
                     failed += row(f"{what}: speed-up {speed_up:.2f} over {free:.2f} free cores", share, SPEED_UP, 1)
                 else:
@@ -108,21 +110,30 @@ def measure(
 ) -> Pass:
     """Solve all runs, kill a worker half way if wanted, and take the results away."""
     with watched_memory() as memory_MB:
-        start_s = perf_counter()
+        start_s, start_others_s = perf_counter(), others_s()
         with engine() as workers:
             for number, (_, found) in enumerate(solve_again(runs, workers), 1):
                 if isinstance(found, str):
                     say(found)
                 if kill and number == len(runs) // 2:
                     kill_busiest_worker()
-        wall_s = perf_counter() - start_s
+            wall_s = perf_counter() - start_s
+            free_cores = (os.cpu_count() or 1) - (others_s() - start_others_s) / wall_s
     wrong = 0
     for i, run in enumerate(runs):
         path = solved_path(run)
         right = expected[i % DISTINCT].replace(runs[i % DISTINCT].name, run.name)
         wrong += not (path.exists() and path.read_text() == right)
         path.unlink(missing_ok=True)
-    return Pass(wall_s, memory_MB, wrong)
+    return Pass(wall_s, free_cores, memory_MB, wrong)
+
+
+def others_s() -> float:
+    """Return the computing time of all programs but this one and the processes below it."""
+    all_s = psutil.cpu_times()
+    this = psutil.Process()
+    ours = [one.cpu_times() for one in (this, *this.children(recursive=True))]
+    return float(all_s.user + all_s.nice + all_s.system - sum(one.user + one.system for one in ours))
 
 
 @contextmanager

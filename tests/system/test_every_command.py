@@ -44,8 +44,9 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
 }
 """What a command cannot do without; any other must work with --simulate and --json alone."""
 
-OFFLINE = ("convert", "compensate", "history", "diff", "export formats")
-"""They know no cell."""
+FLEET = tuple(name for name in names(cli) if name.startswith("fleet "))
+OFFLINE = ("convert", "compensate", "history", "diff", "export formats", *FLEET)
+"""They know no cell, or many."""
 
 REHEARSED = ("bundle", "replay", "report", "solve", "export calibration")
 """They calibrate an emulated cell first, as do live, push (test_push.py) and demo (test_demo.py)."""

@@ -18,36 +18,19 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-
-class Since(click.ParamType):
-    """A time in the past: an age such as 90d or 12h, or a date."""
-
-    name = "time"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> datetime:
-        """Return the time, UTC."""
-        if isinstance(value, datetime):
-            return value
-        try:
-            if found := re.fullmatch(r"(\d+)([dh])", value):
-                number, unit = int(found[1]), found[2]
-                return datetime.now(UTC) - (timedelta(days=number) if unit == "d" else timedelta(hours=number))
-            time = datetime.fromisoformat(value)
-        except (ValueError, OverflowError):
-            self.fail(f"'{value}' is neither an age such as 90d or 12h nor a date such as 2026-08-31.", param, ctx)
-        return time if time.tzinfo else time.replace(tzinfo=UTC)
+_UNITS = {"d": timedelta(days=1), "h": timedelta(hours=1)}
 
 
 @click.command()
 @click.argument("folders", metavar="[RUNS]...", nargs=-1, type=FOLDER)
-@click.option("--since", metavar="TIME", type=Since(), help="Only runs since then: 90d, 12h or a date (UTC).")
+@click.option("--since", metavar="TIME", help="Only runs since then: 90d, 12h or a date (UTC).")
 @click.option("--workers", metavar="N", type=click.IntRange(min=1), help="Processes.  [default: one per core]")
 @click.option("--cluster", metavar="dask://HOST:PORT", help="Solve on this Dask cluster instead.")
 @click.option("--store", metavar="URL", help="Store that knows the runs, instead of [store] url.")
 @JSON
 def solve(
     folders: Sequence[Path],
-    since: datetime | None,
+    since: str | None,
     workers: int | None,
     cluster: str | None,
     store: str | None,
@@ -71,7 +54,7 @@ def solve(
     ):
         if both:
             raise ConfigError(f"{first} and {second} exclude one another: leave one out")
-    runs = _runs(folders, store, since)
+    runs = _runs(folders, store, None if since is None else _time(since))
     report = _Report(runs=len(runs), solved_before=sum(solved_path(run).exists() for run in runs))
     with local_workers(workers) if cluster is None else cluster_workers(cluster) as pool:
         for run, found in _with_progress(solve_again(runs, pool), len(runs)):
@@ -82,6 +65,21 @@ def solve(
         report.print()
     if report.failed:
         raise NotAccepted(f"{len(report.failed)} of {len(runs)} runs could not be solved: fix the reasons, and repeat")
+
+
+def _time(since: str) -> datetime:
+    """Return the time, UTC, of an age such as 90d or of a date; raises `ConfigError`."""
+    from ftdrive.errors import ConfigError
+
+    try:
+        if age := re.fullmatch(r"(\d+)([dh])", since):
+            return datetime.now(UTC) - int(age[1]) * _UNITS[age[2]]
+        time = datetime.fromisoformat(since)
+    except (ValueError, OverflowError):
+        raise ConfigError(
+            f"--since is '{since}': give an age such as 90d or 12h, or a date such as 2026-08-31"
+        ) from None
+    return time if time.tzinfo else time.replace(tzinfo=UTC)
 
 
 def _runs(folders: Sequence[Path], store: str | None, since: datetime | None) -> list[Path]:

@@ -109,7 +109,7 @@ def test_an_address_of_another_form_is_refused_without_connecting(address: str) 
 @pytest.mark.parametrize(("name", "other", "words"), [("ftdrive", None, r"\(none\)"), ("numpy", "1.0", r"1\.0")])
 def test_a_worker_of_another_version_is_refused(name: str, other: str | None, words: str) -> None:
     ours = dict.fromkeys(SAME, "9.9")
-    found = {
+    found: dict[str, Any] = {
         "client": {"packages": ours},
         "workers": {"tcp://a:1": {"packages": ours}, "tcp://b:2": {"packages": {**ours, name: other}}},
     }
