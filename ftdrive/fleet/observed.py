@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.model import Array
 from ftdrive.fleet.cells import Owners
-from ftdrive.store.records import StoredCell, StoredResult, StoredVerification
+from ftdrive.store.records import Check, StoredCell, StoredResult, StoredVerification
 from ftdrive.store.store import Store
 
 WINDOW: Final = timedelta(days=90)
@@ -46,8 +46,8 @@ class Observed:
     cells: tuple[StoredCell, ...]
     results: Mapping[str, Sequence[StoredResult]]
     """The newest accepted results of each tool, by cell, the oldest first."""
-    checks: Mapping[str, Sequence[StoredVerification]]
-    """Verifications with a time, by calibration, the oldest first; none without, or older than `WINDOW`."""
+    checks: Mapping[str, Sequence[Check]]
+    """Verifications by calibration, the oldest first; none without a time, or older than `WINDOW`."""
     changes: Mapping[str, BiasChanges]
     """By calibration, where its verifications have them."""
     now: datetime
@@ -61,10 +61,9 @@ class Observed:
         for one in store.newest_accepted(NEWEST):
             if (name := owners.cell_of(one)) is not None:
                 results[name].append(one)
-        checks = dict[str, list[StoredVerification]]()
-        for check in store.verifications(since=now - WINDOW):
-            if check.created_utc is not None:
-                checks.setdefault(check.calibration_id, []).append(check)
+        checks = dict[str, list[Check]]()
+        for check in store.checks(now - WINDOW):
+            checks.setdefault(check.calibration_id, []).append(check)
         known = [one for found in results.values() for one in found if one.id in checks]
         changes = {one.id: found for one in known if (found := _changes(one, checks[one.id])) is not None}
         return cls(cells, results, checks, changes, now)
@@ -88,28 +87,24 @@ class Observed:
         return when(result) < self.now - WINDOW
 
 
-def _changes(result: StoredResult, checks: Sequence[StoredVerification]) -> BiasChanges | None:
+def _changes(result: StoredResult, checks: Sequence[Check]) -> BiasChanges | None:
     """Return how the bias has changed since a calibration; None if no verification has this.
 
     A verification counts if it passed, or found that the bias has changed: another change, or a hand on the tool,
     spoils the estimate.
     """
-    start = when(result)
-    rows = [
-        (when(one), one.bias_change, one.bias_change_sigma, one.calibration_sigma, one.temperature_C)
-        for one in checks
-        if (one.passed or one.change == "bias")
-        and (one.bias_change and one.bias_change_sigma and one.calibration_sigma)
-        and min(one.bias_change_sigma) > 0
-    ]
-    if not rows:
+    used = [one for one in checks if (one.passed or one.change == "bias") and None not in one.bias]
+    bias = np.array([one.bias for one in used], dtype=np.float64).reshape(-1, 18)
+    measured = bias[:, 6:12].min(axis=1, initial=np.inf) > 0
+    if not measured.any():
         return None
-    times, change, sigma, common, temperature = zip(*rows, strict=True)
-    days = np.array([(time - start).total_seconds() for time in times]) / 86400
-    known = np.array([np.nan if one is None else one for one in temperature])
-    return BiasChanges(days, np.array(change), np.array(sigma), np.median(np.array(common), axis=0), known)
+    start = when(result)
+    days = np.array([(when(one) - start).total_seconds() for one in used]) / 86400
+    known = np.array([one.temperature_C for one in used], dtype=np.float64)  # None becomes nan
+    change, sigma, common = np.split(bias[measured], 3, axis=1)
+    return BiasChanges(days[measured], change, sigma, np.median(common, axis=0), known[measured])
 
 
-def when(one: StoredResult | StoredVerification) -> datetime:
+def when(one: StoredResult | StoredVerification | Check) -> datetime:
     """Return the time of a record that has one."""
     return datetime.fromisoformat(str(one.created_utc))

@@ -11,6 +11,7 @@ from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete
 from ftdrive.store import tables
 from ftdrive.store.database import Database
 from ftdrive.store.records import (
+    Check,
     Record,
     StoredCell,
     StoredResult,
@@ -137,9 +138,9 @@ class Store:
 
     # -------------------------------------------------------------------------------------------------------- reading
 
-    def results(self, tool: str | None = None, *, since: datetime | None = None) -> list[StoredResult]:
-        """Return all results, the oldest first; only those of a tool, or made at a time or later, if it is given."""
-        query = _oldest_first(tables.results, since)
+    def results(self, tool: str | None = None) -> list[StoredResult]:
+        """Return all results, or those of a tool, the oldest first."""
+        query = _oldest_first(tables.results)
         if tool is not None:
             query = query.where(tables.results.c.tool == tool)
         return self._read(query, tables.to_result)
@@ -154,21 +155,25 @@ class Store:
         )
         found = ranked.subquery()
         newest = select(found.c.id).where(found.c.rank <= most)
-        return self._read(_oldest_first(table, None).where(table.c.id.in_(newest)), tables.to_result)
+        return self._read(_oldest_first(table).where(table.c.id.in_(newest)), tables.to_result)
 
     def find(self, start: str) -> list[StoredResult]:
         """Return the results whose id begins so."""
         query = select(tables.results).where(tables.results.c.id.startswith(start, autoescape=True))
         return self._read(query, tables.to_result)
 
-    def verifications(
-        self, calibration_id: str | None = None, *, since: datetime | None = None
-    ) -> list[StoredVerification]:
-        """Return all verifications, the oldest first; only those of a calibration, or made at a time or later."""
-        query = _oldest_first(tables.verifications, since)
+    def verifications(self, calibration_id: str | None = None) -> list[StoredVerification]:
+        """Return all verifications, or those of a calibration, the oldest first."""
+        query = _oldest_first(tables.verifications)
         if calibration_id is not None:
             query = query.where(tables.verifications.c.calibration_id == calibration_id)
         return self._read(query, tables.to_verification)
+
+    def checks(self, since: datetime) -> list[Check]:
+        """Return the verifications made at a time or later, the oldest first, in the part that a fleet needs."""
+        start = since.astimezone(UTC).isoformat(timespec="microseconds")
+        query = _oldest_first(tables.verifications).where(tables.verifications.c.created_utc >= start)
+        return self._read(query.with_only_columns(*tables.CHECK), tables.to_check)
 
     def last_verification(self, calibration_id: str) -> StoredVerification | None:
         """Return the newest verification of a calibration, if there is one."""
@@ -200,8 +205,5 @@ def _paths_where(connection: Connection, table: Table, column: Column[Any], valu
         yield from connection.scalars(select(table.c.path).where(column.in_(values[start : start + _MOST])))
 
 
-def _oldest_first(table: Table, since: datetime | None) -> Select[Any]:
-    query = select(table).order_by(table.c.created_utc.nulls_first(), table.c.id)
-    if since is None:
-        return query
-    return query.where(table.c.created_utc >= since.astimezone(UTC).isoformat(timespec="microseconds"))
+def _oldest_first(table: Table) -> Select[Any]:
+    return select(table).order_by(table.c.created_utc.nulls_first(), table.c.id)

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from sqlalchemy import JSON, Boolean, Column, Float, Integer, MetaData, Row, String, Table
 
-from ftdrive.store.records import Record, StoredCell, StoredResult, StoredVerification
+from ftdrive.store.records import Check, Record, StoredCell, StoredResult, StoredVerification
 
 SCHEMA: Final = 2
 """Version of the tables, kept in the database."""
@@ -61,6 +61,11 @@ cells: Final = Table(
 )
 RECORDS: Final[Mapping[type[Record], Table]] = {StoredResult: results, StoredVerification: verifications}
 
+CHECK: Final = [
+    *(verifications.c[name] for name in Check._fields[:-1]),
+    *(verifications.c[f"{name}_{axis}"] for name in _WRENCHES for axis in _WRENCH),
+]
+"""Columns of a check."""
 _SINGLE = tuple(column.name for column in verifications.columns if not column.name.endswith(_WRENCH))
 
 
@@ -91,6 +96,11 @@ def to_verification(row: Row[Any]) -> StoredVerification:
         bias_change_sigma=_wrench(row[-12:-6]),
         calibration_sigma=_wrench(row[-6:]),
     )
+
+
+def to_check(row: Row[Any]) -> Check:
+    """Return a row with the columns `CHECK` as a check."""
+    return Check(*row[:5], row[5:])
 
 
 def _wrench(values: Sequence[Any]) -> list[float] | None:

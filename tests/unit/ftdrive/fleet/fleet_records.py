@@ -12,7 +12,7 @@ from calib.model import Array
 from ftdrive.fleet.observed import Observed
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
-from ftdrive.store.records import StoredCell, StoredResult, StoredVerification
+from ftdrive.store.records import Check, StoredCell, StoredResult, StoredVerification
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.live.simulated import calibrated
 
@@ -88,6 +88,12 @@ def time(days_ago: float) -> str:
     return (NOW - timedelta(days=days_ago)).isoformat(timespec="microseconds")
 
 
+def _check(one: StoredVerification) -> Check:
+    bias = [one.bias_change, one.bias_change_sigma, one.calibration_sigma]
+    values = tuple(value for part in bias for value in part or [None] * 6)
+    return Check(one.calibration_id, one.created_utc or "", one.passed, one.change, one.temperature_C, values)
+
+
 @dataclass
 class FakeStore:
     """The reading half of a store."""
@@ -110,10 +116,10 @@ class FakeStore:
                 kept.append(one)
         return kept[::-1]
 
-    def verifications(self, *, since: datetime) -> list[StoredVerification]:
+    def checks(self, since: datetime) -> list[Check]:
         start = since.isoformat(timespec="microseconds")
         found = [one for one in self.kept_checks if one.created_utc is not None and one.created_utc >= start]
-        return sorted(found, key=lambda one: (one.created_utc or "", one.id))
+        return [_check(one) for one in sorted(found, key=lambda one: (one.created_utc or "", one.id))]
 
     def last_verification(self, calibration_id: str) -> StoredVerification | None:
         found = [one for one in self.kept_checks if one.calibration_id == calibration_id]
