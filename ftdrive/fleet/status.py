@@ -10,7 +10,7 @@ from ftdrive.fleet.findings import findings
 from ftdrive.fleet.observed import BiasChanges, Observed, when
 from ftdrive.fleet.state import CellState, Drift, Fleet
 from ftdrive.report.words import rounded
-from ftdrive.store.records import StoredCell, StoredResult
+from ftdrive.store.records import Check, StoredCell, StoredResult, StoredVerification
 from ftdrive.store.store import Store
 
 LEVEL_DAYS: Final = 7.0
@@ -61,7 +61,7 @@ def drift_of(changes: BiasChanges | None, start: datetime) -> Drift | None:
 
 def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: Store) -> CellState:
     calibrated = when(result)
-    check = next(reversed(observed.checks.get(result.id, ())), None)
+    check: Check | StoredVerification | None = next(reversed(observed.checks.get(result.id, ())), None)
     if check is None and observed.is_cut(result):
         check = store.last_verification(result.id)
     verified = None if check is None or check.created_utc is None else when(check)

@@ -98,9 +98,10 @@ def to_verification(row: Row[Any]) -> StoredVerification:
     )
 
 
-def to_check(row: Row[Any]) -> Check:
+def to_check(row: Sequence[Any]) -> Check:
     """Return a row with the columns `CHECK` as a check."""
-    return Check(*row[:5], row[5:])
+    calibration_id, created_utc, passed, change, temperature_C, *bias = row
+    return Check(calibration_id, created_utc, passed, change, temperature_C, tuple(bias))
 
 
 def _wrench(values: Sequence[Any]) -> list[float] | None:

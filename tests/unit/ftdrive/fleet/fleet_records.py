@@ -89,8 +89,9 @@ def time(days_ago: float) -> str:
 
 
 def _check(one: StoredVerification) -> Check:
-    bias = [one.bias_change, one.bias_change_sigma, one.calibration_sigma]
-    values = tuple(value for part in bias for value in part or [None] * 6)
+    nothing: list[float | None] = [None] * 6
+    bias = (one.bias_change or nothing, one.bias_change_sigma or nothing, one.calibration_sigma or nothing)
+    values = tuple(value for part in bias for value in part)
     return Check(one.calibration_id, one.created_utc or "", one.passed, one.change, one.temperature_C, values)
 
 
