@@ -1,6 +1,5 @@
 """`ftdrive history`: results and verifications of the store, with trends and warnings."""
 
-import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -101,17 +100,13 @@ def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime)
 
 
 def _print_table(rows: Sequence[Sequence[str]]) -> None:
-    """Print the table; a narrow terminal breaks the last columns, a file or pipe has one line a row."""
-    from rich.console import Console
-    from rich.table import Table
+    """Print the columns that every table has, and those that a result has."""
+    from ftdrive.terminal.table import print_table
 
     shown = [n for n, title in enumerate(_TITLES) if title not in _OPTIONAL or any(row[n] for row in rows)]
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    for n in shown:
-        table.add_column(_TITLES[n], no_wrap=_TITLES[n] not in {"tool", "verified", "parent"}, overflow="fold")
-    for row in rows:
-        table.add_row(*(row[n] for n in shown))
-    Console(width=None if sys.stdout.isatty() else 300, highlight=False, markup=False).print(table)
+    print_table(
+        [_TITLES[n] for n in shown], [[row[n] for n in shown] for row in rows], folding={"tool", "verified", "parent"}
+    )
 
 
 def _as_json(one: "StoredResult", check: "StoredVerification | None", now: datetime) -> dict[str, Any]:

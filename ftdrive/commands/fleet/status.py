@@ -1,7 +1,6 @@
 """`ftdrive fleet status`: what is due, what drifts, and what several cells show together."""
 
 import gc
-import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -51,24 +50,12 @@ def status(store: str | None, page_path: Path | None, as_json: bool) -> None:
         talk.print("No cells. `ftdrive fleet add cells.toml` adds them.")
     elif page_path is None:
         from ftdrive.fleet.words import attention, summary
+        from ftdrive.terminal.table import print_table
 
-        _print_table(fleet, now)
+        print_table(_TITLES, [_row(one, now) for one in fleet.cells], folding={"cell", "tool"})
         talk.print(summary(fleet, now), style="bold")
         for words in attention(fleet, now):
             talk.print(hanging(" ! ", words), style="yellow")
-
-
-def _print_table(fleet: "Fleet", now: datetime) -> None:
-    """Print the table; a narrow terminal folds long names, a file or pipe has one line a row."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    for title in _TITLES:
-        table.add_column(title, no_wrap=title not in {"cell", "tool"}, overflow="fold")
-    for one in fleet.cells:
-        table.add_row(*_row(one, now))
-    Console(width=None if sys.stdout.isatty() else 300, highlight=False, markup=False).print(table)
 
 
 def _row(one: "CellState", now: datetime) -> tuple[str, ...]:

@@ -1,0 +1,41 @@
+"""A table on stdout: one line a row where it fits, long texts folded where the terminal is narrow."""
+
+import shutil
+import sys
+from collections.abc import Collection, Sequence
+
+import click
+
+GAP = "  "
+
+
+def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], folding: Collection[str]) -> None:
+    """Print a table; a file or pipe has one line a row, and so has a terminal that is wide enough.
+
+    Parameters
+    ----------
+    titles : sequence of str
+        Of the columns.
+    rows : sequence of sequences of str
+    folding : collection of str
+        Titles of the columns whose texts may be folded.
+    """
+    widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
+    width = sum(widths) + len(GAP) * (len(widths) - 1)
+    if not sys.stdout.isatty() or width <= shutil.get_terminal_size().columns:
+        head, *lines = (_line(row, widths) for row in (titles, *rows))
+        click.echo("\n".join([click.style(head, bold=True), *lines]))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, padding=(0, len(GAP), 0, 0), header_style="bold")
+    for title in titles:
+        table.add_column(title, no_wrap=title not in folding, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    Console(highlight=False, markup=False).print(table)
+
+
+def _line(row: Sequence[str], widths: Sequence[int]) -> str:
+    return GAP.join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()

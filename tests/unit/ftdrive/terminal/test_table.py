@@ -1,0 +1,32 @@
+"""A table in wide and narrow terminals, and in a pipe."""
+
+import pytest
+
+from ftdrive.terminal.table import print_table
+
+TITLES = ("cell", "tool", "due")
+ROWS = [("press-4", "a gripper with a long name", "now"), ("b", "", "in 5 d")]
+
+
+def printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int | None) -> list[str]:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: columns is not None)
+    monkeypatch.setenv("COLUMNS", str(columns or 10))
+    monkeypatch.setenv("NO_COLOR", "1")
+    print_table(TITLES, ROWS, folding={"tool"})
+    return capsys.readouterr().out.splitlines()
+
+
+@pytest.mark.parametrize("columns", [None, 80])
+def test_a_row_is_one_line_where_it_fits_and_in_a_pipe(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int | None
+) -> None:
+    head, *lines = printed(capsys, monkeypatch, columns)
+    assert head.removeprefix("\x1b[1m").startswith("cell     tool                        due")
+    assert lines == ["press-4  a gripper with a long name  now", "b                                    in 5 d"]
+
+
+def test_a_narrow_terminal_folds_only_what_may_be_folded(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, *lines = (line.rstrip() for line in printed(capsys, monkeypatch, 30))
+    assert lines == ["press-4  a gripper      now", "         with a long", "         name", "b                       in 5 d"]
