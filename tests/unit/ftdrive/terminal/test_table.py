@@ -29,4 +29,9 @@ def test_a_narrow_terminal_folds_only_what_may_be_folded(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, *lines = (line.rstrip() for line in printed(capsys, monkeypatch, 30))
-    assert lines == ["press-4  a gripper      now", "         with a long", "         name", "b                       in 5 d"]
+    assert lines == [
+        "press-4  a gripper      now",
+        "         with a long",
+        "         name",
+        "b                       in 5 d",
+    ]
