@@ -10,6 +10,7 @@
 A run belongs to a cell by the serial number of its arm if the cell has one, else by the address of its controller.
 """
 
+import os
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -23,6 +24,7 @@ from ftdrive.store.records import StoredCell, StoredResult
 FORMAT: Final = "ftdrive.cells/1"
 _NAME = re.compile(r"[\w.-]{1,40}")
 _KEYS = ("config", "verify_every_days", "arm_serial")
+_OF_ONE_CELL = tuple(f"FTDRIVE_{section}_" for section in ("ROBOT", "SENSOR", "TOOL", "WORKCELL"))
 MOST_DAYS: Final = 3650.0
 
 
@@ -33,10 +35,11 @@ def read_cells(path: Path) -> list[StoredCell]:
     ------
     ConfigError
         With file, cell, key and what to do: no TOML, another format, an unknown key, a configuration that cannot be
-        read or has no address of a controller.
+        read or has no address of a controller, a variable of the environment that would replace it.
     OSError
         The file cannot be read.
     """
+    refuse_variables()
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -50,6 +53,12 @@ def read_cells(path: Path) -> list[StoredCell]:
         what = f"the key {unknown[0]} is unknown" if unknown else "no cell is listed"
         raise ConfigError(f"{path}: {what}: write a table [cells.NAME] for each cell")
     return [_cell(path, name, table) for name, table in cells.items()]
+
+
+def refuse_variables() -> None:
+    """Raise `ConfigError` if a variable of the environment would replace a value of every cell."""
+    if found := sorted(name for name in os.environ if name.startswith(_OF_ONE_CELL)):
+        raise ConfigError(f"{found[0]} is set and would replace a value of every cell: unset it")
 
 
 def refuse_ambiguous(cells: Iterable[StoredCell]) -> None:

@@ -16,6 +16,11 @@ def listed(names: Sequence[str]) -> str:
     return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"
 
 
+def counted(number: int, noun: str) -> str:
+    """Write a number with its noun, such as "1 result" or "2 results"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def due_in_words(due: datetime | None, now: datetime) -> str:
     """Write when a verification is due, such as "in 5 d", "now" or "3 d ago"."""
     if due is None:
@@ -43,7 +48,7 @@ def summary(fleet: Fleet, now: datetime) -> str:
         "due": sum(one.is_due(now) and one.calibration_id is not None for one in tools),
     }
     found = ", ".join(f"{number} {what}" for what, number in counts.items() if number)
-    return f"{len(cells)} {'cell' if len(cells) == 1 else 'cells'}: {found or 'none needs attention'}"
+    return f"{counted(len(cells), 'cell')}: {found or 'none needs attention'}"
 
 
 def attention(fleet: Fleet, now: datetime) -> list[str]:

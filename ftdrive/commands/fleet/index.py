@@ -14,8 +14,10 @@ from ftdrive.commands.common import FOLDER, store_url, upgrade_store
 def index(folders: Sequence[Path], store: str | None) -> None:
     """Add the runs in the folders RUNS to the store. A run that is known is not read again.
 
-    A store of an earlier version is upgraded first.
+    A store of an earlier version is upgraded first. If cells were added, arms that belong to none of them are listed.
     """
+    from ftdrive.fleet.cells import Owners
+    from ftdrive.fleet.words import counted, listed
     from ftdrive.store.store import Store
     from ftdrive.terminal.console import hanging, talk
 
@@ -24,4 +26,14 @@ def index(folders: Sequence[Path], store: str | None) -> None:
     indexed = found.index(*folders)
     for words in indexed.unreadable:
         talk.print(hanging(" left out: ", words))
-    talk.print(f" {indexed.results} results and {indexed.verifications} verifications added to {found.name}")
+    added = f"{counted(indexed.results, 'result')} and {counted(indexed.verifications, 'verification')}"
+    talk.print(f" {added} added to {found.name}")
+    if cells := found.cells():
+        owners = Owners(cells)
+        strange = {one.arm_serial or one.robot_host or "?" for one in found.results() if owners.cell_of(one) is None}
+        if strange:
+            arms, them = ("arm", "it") if len(strange) == 1 else ("arms", "them")
+            words = (
+                f"no cell has the {arms} {listed(sorted(strange))}: add {them} to cells.toml, then `ftdrive fleet add`"
+            )
+            talk.print(hanging(" ! ", words), style="yellow")

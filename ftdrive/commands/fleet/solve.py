@@ -36,11 +36,12 @@ def solve(
     store: str | None,
     as_json: bool,
 ) -> None:
-    """Solve runs again with this version, and compare the results with the calibrations of the runs.
+    """Solve runs again with this version, and compare.
 
-    RUNS are run folders or folders of runs, by default all runs that the store knows. Verifications are left out. Each
-    result is written into its run folder as solved-VERSION.json, and no other command uses it. A run that has this file
-    is only compared, so an interrupted command continues when it is repeated.
+    The results are compared with the calibrations of the runs. RUNS are run folders or folders of runs, by default all
+    runs that the store knows. Verifications are left out. Each result is written into its run folder as
+    solved-VERSION.json, and no other command uses it. A run that has this file is only compared, so an interrupted
+    command continues when it is repeated.
 
     The exit code is 7 if a run could not be solved.
     """

@@ -21,7 +21,7 @@ _TITLES = ("cell", "tool", "verdict", "age", "verified", "drift, σ", "due")
 @click.option("--html", "page_path", metavar="FILE", type=NewFile(), help="New file: a page with plots of the drift.")
 @JSON
 def status(store: str | None, page_path: Path | None, as_json: bool) -> None:
-    """List all cells: what is due, what drifts, what several show together.
+    """List all cells: what is due, and what drifts.
 
     The columns are the age of the calibration, that of the last verification, the drift of the bias in sigmas of a
     verification, and when the next one is due. A cell has one line for each tool in use. Below the list is what needs

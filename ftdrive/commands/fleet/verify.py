@@ -1,6 +1,5 @@
 """`ftdrive fleet verify`: one cell after the other, each with an operator at it."""
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from ftdrive.store.records import StoredCell
     from ftdrive.store.store import Store
 
-_OF_ONE_CELL = tuple(f"FTDRIVE_{section}_" for section in ("ROBOT", "SENSOR", "TOOL", "WORKCELL"))
-
 
 @click.command()
 @click.argument("names", metavar="[CELL]...", nargs=-1)
@@ -35,10 +32,12 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
     skips the cell. No option answers these questions, and a terminal is required.
     """
     from ftdrive.errors import Declined, NotAccepted
+    from ftdrive.fleet.cells import refuse_variables
     from ftdrive.fleet.status import fleet_state
     from ftdrive.store.store import Store
 
     _require_terminal()
+    refuse_variables()
     if names and due:
         raise ConfigError("CELL and --due exclude one another: leave one of them out")
     url = url or store_url()
@@ -74,11 +73,9 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
 
 
 def _require_terminal() -> None:
-    """Raise `ConfigError` if no operator can read and answer, or if the environment describes a cell of its own."""
+    """Raise `ConfigError` if no operator can read and answer."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ConfigError("fleet verify asks at every cell and never without a terminal: run it in one, at the cells")
-    if alien := sorted(name for name in os.environ if name.startswith(_OF_ONE_CELL)):
-        raise ConfigError(f"{alien[0]} is set and would replace a value of every cell: unset it")
 
 
 def _named(cells: "Sequence[StoredCell]", names: Sequence[str]) -> "list[StoredCell]":

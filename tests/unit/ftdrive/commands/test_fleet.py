@@ -67,7 +67,7 @@ def test_from_an_empty_store_to_a_status(run: Callable[..., Ran], cells: Path, r
     assert "No cells. `ftdrive fleet add cells.toml`" in run("status")[2]
     assert run("add", cells)[::2] == (0, f"2 added, 0 replaced in {tmp_path}/data/ftdrive/store.sqlite")
     assert "0 added, 2 replaced" in run("add", cells)[2]
-    assert "1 results and 35 verifications added" in run("index", runs)[2]
+    assert run("index", runs)[2] == f"1 result and 35 verifications added to {tmp_path}/data/ftdrive/store.sqlite"
     code, out, err = run("status")
     head, lathe, press = (re.split(r"\s{2,}", line.strip()) for line in out.splitlines())
     assert (code, head) == (0, ["cell", "tool", "verdict", "age", "verified", "drift, σ", "due"])
@@ -78,6 +78,12 @@ def test_from_an_empty_store_to_a_status(run: Callable[..., Ran], cells: Path, r
     assert "2 cells: 1 never calibrated, 1 drifting" in err
     assert "! press, gripper: force bias y drifts by 0.0" in err
     assert max(cell_len(line.rstrip()) for line in out.splitlines()) <= 80
+
+
+def test_an_arm_that_belongs_to_no_cell_is_mentioned(run: Callable[..., Ran], cells: Path, runs: Path) -> None:
+    run("add", cells)
+    new_run(runs, "stray", result(DAY, serials=("arm-9", "ft-9")))
+    assert "no cell has the arm arm-9: add it to cells.toml" in run("index", runs)[2]
 
 
 def test_the_json_has_all_of_it(run: Callable[..., Ran], cells: Path, runs: Path) -> None:

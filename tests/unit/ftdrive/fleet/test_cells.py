@@ -44,6 +44,14 @@ def test_a_cell_has_what_its_configuration_says(folder: Path, monkeypatch: pytes
     assert (lab.arm_serial, lab.verify_every_days, lab.sensor_url) == ("222", 0.5, "ati-can://can0")
 
 
+def test_a_variable_that_would_be_the_same_in_all_cells_is_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FTDRIVE_ROBOT_HOST", "10.0.0.9")
+    with pytest.raises(ConfigError, match="FTDRIVE_ROBOT_HOST is set and would replace a value of every cell"):
+        read_cells(written(folder, _CELL))
+
+
 _CELL = '[cells.a]\nconfig = "b.toml"\nverify_every_days = 7\n'
 
 
