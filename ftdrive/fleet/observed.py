@@ -55,18 +55,18 @@ class Observed:
     @classmethod
     def read(cls, store: Store, now: datetime) -> Self:
         """Read the store; raises `BadStore`."""
-        cells = tuple(store.cells())
+        cells, newest, recent = store.fleet(NEWEST, now - WINDOW)
         owners = Owners(cells)
         results: dict[str, list[StoredResult]] = {cell.name: [] for cell in cells}
-        for one in store.newest_accepted(NEWEST):
+        for one in newest:
             if (name := owners.cell_of(one)) is not None:
                 results[name].append(one)
         checks = dict[str, list[Check]]()
-        for check in store.checks(now - WINDOW):
+        for check in recent:
             checks.setdefault(check.calibration_id, []).append(check)
         known = [one for found in results.values() for one in found if one.id in checks]
         changes = {one.id: found for one in known if (found := _changes(one, checks[one.id])) is not None}
-        return cls(cells, results, checks, changes, now)
+        return cls(tuple(cells), results, checks, changes, now)
 
     def newest(self, cell: StoredCell) -> Iterator[StoredResult]:
         """Yield the newest result of each tool in use, in the order of their names.

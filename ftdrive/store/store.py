@@ -145,18 +145,6 @@ class Store:
             query = query.where(tables.results.c.tool == tool)
         return self._read(query, tables.to_result)
 
-    def newest_accepted(self, most: int) -> list[StoredResult]:
-        """Return the newest results of each tool on each arm that are not rejected, the oldest first."""
-        table = tables.results
-        one = (table.c.arm_serial, table.c.robot_host, table.c.tool)
-        rank = func.row_number().over(partition_by=one, order_by=(table.c.created_utc.desc(), table.c.id.desc()))
-        ranked = select(table.c.id, rank.label("rank")).where(
-            table.c.verdict != "rejected", table.c.created_utc.is_not(None)
-        )
-        found = ranked.subquery()
-        newest = select(found.c.id).where(found.c.rank <= most)
-        return self._read(_oldest_first(table).where(table.c.id.in_(newest)), tables.to_result)
-
     def find(self, start: str) -> list[StoredResult]:
         """Return the results whose id begins so."""
         query = select(tables.results).where(tables.results.c.id.startswith(start, autoescape=True))
@@ -169,12 +157,6 @@ class Store:
             query = query.where(tables.verifications.c.calibration_id == calibration_id)
         return self._read(query, tables.to_verification)
 
-    def checks(self, since: datetime) -> list[Check]:
-        """Return the verifications made at a time or later, the oldest first, in the part that a fleet needs."""
-        start = since.astimezone(UTC).isoformat(timespec="microseconds")
-        query = _oldest_first(tables.verifications).where(tables.verifications.c.created_utc >= start)
-        return self._read(query.with_only_columns(*tables.CHECK), tables.to_check)
-
     def last_verification(self, calibration_id: str) -> StoredVerification | None:
         """Return the newest verification of a calibration, if there is one."""
         return next(reversed(self.verifications(calibration_id)), None)
@@ -183,9 +165,31 @@ class Store:
         """Return all cells by name."""
         return sorted(self._read(select(tables.cells), tables.to_cell), key=lambda cell: cell.name)
 
+    def fleet(self, newest: int, since: datetime) -> tuple[list[StoredCell], list[StoredResult], list[Check]]:
+        """Return what a fleet needs, in one look at the database: cells, results and checks, the oldest first.
+
+        Parameters
+        ----------
+        newest : int
+            Results of each tool on each arm that are not rejected.
+        since : datetime
+            Verifications made then or later.
+        """
+        start = since.astimezone(UTC).isoformat(timespec="microseconds")
+        checks = _oldest_first(tables.verifications).where(tables.verifications.c.created_utc >= start)
+        with self._database.reading() as connection:
+            cells = _rows(connection, select(tables.cells), tables.to_cell)
+            results = _rows(connection, _newest_accepted(newest), tables.to_result)
+            found = _rows(connection, checks.with_only_columns(*tables.CHECK), tables.to_check)
+        return sorted(cells, key=lambda cell: cell.name), results, found
+
     def _read(self, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
         with self._database.reading() as connection:
-            return [] if connection is None else [make(row) for row in connection.execute(query).all()]
+            return _rows(connection, query, make)
+
+
+def _rows(connection: Connection | None, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
+    return [] if connection is None else [make(row) for row in connection.execute(query).all()]
 
 
 def _all_paths(connection: Connection) -> set[str]:
@@ -207,3 +211,14 @@ def _paths_where(connection: Connection, table: Table, column: Column[Any], valu
 
 def _oldest_first(table: Table) -> Select[Any]:
     return select(table).order_by(table.c.created_utc.nulls_first(), table.c.id)
+
+
+def _newest_accepted(most: int) -> Select[Any]:
+    table = tables.results
+    one = (table.c.arm_serial, table.c.robot_host, table.c.tool)
+    rank = func.row_number().over(partition_by=one, order_by=(table.c.created_utc.desc(), table.c.id.desc()))
+    ranked = select(table.c.id, rank.label("rank")).where(
+        table.c.verdict != "rejected", table.c.created_utc.is_not(None)
+    )
+    found = ranked.subquery()
+    return _oldest_first(table).where(table.c.id.in_(select(found.c.id).where(found.c.rank <= most)))

@@ -81,9 +81,9 @@ def measure(url: str, every: list[Record], runs: Path) -> None:
             rows = [tables.to_row(one) for one in every if isinstance(one, kind)]
             connection.execute(store._database.upsert(table), rows)
     since = NOW - timedelta(days=READ_DAYS)
-    n = len(store.checks(since))
+    n = len(store.fleet(3, since)[2])
     times = {
-        f"{n} verifications of {READ_DAYS} days": best_of(lambda: store.checks(since)),
+        f"{CELLS} cells, results, {n} verifications": best_of(lambda: store.fleet(3, since)),
         f"{CELLS} results": best_of(store.results),
         f"{CELLS} cells": best_of(store.cells),
         "index one new run": best_of(

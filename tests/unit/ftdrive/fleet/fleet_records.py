@@ -106,7 +106,10 @@ class FakeStore:
     def cells(self) -> list[StoredCell]:
         return sorted(self.kept_cells, key=lambda one: one.name)
 
-    def newest_accepted(self, most: int) -> list[StoredResult]:
+    def fleet(self, newest: int, since: datetime) -> tuple[list[StoredCell], list[StoredResult], list[Check]]:
+        return self.cells(), self._newest_accepted(newest), self._checks(since)
+
+    def _newest_accepted(self, most: int) -> list[StoredResult]:
         found = sorted(self.kept_results, key=lambda one: (one.created_utc or "", one.id), reverse=True)
         count = Counter[tuple[str | None, ...]]()
         kept = []
@@ -117,7 +120,7 @@ class FakeStore:
                 kept.append(one)
         return kept[::-1]
 
-    def checks(self, since: datetime) -> list[Check]:
+    def _checks(self, since: datetime) -> list[Check]:
         start = since.isoformat(timespec="microseconds")
         found = [one for one in self.kept_checks if one.created_utc is not None and one.created_utc >= start]
         return [_check(one) for one in sorted(found, key=lambda one: (one.created_utc or "", one.id))]

@@ -118,4 +118,4 @@ def test_a_store_gives_the_same_state_as_its_records(store_url: str) -> None:
     with store._database.writing() as connection:
         store._write(connection, [made, other, *more, *checks])
     assert fleet_state(store, NOW) == fleet(cells, [made, other, *more], checks)
-    assert [one.id for one in store.newest_accepted(2) if one.tool is None] == ["b-210", "b-200"]
+    assert [one.id for one in store.fleet(2, NOW)[1] if one.tool is None] == ["b-210", "b-200"]
