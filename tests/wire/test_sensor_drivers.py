@@ -166,15 +166,19 @@ def test_a_silent_device_is_no_device(start: Start, scheme: str) -> None:
 )
 def test_damage_is_dropped_and_counted(start: Start, scheme: str, fault: str) -> None:
     emulator = start(scheme)
+    has_no_number = fault == "drop" and scheme in {"robotous-serial", "robotiq-ft300"}  # its frames: documented
     with emulator.sensor() as sensor:
         # a sample is two frames on CAN
         emulator.faults(**{fault: {"robotous-can": 0.05, "ati-can": 0.1}.get(scheme, 0.2)})
-        samples = sensor.collect(0.35)
+        for _ in range(20):  # by chance a short record has no damage
+            samples = sensor.collect(0.35)
+            gaps = int((np.diff(samples.seq) - 1).sum())
+            if gaps or has_no_number:
+                break
         health = sensor.health()
     assert np.abs(samples.wrench - WRENCH).max() < 0.3
-    gaps = int((np.diff(samples.seq) - 1).sum())
-    if fault == "drop" and scheme in {"robotous-serial", "robotiq-ft300"}:
-        assert gaps == 0  # frames carry no number: documented
+    if has_no_number:
+        assert gaps == 0
     else:
         assert 0 < gaps <= health.lost
     # with a lost half on CAN goes all that came together with it: much, where this program is starved
