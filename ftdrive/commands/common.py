@@ -222,6 +222,16 @@ def upgrade_store(store: "Store") -> None:
         talk.print(f"The store {store.name} is upgraded from version {version}.")
 
 
+STORE = click.option("--store", "url", metavar="URL", help="Database to use, instead of [store] url.")
+
+
+def open_store(url: str | None) -> "Store":
+    """Return the store of the option --store, else that of environment and files."""
+    from ftdrive.store.store import Store
+
+    return Store(url or store_url())
+
+
 def store_url(config: Path | None = None) -> str | None:
     """Return [store] url from environment and files; None is the user's store."""
     from ftdrive.cell.config import settings

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import FOLDER, JSON, store_url, upgrade_store, write_json
+from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, upgrade_store, write_json
 
 if TYPE_CHECKING:
     from ftdrive.store.records import StoredResult, StoredVerification
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @click.option("--tool", metavar="NAME", help="Only results of this tool.")
 @click.option("--index", metavar="FOLDER", multiple=True, type=FOLDER, help="First add the runs in FOLDER. Repeatable.")
 @click.option("--rebuild", is_flag=True, help="First read all runs again, and forget those that were deleted.")
-@click.option("--store", "url", metavar="URL", help="Database to use, instead of [store] url.")
+@STORE
 @JSON
 def history(
     folders: Sequence[Path], tool: str | None, index: Sequence[Path], rebuild: bool, url: str | None, as_json: bool
@@ -33,7 +33,6 @@ def history(
     from ftdrive.errors import ConfigError
     from ftdrive.store.history import drifts, warnings
     from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
-    from ftdrive.store.store import Store
     from ftdrive.terminal.console import hanging, talk
 
     left_out: tuple[str, ...] = ()
@@ -47,7 +46,7 @@ def history(
         checks = [one for one in records if isinstance(one, StoredVerification)]
         checks.sort(key=lambda one: one.created_utc or "")
     else:
-        store = Store(url or store_url())
+        store = open_store(url)
         name = store.name
         if index or rebuild:
             upgrade_store(store)

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import click
 
-from ftdrive.commands.common import FILE, store_url
+from ftdrive.commands.common import FILE, STORE, open_store
 
 
 @click.command()
 @click.argument("file", metavar="CELLS.TOML", type=FILE)
-@click.option("--store", metavar="URL", help="Store to write, instead of [store] url.")
-def add(file: Path, store: str | None) -> None:
+@STORE
+def add(file: Path, url: str | None) -> None:
     """Add the cells of CELLS.TOML to the store.
 
     Cells of the same name are replaced. Each has a table [cells.NAME] with `config`, the path of its ftdrive.toml, and
@@ -18,10 +18,9 @@ def add(file: Path, store: str | None) -> None:
     [robot] host.
     """
     from ftdrive.fleet.cells import read_cells, refuse_ambiguous
-    from ftdrive.store.store import Store
     from ftdrive.terminal.console import talk
 
-    found = Store(store or store_url())
+    found = open_store(url)
     cells = read_cells(file)
     names = {cell.name for cell in cells}
     known = found.cells()

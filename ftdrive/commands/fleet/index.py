@@ -5,23 +5,22 @@ from pathlib import Path
 
 import click
 
-from ftdrive.commands.common import FOLDER, store_url, upgrade_store
+from ftdrive.commands.common import FOLDER, STORE, open_store, upgrade_store
 
 
 @click.command()
 @click.argument("folders", metavar="RUNS...", nargs=-1, required=True, type=FOLDER)
-@click.option("--store", metavar="URL", help="Store to write, instead of [store] url.")
-def index(folders: Sequence[Path], store: str | None) -> None:
+@STORE
+def index(folders: Sequence[Path], url: str | None) -> None:
     """Add the runs in the folders RUNS to the store. A run that is known is not read again.
 
     A store of an earlier version is upgraded first. If cells were added, arms that belong to none of them are listed.
     """
     from ftdrive.fleet.cells import Owners
     from ftdrive.fleet.words import counted, listed
-    from ftdrive.store.store import Store
     from ftdrive.terminal.console import hanging, talk
 
-    found = Store(store or store_url())
+    found = open_store(url)
     upgrade_store(found)
     indexed = found.index(*folders)
     for words in indexed.unreadable:

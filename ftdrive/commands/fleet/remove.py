@@ -4,20 +4,19 @@ from collections.abc import Sequence
 
 import click
 
-from ftdrive.commands.common import store_url
+from ftdrive.commands.common import STORE, open_store
 
 
 @click.command()
 @click.argument("names", metavar="CELL...", nargs=-1, required=True)
-@click.option("--store", metavar="URL", help="Store to write, instead of [store] url.")
-def remove(names: Sequence[str], store: str | None) -> None:
+@STORE
+def remove(names: Sequence[str], url: str | None) -> None:
     """Remove cells from the store. Their runs and results stay."""
     from ftdrive.errors import ConfigError
     from ftdrive.fleet.words import listed
-    from ftdrive.store.store import Store
     from ftdrive.terminal.console import talk
 
-    found = Store(store or store_url())
+    found = open_store(url)
     known = [cell.name for cell in found.cells()]
     if unknown := [name for name in names if name not in known]:
         instead = f"the cells are {listed(known)}" if known else "it has no cells"

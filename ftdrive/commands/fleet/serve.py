@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import host_and_port, is_loopback, store_url
+from ftdrive.commands.common import STORE, host_and_port, is_loopback, open_store
 
 if TYPE_CHECKING:
     from ftdrive.fleet.serve import Sink
@@ -35,8 +35,8 @@ MONITORING = Path(__file__).parents[2] / "fleet" / "monitoring"
     show_envvar=True,
     help="Also publish to the broker mqtt[s]://[USER:PASSWORD@]HOST[:PORT][/PREFIX].",
 )
-@click.option("--store", metavar="URL", help="Store to read, instead of [store] url.")
-def serve(address: str, broker_url: str | None, store: str | None) -> None:
+@STORE
+def serve(address: str, broker_url: str | None, url: str | None) -> None:
     """Serve the state of all cells to Prometheus and to an MQTT broker.
 
     The store is read every 60 s. If it cannot be read later, the last state stays, with its age. Alert rules and a
@@ -46,11 +46,10 @@ def serve(address: str, broker_url: str | None, store: str | None) -> None:
     from ftdrive.fleet.metrics import MetricsServer
     from ftdrive.fleet.serve import serve as serve_fleet
     from ftdrive.fleet.status import fleet_state
-    from ftdrive.store.store import Store
     from ftdrive.terminal.console import talk
 
     host, port = host_and_port("--metrics", address, f"127.0.0.1:{PORT}", lowest=0)
-    found = Store(store or store_url())
+    found = open_store(url)
     wake = Event()
     with ExitStack() as stack:
         metrics = stack.enter_context(closing(MetricsServer(host, port)))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from ftdrive import __version__
-from ftdrive.commands.common import FOLDER, JSON, store_url, write_json
+from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
 
 if TYPE_CHECKING:
     from ftdrive.fleet.resolve import Comparison
@@ -26,14 +26,14 @@ _UNITS = {"d": timedelta(days=1), "h": timedelta(hours=1)}
 @click.option("--since", metavar="TIME", help="Only runs since then: 90d, 12h or a date (UTC).")
 @click.option("--workers", metavar="N", type=click.IntRange(min=1), help="Processes.  [default: one per core]")
 @click.option("--cluster", metavar="dask://HOST:PORT", help="Solve on this Dask cluster instead.")
-@click.option("--store", metavar="URL", help="Store that knows the runs, instead of [store] url.")
+@STORE
 @JSON
 def solve(
     folders: Sequence[Path],
     since: str | None,
     workers: int | None,
     cluster: str | None,
-    store: str | None,
+    url: str | None,
     as_json: bool,
 ) -> None:
     """Solve runs again with this version, and compare.
@@ -51,11 +51,11 @@ def solve(
 
     for first, second, both in (
         ("--workers", "--cluster", workers and cluster),
-        ("RUNS", "--store", folders and store),
+        ("RUNS", "--store", folders and url),
     ):
         if both:
             raise ConfigError(f"{first} and {second} exclude one another: leave one out")
-    runs = _runs(folders, store, None if since is None else _time(since))
+    runs = _runs(folders, url, None if since is None else _time(since))
     report = _Report(runs=len(runs), solved_before=sum(solved_path(run).exists() for run in runs))
     with local_workers(workers) if cluster is None else cluster_workers(cluster) as pool:
         for run, found in _with_progress(solve_again(runs, pool), len(runs)):
@@ -83,17 +83,13 @@ def _time(since: str) -> datetime:
     return time if time.tzinfo else time.replace(tzinfo=UTC)
 
 
-def _runs(folders: Sequence[Path], store: str | None, since: datetime | None) -> list[Path]:
+def _runs(folders: Sequence[Path], url: str | None, since: datetime | None) -> list[Path]:
     """Return the calibrations to solve."""
     from ftdrive.fleet.resolve import is_calibration, run_folders
     from ftdrive.runs.run import Run
-    from ftdrive.store.store import Store
     from ftdrive.terminal.console import talk
 
-    if folders:
-        found = run_folders(folders)
-    else:
-        found = sorted({Path(one.path).parent for one in Store(store or store_url()).results()})
+    found = run_folders(folders) if folders else sorted({Path(one.path).parent for one in open_store(url).results()})
     runs, unfinished = list[Path](), 0
     for run in found:
         if is_calibration(run, since):

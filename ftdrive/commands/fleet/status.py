@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import JSON, NewFile, store_url, write_json
+from ftdrive.commands.common import JSON, STORE, NewFile, open_store, write_json
 
 if TYPE_CHECKING:
     from ftdrive.fleet.state import CellState, Fleet
@@ -17,10 +17,10 @@ _TITLES = ("cell", "tool", "verdict", "age", "verified", "drift, σ", "due")
 
 
 @click.command()
-@click.option("--store", metavar="URL", help="Store to read, instead of [store] url.")
+@STORE
 @click.option("--html", "page_path", metavar="FILE", type=NewFile(), help="New file: a page with plots of the drift.")
 @JSON
-def status(store: str | None, page_path: Path | None, as_json: bool) -> None:
+def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     """List all cells: what is due, and what drifts.
 
     The columns are the age of the calibration, that of the last verification, the drift of the bias in sigmas of a
@@ -32,11 +32,10 @@ def status(store: str | None, page_path: Path | None, as_json: bool) -> None:
     from calib.files import write_new
     from ftdrive.fleet.observed import Observed
     from ftdrive.fleet.status import fleet_of
-    from ftdrive.store.store import Store
     from ftdrive.terminal.console import hanging, talk
 
     gc.freeze()  # or the imports are searched for garbage again and again: a tenth of the time
-    found, now = Store(store or store_url()), datetime.now(UTC)
+    found, now = open_store(url), datetime.now(UTC)
     observed = Observed.read(found, now)
     fleet = fleet_of(observed, found)
     if page_path is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import read_cell, store_url
+from ftdrive.commands.common import STORE, read_cell, store_url
 from ftdrive.commands.verify import Wanted, failure_in_words, verify_cell
 from ftdrive.errors import ConfigError
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("names", metavar="[CELL]...", nargs=-1)
 @click.option("--due", is_flag=True, help="Only the cells whose verification is due.")
-@click.option("--store", "url", metavar="URL", help="Store that lists the cells, instead of [store] url.")
+@STORE
 def verify(names: Sequence[str], due: bool, url: str | None) -> None:
     """Verify cells one after the other, with an operator at each.
 
