@@ -1,6 +1,6 @@
 """What several results show together: wrong payloads, moved bases, late verifications."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Final
@@ -153,16 +153,13 @@ def _centre(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
         if one.configured_off_axis_m is not None
         and (abs(one.configured_off_axis_m - one.off_axis_m) > _either(WRONG_M, one.off_axis_sigma_m)).any()
     ]
-    if len(wrong) > 1:
-        cells = tuple(sorted(one.cell for one in wrong))
-        first = min(wrong, key=lambda one: one.cell)
-        yield Finding(
-            "payload",
-            cells,
-            f"The tool {tool} has its centre of mass {_mm(centre)} mm off the flange axis in {listed(cells)} alike. "
-            f"The payloads of their controllers amount to others, such as {_mm(first.configured_off_axis_m)} mm in "
-            f"{first.cell}: set them with `ftdrive push`",
-        )
+    yield from _wrong_payloads(
+        wrong,
+        lambda first, cells: (
+            f"The tool {tool} has its centre of mass {_mm(centre)} mm off the flange axis in {cells} alike. "
+            f"The payloads of their controllers amount to others, such as {_mm(first.configured_off_axis_m)} mm"
+        ),
+    )
 
 
 def _mass(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
@@ -174,16 +171,22 @@ def _mass(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
         alike = abs(one.mass_kg - mass_kg) <= max(ALIKE_SHARE * mass_kg, SIGMAS * one.mass_sigma_kg)
         if alike and not -margin_kg <= above_kg <= MOST_SENSOR_KG + margin_kg:
             wrong.append(one)
-    if len(wrong) > 1:
-        cells = tuple(sorted(one.cell for one in wrong))
-        first = min(wrong, key=lambda one: one.cell)
-        yield Finding(
-            "payload",
-            cells,
-            f"The tool {tool} weighs {mass_kg:.2f} kg without sensor and adapter in {listed(cells)} alike. "
-            f"The payloads of their controllers do not agree, such as {first.payload_kg:.2f} kg in {first.cell}: set "
-            "them with `ftdrive push`",
-        )
+    yield from _wrong_payloads(
+        wrong,
+        lambda first, cells: (
+            f"The tool {tool} weighs {mass_kg:.2f} kg without sensor and adapter in {cells} alike. "
+            f"The payloads of their controllers do not agree, such as {first.payload_kg:.2f} kg"
+        ),
+    )
+
+
+def _wrong_payloads(wrong: Iterable[_Load], words: Callable[[_Load, str], str]) -> Iterator[Finding]:
+    """Yield a finding of several loads; `words` takes the first of them and the names of all cells."""
+    loads = sorted(wrong, key=lambda one: one.cell)
+    if len(loads) > 1:
+        cells, first = tuple(one.cell for one in loads), loads[0]
+        fix = "set them with `ftdrive push`"
+        yield Finding("payload", cells, f"{words(first, listed(cells))} in {first.cell}: {fix}")
 
 
 def _either(least: float, sigma: Array) -> Array:
