@@ -22,25 +22,25 @@ class CellState:
     """One tool of one cell. Without any calibration the cell has one state with `tool` None."""
 
     cell: str
-    tool: str | None
-    arm_serial: str | None
-    sensor_serial: str | None
-    sensor_model: str | None
-    calibration_id: str | None
+    tool: str | None = None
+    arm_serial: str | None = None
+    sensor_serial: str | None = None
+    sensor_model: str | None = None
+    calibration_id: str | None = None
     """Of the newest accepted calibration."""
-    verdict: str | None
-    calibrated: datetime | None
+    verdict: str | None = None
+    calibrated: datetime | None = None
     """UTC."""
-    verified: datetime | None
+    verified: datetime | None = None
     """Of the last verification of that calibration, UTC."""
-    passed: bool | None
-    change: str | None
+    passed: bool | None = None
+    change: str | None = None
     """What the last verification found to have changed, such as "bias"."""
-    due: datetime | None
+    due: datetime | None = None
     """When the next verification is due, UTC; None for a cell that was never calibrated, which is due at once."""
-    mass_kg: float | None
-    temperature_C: float | None
-    drift: Drift | None
+    mass_kg: float | None = None
+    temperature_C: float | None = None
+    drift: Drift | None = None
     """None with too few verifications."""
 
     def is_due(self, now: datetime) -> bool:

@@ -34,7 +34,7 @@ def fleet_of(observed: Observed, store: Store) -> Fleet:
     states = list[CellState]()
     for cell in observed.cells:
         found = [_state(cell, one, observed, store) for one in observed.newest(cell)]
-        states += found or [_never_calibrated(cell)]
+        states += found or [CellState(cell.name, arm_serial=cell.arm_serial)]
     return Fleet(tuple(states), findings(observed, states))
 
 
@@ -82,24 +82,4 @@ def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: St
         mass_kg=result.mass_kg,
         temperature_C=next((one for one in temperatures if one is not None), None),
         drift=drift_of(observed.changes.get(result.id), calibrated),
-    )
-
-
-def _never_calibrated(cell: StoredCell) -> CellState:
-    return CellState(
-        cell=cell.name,
-        tool=None,
-        arm_serial=cell.arm_serial,
-        sensor_serial=None,
-        sensor_model=None,
-        calibration_id=None,
-        verdict=None,
-        calibrated=None,
-        verified=None,
-        passed=None,
-        change=None,
-        due=None,
-        mass_kg=None,
-        temperature_C=None,
-        drift=None,
     )
