@@ -1,15 +1,14 @@
 """The state of a fleet as one HTML page without a link to anything outside it."""
 
-import re
 from datetime import datetime
 
 import numpy as np
 
 from ftdrive import __version__
-from ftdrive.errors import ConfigError
 from ftdrive.fleet.observed import WINDOW, BiasChanges, Observed, when
 from ftdrive.fleet.state import CellState, Fleet
 from ftdrive.fleet.words import attention, due_in_words, summary, verified_in_words
+from ftdrive.report.page import templates, with_code
 from ftdrive.runs.verification import age_in_words
 
 WIDTH, HEIGHT, MARGIN = 220, 44, 3
@@ -30,23 +29,9 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
     ConfigError
         The extra `fleet` is not installed.
     """
-    try:
-        from jinja2 import Environment, PackageLoader, StrictUndefined
-        from markupsafe import Markup, escape
-    except ImportError:
-        raise ConfigError("the page of a fleet needs jinja2: pip install 'ftdrive[fleet]', or --json") from None
+    environment = templates("ftdrive.fleet", "the page of a fleet", "pip install 'ftdrive[fleet]', or --json")
+    from markupsafe import Markup
 
-    def with_code(text: str) -> Markup:
-        """Escape a sentence, and set what stands between backticks as code."""
-        return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))
-
-    environment = Environment(
-        loader=PackageLoader("ftdrive.fleet"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     environment.filters["with_code"] = with_code
     results = {one.id: one for name in observed.results for one in observed.results[name]}
     rows = []
