@@ -147,6 +147,8 @@ class Messages:
         stopping = Thread(target=self._client.loop_stop, daemon=True)  # it may be in an attempt to connect
         stopping.start()
         stopping.join(_GOODBYE_S)
+        for event in ("on_connect", "on_connect_fail", "on_disconnect", "on_message"):
+            setattr(self._client, event, None)  # else a cycle keeps the client, and with it its sockets
 
     # ------------------------------------------------------------------------------------------------ thread of paho
 

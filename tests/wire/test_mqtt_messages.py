@@ -50,6 +50,11 @@ def server_at(mosquitto: Mosquitto) -> dict[str, Any]:
     return found
 
 
+def open_sockets() -> int:
+    links = [link for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+    return sum(link.readlink().name.startswith("socket:") for link in links)
+
+
 def test_each_cell_has_a_retained_message_and_the_server_one(tmp_path: Path) -> None:
     base = Finding("base", ("A", "B"), "the base of A and B has tilted")
     gripper, drill = cell("A", drift=DRIFTING, due=NOW - timedelta(days=1)), cell("A", "drill", change="bias")
@@ -168,6 +173,24 @@ def test_the_last_will_says_that_the_server_is_gone(tmp_path: Path) -> None:
         found._client.socket().shutdown(2)  # type: ignore[union-attr]
         wait_until(lambda: not server_at(mosquitto)["online"])
         assert cells_at(mosquitto) == {"A"}
+
+
+def test_a_closed_one_leaves_no_socket_to_the_garbage_collector(tmp_path: Path) -> None:
+    def publish_once(mosquitto: Mosquitto) -> int:
+        with messages(mosquitto) as (found, _, _):
+            found.update(reading(cell("A")))
+            wait_until(lambda: found._answers)
+            return open_sockets()
+
+    gc.collect()
+    gc.disable()
+    try:
+        with Mosquitto(tmp_path) as mosquitto:
+            before = open_sockets()
+            assert publish_once(mosquitto) > before
+            assert open_sockets() == before
+    finally:
+        gc.enable()
 
 
 @pytest.mark.filterwarnings("ignore:unclosed <ssl:ResourceWarning")  # paho leaves it to the garbage collector
