@@ -176,12 +176,12 @@ class Store:
             Verifications made then or later.
         """
         start = since.astimezone(UTC).isoformat(timespec="microseconds")
-        checks = _oldest_first(tables.verifications).where(tables.verifications.c.created_utc >= start)
+        checks = select(*tables.CHECK).where(tables.verifications.c.created_utc >= start)
         with self._database.reading() as connection:
             cells = _rows(connection, select(tables.cells), tables.to_cell)
             results = _rows(connection, _newest_accepted(newest), tables.to_result)
-            found = _rows(connection, checks.with_only_columns(*tables.CHECK), tables.to_check)
-        return sorted(cells, key=lambda cell: cell.name), results, found
+            found = _rows(connection, checks, tables.to_check)
+        return sorted(cells, key=lambda cell: cell.name), results, sorted(found, key=lambda check: check.created_utc)
 
     def _read(self, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
         with self._database.reading() as connection:
