@@ -1,7 +1,7 @@
 """Calls on workers that may die; here the workers are threads, or futures that are done at once."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ import pytest
 
 from calib.errors import BadDataset
 from ftdrive.errors import ConfigError
-from ftdrive.fleet.workers import SAME, WorkerDied, Workers, _require_same_versions, answers, cluster_workers
+from ftdrive.fleet.workers import SAME, Answer, WorkerDied, Workers, _require_same_versions, answers, cluster_workers
 
 ITEMS = [Path(f"run-{number}") for number in range(40)]
 
@@ -48,39 +48,42 @@ class FragileWorkers:
         self.deaths = deaths
         self.calls = Counter[Path]()
 
-    def submit(self, function: Any, item: Path) -> "Future[bytes]":
-        self.calls[item] += 1
-        future = Future[bytes]()
-        if self.calls[item] <= self.deaths.get(item, 0):
+    def submit(self, each: Any, function: Any, calls: Sequence[tuple[Path]]) -> "Future[list[Answer]]":
+        self.calls.update(item for (item,) in calls)
+        future = Future[list[Answer]]()
+        if any(self.calls[item] <= self.deaths.get(item, 0) for (item,) in calls):
             future.set_exception(BrokenExecutor())
         else:
-            future.set_result(function(item))
+            future.set_result(each(function, calls))
         return future
 
 
-def test_a_lost_call_is_repeated_and_one_that_kills_three_workers_is_given_up() -> None:
-    killer, late, companion, *rest = ITEMS
+@pytest.mark.parametrize("group", [1, 4])
+def test_a_lost_call_is_repeated_and_one_that_kills_three_workers_is_given_up(group: int) -> None:
+    killer, late, companion, fourth, *rest = ITEMS
     fragile = FragileWorkers({killer: 99, late: 2, companion: 1})
-    found = dict(answers(name_of, own, ITEMS, Workers(2, fragile.submit, BrokenExecutor)))
+    found = dict(answers(name_of, own, ITEMS, Workers(2, fragile.submit, BrokenExecutor, group)))
     assert isinstance(found.pop(killer), WorkerDied)
     assert found == {item: name_of(item) for item in ITEMS if item != killer}
-    assert fragile.calls == {killer: 3, late: 3, companion: 2, **dict.fromkeys(rest, 1)}
+    repeated = {killer: 3, late: 3, companion: 2, fourth: 1 if group == 1 else 2}
+    assert fragile.calls == repeated | dict.fromkeys(rest, 1)
 
 
 def test_workers_that_break_while_a_call_is_submitted_lose_only_time() -> None:
     broken = iter([True, False, True])
 
-    def submit(function: Any, item: Path) -> "Future[bytes]":
+    def submit(each: Any, function: Any, calls: Any) -> "Future[list[Answer]]":
         if next(broken, False):
             raise BrokenExecutor
-        future = Future[bytes]()
-        future.set_result(function(item))
+        future = Future[list[Answer]]()
+        future.set_result(each(function, calls))
         return future
 
     assert dict(answers(name_of, own, ITEMS, Workers(1, submit, BrokenExecutor))) == {i: name_of(i) for i in ITEMS}
 
 
-def test_an_error_concerns_one_item() -> None:
+@pytest.mark.parametrize("group", [1, 4])
+def test_an_error_concerns_one_item(group: int) -> None:
     damaged, impossible, *_ = ITEMS
 
     def arguments(item: Path) -> Iterable[Path]:
@@ -94,7 +97,7 @@ def test_an_error_concerns_one_item() -> None:
         return name_of(item)
 
     with ThreadPoolExecutor(1) as threads:
-        found = dict(answers(called, arguments, ITEMS, Workers(1, threads.submit, BrokenExecutor)))
+        found = dict(answers(called, arguments, ITEMS, Workers(1, threads.submit, BrokenExecutor, group)))
     assert isinstance(found.pop(damaged), BadDataset)
     assert isinstance(found.pop(impossible), ZeroDivisionError)
     assert found == {item: name_of(item) for item in ITEMS[2:]}
