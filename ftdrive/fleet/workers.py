@@ -24,6 +24,8 @@ SAME: Final = ("ftdrive", "numpy", "scipy")
 _ONE_THREAD: Final = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
 """More threads than cores are slow, and their number can change the last digits."""
 _LOGS: Final = ("distributed", "distributed.client", "tornado.application")
+_SHORT_LOG: Final = {"distributed.admin.low-level-log-length": 10}
+"""Messages that a client keeps for developers of Dask: 1000 by default, with their datasets 130 MB."""
 _NO_ENGINE: Final = "solving many runs needs {}: pip install 'ftdrive[fleet]'"
 
 _DIED: Final = "each worker that was given it died: `ftdrive solve` may show the cause"
@@ -97,13 +99,15 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
         raise ConfigError(f"--cluster is '{address}': give the address of a Dask scheduler, such as dask://host:8786")
     try:
         import distributed
+        from dask import config
     except ModuleNotFoundError as error:
         raise ConfigError(_NO_ENGINE.format(error.name)) from None
     for name in _LOGS:
         logging.getLogger(name).setLevel(logging.CRITICAL)  # a lost cluster is one sentence, not several tracebacks
     dask: Any = distributed  # most of it has no types
     try:
-        client = dask.Client(f"tcp://{found[1]}:{found[2]}", timeout=timeout_s, set_as_default=False)
+        with config.set(_SHORT_LOG):
+            client = dask.Client(f"tcp://{found[1]}:{found[2]}", timeout=timeout_s, set_as_default=False)
     except (OSError, ValueError, MemoryError) as error:  # the answer of another server may look like a huge length
         raise Unreachable(
             f"no Dask scheduler answers at {address} ({error})", "start it, or correct --cluster"
