@@ -3,14 +3,13 @@
 import logging
 import re
 import signal
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from calib.errors import CalibError
 from drivers.errors import StreamBroken, Unreachable
@@ -33,6 +32,7 @@ _DIED: Final = "each worker that was given it died: `ftdrive solve` may show the
 GROUP: Final = 8
 """Calls that a Dask worker gets at once: a message costs 15 ms of computing time, a solve 65 ms."""
 
+Item = TypeVar("Item", bound=Hashable)
 Answer = bytes | BaseException
 """What a call returned or raised."""
 
@@ -141,8 +141,8 @@ def _require_same_versions(found: Any, address: str) -> None:
 
 
 def answers(
-    function: Callable[..., bytes], arguments: Callable[[Path], Iterable[Any]], items: Iterable[Path], workers: Workers
-) -> Iterator[tuple[Path, Answer]]:
+    function: Callable[..., bytes], arguments: Callable[[Item], Iterable[Any]], items: Iterable[Item], workers: Workers
+) -> Iterator[tuple[Item, Answer]]:
     """Call a function for each item, and yield item and answer as they come.
 
     A call whose worker died is repeated: first among the others, because most workers are killed from outside, then
@@ -153,7 +153,7 @@ def answers(
     arguments : callable
         Makes the arguments of an item when it is its turn, so that few are in memory.
     """
-    left: Iterable[Path] = items
+    left: Iterable[Item] = items
     for at_once, group in ((2 * workers.count, workers.group), (2 * workers.count, 1), (1, 1)):
         left = yield from _round(function, arguments, left, workers, at_once, group)
     for item in left:
@@ -162,17 +162,17 @@ def answers(
 
 def _round(
     function: Callable[..., bytes],
-    arguments: Callable[[Path], Iterable[Any]],
-    items: Iterable[Path],
+    arguments: Callable[[Item], Iterable[Any]],
+    items: Iterable[Item],
     workers: Workers,
     at_once: int,
     group: int,
-) -> Generator[tuple[Path, Answer], None, list[Path]]:
+) -> Generator[tuple[Item, Answer], None, list[Item]]:
     """Call each item once, some groups at a time; return those whose worker died."""
-    waiting, running, died = iter(items), dict["Future[list[Answer]]", list[Path]](), list[Path]()
+    waiting, running, died = iter(items), dict["Future[list[Answer]]", list[Item]](), list[Item]()
     while True:
         while len(running) < at_once and (new := list(islice(waiting, group))):
-            calls = dict[Path, Iterable[Any]]()
+            calls = dict[Item, Iterable[Any]]()
             for item in new:
                 try:
                     calls[item] = arguments(item)

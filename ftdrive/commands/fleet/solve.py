@@ -1,22 +1,21 @@
 """`ftdrive fleet solve`: solve many runs again with this version, here or on a Dask cluster."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime, timedelta
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ftdrive import __version__
 from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
+from ftdrive.commands.fleet.engine import ENGINE, open_workers, with_progress
 
 if TYPE_CHECKING:
     from ftdrive.fleet.resolve import Comparison
-
-T = TypeVar("T")
 
 _UNITS = {"d": timedelta(days=1), "h": timedelta(hours=1)}
 
@@ -24,8 +23,7 @@ _UNITS = {"d": timedelta(days=1), "h": timedelta(hours=1)}
 @click.command()
 @click.argument("folders", metavar="[RUNS]...", nargs=-1, type=FOLDER)
 @click.option("--since", metavar="TIME", help="Only runs since then: 90d, 12h or a date (UTC).")
-@click.option("--workers", metavar="N", type=click.IntRange(min=1), help="Processes.  [default: one per core]")
-@click.option("--cluster", metavar="dask://HOST:PORT", help="Solve on this Dask cluster instead.")
+@ENGINE
 @STORE
 @JSON
 def solve(
@@ -47,18 +45,13 @@ def solve(
     """
     from ftdrive.errors import ConfigError, NotAccepted
     from ftdrive.fleet.resolve import solve_again, solved_path
-    from ftdrive.fleet.workers import cluster_workers, local_workers
 
-    for first, second, both in (
-        ("--workers", "--cluster", workers and cluster),
-        ("RUNS", "--store", folders and url),
-    ):
-        if both:
-            raise ConfigError(f"{first} and {second} exclude one another: leave one out")
+    if folders and url:
+        raise ConfigError("RUNS and --store exclude one another: leave one out")
     runs = _runs(folders, url, None if since is None else _time(since))
     report = _Report(runs=len(runs), solved_before=sum(solved_path(run).exists() for run in runs))
-    with local_workers(workers) if cluster is None else cluster_workers(cluster) as pool:
-        for run, found in _with_progress(solve_again(runs, pool), len(runs)):
+    with open_workers(workers, cluster) as pool:
+        for run, found in with_progress("Solving", solve_again(runs, pool), len(runs)):
             report.add(run, found)
     if as_json:
         write_json(report.to_dict())
@@ -103,17 +96,6 @@ def _runs(folders: Sequence[Path], url: str | None, since: datetime | None) -> l
     if not found:
         talk.print("No runs: name their folders, or add them to the store with `ftdrive fleet index RUNS`.")
     return runs
-
-
-def _with_progress(found: Iterator[T], total: int) -> Iterator[T]:
-    """Show a progress bar on stderr."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from ftdrive.terminal.console import talk
-
-    columns = (TextColumn("Solving"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=talk, transient=True, disable=not talk.is_terminal) as progress:
-        yield from progress.track(found, total=total)
 
 
 @dataclass(slots=True)
