@@ -27,6 +27,7 @@ from ftdrive.store.records import Record, StoredCell, StoredResult, StoredVerifi
 from ftdrive.store.store import Store
 from tests.postgres import Server, find_programs
 from tests.unit.ftdrive.live.simulated import calibrated
+from tests.unit.ftdrive.store.run_folders import new_run, result
 
 NOW = datetime.now(UTC)
 SIGMA = np.repeat([0.01, 0.0005], 3)
@@ -132,6 +133,7 @@ def main() -> None:
             ("`ftdrive fleet status --html`", lambda: _run([*command, "--html", _new(folder)], environment)),
             ("`ftdrive --help`, whole process", lambda: _run([sys.executable, "-m", "ftdrive", "--help"], environment)),
             ("`fleet_state`, in the process of a server", lambda: fleet_state(store, NOW)),
+            ("index one new run", lambda: store.index(_new_run(Path(folder)))),
         )
         for title, call in rows:
             best = [min(column) for column in zip(*(_seconds(call) for _ in range(5)), strict=True)]
@@ -144,6 +146,11 @@ def main() -> None:
 
 def _new(folder: str) -> str:
     return f"{folder}/{time.monotonic_ns()}.html"
+
+
+def _new_run(folder: Path) -> Path:
+    day = time.time() % 1e6
+    return new_run(folder / "new", f"{time.monotonic_ns()}", result(day))
 
 
 def _run(command: list[str], environment: dict[str, str]) -> object:
