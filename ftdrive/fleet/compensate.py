@@ -76,7 +76,7 @@ def task_of(calibration: Path | None, frame: WrenchFrame, bias: str) -> bytes:
 
 
 def compensated_file(recording: bytes, name: str, task: bytes) -> bytes:
-    """Return a line of JSON and the file of the result: a pure function of its arguments and the installed versions.
+    """Return the file of the result and a line of JSON: a pure function of its arguments and the installed versions.
 
     The line has what `ftdrive.recording.compensation.compensated` returns, and `cut` of the recording.
 
@@ -91,20 +91,27 @@ def compensated_file(recording: bytes, name: str, task: bytes) -> bytes:
     """
     given: dict[str, Any] = json.loads(task)
     require_version(given["version"])
-    document, estimate_bias = given["calibration"], given["bias"] == "estimate"
-    calibration = None if document is None else CalibrationResult.from_dict(document)
     try:
         with TemporaryDirectory(prefix="ftdrive-compensate-") as folder:
             source, output = Path(folder) / name, Path(folder) / f"result{Path(name).suffix}"
             source.write_bytes(recording)
             try:
-                read = read_with_calibration(source, calibration, given["calibration_name"])
-                result = compensated(read, frame_of(given), output, estimate_bias=estimate_bias)
+                numbers = _compensated(source, output, given)
             except (BadRecording, ConfigError) as error:  # the temporary folder means nothing to a user
                 raise type(error)(str(error).removeprefix(f"{source}: ").replace(str(source), name)) from error
-            return b"\n".join([json.dumps({**result, "cut": read.cut}).encode(), output.read_bytes()])
+            with output.open("ab") as file:
+                file.write(b"\n" + json.dumps(numbers).encode())
+            return output.read_bytes()
     except OSError as error:
         raise OSError(f"{gettempdir()} on the worker: {error}: make room there, or set TMPDIR") from error
+
+
+def _compensated(source: Path, output: Path, given: dict[str, Any]) -> dict[str, Any]:
+    document = given["calibration"]
+    calibration = None if document is None else CalibrationResult.from_dict(document)
+    recording = read_with_calibration(source, calibration, given["calibration_name"])
+    numbers = compensated(recording, frame_of(given), output, estimate_bias=given["bias"] == "estimate")
+    return {**numbers, "cut": recording.cut}
 
 
 def compensate_all(
@@ -136,7 +143,7 @@ def compensate_all(
 
 def _saved(path: Path, answer: bytes) -> dict[str, Any] | str:
     """Write a result; return its numbers, or why it cannot be written."""
-    line, _, content = answer.partition(b"\n")
+    content, _, line = answer.rpartition(b"\n")
     try:
         write_new(path, content)
     except OSError as error:

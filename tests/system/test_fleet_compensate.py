@@ -34,7 +34,7 @@ def results(recordings: list[Path], folder: Path, workers: Workers) -> list[byte
 
 
 def test_processes_and_a_cluster_give_the_same_bytes(recordings: list[Path], tmp_path: Path) -> None:
-    here = [compensated_file(one.read_bytes(), one.name, TASK).partition(b"\n")[2] for one in recordings]
+    here = [compensated_file(one.read_bytes(), one.name, TASK).rpartition(b"\n")[0] for one in recordings]
     with local_workers(2) as workers:
         assert results(recordings, tmp_path / "processes", workers) == here
     with dask_cluster() as cluster:

@@ -47,11 +47,11 @@ def test_the_bytes_are_those_of_the_same_work_without_workers_and_come_again(end
     source = record(tmp_path / f"a{ending}")
     numbers = compensated(read_recording(source), FRAME, tmp_path / f"b{ending}")
     task = task_of(None, FRAME, "keep")
-    line, _, content = compensated_file(source.read_bytes(), source.name, task).partition(b"\n")
+    content, _, line = compensated_file(source.read_bytes(), source.name, task).rpartition(b"\n")
     assert content == (tmp_path / f"b{ending}").read_bytes()
     assert json.loads(line) == {**numbers, "cut": ""}
     again = compensated_file(source.read_bytes(), "renamed" + ending, task)
-    assert again == line + b"\n" + content
+    assert again == content + b"\n" + line
     assert tempfile.gettempdir().encode() not in again
 
 
@@ -61,7 +61,7 @@ def test_calibration_and_bias_are_those_of_the_options(tmp_path: Path) -> None:
     run.mkdir()
     calibration().save(run / "calibration.json")
     task = task_of(run, FRAME, "estimate")
-    found = json.loads(compensated_file(source.read_bytes(), source.name, task).partition(b"\n")[0])
+    found = json.loads(compensated_file(source.read_bytes(), source.name, task).rpartition(b"\n")[2])
     assert found["calibration"] == f"{run}, bias estimated"
     assert (found["axes"], found["about"]) == ("base", "sensor")
     assert max(map(abs, found["bias_change"]["value"])) < 0.05
