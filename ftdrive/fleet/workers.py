@@ -26,9 +26,11 @@ _ONE_THREAD: Final = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPEN
 _LOGS: Final = ("distributed", "distributed.client", "tornado.application")
 _SHORT_LOG: Final = {"distributed.admin.low-level-log-length": 10}
 """Messages that a client keeps for developers of Dask: 1000 by default, with their datasets 130 MB."""
+_LARGE_CALLS: Final = {"distributed.admin.large-graph-warning-threshold": "1TB"}
+"""A recording of 40 s at 1 kHz exceeds the default, and its warning means nothing to a user."""
 _NO_ENGINE: Final = "the workers need {}: pip install 'ftdrive[fleet]'"
 
-_DIED: Final = "each worker that was given it died: the command without `fleet` may show the cause"
+_DIED: Final = "each worker that was given it died: `ftdrive solve` or `ftdrive compensate` may show the cause"
 
 GROUP: Final = 8
 """Calls that a Dask worker gets at once: a message costs 15 ms of computing time, a solve 65 ms."""
@@ -132,7 +134,7 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
         raise Unreachable(
             f"no Dask scheduler answers at {address} ({error})", "start it, or correct --cluster"
         ) from error
-    with client:
+    with config.set(_LARGE_CALLS), client:
         try:
             client.wait_for_workers(1, timeout=timeout_s)
         except TimeoutError as error:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from dask import config
 
 from ftdrive.fleet.compensate import compensate_all, compensated_file, task_of
 from ftdrive.fleet.workers import Workers, cluster_workers, local_workers
@@ -37,7 +38,7 @@ def test_processes_and_a_cluster_give_the_same_bytes(recordings: list[Path], tmp
     here = [compensated_file(one.read_bytes(), one.name, TASK).rpartition(b"\n")[0] for one in recordings]
     with local_workers(2) as workers:
         assert results(recordings, tmp_path / "processes", workers) == here
-    with dask_cluster() as cluster:
+    with dask_cluster() as cluster, config.set({"distributed.admin.large-graph-warning-threshold": "1kB"}):
         cluster.start_worker()
         with cluster_workers(cluster.address, timeout_s=60) as workers:
             assert results(recordings, tmp_path / "cluster", workers) == here
