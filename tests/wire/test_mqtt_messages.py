@@ -18,8 +18,9 @@ import pytest
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.mqtt import Broker, Messages
 from ftdrive.fleet.state import Finding
-from tests.mosquitto import Mosquitto, wait_until
+from tests.mosquitto import Mosquitto
 from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated, reading
+from tests.wire.waiting import wait_until
 
 A, B = "ftdrive/cells/A/state", "ftdrive/cells/B/state"
 
