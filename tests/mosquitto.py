@@ -3,8 +3,7 @@
 import shutil
 import socket
 import subprocess
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
@@ -12,16 +11,7 @@ import pytest
 from paho.mqtt.client import Client, MQTTMessage
 from paho.mqtt.enums import CallbackAPIVersion
 
-_LONG_S = 60
-"""What takes so long hangs; no computer is that busy."""
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    """Look again and again."""
-    deadline_s = time.monotonic() + _LONG_S
-    while not condition():
-        assert time.monotonic() < deadline_s, "it never happens"
-        time.sleep(0.02)
+from tests.wire.waiting import wait_until
 
 
 def free_port() -> int:

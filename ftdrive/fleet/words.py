@@ -46,6 +46,7 @@ def summary(fleet: Fleet, now: datetime) -> str:
         "failed": sum(one.passed is False for one in tools),
         "drifting": sum(_drifts(one) for one in tools),
         "due": sum(one.is_due(now) and one.calibration_id is not None for one in tools),
+        "with a finding": len({cell for one in fleet.findings if one.kind != "overdue" for cell in one.cells}),
     }
     found = ", ".join(f"{number} {what}" for what, number in counts.items() if number)
     return f"{counted(len(cells), 'cell')}: {found or 'none needs attention'}"

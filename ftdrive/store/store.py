@@ -111,11 +111,12 @@ class Store:
             with self._database.writing() as connection:
                 connection.execute(self._database.upsert(tables.cells), rows)
 
-    def remove_cells(self, names: Iterable[str]) -> list[str]:
-        """Remove cells by name; return the names that are unknown."""
+    def remove_cells(self, names: Iterable[str]) -> None:
+        """Remove cells by name; an unknown one is no error."""
         by_name = delete(tables.cells).where(tables.cells.c.name == bindparam("cell"))
         with self._database.writing() as connection:
-            return [name for name in names if not connection.execute(by_name, {"cell": name}).rowcount]
+            for name in names:
+                connection.execute(by_name, {"cell": name})
 
     def _add(self, paths: Iterable[Path], forget: Sequence[str] = ()) -> Indexed:
         records, unreadable = read_records(paths)

@@ -5,7 +5,7 @@
 Prints one row per figure: name, figure, target, pass or FAIL. The exit code is the number of rows that failed. The run
 folders are copies of few distinct tours of 24 poses. Free cores are those that nothing else used during the pass, but
 not more than workers.
-`--dask` repeats it on a scheduler and as many workers of one thread, as processes on this computer.
+`--dask` uses a scheduler and as many workers of one thread instead, as processes on this computer.
 """
 
 import os
@@ -18,6 +18,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -63,29 +64,27 @@ def main() -> int:
         few = runs[: max(100, len(runs) // 10)]
         one = measure(few, lambda: local_workers(1), expected)
         say(f"one worker: {one.wall_s / len(few) * 1e3:.0f} ms a run over {len(few)} runs")
-        engines: dict[str, Callable[[], AbstractContextManager[Workers]]] = {
-            f"{options.workers} processes": lambda: local_workers(options.workers)
-        }
+        words = f"{options.workers} processes"
+        engine: Callable[[], AbstractContextManager[Workers]] = partial(local_workers, options.workers)
         if options.dask:
             cluster = stack.enter_context(dask_cluster())
             for _ in range(options.workers):
                 cluster.start_worker()
-            engines[f"Dask, {options.workers} workers"] = lambda: cluster_workers(cluster.address)
-        for words, engine in engines.items():
-            for killed in (False, True):
-                found = measure(runs, engine, expected, kill=killed)
-                speed_up = serial_s * len(runs) / found.wall_s
-                what = f"{words}, one killed" if killed else words
-                if not killed:
-                    free = min(found.free_cores, options.workers)
-                    share = speed_up / free
-                    failed += row(f"{what}: speed-up {speed_up:.2f} over {free:.2f} free cores", share, SPEED_UP, 1)
-                else:
-                    say(f"{what}: speed-up {speed_up:.2f}")
-                fifth, last = found.memory_MB[len(found.memory_MB) // 5], found.memory_MB[-1]
-                say(f"{what}: memory {fifth:.0f} MB after a fifth, {last:.0f} MB at the end")
-                failed += row(f"{what}: memory, MB of growth", last - fifth, GROWTH_MB, -1)
-                failed += row(f"{what}: runs without result or with other bytes", found.wrong, 0, -1)
+            words, engine = f"Dask, {options.workers} workers", partial(cluster_workers, cluster.address)
+        for killed in (False, True):
+            found = measure(runs, engine, expected, kill=killed)
+            speed_up = serial_s * len(runs) / found.wall_s
+            what = f"{words}, one killed" if killed else words
+            if not killed:
+                free = min(found.free_cores, options.workers)
+                share = speed_up / free
+                failed += row(f"{what}: speed-up {speed_up:.2f} over {free:.2f} free cores", share, SPEED_UP, 1)
+            else:
+                say(f"{what}: speed-up {speed_up:.2f}")
+            fifth, last = found.memory_MB[len(found.memory_MB) // 5], found.memory_MB[-1]
+            say(f"{what}: memory {fifth:.0f} MB after a fifth, {last:.0f} MB at the end")
+            failed += row(f"{what}: memory, MB of growth", last - fifth, GROWTH_MB, -1)
+            failed += row(f"{what}: runs without result or with other bytes", found.wrong, 0, -1)
         failed += row("one worker: runs without result or with other bytes", one.wrong, 0, -1)
     return failed
 

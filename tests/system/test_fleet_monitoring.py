@@ -25,10 +25,11 @@ from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
 from ftdrive.store import tables
 from ftdrive.store.store import Store
-from tests.mosquitto import Mosquitto, free_port, wait_until
+from tests.mosquitto import Mosquitto, free_port
 from tests.system.command_line import CommandLine, end_of, listen_for
 from tests.unit.ftdrive.fleet import fleet_records
 from tests.unit.ftdrive.fleet.fleet_records import SIGMA, cell, check, result, time
+from tests.wire.waiting import wait_until
 
 ALERTS = MONITORING / "alerts.yml"
 CELLS = [f"cell-{n:03d}" for n in range(200)]

@@ -1,4 +1,4 @@
-"""How patiently the tests of emulators wait: for conditions, never for a time."""
+"""How patiently tests wait: for conditions, never for a time."""
 
 import time
 from collections.abc import Callable
@@ -9,7 +9,7 @@ LIMIT_S = 30.0
 """Whatever must happen has happened by then, on a busy machine too."""
 
 
-def wait_until(condition: Callable[[], bool], limit_s: float = LIMIT_S) -> None:
+def wait_until(condition: Callable[[], object], limit_s: float = LIMIT_S) -> None:
     deadline_s = time.monotonic() + limit_s
     while not condition():
         assert time.monotonic() < deadline_s, "the condition never came true"

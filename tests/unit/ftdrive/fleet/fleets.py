@@ -33,7 +33,7 @@ def cell(name: str, tool: str | None = "gripper", **more: Any) -> CellState:
 
 def never_calibrated(name: str) -> CellState:
     """A cell without any result."""
-    return CellState(name, None, *[None] * 13)
+    return CellState(name)
 
 
 def fleet(*cells: CellState, findings: tuple[Finding, ...] = ()) -> Fleet:
