@@ -13,21 +13,25 @@ if TYPE_CHECKING:
     from ftdrive.recording import Recording
 
 _EXISTING = click.Path(exists=True, path_type=Path)
-
-
-@click.command()
-@click.argument("path", metavar="[RECORDING]", required=False, type=_EXISTING)
-@click.option("--calibration", metavar="PATH", type=_EXISTING, help="A calibration.json or its run folder.")
-@click.option("--wrench", metavar="FILE", type=FILE, help="Instead of RECORDING: CSV with t,fx,fy,fz,tx,ty,tz.")
-@click.option("--orientation-file", metavar="FILE", type=FILE, help="With --wrench: CSV with t and the orientation.")
-@click.option("--delay", metavar="S|auto", help="With --wrench: delay of the wrench, s.  [default: auto]")
-@click.option(
+CALIBRATION = click.option(
+    "--calibration", metavar="PATH", type=_EXISTING, help="A calibration.json or its run folder."
+)
+BIAS = click.option(
     "--bias",
     type=click.Choice(["keep", "estimate"]),
     default="keep",
     show_default=True,
     help="Of the calibration, or estimated from the recording: for sensors that are zeroed at start.",
 )
+
+
+@click.command()
+@click.argument("path", metavar="[RECORDING]", required=False, type=_EXISTING)
+@CALIBRATION
+@click.option("--wrench", metavar="FILE", type=FILE, help="Instead of RECORDING: CSV with t,fx,fy,fz,tx,ty,tz.")
+@click.option("--orientation-file", metavar="FILE", type=FILE, help="With --wrench: CSV with t and the orientation.")
+@click.option("--delay", metavar="S|auto", help="With --wrench: delay of the wrench, s.  [default: auto]")
+@BIAS
 @FRAME
 @click.option("-o", "--output", type=NewFile(), help="Save the result as a new .mcap, .csv or .parquet.")
 @JSON
@@ -49,20 +53,14 @@ def compensate(
     two CSV files on one clock, each at its own rate: the wrench in N and N·m, and the orientation of the flange in base
     as r11..r33, qx,qy,qz,qw or rx,ry,rz in rad.
     """
-    from ftdrive.recording.compensation import compensated, with_estimated_bias
+    from ftdrive.recording.compensation import compensated
     from ftdrive.terminal.console import talk
 
     frame = read_frame(axes, about)
     recording, found = _read(path, calibration, wrench, orientation_file, delay, everything=output is not None)
-    change = None
-    if bias == "estimate":
-        recording, change = with_estimated_bias(recording)
     result = {
-        **compensated(recording, frame, output),
+        **compensated(recording, frame, output, estimate_bias=bias == "estimate"),
         "delay_s": found,
-        "bias_change": change,
-        **frame.to_dict(),
-        "calibration": recording.header.info.calibration_name,
         "file": None if output is None else str(output),
     }
     if as_json:
@@ -83,11 +81,9 @@ def _read(
     everything: bool,
 ) -> tuple["Recording", dict[str, float] | None]:
     """Return the recording with the calibration, and the delay of the wrench with one sigma, where it is known."""
-    from ftdrive.checks.devices import belonging
     from ftdrive.errors import ConfigError
     from ftdrive.live.stream import load_calibration
-    from ftdrive.recording import read_recording
-    from ftdrive.recording.compensation import NEEDED
+    from ftdrive.recording.compensation import NEEDED, read_with_calibration
     from ftdrive.recording.csv_pair import read_pair
     from ftdrive.recording.recording import ROW
     from ftdrive.terminal.console import talk
@@ -100,14 +96,10 @@ def _read(
         return read_pair(wrench, orientation, loaded, str(calibration), delay_s)
     if wrench or orientation or delay:
         raise ConfigError("--wrench, --orientation-file and --delay do not go with RECORDING: leave it or them out")
-    recording = read_recording(path, ROW.names or () if everything else NEEDED)
+    columns = ROW.names or () if everything else NEEDED
+    recording = read_with_calibration(path, loaded, str(calibration), columns)
     if recording.cut:
         talk.print(f" {path} is incomplete: {recording.duration_s:.1f} s of it are used.")
-    info = recording.header.info
-    if loaded is not None:
-        if others := belonging(loaded, {"arm": info.arm, "sensor": info.sensor}).others:
-            raise ConfigError(f"{path} is of other devices than the calibration: {others[0]}")
-        recording = recording.with_calibration(loaded, str(calibration))
     delays = [event.values for event in recording.events if event.kind == "delay"]
     return recording, {name: delays[-1][name] for name in ("value", "sigma")} if delays else None
 

@@ -1,5 +1,6 @@
 """A whole recording compensated at once, without a device."""
 
+from collections.abc import Collection
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -8,13 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import CalibrationResult
 from calib.errors import BadDataset
 from calib.model import BIASES, jacobian
 from drivers.interfaces import Array
+from ftdrive.checks.devices import belonging
+from ftdrive.errors import ConfigError
 from ftdrive.live.processing import Processor
 from ftdrive.live.samples import StreamEvent, WrenchFrame
+from ftdrive.recording.files import read_recording
 from ftdrive.recording.recorder import Recorder
-from ftdrive.recording.recording import Recording
+from ftdrive.recording.recording import ROW, Recording
 
 _PIECE_ROWS = 1 << 13
 _NOISE_S = 30.0
@@ -27,7 +32,39 @@ _OUTLIER_SIGMAS = 4.0
 _LEAST_READINGS = 20
 
 
-def compensated(recording: Recording, frame: WrenchFrame, output: Path | None = None) -> dict[str, Any]:
+def read_with_calibration(
+    path: Path, calibration: CalibrationResult | None, name: str, columns: Collection[str] = ROW.names or ()
+) -> Recording:
+    """Read a recording, and replace its calibration unless there is no other.
+
+    Parameters
+    ----------
+    path : Path
+    calibration : CalibrationResult, optional
+    name : str
+        Of that calibration.
+    columns : collection of str
+        As in `read_recording`.
+
+    Raises
+    ------
+    ConfigError
+        The calibration is of other devices, or `read_recording` raises it.
+    BadRecording, OSError
+        As in `read_recording`.
+    """
+    recording = read_recording(path, columns)
+    if calibration is None:
+        return recording
+    info = recording.header.info
+    if others := belonging(calibration, {"arm": info.arm, "sensor": info.sensor}).others:
+        raise ConfigError(f"{path} is of other devices than the calibration: {others[0]}")
+    return recording.with_calibration(calibration, name)
+
+
+def compensated(
+    recording: Recording, frame: WrenchFrame, output: Path | None = None, *, estimate_bias: bool = False
+) -> dict[str, Any]:
     """Compensate a recording with the calibration of its header, bias and gravity subtracted.
 
     Parameters
@@ -37,20 +74,28 @@ def compensated(recording: Recording, frame: WrenchFrame, output: Path | None = 
         Of the result.
     output : Path, optional
         A new recording for the result, and for those events of the old one that still hold.
+    estimate_bias : bool
+        Whether `with_estimated_bias` replaces the bias of the calibration.
 
     Returns
     -------
     dict
         samples, duration_s, gaps; `raw` and `compensated` with root mean square and maximum of force in N and torque in
-        N·m; `contacts` with time since the first sample in s, duration in s, peak in N and direction.
+        N·m; `contacts` with time since the first sample in s, duration in s, peak in N and direction; `bias_change`, if
+        it was estimated; axes, about and calibration, the name.
 
     Raises
     ------
     ConfigError
         The frame needs what is not configured.
+    BadDataset
+        The recording is too short for an estimate.
     OSError
         The result cannot be written.
     """
+    change = None
+    if estimate_bias:
+        recording, change = with_estimated_bias(recording)
     info = recording.header.info
     processor = Processor(info, frame)
     processor.learn_noise(recording.paired(slice(round(_NOISE_S * info.sensor_rate_Hz))))
@@ -91,6 +136,9 @@ def compensated(recording: Recording, frame: WrenchFrame, output: Path | None = 
         "compensated": compensated,
         "contacts": contacts,
         "gaps": recording.gaps,
+        "bias_change": change,
+        **frame.to_dict(),
+        "calibration": info.calibration_name,
     }
 
 

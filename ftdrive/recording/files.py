@@ -43,6 +43,7 @@ _FORMATS = {
     ".csv": Format(CsvFile, read_csv, "csv"),
     ".parquet": Format(ParquetFile, read_parquet, "duckdb"),
 }
+ENDINGS = tuple(_FORMATS)
 
 
 def format_of(path: Path) -> Format:
