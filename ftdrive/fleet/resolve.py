@@ -21,8 +21,7 @@ from calib.files import read_object, write_new
 from calib.model import PARAMETER_NAMES
 from ftdrive import __version__
 from ftdrive.checks.plausibility import judged
-from ftdrive.errors import ConfigError
-from ftdrive.fleet.workers import WorkerDied, Workers, answers
+from ftdrive.fleet.workers import OtherVersion, Workers, answers, in_words, require_version
 from ftdrive.runs.outcome import circumstances_of
 from ftdrive.runs.run import Run
 
@@ -74,16 +73,12 @@ def solved(dataset: bytes, task: bytes) -> bytes:
 
     Raises
     ------
-    ConfigError
+    OtherVersion
         The task was made by another version.
     CalibError
     """
     given: dict[str, Any] = json.loads(task)
-    if given["version"] != __version__:
-        raise ConfigError(
-            f"a worker has ftdrive {__version__}, but this computer has ftdrive {given['version']}: install the same "
-            "version on both"
-        )
+    require_version(given["version"])
     try:
         document = json.loads(dataset)
     except ValueError as error:
@@ -127,7 +122,7 @@ def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Pat
 
     Raises
     ------
-    ConfigError
+    OtherVersion
         A worker has another version.
     """
     rest = list[Path]()
@@ -137,9 +132,9 @@ def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Pat
         else:
             rest.append(folder)
     for folder, answer in answers(solved, task_of, rest, workers):
-        if isinstance(answer, ConfigError):
+        if isinstance(answer, OtherVersion):
             raise answer
-        yield folder, _in_words(answer) if isinstance(answer, BaseException) else _compared(folder, answer)
+        yield folder, in_words(answer) if isinstance(answer, BaseException) else _compared(folder, answer)
 
 
 def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
@@ -150,15 +145,10 @@ def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
         new, path = CalibrationResult.load(solved_path(folder)), Run(folder).calibration_path
         old = CalibrationResult.load(path) if path.is_file() else None
     except (CalibError, OSError) as error:
-        return _in_words(error)
+        return in_words(error)
     reason = "" if new.verdict == "good" else next(iter(new.reasons), "")
     if old is None or old.provenance.get("dataset_sha256") != new.provenance["dataset_sha256"]:
         return Comparison(None, new.verdict, reason, PARAMETER_NAMES[0], 0.0)
     change = difference(old, new).in_sigmas
     most = int(np.argmax(np.abs(change)))
     return Comparison(old.verdict, new.verdict, reason, PARAMETER_NAMES[most], float(change[most]))
-
-
-def _in_words(error: BaseException) -> str:
-    expected = isinstance(error, CalibError | WorkerDied | OSError)
-    return str(error) if expected else f"unexpected {type(error).__name__}: {error}"

@@ -13,7 +13,8 @@ from typing import Any, Final, TypeVar
 
 from calib.errors import CalibError
 from drivers.errors import StreamBroken, Unreachable
-from ftdrive.errors import ConfigError
+from ftdrive import __version__
+from ftdrive.errors import BadRecording, ConfigError
 
 CONNECT_S: Final = 10.0
 """For a scheduler to answer, and for its first worker."""
@@ -25,9 +26,9 @@ _ONE_THREAD: Final = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPEN
 _LOGS: Final = ("distributed", "distributed.client", "tornado.application")
 _SHORT_LOG: Final = {"distributed.admin.low-level-log-length": 10}
 """Messages that a client keeps for developers of Dask: 1000 by default, with their datasets 130 MB."""
-_NO_ENGINE: Final = "solving many runs needs {}: pip install 'ftdrive[fleet]'"
+_NO_ENGINE: Final = "the workers need {}: pip install 'ftdrive[fleet]'"
 
-_DIED: Final = "each worker that was given it died: `ftdrive solve` may show the cause"
+_DIED: Final = "each worker that was given it died: the command without `fleet` may show the cause"
 
 GROUP: Final = 8
 """Calls that a Dask worker gets at once: a message costs 15 ms of computing time, a solve 65 ms."""
@@ -39,6 +40,25 @@ Answer = bytes | BaseException
 
 class WorkerDied(Exception):
     """Each worker that was given this call ended without an answer."""
+
+
+class OtherVersion(ConfigError):
+    """A worker has another version of ftdrive than the computer that calls it."""
+
+
+def require_version(version: str) -> None:
+    """Raise `OtherVersion`, in a worker, unless it has this version of ftdrive."""
+    if version != __version__:
+        raise OtherVersion(
+            f"a worker has ftdrive {__version__}, but this computer has ftdrive {version}: install the same version on "
+            "both"
+        )
+
+
+def in_words(error: BaseException) -> str:
+    """Return why a call failed."""
+    expected = isinstance(error, CalibError | BadRecording | ConfigError | WorkerDied | OSError)
+    return str(error) if expected else f"unexpected {type(error).__name__}: {error}"
 
 
 @dataclass(frozen=True, slots=True)
