@@ -2,6 +2,7 @@
 
 import click
 
+from ftdrive.commands.fleet.accuracy import accuracy
 from ftdrive.commands.fleet.add import add
 from ftdrive.commands.fleet.index import index
 from ftdrive.commands.fleet.remove import remove
@@ -21,5 +22,6 @@ fleet.add_command(remove)
 fleet.add_command(index)
 fleet.add_command(status)
 fleet.add_command(solve)
+fleet.add_command(accuracy)
 fleet.add_command(verify)
 fleet.add_command(serve)
