@@ -1,10 +1,14 @@
-"""Where the commands of a fleet compute: the options that choose it, and the progress bar."""
+"""What the commands of a fleet that compute share: which runs, where, and the progress bar."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+
+from ftdrive.commands.common import open_store
 
 if TYPE_CHECKING:
     from ftdrive.fleet.workers import Workers
@@ -41,3 +45,31 @@ def with_progress(title: str, found: Iterator[T], total: int) -> Iterator[T]:
     columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=talk, transient=True, disable=not talk.is_terminal) as progress:
         yield from progress.track(found, total=total)
+
+
+def runs_to_solve(folders: Sequence[Path], url: str | None, since: datetime | None = None) -> list[Path]:
+    """Return the calibrations in these folders, or of the store; raises `ConfigError` if both are given.
+
+    Those without a dataset are left out, and counted on stderr.
+    """
+    from ftdrive.errors import ConfigError
+    from ftdrive.fleet.resolve import is_calibration, run_folders
+    from ftdrive.runs.run import Run
+    from ftdrive.terminal.console import talk
+
+    if folders and url:
+        raise ConfigError("RUNS and --store exclude one another: leave one out")
+    found = run_folders(folders) if folders else sorted({Path(one.path).parent for one in open_store(url).results()})
+    runs, unfinished = list[Path](), 0
+    for run in found:
+        if is_calibration(run, since):
+            if run.is_dir() and not Run(run).dataset_path.exists():
+                unfinished += 1
+            else:
+                runs.append(run)
+    if unfinished:
+        words = "`ftdrive calibrate --resume RUN` finishes one"
+        talk.print(f"Left out, because they have no dataset: {unfinished} runs; {words}.")
+    if not found:
+        talk.print("No runs: name their folders, or add them to the store with `ftdrive fleet index RUNS`.")
+    return runs

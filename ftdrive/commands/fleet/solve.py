@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ftdrive import __version__
-from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
-from ftdrive.commands.fleet.engine import ENGINE, open_workers, with_progress
+from ftdrive.commands.common import FOLDER, JSON, STORE, write_json
+from ftdrive.commands.fleet.engine import ENGINE, open_workers, runs_to_solve, with_progress
 
 if TYPE_CHECKING:
     from ftdrive.fleet.resolve import Comparison
@@ -43,12 +43,10 @@ def solve(
 
     The exit code is 7 if a run could not be solved.
     """
-    from ftdrive.errors import ConfigError, NotAccepted
+    from ftdrive.errors import NotAccepted
     from ftdrive.fleet.resolve import solve_again, solved_path
 
-    if folders and url:
-        raise ConfigError("RUNS and --store exclude one another: leave one out")
-    runs = _runs(folders, url, None if since is None else _time(since))
+    runs = runs_to_solve(folders, url, None if since is None else _time(since))
     report = _Report(runs=len(runs), solved_before=sum(solved_path(run).exists() for run in runs))
     with open_workers(workers, cluster) as pool:
         for run, found in with_progress("Solving", solve_again(runs, pool), len(runs)):
@@ -74,28 +72,6 @@ def _time(since: str) -> datetime:
             f"--since is '{since}': give an age such as 90d or 12h, or a date such as 2026-08-31"
         ) from None
     return time if time.tzinfo else time.replace(tzinfo=UTC)
-
-
-def _runs(folders: Sequence[Path], url: str | None, since: datetime | None) -> list[Path]:
-    """Return the calibrations to solve."""
-    from ftdrive.fleet.resolve import is_calibration, run_folders
-    from ftdrive.runs.run import Run
-    from ftdrive.terminal.console import talk
-
-    found = run_folders(folders) if folders else sorted({Path(one.path).parent for one in open_store(url).results()})
-    runs, unfinished = list[Path](), 0
-    for run in found:
-        if is_calibration(run, since):
-            if run.is_dir() and not Run(run).dataset_path.exists():
-                unfinished += 1
-            else:
-                runs.append(run)
-    if unfinished:
-        words = "`ftdrive calibrate --resume RUN` finishes one"
-        talk.print(f"Left out, because they have no dataset: {unfinished} runs; {words}.")
-    if not found:
-        talk.print("No runs: name their folders, or add them to the store with `ftdrive fleet index RUNS`.")
-    return runs
 
 
 @dataclass(slots=True)
