@@ -144,6 +144,11 @@ def _arguments(folder: Path) -> tuple[bytes, bytes, bytes]:
             f"{run.calibration_path.name} is not of the poses in {run.dataset_path.name}, which have no calibration: "
             f"`{run.solve_command}` shows why"
         )
+    if not stated_sigma(result).all():
+        raise BadCalibration(
+            f"{run.calibration_path.name} was solved with exactly known values, which a run does not have: "
+            "keep it elsewhere"
+        )
     return dataset, run.calibration_path.read_bytes(), task
 
 

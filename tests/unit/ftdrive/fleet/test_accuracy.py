@@ -101,6 +101,11 @@ def test_a_failure_has_its_reason(tmp_path: Path) -> None:
     document = json.loads(path.read_text())
     path.write_text(json.dumps(document | {"components": {"hysteresis_N": 1.0}}))
     assert "this version does not know" in str(accuracy_of(folder, HERE, draws=20))
+    covariance = np.array(document["covariance"])
+    covariance[:3] = covariance[:, :3] = 0.0
+    path.write_text(json.dumps(document | {"covariance": covariance.tolist()}))
+    assert "exactly known values" in str(accuracy_of(folder, HERE, draws=20))
+    path.write_text(json.dumps(document))
 
     def other_version(*_: object) -> "Future[list[Answer]]":
         return at_once(lambda: [OtherVersion("a worker has ftdrive 0.0.1")])
