@@ -8,7 +8,7 @@ from calib import CalibrationResult
 from calib.assessment.load_shift import Change, lasting_change
 from calib.assessment.verdict import out_of_line
 from calib.model import Array
-from calib.routine import MOVED_RAD, PoseRecord, drift_check, is_return, turned_rad
+from calib.routine import MOVED_RAD, DriftCheck, PoseRecord, drift_check, is_return, turned_rad
 from ftdrive.checks.controller_settings import mismatches
 
 _SIGNIFICANT = 4.0
@@ -57,7 +57,7 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[str
         together = ", ".join(names[row] for row in pulled)
         words.append(f"something pulls in {together}: a cable that is too short there? Give it slack, repeat these")
     if again is not None and np.abs(again.change / again.sigma).max() > _SIGNIFICANT:
-        if result.drift is not None:
+        if _drifts_alike(result, again):
             words.append("the sensor drifts: let it warm up for 15 to 30 min, then calibrate again")
         elif np.abs(again.change / _sigma(result)).max() > np.sqrt(2) * _SIGNIFICANT:
             words.append(
@@ -101,6 +101,14 @@ def _sigma(result: CalibrationResult) -> Array:
 
 def _pulled(result: CalibrationResult, row: int) -> bool:
     return bool(np.abs(result.residuals[row, :3] / _sigma(result)[:3]).max() > _SIGNIFICANT)
+
+
+def _drifts_alike(result: CalibrationResult, again: DriftCheck) -> bool:
+    """Check whether the drift in the fit is at least half of the largest change of the first pose."""
+    if result.drift is None:
+        return False
+    k = np.abs(again.change / again.sigma).argmax()
+    return bool(result.drift.change[k] / again.change[k] > 0.5)
 
 
 def _lasting_change(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Change, int] | None:

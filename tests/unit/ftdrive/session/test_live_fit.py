@@ -374,6 +374,15 @@ def test_a_first_pose_that_is_touched_at_the_end_is_no_drift() -> None:
     assert "touched" in words
 
 
+def test_a_slight_drift_of_the_torque_does_not_explain_a_touch_at_the_end() -> None:
+    touch, drift = np.array([0.5, 0, 0, 0, 0, 0]), np.array([0, 0, 0, 0, 0, 0.003])
+    taken = disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 25) * touch + stop / 25 * drift)
+    result = solve(dataset_from(taken, {}))
+    assert result.drift is not None
+    (words,) = hints(result, taken)
+    assert words.startswith(f"{name(1)} reads otherwise at the end")
+
+
 def test_the_rate_of_a_drift_is_that_of_what_drifts(capsys: pytest.CaptureFixture[str]) -> None:
     taken = disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop - 1) / 24 * np.array([0, 0, 0, 0, 0, 0.096]))
     print_result(solve(dataset_from(taken, {})), drift=drift_check(taken), records=taken)
