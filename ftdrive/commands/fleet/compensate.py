@@ -118,10 +118,12 @@ class _Report:
 
     def words(self) -> Iterator[str]:
         """Give the numbers, then one line for each recording with contacts or gaps, and for each that failed."""
+        from ftdrive.fleet.words import counted
+
         found = self.to_dict()
         yield (
-            f"{self.recordings} recordings: {len(self.compensated)} compensated now, {self.before} before, "
-            f"{len(self.failed)} failed; {self.samples} samples."
+            f"{counted(self.recordings, 'recording')}: {len(self.compensated)} compensated now, {self.before} before, "
+            f"{len(self.failed)} failed; {counted(self.samples, 'sample')}."
         )
         for one in found["compensated"]:
             facts = list[str]()
