@@ -1,18 +1,15 @@
 """`fleet accuracy` as a command; the solver runs in this process."""
 
 import json
-from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from calib import CalibrationResult
-from ftdrive import __version__, cli
-from ftdrive.fleet import workers
-from ftdrive.fleet.workers import Workers
+from ftdrive import __version__
 from ftdrive.store.store import Store
 from tests.calibrated_runs import calibrated_run, white_run
 
@@ -20,24 +17,8 @@ Ran = tuple[int, str, str]
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
-    """Run the command in an empty folder; return its exit code, stdout and stderr."""
-
-    @contextmanager
-    def here(_: int | None) -> Iterator[Workers]:
-        with ThreadPoolExecutor(1) as thread:
-            yield Workers(1, thread.submit, BrokenExecutor)
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    monkeypatch.setattr(workers, "local_workers", here)
-
-    def call(*arguments: str | Path) -> Ran:
-        code = cli.run(["fleet", "accuracy", *map(str, arguments)])
-        out, err = capsys.readouterr()
-        return code, out, " ".join(err.split())
-
-    return call
+def run(fleet_here: Callable[..., Ran]) -> Callable[..., Ran]:
+    return partial(fleet_here, "accuracy")
 
 
 def too_sure(folder: Path) -> Path:

@@ -1,18 +1,14 @@
 """`fleet compensate` as a command; the work is done in this process."""
 
 import json
-from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ftdrive import cli
-from ftdrive.fleet import workers
-from ftdrive.fleet.workers import Workers
 from ftdrive.recording import Recorder
 from ftdrive.recording.files import read_recording
 from tests.unit.ftdrive.recorded import block, calibration, info
@@ -21,23 +17,8 @@ Ran = tuple[int, str, str]
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
-    """Run a command in an empty folder; return its exit code, stdout and stderr."""
-
-    @contextmanager
-    def here(_: int | None) -> Iterator[Workers]:
-        with ThreadPoolExecutor(1) as thread:
-            yield Workers(1, thread.submit, BrokenExecutor)
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(workers, "local_workers", here)
-
-    def call(*arguments: str | Path) -> Ran:
-        code = cli.run(["fleet", "compensate", *map(str, arguments)])
-        out, err = capsys.readouterr()
-        return code, out, " ".join(err.split())
-
-    return call
+def run(fleet_here: Callable[..., Ran]) -> Callable[..., Ran]:
+    return partial(fleet_here, "compensate")
 
 
 def record(path: Path, *, push_N: float = 0.0, lost: int = 0) -> Path:
