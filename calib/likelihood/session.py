@@ -9,7 +9,7 @@ from calib.known import Constraints
 from calib.likelihood.descent import Descent, Minimum, column_scale
 from calib.likelihood.gain_and_cross_talk import response_columns
 from calib.likelihood.outliers import Kept
-from calib.likelihood.session_noise import Noise
+from calib.likelihood.session_noise import Noise, pose_times
 from calib.likelihood.sufficient_statistics import Statistics, coefficients, features
 from calib.likelihood.variance_components import FORCE, RESPONSE, ROTATION, TORQUE, Component, Linearised, component
 from calib.model import Array, Parameters, jacobian, predict
@@ -41,11 +41,9 @@ class Session:
         self.given = R_base_flange, wrench
         self.drift, self.constraints = drift, constraints
         self.measured = wrench_cov is not None
-        self.order = np.arange(self.n)
-        self.time = np.arange(self.n, dtype=np.float64)
-        if t_s is not None and not np.isnan(t_s).any() and np.ptp(t_s) > 0:
-            self.order = np.argsort(t_s, kind="stable")
-            self.time = (t_s[self.order] - t_s.min()) * (self.n - 1) / np.ptp(t_s)
+        time = np.arange(self.n, dtype=np.float64) if t_s is None else pose_times(t_s)
+        self.order = np.argsort(time, kind="stable")
+        self.time = time[self.order]
         ordered = bool((self.order[1:] > self.order[:-1]).all())
         self.R, self.wrench = (x if ordered else x[self.order] for x in self.given)
         cov = white(*self._least()) if wrench_cov is None else np.asarray(wrench_cov, dtype=np.float64)

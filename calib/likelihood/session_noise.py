@@ -199,6 +199,14 @@ def summed_products(X: Array, Y: Array) -> Array:
     return np.asarray(X.reshape(-1, X.shape[-1]).T @ Y.reshape(-1, Y.shape[-1]))
 
 
+def pose_times(t_s: Array) -> Array:
+    """Return times (n,) in mean intervals between poses, from 0; the poses counted if t_s lacks a time."""
+    n = len(t_s)
+    if np.isnan(t_s).any() or np.ptp(t_s) == 0:
+        return np.arange(n, dtype=np.float64)
+    return np.asarray((t_s - t_s.min()) * (n - 1) / np.ptp(t_s))
+
+
 def steps(time: Array) -> Array:
     """Intervals (n,) before each pose; the first is one unit, which the mean bias takes up."""
     return np.maximum(np.diff(time, prepend=time[0] - 1.0), SHORTEST_STEP)

@@ -10,10 +10,11 @@ from calib.data.pooling import pooled_covariance
 from calib.errors import BadCalibration, NotObservable
 from calib.likelihood.gain_and_cross_talk import response_columns
 from calib.likelihood.session import LEVER_M
-from calib.likelihood.session_noise import centred, steps
+from calib.likelihood.session_noise import centred, pose_times, steps
 from calib.likelihood.variance_components import FORCE, TORQUE, Kind, component
 from calib.model import Array, predict
 from ftdrive.fleet.resolve import solver
+from ftdrive.store.records import mass_sigma_kg
 
 DRAW = np.dtype([("outcome", "i1"), ("error", "f8", 16), ("sigma", "f8", 16), ("chi2", "f8")])
 """What became of a draw: estimate minus truth, the sigma that the draw itself states, and its normalised square."""
@@ -48,7 +49,7 @@ def drawn(dataset: CalibrationDataset, result: CalibrationResult, rng: np.random
     R, p = dataset.R_base_flange @ Rotation.from_rotvec(turn_rad).as_matrix(), result.parameters
     wrench = predict(p, R) + response_columns(p, R) @ np.append(gain, cross_talk)
     wrench += (np.linalg.cholesky(cov) @ white)[..., 0]
-    time = _time(dataset.t_s)
+    time = pose_times(dataset.t_s)
     order = np.flatnonzero(used)[np.argsort(time[used], kind="stable")]
     bias = centred(time)[:, None] * slope
     bias[order] += np.cumsum(np.sqrt(steps(time[order]))[:, None] * walk[order], axis=0)
@@ -78,14 +79,6 @@ def _noise(dataset: CalibrationDataset, result: CalibrationResult) -> tuple[Arra
     if not white.all():
         raise BadCalibration("the calibration states no noise, because its readings have none: nothing can be drawn")
     return np.broadcast_to(np.diag(white), (len(dataset), 6, 6)), variance
-
-
-def _time(t_s: Array) -> Array:
-    """Return times (n,) in mean intervals between poses, as `calib.likelihood.session` has them."""
-    n = len(t_s)
-    if np.isnan(t_s).any() or np.ptp(t_s) == 0:
-        return np.arange(n, dtype=np.float64)
-    return np.asarray((t_s - t_s.min()) * (n - 1) / np.ptp(t_s))
 
 
 def solved_draws(dataset: bytes, calibration: bytes, task: bytes, seed: int, first: int, count: int) -> bytes:
@@ -121,7 +114,5 @@ def solved_draws(dataset: bytes, calibration: bytes, task: bytes, seed: int, fir
 
 def stated_sigma(result: CalibrationResult) -> Array:
     """Return the stated sigmas (16,); that of the mass without a gain common to all axes, which is not drawn."""
-    F, C = result.gravity_force_base_N, result.covariance
-    along = F / np.linalg.norm(F)
-    mass = along @ C[3:6, 3:6] @ along / result.g_m_s2**2
-    return np.sqrt(np.append(np.diag(C), mass))
+    mass_kg = mass_sigma_kg(result.parameters, result.covariance, result.g_m_s2)
+    return np.asarray(np.sqrt(np.append(np.diag(result.covariance), mass_kg**2)))
